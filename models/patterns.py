@@ -1,0 +1,106 @@
+"""Drive patterns: which electrodes carry the current and between which the voltage is read.
+
+A pattern is an int array (K, 4), 0-based: drive+, drive-, sense+, sense-. Unit current enters at drive+ and leaves at drive-;
+the impedance is the voltage of sense+ over sense-. Needs only numpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+NAMES = ("pairs", "adjacent", "opposite")
+
+
+class PatternError(ValueError):
+    """A pattern that cannot be measured or cannot be inverted; the message says which entry or which rank."""
+
+
+def pairs(n: int = 16) -> NDArray[np.int64]:
+    """Each of the n(n-1)/2 electrode pairs drives and senses itself: (0,1), (0,2) ... (n-2,n-1)."""
+    return np.array([(i, j, i, j) for i, j in combinations(range(n), 2)], dtype=np.int64)
+
+
+def adjacent(n: int = 16) -> NDArray[np.int64]:
+    """Neighbours drive (k+1, k), neighbours that carry no current sense (m, m+1): n(n-3) measurements."""
+    rows = []
+    for k in range(n):
+        plus = (k + 1) % n
+        rows += [(plus, k, m, (m + 1) % n) for m in range(n) if not {m, (m + 1) % n} & {k, plus}]
+    return np.array(rows, dtype=np.int64)
+
+
+def opposite(n: int = 16) -> NDArray[np.int64]:
+    """Opposite electrodes drive (k, k+n/2), neighbours that carry no current sense (m+1, m): n(n-4) measurements."""
+    if n % 2:
+        raise PatternError(f"pattern 'opposite' needs an even number of electrodes, found {n}")
+    rows = []
+    for k in range(n):
+        minus = (k + n // 2) % n
+        rows += [(k, minus, (m + 1) % n, m) for m in range(n) if not {m, (m + 1) % n} & {k, minus}]
+    return np.array(rows, dtype=np.int64)
+
+
+def pattern(spec: str | ArrayLike, n: int = 16) -> NDArray[np.int64]:
+    """The (K, 4) array of a name in NAMES or of a custom list of [drive+, drive-, sense+, sense-]; checked.
+
+    Raises PatternError for an unknown name, an electrode that does not exist, or a pattern that measures too little.
+    """
+    if isinstance(spec, str):
+        try:
+            return {"pairs": pairs, "adjacent": adjacent, "opposite": opposite}[spec](n)
+        except KeyError:
+            raise PatternError(f"unknown pattern {spec!r}: expected one of {', '.join(NAMES)} or a list") from None
+    return check(spec, n)
+
+
+def check(spec: ArrayLike, n: int = 16, minimum_rank: int | None = None) -> NDArray[np.int64]:
+    """Validate a custom pattern and return it as (K, 4) int64.
+
+    minimum_rank: fewest independent measurements accepted; the default is half of what `adjacent` gives, n(n-3)/4, below which
+    an image of the skin is not determined in any useful sense.
+    """
+    raw = np.asarray(spec)
+    if raw.ndim != 2 or raw.shape[1] != 4 or not np.issubdtype(raw.dtype, np.integer):
+        raise PatternError(f"a pattern is rows of four integers, found an array of shape {raw.shape}, type {raw.dtype}")
+    rows = raw.astype(np.int64)
+    for k, row in enumerate(rows):
+        bad = [int(e) for e in row if not 0 <= e < n]
+        if bad:
+            raise PatternError(
+                f"measurement {k} {row.tolist()} names electrode {bad[0]}: there are {n}, numbered 0 to {n - 1}"
+            )
+        if row[0] == row[1] or row[2] == row[3]:
+            side = "drives" if row[0] == row[1] else "senses"
+            raise PatternError(f"measurement {k} {row.tolist()} {side} an electrode against itself")
+    unseen = sorted(set(range(n)) - set(rows.ravel().tolist()))
+    if unseen:
+        raise PatternError(f"the pattern never uses electrode {', '.join(map(str, unseen))} of {n}")
+    needed = int(np.ceil(n * (n - 3) / 4)) if minimum_rank is None else minimum_rank
+    found = rank(rows, n)
+    if found < needed:
+        raise PatternError(
+            f"the pattern's {len(rows)} measurements have rank {found}, at least {needed} is needed "
+            f"({n} electrodes allow {n * (n - 1) // 2}): add measurements that are not sums of others"
+        )
+    return rows
+
+
+def rank(rows: NDArray[np.int64], n: int = 16) -> int:
+    """How many measurements are independent, reciprocity counted (at most n(n-1)/2)."""
+    drive, sense = incidence(rows[:, :2], n), incidence(rows[:, 2:], n)
+    outer = np.einsum("ki,kj->kij", drive, sense)
+    upper = np.triu_indices(n)
+    return int(np.linalg.matrix_rank((outer + outer.transpose(0, 2, 1))[:, upper[0], upper[1]]))
+
+
+def incidence(pair: NDArray[np.int64] | Sequence[Sequence[int]], n: int = 16) -> NDArray[np.float64]:
+    """(K, n): +1 at the first, -1 at the second electrode of each of the K pairs."""
+    pair = np.asarray(pair)
+    matrix = np.zeros((len(pair), n))
+    matrix[np.arange(len(pair)), pair[:, 0]] += 1
+    matrix[np.arange(len(pair)), pair[:, 1]] -= 1
+    return matrix
