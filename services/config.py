@@ -1,0 +1,197 @@
+"""skin.toml: which skins there are, where their boards are, who may listen. Validated before anything starts.
+
+An error names the file, the key, what was found and what is allowed; see `ConfigError`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+ROOT = Path(__file__).resolve().parents[1]
+SKIN_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
+
+Metres = Annotated[float, Field(gt=0, le=10)]
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class ConfigError(Exception):
+    """The configuration cannot be used. The text is for the person who must mend the file."""
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Pose(Section):
+    """Where the skin's frame (origin at its centre, x right, y up, z out) sits in its parent frame."""
+
+    parent: str = "base"
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+    @field_validator("quaternion_xyzw")
+    @classmethod
+    def unit_length(cls, q: Quaternion) -> Quaternion:
+        if abs(sum(v * v for v in q) - 1) > 1e-3:
+            raise ValueError("a quaternion of length 1")
+        return q
+
+
+class Indenter(Section):
+    """Known-indenter prior: everything that touches is a disc of this radius."""
+
+    radius_m: Metres
+
+
+class Tare(Section):
+    """How the untouched baseline is taken and kept."""
+
+    frames: Annotated[int, Field(ge=8, le=4096)] = 64
+    max_age_s: Annotated[float, Field(gt=0)] = 12 * 3600.0  # an older persisted baseline is not loaded
+    tracking_s: Annotated[float, Field(gt=0)] = 60.0  # time constant with which drift is followed while untouched
+
+
+class Touch(Section):
+    """The touch decision: see services/touch.py."""
+
+    false_alarms: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
+    hold: bool = True  # switch of the rule "nothing changed: do not reconstruct again"
+    skip_untouched: bool = True  # switch of the rule "nothing touches: do not reconstruct"
+
+
+class Skin(Section):
+    """One skin: one board on one port, one bundle."""
+
+    port: str
+    bundle: str
+    frame_id: str = ""  # default: the skin's name
+    pose: Pose = Pose()
+    calibration: Path | None = None
+    indenter: Indenter | None = None
+    network: Literal["full", "fast", "int8", "none"] = "full"
+    dft_points: Literal[128, 256, 512] = 128
+    tare: Tare = Tare()
+    touch: Touch = Touch()
+
+    @field_validator("port")
+    @classmethod
+    def some_port(cls, port: str) -> str:
+        if port == "stub" or port.startswith("/") or "://" in port or Path(port).suffix in RECORDINGS:
+            return port
+        raise ValueError('"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000) or a recording (*.mcap)')
+
+
+RECORDINGS = (".mcap", ".npz")
+
+
+class Sockets(Section):
+    """Data sockets are ipc files in the runtime folder unless told otherwise."""
+
+    transport: Literal["ipc", "tcp"] = "ipc"
+    bind: str = "127.0.0.1"
+    first_port: Annotated[int, Field(ge=1024, le=65000)] = 47600
+
+
+class Security(Section):
+    """TCP only: CURVE keys. Unencrypted beyond loopback is refused unless `insecure` says so."""
+
+    keys: Path | None = None
+    allowed_clients: Path | None = None
+    insecure: bool = False
+
+
+class Logging(Section):
+    level: Literal["debug", "info", "warning", "error"] = "info"
+
+
+class Config(Section):
+    """The whole file. `path` is where it was read from; relative paths in it are relative to its folder."""
+
+    skins: Annotated[dict[str, Skin], Field(min_length=1)]
+    sockets: Sockets = Sockets()
+    security: Security = Security()
+    logging: Logging = Logging()
+    path: Annotated[Path, Field(exclude=True)] = Path("skin.toml")
+
+    @field_validator("skins")
+    @classmethod
+    def names(cls, skins: dict[str, Skin]) -> dict[str, Skin]:
+        for name in skins:
+            if not SKIN_NAME.fullmatch(name):
+                raise ValueError(f"skin names of lower-case letters, digits, - and _ (found {name!r})")
+        return {name: s if s.frame_id else s.model_copy(update={"frame_id": name}) for name, s in skins.items()}
+
+    @model_validator(mode="after")
+    def encrypted(self) -> Config:
+        loopback = self.sockets.bind in ("127.0.0.1", "::1", "localhost")
+        if self.sockets.transport == "tcp" and not loopback and not self.security.insecure and self.security.keys is None:
+            raise ValueError("sockets.bind beyond loopback needs security.keys (`skin keys new`) or security.insecure = true")
+        return self
+
+    def skin(self, name: str) -> Skin:
+        """The skin called `name`; ConfigError names those there are."""
+        if name not in self.skins:
+            raise ConfigError(f"{self.path}: no skin called {name!r}; configured: {', '.join(self.skins)}")
+        return self.skins[name]
+
+
+def config_path(path: str | Path | None = None) -> Path:
+    """The file in force: the argument, else $EITSKIN_CONFIG, else skin.toml of the checkout."""
+    return Path(path or os.environ.get("EITSKIN_CONFIG") or ROOT / "skin.toml")
+
+
+def load(path: str | Path | None = None) -> Config:
+    """Read and check the configuration. Raises ConfigError, one line for each thing that is wrong."""
+    file = config_path(path)
+    try:
+        raw = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as why:
+        raise ConfigError(f"{file}: cannot be read: {why.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as why:
+        raise ConfigError(f"{file}: is not TOML: {why}") from None
+    return parse(raw, file)
+
+
+def parse(raw: dict[str, Any], file: Path = Path("skin.toml")) -> Config:
+    """Check a configuration that is already a dict; `file` is named in errors."""
+    try:
+        return Config.model_validate(raw | {"path": file})
+    except ValidationError as wrong:
+        raise ConfigError("\n".join(_explain(file, e) for e in wrong.errors())) from None
+
+
+def _explain(file: Path, error: Any) -> str:
+    key = ".".join(str(part) for part in error["loc"]) or "(top level)"
+    if error["type"] == "missing":
+        return f"{file}: {key}: is missing; add it"
+    if error["type"] == "extra_forbidden":
+        return f"{file}: {key}: unknown key; allowed here: {', '.join(_allowed(error['loc'][:-1]))}"
+    found = repr(error["input"])
+    found = found if len(found) < 80 else found[:77] + "..."
+    allowed = error["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    return f"{file}: {key}: found {found}; allowed: {allowed}"
+
+
+def _allowed(location: tuple[int | str, ...]) -> list[str]:
+    """Keys that the section at `location` knows."""
+    model: Any = Config
+    for part in location:
+        if model is Config and part == "skins":
+            continue
+        if location[0] == "skins" and part == location[1] and model is Config:
+            model = Skin
+            continue
+        model = _section(model.model_fields[str(part)].annotation)
+    return [name for name, field in model.model_fields.items() if not field.exclude]
+
+
+def _section(annotation: Any) -> type[BaseModel]:
+    options = getattr(annotation, "__args__", (annotation,))
+    return next(o for o in options if isinstance(o, type) and issubclass(o, BaseModel))
