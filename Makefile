@@ -1,0 +1,53 @@
+# The two commands of README: `make up` and `make test`. Everything else here is a step of one of them.
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+SKIN ?= square16
+# The CPU build of PyTorch by its full version: plain "torch" would bring several GB of CUDA.
+TORCH := torch==2.13.0+cpu
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: up venv venv-dev test lint train lock wire clean
+
+up: venv
+	./skin up
+
+venv: $(VENV)/.service
+venv-dev: $(VENV)/.dev
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "found Python %s; eitskin needs 3.11 or newer: make PYTHON=python3.11 ..." % sys.version.split()[0])'
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.service: requirements/service.lock | $(BIN)/python
+	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
+	@touch $@
+
+$(VENV)/.dev: requirements/dev.lock requirements/service.lock | $(BIN)/python
+	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
+	$(BIN)/python -m pip install -q --disable-pip-version-check "$(TORCH)" || { echo \
+	  "no wheel of $(TORCH) found: install PyTorch's CPU build 2.13.0 into $(VENV) as pytorch.org describes, then run make again"; exit 1; }
+	@touch $@ $(VENV)/.service
+
+test: venv-dev lint
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+lint: venv-dev
+	$(BIN)/ruff check .
+	$(BIN)/mypy protocol services
+
+# geometry -> forward model -> data -> network -> bundle in models/bundles/$(SKIN)
+train: venv-dev
+	$(BIN)/python -m models.build --skin $(SKIN) $(if $(QUICK),--quick) $(if $(MINUTES),--minutes $(MINUTES))
+
+# Needs uv (one lock for every Python from 3.11 on, hashes of every file).
+LOCK := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
+lock:
+	$(LOCK) --extra service --extra stub -o requirements/service.lock pyproject.toml
+	$(LOCK) -c requirements/service.lock --extra service --extra stub --extra offline --extra dev \
+	  -o requirements/dev.lock pyproject.toml requirements/torch-needs.in
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache
