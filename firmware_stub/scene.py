@@ -1,0 +1,125 @@
+"""Scenes as TOML files: read, checked, turned into scripts. `scenes/README.md` documents the keys."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from .timeline import Cue, Curve, Script, Track
+from .world import NEWTON, Touch
+
+FOLDER = Path(__file__).with_name("scenes")
+POSE = {f.name for f in fields(Touch)} - {"kind", "drop"}
+
+
+class SceneError(ValueError):
+    """A scene that cannot be played: says which file, which key, what was found and what is allowed."""
+
+
+def names() -> list[str]:
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def load(name: str | Path) -> Script:
+    """A shipped scene by name, or any TOML file by its path. Raises SceneError."""
+    path = Path(name) if str(name).endswith(".toml") else FOLDER / f"{name}.toml"
+    try:
+        data = tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        raise SceneError(f"no scene {str(name)!r}: expected one of {', '.join(names())}, or a .toml file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{path}: {error}") from None
+    try:
+        return parse(data, path.stem)
+    except (KeyError, TypeError, ValueError) as error:
+        what = f"the key {error} is missing" if isinstance(error, KeyError) else error
+        raise SceneError(f"{path}: {what}") from None
+
+
+def parse(data: Mapping[str, Any], name: str = "scene") -> Script:
+    known = {"about", "duration", "loop", "touch", "grid", "drift", "fault"}
+    if unknown := set(data) - known:
+        raise ValueError(f"unknown key {', '.join(sorted(unknown))}: allowed are {', '.join(sorted(known))}")
+    tracks = [_track(touch) for touch in data.get("touch", [])]
+    tracks += [track for grid in data.get("grid", []) for track in _grid(**grid)]
+    drift = data.get("drift", {})
+    loop = bool(data.get("loop", False))
+    ends = [track.times[-1] for track in tracks]
+    duration = float(data.get("duration", max(ends, default=0.0)))
+    if loop and not duration > 0:
+        raise ValueError("a loop needs a duration in seconds above 0")
+    if loop and max(ends, default=0.0) > duration:
+        raise ValueError(f"a touch ends at {max(ends)} s, after the loop's duration of {duration} s")
+    return Script(
+        name=name,
+        about=str(data.get("about", "")),
+        tracks=tuple(tracks),
+        background=_curve(drift["background"]) if "background" in drift else None,
+        contact=tuple((c.get("electrode"), _curve(c["keys"])) for c in drift.get("contact", [])),
+        cues=tuple(Cue(f["t"], f["name"], dict(f.get("args", {})), f.get("seconds", 5.0)) for f in data.get("fault", [])),
+        duration=duration,
+        loop=loop,
+    )
+
+
+def touch(values: Mapping[str, Any]) -> Touch:
+    """A touch from keys as in a scene or a `press`: metres and newtons, or `drop` in S/m instead of `force`.
+
+    Raises ValueError for what no skin could feel.
+    """
+    if "drop" in values and values["drop"] is not None:
+        drop = float(values["drop"])
+    else:
+        drop = NEWTON * float(values["force"])
+    kind = str(values.get("shape", "circle"))
+    kinds = ("circle", "triangle", "rectangle", "square", "L", "hertz")
+    if kind not in kinds:
+        raise ValueError(f"shape {kind!r}: expected one of {', '.join(kinds)}")
+    if not 0 <= drop < 1:
+        raise ValueError(f"a conductivity drop of {drop:g} S/m ({drop / NEWTON:g} N): expected 0 to below 1 S/m (10 N)")
+    pose = {key: float(values[key]) for key in POSE & set(values)}
+    pose.setdefault("radius", 0.01)
+    if not 0 < pose["radius"] <= 0.1:
+        raise ValueError(f"radius {pose['radius']:g} m: expected above 0, up to 0.1 m")
+    if not all(abs(pose[key]) <= 1 for key in ("x", "y")):
+        raise ValueError(f"position ({pose['x']:g}, {pose['y']:g}) m: not on any skin; positions are metres")
+    return Touch(kind=kind, drop=drop, **pose)
+
+
+def _track(values: Mapping[str, Any]) -> Track:
+    """Keys inherit what the touch, or the key before them, says."""
+    state = {key: value for key, value in values.items() if key != "keys"}
+    times, poses = [], []
+    for key in values["keys"]:
+        state.update(key)
+        times.append(float(state["t"]))
+        poses.append(touch(state))
+    if len(times) < 2 or times[0] < 0 or sorted(times) != times or times[0] == times[-1]:
+        raise ValueError(f"a touch's keys at {times}: expected at least two times, from 0 on, not decreasing")
+    return Track(tuple(times), tuple(poses))
+
+
+def _curve(keys: list[Mapping[str, float]]) -> Curve:
+    times = tuple(float(key["t"]) for key in keys)
+    if not keys or list(times) != sorted(times):
+        raise ValueError(f"drift keys at {times}: expected times that do not decrease")
+    return Curve(times, tuple(float(key["value"]) for key in keys))
+
+
+def _grid(
+    *, count: int, spacing: float, forces: list[float], seconds: float, pause: float, ramp: float = 0.1, **pose: Any
+) -> Iterator[Track]:
+    """An indenter on count x count positions, from the top left row by row, every force at each before the next."""
+    t = pause
+    half = (count - 1) / 2
+    for k in range(count * count):
+        x, y = (k % count - half) * spacing, (half - k // count) * spacing
+        for force in forces:
+            common = {**pose, "x": x, "y": y}
+            level = [(0.0, 0.0), (ramp, force), (seconds - ramp, force), (seconds, 0.0)]
+            keys = [{"t": round(t + dt, 6), "force": f} for dt, f in level]
+            yield _track({**common, "keys": keys})
+            t += seconds + pause
