@@ -1,0 +1,135 @@
+"""Graded triangle meshes of a skin: fine at the electrodes' ends, where the current density is nearly singular.
+
+Four uses, four meshes that differ in spacing and in structure (the points are relaxed from different starts), so that a network
+is never tested on the mesh it was trained on. A mesh is a function of the skin and the use only: the same call gives the same mesh.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay
+from skfem import MeshTri
+
+from models.geometry import Skin
+
+
+@dataclass(frozen=True)
+class Grading:
+    """Spacing h(p) = min(interior, edge + growth * distance of p to the nearest electrode's end), model units."""
+
+    edge: float
+    growth: float
+    interior: float
+    offset: float  # where the quadtree that seeds the interior points begins: another value, another mesh
+    relaxation: int = 12
+
+
+USES = {
+    "training": Grading(edge=4e-4, growth=0.4, interior=0.031, offset=0.0),
+    "stub": Grading(edge=8e-4, growth=0.45, interior=0.037, offset=0.37),
+    "inverse": Grading(edge=2e-3, growth=0.5, interior=0.045, offset=0.61),
+    "reference": Grading(edge=5e-5, growth=0.14, interior=0.0105, offset=0.23, relaxation=6),
+}
+
+
+def build(skin: Skin, use: str | Grading = "training") -> MeshTri:
+    """The skin's mesh for a use in USES or a grading of one's own. Every electrode end and corner is a node.
+
+    Raises ValueError for an unknown use, RuntimeError where the outline could not be meshed (features finer than the spacing).
+    """
+    if isinstance(use, str):
+        if use not in USES:
+            raise ValueError(f"unknown mesh {use!r}: expected one of {', '.join(USES)}")
+        use = USES[use]
+    arcs = _boundary_arcs(skin, use)
+    rim = skin.point(arcs)
+    points = np.vstack([rim, _seeds(skin, use)])
+    for _ in range(use.relaxation):
+        points = _relax(skin, use, points, _triangles(skin, points, len(rim)), len(rim))
+    cells = _triangles(skin, points, len(rim))
+    used = np.unique(cells)
+    mesh = MeshTri(points[used].T.copy(), np.searchsorted(used, cells).T.copy())
+    if len(mesh.boundary_facets()) != len(rim):
+        raise RuntimeError(
+            f"skin '{skin.name}': {len(mesh.boundary_facets())} boundary edges in the mesh, {len(rim)} on the outline; use a finer interior spacing"
+        )
+    return mesh
+
+
+def spacing(skin: Skin, use: Grading, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N,) wanted spacing at points (N, 2)."""
+    ends = skin.point(skin.edges.ravel())
+    nearest = np.full(len(points), np.inf)
+    for end in ends:
+        np.minimum(nearest, np.hypot(points[:, 0] - end[0], points[:, 1] - end[1]), out=nearest)
+    return np.minimum(use.interior, use.edge + use.growth * nearest)
+
+
+def _boundary_arcs(skin: Skin, use: Grading) -> NDArray[np.float64]:
+    """Arc lengths of the boundary nodes: every fixed point, and between two of them equal steps of the integral of 1/h."""
+    fixed = np.unique(np.round(np.mod(np.concatenate([skin.corners, skin.edges.ravel()]), skin.perimeter), 12))
+    arcs = []
+    for a, b in zip(fixed, np.append(fixed[1:], fixed[0] + skin.perimeter), strict=True):
+        if b - a < 1e-9:
+            continue
+        # cosine spacing resolves the grading at both ends of the piece
+        s = a + (b - a) * (1 - np.cos(np.linspace(0, np.pi, 4001))) / 2
+        density = 1 / spacing(skin, use, skin.point(s))
+        steps = np.concatenate([[0.0], np.cumsum(np.diff(s) * (density[1:] + density[:-1]) / 2)])
+        n = max(1, int(np.ceil(steps[-1])))
+        arcs.append(np.interp(np.linspace(0, steps[-1], n + 1)[:-1], steps, s))
+    return np.mod(np.concatenate(arcs), skin.perimeter)
+
+
+def _seeds(skin: Skin, use: Grading) -> NDArray[np.float64]:
+    """Interior points: centres of the leaves of a quadtree refined to the wanted spacing, none too close to the outline."""
+    size = 0.25 * (1 + use.offset / 4)
+    n = int(np.ceil(2.2 / size))
+    grid = (np.arange(n) - (n - 1) / 2) * size
+    cells = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    leaves = []
+    while len(cells):
+        wanted = spacing(skin, use, cells)
+        # sqrt(sqrt(3)/2): a square cell of this side holds as much area as one point of a triangular lattice of spacing h
+        split = size > 1.3 * wanted
+        keep = cells[~split]
+        keep = keep[skin.inside(keep)]
+        leaves.append(keep[skin.distance(keep) > 0.55 * spacing(skin, use, keep)])
+        size /= 2
+        cells = (cells[split][:, None] + size / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])).reshape(-1, 2)
+        cells = cells[skin.inside(cells) | (skin.distance(cells) < size * 2)]
+    return np.vstack(leaves)
+
+
+def _triangles(skin: Skin, points: NDArray[np.float64], n_rim: int) -> NDArray[np.int64]:
+    """Delaunay triangles inside the outline, counter-clockwise, without the slivers along straight sides."""
+    cells = Delaunay(points).simplices.astype(np.int64)
+    a, b, c = (points[cells[:, k]] for k in range(3))
+    twice = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    longest = np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    cells[twice < 0] = cells[twice < 0][:, [0, 2, 1]]
+    keep = np.abs(twice) > 1e-6 * longest
+    if skin.outline is not None:
+        keep &= skin.inside((a + b + c) / 3)
+    return cells[keep]
+
+
+def _relax(
+    skin: Skin, use: Grading, points: NDArray[np.float64], cells: NDArray[np.int64], n_rim: int
+) -> NDArray[np.float64]:
+    """One step of smoothing: interior points move to the mean of their triangles' centroids, weighted by area over h^2."""
+    corners = points[cells]
+    centroid = corners.mean(axis=1)
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    weight = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / spacing(skin, use, centroid) ** 2
+    total = np.bincount(cells.ravel(), np.repeat(weight, 3), len(points))
+    target = np.stack(
+        [np.bincount(cells.ravel(), np.repeat(weight * centroid[:, k], 3), len(points)) for k in range(2)], axis=1
+    )
+    moved = points.copy()
+    inner = np.arange(n_rim, len(points))[total[n_rim:] > 0]
+    moved[inner] = target[inner] / total[inner, None]
+    return moved
