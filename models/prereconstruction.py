@@ -1,0 +1,237 @@
+"""Pre-reconstruction: from a normalised difference to the stack of images the network reads (numpy only).
+
+Everything is in dual form. With J the sensitivity of the K measurements to the conductivity *drop* and R the NOSER prior of the
+untouched skin, a bundle ships B = R^-1 J^T at the network's resolution and the Gram matrix A = J R^-1 J^T; then for any noise
+covariance C and any lambda
+
+    x = B (A + lambda^2 C)^-1 d
+
+is one K x K problem. That is equation 1 of the paper, (J^T W J + lambda^2 R)^-1 J^T W d with W = C^-1, by the push-through identity.
+A measurement of weight zero (dead electrode) is a row and column less. `PreReconstructor.condition` does the one eigen-decomposition
+that a new noise level, drift allowance or dead electrode needs; `Operator.stack` is then a single matrix-vector product a frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from statistics import NormalDist
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.floating]
+
+ONE_STEP_LAMBDA = 0.15  # the paper's, section II; relative to the mean eigenvalue of the whitened Gram matrix
+THRESHOLD_T = 0.35  # t of equation 5; the paper chose it by trial and does not state it, and so did we
+TARE_FRAMES = 64
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Standard deviations of what changes on a skin that nobody touches: relative, since the tare."""
+
+    scale: float = 0.0  # global conductivity and gain
+    contact: float = 0.0  # each electrode's contact impedance, of its nominal value
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """What a bundle ships of the linearised physics. K measurements, E electrodes, P = h * w pixels, C lambdas."""
+
+    pattern: npt.NDArray[np.integer]  # (K, 4) drive+, drive-, sense+, sense-
+    z0: Array  # (K,) ohm, |Z| of the untouched skin as the forward model has it
+    gram: Array  # (K, K) float64, J R^-1 J^T
+    back: Array  # (P, K) B = R^-1 J^T averaged over each pixel; rows in [iy, ix] order
+    jacobian: Array  # (K, P) d per S/m of drop in a pixel
+    contact: Array  # (K, E) d per relative change of an electrode's contact impedance
+    inside: npt.NDArray[np.bool_]  # (h, w) pixels on the skin
+    ladder: Array  # (C,) lambda^2 relative to the mean eigenvalue of the whitened Gram matrix, decreasing
+    level: Array  # (C,) typical magnitude of each image of the ladder, of the frame's `scale`
+    scale_index: int  # the image of the ladder whose peak is the frame's `scale`
+    normalisation: str  # "model": (|Z| - |Z0|) / (g z0) with g the fitted gain; "measured": |Z| / |Z0| - 1
+    model_error: float = 1e-4  # what the forward model is wrong by, of |Z|
+
+
+@dataclass
+class Operator:
+    """The reconstruction of one noise level, drift allowance and set of live measurements. Made by `condition`."""
+
+    shape: tuple[int, int]
+    inside: npt.NDArray[np.bool_]
+    matrix: Array  # (C * h * w, K) float32
+    variance: Array  # (C * h * w,) float32: variance of those images from noise alone
+    level: Array  # (C,)
+    scale_index: int
+    noise: float  # rms standard deviation of d from noise and model error, live measurements
+    drift: float  # rms standard deviation of d from drift
+    live: float  # fraction of the measurements that count
+    whiten: Array  # (K', K) noise of unit covariance, in the eigenvectors of the whitened Gram matrix
+    detection: Array  # (K',) weight of each squared coefficient in the detection statistic
+    step: Array  # (h * w, K) the one-step image's matrix
+    jacobian: Array  # (K, P)
+    _axis: dict[int, Array] = field(default_factory=dict)
+
+    def stack(self, d: Array) -> tuple[Array, Array, float]:
+        """(K,) difference -> stack (C, h, w), context (4,), scale [S/m]. Multiply the network's drop by scale."""
+        stack, context, scale = self.stacks(np.asarray(d)[None])
+        return stack[0], context[0], float(scale[0])
+
+    def stacks(self, d: Array) -> tuple[Array, Array, Array]:
+        """The same for a batch (N, K) -> (N, C, h, w), (N, 4), (N,); every image is divided by the frame's scale."""
+        n, c, (h, w) = len(d), len(self.level), self.shape
+        d = np.asarray(d, dtype=np.float32)
+        images = (self.matrix @ d[0] if n == 1 else d @ self.matrix.T).reshape(n, c, h * w)
+        spread = self.variance.reshape(c, h * w)
+        # The scale is a peak, so it cannot be below what noise alone makes of the strongest pixel.
+        floor = 2.0 * float(np.sqrt(spread[self.scale_index].max()))
+        scale = np.maximum(images[:, self.scale_index].max(axis=1), max(floor, 1e-9))
+        # Bounded whatever the noise: an image that is all noise comes out with unit variance, not with its huge values.
+        images /= np.sqrt((scale[:, None] * self.level)[:, :, None] ** 2 + spread)
+        log_scale = np.log10(scale)
+        context = np.stack(
+            [
+                log_scale + 1.0,
+                (np.log10(self.noise) - log_scale + 2.5) / 1.5,
+                np.full(n, (np.log10(max(self.drift, 1e-7)) + 5.0) / 2.0),
+                np.full(n, 10.0 * (1.0 - self.live)),
+            ],
+            axis=1,
+        )
+        return images.reshape(n, c, h, w), context.astype(np.float32), scale.astype(np.float32)
+
+    def score(self, d: Array) -> float:
+        """Detection statistic of (K,) d: its whitened energy, each direction weighted by how much a touch could put there."""
+        return float(self.detection @ (self.whiten @ d) ** 2)
+
+    def threshold(self, false_alarm: float = 1e-6, tare_frames: int = TARE_FRAMES) -> float:
+        """The score that an untouched frame exceeds with probability `false_alarm`.
+
+        The weighted sum of squares is matched by a scaled chi-square (Satterthwaite); sigma estimated from `tare_frames`
+        frames makes each square an F(1, nu) variable, whose larger mean and variance are used.
+        """
+        nu = max(tare_frames - 1, 5)
+        mean1, var1 = nu / (nu - 2), 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
+        mean, var = self.detection.sum() * mean1, (self.detection**2).sum() * var1
+        factor, dof = var / (2 * mean), 2 * mean**2 / var
+        quantile = NormalDist().inv_cdf(1 - false_alarm)
+        return float(factor * dof * (1 - 2 / (9 * dof) + quantile * np.sqrt(2 / (9 * dof))) ** 3)  # Wilson-Hilferty
+
+    def one_step(self, d: Array, n: int, threshold: float | None = THRESHOLD_T) -> Array:
+        """(K,) -> (n, n) drop [S/m] of the paper's equations 1 to 5: one-step image, mask H(x > 0), MReLU at |t x_m|.
+
+        threshold is t; None leaves the image as equation 1 gives it, both signs.
+        """
+        coarse = (self.step @ d.astype(np.float32)).reshape(self.shape)
+        image = self._upsample(n, self.shape[0]) @ coarse @ self._upsample(n, self.shape[1]).T
+        if threshold is not None:
+            image = np.where(image > max(threshold * image.max(initial=0.0), 0.0), image, 0.0)
+        return image.astype(np.float32)
+
+    def residual(self, d: Array, image: Array) -> float:
+        """rms whitened difference between d and what the linearised model makes of a drop image (n, n) [S/m]; 1 = noise.
+
+        Linear: a drop of 0.5 S/m leaves a tenth to a third of the signal unexplained, so read it against strong touches with care.
+        """
+        h, w = self.shape
+        coarse = image.reshape(h, image.shape[0] // h, w, image.shape[1] // w).mean(axis=(1, 3))
+        return float(np.sqrt(np.mean((self.whiten @ (d - self.jacobian @ coarse.ravel())) ** 2)))
+
+    def _upsample(self, n: int, m: int) -> Array:
+        """(n, m) linear interpolation between pixel centres."""
+        if n not in self._axis:
+            at = np.clip((np.arange(n) + 0.5) * m / n - 0.5, 0, m - 1)
+            low = np.minimum(at.astype(int), m - 2)
+            weight = np.zeros((n, m), dtype=np.float32)
+            weight[np.arange(n), low], weight[np.arange(n), low + 1] = 1 - (at - low), at - low
+            self._axis[n] = weight
+        return self._axis[n]
+
+
+class PreReconstructor:
+    """The bundle's linear physics, ready to be conditioned on the noise that the tare found."""
+
+    def __init__(self, matrices: Matrices) -> None:
+        self.m = matrices
+        self.measurements = len(matrices.z0)
+
+    def normaliser(self, z0: Array) -> Array:
+        """(K,) ohm by which |Z| - |Z0| is divided to give d; z0 is the measured baseline |Z0|.
+
+        "model": the bundle's own z0 times the gain fitted to the baseline. Contact impedance adds to |Z| and |Z0| alike and so
+        cancels from their difference; dividing by the measured |Z0| would let it back in.
+        """
+        if self.m.normalisation == "measured":
+            return np.abs(z0)
+        live = np.isfinite(z0) & (np.abs(z0) > 0)
+        gain = float(np.median(np.abs(z0[live]) / self.m.z0[live])) if live.any() else 1.0
+        return gain * self.m.z0
+
+    def difference(self, z: Array, z0: Array) -> Array:
+        """d (..., K) of |Z| (..., K) against the baseline |Z0| (K,)."""
+        return (np.abs(z) - np.abs(z0)) / self.normaliser(np.abs(z0))
+
+    def condition(
+        self,
+        sigma: Array,
+        *,
+        drift: Drift | None = None,
+        weights: Array | None = None,
+        tare_frames: int = TARE_FRAMES,
+    ) -> Operator:
+        """Operator for noise of standard deviation sigma (K,) in d on each frame.
+
+        drift: allowance since the last untouched frame. weights: (K,), 1 = as measured, 0 = leave out (dead electrode), between = trust
+        less. tare_frames: how many frames the baseline is the mean of (its own error adds to every difference).
+        """
+        m, k = self.m, self.measurements
+        weights = np.ones(k) if weights is None else np.asarray(weights, dtype=float)
+        live = (weights > 0) & np.isfinite(sigma)
+        if live.sum() < 2:
+            raise ValueError(f"only {int(live.sum())} of {k} measurements are live: nothing can be reconstructed")
+        noise = (np.asarray(sigma, dtype=float)[live] ** 2 * (1 + 1 / tare_frames) + m.model_error**2) / weights[live]
+        cov = np.diag(noise)
+        drift = drift or Drift()
+        if drift.scale or drift.contact:
+            contact = m.contact[live]
+            cov += drift.scale**2 + drift.contact**2 * contact @ contact.T
+        inverse = np.linalg.inv(np.linalg.cholesky(cov))
+        gram = inverse @ m.gram[np.ix_(live, live)] @ inverse.T
+        values, vectors = np.linalg.eigh(0.5 * (gram + gram.T))
+        values = np.maximum(values, 0.0)
+        whiten = np.zeros((int(live.sum()), k))
+        whiten[:, live] = vectors.T @ inverse
+        back = m.back[:, live] @ inverse.T @ vectors  # (P, K')
+        # The ladder is relative to measurement noise of the same size in every channel, so that its images stay the same
+        # combinations of d whatever the level; drift and unequal noise change the metric, not the rungs.
+        mean = float(np.trace(m.gram[np.ix_(live, live)]) / live.sum() / noise.mean())
+        gains = [1.0 / (values + lam * mean) for lam in m.ladder]
+        images = [(back * gain) for gain in gains]
+        matrix = np.concatenate([image @ whiten for image in images])
+        step = (back / (values + ONE_STEP_LAMBDA**2 * mean)) @ whiten
+        return Operator(
+            shape=(m.inside.shape[0], m.inside.shape[1]),
+            inside=m.inside,
+            matrix=np.ascontiguousarray(matrix, dtype=np.float32),
+            variance=np.concatenate([(image**2).sum(axis=1) for image in images]).astype(np.float32),
+            level=m.level.astype(np.float32),
+            scale_index=m.scale_index,
+            noise=float(np.sqrt(noise.mean())),
+            drift=float(np.sqrt(np.trace(cov) / len(cov) - noise.mean())) if (drift.scale or drift.contact) else 0.0,
+            live=float(live.mean()),
+            whiten=whiten,
+            detection=values / (values + mean * 1e-3),
+            step=step.astype(np.float32),
+            jacobian=m.jacobian,
+        )
+
+
+def noise_of_frames(frames: Array, z0: Array) -> Array:
+    """(K,) sigma of |Z| [unit of frames] from (N, K) untouched |Z|: per channel, shrunk towards noise proportional to |Z0|.
+
+    With N frames a channel's own estimate is uncertain by 1 / sqrt(2 N); the shrinkage gives the pooled relative level the weight of
+    32 frames, which keeps one channel's lucky tare from being trusted too much.
+    """
+    own = frames.var(axis=0, ddof=1)
+    pooled = np.median(own / z0**2) * z0**2
+    n = len(frames)
+    return np.sqrt((n * own + 32 * pooled) / (n + 32))
