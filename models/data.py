@@ -1,0 +1,235 @@
+"""Training data: random contacts, solved on perturbed skins, in chunk files that can be made anywhere and in any order.
+
+    python -m models.data --skin square16 --n 20000 --jobs 2
+
+Each chunk is several hundred scenes on one skin as it might have been mounted (electrodes shifted along the outline,
+contact impedances and background off); 40 % of chunks are the nominal skin. A chunk depends on (seed, split, index) only,
+so a run can be stopped and taken up again, and any number of processes on any joblib backend gives the same files. Noise
+and drift are not in the data: training adds them, afresh each time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from models import geometry
+from models.forward import ForwardModel
+from models.scenes import TRAINING, random_scene
+from models.shapes import drop_image, element_conductivity, from_rows, to_rows
+
+WORK = Path(__file__).parent / "work"
+SPLITS = {"train": "training", "valid": "training", "test": "reference"}  # and the mesh each is solved on
+IMAGE = 48  # pixels a side
+SCHEMA = 1
+
+NOMINAL_SHARE = 0.4
+CONTACT_SPREAD = 0.30  # each electrode, relative, uniform
+BACKGROUND_SPREAD = 0.05
+SHIFT_SPREAD = 0.03  # of the electrode spacing, standard deviation
+
+
+@dataclass(frozen=True)
+class ChunkSpec:
+    """What a chunk is made from, and all it depends on."""
+
+    skin: str
+    split: str
+    index: int
+    size: int
+    seed: int
+
+    @property
+    def file(self) -> str:
+        return f"{self.split}-{self.index:05d}.npz"
+
+
+@lru_cache(maxsize=1)
+def _nominal(skin: str, mesh: str) -> ForwardModel:
+    """Kept for the process: meshing takes as long as dozens of solves."""
+    nominal = geometry.load(skin)
+    return ForwardModel(nominal, nominal.pattern, mesh=mesh)
+
+
+def make_chunk(spec: ChunkSpec) -> dict[str, NDArray[Any]]:
+    """Solve one chunk of S scenes on one variant of the skin; K measurements, E electrodes.
+
+    difference (S, K) float32: |Z| / |Z0| - 1 against this variant's own Z0, without noise
+    shapes (S, 3, 7) float32, image (S, 48, 48) float16: drop [S/m] on a background of 1
+    z0 (K,) ohm, contact_impedance (E,), background (), shift (E,) of each electrode along the outline [model units]
+    """
+    rng = np.random.default_rng([spec.seed, sorted(SPLITS).index(spec.split), spec.index])
+    mesh = SPLITS[spec.split]
+    skin = geometry.load(spec.skin)
+    n = skin.n_electrodes
+    nominal = rng.random() < NOMINAL_SHARE or spec.split == "test"
+    if nominal:
+        wide, shift, model = 0.0, np.zeros(n), _nominal(spec.skin, mesh)
+    else:
+        wide, shift = 1.0, np.clip(rng.standard_normal(n), -2, 2) * SHIFT_SPREAD * skin.perimeter / n
+        model = ForwardModel(skin.moved(shift), skin.pattern, mesh=mesh)
+    contact = skin.contact_impedance * (1 + wide * CONTACT_SPREAD * rng.uniform(-1, 1, n))
+    background = 1 + wide * BACKGROUND_SPREAD * rng.uniform(-1, 1)
+    z0 = np.abs(model.solve(background, contact).impedances())
+    corners = model.mesh.p.T[model.mesh.t.T]
+    difference = np.empty((spec.size, len(z0)), np.float32)
+    rows = np.empty((spec.size, 3, 7), np.float32)
+    images = np.empty((spec.size, IMAGE, IMAGE), np.float16)
+    for k in range(spec.size):
+        rows[k] = to_rows(random_scene(rng, TRAINING, skin.inside))
+        scene = from_rows(rows[k].astype(float))  # the float32 rows: what is stored is what was solved
+        conductivity = background * element_conductivity(scene, corners)
+        difference[k] = np.abs(model.solve(conductivity, contact).impedances()) / z0 - 1
+        images[k] = drop_image(scene, IMAGE)
+    return {
+        "difference": difference,
+        "shapes": rows,
+        "image": images,
+        "z0": z0,
+        "contact_impedance": contact,
+        "background": np.array(background),
+        "shift": shift,
+    }
+
+
+def _backend(name: str, scheduler: str | None) -> AbstractContextManager[Any]:
+    """joblib's configuration for a backend by name; "dask" joins the scheduler's cluster, "ray" the running one."""
+    if name == "dask":
+        from distributed import Client
+
+        Client(scheduler)  # becomes the default client, which joblib's backend asks for
+    elif name == "ray":
+        from ray.util.joblib import register_ray
+
+        register_ray()
+    return joblib.parallel_config(backend=name) if name != "loky" else nullcontext()
+
+
+def generate(
+    folder: Path,
+    specs: list[ChunkSpec],
+    jobs: int = 1,
+    backend: str = "loky",
+    scheduler: str | None = None,
+    quiet: bool = False,
+) -> int:
+    """Make the chunks that `folder` lacks; returns how many scenes that was. Files appear whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _check_same_run(folder, specs[0])
+    todo = [s for s in specs if not (folder / s.file).exists()]
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with _backend(backend, scheduler), Progress(*columns, disable=quiet) as progress:
+        bar = progress.add_task(f"{specs[0].skin} scenes", total=sum(s.size for s in specs))
+        progress.advance(bar, sum(s.size for s in specs) - sum(s.size for s in todo))
+        for start in range(0, len(todo), max(1, 2 * jobs)):
+            # a few chunks at a time: every backend has ordered lists, not all have generators
+            batch = todo[start : start + max(1, 2 * jobs)]
+            made = joblib.Parallel(n_jobs=jobs)(joblib.delayed(make_chunk)(s) for s in batch)
+            for spec, arrays in zip(batch, made, strict=True):
+                partial = folder / f".{spec.file}.part"
+                with partial.open("wb") as file:
+                    np.savez_compressed(file, **arrays)
+                os.replace(partial, folder / spec.file)
+                progress.advance(bar, spec.size)
+    return sum(s.size for s in todo)
+
+
+def _check_same_run(folder: Path, spec: ChunkSpec) -> None:
+    """Chunks of another seed or skin must not be mixed in: the samples could repeat."""
+    wanted = {"schema": SCHEMA, "skin": spec.skin, "seed": spec.seed, "chunk": spec.size, "image": IMAGE}
+    path = folder / "data.json"
+    if not path.exists():
+        path.write_text(json.dumps(wanted, indent=1) + "\n")
+    found = json.loads(path.read_text())
+    if found != wanted:
+        raise ValueError(f"{path} says {found}, this run is {wanted}: use another folder, or remove this one")
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """N scenes of V chunks: see `make_chunk`. z0 is (V, K) and `variant` (N,) points into it."""
+
+    difference: NDArray[np.float32]
+    image: NDArray[np.float16]
+    shapes: NDArray[np.float32]
+    variant: NDArray[np.int64]
+    z0: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.difference)
+
+
+def chunk_files(folder: Path, split: str = "train") -> list[Path]:
+    """Finished chunks of a split, in order: more may appear while a generation runs."""
+    return sorted(folder.glob(f"{split}-*.npz"))
+
+
+def load(folder: Path, split: str = "train", limit: int | None = None, skip: int = 0) -> Dataset:
+    """Read the finished chunks of a split from number `skip` on, `limit` scenes at most. Raises FileNotFoundError."""
+    parts = list(_read(folder, split, limit, skip))
+    if not parts:
+        raise FileNotFoundError(f"no {split}-*.npz in {folder}: make some with python -m models.data")
+    variant = np.repeat(np.arange(len(parts)), [len(p["difference"]) for p in parts])
+    rest = {k: np.concatenate([p[k] for p in parts]) for k in ("difference", "image", "shapes")}
+    cut = slice(0, limit)
+    z0 = np.stack([p["z0"] for p in parts])
+    return Dataset(rest["difference"][cut], rest["image"][cut], rest["shapes"][cut], variant[cut], z0)
+
+
+def _read(folder: Path, split: str, limit: int | None, skip: int) -> Iterator[dict[str, NDArray[Any]]]:
+    count = 0
+    for path in chunk_files(folder, split)[skip:]:
+        if limit is not None and count >= limit:
+            return
+        with np.load(path) as file:
+            part = {k: file[k] for k in file.files}
+        count += len(part["difference"])
+        yield part
+
+
+def specs(skin: str, split: str, n: int, seed: int, chunk: int = 500) -> list[ChunkSpec]:
+    """Chunks that hold at least n scenes."""
+    return [ChunkSpec(skin, split, k, chunk, seed) for k in range(-(-n // chunk))]
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m models.data", description="Make training data for a skin.")
+    parser.add_argument("--skin", default="square16", help="a shipped skin or a .toml file")
+    parser.add_argument("--n", type=int, default=20000, help="training scenes")
+    parser.add_argument("--valid", type=int, default=1000, help="held-out scenes")
+    parser.add_argument("--out", type=Path, help="folder (default models/work/SKIN)")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--backend", default="loky", help="joblib backend: loky, threading, dask, ray")
+    parser.add_argument("--scheduler", help="address of a Dask scheduler")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    args = parser.parse_args(argv)
+    folder = args.out or WORK / Path(args.skin).stem
+    start = time.perf_counter()
+    wanted = specs(args.skin, "valid", args.valid, args.seed) + specs(args.skin, "train", args.n, args.seed)
+    made = generate(folder, wanted, args.jobs, args.backend, args.scheduler, args.quiet)
+    took = time.perf_counter() - start
+    print(f"{folder}: {made} scenes made in {took:.0f} s ({made / max(took, 1e-9):.1f}/s with {args.jobs} jobs)")
+
+
+if __name__ == "__main__":
+    main()
