@@ -1,0 +1,438 @@
+"""What a field of a frame may hold: one small checker per kind of value.
+
+A checker turns what msgpack read into what Python code uses (`decode`), the other way round (`encode`), says whether a decoded
+value is finite (`finite`), and describes itself for WIRE.md (`describe`). `decode` raises `Mismatch`; `frames.unpack` adds the
+topic and the field's name to it. Nothing here knows a topic, a frame or a socket.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
+from dataclasses import fields as dataclass_fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+INT64_MAX = 2**63 - 1
+UINT64_MAX = 2**64 - 1
+MAX_LIST = 4096
+MAX_MAP = 1024
+MAX_TEXT = 65536
+MAX_DEPTH = 8
+
+
+class Mismatch(Exception):
+    """A value is not what its field allows: `path` inside the field ("" for the field itself), `found`, `expected`."""
+
+    def __init__(self, found: str, expected: str, path: str = "") -> None:
+        super().__init__(found, expected, path)
+        self.found, self.expected, self.path = found, expected, path
+
+    def below(self, step: str) -> Mismatch:
+        """The same mismatch seen from one level further out."""
+        return Mismatch(self.found, self.expected, step + self.path)
+
+
+def brief(value: object) -> str:
+    """A value as an error message shows it: its type, and the value itself where that is short."""
+    if isinstance(value, (bytes, list, dict)) and len(value) > 3:
+        return f"{type(value).__name__} of length {len(value)}"
+    text = repr(value)
+    return f"{type(value).__name__} {text if len(text) <= 40 else text[:37] + '...'}"
+
+
+class Check:
+    """Base of the checkers; a plain value by itself."""
+
+    unit: str = ""
+
+    def decode(self, value: Any) -> Any:
+        raise NotImplementedError
+
+    def encode(self, value: Any) -> Any:
+        return value
+
+    def finite(self, value: Any) -> bool:
+        return True
+
+    def describe(self) -> str:
+        raise NotImplementedError
+
+    def refuse(self, value: object) -> Mismatch:
+        return Mismatch(brief(value), self.describe())
+
+
+@dataclass(frozen=True)
+class Bool(Check):
+    """true or false."""
+
+    def decode(self, value: Any) -> bool:
+        if value is True or value is False:
+            return bool(value)
+        raise self.refuse(value)
+
+    def encode(self, value: Any) -> bool:
+        return bool(value)
+
+    def describe(self) -> str:
+        return "bool"
+
+
+@dataclass(frozen=True)
+class Int(Check):
+    """A whole number in [low, high]; a bool is not one."""
+
+    low: int = 0
+    high: int = INT64_MAX
+    unit: str = ""
+
+    def decode(self, value: Any) -> int:
+        if type(value) is int and self.low <= value <= self.high:
+            return value
+        raise self.refuse(value)
+
+    def encode(self, value: Any) -> int:
+        return int(value)
+
+    def describe(self) -> str:
+        high = {INT64_MAX: "2^63-1", UINT64_MAX: "2^64-1", 2**32 - 1: "2^32-1"}.get(self.high, str(self.high))
+        return f"int {self.low}..{high}"
+
+
+@dataclass(frozen=True)
+class Float(Check):
+    """A number, in [low, high] if it is finite; a whole number is accepted for it.
+
+    A non-finite value decodes (it is data); `valid` of its frame then becomes false, unless `gaps` says that it means something.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+    gaps: bool = False
+
+    def decode(self, value: Any) -> float:
+        if type(value) is float or type(value) is int:
+            number = float(value)
+            if self.low <= number <= self.high or not math.isfinite(number):
+                return number
+        raise self.refuse(value)
+
+    def encode(self, value: Any) -> float:
+        return float(value)
+
+    def finite(self, value: Any) -> bool:
+        return self.gaps or math.isfinite(value)
+
+    def describe(self) -> str:
+        if self.low == -math.inf and self.high == math.inf:
+            return "float"
+        return f"float {self.low:g}.." + ("" if self.high == math.inf else f"{self.high:g}")
+
+
+@dataclass(frozen=True)
+class Text(Check):
+    """UTF-8 text of at most `most` characters, one of `choices` or of the whole form `form` where given."""
+
+    most: int = 256
+    choices: tuple[str, ...] = ()
+    form: str = ""
+
+    def decode(self, value: Any) -> str:
+        if type(value) is str and len(value) <= self.most:
+            if self.choices:
+                if value in self.choices:
+                    return value
+            elif not self.form or re.fullmatch(self.form, value):
+                return value
+        raise self.refuse(value)
+
+    def describe(self) -> str:
+        if self.choices:
+            return "text, one of " + ", ".join(f'"{c}"' for c in self.choices)
+        return f"text `{self.form}`" if self.form else f"text, at most {self.most} characters"
+
+
+@dataclass(frozen=True)
+class Vector(Check):
+    """A list of exactly `size` numbers."""
+
+    size: int
+    unit: str = ""
+
+    def decode(self, value: Any) -> list[float]:
+        if type(value) is list and len(value) == self.size:
+            for x in value:
+                if type(x) is not float:
+                    if type(x) is not int:
+                        raise self.refuse(value)
+                    return self.decode([float(y) if type(y) is int else y for y in value])
+            return value
+        raise self.refuse(value)
+
+    def encode(self, value: Any) -> list[float]:
+        return [float(x) for x in value]
+
+    def finite(self, value: Any) -> bool:
+        return math.isfinite(sum(value))
+
+    def describe(self) -> str:
+        return f"list of {self.size} floats"
+
+
+@dataclass(frozen=True)
+class Array(Check):
+    """A numpy array: a map {dtype, shape, data}, row-major, little-endian; decoded without a copy, read-only.
+
+    `shape` has one entry per dimension: a number is fixed, a name is free. With `or_empty` an array without elements, of any
+    shape, stands for "not computed". `gaps` says that non-finite entries mean something and do not make the frame invalid.
+    """
+
+    dtype: str
+    shape: tuple[int | str, ...]
+    unit: str = ""
+    or_empty: bool = False
+    gaps: bool = False
+
+    def decode(self, value: Any) -> NDArray[Any]:
+        array = decode_array(value)
+        if array.dtype.str.replace("|", "<") != self.dtype.replace("|", "<"):
+            raise Mismatch(f"dtype {array.dtype.str}", self.describe())
+        self._check_shape(array)
+        return array
+
+    def encode(self, value: Any) -> dict[str, Any]:
+        array = np.ascontiguousarray(value, dtype=self.dtype)
+        self._check_shape(array)
+        return encode_array(array)
+
+    def _check_shape(self, array: NDArray[Any]) -> None:
+        shape = array.shape
+        if len(shape) == len(self.shape):
+            for have, want in zip(shape, self.shape, strict=True):
+                if have != want and type(want) is int:
+                    break
+            else:
+                return
+        if self.or_empty and array.size == 0:
+            return
+        raise Mismatch(f"shape {list(shape)}", self.describe())
+
+    def finite(self, value: Any) -> bool:
+        return self.gaps or value.dtype.kind not in "fc" or bool(np.isfinite(value).all())
+
+    def describe(self) -> str:
+        shape = ", ".join(str(s) for s in self.shape)
+        return f"array {self.dtype} ({shape})" + (", or of size 0" if self.or_empty else "")
+
+
+@dataclass(frozen=True)
+class ListOf(Check):
+    """A list of at most `most` values of one kind."""
+
+    item: Check
+    most: int = MAX_LIST
+
+    def decode(self, value: Any) -> list[Any]:
+        if type(value) is not list or len(value) > self.most:
+            raise self.refuse(value)
+        out, decode = [], self.item.decode
+        for i, x in enumerate(value):
+            try:
+                out.append(decode(x))
+            except Mismatch as bad:
+                raise bad.below(f"[{i}]") from None
+        return out
+
+    def encode(self, value: Any) -> list[Any]:
+        return [self.item.encode(x) for x in value]
+
+    def finite(self, value: Any) -> bool:
+        return all(self.item.finite(x) for x in value)
+
+    def describe(self) -> str:
+        return f"list of at most {self.most}: {self.item.describe()}"
+
+
+@dataclass(frozen=True)
+class MapOf(Check):
+    """A map from text to values of one kind; `keys` documents the usual ones, others are allowed."""
+
+    item: Check
+    keys: tuple[str, ...] = ()
+    most: int = 256
+
+    def decode(self, value: Any) -> dict[str, Any]:
+        if type(value) is not dict or len(value) > self.most:
+            raise self.refuse(value)
+        out, decode = {}, self.item.decode
+        for key, x in value.items():
+            if type(key) is not str or len(key) > 128:
+                raise Mismatch(f"key {brief(key)}", self.describe())
+            try:
+                out[key] = decode(x)
+            except Mismatch as bad:
+                raise bad.below(f".{key}") from None
+        return out
+
+    def encode(self, value: Any) -> dict[str, Any]:
+        return {str(key): self.item.encode(x) for key, x in value.items()}
+
+    def finite(self, value: Any) -> bool:
+        return all(self.item.finite(x) for x in value.values())
+
+    def describe(self) -> str:
+        keys = f" (keys: {', '.join(self.keys)})" if self.keys else ""
+        return f"map of text to {self.item.describe()}{keys}"
+
+
+@dataclass(frozen=True)
+class Maybe(Check):
+    """nil (None), or a value of one kind."""
+
+    item: Check
+
+    @property
+    def unit(self) -> str:  # type: ignore[override]
+        return self.item.unit
+
+    def decode(self, value: Any) -> Any:
+        return None if value is None else self.item.decode(value)
+
+    def encode(self, value: Any) -> Any:
+        return None if value is None else self.item.encode(value)
+
+    def finite(self, value: Any) -> bool:
+        return value is None or self.item.finite(value)
+
+    def describe(self) -> str:
+        return self.item.describe() + ", or nil"
+
+
+@dataclass(frozen=True)
+class Tree(Check):
+    """Free content: nil, bool, number, text, bytes, arrays, and lists and maps of these, at most MAX_DEPTH deep."""
+
+    def decode(self, value: Any) -> Any:
+        return self._walk(value, 0, decode_array)
+
+    def encode(self, value: Any) -> Any:
+        return self._walk(value, 0, None)
+
+    def _walk(self, value: Any, depth: int, array: Callable[[Any], NDArray[Any]] | None) -> Any:
+        if depth > MAX_DEPTH:
+            raise Mismatch("deeper nesting", f"at most {MAX_DEPTH} levels")
+        if isinstance(value, dict):
+            if array and len(value) == 3 and value.keys() == {"dtype", "shape", "data"}:
+                return array(value)
+            out = {}
+            for key, x in value.items():
+                if type(key) is not str:
+                    raise Mismatch(f"key {brief(key)}", "text keys")
+                try:
+                    out[key] = self._walk(x, depth + 1, array)
+                except Mismatch as bad:
+                    raise bad.below(f".{key}") from None
+            return out
+        if isinstance(value, (list, tuple)):
+            return [self._walk(x, depth + 1, array) for x in value]
+        if array is None:
+            if isinstance(value, np.ndarray):
+                return encode_array(np.ascontiguousarray(value))
+            if isinstance(value, np.generic):
+                return value.item()
+        if value is None or isinstance(value, (bool, int, float, str, bytes)):
+            return value
+        raise self.refuse(value)
+
+    def describe(self) -> str:
+        return "free content"
+
+
+class Record(Check):
+    """A map with named fields, read into the dataclass `kind`. Unknown keys are ignored, missing ones are a mismatch."""
+
+    def __init__(self, kind: type[Any]) -> None:
+        self.kind = kind
+        self.checks: tuple[tuple[str, Check], ...] = tuple(
+            (f.name, f.metadata["check"]) for f in dataclass_fields(kind)
+        )
+        self._can_be_infinite = tuple((n, c) for n, c in self.checks if type(c).finite is not Check.finite)
+
+    def decode(self, value: Any) -> Any:
+        if type(value) is not dict:
+            raise self.refuse(value)
+        read = {}
+        for name, check in self.checks:
+            try:
+                read[name] = check.decode(value[name])
+            except KeyError:
+                raise Mismatch("nothing", check.describe(), f".{name}") from None
+            except Mismatch as bad:
+                raise bad.below(f".{name}") from None
+        return self.kind(**read)
+
+    def encode(self, value: Any) -> dict[str, Any]:
+        out = {}
+        for name, check in self.checks:
+            try:
+                out[name] = check.encode(getattr(value, name))
+            except Mismatch as bad:
+                raise bad.below(f".{name}") from None
+            except (TypeError, ValueError, AttributeError) as bad:
+                raise Mismatch(f"{brief(getattr(value, name))} ({bad})", check.describe(), f".{name}") from None
+        return out
+
+    def finite(self, value: Any) -> bool:
+        return all(check.finite(getattr(value, name)) for name, check in self._can_be_infinite)
+
+    def describe(self) -> str:
+        return f"map {self.kind.__name__}"
+
+
+def decode_array(value: Any) -> NDArray[Any]:
+    """Read {dtype, shape, data} without copying `data`. Raises Mismatch."""
+    expected = "array: map {dtype, shape, data}"
+    try:
+        name, shape, data = value["dtype"], value["shape"], value["data"]
+        dtype = _DTYPES[name]
+    except (TypeError, KeyError):
+        raise Mismatch(brief(value), f"{expected}, dtype one of {' '.join(_DTYPES)}") from None
+    if type(shape) is not list or type(data) is not bytes or len(shape) > 8:
+        raise Mismatch(f"shape {brief(shape)}, data {brief(data)}", expected)
+    size = dtype.itemsize
+    for n in shape:
+        if type(n) is not int or n < 0:
+            raise Mismatch(f"shape {brief(shape)}", expected)
+        size *= n
+    if size != len(data):
+        raise Mismatch(f"{len(data)} bytes of data", f"{size} bytes for shape {shape} of {name}")
+    return np.frombuffer(data, dtype).reshape(shape)
+
+
+def encode_array(array: NDArray[Any]) -> dict[str, Any]:
+    """The map that stands for a contiguous array of one of the allowed dtypes. Raises Mismatch for another dtype."""
+    name = array.dtype.newbyteorder("<").str
+    if name not in _DTYPES:
+        raise Mismatch(f"dtype {array.dtype}", f"one of {' '.join(_DTYPES)}")
+    return {"dtype": name, "shape": list(array.shape), "data": array.astype(name, copy=False).tobytes()}
+
+
+_DTYPES: Mapping[str, np.dtype[Any]] = {
+    n: np.dtype(n) for n in ("<f4", "<f8", "<c8", "<c16", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "|b1")
+}
+
+
+def wire(check: Check, doc: str, default: Any = ...) -> Any:
+    """A dataclass field with its checker and its one line of documentation; `default` may be a class to call for a fresh value."""
+    metadata = {"check": check, "doc": doc}
+    if default is ...:
+        return dataclass_field(metadata=metadata)
+    if isinstance(default, type) or callable(default):
+        return dataclass_field(default_factory=default, metadata=metadata)
+    return dataclass_field(default=default, metadata=metadata)

@@ -1,0 +1,271 @@
+"""The frames: one dataclass per topic, every field with its type, range and unit beside it.
+
+WIRE.md's tables are printed from these. `frames.pack` and `frames.unpack` turn them into messages and back; which topic carries
+which frame is in topics.py.
+
+Frames start out invalid and earn `valid`. Fields of the header have defaults, so that a stage sets only what it knows: session,
+seq and host are filled in by the publisher, the stamps by the runner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .fields import UINT64_MAX, Array, Bool, Float, Int, ListOf, MapOf, Maybe, Record, Text, Tree, Vector, wire
+
+SCHEMA = 1
+"""Version of the frames' layout: raised when a field changes its meaning, goes, or is added as required."""
+
+STAMPS = ("sample", "read", "preprocess", "infer", "publish")
+SOURCES = ("board", "stub", "replay")
+REASONS = {
+    "stale_baseline": "the baseline is too old or does not fit: tare",
+    "saturated": "a measurement's converter was clipped",
+    "electrode_open": "an electrode has no contact with the skin",
+    "electrode_short": "two electrodes are connected to each other",
+    "gap": "scans are missing just before this one",
+    "low_snr": "the measurements are too noisy for the stated uncertainty",
+    "out_of_distribution": "the measurements look like nothing the model was trained on",
+    "coarse": "from the short sentinel scan: that something touches, roughly where",
+    "extrapolated": "a force beyond the calibrated range",
+    "clock": "the sample time is uncertain: the clock regression has not settled, or the board's clock jumped",
+    "uncalibrated_force": "the skin has no force law: forces are nil",
+    "replay": "from a recording",
+    "non_finite": "set by the reader: a measured field holds NaN or infinity",
+}
+"""The reasons in use and what they mean; a reader accepts others too."""
+
+SHAPES = ("circle", "triangle", "rectangle", "square", "L")
+ELECTRODE_STATES = ("ok", "open", "short", "unknown")
+STATUS_CLIPPED, STATUS_OPEN, STATUS_RTIA, STATUS_FIFO = 1, 2, 4, 8
+"""Bits of a measurement's status: converter clipped (ADCMIN/ADCMAX); current out of range (open electrode); RTIA overrange;
+FIFO error or missed interrupt."""
+
+NAME = r"[A-Za-z0-9_.\-]{1,64}"
+_NAME = Text(64, form=NAME)
+_COUNT = Int(0)
+
+
+def _empty(dtype: str, dimensions: int) -> Any:
+    return lambda: np.zeros((0,) * dimensions, dtype)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Frame:
+    """The header: what every frame carries."""
+
+    schema: int = wire(Int(SCHEMA, SCHEMA), "version of this layout", SCHEMA)
+    skin: str = wire(_NAME, "name of the skin, as in the topic")
+    session: str = wire(Text(16, form="[0-9a-f]{16}"), "random, new each time the producer starts", "0" * 16)
+    seq: int = wire(_COUNT, "number of this frame: counts up by one, per topic, in this session", 0)
+    scan: int = wire(_COUNT, "the board's number of the scan that this frame comes from", 0)
+    host: str = wire(Text(64), "host whose monotonic clock the stamps are of (its boot id)", "")
+    stamps: dict[str, int] = wire(
+        MapOf(Int(0, unit="ns"), STAMPS, 16),
+        "monotonic ns: `sample` = middle of the scan, the others = that stage was done",
+        dict,
+    )
+    sample_sigma_ns: int = wire(Int(0, unit="ns"), "standard uncertainty of `sample`", 0)
+    source: str = wire(Text(choices=SOURCES), "where the measurements come from", "board")
+    valid: bool = wire(Bool(), "whether the payload may be acted on", False)
+    reasons: list[str] = wire(ListOf(Text(64), 64), "why it is not valid, or what to know although it is", list)
+    valid_for_s: float = wire(Float(0, unit="s"), "how long after `publish` the frame may be acted on", 0.0)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class RawFrame(Frame):
+    """One scan of the board, in the scan list's order."""
+
+    z: NDArray[np.complex64] = wire(Array("<c8", ("K",)), "impedance (or raw quotient) of each measurement")
+    status: NDArray[np.uint8] = wire(
+        Array("|u1", ("K",)), "bits: 1 converter clipped, 2 current out of range, 4 RTIA overrange, 8 FIFO or missed"
+    )
+    device_us: int = wire(Int(0, UINT64_MAX, "us"), "board's clock at the start of the scan", 0)
+    config: int = wire(Int(0, 65535), "board's configuration that was scanned", 0)
+    kind: str = wire(
+        Text(choices=("full", "sentinel", "reference")),
+        "the whole drive pattern; the short list while idle; or, from imported files only, a frame known to be untouched",
+        "full",
+    )
+    board: str = wire(Text(64), "unique id of the board", "")
+    pattern: str = wire(_NAME, "name of the drive pattern", "pairs")
+    unit: str = wire(Text(choices=("ohm", "counts")), "unit of z", "ohm")
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class DeltaFrame(Frame):
+    """One scan against the baseline, prepared for the network."""
+
+    touched: bool = wire(Bool(), "whether anything touches", False)
+    held: bool = wire(Bool(), "nothing changed since the frame last reconstructed", False)
+    reconstructed: int = wire(_COUNT, "scan of the frame last reconstructed in this touch; 0 while untouched", 0)
+    score: float = wire(Float(), "noise-whitened statistic that `touched` was decided by", 0.0)
+    threshold: float = wire(Float(), "what `score` is compared with", 0.0)
+    difference: NDArray[np.float32] = wire(
+        Array("<f4", ("K",)), "|Z|/|Z0| - 1; 0 where `sigma` is infinite", _empty("<f4", 1)
+    )
+    sigma: NDArray[np.float32] = wire(
+        Array("<f4", ("K",), gaps=True), "standard uncertainty of `difference`; infinite: not used", _empty("<f4", 1)
+    )
+    stack: NDArray[np.float32] = wire(
+        Array("<f4", ("C", "h", "w"), or_empty=True),
+        "pre-reconstructions, the network's input; empty when no reconstruction is needed",
+        _empty("<f4", 3),
+    )
+    context: NDArray[np.float32] = wire(
+        Array("<f4", ("n",)), "what the network is told beside them (noise level, ...)", _empty("<f4", 1)
+    )
+    scale: float = wire(Float(unit="S/m"), "the network's output times this is in S/m", 1.0)
+    electrodes: NDArray[np.uint8] = wire(
+        Array("|u1", ("E",)), "state of each electrode: 0 ok, 1 open, 2 short, 3 unknown", lambda: np.zeros(16, "u1")
+    )
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class ImageFrame(Frame):
+    """The conductivity drop over the skin's bounding box."""
+
+    touched: bool = wire(Bool(), "whether anything touches", False)
+    held: bool = wire(Bool(), "the image is that of an earlier frame: nothing changed since", False)
+    image: NDArray[np.float32] = wire(
+        Array("<f4", ("H", "W"), "S/m", or_empty=True),
+        "conductivity drop [iy, ix], positive where touched, row 0 lowest y; empty while untouched",
+        _empty("<f4", 2),
+    )
+    sigma: NDArray[np.float32] = wire(
+        Array("<f4", ("H", "W"), "S/m", or_empty=True), "its standard uncertainty, or empty", _empty("<f4", 2)
+    )
+    classes: NDArray[np.float32] = wire(
+        Array("<f4", (len(SHAPES), "h", "w"), or_empty=True),
+        "probability of " + ", ".join(SHAPES) + ", on a coarser grid over the same box; or empty",
+        _empty("<f4", 3),
+    )
+    metres_per_pixel: float = wire(Float(0, unit="m"), "side of a pixel of `image`", 0.0)
+    origin: list[float] = wire(Vector(2, "m"), "x, y of the image's lower left corner", lambda: [0.0, 0.0])
+    residual: float | None = wire(Maybe(Float(0)), "misfit of the reconstruction, in standard deviations, or nil", None)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Contact:
+    """One touch."""
+
+    id: int = wire(_COUNT, "stays the same while the touch lasts; unique in a session")
+    state: str = wire(Text(choices=("begin", "hold", "end")), "first frame of the touch, in between, last one", "hold")
+    position: list[float] = wire(Vector(3, "m"), "centroid of the contact patch, in the skin's frame")
+    velocity: list[float] = wire(Vector(3, "m/s"), "of `position`", lambda: [0.0] * 3)
+    normal: list[float] = wire(Vector(3), "unit vector out of the skin", lambda: [0.0, 0.0, 1.0])
+    area_m2: float = wire(Float(0, unit="m^2"), "area of the contact patch", 0.0)
+    force_n: float | None = wire(Maybe(Float(unit="N")), "normal force; nil where the skin has no force law", None)
+    force_sigma_n: float | None = wire(Maybe(Float(0, unit="N")), "its standard uncertainty, or nil", None)
+    wrench: list[float] = wire(
+        Vector(6), "Fx, Fy, Fz [N], Tx, Ty, Tz [N m] on the skin, at its frame's origin", lambda: [0.0] * 6
+    )
+    shape: str = wire(Text(32), "most probable of " + ", ".join(SHAPES) + "; or unknown", "unknown")
+    shape_probability: float | None = wire(Maybe(Float(0, 1)), "of `shape`, or nil", None)
+    confidence: float = wire(Float(0, 1), "probability that this is a touch", 1.0)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class ContactFrame(Frame):
+    """All touches: published at the board's full-scan rate also when there is none, so that silence means fault."""
+
+    held: bool = wire(Bool(), "the contacts are those of an earlier frame: nothing changed since", False)
+    frame_id: str = wire(Text(128), "name of the coordinate frame of positions and wrenches", "")
+    force_calibrated: bool = wire(Bool(), "whether forces come from a calibration of this skin", False)
+    contacts: list[Contact] = wire(ListOf(Record(Contact), 256), "the touches, strongest first", list)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class ForceFrame(Frame):
+    """The total load alone: small, for fast loops."""
+
+    wrench: list[float] = wire(
+        Vector(6), "Fx, Fy, Fz [N], Tx, Ty, Tz [N m] on the skin, at its frame's origin", lambda: [0.0] * 6
+    )
+    force_n: float | None = wire(Maybe(Float(unit="N")), "sum of the normal forces, or nil", None)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class ShapeFrame(Frame):
+    """What the touches look like; one entry per contact in each list, in the same order."""
+
+    ids: list[int] = wire(ListOf(_COUNT, 256), "`id` of the contact", list)
+    outlines: list[list[list[float]]] = wire(
+        ListOf(ListOf(Vector(2, "m"), 4096), 256), "its outline, a closed polygon of (x, y), counter-clockwise", list
+    )
+    orientation: list[float] = wire(ListOf(Float(unit="rad"), 256), "angle of its longest axis to x", list)
+    probabilities: list[list[float]] = wire(
+        ListOf(Vector(len(SHAPES)), 256), "probability of " + ", ".join(SHAPES), list
+    )
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class StatusFrame(Frame):
+    """How a process is: once a second, and at once when something changes."""
+
+    process: str = wire(_NAME, "who says so")
+    level: str = wire(Text(choices=("OK", "WARN", "ERROR", "STALE")), "in one word", "STALE")
+    messages: list[str] = wire(ListOf(Text(1024), 64), "what is the matter and what to do about it", list)
+    rates: dict[str, float] = wire(MapOf(Float(0, unit="Hz")), "frames per second, by topic", dict)
+    drops: dict[str, int] = wire(MapOf(_COUNT), "frames lost or skipped since the start, by cause", dict)
+    counters: dict[str, int] = wire(MapOf(_COUNT), "other counts since the start", dict)
+    latency: dict[str, float] = wire(
+        MapOf(Float(), ("p50", "p99")), "milliseconds (not s) from `sample` to this process's output", dict
+    )
+    cpu: float = wire(Float(0), "share of one core used since the last status", 0.0)
+
+
+INFO_KEYS = {
+    "bundle": "name of the model bundle",
+    "bundle_hash": "sha256 of its manifest",
+    "geometry": "map: outline (n, 2) [m], electrodes (E, 2) [m], metres_per_unit, name",
+    "pattern": "name of the drive pattern",
+    "frame_id": "name of the skin's coordinate frame",
+    "parent_frame_id": "name of the frame that `pose` is given in",
+    "pose": "x, y, z [m], qx, qy, qz, qw: the skin's frame in its parent",
+    "units": "map: name of a field -> its unit",
+    "force_law": "map: kind and parameters of the force law, or nil",
+    "calibration_hash": "sha256 of the calibration file, or nil",
+    "baseline": "array (K,): |Z0|",
+    "baseline_sigma": "array (K,): standard deviation of the frames that the baseline was taken from",
+    "baseline_hash": "sha256 of the baseline's bytes",
+    "tare_age_s": "seconds since the tare when this frame was made",
+    "state": "map: the stages' temporal state, for lossless replay",
+}
+"""Keys in use in InfoFrame.info; a process leaves out what it does not know and may add others."""
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class InfoFrame(Frame):
+    """What changes rarely: given to each new subscriber."""
+
+    process: str = wire(_NAME, "who says so", "preprocessing")
+    info: dict[str, Any] = wire(MapOf(Tree(), tuple(INFO_KEYS), 1024), "see the keys below", dict)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Touch:
+    """What the stub's skin is really touched by."""
+
+    shape: str = wire(Text(32), "kind: circle, triangle, rectangle, square, L, hertz")
+    x: float = wire(Float(unit="m"), "centre, in the skin's frame")
+    y: float = wire(Float(unit="m"), "centre, in the skin's frame")
+    radius_m: float = wire(Float(0, unit="m"), "circumscribed radius")
+    rotation: float = wire(Float(unit="rad"), "counter-clockwise", 0.0)
+    aspect: float = wire(Float(0), "ratio of a rectangle's sides", 1.0)
+    drop: float = wire(Float(unit="S/m"), "conductivity drop inside")
+    force_n: float | None = wire(Maybe(Float(unit="N")), "force that belongs to the drop, or nil", None)
+    outline: list[list[float]] | None = wire(
+        Maybe(ListOf(Vector(2, "m"), 4096)), "closed polygon of (x, y), or nil", None
+    )
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class TruthFrame(Frame):
+    """What really touches at the middle of the scan; only a stub knows."""
+
+    touches: list[Touch] = wire(ListOf(Record(Touch), 256), "the touches", list)

@@ -1,0 +1,73 @@
+"""The table of topics: the only place that names them.
+
+Sockets, `skin top`, the recorder, WIRE.md's table and tests derive from it. A message's topic on the wire is `name/skin`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from . import frame_types as f
+
+PRODUCERS = ("acquisition", "preprocessing", "inference", "publisher", "stub")
+"""Processes that own a data socket `<producer>.ipc`. A replay stands in for acquisition and binds its socket."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """What is to be known of a topic.
+
+    `rate_hz`: nominal, of the demo; 0: on change only. `lazy`: its extra work is done only while somebody subscribes.
+    `latched`: a late joiner is given the last value. `behind`: what a reader does that cannot keep up, skip to the newest or read all.
+    """
+
+    name: str
+    frame: type[f.Frame]
+    producer: str | tuple[str, ...]
+    rate_hz: float
+    lazy: bool
+    latched: bool
+    behind: Literal["newest", "all"]
+    carries: str
+
+    @property
+    def producers(self) -> tuple[str, ...]:
+        """The processes that publish it."""
+        return (self.producer,) if isinstance(self.producer, str) else self.producer
+
+
+TOPICS: dict[str, Topic] = {
+    t.name: t
+    for t in (
+        Topic(
+            "raw", f.RawFrame, "acquisition", 22, False, False, "newest", "complex impedance and status per measurement"
+        ),
+        Topic(
+            "delta",
+            f.DeltaFrame,
+            "preprocessing",
+            22,
+            False,
+            False,
+            "newest",
+            "difference, pre-reconstructions, touched?",
+        ),
+        Topic("image", f.ImageFrame, "inference", 22, False, False, "newest", "conductivity-drop image"),
+        Topic("contact", f.ContactFrame, "publisher", 22, False, False, "newest", "list of contacts, also when empty"),
+        Topic("force", f.ForceFrame, "publisher", 22, True, False, "newest", "total wrench only"),
+        Topic(
+            "shape", f.ShapeFrame, "publisher", 22, True, False, "newest", "outline, orientation, class probabilities"
+        ),
+        Topic("status", f.StatusFrame, PRODUCERS, 1, False, True, "all", "diagnostics, also on change"),
+        Topic("info", f.InfoFrame, "preprocessing", 0, False, True, "all", "geometry, units, baseline, hashes"),
+        Topic("truth", f.TruthFrame, "stub", 22, False, False, "newest", "what really touches (stub only)"),
+    )
+}
+
+TOPIC_OF: dict[type[f.Frame], Topic] = {t.frame: t for t in TOPICS.values()}
+
+
+def wire_topic(name: str, skin: str) -> bytes:
+    """A message's topic as its first bytes, without the 0 that ends it: b"contact/palm". Raises KeyError for an unknown topic."""
+    return f"{TOPICS[name].name}/{skin}".encode()
