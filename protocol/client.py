@@ -17,7 +17,10 @@ from .sockets import NewestReader
 
 
 class Stale(RuntimeError):
-    """There is no contact frame that is new enough: stop, or fall back. `age_s`: of the newest one, None where there was none."""
+    """There is no contact frame that is new enough: stop, or fall back.
+
+    `age_s` is the age of the newest one, None where there was none.
+    """
 
     def __init__(self, message: str, age_s: float | None = None) -> None:
         super().__init__(message)
@@ -25,7 +28,10 @@ class Stale(RuntimeError):
 
 
 class ContactSubscriber:
-    """The contacts of one skin. Reconnects by itself; ignores replayed frames unless `replay`. Belongs to one thread."""
+    """The contacts of one skin.
+
+    Reconnects by itself; ignores replayed frames unless `replay`. Belongs to one thread.
+    """
 
     def __init__(self, skin: str, endpoint: str | None = None, *, replay: bool = False) -> None:
         self.skin, self.replay = skin, replay
@@ -36,9 +42,9 @@ class ContactSubscriber:
         self._received_ns = 0
 
     def latest(self, max_age: float = 0.05, wait_s: float = 0.0) -> ContactFrame:
-        """The newest frame, at most `max_age` seconds old and within its own `valid_for_s`; waits up to `wait_s` for one.
+        """The newest frame, at most `max_age` seconds old and within its own `valid_for_s`.
 
-        Age counts from `publish`, or on another host, whose clock is not ours, from reception. Raises Stale. Look at
+        Waits up to `wait_s` for one. Age counts from `publish`, or on another host, whose clock is not ours, from reception. Raises Stale. Look at
         `frame.valid` before acting on the contacts.
         """
         self._take(0.0)

@@ -24,7 +24,9 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def cobs_decode(stuffed: bytes) -> bytes:
-    """What `cobs_encode` was given. Raises ValueError where no encoder makes such bytes: a 0 inside, or a block cut short."""
+    """What `cobs_encode` was given. Raises ValueError where no encoder makes such bytes: a 0 inside, or a block cut
+    short.
+    """
     out = bytearray()
     at, end = 0, len(stuffed)
     while at < end:

@@ -1,7 +1,7 @@
 """Commands: one control socket per process, typed replies, and no caller that waits for ever.
 
-A request is a msgpack map {command: text, args: map}; the reply {ok: true, result: map} or {ok: false, error: {type, message}}.
-Any ZeroMQ REQ socket can talk to it.
+A request is a msgpack map {command: text, args: map}; the reply {ok: true, result: map} or {ok: false, error: {type,
+message}}. Any ZeroMQ REQ socket can talk to it.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ log = logging.getLogger(__name__)
 class ControlError(RuntimeError):
     """A command was not carried out.
 
-    `kind` is `unreachable` (no such process), `timeout` (no answer), `bad_reply`, `bad_request`, `unknown_command`, or the
-    name of the exception that the command raised in the process.
+    `kind` is `unreachable` (no such process), `timeout` (no answer), `bad_reply`, `bad_request`, `unknown_command`,
+    or the name of the exception that the command raised in the process.
     """
 
     def __init__(self, kind: str, message: str) -> None:
@@ -42,8 +42,9 @@ class ControlError(RuntimeError):
 class ControlServer:
     """Takes a process's commands: `handlers` maps a command's name to a function from its arguments to its result.
 
-    Poll `socket` and call `serve_once` when it is readable. An exception in a handler becomes the reply; the process goes on.
-    `clock` is built in: this host's monotonic clock, from which a reader elsewhere finds its offset (see `clock_offset`).
+    Poll `socket` and call `serve_once` when it is readable. An exception in a handler becomes the reply; the process
+    goes on. `clock` is built in: this host's monotonic clock, from which a reader elsewhere finds its offset (see
+    `clock_offset`).
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class ControlClient:
         """The command's result. Raises ControlError, at the latest after `timeout_s`."""
         request = _packed({"command": command, "args": args})
         deadline = time.monotonic() + self.timeout_s
-        # IMMEDIATE: writable only once somebody is there, so that a request never waits for a process that starts later.
+        # IMMEDIATE: writable only once somebody is there; no request waits for a process that starts later.
         socket = transport.connect(self._context, zmq.REQ, {self.process: self.address}, {zmq.IMMEDIATE: 1})
         try:
             if not socket.poll(_left_ms(deadline), zmq.POLLOUT):

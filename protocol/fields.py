@@ -1,8 +1,8 @@
 """What a field of a frame may hold: one small checker per kind of value.
 
-A checker turns what msgpack read into what Python code uses (`decode`), the other way round (`encode`), says whether a decoded
-value is finite (`finite`), and describes itself for WIRE.md (`describe`). `decode` raises `Mismatch`; `frames.unpack` adds the
-topic and the field's name to it. Nothing here knows a topic, a frame or a socket.
+A checker turns what msgpack read into what Python code uses (`decode`), the other way round (`encode`), says whether
+a decoded value is finite (`finite`), and describes itself for WIRE.md (`describe`). `decode` raises `Mismatch`;
+`frames.unpack` adds the topic and the field's name to it. Nothing here knows a topic, a frame or a socket.
 """
 
 from __future__ import annotations
@@ -100,6 +100,8 @@ class Int(Check):
         return int(value)
 
     def describe(self) -> str:
+        if self.low == self.high:
+            return f"int {self.low}"
         high = {INT64_MAX: "2^63-1", UINT64_MAX: "2^64-1", 2**32 - 1: "2^32-1"}.get(self.high, str(self.high))
         return f"int {self.low}..{high}"
 
@@ -108,7 +110,8 @@ class Int(Check):
 class Float(Check):
     """A number, in [low, high] if it is finite; a whole number is accepted for it.
 
-    A non-finite value decodes (it is data); `valid` of its frame then becomes false, unless `gaps` says that it means something.
+    A non-finite value decodes (it is data); `valid` of its frame then becomes false, unless `gaps` says that it means
+    something.
     """
 
     low: float = -math.inf
@@ -189,8 +192,9 @@ class Vector(Check):
 class Array(Check):
     """A numpy array: a map {dtype, shape, data}, row-major, little-endian; decoded without a copy, read-only.
 
-    `shape` has one entry per dimension: a number is fixed, a name is free. With `or_empty` an array without elements, of any
-    shape, stands for "not computed". `gaps` says that non-finite entries mean something and do not make the frame invalid.
+    `shape` has one entry per dimension: a number is fixed, a name is free. With `or_empty` an array without elements,
+    of any shape, stands for "not computed". `gaps` says that non-finite entries mean something and do not make the
+    frame invalid.
     """
 
     dtype: str
@@ -355,13 +359,17 @@ class Tree(Check):
 
 
 class Record(Check):
-    """A map with named fields, read into the dataclass `kind`. Unknown keys are ignored, missing ones are a mismatch."""
+    """A map with named fields, read into the dataclass `kind`.
+
+    Unknown keys are ignored, missing ones are a mismatch. Fields named in the dataclass's `same_length` have one length.
+    """
 
     def __init__(self, kind: type[Any]) -> None:
         self.kind = kind
         self.checks: tuple[tuple[str, Check], ...] = tuple(
             (f.name, f.metadata["check"]) for f in dataclass_fields(kind)
         )
+        self._same_length: tuple[str, ...] = getattr(kind, "same_length", ())
         self._can_be_infinite = tuple((n, c) for n, c in self.checks if type(c).finite is not Check.finite)
 
     def decode(self, value: Any) -> Any:
@@ -375,6 +383,7 @@ class Record(Check):
                 raise Mismatch("nothing", check.describe(), f".{name}") from None
             except Mismatch as bad:
                 raise bad.below(f".{name}") from None
+        self._check_lengths(read)
         return self.kind(**read)
 
     def encode(self, value: Any) -> dict[str, Any]:
@@ -386,7 +395,16 @@ class Record(Check):
                 raise bad.below(f".{name}") from None
             except (TypeError, ValueError, AttributeError) as bad:
                 raise Mismatch(f"{brief(getattr(value, name))} ({bad})", check.describe(), f".{name}") from None
+        self._check_lengths({name: getattr(value, name) for name in self._same_length})
         return out
+
+    def _check_lengths(self, values: Mapping[str, Any]) -> None:
+        first, *others = self._same_length or ("",)
+        for name in others:
+            if len(values[name]) != len(values[first]):
+                raise Mismatch(
+                    f"length {len(values[name])}", f"length {len(values[first])}, as {first} has", f".{name}"
+                )
 
     def finite(self, value: Any) -> bool:
         return all(check.finite(getattr(value, name)) for name, check in self._can_be_infinite)
@@ -429,7 +447,9 @@ _DTYPES: Mapping[str, np.dtype[Any]] = {
 
 
 def wire(check: Check, doc: str, default: Any = ...) -> Any:
-    """A dataclass field with its checker and its one line of documentation; `default` may be a class to call for a fresh value."""
+    """A dataclass field with its checker and its one line of documentation; `default` may be a class to call for a
+    fresh value.
+    """
     metadata = {"check": check, "doc": doc}
     if default is ...:
         return dataclass_field(metadata=metadata)

@@ -1,16 +1,16 @@
 """The frames: one dataclass per topic, every field with its type, range and unit beside it.
 
-WIRE.md's tables are printed from these. `frames.pack` and `frames.unpack` turn them into messages and back; which topic carries
-which frame is in topics.py.
+WIRE.md's tables are printed from these. `frames.pack` and `frames.unpack` turn them into messages and back; which
+topic carries which frame is in topics.py.
 
-Frames start out invalid and earn `valid`. Fields of the header have defaults, so that a stage sets only what it knows: session,
-seq and host are filled in by the publisher, the stamps by the runner.
+Frames start out invalid and earn `valid`. Fields of the header have defaults, so that a stage sets only what it
+knows: session, seq and host are filled in by the publisher, the stamps by the runner.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,9 @@ REASONS = {
 SHAPES = ("circle", "triangle", "rectangle", "square", "L")
 ELECTRODE_STATES = ("ok", "open", "short", "unknown")
 STATUS_CLIPPED, STATUS_OPEN, STATUS_RTIA, STATUS_FIFO = 1, 2, 4, 8
-"""Bits of a measurement's status: converter clipped (ADCMIN/ADCMAX); current out of range (open electrode); RTIA overrange;
-FIFO error or missed interrupt."""
+"""Bits of a measurement's status: converter clipped (ADCMIN/ADCMAX); current out of range (open electrode); RTIA
+overrange; FIFO error or missed interrupt.
+"""
 
 NAME = r"[A-Za-z0-9_.\-]{1,64}"
 _NAME = Text(64, form=NAME)
@@ -80,6 +81,8 @@ class Frame:
 class RawFrame(Frame):
     """One scan of the board, in the scan list's order."""
 
+    same_length: ClassVar[tuple[str, ...]] = ("z", "status")
+
     z: NDArray[np.complex64] = wire(Array("<c8", ("K",)), "impedance (or raw quotient) of each measurement")
     status: NDArray[np.uint8] = wire(
         Array("|u1", ("K",)), "bits: 1 converter clipped, 2 current out of range, 4 RTIA overrange, 8 FIFO or missed"
@@ -88,7 +91,7 @@ class RawFrame(Frame):
     config: int = wire(Int(0, 65535), "board's configuration that was scanned", 0)
     kind: str = wire(
         Text(choices=("full", "sentinel", "reference")),
-        "the whole drive pattern; the short list while idle; or, from imported files only, a frame known to be untouched",
+        "whole pattern; short list while idle; or, from imported files only, a scan known to be untouched",
         "full",
     )
     board: str = wire(Text(64), "unique id of the board", "")
@@ -99,6 +102,8 @@ class RawFrame(Frame):
 @dataclass(slots=True, kw_only=True, eq=False)
 class DeltaFrame(Frame):
     """One scan against the baseline, prepared for the network."""
+
+    same_length: ClassVar[tuple[str, ...]] = ("difference", "sigma")
 
     touched: bool = wire(Bool(), "whether anything touches", False)
     held: bool = wire(Bool(), "nothing changed since the frame last reconstructed", False)
@@ -192,6 +197,8 @@ class ForceFrame(Frame):
 @dataclass(slots=True, kw_only=True, eq=False)
 class ShapeFrame(Frame):
     """What the touches look like; one entry per contact in each list, in the same order."""
+
+    same_length: ClassVar[tuple[str, ...]] = ("ids", "outlines", "orientation", "probabilities")
 
     ids: list[int] = wire(ListOf(_COUNT, 256), "`id` of the contact", list)
     outlines: list[list[list[float]]] = wire(

@@ -70,7 +70,7 @@ class FrameError(ValueError):
 
 
 def pack(frame: Frame) -> bytes:
-    """The message for a frame. Arrays are brought to their wire type. Raises FrameError where a field cannot be sent."""
+    """The message for a frame, arrays brought to their wire type. Raises FrameError where a field cannot be sent."""
     topic = TOPIC_OF[type(frame)].name
     try:
         body = _RECORDS[topic].encode(frame)
@@ -85,8 +85,8 @@ def pack(frame: Frame) -> bytes:
 def unpack(message: bytes) -> Frame:
     """The frame in a message. Arrays share the message's memory and are read-only.
 
-    Raises FrameError where the message has another form, type, shape or range than documented. Non-finite measurements are
-    data: the frame comes back with `valid` false and the reason `non_finite`.
+    Raises FrameError where the message has another form, type, shape or range than documented. Non-finite
+    measurements are data: the frame comes back with `valid` false and the reason `non_finite`.
     """
     head, zero, body = bytes(message[:128]).partition(b"\0")
     known = _TOPIC.fullmatch(head) if zero else None
@@ -101,8 +101,6 @@ def unpack(message: bytes) -> Frame:
         raise FrameError(name, bad.path.lstrip("."), bad.found, bad.expected) from None
     if frame.skin != known[2].decode():
         raise FrameError(name, "skin", brief(frame.skin), f"{known[2].decode()!r}, as in the message's topic")
-    if isinstance(frame, RawFrame) and len(frame.status) != len(frame.z):
-        raise FrameError(name, "status", f"shape {[len(frame.status)]}", f"shape {[len(frame.z)]}, as z has")
     if not record.finite(frame):
         frame.valid = False
         if "non_finite" not in frame.reasons:
@@ -111,7 +109,9 @@ def unpack(message: bytes) -> Frame:
 
 
 def read_map(packed: bytes, topic: str) -> dict[str, Any]:
-    """Read a msgpack map within the limits that bound time and memory. Raises FrameError, and nothing else, whatever the bytes."""
+    """Read a msgpack map within the limits that bound time and memory. Raises FrameError, and nothing else, whatever
+    the bytes.
+    """
     if len(packed) > MAX_MESSAGE:
         raise FrameError(topic, "", f"{len(packed)} bytes", f"at most {MAX_MESSAGE}")
     try:

@@ -1,7 +1,7 @@
 """The runtime folder: where the sockets of one running service lie, whose it is, and that there is only one.
 
-`$EITSKIN_RUNTIME`, else `$XDG_RUNTIME_DIR/eitskin`, else `/tmp/eitskin-<uid>`; mode 0700, so that reaching a socket needs the
-owner's rights.
+`$EITSKIN_RUNTIME`, else `$XDG_RUNTIME_DIR/eitskin`, else `/tmp/eitskin-<uid>`; mode 0700, so that reaching a socket
+needs the owner's rights.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ def runtime_dir(create: bool = True) -> Path:
         raise RuntimeDirError(f"runtime folder {path} is not a folder: set EITSKIN_RUNTIME to another path")
     if found.st_uid != os.geteuid():
         raise RuntimeDirError(
-            f"runtime folder {path} belongs to user {found.st_uid}, expected {os.geteuid()} (you): set EITSKIN_RUNTIME to your own"
+            f"runtime folder {path} belongs to user {found.st_uid}, expected {os.geteuid()} (you): "
+            "set EITSKIN_RUNTIME to your own"
         )
     if found.st_mode & 0o077:
         raise RuntimeDirError(
@@ -84,14 +85,16 @@ def _ipc(name: str) -> str:
     path = runtime_dir() / name
     if len(os.fsencode(path)) > MAX_SOCKET_PATH:
         raise RuntimeDirError(
-            f"{path} has {len(os.fsencode(path))} bytes, a socket's path at most {MAX_SOCKET_PATH}: set EITSKIN_RUNTIME to a shorter one"
+            f"{path} has {len(os.fsencode(path))} bytes, a socket's path at most {MAX_SOCKET_PATH}: "
+            "set EITSKIN_RUNTIME to a shorter one"
         )
     return f"ipc://{path}"
 
 
 @contextlib.contextmanager
 def lock(folder: Path | None = None) -> Iterator[Path]:
-    """Hold the runtime folder for one service; the kernel lets go of it however the process ends. Raises AlreadyRunning.
+    """Hold the runtime folder for one service; the kernel lets go of it however the process ends. Raises
+    AlreadyRunning.
 
     Without it a second service would take over the first one's sockets without either of them noticing.
     """
@@ -112,7 +115,9 @@ def lock(folder: Path | None = None) -> Iterator[Path]:
 
 @cache
 def host_id() -> str:
-    """Which monotonic clock our stamps are of: the boot id, equal in all containers of a host and new after each boot."""
+    """Which monotonic clock our stamps are of: the boot id, equal in all containers of a host and new after each
+    boot.
+    """
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip().replace("-", "")
     except OSError:

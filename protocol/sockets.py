@@ -1,7 +1,8 @@
-"""Publishing and subscribing: one part per message, counted subscribers, readers that are never behind or never miss one.
+"""Publishing and subscribing: one part per message, counted subscribers, readers that are never behind or never miss
+one.
 
-A reader survives anything that arrives: what is no frame is counted, logged once per source, and dropped.
-Sockets are not thread-safe: each belongs to the thread that uses it.
+A reader survives anything that arrives: what is no frame is counted, logged once per source, and dropped. Sockets are
+not thread-safe: each belongs to the thread that uses it.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ from .transport import Context, Socket
 __all__ = ["AllReader", "ControlClient", "ControlError", "ControlServer", "NewestReader", "Publisher", "clock_offset"]
 
 SEND_QUEUE = 100
-"""Messages held for one subscriber that does not read; its further ones are dropped, nobody else's. Bounds memory (100 images: 4 MB)."""
+"""Messages held for one subscriber that does not read (100 images: 4 MB); its further ones are dropped, nobody else's."""
 ALL_QUEUE = 10_000
 """Messages held in a reader of all."""
+
+GARBAGE_AT_ONCE = 1000
+"""Malformed messages dropped in one call, after which a flood of them cannot hold the reader."""
 
 log = logging.getLogger(__name__)
 
@@ -34,8 +38,9 @@ log = logging.getLogger(__name__)
 class Publisher:
     """A producer's data socket.
 
-    XPUB that is told of every subscription and counts them itself: by default ZeroMQ hides the second one, so that a late
-    joiner would not get latched values and `wanted` could not be known. `session` is new with each Publisher unless given.
+    XPUB that is told of every subscription and counts them itself: by default ZeroMQ hides the second one, so that a
+    late joiner would not get latched values and `wanted` could not be known. `session` is new with each Publisher
+    unless given.
     """
 
     def __init__(
@@ -55,7 +60,9 @@ class Publisher:
         )
 
     def send(self, frame: Frame) -> bytes:
-        """Publish a frame; its session, seq and host are set here. Returns the message. Never blocks. Raises FrameError."""
+        """Publish a frame; its session, seq and host are set here. Returns the message. Never blocks. Raises
+        FrameError.
+        """
         topic = TOPIC_OF[type(frame)]
         name = wire_topic(topic.name, frame.skin)
         key = name.decode()
@@ -73,17 +80,20 @@ class Publisher:
         return self.subscribers(topic, skin) > 0
 
     def subscribers(self, topic: str, skin: str) -> int:
-        """How many subscriptions cover the topic: a subscription is a prefix, so "" and b"contact/" cover b"contact/palm" too."""
+        """How many subscriptions cover the topic: a subscription is a prefix, so "" and b"contact/" cover
+        b"contact/palm" too.
+        """
         head = wire_topic(topic, skin) + b"\0"
         return sum(n for prefix, n in self._subscriptions.items() if head.startswith(prefix) or prefix.startswith(head))
 
     def poll(self) -> None:
-        """Take in new and ended subscriptions, and send latched values to who has just come. Call it at least once a second.
+        """Take in new and ended subscriptions, and send latched values to who has just come. Call it at least once a
+        second.
 
         A latched value goes to all who subscribe to it, not only to the newcomer: readers know it by its seq.
         """
         newcomers = []
-        while self.socket.getsockopt(zmq.EVENTS) & zmq.POLLIN:  # type: ignore[operator]
+        while self.socket.poll(0):
             try:
                 event = self.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
@@ -96,7 +106,7 @@ class Publisher:
                 if self._subscriptions[event[1:]] <= 0:
                     del self._subscriptions[event[1:]]
         if newcomers:
-            for name, message in self._latched.items():
+            for message in self._latched.values():
                 if any(message.startswith(prefix) for prefix in newcomers):
                     self.socket.send(message, zmq.NOBLOCK)
 
@@ -120,7 +130,7 @@ class _Reader:
     def _receive(self, timeout_s: float) -> tuple[Frame, bytes] | None:
         """The next frame and its message; None when none came within `timeout_s` (0: what is there now)."""
         deadline = time.monotonic() + timeout_s
-        while True:
+        for _ in range(GARBAGE_AT_ONCE):
             try:
                 message = self.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
@@ -139,8 +149,7 @@ class _Reader:
                     log.warning(
                         "dropped a malformed message from %s (further ones are only counted): %s", self._where, bad
                     )
-                if time.monotonic() > deadline:
-                    return None
+        return None
 
     def close(self) -> None:
         """Close the socket."""
@@ -150,8 +159,8 @@ class _Reader:
 class NewestReader(_Reader):
     """The newest frame of one topic of one skin; older ones are skipped.
 
-    CONFLATE, because a high-water mark bounds neither the age of what is queued nor the kernel's buffers; one topic and skin per
-    socket, because a conflating socket holds one message, whatever its topic.
+    CONFLATE, because a high-water mark bounds neither the age of what is queued nor the kernel's buffers; one topic
+    and skin per socket, because a conflating socket holds one message, whatever its topic.
     """
 
     def __init__(self, topic: str, skin: str, endpoint: str | None = None, context: Context | None = None) -> None:
@@ -170,7 +179,9 @@ class NewestReader(_Reader):
         self.socket.subscribe(wire_topic(topic, skin) + b"\0")
 
     def recv(self, timeout_s: float = 0.0) -> Frame | None:
-        """The newest frame not yet read, waiting up to `timeout_s` for one; None when there is none. Never raises on bad input."""
+        """The newest frame not yet read, waiting up to `timeout_s` for one; None when there is none. Never raises on
+        bad input.
+        """
         got = self._receive(timeout_s)
         if got is None:
             return None

@@ -1,6 +1,7 @@
 """The table of topics: the only place that names them.
 
-Sockets, `skin top`, the recorder, WIRE.md's table and tests derive from it. A message's topic on the wire is `name/skin`.
+Sockets, `skin top`, the recorder, WIRE.md's table and tests derive from it. A message's topic on the wire is
+`name/skin`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ class Topic:
     """What is to be known of a topic.
 
     `rate_hz`: nominal, of the demo; 0: on change only. `lazy`: its extra work is done only while somebody subscribes.
-    `latched`: a late joiner is given the last value. `behind`: what a reader does that cannot keep up, skip to the newest or read all.
+    `latched`: a late joiner is given the last value. `behind`: what a reader does that cannot keep up, skip to the
+    newest or read all.
     """
 
     name: str
@@ -69,5 +71,7 @@ TOPIC_OF: dict[type[f.Frame], Topic] = {t.frame: t for t in TOPICS.values()}
 
 
 def wire_topic(name: str, skin: str) -> bytes:
-    """A message's topic as its first bytes, without the 0 that ends it: b"contact/palm". Raises KeyError for an unknown topic."""
+    """A message's topic as its first bytes, without the 0 that ends it: b"contact/palm". Raises KeyError for an
+    unknown topic.
+    """
     return f"{TOPICS[name].name}/{skin}".encode()

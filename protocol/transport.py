@@ -1,7 +1,8 @@
-"""How this process's sockets reach the others: which addresses, which keys. Every socket of the project is opened here.
+"""How this process's sockets reach the others: which addresses, which keys. Every socket of the project is opened
+here.
 
-By default all are ipc sockets in the runtime folder. A configuration may put producers at tcp:// addresses; then traffic is
-encrypted and both ends known to each other by CURVE, or, beyond the loopback, refused.
+By default all are ipc sockets in the runtime folder. A configuration may put producers at tcp:// addresses; then
+traffic is encrypted and both ends known to each other by CURVE, or, beyond the loopback, refused.
 """
 
 from __future__ import annotations
@@ -34,9 +35,10 @@ class TransportError(RuntimeError):
 class Transport:
     """Addresses and keys.
 
-    `addresses`: producer -> address of its data socket, `<process>.ctl` -> of its control socket; the runtime folder's for the rest.
-    `secret_key`: file with our key pair (as `write_keys` makes it). `server_keys`: producer -> file with its public key.
-    `clients`: folder with the public keys that may connect to us. `insecure`: allow unencrypted TCP beyond this host.
+    `addresses`: producer -> address of its data socket, `<process>.ctl` -> of its control socket; the runtime
+    folder's for the rest. `secret_key`: file with our key pair (as `write_keys` makes it). `server_keys`: producer ->
+    file with its public key. `clients`: folder with the public keys that may connect to us. `insecure`: allow
+    unencrypted TCP beyond this host.
     """
 
     addresses: Mapping[str, str] = field(default_factory=dict)
@@ -70,7 +72,9 @@ def current() -> Transport:
 
 
 def bind(context: Context, kind: int, address: str, options: Mapping[int, Any]) -> Socket:
-    """A bound socket. Raises TransportError for an address that is taken, or unencrypted and reachable from other hosts."""
+    """A bound socket. Raises TransportError for an address that is taken, or unencrypted and reachable from other
+    hosts.
+    """
     transport = _current
     secured = transport.secret_key is not None and address.startswith("tcp://")
     if address.startswith("tcp://") and not secured and not transport.insecure and not _is_loopback(address):
@@ -91,7 +95,9 @@ def bind(context: Context, kind: int, address: str, options: Mapping[int, Any]) 
 
 
 def connect(context: Context, kind: int, addresses: Mapping[str, str], options: Mapping[int, Any]) -> Socket:
-    """A socket connected to `addresses` (name of who is there -> address); who is not there yet is found when it comes."""
+    """A socket connected to `addresses` (name of who is there -> address); who is not there yet is found when it
+    comes.
+    """
     transport = _current
     socket = _open(context, kind, options)
     for name, address in addresses.items():
