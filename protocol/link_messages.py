@@ -1,0 +1,301 @@
+"""The messages of the board's link: their numbers, fields and layout.
+
+A body is the message's number and its fields, packed, little-endian. link.py puts bodies on the line and takes them
+off it.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+LINK_VERSION = 1
+MAX_SCAN = 512
+"""Most measurements in a scan list."""
+MAX_BODY = 8192
+"""Longest body with its CRC, in bytes; a receiver drops what is longer."""
+MAX_TEXT = 200
+"""Longest text in a message, in UTF-8 bytes; a longer one is cut."""
+CHIP_ID = 0x5502
+"""What a healthy AD5940 says it is."""
+
+
+class LinkError(ValueError):
+    """A message's fields cannot be sent, or do not fit their message: says which, what was found, what is allowed."""
+
+
+class Capability(IntFlag):
+    """Bits of Ident.capabilities."""
+
+    SENTINEL = 1
+    SELF_TEST = 2
+    VARIABLE_DFT = 4
+
+
+class NakReason(IntEnum):
+    """Why a command was refused."""
+
+    UNKNOWN = 1
+    SCHEMA = 2
+    BAD_CONFIG = 3
+    NOT_CONFIGURED = 4
+    BUSY = 5
+    CHIP_ID = 6
+    CALIBRATION = 7
+
+
+class EventCode(IntEnum):
+    """What the board reports unasked."""
+
+    BOOT = 1
+    BROWN_OUT = 2
+    CHIP_ID = 3
+    FIFO_OVERFLOW = 4
+    FIFO_UNDERFLOW = 5
+    MISSED_INTERRUPT = 6
+    CALIBRATION = 7
+    MULTIPLEXER = 8
+    OVERRUN = 9
+
+
+class SelfTestFault(IntFlag):
+    """Bits of the value in the ACK to SELF_TEST: what failed; 0 when all is well."""
+
+    CHIP_ID = 1
+    CALIBRATION = 2
+    MULTIPLEXER = 4
+    FIFO = 8
+
+
+STRUCT_CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "f32": "f", "12 bytes": "12s"}
+
+
+def _wired(kind: str, doc: str, default: Any = ...) -> Any:
+    """A field with its kind on the wire and its one line of documentation."""
+    metadata = {"kind": kind, "doc": doc}
+    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    """Base: the fields of a fixed size come first; what has no fixed size is packed by `_tail` and read by
+    `_read_tail`.
+    """
+
+    number: ClassVar[int]
+    sender: ClassVar[str]
+    plain_crc: ClassVar[bool] = False
+
+    @classmethod
+    def layout(cls) -> list[tuple[str, str, str]]:
+        """(name, kind, what it is) of each field, in the order sent."""
+        return [(n, f.metadata["kind"], f.metadata["doc"]) for n, f in cls.__dataclass_fields__.items() if f.metadata]
+
+    @classmethod
+    def _head(cls) -> tuple[list[str], struct.Struct]:
+        fixed = [(n, STRUCT_CODES[k]) for n, k, _ in cls.layout() if k in STRUCT_CODES]
+        return [n for n, _ in fixed], struct.Struct("<" + "".join(c for _, c in fixed))
+
+    def _tail(self) -> bytes:
+        return b""
+
+    @classmethod
+    def _read_tail(cls, rest: bytes) -> dict[str, Any]:
+        if rest:
+            raise LinkError(f"{len(rest)} bytes left over")
+        return {}
+
+    def body(self) -> bytes:
+        """Number and fields. Raises LinkError where a field does not fit its place."""
+        names, head = HEADS[type(self)]
+        try:
+            return bytes([self.number]) + head.pack(*(getattr(self, n) for n in names)) + self._tail()
+        except (struct.error, TypeError, ValueError, OverflowError) as bad:
+            raise LinkError(f"{type(self).__name__} cannot be sent: {bad}") from None
+
+    @classmethod
+    def read(cls, body: bytes) -> Message:
+        """The message in `body`. Raises LinkError."""
+        names, head = HEADS[cls]
+        if len(body) < 1 + head.size:
+            raise LinkError(f"{cls.__name__}: found {len(body)} bytes, expected at least {1 + head.size}")
+        try:
+            tail = cls._read_tail(body[1 + head.size :])
+        except LinkError as bad:
+            raise LinkError(f"{cls.__name__}: {bad}") from None
+        return cls(**dict(zip(names, head.unpack_from(body, 1), strict=True)), **tail)
+
+
+class _WithText(Message):
+    """A message that ends in text."""
+
+    text_field: ClassVar[str] = "text"
+
+    def _tail(self) -> bytes:
+        return str(getattr(self, self.text_field)).encode()[:MAX_TEXT]
+
+    @classmethod
+    def _read_tail(cls, rest: bytes) -> dict[str, Any]:
+        if len(rest) > MAX_TEXT:
+            raise LinkError(f"found {len(rest)} bytes of text, expected at most {MAX_TEXT}")
+        return {cls.text_field: rest.decode(errors="replace")}
+
+
+@dataclass(frozen=True, eq=False)
+class Hello(Message):
+    """Who is there? A board answers it in any state, with IDENT."""
+
+    number, sender, plain_crc = 0x01, "host", True
+    link_version: int = _wired("u8", "version of this framing", LINK_VERSION)
+    schema_hash: int = _wired("u32", "CRC-32 of the sender's schema text", 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Config(Message):
+    """A configuration to keep under its id; a board holds at least 4. ACK value: the id."""
+
+    number, sender = 0x02, "host"
+    config: int = _wired("u16", "id, chosen by the host")
+    dft_points: int = _wired("u16", "points of each DFT: 4, 8 ... 16384")
+    rtia_ohm: float = _wired("f32", "gain resistor of the current measurement [ohm]")
+    scan: NDArray[np.uint8] = _wired(
+        "n u16, n x 4 u8", "electrodes drive+, drive-, sense+, sense- of each measurement, from 0"
+    )
+
+    def _tail(self) -> bytes:
+        scan = np.asarray(self.scan)
+        if scan.ndim != 2 or scan.shape[1] != 4 or not 0 < len(scan) <= MAX_SCAN:
+            raise LinkError(f"scan has shape {scan.shape}, expected (1..{MAX_SCAN}, 4)")
+        if scan.min() < 0 or scan.max() > 255:
+            raise LinkError(f"electrodes {scan.min()}..{scan.max()}, expected 0..255")
+        return struct.pack("<H", len(scan)) + scan.astype("u1").tobytes()
+
+    @classmethod
+    def _read_tail(cls, rest: bytes) -> dict[str, Any]:
+        n = _count(rest)
+        if len(rest) != 2 + 4 * n:
+            raise LinkError(f"found {len(rest)} bytes of scan list, expected {2 + 4 * n} for n = {n}")
+        return {"scan": np.frombuffer(rest, "u1", offset=2).reshape(n, 4)}
+
+
+@dataclass(frozen=True, eq=False)
+class Start(Message):
+    """Scan a configuration over and over; while running: change over to it after the scan under way."""
+
+    number, sender = 0x03, "host"
+    config: int = _wired("u16", "id of the configuration")
+
+
+@dataclass(frozen=True, eq=False)
+class Stop(Message):
+    """Stop scanning."""
+
+    number, sender = 0x04, "host"
+
+
+@dataclass(frozen=True, eq=False)
+class SelfTest(Message):
+    """Check the chip, calibrate RTIA against RCAL, try the multiplexers. Only while stopped. ACK value: what failed."""
+
+    number, sender = 0x05, "host"
+
+
+@dataclass(frozen=True, eq=False)
+class Ident(_WithText):
+    """The answer to HELLO."""
+
+    number, sender, plain_crc, text_field = 0x81, "board", True, "firmware"
+    link_version: int = _wired("u8", "version of this framing", LINK_VERSION)
+    schema_hash: int = _wired("u32", "CRC-32 of the firmware's schema text", 0)
+    chip_id: int = _wired("u16", "the AD5940's CHIPID register: 0x5502", CHIP_ID)
+    unique_id: bytes = _wired("12 bytes", "the microcontroller's unique id", bytes(12))
+    capabilities: int = _wired("u32", "bits, see Capability", 0)
+    electrodes: int = _wired("u8", "how many it has", 16)
+    max_scan: int = _wired("u16", "longest scan list it takes", MAX_SCAN)
+    firmware: str = _wired("text", "name and version of the firmware", "")
+
+
+@dataclass(frozen=True, eq=False)
+class Ack(Message):
+    """A command was carried out."""
+
+    number, sender = 0x82, "board"
+    of: int = _wired("u8", "number of the command's message")
+    value: int = _wired("u32", "the command's result, see there", 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Nak(_WithText):
+    """A command was refused, or not understood (then `of` is the number it seemed to have, or 0)."""
+
+    number, sender, plain_crc = 0x83, "board", True
+    of: int = _wired("u8", "number of the command's message")
+    reason: int = _wired("u8", "see NakReason")
+    text: str = _wired("text", "why, for a person", "")
+
+
+@dataclass(frozen=True, eq=False)
+class Frame(Message):
+    """One scan."""
+
+    number, sender = 0x84, "board"
+    seq: int = _wired("u32", "counts scans since START, also those that could not be sent; wraps to 0")
+    device_us: int = _wired("u64", "the microcontroller's clock at the start of the scan [us]")
+    duration_us: int = _wired("u32", "how long the scan took [us]")
+    config: int = _wired("u16", "id of the configuration that was scanned")
+    z: NDArray[np.complex64] = _wired("n u16, n x (re, im f32)", "impedance of each measurement [ohm]")
+    status: NDArray[np.uint8] = _wired(
+        "ceil(n/2) u8",
+        "4 bits a measurement, the first in the low half: 1 clipped, 2 open, 4 RTIA overrange, 8 FIFO or missed",
+    )
+
+    def _tail(self) -> bytes:
+        z, status = np.ascontiguousarray(self.z, "<c8"), np.asarray(self.status)
+        if z.ndim != 1 or z.shape != status.shape or not 0 < len(z) <= MAX_SCAN:
+            raise LinkError(f"z has shape {z.shape}, status {status.shape}, expected (n,) twice, n 1..{MAX_SCAN}")
+        nibbles = np.zeros(len(z) + len(z) % 2, "u1")
+        nibbles[: len(z)] = status & 15
+        packed = bytes(nibbles[0::2] | nibbles[1::2] << 4)
+        return struct.pack("<H", len(z)) + bytes(z) + packed
+
+    @classmethod
+    def _read_tail(cls, rest: bytes) -> dict[str, Any]:
+        n = _count(rest)
+        size = 2 + 8 * n + (n + 1) // 2
+        if len(rest) != size:
+            raise LinkError(f"found {len(rest)} bytes of values, expected {size} for n = {n}")
+        packed = np.frombuffer(rest, "u1", offset=2 + 8 * n)
+        status = np.stack([packed & 15, packed >> 4], axis=1).reshape(-1)[:n]
+        return {"z": np.frombuffer(rest, "<c8", n, 2).copy(), "status": status}
+
+
+@dataclass(frozen=True, eq=False)
+class Event(_WithText):
+    """Something happened."""
+
+    number, sender = 0x85, "board"
+    code: int = _wired("u16", "see EventCode")
+    text: str = _wired("text", "what, for a person", "")
+
+
+MESSAGES: tuple[type[Message], ...] = (Hello, Config, Start, Stop, SelfTest, Ident, Ack, Nak, Frame, Event)
+BY_NUMBER = {m.number: m for m in MESSAGES}
+HEADS = {m: m._head() for m in MESSAGES}
+SCHEMA_TEXT = "".join(
+    f"{m.number:02x} {m.__name__}: {'; '.join(f'{name} {kind}' for name, kind, _ in m.layout())}\n" for m in MESSAGES
+)
+"""One line a message: what both ends must agree on."""
+SCHEMA_HASH = zlib.crc32(SCHEMA_TEXT.encode())
+
+
+def _count(rest: bytes) -> int:
+    n = int.from_bytes(rest[:2], "little")
+    if len(rest) < 2 or not 0 < n <= MAX_SCAN:
+        raise LinkError(f"found n = {n}, expected 1..{MAX_SCAN}")
+    return n
