@@ -4,8 +4,8 @@
 
 Each chunk is several hundred scenes on one skin as it might have been mounted (electrodes shifted along the outline,
 contact impedances and background off); 40 % of chunks are the nominal skin. A chunk depends on (seed, split, index)
-alone, so a run can be stopped and taken up again, and any number of processes on any joblib backend gives the same files.
-Noise and drift are not in the data: training adds them, afresh each time.
+alone, so a run can be stopped and taken up again, and any number of processes on any joblib backend gives the same
+files. Noise and drift are not in the data: training adds them, afresh each time.
 """
 
 from __future__ import annotations
@@ -232,8 +232,7 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    from models.data import (
-        main as importable,
-    )  # workers look make_chunk up by its module's name, which must not be __main__
+    # Workers look make_chunk up by its module's name, which must not be __main__.
+    from models.data import main as importable
 
     importable()
