@@ -20,8 +20,10 @@ ROOT = Path(__file__).resolve().parents[2]
 def messages(n: int) -> list[Recorded]:
     """Two topics, incompressible bodies of uneven length."""
     rng = random.Random(7)
-    return [Recorded(("raw/palm", "contact/palm")[k % 2], 10**18 + k * 20_000_000, rng.randbytes(rng.randint(1, 900)))
-            for k in range(n)]
+    return [
+        Recorded(("raw/palm", "contact/palm")[k % 2], 10**18 + k * 20_000_000, rng.randbytes(rng.randint(1, 900)))
+        for k in range(n)
+    ]
 
 
 def write(path: Path, sent: list[Recorded], per_chunk: int = 5) -> None:

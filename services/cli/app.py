@@ -1,0 +1,48 @@
+"""The command `skin`: all commands by group, and the one place where errors become a line and an exit code."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import typer
+
+from services.cli import board, offline, recordings, service, watch
+from services.cli.common import FAILED, expected_code
+
+app = typer.Typer(
+    name="skin",
+    help="A tactile skin: start it, watch it, press it, record it, reconstruct from files.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+for group in (service, watch, board, recordings, offline):
+    group.register(app)
+
+
+def run() -> int:
+    """Runs the command line of this process and returns its exit code."""
+    try:
+        app()
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 0 if end.code is None else FAILED
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # `skin echo contact | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        code = expected_code(error)
+        if os.environ.get("EITSKIN_DEBUG"):
+            raise
+        if code is None:
+            hint = "a fault of this program: set EITSKIN_DEBUG=1 to see where, and report it"
+            first = (str(error).splitlines() or [""])[0]
+            print(f"skin: {type(error).__name__}: {first} ({hint})", file=sys.stderr)
+            return FAILED
+        for line in str(error).splitlines():
+            print(f"skin: {line}", file=sys.stderr)
+        return code
+    return 0

@@ -1,0 +1,116 @@
+"""Commands to a running service that return as soon as they are taken: press, scene, fault, release, tare."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import typer
+
+from services.cli.common import USAGE, JsonOption, SkinOption, control, emit, fail, skin_name
+
+Metre = Annotated[float, typer.Option(help="Metres in the skin's frame, origin at its centre.")]
+
+
+def register(app: typer.Typer) -> None:
+    for command in (press, release, scene, fault, tare):
+        app.command()(command)
+
+
+def press(
+    x: Metre,
+    y: Metre,
+    force: Annotated[float, typer.Option(help="Newtons.")],
+    radius: Annotated[float, typer.Option(help="Metres, of the circumscribed circle.")] = 0.01,
+    shape: Annotated[str, typer.Option(help="circle, triangle, rectangle, square, L or hertz.")] = "circle",
+    to_x: Annotated[float | None, typer.Option(help="Slide to this x.")] = None,
+    to_y: Annotated[float | None, typer.Option(help="Slide to this y.")] = None,
+    seconds: Annotated[float, typer.Option(help="How long the press goes on.")] = 20.0,
+    skin: SkinOption = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Press the stub's skin. Returns as soon as the board has taken it; the press goes on for its seconds."""
+    args: dict[str, Any] = {"x": x, "y": y, "force": force, "radius": radius, "shape": shape, "seconds": seconds}
+    if (to_x is None) != (to_y is None):
+        fail("a slide needs both --to-x and --to-y: found only one of them", USAGE)
+    if to_x is not None:
+        args |= {"to_x": to_x, "to_y": to_y}
+    answer = _stub("press", skin, **args)
+    if as_json:
+        emit(answer)
+    else:
+        slide = f" sliding to ({to_x:+.4f}, {to_y:+.4f})" if to_x is not None else ""
+        print(f"pressing at ({x:+.4f}, {y:+.4f}) m with {force:g} N{slide} for {seconds:g} s")
+
+
+def release(skin: SkinOption = "", as_json: JsonOption = False) -> None:
+    """Take every press off the stub's skin."""
+    answer = _stub("release", skin)
+    emit(answer) if as_json else print("released")
+
+
+def scene(
+    name: Annotated[str, typer.Argument(help="A scene of firmware_stub/scenes, or a .toml file.")] = "",
+    skin: SkinOption = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Play a scene on the stub's skin; without a name, list the scenes."""
+    if not name:
+        from services.cli.common import ROOT
+
+        names = sorted(path.stem for path in (ROOT / "firmware_stub" / "scenes").glob("*.toml"))
+        emit(names) if as_json else print("\n".join(names))
+        return
+    if name.endswith(".toml"):
+        from pathlib import Path
+
+        name = str(Path(name).resolve())
+    answer = _stub("scene", skin, name=name)
+    emit(answer) if as_json else print(f"playing {name}")
+
+
+def fault(
+    name: Annotated[str, typer.Argument(help="Which fault; without one, list them.")] = "",
+    arguments: Annotated[list[str] | None, typer.Argument(help="key=value, as the list shows them.")] = None,
+    seconds: Annotated[float, typer.Option(help="How long it lasts.")] = 5.0,
+    clear: Annotated[bool, typer.Option("--clear", help="End this fault, or all.")] = False,
+    skin: SkinOption = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Let something go wrong with the stub board, as on a real one."""
+    args: dict[str, Any] = {"name": name, "args": dict(_pair(a) for a in arguments or [])}
+    args |= {"seconds": seconds, "clear": clear}
+    answer = _stub("faults", skin, **(args if name or clear else {}))
+    if as_json or name or clear:
+        emit(answer)
+        return
+    for fault_name, row in answer.get("known", answer).items():
+        what, defaults = (row.get("what", ""), row.get("args", {})) if isinstance(row, dict) else (row, {})
+        listed = ", ".join(f"{key}={value}" for key, value in defaults.items())
+        print(f"{fault_name:20s} {what}" + (f"  [{listed}]" if listed else ""))
+
+
+def _pair(text: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals:
+        fail(f"found {text!r}, expected key=value (for example electrode=3)", USAGE)
+    try:
+        return key, json.loads(value)
+    except ValueError:
+        return key, value
+
+
+def _stub(command: str, skin: str, **args: Any) -> dict[str, Any]:
+    return control("stub", command, **args, **({"skin": skin} if skin else {}))
+
+
+def tare(skin: SkinOption = "", as_json: JsonOption = False) -> None:
+    """Take a new baseline: nothing may touch the skin for the next seconds."""
+    answer = control("preprocessing", "tare", skin=skin_name(skin), timeout_s=10.0)
+    if as_json:
+        emit(answer)
+    else:
+        frames = answer.get("frames")
+        print(
+            "taking a new baseline" + (f" from the next {frames} frames" if frames else "") + ": leave the skin alone"
+        )

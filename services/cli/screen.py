@@ -1,0 +1,89 @@
+"""The picture of `skin top`: tables of topics and processes beside the skin's heat map."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from services.cli.heatmap import draw
+from services.cli.monitor import Monitor
+
+LEVELS = {"OK": "green", "WARN": "yellow", "ERROR": "bold red", "STALE": "bold red"}
+
+
+def screen(monitor: Monitor) -> RenderableType:
+    now = monitor.snapshot()
+    if not monitor.heard:
+        return Text(f"waiting for frames of skin {monitor.skin!r}; is the service running (`skin up`)?", style="yellow")
+    right = Group(_skin(monitor), _contacts(now))
+    page = Table.grid(padding=(0, 2))
+    page.add_row(Group(_topics(now), _processes(now)), right)
+    return page
+
+
+def _topics(now: dict[str, Any]) -> Table:
+    table = Table(title=f"skin {now['skin']}", title_justify="left", box=None)
+    for head in ("topic", "Hz", "age ms", "p50 ms", "p99 ms", "lost", "CPU %", "says"):
+        table.add_column(head, justify="left" if head in ("topic", "says") else "right")
+    for name, row in now["topics"].items():
+        process = now["processes"].get(row["producer"])
+        says = Text("valid", style="green") if row["valid"] else Text("invalid", style="bold red")
+        says.append(" " + ", ".join(row["reasons"]), style="yellow")
+        table.add_row(
+            name,
+            _number(row["rate_hz"]),
+            _number(row["age_ms"], 0),
+            _number(row["latency_ms"]["p50"]),
+            _number(row["latency_ms"]["p99"]),
+            str(row["lost"]),
+            _number(process["cpu"] * 100) if process else "",
+            says,
+        )
+    return table
+
+
+def _processes(now: dict[str, Any]) -> Table:
+    table = Table(box=None)
+    for head in ("process", "level", "CPU %", "p50 ms", "p99 ms", "drops", "says"):
+        table.add_column(head, justify="left" if head in ("process", "level", "says") else "right")
+    for name, row in now["processes"].items():
+        drops = " ".join(f"{cause} {n}" for cause, n in row["drops"].items() if n)
+        latency = row["latency_ms"]
+        table.add_row(
+            name,
+            Text(row["level"], style=LEVELS[row["level"]]),
+            _number(row["cpu"] * 100),
+            _number(latency.get("p50")),
+            _number(latency.get("p99")),
+            drops or "0",
+            "; ".join(row["messages"]),
+        )
+    return table
+
+
+def _skin(monitor: Monitor) -> RenderableType:
+    image, contact = monitor.image, monitor.contact
+    geometry = monitor.info.get("geometry") or {}
+    outline = geometry.get("outline")
+    outline = outline.tolist() if hasattr(outline, "tolist") else outline
+    half = max((abs(v) for point in outline for v in point), default=0.05) if outline else 0.05
+    if image is not None and image.image.size:
+        half = max(half, -min(image.origin))
+    marks = [(c.position[0], c.position[1]) for c in contact.contacts] if contact else []
+    return draw(image.image if image is not None else None, half, marks, outline)
+
+
+def _contacts(now: dict[str, Any]) -> Text:
+    text = Text()
+    for c in now["contacts"]:
+        force = f"{c['force_n']:.2f} N" if c["force_n"] is not None else "force unknown"
+        x, y = c["position"][0] * 1e3, c["position"][1] * 1e3
+        text.append(f"{c['id']:4d} ({x:+6.1f}, {y:+6.1f}) mm  {force}  {c['shape']}\n")
+    return text if now["contacts"] else Text("nothing touches", style="dim")
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return "" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,108 @@
+"""Contacts beside the stub's truth: what `skin compare` prints."""
+
+from __future__ import annotations
+
+import math
+import time
+from statistics import median
+from typing import Any
+
+from protocol.frames import ContactFrame, TruthFrame
+from protocol.sockets import AllReader
+from services.cli.common import NOT_RUNNING, emit, fail
+from services.cli.watch import nobody
+
+
+def pairs(truth: TruthFrame, contact: ContactFrame) -> list[dict[str, Any]]:
+    """Each true touch with the nearest contact not yet taken; `found` is None where none is left."""
+    left = [c for c in contact.contacts if c.state != "end"]
+    rows = []
+    for touch in truth.touches:
+        row: dict[str, Any] = {
+            "scan": contact.scan,
+            "x": touch.x,
+            "y": touch.y,
+            "force_n": touch.force_n,
+            "shape": touch.shape,
+        }
+        best = min(left, key=lambda c: math.dist(c.position[:2], (touch.x, touch.y)), default=None)
+        row["found"] = None
+        if best is not None:
+            left.remove(best)
+            row["found"] = {
+                "x": best.position[0],
+                "y": best.position[1],
+                "force_n": best.force_n,
+                "shape": best.shape,
+                "id": best.id,
+                "error_mm": math.dist(best.position[:2], (touch.x, touch.y)) * 1e3,
+            }
+        rows.append(row)
+    return rows
+
+
+def compare_for(skin: str, seconds: float, as_json: bool) -> None:
+    contacts, truths = AllReader(["contact"], skin), AllReader(["truth"], skin)
+    known: dict[int, TruthFrame] = {}
+    waiting: dict[int, ContactFrame] = {}
+    rows: list[dict[str, Any]] = []
+    end = time.monotonic() + seconds
+    heard_contact = heard_truth = False
+    while (now := time.monotonic()) < end:
+        frame = contacts.recv(min(0.05, end - now))
+        if isinstance(frame, ContactFrame):
+            waiting[frame.scan], heard_contact = frame, True
+        while (true := truths.recv(0.0)) is not None:
+            if isinstance(true, TruthFrame):
+                known[true.scan], heard_truth = true, True
+        for scan in sorted(waiting.keys() & known.keys()):
+            for row in pairs(known.pop(scan), waiting.pop(scan)):
+                rows.append(row)
+                emit(row) if as_json else print(_line(row), flush=True)
+        for old in (known, waiting):
+            while len(old) > 200:
+                old.pop(next(iter(old)))
+    if not heard_contact:
+        fail(nobody(skin, seconds), NOT_RUNNING)
+    if not heard_truth:
+        fail(f"no truth/{skin} came: only the stub board knows the truth", NOT_RUNNING)
+    _summary(rows, as_json)
+
+
+def _line(row: dict[str, Any]) -> str:
+    true, found = f"scan {row['scan']:7d}  true {_touch(row)}", row["found"]
+    return f"{true}  seen {_touch(found)}  off by {found['error_mm']:.2f} mm" if found else f"{true}  not seen"
+
+
+def _touch(row: dict[str, Any]) -> str:
+    return f"({row['x'] * 1e3:+6.1f}, {row['y'] * 1e3:+6.1f}) mm {_newton(row['force_n'])} {row['shape']:9s}"
+
+
+def _newton(force: float | None) -> str:
+    return "   -  N" if force is None else f"{force:5.2f} N"
+
+
+def _summary(rows: list[dict[str, Any]], as_json: bool) -> None:
+    seen = [row for row in rows if row["found"] is not None]
+    errors = sorted(row["found"]["error_mm"] for row in seen)
+    forces = [
+        abs(row["found"]["force_n"] / row["force_n"] - 1) * 100
+        for row in seen
+        if row["force_n"] and row["found"]["force_n"] is not None
+    ]
+    result = {
+        "touches": len(rows),
+        "seen": len(seen),
+        "position_error_mm": {"median": median(errors), "max": errors[-1]} if errors else None,
+        "force_error_percent": {"median": median(forces), "max": max(forces)} if forces else None,
+    }
+    if as_json:
+        emit({"summary": result})
+    elif not rows:
+        print("nothing touched: `skin press --x 0.02 --y -0.01 --force 3`")
+    else:
+        print(f"{len(seen)} of {len(rows)} true touches seen")
+        if errors:
+            print(f"position error: median {median(errors):.2f} mm, largest {errors[-1]:.2f} mm")
+        if forces:
+            print(f"force error: median {median(forces):.1f} %, largest {max(forces):.1f} %")

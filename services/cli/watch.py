@@ -1,0 +1,147 @@
+"""Commands that watch a running service: top, echo, compare."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from services.cli.common import NOT_RUNNING, USAGE, JsonOption, SkinOption, emit, fail, skin_name
+
+if TYPE_CHECKING:
+    from services.cli.monitor import Monitor
+
+
+def register(app: typer.Typer) -> None:
+    for command in (top, echo, compare):
+        app.command()(command)
+
+
+def nobody(skin: str, seconds: float) -> str:
+    from protocol.runtime import runtime_dir
+
+    found = f"no frame of skin {skin!r} came within {seconds:g} s at {runtime_dir()}"
+    return f"{found}: start the service with `skin up`, or set EITSKIN_RUNTIME"
+
+
+def top(
+    skin: SkinOption = "",
+    once: Annotated[bool, typer.Option("--once", help="Watch for a moment, print, leave.")] = False,
+    seconds: Annotated[float, typer.Option(help="How long --once watches.")] = 2.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Rates, ages, latencies, drops and CPU of every topic and process, and the skin itself, live."""
+    from services.cli.monitor import Monitor
+
+    monitor = Monitor(skin_name(skin))
+    if once or as_json:
+        while True:
+            monitor.read(seconds)
+            if not monitor.heard:
+                fail(nobody(monitor.skin, seconds), NOT_RUNNING)
+            if as_json:
+                emit(monitor.snapshot())
+            else:
+                from rich.console import Console
+
+                from services.cli.screen import screen
+
+                Console().print(screen(monitor))
+            if once:
+                return
+    _live(monitor)
+
+
+def _live(monitor: Monitor) -> None:
+    from rich.console import Console
+    from rich.live import Live
+
+    from services.cli.screen import screen
+
+    with Live(screen(monitor), console=Console(), screen=True, auto_refresh=False) as live:
+        while True:
+            monitor.read(0.2)
+            live.update(screen(monitor), refresh=True)
+
+
+def echo(
+    topic: Annotated[str, typer.Argument(help="raw, delta, image, contact, force, shape, status, info or truth.")],
+    skin: SkinOption = "",
+    count: Annotated[int, typer.Option("--count", "-n", help="Leave after so many frames; 0: never.")] = 0,
+    timeout: Annotated[float, typer.Option(help="Give up after so many seconds without a frame; 0: never.")] = 10.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Print a topic's frames as they come."""
+    from protocol.sockets import AllReader
+    from protocol.topics import TOPICS
+
+    name, _, named_skin = topic.partition("/")
+    if name not in TOPICS:
+        fail(f"no topic {name!r}: expected one of {', '.join(TOPICS)}", USAGE)
+    wanted = skin_name(skin or named_skin)
+    reader = AllReader([name], wanted)
+    shown = 0
+    while not count or shown < count:
+        frame = reader.recv(timeout or 1e6)
+        if frame is None:
+            fail(nobody(wanted, timeout), NOT_RUNNING)
+        if as_json:
+            emit(plain(frame))
+        else:
+            print(line(name, frame), flush=True)
+        shown += 1
+
+
+def plain(value: Any) -> Any:
+    """A frame as maps and lists."""
+    from dataclasses import fields, is_dataclass
+
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    return value
+
+
+def line(name: str, frame: Any) -> str:
+    """A frame for a person: what it says first, then where it comes from."""
+    head = f"{name}/{frame.skin} {frame.seq:6d} {'valid  ' if frame.valid else 'INVALID'}"
+    reasons = f" [{', '.join(frame.reasons)}]" if frame.reasons else ""
+    if name == "contact":
+        body = "; ".join(
+            f"{c.id} {c.state} ({c.position[0] * 1e3:+.1f}, {c.position[1] * 1e3:+.1f}) mm"
+            + (f" {c.force_n:.2f} N" if c.force_n is not None else "")
+            + f" {c.shape}"
+            for c in frame.contacts
+        )
+        return f"{head} {body or 'no contact'}{' (held)' if frame.held else ''}{reasons}"
+    from protocol.frames import Frame
+
+    header = set(Frame.__dataclass_fields__)
+    body = " ".join(f"{key}={_short(value)}" for key, value in plain(frame).items() if key not in header)
+    return f"{head}{reasons} {body}"
+
+
+def _short(value: Any) -> str:
+    if hasattr(value, "dtype"):
+        import numpy as np
+
+        if value.size == 0:
+            return "-"
+        size = np.abs(value)
+        return f"{value.dtype}{list(value.shape)} |{size.min():.4g}..{size.max():.4g}|"
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    text = str(value)
+    return text if len(text) < 200 else text[:197] + "..."
+
+
+def compare(
+    skin: SkinOption = "",
+    seconds: Annotated[float, typer.Option(help="How long to compare.")] = 10.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Print position and force of every contact beside the stub's truth, scan by scan, and the errors at the end."""
+    from services.cli.truth import compare_for
+
+    compare_for(skin_name(skin), seconds, as_json)

@@ -1,0 +1,234 @@
+"""The recorder: `python -m services.recorder FILE` or `--folder FOLDER`. Only subscribes; nothing waits for it.
+
+Recording does not wake lazy topics unless they are asked for. What the stages' state was is asked of them when the
+recording starts and after each new baseline, and stored as `state/<skin>`: a replay begins from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import msgpack
+
+from protocol.frames import Frame, InfoFrame
+from protocol.runtime import host_id
+from protocol.sockets import AllReader, ControlClient, ControlError, ControlServer
+from protocol.topics import TOPICS
+from services.recording import STATE_TOPIC, RecordingError, RecordingWriter
+
+DEFAULT_TOPICS = ("raw", "contact", "status", "info")
+STAGES = ("preprocessing", "inference", "publisher")
+POLL_S = 0.05
+STATE_TIMEOUT_S = 0.5
+
+log = logging.getLogger("recorder")
+
+
+class Recorder:
+    """Subscribes and writes. `step` often; not thread-safe."""
+
+    def __init__(
+        self, path: Path, topics: Iterable[str] = DEFAULT_TOPICS, skin: str | None = None, overwrite: bool = False
+    ) -> None:
+        topics = list(topics)
+        for name in topics:
+            if name not in TOPICS:
+                raise RecordingError(f"no topic {name!r}: expected some of {', '.join(TOPICS)}")
+        self.path = path
+        self.writer = RecordingWriter(path, _metadata(topics, skin), overwrite)
+        self.reader = AllReader(topics, skin)
+        self.states = _StateReader()
+        self._zero_ns = (
+            time.time_ns() - time.monotonic_ns()
+        )  # a clock that is set meanwhile must not tear the file's times
+        self._baselines: dict[str, Any] = {}
+        self.states.ask(skin)
+
+    def step(self, seconds: float = POLL_S) -> int:
+        """Writes what arrives within `seconds`; how many messages that was."""
+        end, taken = time.monotonic() + seconds, 0
+        while True:
+            got = self.reader.recv_message(max(0.0, end - time.monotonic()))
+            self._write_states()
+            if got is None:
+                self.writer.flush_if_due()
+                return taken
+            frame, message = got
+            topic, _, data = message.partition(b"\0")
+            self.writer.write(topic.decode(), data, self._now_ns())
+            taken += 1
+            self._watch_baseline(frame)
+
+    def _watch_baseline(self, frame: Frame) -> None:
+        if isinstance(frame, InfoFrame):
+            found = frame.info.get("baseline_hash")
+            if self._baselines.setdefault(frame.skin, found) != found:
+                self._baselines[frame.skin] = found
+                self.states.ask(frame.skin)
+
+    def _write_states(self) -> None:
+        for skin, packed in self.states.answers():
+            self.writer.write(f"{STATE_TOPIC}/{skin}", packed, self._now_ns())
+
+    def _now_ns(self) -> int:
+        return self._zero_ns + time.monotonic_ns()
+
+    @property
+    def gaps(self) -> int:
+        """Messages that got lost before they reached us."""
+        return self.reader.gaps
+
+    def close(self) -> None:
+        self.states.close()
+        self._write_states()
+        self.reader.close()
+        self.writer.close()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _StateReader:
+    """Asks the stages for their state on a thread of its own, so that a silent stage holds up no message."""
+
+    def __init__(self) -> None:
+        self._asked: list[str | None] = []
+        self._answers: list[tuple[str, bytes]] = []
+        self._lock = threading.Condition()
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="states", daemon=True)
+        self._thread.start()
+
+    def ask(self, skin: str | None) -> None:
+        with self._lock:
+            self._asked.append(skin)
+            self._lock.notify()
+
+    def answers(self) -> Iterator[tuple[str, bytes]]:
+        """(skin, msgpack map process -> state) not yet taken."""
+        with self._lock:
+            found, self._answers = self._answers, []
+        yield from found
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                while not self._asked and not self._closing:
+                    self._lock.wait()
+                if self._closing:
+                    return
+                skin = self._asked.pop(0)
+            for name, states in stage_states(skin).items():
+                with self._lock:
+                    self._answers.append((name, pack_state(states)))
+
+    def close(self) -> None:
+        with self._lock:
+            self._closing = True
+            self._lock.notify()
+        self._thread.join(len(STAGES) * STATE_TIMEOUT_S + 0.5)
+
+
+def stage_states(skin: str | None) -> dict[str, dict[str, Any]]:
+    """skin -> process -> state, of the stages that answer; of all skins where `skin` is None."""
+    found: dict[str, dict[str, Any]] = {}
+    for process in STAGES:
+        try:
+            answer = ControlClient(process, STATE_TIMEOUT_S).call("state", **({"skin": skin} if skin else {}))
+        except ControlError as error:
+            log.warning("the state of %s is not in the recording: %s", process, error)
+            continue
+        for name, state in answer.get("skins", {}).items():
+            found.setdefault(name, {})[process] = state
+    return found
+
+
+def pack_state(states: dict[str, Any]) -> bytes:
+    packed: bytes = msgpack.packb(states)
+    return packed
+
+
+def _metadata(topics: list[str], skin: str | None) -> dict[str, str]:
+    from services.config import config_path
+
+    try:
+        configuration = config_path().read_text(encoding="utf-8")
+    except OSError:
+        configuration = ""
+    return {
+        "origin": "record",
+        "host": host_id(),
+        "topics": " ".join(topics),
+        "skin": skin or "",
+        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "configuration": configuration,
+    }
+
+
+def file_in(folder: Path) -> Path:
+    """A name not yet taken in a folder: the time, to the second, and a number where need be."""
+    stem = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+    names = (folder / f"{stem}{suffix}.mcap" for suffix in ("", *(f"-{n}" for n in range(1, 1000))))
+    return next(path for path in names if not path.exists())
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="services.recorder", description="Records a running service.")
+    parser.add_argument("file", nargs="?", type=Path)
+    parser.add_argument("--folder", type=Path, help="write a new file, named by the time, in this folder")
+    parser.add_argument("--skin", help="only this skin")
+    parser.add_argument("--topics", default=",".join(DEFAULT_TOPICS))
+    args = parser.parse_args(argv)
+    if (args.file is None) == (args.folder is None):
+        parser.error("name either a file or --folder")
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    signal.signal(signal.SIGINT, on_signal)
+    signal.signal(signal.SIGTERM, on_signal)
+    try:
+        if args.folder is not None:
+            args.folder.mkdir(parents=True, exist_ok=True)
+        path = args.file or file_in(args.folder)
+        recorder = Recorder(path, args.topics.split(","), args.skin)
+    except (RecordingError, OSError) as error:
+        log.error("%s", error)
+        return 2
+    server = ControlServer("recorder", {"status": lambda _: _status(recorder)})
+    log.info("recording to %s", path)
+    try:
+        with recorder:
+            while not stop.is_set():
+                recorder.step()
+                while server.serve_once():
+                    pass
+    except OSError as error:  # disk full, folder gone
+        log.error("cannot go on writing %s: %s", path, error.strerror)
+        return 1
+    finally:
+        server.close()
+    log.info("recorded %s", ", ".join(f"{topic} {n}" for topic, n in recorder.writer.counts.items()) or "nothing")
+    return 0
+
+
+def _status(recorder: Recorder) -> dict[str, Any]:
+    return {"file": str(recorder.path), "messages": recorder.writer.counts, "gaps": recorder.gaps}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
