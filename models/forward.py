@@ -11,6 +11,7 @@ at the others: one sparse factorisation and n-1 right-hand sides give the transf
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 
 import numpy as np
@@ -21,11 +22,15 @@ from skfem import MeshTri
 
 from models import geometry, meshing, patterns
 from models.geometry import Skin
+from models.shapes import Shape
 
 Array = NDArray[np.float64]
 
-# Points of an element in barycentric coordinates, all of equal weight: the centroids of its 1, 4 or 16 equal sub-triangles.
-SUBPOINTS = {1: 1, 4: 2, 16: 4}
+# Share of the laminate's anisotropy in elements that an outline crosses, see ForwardModel.touched. Chosen so that the difference
+# signals of the coarser meshes are those of the reference mesh, whose elements are small enough for plain area fractions.
+LAMINATE = 0.65
+LAMINATE_REFERENCE = 0.0
+CROSSED_LEVEL = 7  # such an element is sampled at the centroids of 7 x 7 equal sub-triangles
 
 
 class ForwardModel:
@@ -36,7 +41,7 @@ class ForwardModel:
 
         model = ForwardModel("square16")
         z0 = model.solve(1.0).impedances()                     # (120,)
-        touched = model.solve(1.0 - model.average(drop))       # drop: function of points (..., 2) -> S/m
+        touched = model.solve(model.touched([Shape("circle", 0.2, 0.1, 0.3, 0.15)]))
         touched.impedances("adjacent"), touched.jacobian()     # (208,), (120, n_elements)
 
     Attributes: n_elements, areas (n_elements,), centroids (n_elements, 2), pattern (K, 4), contact_impedance (n,), mesh.
@@ -50,6 +55,7 @@ class ForwardModel:
         self.pattern = self.skin.pattern if pattern is None else patterns.pattern(pattern, n)
         self.mesh = mesh if isinstance(mesh, MeshTri) else meshing.build(self.skin, mesh)
         self.contact_impedance: Array = self.skin.contact_impedance
+        self._share = LAMINATE_REFERENCE if mesh == "reference" else LAMINATE
         self._geometry()
         self._electrodes()
         self._structure()
@@ -57,15 +63,41 @@ class ForwardModel:
     # --- what a shape needs to become a conductivity ---
 
     def subpoints(self, q: int = 16) -> Array:
-        """(n_elements, q, 2) points of equal weight in every element; q = 1, 4 or 16."""
-        if q not in SUBPOINTS:
-            raise ValueError(f"{q} points per element: expected 1, 4 or 16")
-        corners = self.mesh.p.T[self.mesh.t.T]
-        return np.asarray(np.einsum("qc,eck->eqk", _barycentric(SUBPOINTS[q]), corners))
+        """(n_elements, q, 2) points of equal weight in every element; q is a square: 1, 4, 9, 16 ..."""
+        level = round(q**0.5)
+        if level**2 != q:
+            raise ValueError(f"{q} points per element: expected a square number (an element is cut into that many)")
+        return np.asarray(np.einsum("qc,eck->eqk", _barycentric(level), self.corners))
 
     def average(self, field, q: int = 16) -> Array:  # type: ignore[no-untyped-def]
         """(n_elements,) mean over each element of field(points (n_elements, q, 2)) -> (n_elements, q)."""
         return np.asarray(np.asarray(field(self.subpoints(q)), dtype=float).mean(axis=1))
+
+    def touched(self, shapes: Iterable[Shape], background: float = 1.0) -> Array:
+        """(n_elements, 3) conductivity xx, xy, yy [S] of a background less the drop of touches (where two overlap, the larger).
+
+        An element that an outline crosses conducts like a laminate: the harmonic mean across the outline, the arithmetic mean
+        along it. A part LAMINATE of that anisotropy gives on the training mesh what plain area fractions give on the reference
+        mesh: the difference signals of the EIDORS scenes to 0.13 % (pairs; rms), where area fractions alone are 0.6 % off and
+        biased low. (All of it would give the limit of ever finer meshes, up to 0.9 % above EIDORS's own frames for small sharp shapes.)
+        Background scales the sheet, drop included: a touch takes the same share of whatever conducts there.
+        """
+        shapes = list(shapes)
+        near, sampled = np.zeros(self.n_elements, dtype=bool), np.zeros(self.n_elements, dtype=bool)
+        for shape in shapes:
+            reach = np.hypot(self.centroids[:, 0] - shape.x, self.centroids[:, 1] - shape.y) - self._sizes
+            close = np.flatnonzero(reach < shape.radius)
+            near[close] = True
+            if shape.kind == "hertz":
+                sampled[close] = True
+            else:
+                sampled[close[shape.edge_distance(self.centroids[close]) < self._sizes[close]]] = True
+        result = np.tile([1.0, 0.0, 1.0], (self.n_elements, 1))
+        whole = np.flatnonzero(near & ~sampled)
+        result[whole, 0] = result[whole, 2] = 1 - _drop(shapes, self.centroids[whole])
+        cut = np.flatnonzero(sampled)
+        result[cut] = _laminate(self.corners[cut], lambda points: 1 - _drop(shapes, points), self._share)
+        return background * result
 
     def pixel_map(self, n: int, q: int = 4) -> sparse.csr_array:
         """(n*n, n_elements) row-stochastic: pixel values of an element-wise field, pixel [iy, ix] at row iy*n + ix.
@@ -87,31 +119,43 @@ class ForwardModel:
     # --- the solution ---
 
     def solve(self, conductivity: ArrayLike = 1.0, contact_impedance: ArrayLike | None = None) -> Solution:
-        """Fields of unit currents for a sheet conductivity (n_elements,) or scalar [S] and contact impedances (n,) or scalar.
+        """Fields of unit currents for a sheet conductivity [S] and contact impedances (n,) or scalar.
 
+        conductivity: a number, (n_elements,), or symmetric tensors (n_elements, 3) as xx, xy, yy (what `touched` returns).
         Raises ValueError where a conductivity or contact impedance is not positive and finite, or has the wrong length.
         """
-        sigma = _positive(conductivity, self.n_elements, "conductivity")
         contact = _positive(
             self.contact_impedance if contact_impedance is None else contact_impedance, self.skin.n_electrodes, "contact impedance"
         )
-        data = self._from_sigma @ sigma + self._from_contact @ (1 / contact)
+        data = self._stiffness(conductivity) + self._from_contact @ (1 / contact)
         matrix = sparse.csc_matrix((data, self._indices, self._indptr), shape=(self._size, self._size))
         factor = splu(
-            matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=8, panel_size=12, options={"SymmetricMode": True}
+            matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=1, panel_size=8, options={"SymmetricMode": True}
         )
         fields = factor.solve(self._currents)
-        return Solution(self, sigma, contact, fields[self._unpermute])
+        return Solution(self, contact, fields[self._unpermute])
+
+    def _stiffness(self, conductivity: ArrayLike) -> Array:
+        """The matrix entries of the sheet without its electrodes."""
+        tensor = np.asarray(conductivity, dtype=float)
+        if tensor.shape != (self.n_elements, 3):
+            return np.asarray(self._from_sigma @ _positive(tensor, self.n_elements, "conductivity"))
+        xx, xy, yy = tensor.T
+        _positive(np.minimum(np.minimum(xx, yy), xx * yy - xy**2), self.n_elements, "conductivity (xx, yy and determinant)")
+        stretch, shear = self._from_tensor
+        return np.asarray(self._from_sigma @ ((xx + yy) / 2) + stretch @ ((xx - yy) / 2) + shear @ xy)
 
     # --- precomputation ---
 
     def _geometry(self) -> None:
-        corners = self.mesh.p.T[self.mesh.t.T]
+        corners: Array = self.mesh.p.T[self.mesh.t.T]
+        self.corners = corners
         edge = np.stack([corners[:, 2] - corners[:, 1], corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 0]], axis=1)
         twice = edge[:, 2, 0] * -edge[:, 1, 1] + edge[:, 2, 1] * edge[:, 1, 0]
         self.areas: Array = np.abs(twice) / 2
         self.centroids: Array = corners.mean(axis=1)
         self.n_elements: int = len(self.areas)
+        self._sizes: Array = np.sqrt(((corners - self.centroids[:, None]) ** 2).sum(axis=2).max(axis=1))
         # gradients of the three hat functions: the opposite edge turned by a right angle, over twice the area
         self._gradients: Array = np.stack([-edge[..., 1], edge[..., 0]], axis=2) / twice[:, None, None]
 
@@ -137,21 +181,19 @@ class ForwardModel:
         n_nodes, n = self.mesh.p.shape[1], self.skin.n_electrodes
         self._n_nodes, self._size = n_nodes, n_nodes + n - 1
         cells = self.mesh.t.T
-        local = np.einsum("eik,ejk,e->eij", self._gradients, self._gradients, self.areas)
         rows, columns = np.repeat(cells, 3, axis=1).ravel(), np.tile(cells, (1, 3)).ravel()
-        element = np.repeat(np.arange(self.n_elements), 9)
 
         a, b = self._facets.T
         electrode, length = self._facet_electrode, self._facet_lengths
         u = n_nodes + electrode
         third, sixth, half = length / 3, length / 6, -length / 2
-        blocks = [(a, a, third), (b, b, third), (a, b, sixth), (b, a, sixth), (a, u, half), (b, u, half), (u, a, half), (u, b, half), (u, u, length)]
+        blocks = [(a, a, third), (b, b, third), (a, b, sixth), (b, a, sixth)]
+        blocks += [(a, u, half), (b, u, half), (u, a, half), (u, b, half), (u, u, length)]
         c_rows, c_columns, c_values = (np.concatenate([block[k] for block in blocks]) for k in range(3))
         c_electrode = np.tile(electrode, len(blocks))
         free = (c_rows < self._size) & (c_columns < self._size)  # the last electrode is the ground
-        c_rows, c_columns, c_values, c_electrode = c_rows[free], c_columns[free], c_values[free], c_electrode[free]
 
-        all_rows, all_columns = np.concatenate([rows, c_rows]), np.concatenate([columns, c_columns])
+        all_rows, all_columns = np.concatenate([rows, c_rows[free]]), np.concatenate([columns, c_columns[free]])
         order = _fill_reducing(all_rows, all_columns, self._size)
         position = np.empty(self._size, dtype=np.int64)
         position[order] = np.arange(self._size)
@@ -159,11 +201,18 @@ class ForwardModel:
         unique, where = np.unique(keys, return_inverse=True)
         self._indices = (unique % self._size).astype(np.int32)
         self._indptr = np.searchsorted(unique, np.arange(self._size + 1) * self._size).astype(np.int32)
-        split = len(rows)
-        self._from_sigma = sparse.csr_array(
-            sparse.coo_array((local.ravel(), (where[:split], element)), shape=(len(unique), self.n_elements))
+
+        def scatter(values: Array, to: NDArray[np.int64], source: NDArray[np.int64], n_source: int) -> sparse.csr_array:
+            return sparse.csr_array(sparse.coo_array((values.ravel(), (to, source)), shape=(len(unique), n_source)))
+
+        gx, gy = self._gradients[..., 0], self._gradients[..., 1]
+        xx, yy, xy = (np.einsum("ei,ej,e->eij", p, q, self.areas) for p, q in ((gx, gx), (gy, gy), (gx, gy)))
+        to, element = where[: len(rows)], np.repeat(np.arange(self.n_elements), 9)
+        self._from_sigma = scatter(xx + yy, to, element, self.n_elements)
+        self._from_tensor = tuple(
+            scatter(local, to, element, self.n_elements) for local in (xx - yy, xy + xy.transpose(0, 2, 1))
         )
-        self._from_contact = sparse.csr_array(sparse.coo_array((c_values, (where[split:], c_electrode)), shape=(len(unique), n)))
+        self._from_contact = scatter(c_values[free], where[len(rows) :], c_electrode[free], n)
         self._unpermute = position
         self._currents: Array = np.zeros((self._size, n - 1), order="F")
         self._currents[position[n_nodes:], np.arange(n - 1)] = 1.0
@@ -172,9 +221,8 @@ class ForwardModel:
 class Solution:
     """Fields of one conductivity: potentials (n_nodes, n-1) and electrode potentials of unit currents that leave at the last electrode."""
 
-    def __init__(self, model: ForwardModel, conductivity: Array, contact_impedance: Array, fields: Array) -> None:
+    def __init__(self, model: ForwardModel, contact_impedance: Array, fields: Array) -> None:
         self.model = model
-        self.conductivity = conductivity
         self.contact_impedance = contact_impedance
         self._fields = fields
 
@@ -250,6 +298,30 @@ def _barycentric(k: int) -> Array:
     points += [((3 * i + 2) / (3 * k), (3 * j + 2) / (3 * k)) for i, j in up if i + j < k - 1]
     xy = np.array(points)
     return np.column_stack([1 - xy.sum(axis=1), xy])
+
+
+def _drop(shapes: list[Shape], points: Array) -> Array:
+    """Conductivity drop at points (..., 2)."""
+    drop = np.zeros(points.shape[:-1])
+    for shape in shapes:
+        np.maximum(drop, shape.drop * shape.profile(points), out=drop)
+    return drop
+
+
+def _laminate(corners: Array, conductivity: Callable[[Array], Array], share: float) -> Array:
+    """(m, 3) conductivity tensors of triangles (m, 3, 2) that an outline crosses; its normal is along the mean gradient."""
+    points = np.einsum("qc,eck->eqk", _barycentric(CROSSED_LEVEL), corners)
+    sigma = conductivity(points)
+    along, across = sigma.mean(axis=1), 1 / (1 / sigma).mean(axis=1)
+    offset = points - points.mean(axis=1, keepdims=True)
+    moment = np.einsum("eqi,eqj->eij", offset, offset)
+    slope = np.einsum("eqi,eq->ei", offset, sigma - along[:, None])
+    gradient = np.linalg.solve(moment, slope[..., None])[..., 0]
+    steepness = np.linalg.norm(gradient, axis=1, keepdims=True)
+    normal = np.divide(gradient, steepness, out=np.zeros_like(gradient), where=steepness > 1e-9)
+    less = share * (across - along)
+    nx, ny = normal.T
+    return np.column_stack([along + less * nx**2, less * nx * ny, along + less * ny**2])
 
 
 def _fill_reducing(rows: NDArray[np.int64], columns: NDArray[np.int64], size: int) -> NDArray[np.int64]:

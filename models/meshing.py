@@ -28,10 +28,10 @@ class Grading:
 
 
 USES = {
-    "training": Grading(edge=4e-4, growth=0.4, interior=0.031, offset=0.0),
-    "stub": Grading(edge=8e-4, growth=0.45, interior=0.037, offset=0.37),
+    "training": Grading(edge=4e-4, growth=0.4, interior=0.03, offset=0.0),
+    "stub": Grading(edge=8e-4, growth=0.45, interior=0.036, offset=0.37),
     "inverse": Grading(edge=2e-3, growth=0.5, interior=0.045, offset=0.61),
-    "reference": Grading(edge=5e-5, growth=0.14, interior=0.0105, offset=0.23, relaxation=6),
+    "reference": Grading(edge=5e-5, growth=0.14, interior=0.0115, offset=0.23, relaxation=6),
 }
 
 
@@ -86,15 +86,14 @@ def _boundary_arcs(skin: Skin, use: Grading) -> NDArray[np.float64]:
 
 def _seeds(skin: Skin, use: Grading) -> NDArray[np.float64]:
     """Interior points: centres of the leaves of a quadtree refined to the wanted spacing, none too close to the outline."""
-    size = 0.25 * (1 + use.offset / 4)
-    n = int(np.ceil(2.2 / size))
-    grid = (np.arange(n) - (n - 1) / 2) * size
+    size = use.interior * 0.93 * 2 ** np.floor(np.log2(0.4 / use.interior))  # halving ends at the interior spacing
+    n = int(np.ceil(2.2 / size)) + 1
+    grid = (np.arange(n) - (n - 1) / 2 + use.offset) * size
     cells = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
     leaves = []
     while len(cells):
         wanted = spacing(skin, use, cells)
-        # sqrt(sqrt(3)/2): a square cell of this side holds as much area as one point of a triangular lattice of spacing h
-        split = size > 1.3 * wanted
+        split = size > wanted  # a square cell of side 0.93 h has the area of a point in a triangular lattice of spacing h
         keep = cells[~split]
         keep = keep[skin.inside(keep)]
         leaves.append(keep[skin.distance(keep) > 0.55 * spacing(skin, use, keep)])
