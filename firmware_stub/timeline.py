@@ -111,8 +111,10 @@ class Timeline:
     def segment(self, t: float) -> Segment:
         """The stretch of time around t on which everything is linear: start <= t < end."""
         script, breaks = self.script, self.script.breaks
-        looping = script.loop and t >= self.start
-        base = self.start + (math.floor((t - self.start) / script.duration) * script.duration if looping else 0.0)
+        base = self.start
+        if script.loop and t >= base:
+            base += math.floor((t - base) / script.duration) * script.duration
+            base += script.duration * ((t - base >= script.duration) - (t < base))  # what rounding did
         k = bisect_right(breaks, t - base)
         starts = [base + breaks[k - 1] if k else -math.inf]
         ends = [base + breaks[k] if k < len(breaks) else math.inf]

@@ -33,6 +33,13 @@ class World:
     background: float = 1.0
     contact: tuple[float, ...] = ()
 
+    def rounded(self) -> World:
+        """To a nanometre: the same pose of a later round of a loop is the same world."""
+        touches = tuple(
+            Touch(t.kind, *(round(v, 9) for v in (t.x, t.y, t.radius, t.drop, t.rotation, t.aspect))) for t in self.touches
+        )
+        return World(touches, round(self.background, 9), tuple(round(v, 9) for v in self.contact))
+
 
 def blend(a: World, b: World, s: float) -> World:
     """The world a fraction `s` of the way from a to b; both have the same touches in the same order."""

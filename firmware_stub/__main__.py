@@ -1,0 +1,142 @@
+"""python -m firmware_stub: the board on a pty in the runtime folder, its sheet, its control socket and the truth."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import select
+import signal
+import socket
+import sys
+import time
+
+import zmq
+
+from protocol.runtime import RuntimeDirError, runtime_dir
+from protocol.sockets import Publisher
+
+from . import scene as scenes
+from .control import Control
+from .port import Port, open_port
+from .rig import Rig
+from .truth import truth_frame
+
+log = logging.getLogger("stub")
+PARENT_CHECK_S = 0.5
+
+
+def arguments(argv: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="firmware_stub", description="A skin's impedance board, without the hardware.")
+    add = parser.add_argument
+    add("--skin", default="palm", help="name the truth is published under (default: %(default)s)")
+    add("--geometry", default="square16", help="skin of models/skins, or a .toml file (default: %(default)s)")
+    add("--scene", default="demo", help=f"one of {', '.join(scenes.names())}, or a .toml file (default: %(default)s)")
+    add("--snr", type=float, default=80.0, help="signal over noise in dB, at 128 DFT points (default: %(default)s)")
+    add("--floor", type=float, default=0.0, help="noise floor in ohm (default: %(default)s)")
+    add("--rate", type=float, help="full scans per second (default: as the real board, about 22)")
+    add("--ppm", type=float, default=12.0, help="how much too fast the board's crystal is (default: %(default)s)")
+    add("--baud", type=int, default=921_600, help="bit rate of the line (default: %(default)s)")
+    add("--listen", metavar="URL", help="socket://HOST:PORT instead of a pty")
+    add("--port-name", default="board", help="the pty's name in the runtime folder (default: %(default)s)")
+    add("--seed", type=int, help="of the noise (default: another one each time)")
+    add("--detached", action="store_true", help="go on when the parent process has ended")
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = arguments(argv)
+    logging.basicConfig(level=logging.INFO, format="stub: %(message)s", stream=sys.stderr)
+    stop = _Stop()
+    parent = None if options.detached else os.getppid()
+    try:
+        rig = Rig(
+            options.geometry,
+            scene=options.scene,
+            snr_db=options.snr,
+            floor_ohm=options.floor,
+            rate_hz=options.rate,
+            crystal_ppm=options.ppm,
+            baud=options.baud,
+            seed=options.seed,
+            threaded=True,
+        )
+        port = open_port(options.listen, runtime_dir(), options.port_name)
+    except (ValueError, OSError, RuntimeDirError) as error:
+        log.error("%s", error)
+        return 2
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    begin_ns = time.monotonic_ns()
+    publisher = control = None
+    try:
+        publisher = Publisher("stub", context)
+        control = Control(rig, options.skin, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context)
+        log.info("board at %s, scene %s", port.url, options.scene)
+        _run(rig, port, publisher, options.skin, begin_ns, stop, parent)
+    except zmq.ZMQError as error:
+        log.error("sockets: %s", error)
+        return 1
+    finally:
+        port.close()
+        if control is not None:
+            control.close()
+        if publisher is not None:
+            publisher.close()
+        rig.close()
+        context.destroy(linger=0)
+    return 0
+
+
+def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, stop: _Stop, parent: int | None) -> None:
+    """Until a signal, or the parent's end: hand bytes to and fro, publish what was true."""
+    name, gone = "", False
+    checked = 0.0
+    while not stop.asked:
+        now = (time.monotonic_ns() - begin_ns) * 1e-9
+        if data := port.read():
+            rig.feed(data, now)
+        if sent := rig.pull(now):
+            port.write(sent)
+        if (rig.unplugged is not None) != gone:
+            gone = not gone
+            if gone:
+                assert rig.unplugged is not None
+                name = rig.unplugged["name"]
+                port.unplug()
+                log.info("unplugged")
+            else:
+                port.plug(name)
+                log.info("plugged in again as %s %s", port.url, name)
+        while rig.scans:
+            scan, world, middle = rig.scans.popleft()
+            publisher.send(truth_frame(skin, rig.sheet, scan, world, begin_ns + round(middle * 1e9)))
+        if now - checked > PARENT_CHECK_S:
+            checked = now
+            publisher.poll()
+            if parent is not None and os.getppid() != parent:
+                log.info("the parent process has ended")
+                return
+        select.select([*port.filenos(), stop.fileno()], [], [], rig.wake_s((time.monotonic_ns() - begin_ns) * 1e-9))
+
+
+class _Stop:
+    """SIGINT and SIGTERM, as something that `select` can wait for."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._read, self._write = socket.socketpair()
+        self._write.setblocking(False)
+        self._read.setblocking(False)
+        signal.set_wakeup_fd(self._write.fileno(), warn_on_full_buffer=False)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._ask)
+
+    def _ask(self, number: int, frame: object) -> None:
+        self.asked = True
+
+    def fileno(self) -> int:
+        return self._read.fileno()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

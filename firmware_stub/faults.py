@@ -1,0 +1,130 @@
+"""What can go wrong with the board: one table, and which of it is going wrong now.
+
+A fault lasts for its seconds; one marked `sticky` lasts until the board is power-cycled (`power_cycle`, `unplug`). The code
+that a fault disturbs asks `Faults.active(name)` at that point and nowhere else.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One row: what the host gets to see, and the arguments with their defaults."""
+
+    what: str
+    args: Mapping[str, Any] = field(default_factory=dict)
+    sticky: bool = False
+
+
+FAULTS: dict[str, Fault] = {
+    # the chip
+    "wrong_chip_id": Fault(
+        "the converter answers with `id` (0x0000, 0xFFFF or 0xA0A0 on real boards): START and SELF_TEST are refused",
+        {"id": 0xFFFF},
+        sticky=True,
+    ),
+    "brown_out": Fault(
+        "the registers are lost while running: no excitation, every measurement noise, until CONFIG comes again; with `silent` no EVENT",
+        {"silent": False},
+        sticky=True,
+    ),
+    "stale_rtia": Fault(
+        "RTIA is not what was calibrated: all impedances times `gain`, turned by `phase` rad", {"gain": 1.05, "phase": 0.02}
+    ),
+    "clipped": Fault(
+        "the voltage channel's gain is `gain` times too high and clips: plausible, too low Z; with `silent` no status bits",
+        {"gain": 4.0, "silent": False},
+    ),
+    "rtia_overrange": Fault("the current channel clips: Z too high; with `silent` no status bits", {"gain": 1.6, "silent": False}),
+    "missed_interrupt": Fault(
+        "a `fraction` of the results is read too early and is the one before; with `silent` no status bits",
+        {"fraction": 0.02, "silent": False},
+    ),
+    "fifo_overflow": Fault("`words` are lost in the middle of a scan, the rest moves up", {"words": 4, "silent": False}),
+    "fifo_underflow": Fault("the last `words` of a scan never come: zeros", {"words": 8, "silent": False}),
+    "fifo_misaligned": Fault("all words are one late: real and imaginary parts, V and I change places", {"silent": False}),
+    # electrodes and multiplexers
+    "electrode_open": Fault("the wire of `electrode` (0-based) is broken: no current, a floating voltage", {"electrode": 0}),
+    "electrodes_shorted": Fault("the wires of two `electrodes` touch each other", {"electrodes": [0, 1]}),
+    "electrodes_swapped": Fault("the wires of two `electrodes` are exchanged", {"electrodes": [0, 1]}),
+    "mux_stuck": Fault(
+        "an address `bit` of one multiplexer (drive+, drive-, sense+, sense-) stays at `value`: rows repeat",
+        {"mux": "drive+", "bit": 2, "value": 0},
+    ),
+    "mux_disabled": Fault("one multiplexer's enable stays low: nothing is connected, all open", {"mux": "drive+"}),
+    # the link
+    "partial_frames": Fault("a `fraction` of the frames ends in the middle", {"fraction": 0.3}),
+    "sequence_gaps": Fault("a `fraction` of the scans is never sent", {"fraction": 0.2}),
+    "line_noise": Fault("`garbage` random bytes for each byte sent, and a `flips` share of bits flipped", {"garbage": 0.02, "flips": 2e-5}),
+    "wrong_schema": Fault("the firmware is another version: another schema hash in IDENT and in every check", {"schema": 0xBAD0F00D}),
+    "hang": Fault("the board neither answers nor sends"),
+    "unplug": Fault(
+        "the device vanishes and comes back, power-cycled, after the fault's seconds; under `name` in the runtime folder where one is given",
+        {"name": ""},
+    ),
+    "power_cycle": Fault("the board restarts, and forgets what it was told and what was sticky"),
+}
+
+
+class Faults:
+    """The faults in force. Used by the board's thread and by the control socket's."""
+
+    def __init__(self) -> None:
+        self._until: dict[str, tuple[float, dict[str, Any]]] = {}
+        self._lock = threading.Lock()
+
+    def inject(self, name: str, args: Mapping[str, Any], now: float, seconds: float = 5.0) -> dict[str, Any]:
+        """Start a fault at `now` (s); returns its arguments. Raises ValueError for a name or argument that is not in the table."""
+        if name not in FAULTS:
+            raise ValueError(f"no fault {name!r}: expected one of {', '.join(FAULTS)}")
+        row = FAULTS[name]
+        if unknown := set(args) - set(row.args):
+            allowed = ", ".join(row.args) or "no arguments"
+            raise ValueError(f"fault {name}: unknown argument {', '.join(sorted(unknown))}, expected {allowed}")
+        if not 0 <= seconds < math.inf:
+            raise ValueError(f"fault {name}: lasts {seconds} s, expected a number of seconds from 0 on")
+        full = dict(row.args)
+        for key, value in args.items():
+            full[key] = _like(row.args[key], value, f"fault {name}: {key}")
+        with self._lock:
+            self._until[name] = (math.inf if row.sticky else now + seconds, full)
+        return full
+
+    def active(self, name: str, now: float) -> dict[str, Any] | None:
+        """The arguments of a fault in force at `now`, else None."""
+        with self._lock:
+            until, args = self._until.get(name, (-math.inf, {}))
+            return args if now < until else None
+
+    def clear(self, *names: str) -> None:
+        """End the named faults, or all."""
+        with self._lock:
+            for name in names or list(self._until):
+                self._until.pop(name, None)
+
+    def power_cycled(self) -> None:
+        self.clear(*(name for name, row in FAULTS.items() if row.sticky))
+
+    def listing(self, now: float) -> dict[str, dict[str, Any]]:
+        with self._lock:
+            return {name: args for name, (until, args) in self._until.items() if now < until}
+
+
+def _like(default: Any, value: Any, what: str) -> Any:
+    """The value in the type of the default. Raises ValueError."""
+    try:
+        if isinstance(default, list):
+            if not isinstance(value, list) or len(value) != len(default):
+                raise ValueError
+            return [int(v) for v in value]
+        if isinstance(default, bool) and not isinstance(value, bool):
+            raise ValueError
+        return type(default)(int(value, 0) if isinstance(default, int) and isinstance(value, str) else value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what} = {value!r}: expected something like {default!r}") from None

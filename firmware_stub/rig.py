@@ -1,0 +1,214 @@
+"""Sheet, board and line in one: what a host has at the other end of its cable. Driven by time, so it also runs faster than it.
+
+    rig = Rig("square16", scene="slide", seed=1)
+    rig.feed(link.encode(link.Hello()), 0.0)
+    data = rig.pull(0.1)                                  # what the host has received by then
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from models.patterns import pattern
+
+from . import scene as scenes
+from .analog import Analog, Noise
+from .board import Board, Scan, measurement_s
+from .faults import FAULTS, Faults
+from .field import Field
+from .port import BAUD, Line
+from .sheet import Sheet
+from .timeline import Timeline, press_track
+from .world import World
+
+SLEPT_S = 1.0  # a longer pause between two calls was the machine's sleep, not the board's
+
+
+class Rig:
+    """A stub board on a sheet. Times are seconds since it was made; nothing in here looks at a clock.
+
+    rate_hz: full scans per second instead of the real board's. threaded: solve ahead in a thread (see Field), and skip the scans
+    of a pause instead of making up for them.
+    """
+
+    def __init__(
+        self,
+        geometry: str | Sheet = "square16",
+        *,
+        scene: str = "demo",
+        snr_db: float = 80.0,
+        floor_ohm: float = 0.0,
+        rate_hz: float | None = None,
+        crystal_ppm: float = 12.0,
+        baud: int = BAUD,
+        seed: int | None = None,
+        threaded: bool = False,
+    ) -> None:
+        self.sheet = geometry if isinstance(geometry, Sheet) else Sheet(geometry)
+        self.faults = Faults()
+        self.field = Field(self.sheet.transfer, self._timeline(scene, 0.0), threaded=threaded)
+        self.scans: deque[tuple[Scan, World, float]] = deque(maxlen=64)
+        self.line = Line(baud)
+        self._rng = np.random.default_rng(seed)
+        self._realtime = threaded
+        noise = Noise(10 ** (-snr_db / 20), floor_ohm)
+        full_s = len(pattern(self.sheet.skin.pattern_name, self.sheet.electrodes)) * measurement_s(128)
+        self.board = Board(
+            self.field,
+            Analog(noise, self.faults, np.random.default_rng(self._rng.integers(2**63))),
+            self.faults,
+            electrodes=self.sheet.electrodes,
+            speed=rate_hz * full_s if rate_hz else 1.0,
+            crystal_ppm=crystal_ppm,
+            on_scan=self._scanned,
+        )
+        self._unplugged: dict[str, Any] | None = None
+        self._then = 0.0
+        self._cued = 0.0
+        self.field.play(self.field.timeline, 0.0)
+
+    # --- the cable ---
+
+    def feed(self, data: bytes, now: float) -> None:
+        """Bytes from the host."""
+        if self._unplugged is None:
+            self.board.feed(data, now)
+
+    def pull(self, now: float) -> bytes:
+        """Bytes that reached the host since the last call."""
+        self._cues(now)
+        if self._plugging(now):
+            return b""
+        if self._realtime and now - self._then > SLEPT_S:
+            self.board.skip_to(now)
+        self._then = now
+        self.field.prepare(now)
+        sent = []
+        for t, message in self.board.advance(now):
+            sent.append(self.line.pull(t))
+            self.line.push(self._cut(message, t), t)
+        sent.append(self.line.pull(now))
+        return self._noisy(b"".join(sent), now)
+
+    def wake_s(self, now: float) -> float:
+        """Seconds until `pull` has something to do."""
+        line = self.line.next_s()
+        return max(0.0, min(self.board.next_s() - now, 0.25 if line is None else line))
+
+    @property
+    def unplugged(self) -> dict[str, Any] | None:
+        """The arguments of the unplug under way, None while the cable is in."""
+        return self._unplugged
+
+    # --- what is done to the skin ---
+
+    def press(self, values: Mapping[str, Any], now: float) -> dict[str, Any]:
+        """Press from now on; the next scan to start feels it. Keys as in `scene.touch`, and seconds, to_x, to_y.
+
+        Raises ValueError for what no skin could feel.
+        """
+        touch = scenes.touch(values)
+        to = (float(values["to_x"]), float(values["to_y"])) if values.get("to_x") is not None else None
+        seconds = float(values.get("seconds", 20.0))
+        if not 0 < seconds <= 86400:
+            raise ValueError(f"a press of {seconds:g} s: expected above 0, up to 86400 s")
+        for point in ((touch.x, touch.y), *([to] if to else [])):
+            if not self.sheet.inside(*point):
+                raise ValueError(f"({point[0]:g}, {point[1]:g}) m is not on the skin, which is {self.sheet.size_text()}")
+        old = self.field.timeline
+        presses = tuple(p for p in old.presses if p.times[-1] > now)
+        track = press_track(now, seconds, touch, to)
+        self.field.play(Timeline(old.script, old.start, (*presses, track), old.electrodes), now)
+        return {"x": touch.x, "y": touch.y, "radius": touch.radius, "drop": touch.drop, "seconds": seconds, "presses": len(presses) + 1}
+
+    def release(self, now: float) -> dict[str, Any]:
+        """Take every press off."""
+        old = self.field.timeline
+        gone = sum(p.times[-1] > now for p in old.presses)
+        self.field.play(Timeline(old.script, old.start, (), old.electrodes), now)
+        return {"released": gone}
+
+    def play(self, name: str, now: float) -> dict[str, Any]:
+        """Begin a scene. Raises SceneError."""
+        timeline = self._timeline(name, now)
+        self.field.play(timeline, now)
+        self._cued = now
+        script = timeline.script
+        return {"scene": script.name, "about": script.about, "seconds": script.duration, "loop": script.loop}
+
+    def fault(self, name: str, args: Mapping[str, Any], now: float, seconds: float = 5.0) -> dict[str, Any]:
+        """Let something go wrong, see FAULTS. Raises ValueError."""
+        return {"fault": name, "args": self.faults.inject(name, args, now, seconds), "what": FAULTS[name].what}
+
+    def status(self, now: float) -> dict[str, Any]:
+        world = self.field.timeline.at(now)
+        return {
+            "scene": self.field.timeline.script.name,
+            "touches": len(world.touches),
+            "scanning": self.board.scanning,
+            "plugged": self._unplugged is None,
+            "faults": self.faults.listing(now),
+            "received": self.board.received,
+            "solves": self.field.solves,
+            "late_poses": self.field.late,
+            "messages_dropped": self.line.dropped,
+        }
+
+    def close(self) -> None:
+        self.field.close()
+
+    # --- inside ---
+
+    def _timeline(self, name: str, start: float) -> Timeline:
+        return Timeline(scenes.load(name), start, (), self.sheet.electrodes)
+
+    def _scanned(self, scan: Scan) -> None:
+        """Note what the scan felt: the world at its middle, as `Field.over` has it."""
+        segment = self.field.segment(scan.start)
+        middle = (scan.start + scan.end) / 2
+        self.scans.append((scan, segment.at(min(middle, segment.end)), middle))
+
+    def _cues(self, now: float) -> None:
+        """Faults that the scene asks for at a time between the last call and this one."""
+        timeline = self.field.timeline
+        script, before, self._cued = timeline.script, self._cued, now
+        for cue in script.cues:
+            rounds = math.floor((now - timeline.start - cue.t) / script.duration) if script.loop else 0
+            due = timeline.start + cue.t + max(0, rounds) * script.duration
+            if before < due <= now:
+                self.faults.inject(cue.name, cue.args, now, cue.seconds)
+
+    def _plugging(self, now: float) -> bool:
+        """Unplug, plug and power-cycle; True while there is no cable."""
+        gone = self.faults.active("unplug", now)
+        if gone is not None or self._unplugged is not None:
+            if gone is None:
+                self.board.power_cycle(now)
+            self.line.clear()
+            self._unplugged = gone
+        if self.faults.active("power_cycle", now) is not None:
+            self.faults.clear("power_cycle")
+            self.line.clear()
+            self.board.power_cycle(now)
+        return self._unplugged is not None
+
+    def _cut(self, message: bytes, now: float) -> bytes:
+        fault = self.faults.active("partial_frames", now)
+        if fault is not None and self._rng.random() < fault["fraction"]:
+            return message[: int(self._rng.integers(1, len(message)))]
+        return message
+
+    def _noisy(self, data: bytes, now: float) -> bytes:
+        noise = self.faults.active("line_noise", now)
+        if noise is None or not data:
+            return data
+        flipped = np.frombuffer(data, np.uint8).copy()
+        bits = self._rng.random((len(data), 8)) < noise["flips"]
+        flipped ^= np.packbits(bits, axis=1)[:, 0]
+        at = np.sort(self._rng.integers(0, len(data) + 1, self._rng.poisson(noise["garbage"] * len(data))))
+        return np.insert(flipped, at, self._rng.integers(0, 256, len(at), np.uint8)).tobytes()

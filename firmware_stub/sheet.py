@@ -1,0 +1,54 @@
+"""The foam sheet that the stub's board measures: from a world to the transfer impedances between its electrodes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models import geometry
+from models.forward import ForwardModel
+from models.shapes import Shape, element_drop
+
+from .world import Touch, World
+
+MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through
+
+
+class Sheet:
+    """Forward model on the mesh "stub", which nothing is trained or inverted on. Units: ohm, metres."""
+
+    def __init__(self, geometry_name: str = "square16") -> None:
+        self.skin = geometry.load(geometry_name)
+        self.model = ForwardModel(self.skin, mesh="stub")
+        self._corners = self.model.mesh.p.T[self.model.mesh.t.T]
+
+    @property
+    def electrodes(self) -> int:
+        return self.skin.n_electrodes
+
+    def shape(self, touch: Touch) -> Shape:
+        """A touch in the forward model's units."""
+        scale = self.skin.metres_per_unit
+        return Shape(
+            touch.kind, touch.x / scale, touch.y / scale, touch.radius / scale, touch.drop, touch.rotation, touch.aspect
+        )
+
+    def outline(self, touch: Touch) -> NDArray[np.float64]:
+        """(m, 2) corners in metres."""
+        return np.asarray(self.shape(touch).outline() * self.skin.metres_per_unit)
+
+    def transfer(self, world: World) -> NDArray[np.float64]:
+        """(n, n) ohm: potential of each electrode over the last, with unit current in at another and out at the last."""
+        shapes = [self.shape(touch) for touch in world.touches if touch.drop > 0]
+        drop = np.minimum(element_drop(shapes, self._corners), MOST_DROP) if shapes else 0.0
+        contact = self.skin.contact_impedance * (np.array(world.contact) if world.contact else 1.0)
+        return self.model.solve(world.background * (1.0 - drop), contact).transfer
+
+    def inside(self, x: float, y: float) -> bool:
+        """Whether the point (metres) is on the skin."""
+        return bool(self.skin.inside(np.array([x, y]) / self.skin.metres_per_unit))
+
+    def size_text(self) -> str:
+        corners = self.skin.polygon() * self.skin.metres_per_unit
+        (x0, y0), (x1, y1) = corners.min(0), corners.max(0)
+        return f"x {x0:.3g} to {x1:.3g}, y {y0:.3g} to {y1:.3g} m"

@@ -1,0 +1,36 @@
+"""What really touches, published beside the board's frames so that somebody can keep the score."""
+
+from __future__ import annotations
+
+from protocol.frames import Touch as TrueTouch
+from protocol.frames import TruthFrame
+
+from .board import Scan
+from .sheet import Sheet
+from .world import NEWTON, Touch, World
+
+
+def truth_frame(skin: str, sheet: Sheet, scan: Scan, world: World, sample_ns: int) -> TruthFrame:
+    """The truth at the middle of a scan, `sample_ns` on the host's monotonic clock: there it is exact."""
+    return TruthFrame(
+        skin=skin,
+        scan=scan.seq,
+        stamps={"sample": sample_ns},
+        source="stub",
+        valid=True,
+        touches=[_touch(sheet, touch) for touch in world.touches if touch.drop > 0],
+    )
+
+
+def _touch(sheet: Sheet, touch: Touch) -> TrueTouch:
+    return TrueTouch(
+        shape=touch.kind,
+        x=touch.x,
+        y=touch.y,
+        radius_m=touch.radius,
+        rotation=touch.rotation,
+        aspect=touch.aspect,
+        drop=touch.drop,
+        force_n=touch.drop / NEWTON,
+        outline=sheet.outline(touch).tolist(),
+    )
