@@ -91,17 +91,18 @@ def _plain(value: Any) -> Any:
 
 def control(process: str, command: str, *, timeout_s: float = 2.0, **args: Any) -> dict[str, Any]:
     """One command over a process's control socket. CliError where nobody answers or the answer is a refusal."""
+    from protocol import transport
     from protocol.sockets import ControlClient, ControlError
 
+    who = "the stub board" if process == "stub" else process
+    address = transport.current().control_address(process)
+    if address.startswith("ipc://") and not os.path.exists(address.removeprefix("ipc://")):
+        fail(f"{who} does not run here (no {address}): start it with `skin up`, or set EITSKIN_RUNTIME", NOT_RUNNING)
     try:
         answer: dict[str, Any] = ControlClient(process, timeout_s).call(command, **args)
         return answer
     except ControlError as error:
-        if error.kind in ("unreachable", "timeout"):
-            who = "the stub board" if process == "stub" else process
-            what = f"{who} does not answer ({error}): start it with `skin up`, or set EITSKIN_RUNTIME"
-            raise CliError(what, NOT_RUNNING) from None
-        raise CliError(f"{process}: {error}") from None
+        raise CliError(str(error), NOT_RUNNING if error.kind in ("unreachable", "timeout") else FAILED) from None
 
 
 def load_npz(path: Path) -> dict[str, Any]:

@@ -1,0 +1,115 @@
+"""Commands that need no running service: reconstruct, register, limits, bench."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.cli.common import FAILED, USAGE, JsonOption, emit, fail, load_npz
+
+PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+BENCHES = ("accuracy", "latency", "real_presses")
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(reconstruct)
+    app.command("register")(register_frame)
+    app.command(context_settings=PASS_ON)(limits)
+    app.command(context_settings=PASS_ON)(bench)
+
+
+def reconstruct(
+    source: Annotated[Path, typer.Argument(metavar="IN.npz")],
+    target: Annotated[Path, typer.Argument(metavar="OUT.npz")],
+    skin: Annotated[str, typer.Option("--skin", metavar="NAME", help="A configured skin, or a bundle.")],
+    sequence: Annotated[
+        bool, typer.Option("--sequence", help="Rows are one recording: keep what the stages know.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the runtime stages over the rows of a file, without sockets.
+
+    IN: measurements (n, k), and untouched (m, k) or reference (n, k). OUT: image (n, 96, 96) float32 conductivity drop
+    [S/m], row 0 at the lowest y; touched, valid, count (n,); position (n, 8, 2) [m] and force (n, 8) [N], strongest
+    first, padded with NaN; shape (n, 8).
+    """
+    import numpy as np
+
+    from services.reconstruction import InputError, find_skin, read_input
+    from services.reconstruction import reconstruct as run
+
+    found, bundle = find_skin(skin)
+    try:
+        data = read_input(load_npz(source), len(bundle.pattern))
+    except InputError as error:
+        fail(f"{source}: {error}", USAGE)
+    if target.suffix != ".npz":  # numpy would add it and the file would not be where it was asked for
+        fail(f"found {target.name}, expected a name ending in .npz", USAGE)
+    if not target.parent.is_dir():
+        fail(f"no folder {target.parent} to write {target.name} to: make it first", USAGE)
+    out = run(data, found, bundle, sequence, warn=lambda text: print(f"skin: {text}", file=sys.stderr), progress=_bar)
+    try:
+        np.savez(target, **out)  # type: ignore[arg-type]
+    except OSError as error:
+        fail(f"cannot write {target}: {error.strerror}", FAILED)
+    result = {"rows": len(out["count"]), "touched": int(out["touched"].sum()), "valid": int(out["valid"].sum())}
+    emit(result) if as_json else print("{rows} rows, {touched} touched, {valid} valid".format(**result))
+
+
+def _bar(rows):  # type: ignore[no-untyped-def]
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    return track(rows, "reconstructing", console=console, transient=True, disable=not console.is_terminal)
+
+
+def register_frame(
+    source: Annotated[Path, typer.Argument(metavar="FILE", help="Presses at known places: npz or recording.")],
+    out: Annotated[Path, typer.Option(help="Calibration to write.")] = Path("calibration.toml"),
+    skin: Annotated[str, typer.Option("--skin", metavar="NAME")] = "disc16",
+    presses: Annotated[int, typer.Option(help="How many presses to use, from the first.")] = 100,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit the skin's frame to a machine's from presses at known places, and say how well it fits."""
+    from services.registration import register_file
+
+    register_file(source, out, skin, presses, as_json)
+
+
+def limits(context: typer.Context) -> None:
+    """What physics allows: floors of a touch's position, radius and drop. See `skin limits --help`."""
+    _dispatch("models.limits", context.args)
+
+
+def bench(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help=f"One of {', '.join(BENCHES)}; its own options follow.")] = "",
+) -> None:
+    """Run a benchmark: `skin bench accuracy --help` shows its options."""
+    from services.cli.common import ROOT
+
+    names = sorted(p.stem for p in (ROOT / "bench").glob("*.py") if not p.stem.startswith("_"))
+    if name in ("", "--help"):
+        print("skin bench NAME [options], NAME one of: " + ", ".join(names))
+        return
+    if name not in names:
+        fail(f"no benchmark {name!r}: expected one of {', '.join(names)}", USAGE)
+    _dispatch(f"bench.{name}", context.args)
+
+
+def _dispatch(module: str, args: list[str]) -> None:
+    """Hands the rest of the command line to a module's `main`."""
+    import importlib
+
+    try:
+        main = importlib.import_module(module).main
+    except ImportError as error:
+        missing = error.name or module
+        if missing.split(".")[0] in ("models", "bench", "services"):
+            fail(f"{module} cannot be loaded: {error}")
+        fail(f"{module} needs the Python package {missing!r}, which is not installed: run `make venv-dev`", USAGE)
+    raise typer.Exit(main(args) or 0)

@@ -1,0 +1,59 @@
+"""Commands about the service as a whole: up, doctor."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.cli.common import FAILED, JsonOption, emit
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(up)
+    app.command()(doctor)
+
+
+def up(
+    config: Annotated[Path | None, typer.Option(help="Configuration; default: skin.toml of the checkout.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Also record, to this folder.")] = None,
+    no_board: Annotated[bool, typer.Option("--no-board", help="Stages only: `skin replay` is the board.")] = False,
+) -> None:
+    """Start all processes and keep them alive, in the foreground; Ctrl-C or SIGTERM stops them all."""
+    from protocol.runtime import runtime_dir
+    from services.config import load
+    from services.supervision import Program, programs
+    from services.supervision import up as supervise
+
+    if config is not None:
+        os.environ["EITSKIN_CONFIG"] = str(config.resolve())
+    found = load(config)
+    wanted = [p for p in programs(found) if not (no_board and p.name in ("acquisition", "stub"))]
+    extra = [Program("recorder", "services.recorder", ("--folder", str(record.resolve())))] if record else []
+    names = ", ".join(found.skins)
+    print(
+        f"skin {names}: contacts at ipc://{runtime_dir()}/publisher.ipc, topics contact/{next(iter(found.skins))} ..."
+    )
+    print(
+        "look with `./skin top`, press with `./skin press --x 0.02 --y -0.01 --force 3`, stop with Ctrl-C", flush=True
+    )
+    raise typer.Exit(supervise(found, extra, wanted))
+
+
+def doctor(
+    config: Annotated[Path | None, typer.Option(help="Configuration; default: skin.toml of the checkout.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what stands in the way of contacts: configuration, bundle, port, board, clock, electrodes."""
+    from services.doctor import examine
+
+    findings = examine(config)
+    if as_json:
+        emit([finding.plain() for finding in findings])
+    else:
+        for finding in findings:
+            print(finding)
+    if any(finding.level == "FAIL" for finding in findings):
+        raise typer.Exit(FAILED)

@@ -1,0 +1,200 @@
+"""`skin reconstruct`: measurements of a file through the runtime stages, without sockets and without a clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from models.prereconstruction import noise_of_frames
+from protocol.frames import RawFrame
+from services.config import ConfigError, Skin, load
+from services.pipeline import Pipeline, Result
+from services.stage import Refused
+from services.tare import Baseline, take
+
+Array = NDArray[np.float64]
+
+IMAGE_SIZE = 96
+MOST_CONTACTS = 8
+ROW_NS = 45_000_000
+"""Time between rows of a --sequence: the board's nominal scan."""
+ASSUMED_NOISE = 1e-3
+"""Relative noise of a frame (60 dB) where a file holds too few untouched frames to find it."""
+FEWEST_FOR_TARE = 16
+
+
+class InputError(ValueError):
+    """The file's arrays are not what is needed; says which, what was found and what is expected."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """What a file gives. N rows of K measurements."""
+
+    measurements: NDArray[Any]  # (N, K) real or complex
+    untouched: Array | None  # (M, K) |Z|
+    reference: Array | None  # (N, K) |Z|
+
+
+def read_input(arrays: Mapping[str, NDArray[Any]], k: int) -> Input:
+    """Checks keys and shapes for a skin of `k` measurements. Raises InputError."""
+    if "measurements" not in arrays:
+        raise InputError(f"no array `measurements` of shape (n, {k}); found {_found(arrays)}")
+    if ("untouched" in arrays) == ("reference" in arrays):
+        both = "both" if "untouched" in arrays else "neither"
+        raise InputError(
+            f"expected either `untouched` (m, {k}) or `reference` (n, {k}), found {both}; arrays: {_found(arrays)}"
+        )
+    measurements = _matrix(arrays, "measurements", k)
+    if "untouched" in arrays:
+        return Input(measurements, np.abs(_matrix(arrays, "untouched", k)).astype(float), None)
+    reference = np.abs(_matrix(arrays, "reference", k)).astype(float)
+    if len(reference) != len(measurements):
+        raise InputError(
+            f"`reference` has {len(reference)} rows, `measurements` {len(measurements)}: one is needed per row"
+        )
+    return Input(measurements, None, reference)
+
+
+def _matrix(arrays: Mapping[str, NDArray[Any]], name: str, k: int) -> NDArray[Any]:
+    a = arrays[name]
+    if a.dtype.kind not in "iufc" or a.ndim != 2 or a.shape[1] != k or not len(a):
+        raise InputError(
+            f"`{name}` is {a.dtype} of shape {a.shape}, expected numbers of shape (rows, {k}), in the skin's pattern order"
+        )
+    if not np.isfinite(a).any():
+        raise InputError(f"`{name}` holds no finite number")
+    return a
+
+
+def _found(arrays: Mapping[str, NDArray[Any]]) -> str:
+    return ", ".join(f"{name} {a.shape}" for name, a in arrays.items()) or "no arrays"
+
+
+def find_skin(name: str) -> tuple[Skin, Bundle]:
+    """A configured skin by its name, else a bundle by name or path. Raises ConfigError or BundleError."""
+    try:
+        config = load()
+        if name in config.skins:
+            return config.skins[name], Bundle.load(config.skins[name].bundle)
+    except ConfigError:
+        pass  # a bundle can be used with no configuration at all
+    return Skin(port="stub", bundle=name, frame_id=name), Bundle.load(name)
+
+
+def baseline_of(frames: Array, pipeline: Pipeline, warn: Callable[[str], None]) -> Baseline:
+    """The tare of (M, K) untouched |Z|; where a board's tare would refuse, the mean all the same, in doubt."""
+    doubt = ""
+    if len(frames) >= FEWEST_FOR_TARE:
+        try:
+            return take(frames, pipeline.pre.pre, "file", 0)
+        except Refused as why:
+            doubt = f"`untouched`: {why}"
+            warn(doubt + "; using their mean")
+    mean, finite = np.nanmean(frames, axis=0), np.isfinite(frames).any(axis=0)
+    if len(frames) >= 2:
+        sigma = noise_of_frames(np.where(np.isfinite(frames), frames, mean), mean)
+    else:
+        sigma = ASSUMED_NOISE * mean
+        warn(f"`untouched` has one row: a noise of {ASSUMED_NOISE:g} of each measurement is assumed")
+    good = finite & (mean > 0)
+    return Baseline(np.where(good, mean, 0.0), np.where(good, sigma, np.inf), len(frames), "file", 0, doubt)
+
+
+def noise_of_references(reference: Array) -> Array:
+    """(K,) relative noise of a frame, from how neighbouring references differ; robust against steps and slow drift."""
+    if len(reference) < 8:
+        return np.full(reference.shape[1], ASSUMED_NOISE)
+    steps = np.diff(np.log(np.where(reference > 0, reference, np.nan)), axis=0)
+    own = np.nanmedian(np.abs(steps), axis=0) / 0.6745 / np.sqrt(2)
+    own = np.where(np.isfinite(own), own, ASSUMED_NOISE)
+    return np.asarray(np.maximum(own, 0.1 * np.median(own) + 1e-7))
+
+
+def reconstruct(
+    data: Input,
+    skin: Skin,
+    bundle: Bundle,
+    sequence: bool = False,
+    warn: Callable[[str], None] = lambda text: None,
+    progress: Callable[[Iterable[int]], Iterable[int]] = lambda rows: rows,
+) -> dict[str, NDArray[Any]]:
+    """The arrays of OUT.npz: see `skin reconstruct --help`. Rows are independent unless `sequence`."""
+    pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
+    n = len(data.measurements)
+    baseline = baseline_of(data.untouched, pipeline, warn) if data.untouched is not None else None
+    noise = noise_of_references(data.reference) if data.reference is not None else None
+    out = _empty(n)
+    for row in progress(range(n)):
+        if not sequence:
+            pipeline.reset()
+        if data.reference is not None and noise is not None:
+            z0 = data.reference[row]
+            good = np.isfinite(z0) & (z0 > 0)
+            baseline = Baseline(np.where(good, z0, 0.0), np.where(good, noise * z0, np.inf), 1, "file", 0)
+        assert baseline is not None
+        if not sequence or row == 0 or data.reference is not None:
+            pipeline.pre.set_baseline(Baseline(**{**baseline.to_dict(), "z0": baseline.z0.copy()}))
+        _store(out, row, pipeline.run(_raw(data.measurements[row], row if sequence else 0)))
+    return out
+
+
+def _raw(measurement: NDArray[Any], scan: int) -> RawFrame:
+    return RawFrame(
+        skin="file",
+        scan=scan,
+        z=measurement.astype(np.complex64),
+        status=np.zeros(len(measurement), np.uint8),
+        stamps={"sample": (scan + 1) * ROW_NS},
+        source="replay",
+        valid=True,
+        board="file",
+    )
+
+
+def _empty(n: int) -> dict[str, NDArray[Any]]:
+    return {
+        "image": np.zeros((n, IMAGE_SIZE, IMAGE_SIZE), np.float32),
+        "touched": np.zeros(n, bool),
+        "valid": np.zeros(n, bool),
+        "count": np.zeros(n, np.int64),
+        "position": np.full((n, MOST_CONTACTS, 2), np.nan),
+        "force": np.full((n, MOST_CONTACTS), np.nan),
+        "shape": np.full((n, MOST_CONTACTS), "", "<U12"),
+    }
+
+
+def _store(out: dict[str, NDArray[Any]], row: int, result: Result) -> None:
+    image = result.image.image
+    if image.size:
+        out["image"][row] = np.nan_to_num(resampled(image, IMAGE_SIZE), posinf=0.0, neginf=0.0)
+    contacts = [c for c in result.contact.contacts if c.state != "end"]
+    out["touched"][row] = result.delta.touched
+    out["valid"][row] = result.contact.valid
+    out["count"][row] = len(contacts)
+    for place, contact in enumerate(contacts[:MOST_CONTACTS]):
+        out["position"][row, place] = contact.position[:2]
+        out["force"][row, place] = np.nan if contact.force_n is None else contact.force_n
+        out["shape"][row, place] = contact.shape
+
+
+def resampled(image: NDArray[np.float32], n: int) -> NDArray[np.float32]:
+    """(h, w) -> (n, n), linear between pixel centres; unchanged where it is that size already."""
+    if image.shape == (n, n):
+        return image
+    rows, columns = (_weights(n, size) for size in image.shape)
+    return np.asarray(rows @ image @ columns.T, np.float32)
+
+
+def _weights(n: int, m: int) -> NDArray[np.float32]:
+    at = np.clip((np.arange(n) + 0.5) * m / n - 0.5, 0, m - 1)
+    low = np.minimum(at.astype(int), max(m - 2, 0))
+    weight = np.zeros((n, m), np.float32)
+    weight[np.arange(n), low] = 1 - (at - low)
+    weight[np.arange(n), np.minimum(low + 1, m - 1)] += at - low
+    return weight
