@@ -29,7 +29,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from models import geometry
 from models.forward import ForwardModel
 from models.scenes import TRAINING, random_scene
-from models.shapes import drop_image, element_conductivity, from_rows, to_rows
+from models.shapes import drop_image, from_rows, to_rows
 
 WORK = Path(__file__).parent / "work"
 SPLITS = {"train": "training", "valid": "training", "test": "reference"}  # and the mesh each is solved on
@@ -84,14 +84,13 @@ def make_chunk(spec: ChunkSpec) -> dict[str, NDArray[Any]]:
     contact = skin.contact_impedance * (1 + wide * CONTACT_SPREAD * rng.uniform(-1, 1, n))
     background = 1 + wide * BACKGROUND_SPREAD * rng.uniform(-1, 1)
     z0 = np.abs(model.solve(background, contact).impedances())
-    corners = model.mesh.p.T[model.mesh.t.T]
     difference = np.empty((spec.size, len(z0)), np.float32)
     rows = np.empty((spec.size, 3, 7), np.float32)
     images = np.empty((spec.size, IMAGE, IMAGE), np.float16)
     for k in range(spec.size):
         rows[k] = to_rows(random_scene(rng, TRAINING, skin.inside))
         scene = from_rows(rows[k].astype(float))  # the float32 rows: what is stored is what was solved
-        conductivity = background * element_conductivity(scene, corners)
+        conductivity = model.touched(scene, background)
         difference[k] = np.abs(model.solve(conductivity, contact).impedances()) / z0 - 1
         images[k] = drop_image(scene, IMAGE)
     return {
@@ -206,7 +205,7 @@ def _read(folder: Path, split: str, limit: int | None, skip: int) -> Iterator[di
         yield part
 
 
-def specs(skin: str, split: str, n: int, seed: int, chunk: int = 500) -> list[ChunkSpec]:
+def specs(skin: str, split: str, n: int, seed: int, chunk: int = 1000) -> list[ChunkSpec]:
     """Chunks that hold at least n scenes."""
     return [ChunkSpec(skin, split, k, chunk, seed) for k in range(-(-n // chunk))]
 

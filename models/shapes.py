@@ -243,23 +243,6 @@ def element_drop(shapes: Iterable[Shape], corners: Array) -> Array:
     return drop
 
 
-def element_conductivity(shapes: Iterable[Shape], corners: Array) -> Array:
-    """Conductivity of each triangle (m, 3, 2), of a background of 1, that best stands for a touch it is only part of.
-
-    A triangle cut by an outline conducts like its arithmetic mean along the outline and like its harmonic mean across
-    it. Half way between the arithmetic and the geometric mean also makes up for the elements' own stiffness: on the
-    training mesh the difference signal is then right to 0.13 % (median over the EIDORS scenes) and without bias, with
-    the arithmetic mean alone to 0.3 % and 0.5 % too small.
-    """
-    conductivity = np.ones(len(corners))
-    for shape in shapes:
-        mean = shape.mean_over_triangles(corners)
-        arithmetic = 1 - shape.drop * mean
-        geometric = arithmetic if shape.kind == "hertz" else (1 - shape.drop) ** mean
-        conductivity = np.minimum(conductivity, (arithmetic + geometric) / 2)
-    return conductivity
-
-
 def to_rows(shapes: Sequence[Shape], length: int = 3) -> Array:
     """(length, 7), NaN where unused: the form shapes have in files."""
     rows = np.full((length, len(ROW)), np.nan)
