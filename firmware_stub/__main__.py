@@ -27,7 +27,9 @@ PARENT_CHECK_S = 0.5
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="firmware_stub", description="A skin's impedance board, without the hardware.")
+    parser = argparse.ArgumentParser(
+        prog="firmware_stub", description="A skin's impedance board, without the hardware."
+    )
     add = parser.add_argument
     add("--skin", default="palm", help="name the truth is published under (default: %(default)s)")
     add("--geometry", default="square16", help="skin of models/skins, or a .toml file (default: %(default)s)")

@@ -1,8 +1,8 @@
-"""The analogue side of the board: electrodes, multiplexers, converter, DFT, FIFO. From transfer impedances to measured Z.
+"""The analogue side of the board, from transfer impedances to measured Z: electrodes, multiplexers, DFT, FIFO.
 
-One measurement is a DFT of the voltage and one of the current through RTIA; the board reports Z = V/I * RTIA, from 18-bit
-registers whose imaginary part has its sign inverted. The sheet's ohm are model ohm (a sheet of 1 S): INPUT_GAIN brings
-10 uA across a few of them into the converter's range.
+One measurement is a DFT of the voltage and one of the current through RTIA; the board reports Z = V/I * RTIA, from
+18-bit registers whose imaginary part has its sign inverted. The sheet's ohm are model ohm (a sheet of 1 S): INPUT_GAIN
+brings 10 uA across a few of them into the converter's range.
 """
 
 from __future__ import annotations
@@ -97,7 +97,9 @@ class Analog:
 
     # --- the ways to the sheet ---
 
-    def _routed(self, scan_list: NDArray[np.int64], electrodes: int, now: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _routed(
+        self, scan_list: NDArray[np.int64], electrodes: int, now: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Which wires each measurement really reaches, and which of them reach nothing."""
         rows = scan_list.copy()
         is_open = np.zeros(len(rows), bool)

@@ -26,7 +26,7 @@ EVENT_PAUSE_S = 1.0  # the same event is reported at most that often
 
 
 def measurement_s(points: int) -> float:
-    """Seconds one measurement takes: voltage and current, each a DFT of `points` at 800 kSPS and the settling before it."""
+    """Seconds one measurement takes: voltage and current, for each the settling and a DFT of `points` at 800 kSPS."""
     return 2 * ((20 * points + 25) / CLOCK_HZ + SETTLE_S)
 
 
@@ -282,5 +282,3 @@ class Board:
     def _schema(self, now: float) -> int:
         wrong = self.faults.active("wrong_schema", now)
         return link.SCHEMA_HASH if wrong is None else wrong["schema"] & 0xFFFFFFFF
-
-

@@ -1,4 +1,4 @@
-"""The stub's control socket: press, release, scene, faults, status. Runs in a thread of its own, since a press costs a solve."""
+"""The stub's control socket: press, release, scene, faults, status. In a thread of its own: a press costs a solve."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """What can go wrong with the board: one table, and which of it is going wrong now.
 
-A fault lasts for its seconds; one marked `sticky` lasts until the board is power-cycled (`power_cycle`, `unplug`). The code
-that a fault disturbs asks `Faults.active(name)` at that point and nowhere else.
+A fault lasts for its seconds; one marked `sticky` lasts until the board is power-cycled (`power_cycle`, `unplug`). The
+code that a fault disturbs asks `Faults.active(name)` at that point and nowhere else.
 """
 
 from __future__ import annotations
@@ -30,27 +30,36 @@ FAULTS: dict[str, Fault] = {
         sticky=True,
     ),
     "brown_out": Fault(
-        "the registers are lost while running: no excitation, every measurement noise, until CONFIG comes again; with `silent` no EVENT",
+        "the registers are lost: no excitation, all measurements noise, until CONFIG comes; with `silent` no EVENT",
         {"silent": False},
         sticky=True,
     ),
     "stale_rtia": Fault(
-        "RTIA is not what was calibrated: all impedances times `gain`, turned by `phase` rad", {"gain": 1.05, "phase": 0.02}
+        "RTIA is not what was calibrated: all impedances times `gain`, turned by `phase` rad",
+        {"gain": 1.05, "phase": 0.02},
     ),
     "clipped": Fault(
-        "the voltage channel's gain is `gain` times too high and clips: plausible, too low Z; with `silent` no status bits",
+        "the voltage channel is `gain` times too sensitive and clips: plausible, low Z; with `silent` no status bits",
         {"gain": 4.0, "silent": False},
     ),
-    "rtia_overrange": Fault("the current channel clips: Z too high; with `silent` no status bits", {"gain": 1.6, "silent": False}),
+    "rtia_overrange": Fault(
+        "the current channel clips: Z too high; with `silent` no status bits", {"gain": 1.6, "silent": False}
+    ),
     "missed_interrupt": Fault(
         "a `fraction` of the results is read too early and is the one before; with `silent` no status bits",
         {"fraction": 0.02, "silent": False},
     ),
-    "fifo_overflow": Fault("`words` are lost in the middle of a scan, the rest moves up", {"words": 4, "silent": False}),
+    "fifo_overflow": Fault(
+        "`words` are lost in the middle of a scan, the rest moves up", {"words": 4, "silent": False}
+    ),
     "fifo_underflow": Fault("the last `words` of a scan never come: zeros", {"words": 8, "silent": False}),
-    "fifo_misaligned": Fault("all words are one late: real and imaginary parts, V and I change places", {"silent": False}),
+    "fifo_misaligned": Fault(
+        "all words are one late: real and imaginary parts, V and I change places", {"silent": False}
+    ),
     # electrodes and multiplexers
-    "electrode_open": Fault("the wire of `electrode` (0-based) is broken: no current, a floating voltage", {"electrode": 0}),
+    "electrode_open": Fault(
+        "the wire of `electrode` (0-based) is broken: no current, a floating voltage", {"electrode": 0}
+    ),
     "electrodes_shorted": Fault("the wires of two `electrodes` touch each other", {"electrodes": [0, 1]}),
     "electrodes_swapped": Fault("the wires of two `electrodes` are exchanged", {"electrodes": [0, 1]}),
     "mux_stuck": Fault(
@@ -61,11 +70,16 @@ FAULTS: dict[str, Fault] = {
     # the link
     "partial_frames": Fault("a `fraction` of the frames ends in the middle", {"fraction": 0.3}),
     "sequence_gaps": Fault("a `fraction` of the scans is never sent", {"fraction": 0.2}),
-    "line_noise": Fault("`garbage` random bytes for each byte sent, and a `flips` share of bits flipped", {"garbage": 0.02, "flips": 2e-5}),
-    "wrong_schema": Fault("the firmware is another version: another schema hash in IDENT and in every check", {"schema": 0xBAD0F00D}),
+    "line_noise": Fault(
+        "`garbage` random bytes for each byte sent, and a `flips` share of bits flipped",
+        {"garbage": 0.02, "flips": 2e-5},
+    ),
+    "wrong_schema": Fault(
+        "the firmware is another version: another schema hash in IDENT and in every check", {"schema": 0xBAD0F00D}
+    ),
     "hang": Fault("the board neither answers nor sends"),
     "unplug": Fault(
-        "the device vanishes and comes back, power-cycled, after the fault's seconds; under `name` in the runtime folder where one is given",
+        "the device vanishes and comes back, power-cycled, after the seconds; as <runtime>/`name` where one is given",
         {"name": ""},
     ),
     "power_cycle": Fault("the board restarts, and forgets what it was told and what was sticky"),
@@ -80,7 +94,7 @@ class Faults:
         self._lock = threading.Lock()
 
     def inject(self, name: str, args: Mapping[str, Any], now: float, seconds: float = 5.0) -> dict[str, Any]:
-        """Start a fault at `now` (s); returns its arguments. Raises ValueError for a name or argument that is not in the table."""
+        """Start a fault at `now` (s); returns its arguments. Raises ValueError for what is not in the table."""
         if name not in FAULTS:
             raise ValueError(f"no fault {name!r}: expected one of {', '.join(FAULTS)}")
         row = FAULTS[name]

@@ -1,4 +1,4 @@
-"""Transfer impedances over time: solved at key poses, interpolated in between, so that a still scene costs no solves."""
+"""Transfer impedances over time: solved at key poses, interpolated in between. A still scene costs no solves."""
 
 from __future__ import annotations
 

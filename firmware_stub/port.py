@@ -1,7 +1,7 @@
 """The board's serial line as the host sees it: a pty under a name in the runtime folder, or a TCP port.
 
-A pty has no baud rate, so `Line` paces what is sent with a token bucket. Both ends of an unplug are played: the name goes,
-readers get an I/O error, and the device comes back as another pty.
+A pty has no baud rate, so `Line` paces what is sent with a token bucket. Both ends of an unplug are played: the name
+goes, readers get an I/O error, and the device comes back as another pty.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Port(Protocol):
 
 
 class PtyPort:
-    """A pty, linked as <folder>/<name>. Its slave end is kept open, or the master would see an error whenever no host reads."""
+    """A pty, linked as <folder>/<name>. Its slave end is kept open: without any, the master sees errors."""
 
     def __init__(self, folder: Path, name: str = "board") -> None:
         self.folder, self.name = folder, name
@@ -143,7 +143,7 @@ class PtyPort:
         self.overrun += len(data) - sent
 
     def _discard_unread(self) -> None:
-        """Drop what no host has read for a while, as a USB driver does with a closed port: who opens it next finds fresh bytes."""
+        """Drop what no host reads for a while, as USB drivers do with a closed port: the next one gets fresh bytes."""
         unread = struct.unpack("i", fcntl.ioctl(self._slave, termios.FIONREAD, b"\0" * 4))[0]
         now = time.monotonic()
         if unread < UNREAD:
@@ -239,7 +239,7 @@ class TcpPort:
 
 
 def open_port(listen: str | None, folder: Path, name: str = "board") -> Port:
-    """A pty in `folder`, or a TCP server at `listen`. Raises ValueError for another kind of URL, OSError where it is taken."""
+    """A pty in `folder`, or a TCP server at `listen`. Raises ValueError for another kind of URL, OSError if taken."""
     return TcpPort(listen) if listen else PtyPort(folder, name)
 
 

@@ -1,8 +1,8 @@
-"""Sheet, board and line in one: what a host has at the other end of its cable. Driven by time, so it also runs faster than it.
+"""Sheet, board and line in one: what a host has at the other end of its cable. Driven by time, at any speed.
 
-    rig = Rig("square16", scene="slide", seed=1)
-    rig.feed(link.encode(link.Hello()), 0.0)
-    data = rig.pull(0.1)                                  # what the host has received by then
+rig = Rig("square16", scene="slide", seed=1)
+rig.feed(link.encode(link.Hello()), 0.0)
+data = rig.pull(0.1)                                  # what the host has received by then
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ SLEPT_S = 1.0  # a longer pause between two calls was the machine's sleep, not t
 class Rig:
     """A stub board on a sheet. Times are seconds since it was made; nothing in here looks at a clock.
 
-    rate_hz: full scans per second instead of the real board's. threaded: solve ahead in a thread (see Field), and skip the scans
-    of a pause instead of making up for them.
+    rate_hz: full scans per second instead of the real board's. threaded: solve ahead in a thread (see Field), and skip
+    the scans of a pause instead of making up for them.
     """
 
     def __init__(
@@ -119,12 +119,21 @@ class Rig:
             raise ValueError(f"a press of {seconds:g} s: expected above 0, up to 86400 s")
         for point in ((touch.x, touch.y), *([to] if to else [])):
             if not self.sheet.inside(*point):
-                raise ValueError(f"({point[0]:g}, {point[1]:g}) m is not on the skin, which is {self.sheet.size_text()}")
+                raise ValueError(
+                    f"({point[0]:g}, {point[1]:g}) m is not on the skin, which is {self.sheet.size_text()}"
+                )
         old = self.field.timeline
         presses = tuple(p for p in old.presses if p.times[-1] > now)
         track = press_track(now, seconds, touch, to)
         self.field.play(Timeline(old.script, old.start, (*presses, track), old.electrodes), now)
-        return {"x": touch.x, "y": touch.y, "radius": touch.radius, "drop": touch.drop, "seconds": seconds, "presses": len(presses) + 1}
+        return {
+            "x": touch.x,
+            "y": touch.y,
+            "radius": touch.radius,
+            "drop": touch.drop,
+            "seconds": seconds,
+            "presses": len(presses) + 1,
+        }
 
     def release(self, now: float) -> dict[str, Any]:
         """Take every press off."""

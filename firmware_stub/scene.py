@@ -59,7 +59,9 @@ def parse(data: Mapping[str, Any], name: str = "scene") -> Script:
         tracks=tuple(tracks),
         background=_curve(drift["background"]) if "background" in drift else None,
         contact=tuple((c.get("electrode"), _curve(c["keys"])) for c in drift.get("contact", [])),
-        cues=tuple(Cue(f["t"], f["name"], dict(f.get("args", {})), f.get("seconds", 5.0)) for f in data.get("fault", [])),
+        cues=tuple(
+            Cue(f["t"], f["name"], dict(f.get("args", {})), f.get("seconds", 5.0)) for f in data.get("fault", [])
+        ),
         duration=duration,
         loop=loop,
     )

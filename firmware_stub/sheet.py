@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from models import geometry
 from models.forward import ForwardModel
-from models.shapes import Shape, element_drop
+from models.shapes import Shape
 
 from .world import Touch, World
 
@@ -20,7 +20,6 @@ class Sheet:
     def __init__(self, geometry_name: str = "square16") -> None:
         self.skin = geometry.load(geometry_name)
         self.model = ForwardModel(self.skin, mesh="stub")
-        self._corners = self.model.mesh.p.T[self.model.mesh.t.T]
 
     @property
     def electrodes(self) -> int:
@@ -30,7 +29,13 @@ class Sheet:
         """A touch in the forward model's units."""
         scale = self.skin.metres_per_unit
         return Shape(
-            touch.kind, touch.x / scale, touch.y / scale, touch.radius / scale, touch.drop, touch.rotation, touch.aspect
+            touch.kind,
+            touch.x / scale,
+            touch.y / scale,
+            touch.radius / scale,
+            min(touch.drop, MOST_DROP),
+            touch.rotation,
+            touch.aspect,
         )
 
     def outline(self, touch: Touch) -> NDArray[np.float64]:
@@ -38,11 +43,10 @@ class Sheet:
         return np.asarray(self.shape(touch).outline() * self.skin.metres_per_unit)
 
     def transfer(self, world: World) -> NDArray[np.float64]:
-        """(n, n) ohm: potential of each electrode over the last, with unit current in at another and out at the last."""
+        """(n, n) ohm: potential of each electrode over the last, for unit currents from each of them to the last."""
         shapes = [self.shape(touch) for touch in world.touches if touch.drop > 0]
-        drop = np.minimum(element_drop(shapes, self._corners), MOST_DROP) if shapes else 0.0
         contact = self.skin.contact_impedance * (np.array(world.contact) if world.contact else 1.0)
-        return self.model.solve(world.background * (1.0 - drop), contact).transfer
+        return self.model.solve(self.model.touched(shapes, world.background), contact).transfer
 
     def inside(self, x: float, y: float) -> bool:
         """Whether the point (metres) is on the skin."""

@@ -114,7 +114,8 @@ class Timeline:
         base = self.start
         if script.loop and t >= base:
             base += math.floor((t - base) / script.duration) * script.duration
-            base += script.duration * ((t - base >= script.duration) - (t < base))  # what rounding did
+            if not base <= t < base + script.duration:  # rounding
+                base += math.copysign(script.duration, t - base)
         k = bisect_right(breaks, t - base)
         starts = [base + breaks[k - 1] if k else -math.inf]
         ends = [base + breaks[k] if k < len(breaks) else math.inf]

@@ -36,7 +36,8 @@ class World:
     def rounded(self) -> World:
         """To a nanometre: the same pose of a later round of a loop is the same world."""
         touches = tuple(
-            Touch(t.kind, *(round(v, 9) for v in (t.x, t.y, t.radius, t.drop, t.rotation, t.aspect))) for t in self.touches
+            Touch(t.kind, *(round(v, 9) for v in (t.x, t.y, t.radius, t.drop, t.rotation, t.aspect)))
+            for t in self.touches
         )
         return World(touches, round(self.background, 9), tuple(round(v, 9) for v in self.contact))
 
