@@ -1,0 +1,6 @@
+"""The running service. Numerical libraries get one thread each: a stage is small, and other stages need the other cores."""
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")

@@ -11,7 +11,10 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from protocol.topics import PRODUCERS
+from protocol.transport import Transport
 
 ROOT = Path(__file__).resolve().parents[1]
 SKIN_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
@@ -77,6 +80,7 @@ class Skin(Section):
     indenter: Indenter | None = None
     network: Literal["full", "fast", "int8", "none"] = "full"
     dft_points: Literal[128, 256, 512] = 128
+    rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
     tare: Tare = Tare()
     touch: Touch = Touch()
 
@@ -92,18 +96,27 @@ RECORDINGS = (".mcap", ".npz")
 
 
 class Sockets(Section):
-    """Data sockets are ipc files in the runtime folder unless told otherwise."""
+    """Where processes publish and take commands: ipc sockets in the runtime folder, or the addresses given here."""
 
-    transport: Literal["ipc", "tcp"] = "ipc"
-    bind: str = "127.0.0.1"
-    first_port: Annotated[int, Field(ge=1024, le=65000)] = 47600
+    addresses: dict[str, str] = {}  # producer, or "<process>.ctl" for its control socket -> tcp://host:port
+
+    @field_validator("addresses")
+    @classmethod
+    def known(cls, addresses: dict[str, str]) -> dict[str, str]:
+        for name, address in addresses.items():
+            if name.removesuffix(".ctl") not in (*PRODUCERS, "recorder"):
+                raise ValueError(f"producers {', '.join(PRODUCERS)}, or one of these with .ctl (found {name!r})")
+            if not re.fullmatch(r"(tcp://\S+:\d+|ipc://\S+)", address):
+                raise ValueError(f"tcp://HOST:PORT or ipc://PATH (found {address!r} for {name})")
+        return addresses
 
 
 class Security(Section):
-    """TCP only: CURVE keys. Unencrypted beyond loopback is refused unless `insecure` says so."""
+    """Of tcp addresses: CURVE keys (`skin keys new`). Unencrypted beyond this host is refused unless `insecure` says so."""
 
-    keys: Path | None = None
-    allowed_clients: Path | None = None
+    secret_key: Path | None = None  # our own key pair
+    server_keys: dict[str, Path] = {}  # producer -> its public key
+    clients: Path | None = None  # folder with the public keys that may connect
     insecure: bool = False
 
 
@@ -128,12 +141,20 @@ class Config(Section):
                 raise ValueError(f"skin names of lower-case letters, digits, - and _ (found {name!r})")
         return {name: s if s.frame_id else s.model_copy(update={"frame_id": name}) for name, s in skins.items()}
 
-    @model_validator(mode="after")
-    def encrypted(self) -> Config:
-        loopback = self.sockets.bind in ("127.0.0.1", "::1", "localhost")
-        if self.sockets.transport == "tcp" and not loopback and not self.security.insecure and self.security.keys is None:
-            raise ValueError("sockets.bind beyond loopback needs security.keys (`skin keys new`) or security.insecure = true")
-        return self
+    def transport(self) -> Transport:
+        """For `protocol.transport.configure`."""
+        keys = self.security
+        return Transport(
+            addresses=self.sockets.addresses,
+            secret_key=self.relative(keys.secret_key),
+            server_keys={name: self.path.parent / key for name, key in keys.server_keys.items()},
+            clients=self.relative(keys.clients),
+            insecure=keys.insecure,
+        )
+
+    def relative(self, path: Path | None) -> Path | None:
+        """A path of the file: relative ones are relative to its folder."""
+        return None if path is None else self.path.parent / path
 
     def skin(self, name: str) -> Skin:
         """The skin called `name`; ConfigError names those there are."""

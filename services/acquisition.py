@@ -1,0 +1,97 @@
+"""Acquisition: raw frames from each skin's source to the sockets. `python -m services.acquisition`
+
+Sources block, so each runs in a thread of its own; the runner takes their frames as they come.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+import threading
+from collections import deque
+
+from protocol.frames import Frame, RawFrame
+from services.runner import Runner, main
+from services.source import Source, open_source
+from services.stage import Health, Stage
+
+QUEUE = 256  # frames that the runner may be behind before the oldest are dropped
+
+log = logging.getLogger(__name__)
+
+
+class Acquiring(Stage):
+    """source -> raw: the frames as the source gives them."""
+
+    reads = ""
+    writes = ("raw",)
+    stamp = "read"
+
+    def __init__(self, name: str, feed: SourceFeed) -> None:
+        super().__init__(name)
+        self._feed = feed
+
+    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        return [frame]
+
+    def health(self) -> Health:
+        found = self._feed.source.health()
+        found.counters["overrun"] = self._feed.overrun
+        return found
+
+
+class SourceFeed:
+    """A source in a thread; `socket` becomes readable when frames wait."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.socket = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self.overrun = 0
+        self.malformed = self.skipped = 0
+        self._frames: deque[RawFrame] = deque()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"source-{source.name}", daemon=True)
+        self._thread.start()
+
+    def recv(self) -> Frame | None:
+        """The oldest frame not yet taken, or None."""
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self.socket)
+        try:
+            return self._frames.popleft()
+        except IndexError:
+            return None
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join(0.5)
+        self.source.close()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                for frame in self.source.frames():
+                    if frame is not None:
+                        self._frames.append(frame)
+                        if len(self._frames) > QUEUE:
+                            self._frames.popleft()
+                            self.overrun += 1
+                        os.eventfd_write(self.socket, 1)
+                    if self._stop.is_set():
+                        return
+            except Exception as why:  # a source that raises is a bug, yet the other skins go on and this one is tried again
+                log.exception("source of %s", self.source.name)
+                self.source.problem = f"internal error: {type(why).__name__}: {why}"
+                self._stop.wait(1.0)
+
+
+def run(runner: Runner) -> None:
+    for name, skin in runner.config.skins.items():
+        feed = SourceFeed(open_source(name, skin, runner.bundle(name)))
+        runner.add(Acquiring(name, feed), feed)
+
+
+if __name__ == "__main__":
+    sys.exit(main("acquisition", run))

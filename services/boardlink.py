@@ -1,0 +1,169 @@
+"""The host's end of the board's link: HELLO, IDENT, check, CONFIG, START, scans. A state machine without I/O.
+
+`received` takes bytes in, `to_send` gives bytes out; both are told the time. Nothing the board does, or fails to do, raises.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol import link
+
+HELLO_EVERY_S = 0.2
+ANSWER_S = 0.5  # a command that is not answered in this time is sent again
+TRIES = 3  # then everything starts from HELLO
+SILENT_S = 1.0  # a running board that sends nothing for so long is asked again
+EXPLAIN_AFTER_S = 1.5  # of unanswered HELLOs
+REFUSED_AGAIN_S = 1.0  # a refused board is tried again, for it may be power-cycled or flashed
+
+
+@dataclass(frozen=True)
+class Scanning:
+    """What the board is to do: scan list (K, 4) of 0-based electrodes, DFT points, gain resistor."""
+
+    pattern: NDArray[np.integer]
+    dft_points: int
+    rtia_ohm: float
+
+    @property
+    def config(self) -> int:
+        """Id of this configuration on the board: from its content, so that one of an earlier session is never taken for it."""
+        text = self.pattern.astype("u1").tobytes() + f"{self.dft_points} {self.rtia_ohm:g}".encode()
+        return zlib.crc32(text) & 0xFFFF
+
+
+class BoardLink:
+    """One connection. `state` is hello, config, start, running or refused."""
+
+    def __init__(self, scanning: Scanning, now_s: float) -> None:
+        self.scanning = scanning
+        self.decoder = link.Decoder()
+        self.ident: link.Ident | None = None
+        self.problem = ""  # what stands in the way, for a person; "" when all is well
+        self.counts: Counter[str] = Counter()  # scans, missing, foreign, events, restarts, and the decoder's bad ones
+        self._last_seq: int | None = None
+        self._to(now_s, "hello")
+        self._asked_since = now_s
+        self.gap = False  # whether scans are missing just before the last one returned
+
+    @property
+    def board(self) -> str:
+        """Unique id of the board, hexadecimal; "" until it has introduced itself."""
+        return self.ident.unique_id.hex() if self.ident else ""
+
+    def received(self, data: bytes, now_s: float) -> list[link.Frame]:
+        """Scans that `data` completes, in order; everything else is dealt with here."""
+        scans = []
+        for message in self.decoder.feed(data):
+            if isinstance(message, link.Frame):
+                if self._is_ours(message):
+                    self._heard_s = now_s
+                    scans.append(message)
+            elif isinstance(message, link.Ident):
+                self._introduced(message, now_s)
+            elif isinstance(message, link.Ack):
+                self._acknowledged(message, now_s)
+            elif isinstance(message, link.Nak):
+                self._refuse(f"the board refuses: {message.text or link.NakReason(message.reason).name}", now_s)
+            elif isinstance(message, link.Event):
+                self._happened(message, now_s)
+        return scans
+
+    def to_send(self, now_s: float) -> bytes:
+        """What is due now."""
+        if self.state == "running":
+            if now_s - self._heard_s <= SILENT_S:
+                return b""
+            self._restart(now_s, f"the board went silent for {SILENT_S:g} s: asking it again")
+        if self.state == "refused" and now_s - self._since >= REFUSED_AGAIN_S:
+            self._to(now_s, "hello")
+        if now_s < self._due_s:
+            return b""
+        if self.state == "hello":
+            self._due_s = now_s + HELLO_EVERY_S
+            if now_s - self._asked_since > EXPLAIN_AFTER_S and not self.problem:
+                self.problem = self._why_no_answer()
+            return link.encode(link.Hello(schema_hash=link.SCHEMA_HASH))
+        if self.state in ("config", "start"):
+            self._tries += 1
+            if self._tries > TRIES:
+                self._restart(now_s, f"the board does not answer {self.state.upper()}: asking it again")
+                return b""
+            self._due_s = now_s + ANSWER_S
+            s = self.scanning
+            if self.state == "config":
+                return link.encode(
+                    link.Config(config=s.config, dft_points=s.dft_points, rtia_ohm=s.rtia_ohm, scan=s.pattern.astype("u1"))
+                )
+            return link.encode(link.Start(config=s.config))
+        return b""
+
+    def _to(self, now_s: float, state: str) -> None:
+        self.state, self._since, self._due_s, self._tries = state, now_s, now_s, 0
+        self._heard_s = now_s
+        if state == "hello":
+            self._asked_since = now_s
+
+    def _restart(self, now_s: float, why: str) -> None:
+        self.counts["restarts"] += 1
+        self.problem = why
+        self._to(now_s, "hello")
+
+    def _introduced(self, ident: link.Ident, now_s: float) -> None:
+        self.ident = ident
+        needed = int(self.scanning.pattern.max()) + 1
+        if ident.schema_hash != link.SCHEMA_HASH or ident.link_version != link.LINK_VERSION:
+            found, ours = f"{ident.schema_hash:08x}", f"{link.SCHEMA_HASH:08x}"
+            self._refuse(f"firmware {ident.firmware!r} speaks schema {found}, this program {ours}: flash a matching one", now_s)
+        elif ident.chip_id != link.CHIP_ID:
+            found = f"0x{ident.chip_id:04x}"
+            self._refuse(f"the converter says chip id {found}, expected 0x{link.CHIP_ID:04x}: power-cycle the board", now_s)
+        elif ident.electrodes < needed or ident.max_scan < len(self.scanning.pattern):
+            self._refuse(
+                f"the board has {ident.electrodes} electrodes and takes {ident.max_scan} measurements; "
+                f"the bundle needs {needed} and {len(self.scanning.pattern)}", now_s
+            )
+        elif self.state in ("hello", "refused"):
+            self._to(now_s, "config")
+
+    def _acknowledged(self, ack: link.Ack, now_s: float) -> None:
+        if self.state == "config" and ack.of == link.Config.number:
+            self._to(now_s, "start")
+        elif self.state == "start" and ack.of == link.Start.number:
+            self._last_seq = None
+            self.problem = ""
+            self._to(now_s, "running")
+
+    def _refuse(self, why: str, now_s: float) -> None:
+        self.problem = why
+        self._to(now_s, "refused")
+
+    def _happened(self, event: link.Event, now_s: float) -> None:
+        self.counts["events"] += 1
+        if event.code in (link.EventCode.BOOT, link.EventCode.BROWN_OUT):
+            self._restart(now_s, f"the board lost its configuration ({event.text or link.EventCode(event.code).name})")
+
+    def _is_ours(self, scan: link.Frame) -> bool:
+        if self.state != "running" or scan.config != self.scanning.config or len(scan.z) != len(self.scanning.pattern):
+            self.counts["foreign"] += 1
+            return False
+        self.gap = False
+        if self._last_seq is not None:
+            missing = (scan.seq - self._last_seq - 1) & 0xFFFFFFFF
+            if missing >= 0x80000000:  # repeated or older: the board started anew
+                missing = 0
+            self.gap = missing > 0
+            self.counts["missing"] += missing
+        self._last_seq = scan.seq
+        self.counts["scans"] += 1
+        return True
+
+    def _why_no_answer(self) -> str:
+        if self.decoder.bad:
+            return f"no answer to HELLO, only noise ({self.decoder.last_error}): is it the board, and at this baud rate?"
+        return "no answer to HELLO: is it the board, and is its firmware running?"

@@ -1,0 +1,37 @@
+"""The force law: from the conductivity drop at a touch's peak [S/m] to its normal force [N]."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+from models.bundle import Bundle
+from services.config import Skin
+
+NEWTONS_PER_SIEMENS = 10.0  # N per S/m: 0.1 to 0.5 S/m are 1 to 5 N
+MOST_N = 5.0
+
+
+@dataclass(frozen=True)
+class ForceLaw:
+    """force = newtons_per_siemens * peak drop. None: this skin has no law, its forces are nil."""
+
+    newtons_per_siemens: float | None
+    most_n: float = MOST_N  # beyond it a force is extrapolated
+    calibrated: bool = False  # of this very skin, not of its kind
+
+    @classmethod
+    def of(cls, skin: Skin, bundle: Bundle) -> ForceLaw:
+        """The law of a skin: its calibration file's, else its bundle's, else the default of bundles in S/m."""
+        law = bundle.manifest.get("force_law", {})
+        if skin.calibration is not None:
+            found = json.loads(skin.calibration.read_text())
+            return cls(float(found["newtons_per_siemens"]), float(found.get("most_n", MOST_N)), calibrated=True)
+        if law is None or bundle.manifest["normalisation"] == "measured":
+            return cls(None)
+        return cls(float(law.get("newtons_per_siemens", NEWTONS_PER_SIEMENS)), float(law.get("most_n", MOST_N)))
+
+    def force(self, peak: float, peak_sigma: float) -> tuple[float | None, float | None]:
+        """(force, its standard uncertainty) [N] of a peak drop and its standard deviation [S/m]."""
+        k = self.newtons_per_siemens
+        return (None, None) if k is None else (k * peak, k * peak_sigma if peak_sigma else None)

@@ -1,0 +1,161 @@
+"""Inference: from the pre-reconstruction stack to the image of the conductivity drop, by the bundle's network.
+
+ONNX Runtime on one thread, warmed up before the stage is ready. A bundle without a network gives the one-step image.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from models.prereconstruction import Operator
+from protocol.frames import DeltaFrame, Frame, ImageFrame
+from services.config import Skin
+from services.stage import Health, Refused, Stage, inherited
+
+WARM_UP_RUNS = 5
+FEWEST_SIGMA = 2  # finite measurements without which there is nothing to reconstruct
+
+
+class Inference(Stage):
+    """delta -> image [S/m], on the bundle's grid."""
+
+    reads = "delta"
+    writes = ("image",)
+    stamp = "infer"
+
+    def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
+        super().__init__(name)
+        self.config, self.bundle = skin, bundle
+        path = None if skin.network == "none" else bundle.network_path(skin.network) or bundle.network_path("full")
+        self._network = Network(str(path)) if path else OneStep(bundle)
+        n = bundle.image_size
+        self._metres_per_pixel = bundle.metres_per_pixel
+        self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
+        self.reset()
+
+    def reset(self) -> None:
+        self._last: ImageFrame | None = None  # of the touch that is being held
+        self._last_scan = 0  # of the frame that it was reconstructed from
+        self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
+        self._counters = {"networks_run": 0, "held": 0, "untouched": 0, "unwanted": 0, "missed": 0}
+
+    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        assert isinstance(frame, DeltaFrame)
+        if "image" not in wanted:
+            self._counters["unwanted"] += 1
+            self._unseen = frame if frame.stack.size else self._unseen
+            return []
+        out = ImageFrame(**inherited(frame), touched=frame.touched)
+        out.metres_per_pixel, out.origin = self._metres_per_pixel, self._origin
+        if frame.stack.size:
+            self._run(frame, out)
+        elif frame.held and self._unseen is not None and self._unseen.scan == frame.reconstructed:
+            self._run(self._unseen, out)
+        elif frame.held:
+            self._hold(frame, out)
+        else:
+            self._counters["untouched"] += 1
+            self._last = None
+        return [out]
+
+    def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        out.image, out.sigma, out.classes = self._network.run(frame)
+        self._counters["networks_run"] += 1
+        self._last, self._unseen = out, None
+        self._last_scan = frame.scan
+
+    def _hold(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        """The image of the frame last reconstructed, if we have seen that one."""
+        last = self._last
+        if last is not None and self._last_scan == frame.reconstructed:
+            out.held = True
+            out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
+            self._counters["held"] += 1
+        else:  # it was skipped, or came before we started: not valid until the next reconstruction, at most 16 frames on
+            out.valid = False
+            out.reasons.append("gap")
+            self._counters["missed"] += 1
+
+    def state(self) -> dict[str, Any]:
+        last = self._last
+        if last is None:
+            return {"last": None}
+        return {"last": {"scan": self._last_scan, "image": last.image, "sigma": last.sigma, "classes": last.classes}}
+
+    def load(self, state: dict[str, Any]) -> None:
+        self.reset()
+        last = state.get("last")
+        if last is None:
+            return
+        try:
+            self._last = ImageFrame(
+                skin=self.skin, image=last["image"], sigma=last["sigma"], classes=last["classes"]
+            )
+            self._last_scan = int(last["scan"])
+        except (KeyError, TypeError) as wrong:
+            raise Refused(f"no image in the saved state ({wrong})") from None
+
+    def health(self) -> Health:
+        if isinstance(self._network, OneStep):
+            return Health("OK", [f"bundle {self.bundle.name} has no network: one-step images"], dict(self._counters))
+        return Health("OK", [], dict(self._counters))
+
+
+class Network:
+    """The bundle's ONNX file. Output: drop (H, W) and its sigma [S/m], class probabilities (5, h, w)."""
+
+    def __init__(self, path: str) -> None:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        inputs = {i.name: [d if isinstance(d, int) else 1 for d in i.shape] for i in self.session.get_inputs()}
+        for _ in range(WARM_UP_RUNS):
+            self.session.run(None, {name: np.zeros(shape, np.float32) for name, shape in inputs.items()})
+
+    def run(self, frame: DeltaFrame) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        drop, log_sigma, logits = self.session.run(
+            ["drop", "log_sigma", "classes"], {"stack": frame.stack[None], "context": frame.context[None]}
+        )
+        scale = np.float32(frame.scale)
+        return drop[0, 0] * scale, np.exp(log_sigma[0, 0]) * scale, softmax(logits[0])
+
+
+class OneStep:
+    """The paper's one-step image, conditioned on the noise that the frames state."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.pre, self.n = bundle.prereconstructor(), bundle.image_size
+        self._operator: Operator | None = None
+        self._sigma = b""
+
+    def run(self, frame: DeltaFrame) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        empty = np.zeros((0, 0), np.float32), np.zeros((0, 0, 0), np.float32)
+        sigma = frame.sigma.astype(float)
+        live = np.isfinite(sigma)
+        if live.sum() < FEWEST_SIGMA:
+            return np.zeros((self.n, self.n), np.float32), *empty
+        if self._operator is None or sigma.tobytes() != self._sigma:
+            self._operator = self.pre.condition(sigma, weights=live.astype(float))
+            self._sigma = sigma.tobytes()
+        return np.asarray(self._operator.one_step(frame.difference, self.n), np.float32), *empty
+
+
+def softmax(logits: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Over the first axis."""
+    e = np.exp(logits - logits.max(axis=0))
+    return np.asarray(e / e.sum(axis=0), np.float32)
+
+
+if __name__ == "__main__":
+    import sys
+
+    from services.runner import main, stages
+
+    sys.exit(main("inference", stages(Inference)))

@@ -1,0 +1,106 @@
+"""A serial port as acquisition needs it: any pyserial URL, raw bytes, and a name that may change when it is plugged in again."""
+
+from __future__ import annotations
+
+import os
+import select
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import serial
+from serial.tools import list_ports
+
+from protocol.runtime import runtime_dir
+
+BAUD = 921_600
+STUB_LINK = "board"  # name of the stub's pty in the runtime folder
+
+
+class PortError(Exception):
+    """The port cannot be opened, or is gone. The text is for a person."""
+
+
+class Port:
+    """An open port. Raises PortError from every method once the device is gone."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        try:
+            self._serial: Any = serial.serial_for_url(url, baudrate=BAUD, timeout=0, write_timeout=1, exclusive=True)
+        except (serial.SerialException, OSError, ValueError) as why:
+            raise PortError(explain(url, why)) from None
+        try:
+            self._serial.set_low_latency_mode(True)
+        except Exception:  # not every driver has it: ptys, sockets, other systems
+            pass
+        try:
+            self._fd = int(self._serial.fileno())
+        except Exception:  # rfc2217:// and loop:// have none
+            self._fd = -1
+        if self._fd < 0:
+            self._serial.timeout = 0.02
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has arrived, waiting up to timeout_s for the first byte; b"" when nothing came."""
+        try:
+            if self._fd < 0:
+                data: bytes = self._serial.read(1)
+                return data + self._serial.read(self._serial.in_waiting) if data else data
+            if not select.select([self._fd], [], [], timeout_s)[0]:
+                return b""
+            data = os.read(self._fd, 65536)
+        except (OSError, ValueError, TypeError, serial.SerialException) as why:
+            raise PortError(f"{self.url} is gone ({why}): is the cable plugged in?") from None
+        if not data:
+            raise PortError(f"{self.url} is gone (ready to read, but nothing to be read): is the cable plugged in?")
+        return data
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._serial.write(data)
+        except (OSError, serial.SerialException) as why:
+            raise PortError(f"{self.url} is gone ({why}): is the cable plugged in?") from None
+
+    def close(self) -> None:
+        try:
+            self._serial.close()
+        except Exception:  # a device that is gone may fail in any way
+            pass
+
+
+def candidates(port: str, usb_serial: str | None, known_board: bool) -> Iterator[str]:
+    """URLs at which the board may be: first the configured one, then, once we know it, the names it may have come back under."""
+    if port == "stub":
+        folder = runtime_dir()
+        yield str(folder / STUB_LINK)
+        if known_board:
+            yield from (str(p) for p in sorted(folder.glob(STUB_LINK + "?*")) if p.is_symlink())
+        return
+    yield port
+    if "://" in port or not known_board:
+        return
+    if usb_serial:
+        yield from (p.device for p in list_ports.comports() if p.serial_number == usb_serial and p.device != port)
+    else:
+        path = Path(port)
+        stem = path.name.rstrip("0123456789")
+        yield from (str(p) for p in sorted(path.parent.glob(stem + "*")) if p != path and (p.is_symlink() or p.is_char_device()))
+
+
+def usb_serial_number(url: str) -> str | None:
+    """Serial number of the USB device behind a device path, if it has one."""
+    real = os.path.realpath(url) if "://" not in url else url
+    return next((p.serial_number for p in list_ports.comports() if p.device == real), None)
+
+
+def explain(url: str, why: Exception) -> str:
+    """What a failure to open means and what to do about it."""
+    text, number = str(why), getattr(why, "errno", None)
+    if "exclusively lock" in text or number in (11, 16):
+        return f"{url} is held by another program: close that one (`fuser {url}` names it)"
+    if number == 2 or "No such file" in text:
+        return f"{url} is not there: plug the board in, or correct `port` in skin.toml"
+    if number == 13 or "Permission denied" in text:
+        return f"{url} may not be opened: add yourself to its group (`ls -l {url}`; usually dialout) and log in again"
+    return f"{url} cannot be opened: {text}"

@@ -1,0 +1,320 @@
+"""The one runner of all processes: sockets, freshness, stamps, counters, heartbeats, commands, signals.
+
+It drives one stage object for each skin. Nothing that arrives on a socket ends it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import zmq
+
+from models.bundle import Bundle, BundleError
+from protocol import transport
+from protocol.frames import Frame, FrameError, InfoFrame
+from protocol.runtime import RuntimeDirError, host_id
+from protocol.sockets import ControlError, ControlServer, NewestReader, Publisher
+from protocol.topics import TOPIC_OF
+from protocol.transport import TransportError
+from services import persistence
+from services.config import Config, ConfigError, Skin, load
+from services.heartbeat import Heartbeat
+from services.stage import Refused, Stage
+
+HEARTBEAT_S = 1.0
+TICK_S = 0.1  # how often silence, changes of health and new subscribers are looked for
+SILENT_S = 0.5  # without frames from upstream: status STALE
+OLD_S = 0.5  # a frame read longer ago is dropped: never stale as fresh
+WARM_FRAMES = 50  # frames after which what lives is taken to live for ever (garbage collection)
+
+log = logging.getLogger(__name__)
+
+
+class Feed(Protocol):
+    """Where a stage's frames come from."""
+
+    malformed: int
+    skipped: int
+
+    @property
+    def socket(self) -> Any: ...
+    def recv(self) -> Frame | None: ...
+    def close(self) -> None: ...
+
+
+class Lane:
+    """One skin in this process: its stage, where its frames come from, how it does."""
+
+    def __init__(self, process: str, stage: Stage, feed: Feed) -> None:
+        self.stage, self.feed = stage, feed
+        self.heartbeat = Heartbeat(process, stage.skin)
+        self.asleep = False
+        self.errors: set[str] = set()
+
+
+class Runner:
+    """A process: its sockets and its lanes. `run` returns when SIGINT or SIGTERM came."""
+
+    def __init__(self, process: str, config: Config) -> None:
+        self.process, self.config = process, config
+        transport.configure(config.transport())
+        self.publisher = Publisher(process)
+        commands = {"status": self._status, "state": self._state, "load": self._load, "reset": self._reset}
+        self.control = ControlServer(process, commands)
+        self.lanes: dict[str, Lane] = {}
+        self._bundles: dict[str, Bundle] = {}
+        self._poller = zmq.Poller()
+        self._by_socket: dict[Any, Lane] = {}
+        self._stop = False
+        self._frames = 0
+
+    def bundle(self, skin: str) -> Bundle:
+        """The bundle of a skin, loaded once."""
+        name = self.config.skins[skin].bundle
+        if name not in self._bundles:
+            self._bundles[name] = Bundle.load(name)
+        return self._bundles[name]
+
+    def add(self, stage: Stage, feed: Feed | None = None) -> None:
+        """Drive this stage; without a feed, from the topic that it reads."""
+        lane = Lane(self.process, stage, feed or _Newest(stage.reads, stage.skin))
+        self.lanes[stage.skin] = lane
+        self._by_socket[lane.feed.socket] = lane
+        for command in stage.commands:
+            self.control.handlers[command] = self._commander(command)
+        if stage.persists:
+            self._restore(lane)
+        stage.warm_up()
+
+    def run(self) -> None:
+        """Drive the lanes until told to stop."""
+        wake = _wake_on_signals(self._on_signal)
+        self._poller.register(wake, zmq.POLLIN)
+        self._poller.register(self.control.socket, zmq.POLLIN)
+        self._poller.register(self.publisher.socket, zmq.POLLIN)
+        for socket in self._by_socket:
+            self._poller.register(socket, zmq.POLLIN)
+        next_tick = 0.0
+        while not self._stop:
+            ready = self._poller.poll(max(0, int((next_tick - time.monotonic()) * 1000)))
+            for socket, _ in ready:
+                lane = self._by_socket.get(socket)
+                if lane is not None:
+                    self._serve(lane)
+                elif socket is self.control.socket:
+                    self.control.serve_once()
+                elif socket is self.publisher.socket:
+                    self.publisher.poll()
+            if time.monotonic() >= next_tick:
+                self._tick()
+                next_tick = time.monotonic() + TICK_S
+        self.close()
+
+    def close(self) -> None:
+        for lane in self.lanes.values():
+            lane.feed.close()
+        self.control.close()
+        self.publisher.close()
+
+    # frames
+
+    def _serve(self, lane: Lane) -> None:
+        while (frame := lane.feed.recv()) is not None:
+            self._handle(lane, frame)
+            if isinstance(lane.feed, _Newest):
+                return
+
+    def _handle(self, lane: Lane, frame: Frame) -> None:
+        beat, stage = lane.heartbeat, lane.stage
+        now = time.monotonic_ns()
+        read = frame.stamps.get("read", 0)
+        if frame.source != "replay" and frame.host in ("", host_id()) and now - read > OLD_S * 1e9:
+            beat.drops["old"] += 1
+            return
+        beat.heard(frame, now)
+        try:
+            made = stage.process(frame, self._wanted(stage))
+        except Exception as why:
+            self._failed(lane, why)
+            return
+        done = time.monotonic_ns()
+        for out in made:
+            out.stamps.setdefault(stage.stamp, done)
+            self._send(lane, out)
+        beat.done(frame, now, time.monotonic_ns())
+        self._frames += 1
+        if self._frames == WARM_FRAMES:
+            gc.collect()
+            gc.freeze()
+            gc.set_threshold(20_000, 50, 50)
+
+    def _send(self, lane: Lane, frame: Frame) -> None:
+        try:
+            self.publisher.send(frame)
+            lane.heartbeat.sent[TOPIC_OF[type(frame)].name] += 1
+        except (FrameError, zmq.ZMQError) as why:
+            self._failed(lane, why)
+
+    def _wanted(self, stage: Stage) -> frozenset[str]:
+        return frozenset(topic for topic in stage.writes if self.publisher.wanted(topic, stage.skin))
+
+    def _failed(self, lane: Lane, why: Exception) -> None:
+        lane.heartbeat.drops["failed"] += 1
+        lane.heartbeat.failure = f"a frame could not be processed: {type(why).__name__}: {why}"
+        if str(why) not in lane.errors and len(lane.errors) < 100:
+            lane.errors.add(str(why))
+            log.exception("%s: a frame was dropped (further ones of this kind are only counted)", lane.stage.skin, exc_info=why)
+
+    # housekeeping
+
+    def _tick(self) -> None:
+        self.publisher.poll()
+        now = time.monotonic()
+        for lane in self.lanes.values():
+            self._sleep_or_wake(lane)
+            beat = lane.heartbeat
+            beat.drops["malformed"], beat.drops["skipped"] = lane.feed.malformed, lane.feed.skipped
+            silent = "" if lane.asleep else beat.silence(SILENT_S, lane.stage.reads)
+            status = beat.status(lane.stage.health(), silent, now, HEARTBEAT_S, asleep=lane.asleep)
+            if status is not None:
+                self._send(lane, status)
+            info = lane.stage.info()
+            if info is not None:
+                age = {"tare_age_s": (time.monotonic_ns() - info["tare_sample_ns"]) * 1e-9} if info.get("tare_sample_ns") else {}
+                self._send(lane, InfoFrame(skin=lane.stage.skin, process=self.process, valid=True, info=info | age))
+            if lane.stage.persists and (saved := lane.stage.saved()) is not None:
+                persistence.save(self.process, lane.stage.skin, saved)
+
+    def _sleep_or_wake(self, lane: Lane) -> None:
+        """A stage whose frames nobody reads does not read either, so that upstream need not work for it."""
+        if not lane.stage.sleeps or not isinstance(lane.feed, _Newest):
+            return
+        idle = not self._wanted(lane.stage)
+        if idle != lane.asleep:
+            lane.asleep = idle
+            lane.feed.listen(not idle)
+
+    def _restore(self, lane: Lane) -> None:
+        found = persistence.restore(self.process, lane.stage.skin)
+        if found is None:
+            return
+        try:
+            lane.stage.restore(*found)
+            log.info("%s: took over the baseline of %.0f s ago", lane.stage.skin, found[1])
+        except Refused as why:
+            log.warning("%s: %s", lane.stage.skin, why)
+
+    def _on_signal(self) -> None:
+        self._stop = True
+
+    # commands
+
+    def _lane(self, args: dict[str, Any]) -> Lane:
+        name = args.get("skin") or next(iter(self.lanes))
+        if name not in self.lanes:
+            raise ControlError("bad_request", f"no skin called {name!r}; configured: {', '.join(self.lanes)}")
+        return self.lanes[name]
+
+    def _commander(self, command: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
+        def carry_out(args: dict[str, Any]) -> dict[str, Any]:
+            lane = self._lane(args)
+            try:
+                return persistence.plain(lane.stage.command(command, args))
+            except Refused as why:
+                raise ControlError("refused", str(why)) from None
+
+        return carry_out
+
+    def _status(self, args: dict[str, Any]) -> dict[str, Any]:
+        """`flowing`: whether a frame came within SILENT_S (or nobody wants one); what status/<skin> said last."""
+        lane = self._lane(args)
+        return lane.heartbeat.summary(asleep=lane.asleep, silent_s=SILENT_S)
+
+    def _state(self, args: dict[str, Any]) -> dict[str, Any]:
+        """The stage's temporal state, for a recording."""
+        return {"state": persistence.plain(self._lane(args).stage.state())}
+
+    def _load(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Take over a state that `state` gave."""
+        if not isinstance(args.get("state"), dict):
+            raise ControlError("bad_request", "load needs `state`, a map as the command state gives it")
+        try:
+            self._lane(args).stage.load(persistence.arrays(args["state"]))
+        except (Refused, KeyError, TypeError, ValueError) as why:
+            self._lane(args).stage.reset()
+            raise ControlError("refused", f"the state does not fit: {why}") from None
+        return {}
+
+    def _reset(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Forget all temporal state."""
+        self._lane(args).stage.reset()
+        return {}
+
+
+class _Newest:
+    """A stage's input from a socket: the newest frame."""
+
+    def __init__(self, topic: str, skin: str) -> None:
+        self.reader = NewestReader(topic, skin)
+        self.socket = self.reader.socket
+        self._name = f"{topic}/{skin}\0".encode()
+
+    @property
+    def malformed(self) -> int:
+        return self.reader.malformed
+
+    @property
+    def skipped(self) -> int:
+        return self.reader.skipped
+
+    def recv(self) -> Frame | None:
+        return self.reader.recv()
+
+    def listen(self, on: bool) -> None:
+        (self.socket.subscribe if on else self.socket.unsubscribe)(self._name)
+
+    def close(self) -> None:
+        self.reader.close()
+
+
+def _wake_on_signals(stop: Callable[[], None]) -> int:
+    """Install handlers of SIGINT and SIGTERM; the returned descriptor becomes readable when one came."""
+    read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop())
+    return read
+
+
+def main(process: str, setup: Callable[[Runner], None]) -> int:
+    """A process's main: configuration, sockets, lanes, loop. Returns the exit status; says on stderr what stands in the way."""
+    logging.basicConfig(format=f"{process}: %(message)s", level=logging.INFO, stream=sys.stderr)
+    try:
+        config = load()
+        logging.getLogger().setLevel(config.logging.level.upper())
+        runner = Runner(process, config)
+        setup(runner)
+    except (ConfigError, BundleError, RuntimeDirError, TransportError) as why:
+        print(f"{process}: {why}", file=sys.stderr)
+        return 1
+    with contextlib.suppress(KeyboardInterrupt):
+        runner.run()
+    return 0
+
+
+def stages(make: Callable[[str, Skin, Bundle], Stage]) -> Callable[[Runner], None]:
+    """Set-up of a process that runs one kind of stage for every configured skin."""
+
+    def setup(runner: Runner) -> None:
+        for name, skin in runner.config.skins.items():
+            runner.add(make(name, skin, runner.bundle(name)))
+
+    return setup

@@ -1,0 +1,255 @@
+"""Where raw frames come from: a board, a recording, an imported file. One interface, so that acquisition does not care.
+
+A source blocks for at most POLL_S at a time, and never raises for what its device or file does.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from protocol import link
+from protocol.frames import RawFrame, unpack
+from services import port as ports
+from services.boardlink import BoardLink, Scanning
+from services.clock import UNSETTLED_NS, DeviceClock
+from services.config import Skin
+from services.stage import Health
+
+POLL_S = 0.1
+REOPEN_S = 0.2  # between attempts to open a port
+INTRODUCE_S = 2.0  # for a board under another name to say who it is
+SCANS_VALID = 3  # a frame is valid until this many scans later
+FILE_RATE_HZ = 22.0  # at which frames of a file without times are given
+
+log = logging.getLogger(__name__)
+
+
+class Source(ABC):
+    """Raw frames of one skin."""
+
+    def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
+        self.name, self.skin, self.bundle = name, skin, bundle
+        self.problem = ""
+        self.counts: Counter[str] = Counter()
+
+    @abstractmethod
+    def frames(self) -> Iterator[RawFrame | None]:
+        """Frames as they come, for ever; None at least every POLL_S while none comes."""
+
+    def health(self) -> Health:
+        return Health("ERROR" if self.problem else "OK", [self.problem] if self.problem else [], dict(self.counts))
+
+    def close(self) -> None:  # noqa: B027  (nothing to close is a valid case)
+        pass
+
+    @property
+    def pattern_name(self) -> str:
+        return str(self.bundle.skin.get("pattern", "custom"))
+
+
+class BoardSource(Source):
+    """A board behind a serial port. Opens, asks, configures, starts, and does so again whenever anything goes wrong."""
+
+    def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
+        super().__init__(name, skin, bundle)
+        self.scanning = Scanning(bundle.pattern, skin.dft_points, skin.rtia_ohm)
+        self._port: ports.Port | None = None
+        self._board = ""  # unique id of the board that we know
+        self._usb_serial: str | None = None
+        self._lost = ""
+
+    def frames(self) -> Iterator[RawFrame | None]:
+        while True:
+            for url in ports.candidates(self.skin.port, self._usb_serial, bool(self._board)):
+                try:
+                    self._port = ports.Port(url)
+                except ports.PortError as why:
+                    self._trouble(str(why), first=url == next(ports.candidates(self.skin.port, None, False)))
+                    continue
+                try:
+                    yield from self._connection(self._port, must_be=self._board if url != self.skin.port else "")
+                except ports.PortError as why:
+                    self._trouble(str(why))
+                    self.counts["disconnects"] += 1
+                finally:
+                    self.close()
+                break
+            time.sleep(REOPEN_S)
+            yield None
+
+    def close(self) -> None:
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    def _connection(self, port: ports.Port, must_be: str) -> Iterator[RawFrame | None]:
+        """Until the port is gone (PortError), or turns out to be another board than `must_be`."""
+        opened = time.monotonic()
+        board, clock = BoardLink(self.scanning, opened), DeviceClock()
+        stub_port = self.skin.port == "stub"
+        seen: Counter[str] = Counter()
+        while True:
+            now = time.monotonic()
+            due = board.to_send(now)
+            if due:
+                port.write(due)
+            data = port.read(POLL_S if board.state == "running" else 0.02)
+            read_ns = time.monotonic_ns()
+            scans = board.received(data, read_ns * 1e-9) if data else []
+            self._count(board, seen)
+            if must_be and not stub_port and (board.board or now - opened > INTRODUCE_S) and board.board != must_be:
+                return  # somebody else's device
+            if board.state == "running" and self._board != board.board:
+                self._board, self._usb_serial = board.board, ports.usb_serial_number(port.url)
+            if board.problem != self.problem:
+                self._trouble(board.problem)
+            for scan in scans:
+                yield self._raw(scan, board, clock, read_ns)
+            if not scans:
+                yield None
+
+    def _raw(self, scan: link.Frame, board: BoardLink, clock: DeviceClock, read_ns: int) -> RawFrame:
+        clock.observe(scan.device_us + scan.duration_us, read_ns)
+        reasons = ["gap"] if board.gap else []
+        if clock.sigma_ns >= UNSETTLED_NS:
+            reasons.append("clock")
+        assert board.ident is not None
+        return RawFrame(
+            skin=self.name,
+            scan=scan.seq,
+            stamps={"sample": min(read_ns, clock.host_ns(scan.device_us + scan.duration_us // 2)), "read": read_ns},
+            sample_sigma_ns=clock.sigma_ns,
+            source="stub" if "stub" in board.ident.firmware.lower() else "board",
+            valid=True,
+            reasons=reasons,
+            valid_for_s=max(0.05, SCANS_VALID * scan.duration_us * 1e-6),
+            z=scan.z,
+            status=scan.status,
+            device_us=scan.device_us,
+            config=scan.config,
+            pattern=self.pattern_name,
+            board=board.board,
+        )
+
+    def _trouble(self, problem: str, first: bool = True) -> None:
+        """Say what is the matter, once each time it changes."""
+        if problem == self.problem or not first:
+            return
+        if problem:
+            log.warning("%s: %s", self.name, problem)
+        else:
+            log.info("%s: the board is running", self.name)
+        self.problem = problem
+
+    def _count(self, board: BoardLink, seen: Counter[str]) -> None:
+        """Add what is new in the connection's counts to ours."""
+        now = board.counts + Counter({f"line_{what}": n for what, n in board.decoder.counts.items() if what != "good"})
+        if now != seen:
+            self.counts += now - seen
+            seen.clear()
+            seen.update(now)
+
+
+class RecordingSource(Source):
+    """The raw frames of a recording, once, at the recorded speed. (`skin replay` is the lossless way.)"""
+
+    def frames(self) -> Iterator[RawFrame | None]:
+        from services.recording import RecordingError, RecordingReader
+
+        previous, due = 0, time.monotonic()
+        try:
+            for recorded in RecordingReader(Path(self.skin.port)).messages({"raw"}):
+                frame = unpack(recorded.wire)
+                assert isinstance(frame, RawFrame)
+                frame.skin, frame.source = self.name, "replay"
+                sample = frame.stamps.get("sample", 0)
+                due += min(max(0.0, (sample - previous) * 1e-9), 1.0) if previous else 0.0
+                previous = sample
+                yield from _wait_until(due)
+                frame.stamps = {"sample": sample, "read": time.monotonic_ns()}
+                yield frame
+        except (RecordingError, OSError, ValueError) as why:
+            self.problem = str(why)
+        self.problem = self.problem or f"the recording {self.skin.port} has ended"
+        while True:
+            time.sleep(POLL_S)
+            yield None
+
+
+class FileSource(Source):
+    """Frames of an npz file: `untouched` (m, K) first, then `measurements` (n, K), each after its row of `reference` if there is one."""
+
+    def frames(self) -> Iterator[RawFrame | None]:
+        due = time.monotonic()
+        try:
+            for scan, (values, kind) in enumerate(rows(Path(self.skin.port), len(self.bundle.pattern))):
+                due += 1 / FILE_RATE_HZ
+                yield from _wait_until(due)
+                yield self.raw(scan, values, kind, time.monotonic_ns())
+        except (OSError, ValueError, KeyError) as why:
+            self.problem = f"{self.skin.port}: {why}"
+        self.problem = self.problem or f"the file {self.skin.port} has ended"
+        while True:
+            time.sleep(POLL_S)
+            yield None
+
+    def raw(self, scan: int, values: NDArray[np.floating], kind: str, now_ns: int) -> RawFrame:
+        return file_frame(self.name, self.pattern_name, scan, values, kind, now_ns)
+
+
+def file_frame(skin: str, pattern: str, scan: int, values: NDArray[np.generic], kind: str, now_ns: int) -> RawFrame:
+    """A raw frame of one row (K,) of a file."""
+    return RawFrame(
+        skin=skin,
+        scan=scan,
+        stamps={"sample": now_ns, "read": now_ns},
+        source="replay",
+        valid=True,
+        valid_for_s=SCANS_VALID / FILE_RATE_HZ,
+        z=np.asarray(values, np.complex64),
+        status=np.zeros(len(values), np.uint8),
+        device_us=now_ns // 1000,
+        kind=kind,
+        pattern=pattern,
+    )
+
+
+def rows(path: Path, measurements: int) -> Iterator[tuple[NDArray[np.generic], str]]:
+    """(values (K,), kind) of an npz file's frames. Raises ValueError or KeyError naming key, shape found and shape expected."""
+    with np.load(path, allow_pickle=False) as data:
+        found = {key: np.asarray(data[key]) for key in ("untouched", "reference", "measurements") if key in data}
+    if "measurements" not in found:
+        raise ValueError("has no array `measurements` (n, K)")
+    for key, values in found.items():
+        if values.ndim != 2 or values.shape[1] != measurements:
+            raise ValueError(f"`{key}` has shape {values.shape}, expected (n, {measurements}) in the skin's pattern order")
+    reference = found.get("reference")
+    if reference is not None and len(reference) != len(found["measurements"]):
+        raise ValueError(f"`reference` has {len(reference)} rows, `measurements` {len(found['measurements'])}: expected one each")
+    yield from ((row, "full") for row in found.get("untouched", ()))
+    for index, row in enumerate(found["measurements"]):
+        if reference is not None:
+            yield reference[index], "reference"
+        yield row, "full"
+
+
+def open_source(name: str, skin: Skin, bundle: Bundle) -> Source:
+    """The source that a skin's `port` names."""
+    kind = {".mcap": RecordingSource, ".npz": FileSource}.get(Path(skin.port).suffix, BoardSource)
+    return kind(name, skin, bundle)
+
+
+def _wait_until(due: float) -> Iterator[None]:
+    while (left := due - time.monotonic()) > 0:
+        time.sleep(min(left, POLL_S))
+        if left > POLL_S:
+            yield None

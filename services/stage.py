@@ -1,0 +1,92 @@
+"""What a stage is: frame in, frames out. No sockets, no clock, no threads; temporal state explicit, so that it can be reset,
+saved and loaded. services/runner.py drives stages over sockets, services/pipeline.py in one process.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from protocol.frames import Frame
+
+
+class Refused(Exception):
+    """A command that the stage will not carry out now. The text says why and what to do."""
+
+
+@dataclass
+class Health:
+    """How a stage finds itself: `level` OK, WARN or ERROR, and why."""
+
+    level: str = "OK"
+    messages: list[str] = field(default_factory=list)
+    counters: dict[str, int] = field(default_factory=dict)
+
+
+class Stage(ABC):
+    """One step of the chain, for one skin."""
+
+    reads: ClassVar[str]  # topic
+    writes: ClassVar[tuple[str, ...]]  # topics; the first one gets exactly one frame for each frame read
+    stamp: ClassVar[str]  # key in Frame.stamps that says when this stage was done
+    commands: ClassVar[tuple[str, ...]] = ()  # what `command` understands
+    sleeps: ClassVar[bool] = False  # unsubscribes while nobody subscribes to what it writes
+    persists: ClassVar[bool] = False  # `saved` is kept in the runtime folder and loaded at start
+
+    def __init__(self, skin: str) -> None:
+        self.skin = skin
+
+    @abstractmethod
+    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        """The frames that follow from `frame`; `wanted`: topics somebody subscribes to. Never raises for what is in a frame."""
+
+    def reset(self) -> None:
+        """Forget all temporal state."""
+
+    def state(self) -> dict[str, Any]:
+        """Temporal state: numbers, texts, lists, arrays. `load(state())` in another process continues bit by bit."""
+        return {}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take over a state. Raises Refused where it does not fit."""
+
+    def saved(self) -> dict[str, Any] | None:
+        """State to keep across a crash, or None where nothing changed since the last call. Only if `persists`."""
+        return None
+
+    def restore(self, saved: dict[str, Any], age_s: float) -> None:
+        """Take over what an earlier process saved `age_s` ago. Raises Refused where it does not fit."""
+
+    def command(self, name: str, args: dict[str, Any]) -> dict[str, Any]:
+        """Carry out one of `commands`. Raises Refused."""
+        raise Refused(f"no command {name!r}")
+
+    def info(self) -> dict[str, Any] | None:
+        """What info/<skin> says, or None where nothing changed since the last call."""
+        return None
+
+    def health(self) -> Health:
+        return Health()
+
+    def warm_up(self) -> None:
+        """Do once what is slow the first time."""
+
+
+def inherited(frame: Frame) -> dict[str, Any]:
+    """Header fields that a frame hands on to what is made of it."""
+    return {
+        "skin": frame.skin,
+        "scan": frame.scan,
+        "stamps": dict(frame.stamps),
+        "sample_sigma_ns": frame.sample_sigma_ns,
+        "source": frame.source,
+        "valid": frame.valid,
+        "reasons": list(frame.reasons),
+        "valid_for_s": frame.valid_for_s,
+    }
+
+
+def add_reason(reasons: list[str], reason: str) -> None:
+    if reason not in reasons:
+        reasons.append(reason)

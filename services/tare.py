@@ -1,0 +1,106 @@
+"""The untouched baseline: when frames agree well enough to be one, what their noise is, and whether the skin was really untouched."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.prereconstruction import PreReconstructor, noise_of_frames
+from services.stage import Refused
+
+Array = NDArray[np.float64]
+
+DISAGREEMENT = 1e-5  # probability that quiet frames are refused
+HARMLESS = 5e-5  # relative change of a measurement within the frames that does no harm as part of a baseline
+TOO_NOISY = 0.05  # median relative noise beyond which no touch could be told from it
+IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
+QUARTERS = 4
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """|Z0| of the untouched skin. K measurements."""
+
+    z0: Array  # (K,) unit of the raw frames
+    sigma: Array  # (K,) standard deviation of one frame's |Z|, same unit
+    frames: int  # how many it is the mean of
+    board: str  # unique id of the board
+    taken_ns: int  # `sample` of the newest frame in it
+    doubt: str = ""  # why the skin may have been touched meanwhile; empty: no doubt
+
+    @property
+    def hash(self) -> str:
+        return hashlib.sha256(self.z0.tobytes() + self.sigma.tobytes()).hexdigest()
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, saved: dict[str, Any], measurements: int) -> Baseline:
+        """Raises Refused where `saved` is no baseline of that many measurements."""
+        try:
+            z0, sigma = np.array(saved["z0"], dtype=float), np.array(saved["sigma"], dtype=float)
+            rest = int(saved["frames"]), str(saved["board"]), int(saved["taken_ns"]), str(saved["doubt"])
+        except (KeyError, TypeError, ValueError) as wrong:
+            raise Refused(f"no baseline in the saved state ({wrong}): tare again") from None
+        if z0.shape != (measurements,) or sigma.shape != (measurements,):
+            raise Refused(f"the saved baseline has {z0.size} measurements, this skin {measurements}: tare again")
+        return cls(z0, sigma, *rest)
+
+
+def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Baseline:
+    """The baseline of (N, K) |Z|. Raises Refused where the frames do not agree with each other.
+
+    A measurement that is not finite in every frame gets an infinite sigma: it is left out until the next tare.
+    """
+    live = np.isfinite(frames).all(axis=0) & (frames > 0).all(axis=0)
+    if live.sum() < 0.5 * frames.shape[1]:
+        raise Refused(f"only {int(live.sum())} of {frames.shape[1]} measurements give values: check the cable and the electrodes")
+    good = frames[:, live]
+    mean = good.mean(axis=0)
+    noise = float(np.median(good.std(axis=0, ddof=1) / mean))
+    if noise > TOO_NOISY:
+        raise Refused(f"the frames scatter by {100 * noise:.1f} % (at most {100 * TOO_NOISY:.0f} %): check grounding and cable")
+    found, limit = disagreement(good)
+    if found > limit:
+        raise Refused(f"the frames disagree (statistic {found:.0f}, limit {limit:.0f}): something touched or moved meanwhile")
+    z0, sigma = np.zeros(frames.shape[1]), np.full(frames.shape[1], np.inf)
+    z0[live], sigma[live] = mean, noise_of_frames(good, mean)
+    doubt = ""
+    misfit = implausibility(z0, pre)
+    if misfit > IMPLAUSIBLE:
+        doubt = f"the baseline is {100 * misfit:.1f} % off what the bundle predicts: free the skin and run `skin tare`"
+    return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
+
+
+def disagreement(frames: Array) -> tuple[float, float]:
+    """Chi-square statistic of the quarters' means against the noise within them, and the limit it keeps to when all is quiet."""
+    n = len(frames) // QUARTERS * QUARTERS
+    quarters = frames[-n:].reshape(QUARTERS, n // QUARTERS, -1)
+    mean = frames.mean(axis=0)
+    within = quarters.var(axis=1, ddof=1).mean(axis=0) / (n // QUARTERS) + (HARMLESS * mean) ** 2
+    statistic = float((((quarters.mean(axis=1) - quarters.mean(axis=(0, 1))) ** 2).sum(axis=0) / within).sum())
+    dof_within = n - QUARTERS
+    f_mean = dof_within / (dof_within - 2)  # the noise within is estimated too
+    dof = (QUARTERS - 1) * frames.shape[1]
+    quantile = NormalDist().inv_cdf(1 - DISAGREEMENT)
+    chi_square = dof * (1 - 2 / (9 * dof) + quantile * (2 / (9 * dof)) ** 0.5) ** 3  # Wilson-Hilferty
+    return statistic, float(chi_square * f_mean * (1 + 2 / dof_within))
+
+
+def implausibility(z0: Array, pre: PreReconstructor) -> float:
+    """rms relative misfit of |Z0| to the bundle's prediction, up to gain and contact impedances; 0 where the bundle predicts none."""
+    if pre.m.normalisation != "model":
+        return 0.0
+    live = z0 > 0
+    relative = z0[live] / pre.m.z0[live]
+    gain = float(np.median(relative))
+    residual = relative / gain - 1
+    columns = np.column_stack([np.ones(int(live.sum())), pre.m.contact[live]])
+    fitted, *_ = np.linalg.lstsq(columns, residual, rcond=1e-6)
+    return float(np.sqrt(np.mean((residual - columns @ fitted) ** 2)))

@@ -1,0 +1,91 @@
+"""Touched or not, and whether anything changed since the frame last reconstructed.
+
+Both compare the operator's detection statistic (noise-whitened energy) with the threshold that an unchanged skin exceeds with a
+stated probability per frame; the threshold allows for the noise having been estimated from few frames.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.prereconstruction import Operator
+
+Array = NDArray[np.float64]
+
+RELEASE = 1e-2  # hysteresis: a touch ends where an untouched skin would be with this probability per frame
+CHANGED = 1e-3  # probability that an unchanged touch is reconstructed again: costs work, not truth
+LONGEST_MEAN = 16  # frames of a hold that are averaged at most, and after which it is reconstructed again at the latest
+
+
+class TouchDecision:
+    """Hysteresis around the detection statistic."""
+
+    def __init__(self, operator: Operator, false_alarms: float, tare_frames: int) -> None:
+        self.operator = operator
+        self.begin = operator.threshold(false_alarms, tare_frames)
+        self.release = operator.threshold(max(RELEASE, false_alarms), tare_frames)
+        self.changed = operator.threshold(max(CHANGED, false_alarms), tare_frames)
+
+    def __call__(self, d: Array, touched: bool) -> tuple[bool, float, float]:
+        """(touched now, statistic, threshold it was compared with)."""
+        score = self.operator.score(d)
+        threshold = self.release if touched else self.begin
+        return score > threshold, score, threshold
+
+
+class Hold:
+    """Decides which frames of a touch are reconstructed, and from what.
+
+    While nothing changes against the frame last reconstructed (not the previous frame: creep must be seen), frames are averaged,
+    and their mean is reconstructed after 2, 4, 8, 16, 32, 48 ... of them.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self._reference: Array | None = None  # the difference last reconstructed
+        self._averaged = 0  # frames in it
+        self._recent: deque[Array] = deque(maxlen=LONGEST_MEAN)
+        self._count = 0  # frames since the last change
+        self.scan = 0  # of the frame last reconstructed
+
+    def __call__(self, d: Array, scan: int, decision: TouchDecision) -> Array | None:
+        """The difference (K,) to reconstruct now, or None to hold."""
+        if self._reference is not None:
+            variance = 1 + 1 / self._averaged  # of the change, in units of one frame's
+            if decision.operator.score(d - self._reference) > variance * decision.changed:
+                self._recent.clear()
+                self._count = 0
+        self._recent.append(d)
+        self._count += 1
+        if self._reference is not None and not _due(self._count):
+            return None
+        self._reference = np.mean(self._recent, axis=0)
+        self._averaged = len(self._recent)
+        self.scan = scan
+        return self._reference
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "reference": self._reference,
+            "averaged": self._averaged,
+            "recent": np.array(self._recent),
+            "count": self._count,
+            "scan": self.scan,
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        self.reset()
+        reference = state["reference"]
+        self._reference = None if reference is None else np.array(reference, dtype=float)
+        self._averaged, self._count, self.scan = int(state["averaged"]), int(state["count"]), int(state["scan"])
+        self._recent.extend(np.array(state["recent"], dtype=float))
+
+
+def _due(count: int) -> bool:
+    return count in (1, 2, 4, 8) or count % LONGEST_MEAN == 0
