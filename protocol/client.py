@@ -44,8 +44,8 @@ class ContactSubscriber:
     def latest(self, max_age: float = 0.05, wait_s: float = 0.0) -> ContactFrame:
         """The newest frame, at most `max_age` seconds old and within its own `valid_for_s`.
 
-        Waits up to `wait_s` for one. Age counts from `publish`, or on another host, whose clock is not ours, from reception. Raises Stale. Look at
-        `frame.valid` before acting on the contacts.
+        Waits up to `wait_s` for one. Age counts from `publish`, or on another host, whose clock is not ours, from
+        reception. Raises Stale. Look at `frame.valid` before acting on the contacts.
         """
         self._take(0.0)
         deadline = time.monotonic() + wait_s

@@ -361,7 +361,7 @@ class Tree(Check):
 class Record(Check):
     """A map with named fields, read into the dataclass `kind`.
 
-    Unknown keys are ignored, missing ones are a mismatch. Fields named in the dataclass's `same_length` have one length.
+    Unknown keys are ignored, missing ones are a mismatch. The fields in its `same_length` are equally long.
     """
 
     def __init__(self, kind: type[Any]) -> None:

@@ -25,7 +25,7 @@ from .transport import Context, Socket
 __all__ = ["AllReader", "ControlClient", "ControlError", "ControlServer", "NewestReader", "Publisher", "clock_offset"]
 
 SEND_QUEUE = 100
-"""Messages held for one subscriber that does not read (100 images: 4 MB); its further ones are dropped, nobody else's."""
+"""Messages held for a subscriber that does not read (100 images: 4 MB); its further ones are dropped, nobody else's."""
 ALL_QUEUE = 10_000
 """Messages held in a reader of all."""
 

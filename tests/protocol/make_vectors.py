@@ -1,0 +1,113 @@
+"""Makes protocol/vectors/*/*.bin from the JSON beside each, as WIRE.md says, with none of the package's code.
+
+    python tests/protocol/make_vectors.py            writes the files
+
+test_vectors.py holds the package against them.
+"""
+
+import json
+import math
+import struct
+from pathlib import Path
+
+import msgpack
+
+PROTOCOL = Path(__file__).parents[2] / "protocol"
+VECTORS = PROTOCOL / "vectors"
+ITEM = {"<f4": "f", "<f8": "d", "<c8": "ff", "|u1": "B"}
+
+# number and fixed fields of each message of the link, from WIRE.md's tables
+LINK = {
+    "Hello": (0x01, "<BI", ("link_version", "schema_hash")),
+    "Config": (0x02, "<HHf", ("config", "dft_points", "rtia_ohm")),
+    "Start": (0x03, "<H", ("config",)),
+    "Stop": (0x04, "<", ()),
+    "SelfTest": (0x05, "<", ()),
+    "Ident": (
+        0x81,
+        "<BIH12sIBH",
+        ("link_version", "schema_hash", "chip_id", "unique_id", "capabilities", "electrodes", "max_scan"),
+    ),
+    "Ack": (0x82, "<BI", ("of", "value")),
+    "Nak": (0x83, "<BB", ("of", "reason")),
+    "Frame": (0x84, "<IQIH", ("seq", "device_us", "duration_us", "config")),
+    "Event": (0x85, "<H", ("code",)),
+}
+PLAIN_CRC = ("Hello", "Ident", "Nak")
+
+
+def number(value):
+    return {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}[value] if isinstance(value, str) else value
+
+
+def on_wire(value):
+    """JSON's arrays {dtype, shape, values} as the wire's {dtype, shape, data}; everything else as it is."""
+    if isinstance(value, dict) and value.keys() == {"dtype", "shape", "values"}:
+        form = "<" + ITEM[value["dtype"]]
+        rows = (v if isinstance(v, list) else [v] for v in value["values"])
+        data = b"".join(struct.pack(form, *(number(x) for x in row)) for row in rows)
+        return {"dtype": value["dtype"], "shape": value["shape"], "data": data}
+    if isinstance(value, dict):
+        return {k: on_wire(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [on_wire(v) for v in value]
+    return value
+
+
+def frame_bytes(vector):
+    return f"{vector['topic']}/{vector['skin']}".encode() + b"\0" + msgpack.packb(on_wire(vector["fields"]))
+
+
+def crc32(data, seed=0):
+    """Bit by bit, from WIRE.md's words."""
+    register = seed ^ 0xFFFFFFFF
+    for byte in data:
+        register ^= byte
+        for _ in range(8):
+            register = register >> 1 ^ (0xEDB88320 if register & 1 else 0)
+    return register ^ 0xFFFFFFFF
+
+
+def stuff(data):
+    """COBS, byte by byte."""
+    out, block = bytearray(), bytearray()
+    for i, byte in enumerate(data):
+        if byte:
+            block.append(byte)
+        if not byte or (len(block) == 254 and i + 1 < len(data)):
+            out += bytes([len(block) + 1]) + block
+            block.clear()
+    return bytes(out + bytes([len(block) + 1]) + block)
+
+
+def schema_hash():
+    text = (PROTOCOL / "WIRE.md").read_text().split("<!-- generated: schema -->")[1].split("```")[1]
+    return crc32(text.lstrip("\n").encode())
+
+
+def link_bytes(vector):
+    name, fields = vector["message"], vector["fields"]
+    code, form, heads = LINK[name]
+    body = bytes([code]) + struct.pack(
+        form, *(bytes.fromhex(v) if isinstance(v, str) else v for v in map(fields.get, heads))
+    )
+    if name == "Config":
+        body += struct.pack("<H", len(fields["scan"])) + bytes(e for row in fields["scan"] for e in row)
+    if name == "Frame":
+        body += struct.pack("<H", len(fields["z"]))
+        body += b"".join(struct.pack("<ff", *map(number, z)) for z in fields["z"])
+        status = fields["status"] + [0] * (len(fields["status"]) % 2)
+        body += bytes(low + 16 * high for low, high in zip(status[::2], status[1::2], strict=True))
+    body += fields.get("text", fields.get("firmware", "")).encode()
+    crc = crc32(body, 0 if name in PLAIN_CRC else schema_hash())
+    return b"\0" + stuff(body + struct.pack("<I", crc)) + b"\0"
+
+
+def main():
+    for folder, encode in (("frames", frame_bytes), ("link", link_bytes)):
+        for path in sorted((VECTORS / folder).glob("*.json")):
+            path.with_suffix(".bin").write_bytes(encode(json.loads(path.read_text())))
+
+
+if __name__ == "__main__":
+    main()
