@@ -1,7 +1,7 @@
 """Graded triangle meshes of a skin: fine at the electrodes' ends, where the current density is nearly singular.
 
-Four uses, four meshes that differ in spacing and in structure (the points are relaxed from different starts), so that a network
-is never tested on the mesh it was trained on. A mesh is a function of the skin and the use only: the same call gives the same mesh.
+Four uses, four meshes that differ in spacing and in structure (the points are relaxed from different starts), so that a
+network is never tested on the mesh it was trained on. The same skin and use give the same mesh.
 """
 
 from __future__ import annotations
@@ -14,6 +14,10 @@ from scipy.spatial import Delaunay
 from skfem import MeshTri
 
 from models.geometry import Skin
+
+
+class MeshError(RuntimeError):
+    """An outline that could not be meshed at the wanted spacing."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ USES = {
 def build(skin: Skin, use: str | Grading = "training") -> MeshTri:
     """The skin's mesh for a use in USES or a grading of one's own. Every electrode end and corner is a node.
 
-    Raises ValueError for an unknown use, RuntimeError where the outline could not be meshed (features finer than the spacing).
+    Raises ValueError for an unknown use, MeshError where the outline's features are finer than the spacing.
     """
     if isinstance(use, str):
         if use not in USES:
@@ -48,13 +52,15 @@ def build(skin: Skin, use: str | Grading = "training") -> MeshTri:
     rim = skin.point(arcs)
     points = np.vstack([rim, _seeds(skin, use)])
     for _ in range(use.relaxation):
-        points = _relax(skin, use, points, _triangles(skin, points, len(rim)), len(rim))
-    cells = _triangles(skin, points, len(rim))
+        points = _relax(skin, use, points, _triangles(skin, points), len(rim))
+    cells = _triangles(skin, points)
     used = np.unique(cells)
     mesh = MeshTri(points[used].T.copy(), np.searchsorted(used, cells).T.copy())
-    if len(mesh.boundary_facets()) != len(rim):
-        raise RuntimeError(
-            f"skin '{skin.name}': {len(mesh.boundary_facets())} boundary edges in the mesh, {len(rim)} on the outline; use a finer interior spacing"
+    found = len(mesh.boundary_facets())
+    if found != len(rim):
+        raise MeshError(
+            f"skin '{skin.name}': the mesh has {found} boundary edges where the outline was cut into {len(rim)}; "
+            f"its features are too fine for a spacing of {use.interior}"
         )
     return mesh
 
@@ -69,8 +75,10 @@ def spacing(skin: Skin, use: Grading, points: NDArray[np.float64]) -> NDArray[np
 
 
 def _boundary_arcs(skin: Skin, use: Grading) -> NDArray[np.float64]:
-    """Arc lengths of the boundary nodes: every fixed point, and between two of them equal steps of the integral of 1/h."""
-    fixed = np.unique(np.round(np.mod(np.concatenate([skin.corners, skin.edges.ravel()]), skin.perimeter), 12))
+    """Arc lengths of the boundary nodes: fixed points, and between two of them equal steps of the integral of 1/h."""
+    fixed = np.unique(
+        np.round(np.mod(np.concatenate([skin.curve.corner_arcs, skin.edges.ravel()]), skin.perimeter), 12)
+    )
     arcs = []
     for a, b in zip(fixed, np.append(fixed[1:], fixed[0] + skin.perimeter), strict=True):
         if b - a < 1e-9:
@@ -81,11 +89,11 @@ def _boundary_arcs(skin: Skin, use: Grading) -> NDArray[np.float64]:
         steps = np.concatenate([[0.0], np.cumsum(np.diff(s) * (density[1:] + density[:-1]) / 2)])
         n = max(1, int(np.ceil(steps[-1])))
         arcs.append(np.interp(np.linspace(0, steps[-1], n + 1)[:-1], steps, s))
-    return np.mod(np.concatenate(arcs), skin.perimeter)
+    return np.asarray(np.mod(np.concatenate(arcs), skin.perimeter))
 
 
 def _seeds(skin: Skin, use: Grading) -> NDArray[np.float64]:
-    """Interior points: centres of the leaves of a quadtree refined to the wanted spacing, none too close to the outline."""
+    """Interior points: centres of the leaves of a quadtree refined to the wanted spacing, not close to the outline."""
     size = use.interior * 0.93 * 2 ** np.floor(np.log2(0.4 / use.interior))  # halving ends at the interior spacing
     n = int(np.ceil(2.2 / size)) + 1
     grid = (np.arange(n) - (n - 1) / 2 + use.offset) * size
@@ -93,17 +101,19 @@ def _seeds(skin: Skin, use: Grading) -> NDArray[np.float64]:
     leaves = []
     while len(cells):
         wanted = spacing(skin, use, cells)
-        split = size > wanted  # a square cell of side 0.93 h has the area of a point in a triangular lattice of spacing h
+        split = (
+            size > wanted
+        )  # a square cell of side 0.93 h has the area of a point in a triangular lattice of spacing h
         keep = cells[~split]
         keep = keep[skin.inside(keep)]
-        leaves.append(keep[skin.distance(keep) > 0.55 * spacing(skin, use, keep)])
+        leaves.append(keep[skin.curve.distance(keep) > 0.55 * spacing(skin, use, keep)])
         size /= 2
         cells = (cells[split][:, None] + size / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])).reshape(-1, 2)
-        cells = cells[skin.inside(cells) | (skin.distance(cells) < size * 2)]
+        cells = cells[skin.inside(cells) | (skin.curve.distance(cells) < size * 2)]
     return np.vstack(leaves)
 
 
-def _triangles(skin: Skin, points: NDArray[np.float64], n_rim: int) -> NDArray[np.int64]:
+def _triangles(skin: Skin, points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Delaunay triangles inside the outline, counter-clockwise, without the slivers along straight sides."""
     cells = Delaunay(points).simplices.astype(np.int64)
     a, b, c = (points[cells[:, k]] for k in range(3))
@@ -113,13 +123,13 @@ def _triangles(skin: Skin, points: NDArray[np.float64], n_rim: int) -> NDArray[n
     keep = np.abs(twice) > 1e-6 * longest
     if skin.outline is not None:
         keep &= skin.inside((a + b + c) / 3)
-    return cells[keep]
+    return np.asarray(cells[keep])
 
 
 def _relax(
     skin: Skin, use: Grading, points: NDArray[np.float64], cells: NDArray[np.int64], n_rim: int
 ) -> NDArray[np.float64]:
-    """One step of smoothing: interior points move to the mean of their triangles' centroids, weighted by area over h^2."""
+    """Smoothing: interior points move to the mean of their triangles' centroids, weighted by area over h^2."""
     corners = points[cells]
     centroid = corners.mean(axis=1)
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

@@ -1,7 +1,7 @@
 """Drive patterns: which electrodes carry the current and between which the voltage is read.
 
-A pattern is an int array (K, 4), 0-based: drive+, drive-, sense+, sense-. Unit current enters at drive+ and leaves at drive-;
-the impedance is the voltage of sense+ over sense-. Needs only numpy.
+A pattern is an int array (K, 4), 0-based: drive+, drive-, sense+, sense-. Unit current enters at drive+ and leaves at
+drive-; the impedance is the voltage of sense+ over sense-. Needs only numpy.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def pattern(spec: str | ArrayLike, n: int = 16) -> NDArray[np.int64]:
 def check(spec: ArrayLike, n: int = 16, minimum_rank: int | None = None) -> NDArray[np.int64]:
     """Validate a custom pattern and return it as (K, 4) int64.
 
-    minimum_rank: fewest independent measurements accepted; the default is half of what `adjacent` gives, n(n-3)/4, below which
-    an image of the skin is not determined in any useful sense.
+    minimum_rank: fewest independent measurements accepted; the default is half of what `adjacent` gives, n(n-3)/4,
+    below which an image of the skin is not determined in any useful sense.
     """
     raw = np.asarray(spec)
     if raw.ndim != 2 or raw.shape[1] != 4 or not np.issubdtype(raw.dtype, np.integer):
