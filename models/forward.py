@@ -17,7 +17,7 @@ from functools import lru_cache
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 from skfem import MeshTri
 
 from models import geometry, meshing, patterns
@@ -61,12 +61,19 @@ class ForwardModel(Elements):
         returns). Raises ValueError where a conductivity or contact impedance is not positive and finite, or has the
         wrong length.
         """
-        given = self.contact_impedance if contact_impedance is None else contact_impedance
-        contact = _positive(given, self.skin.n_electrodes, "contact impedance")
-        data = self._stiffness(conductivity) + self._from_contact @ (1 / contact)
-        matrix = sparse.csc_matrix((data, self._indices, self._indptr), shape=(self._size, self._size))
-        # The order is already fill-reducing and the matrix positive definite: no pivoting, no reordering.
-        factor = splu(
+        contact = self._contact(contact_impedance)
+        fields = self.factorise(self.matrix(conductivity, contact)).solve(self.currents)
+        return Solution(self, contact, fields[self._position])
+
+    def matrix(self, conductivity: ArrayLike = 1.0, contact_impedance: ArrayLike | None = None) -> sparse.csc_matrix:
+        """The system's matrix, nodes and all electrodes but the last, in the fill-reducing order (`currents` too)."""
+        data = self._stiffness(conductivity) + self._from_contact @ (1 / self._contact(contact_impedance))
+        return sparse.csc_matrix((data, self._indices, self._indptr), shape=(self._size, self._size))
+
+    @staticmethod
+    def factorise(matrix: sparse.csc_matrix) -> SuperLU:
+        """Its factorisation: already in a fill-reducing order and positive definite, so no pivoting, no reordering."""
+        return splu(
             matrix,
             permc_spec="NATURAL",
             diag_pivot_thresh=0.0,
@@ -74,7 +81,10 @@ class ForwardModel(Elements):
             panel_size=8,
             options={"SymmetricMode": True},
         )
-        return Solution(self, contact, factor.solve(self._currents)[self._position])
+
+    def _contact(self, given: ArrayLike | None) -> Array:
+        values = self.contact_impedance if given is None else given
+        return _positive(values, self.skin.n_electrodes, "contact impedance")
 
     def _stiffness(self, conductivity: ArrayLike) -> Array:
         """The matrix entries of the sheet without its electrodes."""
@@ -143,8 +153,8 @@ class ForwardModel(Elements):
         )
         self._from_contact = scatter(c_values[free], where[len(rows) :], c_electrode[free], n)
         self._position = position
-        self._currents: Array = np.zeros((self._size, n - 1), order="F")
-        self._currents[position[n_nodes:], np.arange(n - 1)] = 1.0
+        self.currents: Array = np.zeros((self._size, n - 1), order="F")
+        self.currents[position[n_nodes:], np.arange(n - 1)] = 1.0
 
 
 class Solution:
