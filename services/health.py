@@ -1,6 +1,6 @@
 """Does a process answer, and do frames flow through it? What a container's healthcheck asks.
 
-    python -m services.health publisher      exit 0: yes. 1: no, and why.
+python -m services.health publisher      exit 0: yes. 1: no, and why.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ TIMEOUT_S = 2.0
 
 
 def check(process: str) -> str:
-    """What is wrong with a process: empty where frames flow through it (a process whose frames nobody wants is well)."""
+    """What is wrong with a process: empty where frames flow through it (or nobody wants them)."""
     try:
         status = ControlClient(process, TIMEOUT_S).call("status")
     except (ControlError, RuntimeDirError) as why:

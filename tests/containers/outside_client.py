@@ -4,7 +4,8 @@ Run beside `docker compose --profile demo up` with $EITSKIN_RUNTIME pointing at 
 
     python tests/containers/outside_client.py
 
-Plain pyzmq and msgpack, as a stranger would write it. Exit 0 when all was seen; needs the right to kill the container's process.
+Plain pyzmq and msgpack, as a stranger would write it. Exit 0 when all was seen; needs the right to kill a
+container's process.
 """
 
 import os
@@ -75,8 +76,8 @@ def kill(name: str) -> None:
     names = [n for n in found.stdout.split() if name in n]
     if len(names) != 1:
         sys.exit(f"expected one container of {name}, found {names}")
-    pid = subprocess.run([ENGINE, "inspect", "-f", "{{.State.Pid}}", names[0]], capture_output=True, text=True, check=True)
-    os.kill(int(pid.stdout), signal.SIGKILL)
+    pid = subprocess.run([ENGINE, "inspect", "-f", "{{.State.Pid}}", names[0]], capture_output=True, check=True).stdout
+    os.kill(int(pid), signal.SIGKILL)
 
 
 def main() -> None:
@@ -91,7 +92,8 @@ def main() -> None:
     if not seen:
         sys.exit("the press was not seen")
     x, y, _ = seen[-1]["position"]
-    print(f"pressed at (20.0, -10.0) mm with 3 N, seen at ({x * 1e3:.1f}, {y * 1e3:.1f}) mm with {seen[-1]['force_n']:.2f} N")
+    force = seen[-1]["force_n"]
+    print(f"pressed at (20.0, -10.0) mm with 3 N, seen at ({x * 1e3:.1f}, {y * 1e3:.1f}) mm with {force:.2f} N")
     if rate < 15 or abs(x - 0.02) > 0.003 or abs(y + 0.01) > 0.003:
         sys.exit("rate below 15 frames/s or position off by more than 3 mm")
     for name in KILLED:
