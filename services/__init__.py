@@ -1,4 +1,6 @@
-"""The running service. Numerical libraries get one thread each: a stage is small, and other stages need the other cores."""
+"""The running service. Numerical libraries get one thread each: a stage is small, and other stages need the other
+cores.
+"""
 
 import os
 

@@ -81,7 +81,9 @@ class SourceFeed:
                         os.eventfd_write(self.socket, 1)
                     if self._stop.is_set():
                         return
-            except Exception as why:  # a source that raises is a bug, yet the other skins go on and this one is tried again
+            except (
+                Exception
+            ) as why:  # a source that raises is a bug, yet the other skins go on and this one is tried again
                 log.exception("source of %s", self.source.name)
                 self.source.problem = f"internal error: {type(why).__name__}: {why}"
                 self._stop.wait(1.0)

@@ -1,6 +1,7 @@
 """The host's end of the board's link: HELLO, IDENT, check, CONFIG, START, scans. A state machine without I/O.
 
-`received` takes bytes in, `to_send` gives bytes out; both are told the time. Nothing the board does, or fails to do, raises.
+`received` takes bytes in, `to_send` gives bytes out; both are told the time. Nothing the board does, or fails to do,
+raises.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ class Scanning:
 
     @property
     def config(self) -> int:
-        """Id of this configuration on the board: from its content, so that one of an earlier session is never taken for it."""
+        """Id of this configuration on the board: from its content, so that one of an earlier session is never taken
+        for it.
+        """
         text = self.pattern.astype("u1").tobytes() + f"{self.dft_points} {self.rtia_ohm:g}".encode()
         return zlib.crc32(text) & 0xFFFF
 
@@ -47,8 +50,8 @@ class BoardLink:
         self.problem = ""  # what stands in the way, for a person; "" when all is well
         self.counts: Counter[str] = Counter()  # scans, missing, foreign, events, restarts, and the decoder's bad ones
         self._last_seq: int | None = None
-        self._to(now_s, "hello")
-        self._asked_since = now_s
+        self.state, self._since, self._due_s, self._tries = "hello", now_s, now_s, 0
+        self._heard_s = self._asked_since = now_s
         self.gap = False  # whether scans are missing just before the last one returned
 
     @property
@@ -98,7 +101,9 @@ class BoardLink:
             s = self.scanning
             if self.state == "config":
                 return link.encode(
-                    link.Config(config=s.config, dft_points=s.dft_points, rtia_ohm=s.rtia_ohm, scan=s.pattern.astype("u1"))
+                    link.Config(
+                        config=s.config, dft_points=s.dft_points, rtia_ohm=s.rtia_ohm, scan=s.pattern.astype("u1")
+                    )
                 )
             return link.encode(link.Start(config=s.config))
         return b""
@@ -119,14 +124,19 @@ class BoardLink:
         needed = int(self.scanning.pattern.max()) + 1
         if ident.schema_hash != link.SCHEMA_HASH or ident.link_version != link.LINK_VERSION:
             found, ours = f"{ident.schema_hash:08x}", f"{link.SCHEMA_HASH:08x}"
-            self._refuse(f"firmware {ident.firmware!r} speaks schema {found}, this program {ours}: flash a matching one", now_s)
+            self._refuse(
+                f"firmware {ident.firmware!r} speaks schema {found}, this program {ours}: flash a matching one", now_s
+            )
         elif ident.chip_id != link.CHIP_ID:
             found = f"0x{ident.chip_id:04x}"
-            self._refuse(f"the converter says chip id {found}, expected 0x{link.CHIP_ID:04x}: power-cycle the board", now_s)
+            self._refuse(
+                f"the converter says chip id {found}, expected 0x{link.CHIP_ID:04x}: power-cycle the board", now_s
+            )
         elif ident.electrodes < needed or ident.max_scan < len(self.scanning.pattern):
             self._refuse(
                 f"the board has {ident.electrodes} electrodes and takes {ident.max_scan} measurements; "
-                f"the bundle needs {needed} and {len(self.scanning.pattern)}", now_s
+                f"the bundle needs {needed} and {len(self.scanning.pattern)}",
+                now_s,
             )
         elif self.state in ("hello", "refused"):
             self._to(now_s, "config")
@@ -165,5 +175,7 @@ class BoardLink:
 
     def _why_no_answer(self) -> str:
         if self.decoder.bad:
-            return f"no answer to HELLO, only noise ({self.decoder.last_error}): is it the board, and at this baud rate?"
+            return (
+                f"no answer to HELLO, only noise ({self.decoder.last_error}): is it the board, and at this baud rate?"
+            )
         return "no answer to HELLO: is it the board, and is its firmware running?"

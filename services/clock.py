@@ -1,8 +1,10 @@
-"""When was a scan measured, on the host's clock? By regression of the time at which frames arrive on the board's own clock.
+"""When was a scan measured, on the host's clock? By regression of the time at which frames arrive on the board's own
+clock.
 
-A frame arrives late by the link and by the scheduler: always late, never early, and by a varying amount. So the line is fitted
-to the earliest arrivals: of each BLOCK frames only the one that came soonest after the current line counts. The slope is the
-board's crystal against ours; it is bounded, because a crystal wrong by more than MAX_RATE_ERROR is a broken clock.
+A frame arrives late by the link and by the scheduler: always late, never early, and by a varying amount. So the line
+is fitted to the earliest arrivals: of each BLOCK frames only the one that came soonest after the current line counts.
+The slope is the board's crystal against ours; it is bounded, because a crystal wrong by more than MAX_RATE_ERROR is a
+broken clock.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ class DeviceClock:
         """Forget everything: a new connection, or a device clock that jumped."""
         self._origin: tuple[int, int] | None = None  # device ns, host ns
         self._block: list[tuple[float, float]] = []
-        self._points: deque[tuple[float, float]] = deque(maxlen=BLOCKS)  # device s since origin, lateness s against slope 1
+        self._points: deque[tuple[float, float]] = deque(
+            maxlen=BLOCKS
+        )  # device s since origin, lateness s against slope 1
         self._slope = 0.0
         self._offset = 0.0
         self.sigma_ns = UNSETTLED_NS

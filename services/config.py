@@ -89,7 +89,9 @@ class Skin(Section):
     def some_port(cls, port: str) -> str:
         if port == "stub" or port.startswith("/") or "://" in port or Path(port).suffix in RECORDINGS:
             return port
-        raise ValueError('"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000) or a recording (*.mcap)')
+        raise ValueError(
+            '"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000) or a recording (*.mcap)'
+        )
 
 
 RECORDINGS = (".mcap", ".npz")
@@ -112,7 +114,9 @@ class Sockets(Section):
 
 
 class Security(Section):
-    """Of tcp addresses: CURVE keys (`skin keys new`). Unencrypted beyond this host is refused unless `insecure` says so."""
+    """Of tcp addresses: CURVE keys (`skin keys new`). Unencrypted beyond this host is refused unless `insecure` says
+    so.
+    """
 
     secret_key: Path | None = None  # our own key pair
     server_keys: dict[str, Path] = {}  # producer -> its public key

@@ -37,7 +37,9 @@ class ElectrodeHealth:
         reasons = ["saturated"] if (status & STATUS_CLIPPED).any() else []
         states = self._all_well.copy()
         left = bad.copy()
-        while left.any():  # the electrode that explains most failures first: its measurements do not count against the others
+        while (
+            left.any()
+        ):  # the electrode that explains most failures first: its measurements do not count against the others
             failed = (self.member & left).sum(axis=1) / np.maximum(1, (self.member & (left | ~bad)).sum(axis=1))
             worst = int(failed.argmax())
             if failed[worst] < MOSTLY or (self.member[worst] & left).sum() < 2:

@@ -59,7 +59,9 @@ class Heartbeat:
         what = f"{upstream}/{self.skin}" if upstream else "frames from the source"
         return f"no {what} for {int(quiet)} s" if self._heard_any and quiet >= 1 else f"no {what}"
 
-    def status(self, health: Health, silent: str, now: float, every_s: float, asleep: bool = False) -> StatusFrame | None:
+    def status(
+        self, health: Health, silent: str, now: float, every_s: float, asleep: bool = False
+    ) -> StatusFrame | None:
         """The status frame that is due: once every_s, and at once when level or messages changed; else None."""
         level, messages = health.level, list(health.messages)
         if self.failure:

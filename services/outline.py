@@ -33,7 +33,9 @@ def outline(mask: NDArray[np.bool_], metres_per_pixel: float, origin: list[float
 
 
 def _ahead(padded: NDArray[np.bool_], x: int, y: int, dx: int, dy: int) -> tuple[bool, bool]:
-    """Whether the pixels to the left and right of the edge ahead belong to the mask; corner (x, y), pixel (x, y) is above right of it."""
+    """Whether the pixels to the left and right of the edge ahead belong to the mask; corner (x, y), pixel (x, y) is
+    above right of it.
+    """
     if dx:
         column = x if dx > 0 else x - 1
         above, below = bool(padded[y, column]), bool(padded[y - 1, column])

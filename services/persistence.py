@@ -1,4 +1,6 @@
-"""A stage's state in the runtime folder, so that a process that was killed goes on where it stopped; and states as plain maps."""
+"""A stage's state in the runtime folder, so that a process that was killed goes on where it stopped; and states as
+plain maps.
+"""
 
 from __future__ import annotations
 

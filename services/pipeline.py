@@ -21,9 +21,7 @@ class Result(NamedTuple):
     contact: ContactFrame
 
 
-def build_stages(
-    name: str, skin: Skin, bundle: Bundle | None = None
-) -> tuple[Preprocessing, Inference, Publishing]:
+def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> tuple[Preprocessing, Inference, Publishing]:
     """The three stages of one skin. Raises models.bundle.BundleError."""
     bundle = bundle or Bundle.load(skin.bundle)
     return Preprocessing(name, skin, bundle), Inference(name, skin, bundle), Publishing(name, skin, bundle)
@@ -32,8 +30,12 @@ def build_stages(
 class Pipeline:
     """raw -> delta -> image -> contact, one frame at a time, by the very objects that the processes run."""
 
-    def __init__(self, skin: Skin | str, name: str = "skin", bundle: Bundle | None = None, always_reconstruct: bool = False):
-        """skin: a configured one, or the name or path of a bundle. always_reconstruct: an image of untouched frames too."""
+    def __init__(
+        self, skin: Skin | str, name: str = "skin", bundle: Bundle | None = None, always_reconstruct: bool = False
+    ):
+        """skin: a configured one, or the name or path of a bundle. always_reconstruct: an image of untouched frames
+        too.
+        """
         if isinstance(skin, str):
             skin = Skin(port="stub", bundle=skin, frame_id=name)
         self.name = name

@@ -1,4 +1,6 @@
-"""A serial port as acquisition needs it: any pyserial URL, raw bytes, and a name that may change when it is plugged in again."""
+"""A serial port as acquisition needs it: any pyserial URL, raw bytes, and a name that may change when it is plugged
+in again.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,9 @@ class Port:
 
 
 def candidates(port: str, usb_serial: str | None, known_board: bool) -> Iterator[str]:
-    """URLs at which the board may be: first the configured one, then, once we know it, the names it may have come back under."""
+    """URLs at which the board may be: first the configured one, then, once we know it, the names it may have come
+    back under.
+    """
     if port == "stub":
         folder = runtime_dir()
         yield str(folder / STUB_LINK)
@@ -85,7 +89,9 @@ def candidates(port: str, usb_serial: str | None, known_board: bool) -> Iterator
     else:
         path = Path(port)
         stem = path.name.rstrip("0123456789")
-        yield from (str(p) for p in sorted(path.parent.glob(stem + "*")) if p != path and (p.is_symlink() or p.is_char_device()))
+        yield from (
+            str(p) for p in sorted(path.parent.glob(stem + "*")) if p != path and (p.is_symlink() or p.is_char_device())
+        )
 
 
 def usb_serial_number(url: str) -> str | None:

@@ -1,4 +1,5 @@
-"""Preprocessing: from impedances to the network's input, following the paper's equations, and only where something touches.
+"""Preprocessing: from impedances to the network's input, following the paper's equations, and only where something
+touches.
 
     d = (|Z| - |Z0|) / |Z0|                     against the untouched baseline (services/tare.py)
     touched = d^T C^-1 d > threshold            C: noise, model error, drift (services/touch.py)
@@ -75,8 +76,8 @@ class Preprocessing(Stage):
         self._counters["frames"] += 1
         if frame.reasons == ["non_finite"]:  # measurements that failed are left out below
             out.valid, out.reasons = True, []
-        if len(frame.z) != len(self.bundle.pattern) or frame.kind == "sentinel":
-            return [self._foreign(out, frame)]
+        if frame.kind == "sentinel" or len(frame.z) != len(self.bundle.pattern):
+            return [self._no_scan(out, frame)]
         self._follow_source(frame)
         amplitude = np.abs(frame.z.astype(np.complex128))
         baseline = self._baseline
@@ -87,14 +88,14 @@ class Preprocessing(Stage):
         self._window.append(amplitude)
         if frame.kind == "reference":
             self._refer(amplitude, frame)
-        elif baseline is None and len(self._window) == self.config.tare.frames and self._counters["frames"] % RETRY_EVERY == 0:
+        elif (
+            baseline is None
+            and len(self._window) == self.config.tare.frames
+            and self._counters["frames"] % RETRY_EVERY == 0
+        ):
             self._first_tare(frame)
         if self._baseline is None:
-            out.valid = False
-            add_reason(out.reasons, "stale_baseline")
-            out.difference = np.zeros(len(amplitude), np.float32)
-            out.sigma = np.full(len(amplitude), np.inf, np.float32)
-            return [out]
+            return [_unusable(out, "stale_baseline", len(amplitude))]
         if self._baseline.doubt:
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
@@ -140,14 +141,13 @@ class Preprocessing(Stage):
         out.stack, out.context, out.scale = operator.stack(d)
         self._counters["reconstructed"] += 1
 
-    def _foreign(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
-        self._counters["foreign"] += 1
-        self._problem = f"frames of {len(frame.z)} measurements, the bundle {self.bundle.name} has {len(self.bundle.pattern)}"
-        out.valid = False
-        add_reason(out.reasons, "out_of_distribution")
-        out.difference = np.zeros(len(self.bundle.pattern), np.float32)
-        out.sigma = np.full(len(self.bundle.pattern), np.inf, np.float32)
-        return out
+    def _no_scan(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
+        """A frame that cannot be compared with the baseline: a sentinel's short list, or another skin's."""
+        if frame.kind != "sentinel":
+            self._counters["foreign"] += 1
+            found, expected = len(frame.z), len(self.bundle.pattern)
+            self._problem = f"frames of {found} measurements, the bundle {self.bundle.name} has {expected}"
+        return _unusable(out, "coarse" if frame.kind == "sentinel" else "out_of_distribution", len(self.bundle.pattern))
 
     # the baseline
 
@@ -231,7 +231,9 @@ class Preprocessing(Stage):
         if self._touched and not force:
             raise Refused("the skin is touched: free it and try again (or --force, if nothing touches it)")
         if self._baseline is not None and self._untouched_run < needed and not force:
-            raise Refused(f"only {self._untouched_run} of {needed} untouched frames since the last touch: wait and try again")
+            raise Refused(
+                f"only {self._untouched_run} of {needed} untouched frames since the last touch: wait and try again"
+            )
         board = self._baseline.board if self._baseline else str(args.get("board", ""))
         baseline = take(np.array(self._window), self.pre, board, self._last_sample_ns)
         self.set_baseline(dataclasses.replace(baseline, doubt=""))  # whoever gives the command has looked
@@ -275,7 +277,9 @@ class Preprocessing(Stage):
         if saved.get("bundle") != self.bundle.hash:
             raise Refused("the saved baseline is of another bundle")
         if age_s > self.config.tare.max_age_s:
-            raise Refused(f"the saved baseline is {age_s / 3600:.1f} h old, at most {self.config.tare.max_age_s / 3600:.1f} h")
+            raise Refused(
+                f"the saved baseline is {age_s / 3600:.1f} h old, at most {self.config.tare.max_age_s / 3600:.1f} h"
+            )
         self.set_baseline(Baseline.from_dict(saved["baseline"], len(self.bundle.pattern)))
         self._unsaved = False
 
@@ -313,6 +317,14 @@ class Preprocessing(Stage):
             n = self.config.tare.frames
             return Health("WARN", [f"taking the baseline: {len(self._window)} of {n} frames"], counters)
         return Health("OK", [], counters)
+
+
+def _unusable(out: DeltaFrame, reason: str, measurements: int) -> DeltaFrame:
+    out.valid = False
+    add_reason(out.reasons, reason)
+    out.difference = np.zeros(measurements, np.float32)
+    out.sigma = np.full(measurements, np.inf, np.float32)
+    return out
 
 
 if __name__ == "__main__":

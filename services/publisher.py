@@ -1,4 +1,6 @@
-"""The publisher process: contacts, forces, shapes. `python -m services.publisher`; the stage is services/publishing.py."""
+"""The publisher process: contacts, forces, shapes. `python -m services.publisher`; the stage is
+services/publishing.py.
+"""
 
 import sys
 

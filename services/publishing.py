@@ -43,6 +43,9 @@ class Publishing(Stage):
         self._geometry = (0.0, [0.0, 0.0])  # metres per pixel, origin of the segments' image
         self._counters = {"frames": 0, "contacts": 0}
 
+    def new_session(self) -> None:
+        self.tracker = Tracker()
+
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, ImageFrame)
         self._counters["frames"] += 1
@@ -132,7 +135,9 @@ class Publishing(Stage):
 
 
 def _class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float]:
-    """Mean over the touch of the per-pixel class probabilities (5, h, w), which are on a coarser grid; [] where there are none."""
+    """Mean over the touch of the per-pixel class probabilities (5, h, w), which are on a coarser grid; [] where there
+    are none.
+    """
     if not classes.size:
         return []
     y, x = np.nonzero(s.mask)

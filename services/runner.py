@@ -41,11 +41,13 @@ log = logging.getLogger(__name__)
 class Feed(Protocol):
     """Where a stage's frames come from."""
 
-    malformed: int
-    skipped: int
-
+    @property
+    def malformed(self) -> int: ...
+    @property
+    def skipped(self) -> int: ...
     @property
     def socket(self) -> Any: ...
+
     def recv(self) -> Frame | None: ...
     def close(self) -> None: ...
 
@@ -85,7 +87,7 @@ class Runner:
 
     def add(self, stage: Stage, feed: Feed | None = None) -> None:
         """Drive this stage; without a feed, from the topic that it reads."""
-        lane = Lane(self.process, stage, feed or _Newest(stage.reads, stage.skin))
+        lane = Lane(self.process, stage, _Newest(stage.reads, stage.skin) if feed is None else feed)
         self.lanes[stage.skin] = lane
         self._by_socket[lane.feed.socket] = lane
         for command in stage.commands:
@@ -171,7 +173,9 @@ class Runner:
         lane.heartbeat.failure = f"a frame could not be processed: {type(why).__name__}: {why}"
         if str(why) not in lane.errors and len(lane.errors) < 100:
             lane.errors.add(str(why))
-            log.exception("%s: a frame was dropped (further ones of this kind are only counted)", lane.stage.skin, exc_info=why)
+            log.exception(
+                "%s: a frame was dropped (further ones of this kind are only counted)", lane.stage.skin, exc_info=why
+            )
 
     # housekeeping
 
@@ -188,7 +192,11 @@ class Runner:
                 self._send(lane, status)
             info = lane.stage.info()
             if info is not None:
-                age = {"tare_age_s": (time.monotonic_ns() - info["tare_sample_ns"]) * 1e-9} if info.get("tare_sample_ns") else {}
+                age = (
+                    {"tare_age_s": (time.monotonic_ns() - info["tare_sample_ns"]) * 1e-9}
+                    if info.get("tare_sample_ns")
+                    else {}
+                )
                 self._send(lane, InfoFrame(skin=lane.stage.skin, process=self.process, valid=True, info=info | age))
             if lane.stage.persists and (saved := lane.stage.saved()) is not None:
                 persistence.save(self.process, lane.stage.skin, saved)
@@ -227,7 +235,8 @@ class Runner:
         def carry_out(args: dict[str, Any]) -> dict[str, Any]:
             lane = self._lane(args)
             try:
-                return persistence.plain(lane.stage.command(command, args))
+                result: dict[str, Any] = persistence.plain(lane.stage.command(command, args))
+                return result
             except Refused as why:
                 raise ControlError("refused", str(why)) from None
 
@@ -254,9 +263,13 @@ class Runner:
         return {}
 
     def _reset(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Forget all temporal state."""
-        self._lane(args).stage.reset()
-        return {}
+        """Forget all temporal state; with `new_session` also begin a session, whose frames count from 0."""
+        stage = self._lane(args).stage
+        stage.reset()
+        if args.get("new_session"):
+            stage.new_session()
+            self.publisher.renew()
+        return {"session": self.publisher.session}
 
 
 class _Newest:
@@ -295,7 +308,9 @@ def _wake_on_signals(stop: Callable[[], None]) -> int:
 
 
 def main(process: str, setup: Callable[[Runner], None]) -> int:
-    """A process's main: configuration, sockets, lanes, loop. Returns the exit status; says on stderr what stands in the way."""
+    """A process's main: configuration, sockets, lanes, loop. Returns the exit status; says on stderr what stands in
+    the way.
+    """
     logging.basicConfig(format=f"{process}: %(message)s", level=logging.INFO, stream=sys.stderr)
     try:
         config = load()

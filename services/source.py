@@ -186,7 +186,9 @@ class RecordingSource(Source):
 
 
 class FileSource(Source):
-    """Frames of an npz file: `untouched` (m, K) first, then `measurements` (n, K), each after its row of `reference` if there is one."""
+    """Frames of an npz file: `untouched` (m, K) first, then `measurements` (n, K), each after its row of `reference`
+    if there is one.
+    """
 
     def frames(self) -> Iterator[RawFrame | None]:
         due = time.monotonic()
@@ -202,7 +204,7 @@ class FileSource(Source):
             time.sleep(POLL_S)
             yield None
 
-    def raw(self, scan: int, values: NDArray[np.floating], kind: str, now_ns: int) -> RawFrame:
+    def raw(self, scan: int, values: NDArray[np.generic], kind: str, now_ns: int) -> RawFrame:
         return file_frame(self.name, self.pattern_name, scan, values, kind, now_ns)
 
 
@@ -224,17 +226,23 @@ def file_frame(skin: str, pattern: str, scan: int, values: NDArray[np.generic], 
 
 
 def rows(path: Path, measurements: int) -> Iterator[tuple[NDArray[np.generic], str]]:
-    """(values (K,), kind) of an npz file's frames. Raises ValueError or KeyError naming key, shape found and shape expected."""
+    """(values (K,), kind) of an npz file's frames. Raises ValueError or KeyError naming key, shape found and shape
+    expected.
+    """
     with np.load(path, allow_pickle=False) as data:
         found = {key: np.asarray(data[key]) for key in ("untouched", "reference", "measurements") if key in data}
     if "measurements" not in found:
         raise ValueError("has no array `measurements` (n, K)")
     for key, values in found.items():
         if values.ndim != 2 or values.shape[1] != measurements:
-            raise ValueError(f"`{key}` has shape {values.shape}, expected (n, {measurements}) in the skin's pattern order")
+            raise ValueError(
+                f"`{key}` has shape {values.shape}, expected (n, {measurements}) in the skin's pattern order"
+            )
     reference = found.get("reference")
     if reference is not None and len(reference) != len(found["measurements"]):
-        raise ValueError(f"`reference` has {len(reference)} rows, `measurements` {len(found['measurements'])}: expected one each")
+        raise ValueError(
+            f"`reference` has {len(reference)} rows, `measurements` {len(found['measurements'])}: expected one each"
+        )
     yield from ((row, "full") for row in found.get("untouched", ()))
     for index, row in enumerate(found["measurements"]):
         if reference is not None:

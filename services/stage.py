@@ -1,5 +1,5 @@
-"""What a stage is: frame in, frames out. No sockets, no clock, no threads; temporal state explicit, so that it can be reset,
-saved and loaded. services/runner.py drives stages over sockets, services/pipeline.py in one process.
+"""What a stage is: frame in, frames out. No sockets, no clock, no threads; temporal state explicit, so that it can be
+reset, saved and loaded. services/runner.py drives stages over sockets, services/pipeline.py in one process.
 """
 
 from __future__ import annotations
@@ -39,23 +39,28 @@ class Stage(ABC):
 
     @abstractmethod
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
-        """The frames that follow from `frame`; `wanted`: topics somebody subscribes to. Never raises for what is in a frame."""
+        """The frames that follow from `frame`; `wanted`: topics somebody subscribes to. Never raises for what is in a
+        frame.
+        """
 
-    def reset(self) -> None:
+    def reset(self) -> None:  # noqa: B027  (a stage without state)
         """Forget all temporal state."""
+
+    def new_session(self) -> None:  # noqa: B027
+        """What must be unique within a session may begin anew."""
 
     def state(self) -> dict[str, Any]:
         """Temporal state: numbers, texts, lists, arrays. `load(state())` in another process continues bit by bit."""
         return {}
 
-    def load(self, state: dict[str, Any]) -> None:
+    def load(self, state: dict[str, Any]) -> None:  # noqa: B027
         """Take over a state. Raises Refused where it does not fit."""
 
     def saved(self) -> dict[str, Any] | None:
         """State to keep across a crash, or None where nothing changed since the last call. Only if `persists`."""
         return None
 
-    def restore(self, saved: dict[str, Any], age_s: float) -> None:
+    def restore(self, saved: dict[str, Any], age_s: float) -> None:  # noqa: B027
         """Take over what an earlier process saved `age_s` ago. Raises Refused where it does not fit."""
 
     def command(self, name: str, args: dict[str, Any]) -> dict[str, Any]:
@@ -69,7 +74,7 @@ class Stage(ABC):
     def health(self) -> Health:
         return Health()
 
-    def warm_up(self) -> None:
+    def warm_up(self) -> None:  # noqa: B027
         """Do once what is slow the first time."""
 
 

@@ -1,8 +1,9 @@
 """Process supervision of `skin up`: supervisord as a library, in the foreground, quick.
 
-Three things differ from supervisord as it comes: it looks at its children every POLL_S instead of every second and restarts
-one in the same round in which it was reaped; a process that keeps failing is retried for ever, at growing intervals, instead of
-being given up; children write to our own stdout (one log stream, no copying) and die with us, whatever kills us.
+Three things differ from supervisord as it comes: it looks at its children every POLL_S instead of every second and
+restarts one in the same round in which it was reaped; a process that keeps failing is retried for ever, at growing
+intervals, instead of being given up; children write to our own stdout (one log stream, no copying) and die with us,
+whatever kills us.
 """
 
 from __future__ import annotations
@@ -116,7 +117,11 @@ class _Stage(Subprocess):  # type: ignore[misc]
 
 def _settings(runtime: Path, config: Config, running: Sequence[Program]) -> str:
     """supervisord's configuration file."""
-    environment = {"EITSKIN_RUNTIME": str(runtime), "EITSKIN_CONFIG": str(config.path.resolve()), "PYTHONUNBUFFERED": "1"}
+    environment = {
+        "EITSKIN_RUNTIME": str(runtime),
+        "EITSKIN_CONFIG": str(config.path.resolve()),
+        "PYTHONUNBUFFERED": "1",
+    }
     lines = [
         "[supervisord]",
         "nodaemon=true",

@@ -1,4 +1,6 @@
-"""The untouched baseline: when frames agree well enough to be one, what their noise is, and whether the skin was really untouched."""
+"""The untouched baseline: when frames agree well enough to be one, what their noise is, and whether the skin was
+really untouched.
+"""
 
 from __future__ import annotations
 
@@ -60,15 +62,21 @@ def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Bas
     """
     live = np.isfinite(frames).all(axis=0) & (frames > 0).all(axis=0)
     if live.sum() < 0.5 * frames.shape[1]:
-        raise Refused(f"only {int(live.sum())} of {frames.shape[1]} measurements give values: check the cable and the electrodes")
+        raise Refused(
+            f"only {int(live.sum())} of {frames.shape[1]} measurements give values: check the cable and the electrodes"
+        )
     good = frames[:, live]
     mean = good.mean(axis=0)
     noise = float(np.median(good.std(axis=0, ddof=1) / mean))
     if noise > TOO_NOISY:
-        raise Refused(f"the frames scatter by {100 * noise:.1f} % (at most {100 * TOO_NOISY:.0f} %): check grounding and cable")
+        raise Refused(
+            f"the frames scatter by {100 * noise:.1f} % (at most {100 * TOO_NOISY:.0f} %): check grounding and cable"
+        )
     found, limit = disagreement(good)
     if found > limit:
-        raise Refused(f"the frames disagree (statistic {found:.0f}, limit {limit:.0f}): something touched or moved meanwhile")
+        raise Refused(
+            f"the frames disagree (statistic {found:.0f}, limit {limit:.0f}): something touched or moved meanwhile"
+        )
     z0, sigma = np.zeros(frames.shape[1]), np.full(frames.shape[1], np.inf)
     z0[live], sigma[live] = mean, noise_of_frames(good, mean)
     doubt = ""
@@ -79,7 +87,9 @@ def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Bas
 
 
 def disagreement(frames: Array) -> tuple[float, float]:
-    """Chi-square statistic of the quarters' means against the noise within them, and the limit it keeps to when all is quiet."""
+    """Chi-square statistic of the quarters' means against the noise within them, and the limit it keeps to when all
+    is quiet.
+    """
     n = len(frames) // QUARTERS * QUARTERS
     quarters = frames[-n:].reshape(QUARTERS, n // QUARTERS, -1)
     mean = frames.mean(axis=0)
@@ -94,7 +104,9 @@ def disagreement(frames: Array) -> tuple[float, float]:
 
 
 def implausibility(z0: Array, pre: PreReconstructor) -> float:
-    """rms relative misfit of |Z0| to the bundle's prediction, up to gain and contact impedances; 0 where the bundle predicts none."""
+    """rms relative misfit of |Z0| to the bundle's prediction, up to gain and contact impedances; 0 where the bundle
+    predicts none.
+    """
     if pre.m.normalisation != "model":
         return 0.0
     live = z0 > 0

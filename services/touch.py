@@ -1,7 +1,7 @@
 """Touched or not, and whether anything changed since the frame last reconstructed.
 
-Both compare the operator's detection statistic (noise-whitened energy) with the threshold that an unchanged skin exceeds with a
-stated probability per frame; the threshold allows for the noise having been estimated from few frames.
+Both compare the operator's detection statistic (noise-whitened energy) with the threshold that an unchanged skin
+exceeds with a stated probability per frame; the threshold allows for the noise having been estimated from few frames.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class TouchDecision:
 class Hold:
     """Decides which frames of a touch are reconstructed, and from what.
 
-    While nothing changes against the frame last reconstructed (not the previous frame: creep must be seen), frames are averaged,
-    and their mean is reconstructed after 2, 4, 8, 16, 32, 48 ... of them.
+    While nothing changes against the frame last reconstructed (not the previous frame: creep must be seen), frames are
+    averaged, and their mean is reconstructed after 2, 4, 8, 16, 32, 48 ... of them.
     """
 
     def __init__(self) -> None:

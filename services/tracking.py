@@ -1,4 +1,4 @@
-"""Contacts over time: the same touch keeps its id, through crossings and one lost frame; ids are never used again in a session."""
+"""Contacts over time: a touch keeps its id, through crossings and one lost frame; no id is used twice in a session."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ class Tracker:
                 _move(track, x, y, sample_ns)
             track.age += 1
             found.append(track)
-        ended, coasting = [], []
+        ended: list[Track] = []
+        coasting: list[Track] = []
         for track in self.tracks:
             if track.id not in kept:
                 track.missing += 1
@@ -61,7 +62,7 @@ class Tracker:
         return found, ended
 
     def _assign(self, positions: list[tuple[float, float]], sample_ns: int) -> dict[int, int]:
-        """Position index -> track index: the assignment of least total distance to the predicted places, within reach."""
+        """Position index -> track index: least total distance to the predicted places, within reach."""
         if not positions or not self.tracks:
             return {}
         ahead = [min(max(0.0, (sample_ns - t.seen_ns) * 1e-9), LONGEST_PREDICTION_S) for t in self.tracks]
