@@ -75,6 +75,11 @@ class Publisher:
             self._latched[name] = message
         return message
 
+    def renew(self) -> None:
+        """Begin a new session: frames count from 0 again."""
+        self.session = secrets.token_hex(8)
+        self.sent.clear()
+
     def wanted(self, topic: str, skin: str) -> bool:
         """Whether anybody subscribes to it, as of the last `poll` or `send`."""
         return self.subscribers(topic, skin) > 0

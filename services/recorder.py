@@ -29,6 +29,7 @@ DEFAULT_TOPICS = ("raw", "contact", "status", "info")
 STAGES = ("preprocessing", "inference", "publisher")
 POLL_S = 0.05
 STATE_TIMEOUT_S = 0.5
+MOST_SKINS = 64
 
 log = logging.getLogger("recorder")
 
@@ -51,7 +52,7 @@ class Recorder:
             time.time_ns() - time.monotonic_ns()
         )  # a clock that is set meanwhile must not tear the file's times
         self._baselines: dict[str, Any] = {}
-        self.states.ask(skin)
+        self._skins: set[str] = set()
 
     def step(self, seconds: float = POLL_S) -> int:
         """Writes what arrives within `seconds`; how many messages that was."""
@@ -66,11 +67,14 @@ class Recorder:
             topic, _, data = message.partition(b"\0")
             self.writer.write(topic.decode(), data, self._now_ns())
             taken += 1
-            self._watch_baseline(frame)
+            self._ask_states(frame)
 
-    def _watch_baseline(self, frame: Frame) -> None:
-        if isinstance(frame, InfoFrame):
-            found = frame.info.get("baseline_hash")
+    def _ask_states(self, frame: Frame) -> None:
+        """At the first frame of a skin, and when its baseline has changed."""
+        if frame.skin not in self._skins and len(self._skins) < MOST_SKINS:
+            self._skins.add(frame.skin)
+            self.states.ask(frame.skin)
+        if isinstance(frame, InfoFrame) and (found := frame.info.get("baseline_hash")):
             if self._baselines.setdefault(frame.skin, found) != found:
                 self._baselines[frame.skin] = found
                 self.states.ask(frame.skin)
@@ -104,14 +108,14 @@ class _StateReader:
     """Asks the stages for their state on a thread of its own, so that a silent stage holds up no message."""
 
     def __init__(self) -> None:
-        self._asked: list[str | None] = []
+        self._asked: list[str] = []
         self._answers: list[tuple[str, bytes]] = []
         self._lock = threading.Condition()
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="states", daemon=True)
         self._thread.start()
 
-    def ask(self, skin: str | None) -> None:
+    def ask(self, skin: str) -> None:
         with self._lock:
             self._asked.append(skin)
             self._lock.notify()
@@ -130,9 +134,9 @@ class _StateReader:
                 if self._closing:
                     return
                 skin = self._asked.pop(0)
-            for name, states in stage_states(skin).items():
-                with self._lock:
-                    self._answers.append((name, pack_state(states)))
+            packed: bytes = msgpack.packb(stage_states(skin))
+            with self._lock:
+                self._answers.append((skin, packed))
 
     def close(self) -> None:
         with self._lock:
@@ -141,23 +145,15 @@ class _StateReader:
         self._thread.join(len(STAGES) * STATE_TIMEOUT_S + 0.5)
 
 
-def stage_states(skin: str | None) -> dict[str, dict[str, Any]]:
-    """skin -> process -> state, of the stages that answer; of all skins where `skin` is None."""
-    found: dict[str, dict[str, Any]] = {}
+def stage_states(skin: str) -> dict[str, Any]:
+    """process -> state, of the stages that answer, as their control command `state` gives it."""
+    found: dict[str, Any] = {}
     for process in STAGES:
         try:
-            answer = ControlClient(process, STATE_TIMEOUT_S).call("state", **({"skin": skin} if skin else {}))
-        except ControlError as error:
+            found[process] = ControlClient(process, STATE_TIMEOUT_S).call("state", skin=skin)["state"]
+        except (ControlError, KeyError) as error:
             log.warning("the state of %s is not in the recording: %s", process, error)
-            continue
-        for name, state in answer.get("skins", {}).items():
-            found.setdefault(name, {})[process] = state
     return found
-
-
-def pack_state(states: dict[str, Any]) -> bytes:
-    packed: bytes = msgpack.packb(states)
-    return packed
 
 
 def _metadata(topics: list[str], skin: str | None) -> dict[str, str]:

@@ -38,6 +38,10 @@ EXPECTED = {
     ("protocol.sockets", "ControlError"): FAILED,
     ("services.config", "ConfigError"): USAGE,
     ("services.recording", "RecordingError"): USAGE,
+    ("services.replay", "ReplayError"): FAILED,
+    ("services.importing", "ImportRefused"): USAGE,
+    ("services.registration", "RegistrationError"): USAGE,
+    ("protocol.transport", "TransportError"): FAILED,
     ("models.bundle", "BundleError"): USAGE,
 }
 """Exceptions of other modules whose text is already meant for the person at the terminal, and the exit code of each."""

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from services.cli.common import USAGE, JsonOption, SkinOption, emit, fail, load_npz, skin_name
+
+if TYPE_CHECKING:
+    from protocol.frames import ContactFrame
 
 
 def register(app: typer.Typer) -> None:
@@ -71,13 +76,15 @@ def replay(
 ) -> None:
     """Feed a recording's raw frames through the stages, losslessly; contacts come out on the usual sockets, marked `replay`.
 
-    With `skin up --no-board` running it feeds those stages; with nothing running it brings up stages for itself.
+    With `skin up --no-board` running it feeds those stages; with nothing running it brings up its own.
     """
     if speed <= 0:
         fail(f"found --speed {speed:g}, expected a number above 0 (or --fast)", USAGE)
-    from services.replay import replay_file
+    from services.replay_session import replay_file
 
-    report = replay_file(file, None if fast else speed, start, skin, out, private, quiet=as_json)
+    report = replay_file(file, None if fast else speed, start, skin, out, private, progress=_bar)
+    for warning in report["warnings"]:
+        print(f"skin: {warning}", file=sys.stderr)
     if as_json:
         emit(report)
     else:
@@ -86,6 +93,16 @@ def replay(
         )
         if report["damage"] != "whole":
             print(f"the file is {report['damage']}")
+
+
+def _bar(contacts: Iterator[ContactFrame], total: int) -> Iterator[ContactFrame]:
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    yield from track(
+        contacts, "replaying", total=total, console=console, transient=True, disable=not console.is_terminal
+    )
 
 
 def import_file(
@@ -98,8 +115,8 @@ def import_file(
 ) -> None:
     """Turn an npz of measurements into a recording that replays like any other.
 
-    Either measurements (n, k) with untouched (m, k) or reference (n, k); or presses as published with the hydrogel skin:
-    untouched (n, k), touched (n, k) and optionally pattern (k, 4).
+    Either measurements (n, k) with untouched (m, k) or reference (n, k); or presses as published with the hydrogel
+    skin: untouched (n, k), touched (n, k) and optionally pattern (k, 4).
     """
     from services.importing import import_arrays
 

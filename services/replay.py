@@ -1,0 +1,234 @@
+"""Replay: a recording's raw frames, one at a time, through the same sockets as a board's.
+
+Stands in for acquisition: binds its socket and sends the next frame only when the contacts of the one before have come
+out, so that nothing is lost or batched and the same recording gives the same contacts each time. The `sample` stamps
+are used as recorded.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, unpack
+from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
+from services.recording import STATE_TOPIC, Recorded, RecordingReader, RecordingWriter
+
+STAGES = ("preprocessing", "inference", "publisher")
+CHAIN_S = 20.0  # for the stages to start and find each other
+ANSWER_S = 5.0  # for the contacts of one frame
+PRIME_EVERY_S = 0.25
+
+
+class ReplayError(Exception):
+    """The replay cannot begin or go on; the text says why and what to do."""
+
+
+@dataclass
+class Step:
+    """What is to be done next: load states, or send a frame."""
+
+    at_ns: int
+    skin: str
+    raw: RawFrame | None = None
+    states: dict[str, Any] = field(default_factory=dict)
+
+
+def steps(reader: RecordingReader, start_s: float = 0.0, only: str = "") -> Iterator[Step]:
+    """The raw frames from `start_s` on, in order, and the states that belong before them.
+
+    The first state of a skin goes before its first frame: the recorder asked for it on seeing that frame. Malformed
+    messages are left out.
+    """
+    first_ns: int | None = None
+    latest = _first_states(reader)
+    held = set(latest)
+    for message in reader.messages({"raw", STATE_TOPIC}):
+        first_ns = message.log_time_ns if first_ns is None else first_ns
+        step = _step(message)
+        if step is None or (only and step.skin != only):
+            continue
+        if step.raw is None and step.skin in held:
+            held.remove(step.skin)  # that one is in `latest` already
+        elif message.log_time_ns - first_ns >= start_s * 1e9:
+            if step.skin in latest:
+                yield latest.pop(step.skin)
+            yield step
+        elif step.raw is None:
+            latest[step.skin] = step
+
+
+def _first_states(reader: RecordingReader) -> dict[str, Step]:
+    found: dict[str, Step] = {}
+    for message in RecordingReader(reader.path).messages({STATE_TOPIC}):
+        step = _step(message)
+        if step is not None:
+            found.setdefault(step.skin, step)
+    return found
+
+
+def _step(message: Recorded) -> Step | None:
+    topic, _, skin = message.topic.partition("/")
+    try:
+        if topic == STATE_TOPIC:
+            states = msgpack.unpackb(message.data, strict_map_key=False)
+            return Step(message.log_time_ns, skin, states=states) if isinstance(states, dict) else None
+        frame = unpack(message.wire)
+    except (FrameError, ValueError, msgpack.UnpackException):
+        return None
+    return Step(message.log_time_ns, skin, raw=frame) if isinstance(frame, RawFrame) else None
+
+
+class Replayer:
+    """Feeds stages that run already. `speed` None: as fast as they can."""
+
+    def __init__(self, skins: list[str], speed: float | None, out: RecordingWriter | None = None) -> None:
+        self.skins, self.speed, self.out = skins, speed, out
+        self.publisher = Publisher("acquisition")
+        self.contacts = AllReader(["contact"])
+        self.counts: Counter[str] = Counter()
+        self.warnings: list[str] = []
+        self._started: set[str] = set()
+        self._zero: tuple[int, float] | None = None
+        self._status_due = 0.0
+
+    def run(self, source: Iterator[Step]) -> Iterator[ContactFrame]:
+        """The contact frames, one for each raw frame. Raises ReplayError where one does not come."""
+        for step in source:
+            if step.skin not in self.skins:
+                continue
+            if step.skin not in self._started:
+                self._started.add(step.skin)
+                self._prime(step)
+                if step.raw is not None:
+                    self._begin(step.skin, {})
+                    yield self._send(step, step.raw)
+                else:
+                    self._begin(step.skin, step.states)
+            elif step.raw is None:
+                self._load(step.skin, {name: s for name, s in step.states.items() if name == "preprocessing"})
+            else:
+                self._pace(step.at_ns)
+                yield self._send(step, step.raw)
+
+    def _pace(self, at_ns: int) -> None:
+        if self._zero is None or self.speed is None:
+            self._zero = self._zero or (at_ns, time.monotonic())
+            return
+        due = self._zero[1] + (at_ns - self._zero[0]) * 1e-9 / self.speed
+        while (left := due - time.monotonic()) > 0:
+            time.sleep(min(left, 0.2))
+            self._report()
+
+    def _send(self, step: Step, raw: RawFrame) -> ContactFrame:
+        raw.source = "replay"
+        raw.stamps = {"sample": raw.stamps.get("sample", 0), "read": time.monotonic_ns()}
+        raw.reasons = [r for r in raw.reasons if r != "non_finite"]  # the reader's own remark, which it will make again
+        if "replay" not in raw.reasons:
+            raw.reasons.append("replay")
+        self.publisher.send(raw)
+        self.counts["frames"] += 1
+        contact = self._contact(step.skin, raw.scan, ANSWER_S)
+        if contact is None:
+            raise ReplayError(
+                f"no contacts of scan {raw.scan} came within {ANSWER_S:g} s: is a stage down? `skin top` shows which"
+            )
+        self._report()
+        return contact
+
+    def _contact(self, skin: str, scan: int, timeout_s: float) -> ContactFrame | None:
+        end = time.monotonic() + timeout_s
+        while (left := end - time.monotonic()) > 0:
+            got = self.contacts.recv_message(left)
+            if got is None:
+                return None
+            frame, message = got
+            if isinstance(frame, ContactFrame) and frame.skin == skin and frame.scan == scan:
+                if self.out is not None and skin in self._started:
+                    self.out.write(f"contact/{skin}", message.partition(b"\0")[2], time.time_ns())
+                self.counts["contacts"] += 1
+                self.counts["touched"] += bool(frame.contacts)
+                return frame
+        return None
+
+    # getting ready
+
+    def _prime(self, step: Step) -> None:
+        """Sends frames that change nothing until contacts come out: then every socket of the chain is connected."""
+        out, self.out = self.out, None
+        end = time.monotonic() + CHAIN_S
+        try:
+            while time.monotonic() < end:
+                self.publisher.send(_primer(step.skin))
+                if self._contact(step.skin, 0, PRIME_EVERY_S) is not None:
+                    break
+            else:
+                raise ReplayError(
+                    f"no contacts of skin {step.skin!r} came within {CHAIN_S:g} s: is it in the stages' configuration?"
+                )
+            while self.contacts.recv(PRIME_EVERY_S) is not None:  # answers to primers that were under way
+                pass
+        finally:
+            self.out = out
+            self.counts.clear()
+
+    def _begin(self, skin: str, states: dict[str, Any]) -> None:
+        """Every stage forgets what it knew and starts a new session, so that a replay's frames count from 0."""
+        for process in STAGES:
+            self._call(process, "reset", skin=skin, new_session=True)
+        self._load(skin, states)
+
+    def _load(self, skin: str, states: dict[str, Any]) -> None:
+        for process, state in states.items():
+            if process in STAGES:
+                self._call(process, "load", skin=skin, state=state)
+
+    def _call(self, process: str, command: str, **args: Any) -> None:
+        try:
+            ControlClient(process, 5.0).call(command, **args)
+        except ControlError as error:
+            if error.kind in ("unreachable", "timeout"):
+                raise ReplayError(str(error)) from None
+            self.warnings.append(f"{process} could not {command} the recorded state: {error}")
+
+    def _report(self) -> None:
+        """A status a second, as every process gives."""
+        if (now := time.monotonic()) < self._status_due:
+            return
+        self._status_due = now + 1.0
+        for skin in self.skins:
+            self.publisher.send(
+                StatusFrame(
+                    skin=skin, process="replay", level="OK", source="replay", valid=True, counters=dict(self.counts)
+                )
+            )
+
+    def close(self) -> None:
+        self.publisher.close()
+        self.contacts.close()
+
+
+def _primer(skin: str) -> RawFrame:
+    """A frame that no stage takes for a measurement: one value, of a sentinel scan, invalid."""
+    import numpy as np
+
+    return RawFrame(
+        skin=skin,
+        z=np.ones(1, np.complex64),
+        status=np.zeros(1, np.uint8),
+        kind="sentinel",
+        source="replay",
+        reasons=["replay"],
+        stamps={"sample": 0, "read": time.monotonic_ns()},
+    )
+
+
+def skins_in(path: Path) -> dict[str, int]:
+    """The skins whose raw frames a recording holds, and how many. Raises RecordingError."""
+    return dict(Counter(message.topic.partition("/")[2] for message in RecordingReader(path).messages({"raw"})))
