@@ -122,6 +122,13 @@ def write_keys(folder: Path, name: str) -> tuple[Path, Path]:
     return Path(public), Path(secret)
 
 
+def stop_authenticator(context: Context) -> None:
+    """End the thread that checks clients of this context's CURVE sockets; before the context is closed."""
+    authenticator = _authenticators.pop(context.underlying, None)
+    if authenticator is not None:
+        authenticator.stop()
+
+
 def _open(context: Context, kind: int, options: Mapping[int, Any]) -> Socket:
     socket = context.socket(kind)
     socket.setsockopt(zmq.LINGER, 0)

@@ -22,8 +22,8 @@ WIRE_MD = Path(__file__).with_name("WIRE.md")
 
 def table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     """A Markdown table."""
-    head = list(head)
-    lines = [head, ["---"] * len(head), *(list(row) for row in rows)]
+    titles = list(head)
+    lines: list[list[object]] = [[*titles], ["---"] * len(titles), *(list(row) for row in rows)]
     return "".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |\n" for line in lines)
 
 

@@ -1,0 +1,223 @@
+"""Publishing and subscribing over real sockets, with real processes killed and stopped."""
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from protocol.frames import ContactFrame, ForceFrame, ImageFrame, InfoFrame, StatusFrame
+from protocol.runtime import endpoint
+from protocol.sockets import SEND_QUEUE, AllReader, NewestReader, Publisher
+
+ROOT = Path(__file__).parents[2]
+
+
+def until(condition, timeout_s=5.0):
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.005)
+
+
+def subscribed(publisher, topic="contact", skin="palm", count=1):
+    def check():
+        publisher.poll()
+        return publisher.subscribers(topic, skin) == count
+
+    until(check)
+
+
+def run(code):
+    """A process of our code that says "ready" once."""
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE)
+    assert process.stdout.readline() == b"ready\n"
+    return process
+
+
+@pytest.fixture
+def publisher(runtime, context):
+    return Publisher("publisher", context)
+
+
+def test_the_newest_frame_comes_and_older_ones_are_skipped(publisher, context):
+    reader = NewestReader("contact", "palm", context=context)
+    subscribed(publisher)
+    for _ in range(50):
+        publisher.send(ContactFrame(skin="palm", valid=True))
+    time.sleep(0.2)
+    frame = reader.recv(1.0)
+    assert (frame.seq, frame.session) == (49, publisher.session)
+    assert reader.recv(0.0) is None
+    publisher.send(ContactFrame(skin="palm"))
+    assert reader.recv(1.0).seq == 50 and reader.skipped == 0
+
+
+def test_a_reader_takes_its_skin_only(publisher, context):
+    reader = NewestReader("contact", "palm", context=context)
+    subscribed(publisher)
+    publisher.send(ContactFrame(skin="palm2"))
+    publisher.send(ForceFrame(skin="palm"))
+    assert reader.recv(0.1) is None
+
+
+def test_subscribers_are_counted_by_prefix_also_the_second_of_the_same(publisher, context):
+    assert not publisher.wanted("force", "palm")
+    sockets = []
+    for n, prefix in enumerate([b"force/palm\0", b"force/palm\0", b"force/", b""]):
+        socket = context.socket(zmq.SUB)
+        socket.connect(endpoint("publisher"))
+        socket.subscribe(prefix)
+        sockets.append(socket)
+        subscribed(publisher, "force", "palm", n + 1)
+    assert publisher.subscribers("force", "other") == 2
+    assert publisher.subscribers("contact", "palm") == 1
+    for n, socket in enumerate(sockets):
+        socket.close(0)
+        subscribed(publisher, "force", "palm", 3 - n)
+    assert not publisher.wanted("force", "palm")
+
+
+def test_a_killed_subscriber_is_no_longer_counted(publisher, runtime):
+    code = (
+        "import time; from protocol.sockets import NewestReader; r = NewestReader('force', 'palm')\n"
+        "print('ready', flush=True); time.sleep(60)"
+    )
+    process = run(code)
+    subscribed(publisher, "force", "palm", 1)
+    process.kill()
+    process.communicate()
+    subscribed(publisher, "force", "palm", 0)
+
+
+def test_every_late_joiner_is_given_the_latched_value_and_repeats_are_no_gaps(runtime, context):
+    publisher = Publisher("preprocessing", context)
+    publisher.send(InfoFrame(skin="palm", info={"n": 1}))
+    publisher.send(InfoFrame(skin="palm", info={"n": 2}))
+    publisher.send(InfoFrame(skin="other", info={"n": 3}))
+    readers = []
+    for n in range(3):
+        readers.append(AllReader(["info"], "palm", context=context))
+        subscribed(publisher, "info", "palm", n + 1)
+        assert readers[n].recv(1.0).info == {"n": 2}
+    publisher.send(InfoFrame(skin="palm", info={"n": 4}))
+    for reader in readers:
+        assert reader.recv(1.0).info == {"n": 4}
+        assert reader.recv(0.05) is None
+        assert (reader.gaps, reader.malformed) == (0, 0)
+    assert readers[0].repeated >= 1
+
+
+def test_all_readers_get_all_and_count_what_is_missing(publisher, context):
+    reader = AllReader(["contact"], None, context=context)
+    subscribed(publisher)
+    for _ in range(500):
+        publisher.send(ContactFrame(skin="palm"))
+        if publisher.sent["contact/palm"] % 50 == 0:
+            time.sleep(0.01)
+    assert [reader.recv(1.0).seq for _ in range(500)] == list(range(500))
+    publisher.sent["contact/palm"] += 7
+    publisher.send(ContactFrame(skin="palm"))
+    assert reader.recv(1.0).seq == 507
+    assert (reader.gaps, dict(reader.lost)) == (7, {"contact/palm": 7})
+
+
+def test_status_comes_from_every_process(runtime, context):
+    publishers = [Publisher(name, context) for name in ("acquisition", "inference")]
+    reader = AllReader(["status"], "palm", context=context)
+    for publisher in publishers:
+        subscribed(publisher, "status")
+        publisher.send(StatusFrame(skin="palm", process=publisher.producer))
+    assert {reader.recv(1.0).process for _ in publishers} == {"acquisition", "inference"}
+    with pytest.raises(ValueError, match="AllReader"):
+        NewestReader("status", "palm", context=context)
+
+
+@pytest.mark.parametrize("kind", [NewestReader, AllReader])
+def test_garbage_is_counted_logged_once_and_dropped(publisher, context, caplog, kind):
+    reader = kind("contact" if kind is NewestReader else ["contact"], "palm", context=context)
+    subscribed(publisher)
+    kinds = [b"contact/palm\0", b"contact/palm\0\xc1", b"contact/palm\0\x80", b"contact/palm\0" + os.urandom(50)]
+    with caplog.at_level(logging.WARNING):
+        for n, bad in enumerate(kinds * 3):
+            publisher.socket.send(bad)
+            until(lambda n=n: reader.recv(0.05) is None and reader.malformed == n + 1)
+        publisher.socket.send_multipart([b"contact/palm\0", b"\x80"])  # a conflating socket loses these by itself
+        until(lambda: reader.recv(0.05) is None and (kind is NewestReader or reader.malformed == 14))
+    assert 1 <= len(caplog.records) <= 3, "once each: no msgpack, a field missing, no topic"
+    publisher.send(ContactFrame(skin="palm"))
+    assert reader.recv(1.0) is not None
+
+
+def test_a_stopped_subscriber_hurts_neither_the_others_nor_memory(runtime, context):
+    publisher = Publisher("inference", context)
+    stopped = run(
+        "import time; from protocol.sockets import NewestReader; r = NewestReader('image', 'palm')\n"
+        "print('ready', flush=True)\nwhile True: r.recv(1.0)"
+    )
+    reader = NewestReader("image", "palm", context=context)
+    try:
+        subscribed(publisher, "image", count=2)
+        os.kill(stopped.pid, signal.SIGSTOP)
+        before, worst, image = memory_kb(), 0.0, np.zeros((96, 96), "f4")
+        for n in range(5 * SEND_QUEUE):
+            began = time.monotonic()
+            publisher.send(ImageFrame(skin="palm", image=image))
+            worst = max(worst, time.monotonic() - began)
+            if n % 50 == 49:
+                assert reader.recv(1.0) is not None
+        assert worst < 0.1, "send blocked"
+        assert memory_kb() - before < 3 * SEND_QUEUE * image.nbytes / 1024
+    finally:
+        stopped.kill()
+        stopped.communicate()
+
+
+def memory_kb():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
+
+
+def test_a_killed_publisher_comes_back_and_its_readers_find_it(runtime, context):
+    code = (
+        "import time; from protocol.sockets import Publisher; from protocol.frames import ContactFrame\n"
+        "p = Publisher('publisher'); print('ready', flush=True)\n"
+        "while True: p.send(ContactFrame(skin='palm')); time.sleep(0.01)"
+    )
+    reader = NewestReader("contact", "palm", context=context)
+    every = AllReader(["contact"], "palm", context=context)
+    sessions = []
+    for _ in range(2):
+        process = run(code)
+        try:
+            began = time.monotonic()
+            until(
+                lambda: (
+                    (f := reader.recv(0.05)) is not None
+                    and f.session not in sessions
+                    and not sessions.append(f.session)
+                )
+            )
+            assert time.monotonic() - began < 1.0
+        finally:
+            process.kill()
+            process.communicate()
+    assert len(set(sessions)) == 2
+    while every.recv(0.05):
+        pass
+    assert every.gaps == 0, "a new session is no gap"
+
+
+def test_an_address_that_is_no_address_is_an_error_for_humans(runtime, context):
+    from protocol.transport import TransportError
+
+    with pytest.raises(TransportError, match="expected ipc://PATH or tcp://HOST:PORT"):
+        NewestReader("contact", "palm", endpoint="somewhere", context=context)
+    with pytest.raises(TransportError, match="cannot listen at"):
+        Publisher("publisher", context, address="ipc:///nowhere/at/all.ipc")
