@@ -58,6 +58,24 @@ class Inference(Stage):
             self._run(self._unseen, out)
         elif frame.held:
             self._hold(frame, out)
+        else:
+            self._counters["untouched"] += 1
+            self._last = None
+        return [out]
+
+    def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        out.image, out.sigma, out.classes = self._network.run(frame)
+        self._counters["networks_run"] += 1
+        self._last, self._unseen = out, None
+        self._last_scan = frame.scan
+
+    def _hold(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        """The image of the frame last reconstructed, if we have seen that one."""
+        last = self._last
+        if last is not None and self._last_scan == frame.reconstructed:
+            out.held = True
+            out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
+            self._counters["held"] += 1
         else:  # skipped, or before we started: not valid until the next reconstruction, at most 16 frames on
             out.valid = False
             out.reasons.append("gap")
