@@ -54,6 +54,7 @@ class Preprocessing(Stage):
         self.electrodes = ElectrodeHealth(bundle.pattern)
         self.hold = Hold()
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
+        self._operators: dict[tuple[bytes, bytes, int], tuple[Operator, TouchDecision]] = {}
         self.reset()
 
     def reset(self) -> None:
@@ -159,7 +160,6 @@ class Preprocessing(Stage):
 
     def _set_baseline(self, baseline: Baseline | None) -> None:
         self._baseline = baseline
-        self._operators: dict[bytes, tuple[Operator, TouchDecision]] = {}
         self._info_changed = True
         if baseline is not None:
             self._normaliser = self.pre.normaliser(baseline.z0)
@@ -199,9 +199,9 @@ class Preprocessing(Stage):
             self._unsaved = True
 
     def _operator(self, live: NDArray[np.bool_]) -> tuple[Operator, TouchDecision]:
-        key = live.tobytes()
+        assert self._baseline is not None
+        key = live.tobytes(), self._sigma.astype(np.float32).tobytes(), self._baseline.frames
         if key not in self._operators:
-            assert self._baseline is not None
             if len(self._operators) >= OPERATORS:
                 self._operators.pop(next(iter(self._operators)))
             frames = self._baseline.frames
