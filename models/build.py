@@ -9,11 +9,13 @@ python -m models.build --skin square16 --no-network    matrices only: the servic
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
-from models import bundle, geometry, manifest
+from models import bundle, data, geometry, manifest, samples
 from models.forward import ForwardModel
 from models.linearise import linearise
+from models.prereconstruction import PreReconstructor
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -26,6 +28,9 @@ def main(argv: list[str] | None = None) -> None:
     out = args.out or bundle.BUNDLES / skin.name
     model = ForwardModel(skin)
     matrices = linearise(model, "model" if skin.name == "square16" else "measured")
+    scenes = samples.load(data.WORK / skin.name, "valid", PreReconstructor(matrices))
+    matrices = replace(matrices, level=samples.levels(scenes, PreReconstructor(matrices)))
+    print("levels", matrices.level.round(3))
     made = bundle.write(out, manifest.describe(skin.name, skin, matrices), matrices)
     print(f"{made.path}: {sum(f.stat().st_size for f in made.path.iterdir()) / 2**20:.2f} MB, {made.hash[:12]}")
 

@@ -1,10 +1,12 @@
 """A bundle: the folder a skin runs from, with a hash of every file in its manifest (numpy only).
 
-    models/bundles/square16/manifest.json   geometry, pattern, image grid, normalisation, provenance, measured figures, hashes
-                            matrices.npz    see prereconstruction.Matrices
-                            network.onnx    "full"; network_fast.onnx "fast"; network_int8.onnx "int8"; each may be missing
+    models/bundles/square16/manifest.json      geometry, pattern, image grid, provenance, measured figures, hashes
+                            matrices.npz       see prereconstruction.Matrices
+                            network.onnx       "full"
+                            network_fast.onnx  "fast"
+                            network_int8.onnx  "int8"
 
-A bundle without a network is a working bundle: the services then show the one-step image.
+Networks may be missing. A bundle without any is a working bundle: the services then show the one-step image.
 """
 
 from __future__ import annotations
@@ -125,9 +127,11 @@ class Bundle:
 def write(
     path: Path, manifest: Mapping[str, Any], matrices: Matrices, networks: Mapping[str, bytes] | None = None
 ) -> Bundle:
-    """Writes a bundle folder and loads it back. networks: variant -> ONNX bytes. `files` and `schema` are filled in here.
+    """Writes a bundle folder and loads it back. networks: variant -> ONNX bytes. `files` and `schema` are filled in
+    here.
 
-    The manifest is replaced last and at once, so a reader sees the old bundle, an error, or the new one, never a mixture that passes.
+    The manifest is replaced last and at once, so a reader sees the old bundle, an error, or the new one, never a
+    mixture that passes.
     """
     path.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(

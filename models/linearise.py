@@ -1,4 +1,6 @@
-"""The linearised physics a bundle ships: B, A and the sensitivities of `prereconstruction.Matrices`, from a forward model."""
+"""The linearised physics a bundle ships: B, A and the sensitivities of `prereconstruction.Matrices`, from a
+forward model.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,9 @@ def linearise(
 ) -> Matrices:
     """Matrices of the untouched skin. The NOSER prior is a density, so the mesh's element sizes do not enter the image.
 
-    With j_k(r) the sensitivity of d_k to a drop at r, R weighs x(r)^2 by r(r) = (sum_k j_k(r)^2)^NOSER_POWER; the continuous R^-1 J^T is then
-    j_k(r) / r(r), and A its integral against j_l. r is scaled to mean 1, so lambda keeps one meaning over skins.
+    With j_k(r) the sensitivity of d_k to a drop at r, R weighs x(r)^2 by r(r) = (sum_k j_k(r)^2)^NOSER_POWER; the
+    continuous R^-1 J^T is then j_k(r) / r(r), and A its integral against j_l. r is scaled to mean 1, so lambda keeps
+    one meaning over skins.
     """
     solution = model.solve(1.0)
     signed = solution.impedances()
@@ -27,7 +30,8 @@ def linearise(
     density = -(solution.jacobian() / model.areas) / signed[:, None]  # of d = |Z|/|Z0| - 1 to a drop, per area
     prior = (density**2).sum(axis=0) ** NOSER_POWER
     prior /= (prior * model.areas).sum() / model.areas.sum()
-    # The singular points at electrode ends would make one element rule the image: nothing is asked to be stiffer than this.
+    # The singular points at electrode ends would make one element rule the image: nothing is asked to be stiffer than
+    # this.
     prior = np.minimum(prior, 100.0)
     elements = density / prior
     gram = (elements * model.areas) @ density.T

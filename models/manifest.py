@@ -47,14 +47,14 @@ def describe(name: str, skin: Skin, matrices: Matrices, **more: Any) -> dict[str
 def commit() -> str:
     """The checkout's commit, "-dirty" where models/ differs from it; "unknown" outside git."""
     try:
-        run = lambda *args: subprocess.run(
-            ["git", *args], cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout.strip()  # noqa: E731
-        return run("rev-parse", "--short=12", "HEAD") + (
-            "-dirty" if run("status", "--porcelain", "-uno", "--", "models") else ""
-        )
+        head = _git("rev-parse", "--short=12", "HEAD")
+        return head + ("-dirty" if _git("status", "--porcelain", "-uno", "--", "models/*.py") else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+
+
+def _git(*args: str) -> str:
+    return subprocess.run(["git", *args], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def versions() -> dict[str, str]:

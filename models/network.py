@@ -1,11 +1,13 @@
 """The shipped MM-CNN: a small U-Net with CBAM over the pre-reconstruction stack, told the noise it faces.
 
-Inputs are what `prereconstruction.Operator.stack` gives: the stack (N, C, 24, 24), divided by the frame's scale, and its context (N, n).
-Outputs: drop (N, 1, 96, 96) in units of that scale, log_sigma (N, 1, 96, 96) of the same, classes (N, 5, 24, 24) logits.
+Inputs are what `prereconstruction.Operator.stack` gives: the stack (N, C, 24, 24), divided by the frame's scale, and
+its context (N, n). Outputs: drop (N, 1, 96, 96) in units of that scale, log_sigma (N, 1, 96, 96) of the same, classes
+(N, 5, 24, 24) logits.
 
-What differs from the published network (published.py): pooling stops at a quarter of the pixels and the image comes out of one
-pixel shuffle, so that nearly all arithmetic is on 24 x 24 and fewer; the drop is amplitude times mask, because a touch is a patch of
-nearly one drop with a sharp edge; the context sets a gain and an offset of each block's channels (FiLM).
+What differs from the published network (published.py): pooling stops at a quarter of the pixels and the image comes
+out of one pixel shuffle, so that nearly all arithmetic is on 24 x 24 and fewer; the drop is amplitude times mask,
+because a touch is a patch of nearly one drop with a sharp edge; the context sets a gain and an offset of each block's
+channels (FiLM).
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 CONTEXT = 4
+TOLD = 32  # features of the context
 CLASSES = 5
 UPSCALE = 4
 
@@ -28,10 +31,8 @@ class Config:
 
     stack: int = 9
     grid: int = 24
-    channels: tuple[int, int, int] = (32, 64, 128)
-    blocks: tuple[int, int, int] = (1, 2, 1)
-    head: int = 32
-    kernel: int = 3
+    channels: tuple[int, int, int] = (24, 64, 96)
+    blocks: tuple[int, int, int] = (1, 3, 1)
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -42,7 +43,7 @@ class Config:
 
 
 FULL = Config()
-FAST = Config(channels=(16, 32, 64), blocks=(1, 1, 0), head=16)
+FAST = Config(channels=(12, 32, 64), blocks=(1, 2, 1))
 
 
 class CBAM(nn.Module):
@@ -62,33 +63,41 @@ class CBAM(nn.Module):
         return x * torch.sigmoid(self.place(where))
 
 
-class Block(nn.Module):
-    """Residual block: two 3x3 convolutions; context and place (learned per pixel) shift the features, CBAM weighs them."""
+class Told(nn.Module):
+    """x (1 + gain(context)) + offset(context) + place: what the noise and where on the skin do to features (FiLM)."""
 
-    def __init__(self, channels: int, side: int, context: int, attention: bool = False) -> None:
+    def __init__(self, channels: int, side: int) -> None:
         super().__init__()
-        self.first = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.norm1 = nn.BatchNorm2d(channels)
         self.place = nn.Parameter(torch.zeros(1, channels, side, side))
-        self.film = nn.Linear(context, 2 * channels)
+        self.film = nn.Linear(TOLD, 2 * channels)
         nn.init.zeros_(self.film.weight)
         nn.init.zeros_(self.film.bias)
-        self.second = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.norm2 = nn.BatchNorm2d(channels)
-        nn.init.constant_(self.norm2.weight, 0.3)
+
+    def forward(self, x: Tensor, told: Tensor) -> Tensor:
+        gain, offset = self.film(told)[:, :, None, None].chunk(2, 1)
+        return x * (1 + gain) + (offset + self.place)
+
+
+def _convolution(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, size, padding=size // 2, stride=stride, bias=False), nn.BatchNorm2d(outputs)
+    )
+
+
+class Stage(nn.Module):
+    """Residual 3x3 convolutions at one resolution; context and place come in at the first."""
+
+    def __init__(self, blocks: int, channels: int, side: int, attention: bool = False) -> None:
+        super().__init__()
+        self.told = Told(channels, side)
+        self.blocks = nn.ModuleList(_convolution(channels, channels) for _ in range(blocks))
         self.attention = CBAM(channels) if attention else nn.Identity()
 
-    def forward(self, x: Tensor, context: Tensor) -> Tensor:
-        gain, offset = self.film(context)[:, :, None, None].chunk(2, 1)
-        y = self.norm1(self.first(x)) * (1 + gain) + offset + self.place
-        y = self.norm2(self.second(F.silu(y)))
-        return F.silu(x + self.attention(y))
-
-
-def _join(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, padding=1, stride=stride, bias=False), nn.BatchNorm2d(outputs), nn.SiLU()
-    )
+    def forward(self, x: Tensor, told: Tensor) -> Tensor:
+        x = F.relu(self.told(x, told))
+        for block in self.blocks:
+            x = x + F.relu(block(x))
+        return self.attention(x)
 
 
 class MMCNN(nn.Module):
@@ -99,44 +108,40 @@ class MMCNN(nn.Module):
         self.config = config
         a, b, c = config.channels
         n = config.grid
-        axis = torch.linspace(-1 + 1 / n, 1 - 1 / n, n)
-        y, x = torch.meshgrid(axis, axis, indexing="ij")
-        self.register_buffer("coordinates", torch.stack([x, y, x * x, y * y])[None], persistent=False)
-        self.told = nn.Sequential(nn.Linear(CONTEXT, 32), nn.SiLU(), nn.Linear(32, 32), nn.SiLU())
-        self.stem = _join(config.stack + 4, a)
-        self.down1 = _join(a, b, 2)
-        self.blocks1 = nn.ModuleList(Block(b, n // 2, 32) for _ in range(config.blocks[0]))
-        self.down2 = _join(b, c, 2)
-        self.blocks2 = nn.ModuleList(Block(c, n // 4, 32, attention=True) for _ in range(config.blocks[1]))
-        self.up2 = nn.Conv2d(c, 4 * b, 1)
-        self.mix2 = _join(2 * b, b)
-        self.blocks3 = nn.ModuleList(Block(b, n // 2, 32, attention=True) for _ in range(config.blocks[2]))
-        self.up1 = nn.Conv2d(b, 4 * a, 1)
-        self.mix1 = _join(2 * a, config.head)
-        # per pixel of 24 x 24: 16 mask logits, 16 log sigmas, amplitude, 5 classes
-        self.out = nn.Conv2d(config.head, 2 * UPSCALE**2 + 1 + CLASSES, 3, padding=1)
+        self.context = nn.Sequential(nn.Linear(CONTEXT, TOLD), nn.ReLU(), nn.Linear(TOLD, TOLD), nn.ReLU())
+        self.stem, self.told = _convolution(config.stack, a), Told(a, n)
+        self.down1 = _convolution(a, b, stride=2)
+        self.stage1 = Stage(config.blocks[0], b, n // 2)
+        self.down2 = _convolution(b, c, stride=2)
+        self.stage2 = Stage(config.blocks[1], c, n // 4, attention=True)
+        self.up2 = _convolution(c, 4 * b, 1)
+        self.stage3 = Stage(config.blocks[2], b, n // 2)
+        self.up1 = _convolution(b, 4 * a, 1)
+        # per pixel of 24 x 24: 16 mask logits and the amplitude; 16 log sigmas. What shape it is shows in the wider
+        # features.
+        self.out = nn.Conv2d(a, UPSCALE**2 + 1, 3, padding=1)
+        self.aside = nn.Conv2d(a, UPSCALE**2, 1)
+        self.classes = nn.Conv2d(b, 4 * CLASSES, 1)
         with torch.no_grad():
-            self.out.weight *= 0.3
-            self.out.bias.zero_()
-            self.out.bias[: UPSCALE**2] = -2.0
+            for layer in (self.out, self.aside):
+                layer.weight *= 0.3
+                layer.bias.zero_()
+                layer.bias[: UPSCALE**2] = -2.0
 
     def parts(self, stack: Tensor, context: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """mask logits (N, 1, 96, 96), log amplitude (N, 1, 24, 24), log sigma relative to amplitude (N, 1, 96, 96), classes."""
-        told = self.told(context)
-        top = self.stem(torch.cat([stack, self.coordinates.expand(stack.shape[0], -1, -1, -1)], 1))
-        x = self.down1(top)
-        for block in self.blocks1:
-            x = block(x, told)
-        middle = x
-        x = self.down2(x)
-        for block in self.blocks2:
-            x = block(x, told)
-        x = self.mix2(torch.cat([F.pixel_shuffle(self.up2(x), 2), middle], 1))
-        for block in self.blocks3:
-            x = block(x, told)
-        x = self.mix1(torch.cat([F.pixel_shuffle(self.up1(x), 2), top], 1))
-        mask, sigma, amplitude, classes = self.out(x).split([UPSCALE**2, UPSCALE**2, 1, CLASSES], 1)
-        return F.pixel_shuffle(mask, UPSCALE), amplitude, F.pixel_shuffle(sigma, UPSCALE) - 2.0, classes
+        """mask logits (N, 1, 96, 96), log amplitude (N, 1, 24, 24), log sigma over amplitude (N, 1, 96, 96),
+        classes.
+        """
+        told = self.context(context)
+        top = F.relu(self.told(self.stem(stack), told))
+        middle = self.stage1(self.down1(top), told)
+        x = self.stage2(self.down2(middle), told)
+        x = self.stage3(F.pixel_shuffle(self.up2(x), 2) + middle, told)
+        classes = F.pixel_shuffle(self.classes(x), 2)
+        x = F.relu(F.pixel_shuffle(self.up1(x), 2) + top)
+        mask, amplitude = self.out(x).split([UPSCALE**2, 1], 1)
+        mask, sigma = F.pixel_shuffle(torch.cat([mask, self.aside(x)], 1), UPSCALE).chunk(2, 1)
+        return mask, amplitude, sigma, classes
 
     def forward(self, stack: Tensor, context: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         mask, amplitude, sigma, classes = self.parts(stack, context)

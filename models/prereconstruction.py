@@ -1,14 +1,15 @@
 """Pre-reconstruction: from a normalised difference to the stack of images the network reads (numpy only).
 
-Everything is in dual form. With J the sensitivity of the K measurements to the conductivity *drop* and R the NOSER prior of the
-untouched skin, a bundle ships B = R^-1 J^T at the network's resolution and the Gram matrix A = J R^-1 J^T; then for any noise
-covariance C and any lambda
+Everything is in dual form. With J the sensitivity of the K measurements to the conductivity *drop* and R the NOSER
+prior of the untouched skin, a bundle ships B = R^-1 J^T at the network's resolution and the Gram matrix A = J R^-1
+J^T; then for any noise covariance C and any lambda
 
     x = B (A + lambda^2 C)^-1 d
 
-is one K x K problem. That is equation 1 of the paper, (J^T W J + lambda^2 R)^-1 J^T W d with W = C^-1, by the push-through identity.
-A measurement of weight zero (dead electrode) is a row and column less. `PreReconstructor.condition` does the one eigen-decomposition
-that a new noise level, drift allowance or dead electrode needs; `Operator.stack` is then a single matrix-vector product a frame.
+is one K x K problem. That is equation 1 of the paper, (J^T W J + lambda^2 R)^-1 J^T W d with W = C^-1, by the push-
+through identity. A measurement of weight zero (dead electrode) is a row and column less. `PreReconstructor.condition`
+does the one eigen-decomposition that a new noise level, drift allowance or dead electrode needs; `Operator.stack` is
+then a single matrix-vector product a frame.
 """
 
 from __future__ import annotations
@@ -100,14 +101,16 @@ class Operator:
         return images.reshape(n, c, h, w), context.astype(np.float32), scale.astype(np.float32)
 
     def score(self, d: Array) -> float:
-        """Detection statistic of (K,) d: its whitened energy, each direction weighted by how much a touch could put there."""
+        """Detection statistic of (K,) d: its whitened energy, each direction weighted by how much a touch could
+        put there.
+        """
         return float(self.detection @ (self.whiten @ d) ** 2)
 
     def threshold(self, false_alarm: float = 1e-6, tare_frames: int = TARE_FRAMES) -> float:
         """The score that an untouched frame exceeds with probability `false_alarm`.
 
-        The weighted sum of squares is matched by a scaled chi-square (Satterthwaite); sigma estimated from `tare_frames`
-        frames makes each square an F(1, nu) variable, whose larger mean and variance are used.
+        The weighted sum of squares is matched by a scaled chi-square (Satterthwaite); sigma estimated from
+        `tare_frames` frames makes each square an F(1, nu) variable, whose larger mean and variance are used.
         """
         nu = max(tare_frames - 1, 5)
         mean1, var1 = nu / (nu - 2), 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
@@ -128,9 +131,11 @@ class Operator:
         return image.astype(np.float32)
 
     def residual(self, d: Array, image: Array) -> float:
-        """rms whitened difference between d and what the linearised model makes of a drop image (n, n) [S/m]; 1 = noise.
+        """rms whitened difference between d and what the linearised model makes of a drop image (n, n) [S/m]; 1 =
+        noise.
 
-        Linear: a drop of 0.5 S/m leaves a tenth to a third of the signal unexplained, so read it against strong touches with care.
+        Linear: a drop of 0.5 S/m leaves a tenth to a third of the signal unexplained, so read it against strong
+        touches with care.
         """
         h, w = self.shape
         coarse = image.reshape(h, image.shape[0] // h, w, image.shape[1] // w).mean(axis=(1, 3))
@@ -157,8 +162,8 @@ class PreReconstructor:
     def normaliser(self, z0: Array) -> Array:
         """(K,) ohm by which |Z| - |Z0| is divided to give d; z0 is the measured baseline |Z0|.
 
-        "model": the bundle's own z0 times the gain fitted to the baseline. Contact impedance adds to |Z| and |Z0| alike and so
-        cancels from their difference; dividing by the measured |Z0| would let it back in.
+        "model": the bundle's own z0 times the gain fitted to the baseline. Contact impedance adds to |Z| and |Z0|
+        alike and so cancels from their difference; dividing by the measured |Z0| would let it back in.
         """
         if self.m.normalisation == "measured":
             return np.abs(z0)
@@ -180,8 +185,9 @@ class PreReconstructor:
     ) -> Operator:
         """Operator for noise of standard deviation sigma (K,) in d on each frame.
 
-        drift: allowance since the last untouched frame. weights: (K,), 1 = as measured, 0 = leave out (dead electrode), between = trust
-        less. tare_frames: how many frames the baseline is the mean of (its own error adds to every difference).
+        drift: allowance since the last untouched frame. weights: (K,), 1 = as measured, 0 = leave out (dead
+        electrode), between = trust less. tare_frames: how many frames the baseline is the mean of (its own error adds
+        to every difference).
         """
         m, k = self.m, self.measurements
         weights = np.ones(k) if weights is None else np.asarray(weights, dtype=float)
@@ -201,8 +207,8 @@ class PreReconstructor:
         whiten = np.zeros((int(live.sum()), k))
         whiten[:, live] = vectors.T @ inverse
         back = m.back[:, live] @ inverse.T @ vectors  # (P, K')
-        # The ladder is relative to measurement noise of the same size in every channel, so that its images stay the same
-        # combinations of d whatever the level; drift and unequal noise change the metric, not the rungs.
+        # The ladder is relative to measurement noise of the same size in every channel, so that its images stay the
+        # same combinations of d whatever the level; drift and unequal noise change the metric, not the rungs.
         mean = float(np.trace(m.gram[np.ix_(live, live)]) / live.sum() / noise.mean())
         gains = [1.0 / (values + lam * mean) for lam in m.ladder]
         images = [(back * gain) for gain in gains]
@@ -226,10 +232,11 @@ class PreReconstructor:
 
 
 def noise_of_frames(frames: Array, z0: Array) -> Array:
-    """(K,) sigma of |Z| [unit of frames] from (N, K) untouched |Z|: per channel, shrunk towards noise proportional to |Z0|.
+    """(K,) sigma of |Z| [unit of frames] from (N, K) untouched |Z|: per channel, shrunk towards noise proportional to
+    |Z0|.
 
-    With N frames a channel's own estimate is uncertain by 1 / sqrt(2 N); the shrinkage gives the pooled relative level the weight of
-    32 frames, which keeps one channel's lucky tare from being trusted too much.
+    With N frames a channel's own estimate is uncertain by 1 / sqrt(2 N); the shrinkage gives the pooled relative
+    level the weight of 32 frames, which keeps one channel's lucky tare from being trusted too much.
     """
     own = frames.var(axis=0, ddof=1)
     pooled = np.median(own / z0**2) * z0**2

@@ -1,0 +1,166 @@
+"""Training batches: clean differences and pictures of the scenes in memory; symmetry, noise and pre-
+reconstruction as they are drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from models import data, geometry
+from models.augmentation import Condition, Symmetry, random_condition, symmetries
+from models.losses import IGNORE, Target
+from models.prereconstruction import Array, PreReconstructor
+from models.shapes import from_rows
+
+N = 96
+GRID = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """M scenes in memory. d (M, K) float32, drop (M, 96, 96) float16 [S/m], mask (M, 96, 96) uint8 (255 =
+    covered), classes (M, 24, 24) uint8.
+    """
+
+    d: npt.NDArray[np.float32]
+    drop: npt.NDArray[np.float16]
+    mask: npt.NDArray[np.uint8]
+    classes: npt.NDArray[np.uint8]
+    shapes: npt.NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.d)
+
+
+def load(folder: Path, split: str, pre: PreReconstructor, limit: int | None = None, skip: int = 0) -> Samples:
+    """Reads a split, but for its first `skip` chunks, and puts its differences in the bundle's normalisation."""
+    raw = data.load(folder, split, limit, skip)
+    z0 = raw.z0[raw.variant]
+    d = raw.difference.astype(np.float64)
+    if pre.m.normalisation == "model":
+        gain = np.median(z0 / pre.m.z0, axis=1, keepdims=True)
+        d = d * z0 / (gain * pre.m.z0)
+    drop, mask, classes = picture(raw.shapes)
+    return Samples(d.astype(np.float32), drop, mask, classes, raw.shapes)
+
+
+def picture(shapes: npt.NDArray) -> tuple[npt.NDArray, npt.NDArray, npt.NDArray]:
+    """Drop, mask and class pictures of (M, 3, 7) shape rows; see Samples."""
+    m = len(shapes)
+    drop = np.zeros((m, N, N), np.float16)
+    mask = np.zeros((m, N, N), np.uint8)
+    classes = np.full((m, GRID, GRID), IGNORE, np.uint8)
+    for k in range(m):
+        image, covered = np.zeros((N, N)), np.zeros((N, N))
+        for shape in from_rows(shapes[k].astype(float)):
+            part = shape.fraction(N, covered=True)
+            covered += part
+            image += shape.drop * (shape.fraction(N) if shape.kind == "hertz" else part)
+            coarse = part.reshape(GRID, N // GRID, GRID, N // GRID).mean(axis=(1, 3))
+            classes[k][coarse > 0.3] = shape.shape_class
+        drop[k], mask[k] = image, np.round(255 * covered.clip(0, 1))
+    return drop, mask, classes
+
+
+@dataclass
+class Batch:
+    stack: Tensor
+    context: Tensor
+    target: Target
+
+    def to(self, device: torch.device) -> Batch:
+        t = self.target
+        layout = torch.channels_last
+        return Batch(
+            self.stack.to(device, memory_format=layout),
+            self.context.to(device),
+            Target(t.drop.to(device), t.mask.to(device), t.classes.to(device)),
+        )
+
+
+class Batches:
+    """Endless random batches. Operators depend on the noise, so a bank of conditions is kept and one is renewed
+    at every batch.
+    """
+
+    def __init__(
+        self,
+        samples: Samples,
+        pre: PreReconstructor,
+        skin: geometry.Skin,
+        seed: int,
+        size: int = 64,
+        groups: int = 4,
+        bank: int = 96,
+    ) -> None:
+        self.samples, self.pre, self.size, self.groups, self.limit = samples, pre, size, groups, bank
+        self.rng = np.random.default_rng(seed)
+        self.symmetries = symmetries(skin)
+        self.bank: list[Condition] = [random_condition(pre, self.rng) for _ in range(groups)]
+
+    def add(self, more: Samples) -> None:
+        """Takes further scenes in."""
+        mine = vars(self.samples)
+        self.samples = Samples(**{k: np.concatenate([v, getattr(more, k)]) for k, v in mine.items()})
+
+    def draw(self) -> Batch:
+        fresh = random_condition(self.pre, self.rng)
+        if len(self.bank) < self.limit:
+            self.bank.append(fresh)
+        else:
+            self.bank[self.rng.integers(self.limit)] = fresh
+        chosen = self.rng.choice(len(self.bank), self.groups, replace=False)
+        parts = []
+        for c in chosen:
+            index = self.rng.integers(len(self.samples), size=self.size // self.groups)
+            turned = [self.symmetries[s] for s in self.rng.integers(len(self.symmetries), size=len(index))]
+            parts.append(make(self.samples, index, turned, self.bank[c], self.rng))
+        return join(parts)
+
+
+def make(
+    samples: Samples, index: npt.NDArray, turned: list[Symmetry] | None, condition: Condition, rng: np.random.Generator
+) -> Batch:
+    """The samples of `index` under one condition, each turned by its symmetry."""
+    s, same = samples, [None] * len(index)
+    d = np.stack([s.d[i] if t is None else s.d[i][t.measurements] for i, t in zip(index, turned or same, strict=True)])
+
+    def pictures(images: npt.NDArray) -> npt.NDArray:
+        return np.stack(
+            [images[i] if t is None else t.image(images[i]) for i, t in zip(index, turned or same, strict=True)]
+        )
+
+    stack, context, scale = condition.operator.stacks(condition.spoil(d, rng))
+    drop = pictures(s.drop).astype(np.float32)[:, None] / scale[:, None, None, None]
+    mask = pictures(s.mask).astype(np.float32)[:, None] / 255
+    target = Target(torch.from_numpy(drop), torch.from_numpy(mask), torch.from_numpy(pictures(s.classes)).long())
+    return Batch(torch.from_numpy(stack), torch.from_numpy(context), target)
+
+
+def join(parts: list[Batch]) -> Batch:
+    return Batch(
+        torch.cat([p.stack for p in parts]),
+        torch.cat([p.context for p in parts]),
+        Target(
+            torch.cat([p.target.drop for p in parts]),
+            torch.cat([p.target.mask for p in parts]),
+            torch.cat([p.target.classes for p in parts]),
+        ),
+    )
+
+
+def levels(samples: Samples, pre: PreReconstructor) -> Array:
+    """(C,) rms of each rung's images without noise, of the frame's scale: `Matrices.level`. Brings every rung to
+    unit size.
+    """
+    operator = pre.condition(np.full(pre.measurements, 1e-9))
+    c, (h, w) = len(operator.level), operator.shape
+    images = (samples.d @ operator.matrix.T).reshape(len(samples), c, h * w)
+    scale = images[:, operator.scale_index].max(axis=1)
+    return np.sqrt(((images / scale[:, None, None]) ** 2)[:, :, operator.inside.ravel()].mean(axis=(0, 2)))

@@ -1,0 +1,267 @@
+"""Training of the shipped network: budgeted by minutes, resumable, on a GPU where there is one.
+
+    python -m models.train --skin square16 --minutes 80            writes models/work/square16/full.pt and full.png
+    python -m models.train --skin square16 --minutes 80 --resume   goes on from the checkpoint
+
+The budget sets the schedule: the learning rate rises over the first percent and falls to zero at the last minute,
+whatever the machine's speed. What is kept is the running average of the weights; the best on held-out scenes is kept
+aside, and training stops early where the average has not become better for a quarter of the budget.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from models import data, geometry, samples
+from models.augmentation import condition
+from models.bundle import Bundle
+from models.data import WORK
+from models.losses import losses, total
+from models.network import FAST, FULL, MMCNN, Config, compose
+from models.optim import Muon
+from models.prereconstruction import Drift, PreReconstructor
+
+CONFIGS = {"full": FULL, "fast": FAST}
+MUON_RATE, ADAM_RATE = 0.02, 2e-3
+AVERAGE = 0.999
+LEVELS = {"noise-free": 130.0, "70 dB": 70.0}
+
+
+class Trainer:
+    """One network's training state: everything that a checkpoint holds."""
+
+    def __init__(self, config: Config, batches: samples.Batches, held_out: samples.Samples, seed: int = 0) -> None:
+        torch.manual_seed(seed)
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.model = MMCNN(config).to(self.device, memory_format=torch.channels_last)
+        self.average = copy.deepcopy(self.model)
+        self.config, self.batches, self.held_out = config, batches, held_out
+        hidden = [
+            p
+            for n, p in self.model.named_parameters()
+            if p.ndim == 4 and not n.startswith(("out.", "aside.", "classes.")) and not n.endswith("place")
+        ]
+        chosen = {id(p) for p in hidden}
+        rest = [p for p in self.model.parameters() if id(p) not in chosen]
+        self.optimizers = [
+            Muon(hidden, MUON_RATE),
+            torch.optim.AdamW(rest, ADAM_RATE, betas=(0.9, 0.98), weight_decay=0.01),
+        ]
+        self.rates = [MUON_RATE, ADAM_RATE]
+        self.elapsed, self.steps = 0.0, 0  # seconds, batches
+        self.curve: list[dict[str, Any]] = []
+        self.best: dict[str, Any] | None = None
+        self.best_score, self.best_at = -math.inf, 0.0
+
+    def step(self, done: float) -> dict[str, float]:
+        """One batch at fraction `done` of the budget."""
+        batch = self.batches.draw().to(self.device)
+        warm, factor = min(1.0, done / 0.01 + 0.01), 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
+        for optimizer, rate in zip(self.optimizers, self.rates, strict=True):
+            for group in optimizer.param_groups:
+                group["lr"] = rate * warm * factor
+        self.model.train()
+        with torch.autocast("cuda", torch.bfloat16, enabled=self.device.type == "cuda"):
+            parts = self.model.parts(batch.stack, batch.context)
+        terms = losses(tuple(p.float() for p in parts), batch.target)  # type: ignore[arg-type]
+        for optimizer in self.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        total(terms).backward()
+        nn.utils.clip_grad_norm_(self.model.parameters(), 5.0)
+        for optimizer in self.optimizers:
+            optimizer.step()
+        self.steps += 1
+        blend = min(AVERAGE, (1 + self.steps) / (10 + self.steps))
+        with torch.no_grad():
+            for mine, theirs in zip(self.average.state_dict().values(), self.model.state_dict().values(), strict=True):
+                mine.lerp_(theirs, 1 - blend) if mine.dtype.is_floating_point else mine.copy_(theirs)
+        return {name: float(value.detach()) for name, value in terms.items()}
+
+    def run(self, minutes: float, checkpoint: Path, quiet: bool = False, folder: Path | None = None) -> None:
+        """Trains until the budget (all runs together) is spent; a checkpoint every two minutes.
+
+        folder: where samples are still being made; what has appeared there is taken in at every check.
+        """
+        chunks = len(data.chunk_files(folder)) if folder else 0
+        budget, sums, count, saved = 60 * minutes, dict[str, float](), 0, self.elapsed
+        began = time.perf_counter() - self.elapsed
+        checks = max(budget / 30, 20.0)
+        next_check = self.elapsed + checks
+        while self.elapsed < budget:
+            terms = self.step(self.elapsed / budget)
+            sums = {k: sums.get(k, 0.0) + v for k, v in terms.items()}
+            count += 1
+            self.elapsed = time.perf_counter() - began
+            if self.elapsed >= next_check or self.elapsed >= budget:
+                next_check = self.elapsed + checks
+                row = {"minutes": self.elapsed / 60, "steps": self.steps, **{k: v / count for k, v in sums.items()}}
+                for level, decibel in LEVELS.items():
+                    row |= {
+                        f"{k}, {level}": v
+                        for k, v in evaluate(self.average, self.held_out, self.batches.pre, decibel).items()
+                    }
+                row["scenes"] = len(self.batches.samples)
+                self.curve.append(row)
+                if folder and (found := len(data.chunk_files(folder))) > chunks:
+                    self.batches.add(samples.load(folder, "train", self.batches.pre, skip=chunks))
+                    chunks = found
+                sums, count = {}, 0
+                if not quiet:
+                    print(json.dumps({k: round(v, 4) for k, v in row.items()}), flush=True)
+                score = sum(row[f"contact IoU, {level}"] for level in LEVELS)
+                if score > self.best_score:
+                    self.best_score, self.best_at = score, self.elapsed
+                    self.best = copy.deepcopy(self.average.state_dict())
+                elif self.elapsed - self.best_at > 0.25 * budget:
+                    print(f"no better on held-out scenes since minute {self.best_at / 60:.1f}: stopped")
+                    break
+            if self.elapsed - saved > 120:
+                saved = self.elapsed
+                self.save(checkpoint)
+        self.save(checkpoint)
+
+    def result(self) -> MMCNN:
+        """The averaged network that was best on held-out scenes, on the CPU, for inference."""
+        model = copy.deepcopy(self.average)
+        model.load_state_dict(self.best or self.average.state_dict())
+        return model.cpu().to(memory_format=torch.contiguous_format).eval()
+
+    def save(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        state = {
+            "config": self.config.to_dict(),
+            "model": self.model.state_dict(),
+            "average": self.average.state_dict(),
+            "best": self.best,
+            "optimizers": [o.state_dict() for o in self.optimizers],
+            "numbers": {k: getattr(self, k) for k in ("elapsed", "steps", "curve", "best_score", "best_at")},
+        }
+        part = path.with_suffix(".part")
+        torch.save(state, part)
+        part.replace(path)
+
+    def resume(self, path: Path) -> None:
+        state = torch.load(path, map_location=self.device, weights_only=True)
+        self.model.load_state_dict(state["model"])
+        self.average.load_state_dict(state["average"])
+        self.best = state["best"]
+        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(saved)
+        for name, value in state["numbers"].items():
+            setattr(self, name, value)
+
+
+@torch.no_grad()
+def evaluate(
+    model: MMCNN, held_out: samples.Samples, pre: PreReconstructor, decibel: float, limit: int = 256
+) -> dict[str, float]:
+    """Figures on the first single touches of at most `limit` held-out scenes, no drift; a touch is what exceeds
+    half its peak.
+    """
+    single = np.flatnonzero(np.isnan(held_out.shapes[:, 1, 0]) | (held_out.shapes[:, 1, 0] == 0))[:limit]
+    rng = np.random.default_rng(0)
+    sigma = np.full(pre.measurements, 10 ** (-decibel / 20))
+    batch = samples.make(held_out, single, None, condition(pre, rng, sigma, Drift()), rng)
+    device = next(model.parameters()).device
+    model.eval()
+    rows = []
+    for k in range(0, len(single), 64):
+        part = slice(k, k + 64)
+        logits, amplitude, log_sigma, classes = model.parts(
+            batch.stack[part].to(device), batch.context[part].to(device)
+        )
+        drop, log_sigma = compose(logits, amplitude, log_sigma)
+        rows.append(
+            _figures(
+                drop.cpu(), classes.cpu(), batch.target.drop[part], batch.target.mask[part], batch.target.classes[part]
+            )
+        )
+    return {k: float(torch.cat([r[k] for r in rows]).nanmean()) for k in rows[0]}
+
+
+def _figures(drop: Tensor, classes: Tensor, truth: Tensor, mask: Tensor, kinds: Tensor) -> dict[str, Tensor]:
+    axes = (1, 2, 3)
+    peak, true_peak = drop.amax(axes), truth.amax(axes)
+    seen, real = drop > 0.5 * peak[:, None, None, None], mask > 0.5
+    contact = (seen & real).sum(axes) / (seen | real).sum(axes)
+    background = (~seen & ~real).sum(axes) / (~seen | ~real).sum(axes)
+    axis = torch.linspace(-1, 1, 97)[:-1] + 1 / 96
+    where = [
+        torch.stack([(m * a).sum(axes) / m.sum(axes) for a in (axis, axis[:, None])], 1)
+        for m in (seen.float(), real.float())
+    ]
+    known = kinds < 5
+    right = ((classes.argmax(1) == kinds) & known).sum((1, 2)) / known.sum((1, 2))
+    return {
+        "mean IoU": (contact + background) / 2,
+        "contact IoU": contact,
+        "position % of side": 50 * (where[0] - where[1]).norm(dim=1),
+        "peak error": (peak / true_peak - 1).abs(),
+        "integral error": (drop.sum(axes) / truth.sum(axes) - 1).abs(),
+        "class pixels": right,
+    }
+
+
+def plot(curve: list[dict[str, Any]], path: Path) -> None:
+    """Loss and held-out figures against minutes, as PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4))
+    minutes = [row["minutes"] for row in curve]
+    for name in ("image", "mask", "jaccard", "amplitude", "integral", "class"):
+        axes[0].semilogy(minutes, [row[name] for row in curve], label=name)
+    for level in LEVELS:
+        for name in ("mean IoU", "contact IoU"):
+            axes[1].plot(minutes, [row[f"{name}, {level}"] for row in curve], label=f"{name}, {level}")
+    for axis, title in zip(axes, ("training loss, by term", "held-out single touches"), strict=True):
+        axis.set_xlabel("minutes")
+        axis.set_title(title)
+        axis.legend(fontsize=7)
+        axis.grid(alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m models.train", description="Train a skin's network.")
+    parser.add_argument("--skin", default="square16")
+    parser.add_argument("--variant", choices=sorted(CONFIGS), default="full")
+    parser.add_argument("--data", type=Path, help="folder of samples (default models/work/SKIN)")
+    parser.add_argument("--out", type=Path, help="checkpoint (default models/work/SKIN/VARIANT.pt)")
+    parser.add_argument("--minutes", type=float, default=80.0)
+    parser.add_argument("--limit", type=int, help="use at most so many samples")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--resume", action="store_true")
+    args = parser.parse_args(argv)
+    torch.set_num_threads(args.threads)
+    skin = geometry.load(args.skin)
+    folder = args.data or WORK / skin.name
+    checkpoint = args.out or WORK / skin.name / f"{args.variant}.pt"
+    pre = Bundle.load(skin.name).prereconstructor()
+    train, held_out = (samples.load(folder, split, pre, args.limit) for split in ("train", "valid"))
+    trainer = Trainer(CONFIGS[args.variant], samples.Batches(train, pre, skin, args.seed), held_out, args.seed)
+    if args.resume:
+        trainer.resume(checkpoint)
+    size = sum(p.numel() for p in trainer.model.parameters()) / 1e6
+    print(f"{len(train)} scenes, {size:.2f} M parameters, {trainer.device}", flush=True)
+    trainer.run(args.minutes, checkpoint, folder=None if args.limit else folder)
+    plot(trainer.curve, checkpoint.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""The dual form against the paper's equation 1 written out, the detection statistic against counted false alarms."""
+
+import numpy as np
+import pytest
+
+from models.prereconstruction import Drift, Matrices, PreReconstructor, noise_of_frames
+
+K, SIDE, E = 20, 6, 4
+RNG = np.random.default_rng(0)
+J = RNG.standard_normal((K, SIDE**2)) * np.exp(-np.linspace(0, 3, SIDE**2))
+R = np.diag((J**2).sum(axis=0) ** 0.5)
+LADDER = np.array([1e-1, 1e-3])
+
+
+def matrices(**changes: object) -> Matrices:
+    back = np.linalg.solve(R, J.T)
+    values = dict(
+        pattern=np.array([(k % E, (k + 1) % E, k % E, (k + 1) % E) for k in range(K)]),
+        z0=np.linspace(1, 3, K),
+        gram=J @ back,
+        back=back,
+        jacobian=J,
+        contact=RNG.standard_normal((K, E)),
+        inside=np.ones((SIDE, SIDE), bool),
+        ladder=LADDER,
+        level=np.ones(2),
+        scale_index=0,
+        normalisation="model",
+        model_error=0.0,
+    )
+    return Matrices(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def images(operator, d):
+    """The operator's images in S/m."""
+    return (operator.matrix @ d).reshape(len(LADDER), SIDE, SIDE)
+
+
+@pytest.mark.parametrize("unequal", [False, True])
+def test_dual_form_is_equation_one(unequal):
+    sigma = np.full(K, 1e-3) if not unequal else RNG.uniform(0.5e-3, 2e-3, K)
+    operator = PreReconstructor(matrices()).condition(sigma, tare_frames=10**9)
+    d = J @ RNG.uniform(0, 0.3, SIDE**2)
+    weight = np.diag(1 / sigma**2)
+    mean = np.trace(J @ np.linalg.solve(R, J.T)) / K / (sigma**2).mean()
+    for k, lam in enumerate(LADDER):
+        expected = np.linalg.solve(J.T @ weight @ J + lam * mean * R, J.T @ weight @ d).reshape(SIDE, SIDE)
+        assert images(operator, d)[k] == pytest.approx(expected, rel=1e-3, abs=1e-4 * np.abs(expected).max())
+
+
+def test_variance_is_that_of_the_images_of_noise():
+    sigma = RNG.uniform(0.5e-3, 2e-3, K)
+    operator = PreReconstructor(matrices()).condition(sigma, tare_frames=10**9)
+    noise = sigma * RNG.standard_normal((20000, K))
+    counted = (noise @ operator.matrix.T.astype(float)).var(axis=0)
+    assert counted == pytest.approx(operator.variance, rel=0.06)
+
+
+def test_a_dead_electrode_has_no_say():
+    weights = np.ones(K)
+    weights[::4] = 0
+    operator = PreReconstructor(matrices()).condition(np.full(K, 1e-3), weights=weights)
+    d = J @ RNG.uniform(0, 0.3, SIDE**2)
+    wild = np.where(weights > 0, d, 1e3)
+    assert np.array_equal(operator.stack(wild)[0], operator.stack(d)[0])
+    assert operator.score(wild) == operator.score(d)
+    with pytest.raises(ValueError, match="0 of 20 measurements are live"):
+        PreReconstructor(matrices()).condition(np.full(K, 1e-3), weights=np.zeros(K))
+
+
+def test_drift_allowance_silences_drift_and_not_touches():
+    m = matrices()
+    pre, sigma = PreReconstructor(m), np.full(K, 1e-4)
+    drifted = 0.05 * m.contact @ np.array([1.0, -1.0, 0.5, 0.2])
+    without, allowed = pre.condition(sigma), pre.condition(sigma, drift=Drift(contact=0.05))
+    assert without.score(drifted) > without.threshold()
+    assert allowed.score(drifted) < allowed.threshold()
+    assert allowed.score(J @ np.full(SIDE**2, 0.05)) > allowed.threshold()
+
+
+@pytest.mark.parametrize("estimated", [False, True])
+def test_threshold_keeps_its_false_alarm_rate(estimated):
+    """Also where sigma is only estimated, from 64 frames a channel."""
+    pre, true = PreReconstructor(matrices(model_error=0.0)), np.full(K, 1e-3)
+    alarms = trials = 0
+    for _ in range(40):
+        frames = true * RNG.standard_normal((64, K))
+        sigma = frames.std(axis=0, ddof=1) if estimated else true
+        operator = pre.condition(sigma, tare_frames=64 if estimated else 10**9)
+        noise = true * RNG.standard_normal((2000, K)) - (frames.mean(axis=0) if estimated else 0)
+        scores = operator.detection @ (operator.whiten @ noise.T) ** 2
+        alarms += int((scores > operator.threshold(0.01, 64 if estimated else 10**6)).sum())
+        trials += 2000
+    assert 0.004 < alarms / trials < 0.02
+
+
+def test_contact_impedance_leaves_the_model_normalised_difference():
+    """Contact impedance in series adds the same to |Z| and |Z0|: d must not see it, and a gain of the converter must cancel."""
+    pre = PreReconstructor(matrices())
+    z0, change = pre.m.z0, 0.02 * RNG.standard_normal(K)
+    series = 0.1 * RNG.standard_normal(K)
+    series -= np.median((z0 + series) / z0 - 1) * z0
+    d = pre.difference(1.7 * (z0 + series + change), 1.7 * (z0 + series))
+    assert d == pytest.approx(change / z0, rel=0.02, abs=1e-9)
+    measured = PreReconstructor(matrices(normalisation="measured"))
+    assert measured.difference(2 * z0, z0) == pytest.approx(np.ones(K))
+
+
+def test_one_step_is_masked_and_thresholded():
+    operator = PreReconstructor(matrices()).condition(np.full(K, 1e-3))
+    d = J @ np.where(np.arange(SIDE**2) == 14, 0.5, 0.0)
+    raw, shown = operator.one_step(d, 12, threshold=None), operator.one_step(d, 12, threshold=0.5)
+    assert raw.min() < 0
+    assert shown.min() == 0 and np.array_equal(shown > 0, raw > 0.5 * raw.max())
+    assert np.array_equal(shown[shown > 0], raw[shown > 0])
+
+
+def test_scale_makes_the_stack_independent_of_the_drop():
+    """Noise aside, twice the difference is the same stack at twice the scale."""
+    operator = PreReconstructor(matrices()).condition(np.full(K, 1e-9))
+    d = J @ RNG.uniform(0, 0.3, SIDE**2)
+    one, two = operator.stack(d), operator.stack(2 * d)
+    assert two[0] == pytest.approx(one[0], abs=1e-4)
+    assert two[2] == pytest.approx(2 * one[2], rel=1e-4)
+
+
+def test_noise_of_frames_is_steadier_than_a_channels_own_estimate():
+    z0 = np.linspace(1, 3, K)
+    errors = []
+    for _ in range(50):
+        frames = z0 + 1e-3 * z0 * RNG.standard_normal((64, K))
+        errors.append((noise_of_frames(frames, z0) / (1e-3 * z0) - 1, frames.std(axis=0, ddof=1) / (1e-3 * z0) - 1))
+    shrunk, own = np.sqrt((np.array(errors) ** 2).mean(axis=(0, 2)))
+    assert shrunk < 0.75 * own
