@@ -20,6 +20,7 @@ from . import scene as scenes
 from .control import Control
 from .port import Port, open_port
 from .rig import Rig
+from .status import Status
 from .truth import truth_frame
 
 log = logging.getLogger("stub")
@@ -93,6 +94,7 @@ def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, s
     """Until a signal, or the parent's end: hand bytes to and fro, publish what was true."""
     name, gone = "", False
     checked = 0.0
+    status = Status(skin)
     while not stop.asked:
         now = (time.monotonic_ns() - begin_ns) * 1e-9
         if data := port.read():
@@ -112,6 +114,9 @@ def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, s
         while rig.scans:
             scan, world, middle = rig.scans.popleft()
             publisher.send(truth_frame(skin, rig.sheet, scan, world, begin_ns + round(middle * 1e9)))
+            status.scanned()
+        if (due := status.due(rig, port, now)) is not None:
+            publisher.send(due)
         if now - checked > PARENT_CHECK_S:
             checked = now
             publisher.poll()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from protocol.ad5940 import DATA_MAX, decode_fifo, dft_pair, encode_fifo, impedance
 from protocol.frame_types import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA
 
-from .faults import Faults
+from .faults import MUXES, Faults
 
 CURRENT_A = 1e-5
 FULL_SCALE_V = 0.9  # amplitude the converter takes at PGA 1
@@ -23,10 +23,11 @@ INPUT_GAIN = 8000.0
 PGA = np.array([9.0, 4.0, 2.0, 1.5, 1.0])
 HEADROOM = 0.8
 PHASE = np.exp(-0.03j)  # the foam is slightly capacitive
+EXCITATION = np.exp(0.7j)  # phase of the current to the DFT's own reference
 OPEN_CURRENT = 0.02  # of the nominal current: below, the electrode counts as open
 LEAKAGE = 2e-5  # of the nominal current, through an open switch
+FLOATING_OHM = 0.05  # voltage at an input that nothing drives, over the nominal current
 OVERRANGE = 1e6  # ohm: what the firmware reports at most
-MUXES = ("drive+", "drive-", "sense+", "sense-")
 
 Complex = NDArray[np.complex128]
 
@@ -81,16 +82,16 @@ class Analog:
         now: float,
     ) -> tuple[NDArray[np.complex64], NDArray[np.uint8]]:
         """Z (K,) ohm and status (K,) of one scan, while the sheet goes from one transfer matrix to the other."""
-        rows, is_open = self._routed(scan_list, len(transfer[0]), now)
+        rows, driven, sensed = self._routed(scan_list, len(transfer[0]), now)
         z = self._sheet(transfer, rows, now)
-        voltage, current = z * PHASE * CURRENT_A, np.full(len(z), CURRENT_A, complex)
+        current = np.full(len(z), CURRENT_A * EXCITATION)
+        voltage = z * PHASE * current
         sigma = self.noise.sigma(z, points) * CURRENT_A
         voltage = voltage + sigma * self._normal(len(z))
-        brown_out = self.faults.active("brown_out", now) is not None
-        dead = is_open | brown_out
-        floating = 0.05 * CURRENT_A * self._normal(len(z))
-        current = np.where(dead, LEAKAGE * CURRENT_A * self._normal(len(z)), current)
-        voltage = np.where(dead, floating, voltage)
+        if self.faults.active("brown_out", now) is not None:
+            driven, sensed = np.zeros_like(driven), np.zeros_like(sensed)
+        current = np.where(driven, current, LEAKAGE * CURRENT_A * self._normal(len(z)))
+        voltage = np.where(driven & sensed, voltage, FLOATING_OHM * CURRENT_A * self._normal(len(z)))
         registers, status = self._converted(voltage, current, rtia, now)
         registers, status = self._fifo(registers, status, now)
         return self._quotient(registers, status, rtia, now)
@@ -99,24 +100,24 @@ class Analog:
 
     def _routed(
         self, scan_list: NDArray[np.int64], electrodes: int, now: float
-    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Which wires each measurement really reaches, and which of them reach nothing."""
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Electrodes that each measurement really reaches, whether current flows, and whether the voltage is real."""
         rows = scan_list.copy()
-        is_open = np.zeros(len(rows), bool)
-        if (stuck := self.faults.active("mux_stuck", now)) is not None and stuck["mux"] in MUXES:
+        reached = np.ones(rows.shape, bool)
+        if (stuck := self.faults.active("mux_stuck", now)) is not None:
             k, bit = MUXES.index(stuck["mux"]), 1 << (stuck["bit"] & 3)
             rows[:, k] = (rows[:, k] | bit) if stuck["value"] else (rows[:, k] & ~bit)
-        if self.faults.active("mux_disabled", now) is not None:
-            is_open[:] = True
+        if (disabled := self.faults.active("mux_disabled", now)) is not None:
+            reached[:, MUXES.index(disabled["mux"])] = False
         if (swap := self.faults.active("electrodes_swapped", now)) is not None:
             a, b = (e % electrodes for e in swap["electrodes"])
             wires = np.arange(max(electrodes, 16))
             wires[[a, b]] = wires[[b, a]]
             rows = wires[rows]
         if (broken := self.faults.active("electrode_open", now)) is not None:
-            is_open |= (rows == broken["electrode"]).any(1)
-        beyond = (rows >= electrodes).any(1)
-        return np.minimum(rows, electrodes - 1), is_open | beyond
+            reached &= rows != broken["electrode"]
+        reached &= rows < electrodes  # a stuck address bit may lead to where nothing is connected
+        return np.minimum(rows, electrodes - 1), reached[:, :2].all(1), reached[:, 2:].all(1)
 
     def _sheet(
         self, transfer: tuple[NDArray[np.float64], NDArray[np.float64]], rows: NDArray[np.int64], now: float

@@ -7,10 +7,13 @@ code that a fault disturbs asks `Faults.active(name)` at that point and nowhere 
 from __future__ import annotations
 
 import math
+import re
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
+
+MUXES = ("drive+", "drive-", "sense+", "sense-")
 
 
 @dataclass(frozen=True)
@@ -132,13 +135,22 @@ class Faults:
 
 def _like(default: Any, value: Any, what: str) -> Any:
     """The value in the type of the default. Raises ValueError."""
+    if default in MUXES and value not in MUXES:
+        raise ValueError(f"{what} = {value!r}: expected one of {', '.join(MUXES)}")
+    if isinstance(default, list):
+        if not isinstance(value, list) or len(value) != len(default):
+            raise ValueError(f"{what} = {value!r}: expected a list like {default}")
+        return [_like(d, v, what) for d, v in zip(default, value, strict=True)]
+    if isinstance(default, str):
+        if not re.fullmatch(r"[A-Za-z0-9_+.\-]{0,32}", str(value)):
+            raise ValueError(f"{what} = {value!r}: expected a short name")
+        return str(value)
     try:
-        if isinstance(default, list):
-            if not isinstance(value, list) or len(value) != len(default):
-                raise ValueError
-            return [int(v) for v in value]
-        if isinstance(default, bool) and not isinstance(value, bool):
+        if isinstance(default, bool) != isinstance(value, bool):
             raise ValueError
-        return type(default)(int(value, 0) if isinstance(default, int) and isinstance(value, str) else value)
-    except (TypeError, ValueError):
+        number = type(default)(int(value, 0) if isinstance(default, int) and isinstance(value, str) else value)
+        if not math.isfinite(number):
+            raise ValueError
+        return number
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{what} = {value!r}: expected something like {default!r}") from None

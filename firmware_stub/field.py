@@ -167,7 +167,7 @@ def _nodes(segment: Segment) -> list[World]:
     if segment.first == segment.last:
         return [segment.first.rounded()]
     m = steps_between(segment.first, segment.last)
-    m = max(1, min(m, int((segment.end - segment.start) * MOST_SOLVES_HZ)))
+    m = min(m, max(2, int((segment.end - segment.start) * MOST_SOLVES_HZ)))
     return [blend(segment.first, segment.last, k / m).rounded() for k in range(m + 1)]
 
 

@@ -75,8 +75,10 @@ class Line:
 class Port(Protocol):
     """One end of the line: raw bytes, never blocking, silent about a peer that is not there."""
 
-    url: str
+    overrun: int
 
+    @property
+    def url(self) -> str: ...
     def filenos(self) -> list[int]: ...
     def read(self) -> bytes: ...
     def write(self, data: bytes) -> None: ...
@@ -90,12 +92,17 @@ class PtyPort:
 
     def __init__(self, folder: Path, name: str = "board") -> None:
         self.folder, self.name = folder, name
-        self.url = ""
+        self._url = ""
         self.overrun = 0
         self._master = self._slave = -1
         self._link: Path | None = None
         self._full_since = time.monotonic()
         self.plug()
+
+    @property
+    def url(self) -> str:
+        """The pty's device path: another one after each unplug."""
+        return self._url
 
     def plug(self, name: str = "") -> None:
         self._master, self._slave = os.openpty()
@@ -104,14 +111,8 @@ class PtyPort:
         attributes[4] = attributes[5] = termios.B921600
         termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
         os.set_blocking(self._master, False)
-        self.url = os.ttyname(self._slave)
-        link = self.folder / (name or self.name)
-        fresh = link.with_name(f".{link.name}.{os.getpid()}")
-        with contextlib.suppress(FileNotFoundError):
-            fresh.unlink()
-        fresh.symlink_to(self.url)
-        fresh.replace(link)
-        self._link = link
+        self._url = os.ttyname(self._slave)
+        self._link = _publish(self.folder / (name or self.name), self._url)
 
     def unplug(self) -> None:
         self._forget()
@@ -162,10 +163,14 @@ class PtyPort:
 
 
 class TcpPort:
-    """A TCP server for pyserial's `socket://host:port`; the newest client has the board."""
+    """A TCP server for pyserial's `socket://host:port`; the newest client has the board.
 
-    def __init__(self, url: str) -> None:
+    <folder>/<name> becomes a link whose target is the URL, so that a reader finds it where it would find a pty.
+    """
+
+    def __init__(self, url: str, folder: Path, name: str = "board") -> None:
         self._host, self._port = _address(url)
+        self._link = folder / name
         self.overrun = 0
         self._server: socket.socket | None = None
         self._client: socket.socket | None = None
@@ -188,6 +193,7 @@ class TcpPort:
         server.setblocking(False)
         self._port = server.getsockname()[1]
         self._server = server
+        _publish(self._link, self.url)
 
     def unplug(self) -> None:
         for end in (self._client, self._server):
@@ -240,7 +246,17 @@ class TcpPort:
 
 def open_port(listen: str | None, folder: Path, name: str = "board") -> Port:
     """A pty in `folder`, or a TCP server at `listen`. Raises ValueError for another kind of URL, OSError if taken."""
-    return TcpPort(listen) if listen else PtyPort(folder, name)
+    return TcpPort(listen, folder, name) if listen else PtyPort(folder, name)
+
+
+def _publish(link: Path, target: str) -> Path:
+    """Make `link` point at `target`, in one step for whoever looks at it."""
+    fresh = link.with_name(f".{link.name}.{os.getpid()}")
+    with contextlib.suppress(FileNotFoundError):
+        fresh.unlink()
+    fresh.symlink_to(target)
+    fresh.replace(link)
+    return link
 
 
 def _address(url: str) -> tuple[str, int]:

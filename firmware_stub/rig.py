@@ -77,7 +77,7 @@ class Rig:
     def feed(self, data: bytes, now: float) -> None:
         """Bytes from the host."""
         if self._unplugged is None:
-            self.board.feed(data, now)
+            self.board.feed(self._noisy(data, now), now)
 
     def pull(self, now: float) -> bytes:
         """Bytes that reached the host since the last call."""
@@ -152,6 +152,12 @@ class Rig:
 
     def fault(self, name: str, args: Mapping[str, Any], now: float, seconds: float = 5.0) -> dict[str, Any]:
         """Let something go wrong, see FAULTS. Raises ValueError."""
+        for key in ("electrode", "electrodes"):
+            for electrode in np.atleast_1d(args.get(key, 0)):
+                if electrode not in range(self.sheet.electrodes):
+                    raise ValueError(
+                        f"fault {name}: electrode {electrode!r}, expected 0 to {self.sheet.electrodes - 1}"
+                    )
         return {"fault": name, "args": self.faults.inject(name, args, now, seconds), "what": FAULTS[name].what}
 
     def status(self, now: float) -> dict[str, Any]:

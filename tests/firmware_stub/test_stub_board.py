@@ -1,0 +1,178 @@
+"""The board over its link, in simulated time: commands, timing, noise, the physics of what it measures."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.patterns import pattern
+from protocol import link
+
+PAIRS = pattern("pairs").astype("u1")
+REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data"), "eidors_reference.npz")
+
+
+def test_hello_is_answered_with_who_it_is(host):
+    ident = host().ask(link.Hello(schema_hash=link.SCHEMA_HASH))
+    assert isinstance(ident, link.Ident)
+    assert (ident.schema_hash, ident.chip_id, ident.electrodes) == (link.SCHEMA_HASH, link.CHIP_ID, 16)
+    assert "stub" in ident.firmware
+
+
+def test_commands_out_of_order_are_refused_with_the_reason(host):
+    board = host()
+    assert board.ask(link.Start(7)).reason == link.NakReason.NOT_CONFIGURED
+    assert board.ask(link.Config(1, 100, 80e3, PAIRS)).reason == link.NakReason.BAD_CONFIG
+    assert board.ask(link.Config(1, 128, 80e3, np.array([[0, 16, 0, 1]]))).reason == link.NakReason.BAD_CONFIG
+    assert board.ask(link.Config(1, 128, 80e3, np.array([[3, 3, 0, 1]]))).reason == link.NakReason.BAD_CONFIG
+    board.start()
+    assert board.ask(link.SelfTest()).reason == link.NakReason.BUSY
+    assert board.ask(link.Stop()).of == link.Stop.number
+    board.wait(0.1)
+    assert board.frames(0.5) == []
+    assert board.ask(link.SelfTest()).value == 0
+
+
+@pytest.mark.parametrize(("points", "rate"), [(128, 22.9), (256, 12.2), (512, 6.3)])
+def test_the_scan_rate_is_that_of_the_dft(host, points, rate):
+    board = host()
+    board.start(points=points)
+    frames = board.frames(4.0)
+    assert len(frames) / 4.0 == pytest.approx(rate, rel=0.05)
+    assert frames[0].duration_us == pytest.approx(120 * 2 * ((20 * points + 25) / 16 + 20), abs=1)
+    steps = np.diff([frame.device_us for frame in frames])
+    assert np.abs(steps - frames[0].duration_us).max() < 3
+
+
+def test_a_short_list_scans_proportionally_faster_and_numbers_go_on(host):
+    board = host()
+    board.start()
+    last = board.frames(0.5)[-1]
+    board.send(link.Config(2, 128, 80e3, PAIRS[:12]))
+    board.send(link.Start(2))
+    frames = board.frames(0.5)
+    short = [f for f in frames if f.config == 2]
+    assert len(short) > 80
+    assert short[0].duration_us * 10 == pytest.approx(last.duration_us, rel=1e-3)
+    assert [f.seq for f in frames] == list(range(last.seq + 1, last.seq + 1 + len(frames)))
+
+
+def test_the_device_clock_is_off_by_its_crystal(host):
+    board = host(crystal_ppm=200.0)
+    board.start(PAIRS[:30])
+    frames = board.frames(20.0)
+    true_us = 30 * 2 * ((20 * 128 + 25) / 16 + 20) * (frames[-1].seq - frames[0].seq)
+    measured = (frames[-1].device_us - frames[0].device_us) / true_us - 1
+    assert measured * 1e6 == pytest.approx(200, abs=1)
+
+
+def test_noise_is_what_was_asked_for_and_falls_with_the_points(host):
+    scatter = {}
+    for points in (128, 512):
+        board = host(snr_db=70.0)
+        board.start(PAIRS[:20], points)
+        z = board.z(3.0)
+        scatter[points] = (z.std(0) / z.mean(0)).mean()
+    assert scatter[128] == pytest.approx(10 ** (-70 / 20), rel=0.05)
+    assert scatter[128] / scatter[512] == pytest.approx(2.0, rel=0.1)
+
+
+def test_the_link_is_paced(host):
+    """A full frame of 1.05 kB takes 11 ms at 921 600 baud."""
+    board = host()
+    board.start()
+    first = 0.0
+    begin = board.now
+    while not board.decoder.counts["good"] > 3:  # boot event and two answers came before
+        board.wait(0.0005, 0.0005)
+        first = board.now - begin
+    assert 0.0436 + 0.0105 < first + 0.05 < 0.0436 + 0.0135 + 0.05
+
+
+def test_forced_rates_beyond_the_link_lose_scans_that_are_counted(host):
+    board = host(rate_hz=200.0)
+    board.start()
+    frames = board.frames(3.0)
+    assert 80 < len(frames) / 3.0 < 90
+    assert board.decoder.bad == 0
+    assert board.rig.line.dropped > 200
+    assert frames[-1].seq - frames[0].seq > 400
+
+
+@pytest.mark.skipif(not REFERENCE.exists(), reason=f"no {REFERENCE}: set EITSKIN_REFERENCE")
+@pytest.mark.parametrize("name", ["pairs", "adjacent"])
+def test_an_untouched_skin_measures_as_eidors_says(host, name):
+    reference = np.load(REFERENCE)
+    board = host(snr_db=110.0)
+    board.start(pattern(name).astype("u1"))
+    z = board.z(0.5).mean(0)
+    assert np.abs(z / np.abs(reference[f"impedance_{name}"][0]) - 1).max() < 0.01
+
+
+def test_a_press_is_in_the_next_scan_and_gone_after_its_seconds(host):
+    board = host(snr_db=100.0)
+    board.start()
+    before = board.z(0.3).mean(0)
+    at = board.now
+    board.rig.press({"x": 0.02, "y": -0.01, "force": 3.0, "seconds": 1.0}, at)
+    frames = board.frames(0.2)
+    truth = {scan.seq: (scan.start, len(world.touches)) for scan, world, _ in board.rig.scans}
+    for frame in frames:
+        start, touches = truth[frame.seq]
+        change = np.abs(frame.z) / before - 1
+        assert touches == (start >= at)
+        assert (change.max() > 3e-3) == (start >= at)
+    assert truth[frames[-1].seq][1] == 1
+    board.wait(1.0)
+    assert np.abs(board.z(0.2)[-1] / before - 1).max() < 1e-4
+    assert len(board.rig.scans[-1][1].touches) == 0
+
+
+def test_a_mirrored_press_gives_the_mirrored_measurements(host):
+    """The square is its own mirror image: electrode k of the bottom, right, top, left becomes 3 - k (mod 16)."""
+    mirror = (3 - np.arange(16)) % 16
+    row = {tuple(sorted(pair)): k for k, pair in enumerate(PAIRS[:, :2].tolist())}
+    swapped = [row[tuple(sorted((mirror[a], mirror[b])))] for a, b in PAIRS[:, :2]]
+    results = []
+    for x in (0.02, -0.02):
+        board = host(snr_db=120.0)
+        board.start()
+        untouched = board.z(0.1)[-1]
+        board.rig.press({"x": x, "y": 0.01, "force": 4.0}, board.now)
+        results.append(board.z(0.2)[-1] / untouched - 1)
+    assert np.abs(results[0] - results[1][swapped]).max() < 0.02 * np.abs(results[0]).max()
+    assert np.abs(results[0] - results[1]).max() > 0.3 * np.abs(results[0]).max()
+
+
+def test_presses_no_skin_could_feel_are_refused(host):
+    rig = host().rig
+    for values, says in (
+        ({"x": 0.2, "y": 0.0, "force": 1.0}, "not on the skin"),
+        ({"x": 0.0, "y": 0.0, "force": 12.0}, "below 1 S/m"),
+        ({"x": 0.0, "y": 0.0, "force": -1.0}, "expected 0"),
+        ({"x": 0.0, "y": 0.0, "force": float("nan")}, "expected 0"),
+        ({"x": 0.0, "y": 0.0, "force": 1.0, "seconds": 0.0}, "seconds|s: expected"),
+        ({"x": 0.0, "y": 0.0, "force": 1.0, "to_x": 0.0, "to_y": 0.06}, "not on the skin"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            rig.press(values, 0.0)
+
+
+def test_interpolation_between_key_poses_stays_below_the_noise(host):
+    rig = host(scene="slide").rig
+    worst = 0.0
+    for t in np.arange(1.3, 6.0, 0.377).tolist():
+        exact = rig.sheet.transfer(rig.field.timeline.at(t))
+        worst = max(worst, np.abs(rig.field.over(t, t)[0] - exact)[:15, :15].max() / exact.max())
+    assert worst < 3e-5
+    assert rig.field.solves < 45
+
+
+def test_simulated_time_runs_ahead_in_any_steps_and_a_still_scene_is_solved_once(host):
+    board = host()
+    board.start()
+    frames = [m for m in board.wait(30.0, step=0.5) if isinstance(m, link.Frame)]
+    assert len(frames) / 30.0 == pytest.approx(22.9, rel=0.02)
+    assert frames[-1].seq - frames[0].seq == len(frames) - 1
+    assert board.rig.field.solves == 1
