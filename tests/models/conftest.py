@@ -11,7 +11,7 @@ FOLDER = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data"))
 
 @pytest.fixture(scope="session")
 def reference():
-    """reference(name) -> dict of arrays. Skips where the file is missing, fails where EITSKIN_REQUIRE_REFERENCE is set."""
+    """reference(name) -> dict of arrays. Missing: skips, or fails where EITSKIN_REQUIRE_REFERENCE is set."""
 
     def load(name):
         path = FOLDER / f"{name}.npz"
