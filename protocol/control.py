@@ -102,8 +102,9 @@ class ControlServer:
         except ControlError as bad:
             return _refusal(bad.kind, bad.message)
         except Exception as bad:
-            log.exception("command %s failed", command)
-            return _refusal(type(bad).__name__, str(bad) or type(bad).__name__)
+            why = f"{command} needs the argument {bad}" if isinstance(bad, KeyError) else str(bad) or type(bad).__name__
+            log.warning("command %s failed: %s: %s", command, type(bad).__name__, why, exc_info=log.isEnabledFor(10))
+            return _refusal(type(bad).__name__, why)
 
     def close(self) -> None:
         """Close the socket, giving the last answer 0.2 s to leave."""

@@ -1,4 +1,4 @@
-"""What a field of a frame may hold: one small checker per kind of value.
+"""What a field of a frame may hold: one small checker per kind of value (lists, maps and records are in records.py).
 
 A checker turns what msgpack read into what Python code uses (`decode`), the other way round (`encode`), says whether
 a decoded value is finite (`finite`), and describes itself for WIRE.md (`describe`). `decode` raises `Mismatch`;
@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
-from dataclasses import fields as dataclass_fields
 from typing import Any
 
 import numpy as np
@@ -233,184 +232,6 @@ class Array(Check):
     def describe(self) -> str:
         shape = ", ".join(str(s) for s in self.shape)
         return f"array {self.dtype} ({shape})" + (", or of size 0" if self.or_empty else "")
-
-
-@dataclass(frozen=True)
-class ListOf(Check):
-    """A list of at most `most` values of one kind."""
-
-    item: Check
-    most: int = MAX_LIST
-
-    def decode(self, value: Any) -> list[Any]:
-        if type(value) is not list or len(value) > self.most:
-            raise self.refuse(value)
-        out, decode = [], self.item.decode
-        for i, x in enumerate(value):
-            try:
-                out.append(decode(x))
-            except Mismatch as bad:
-                raise bad.below(f"[{i}]") from None
-        return out
-
-    def encode(self, value: Any) -> list[Any]:
-        return [self.item.encode(x) for x in value]
-
-    def finite(self, value: Any) -> bool:
-        return all(self.item.finite(x) for x in value)
-
-    def describe(self) -> str:
-        return f"list of at most {self.most}: {self.item.describe()}"
-
-
-@dataclass(frozen=True)
-class MapOf(Check):
-    """A map from text to values of one kind; `keys` documents the usual ones, others are allowed."""
-
-    item: Check
-    keys: tuple[str, ...] = ()
-    most: int = 256
-
-    def decode(self, value: Any) -> dict[str, Any]:
-        if type(value) is not dict or len(value) > self.most:
-            raise self.refuse(value)
-        out, decode = {}, self.item.decode
-        for key, x in value.items():
-            if type(key) is not str or len(key) > 128:
-                raise Mismatch(f"key {brief(key)}", self.describe())
-            try:
-                out[key] = decode(x)
-            except Mismatch as bad:
-                raise bad.below(f".{key}") from None
-        return out
-
-    def encode(self, value: Any) -> dict[str, Any]:
-        return {str(key): self.item.encode(x) for key, x in value.items()}
-
-    def finite(self, value: Any) -> bool:
-        return all(self.item.finite(x) for x in value.values())
-
-    def describe(self) -> str:
-        keys = f" (keys: {', '.join(self.keys)})" if self.keys else ""
-        return f"map of text to {self.item.describe()}{keys}"
-
-
-@dataclass(frozen=True)
-class Maybe(Check):
-    """nil (None), or a value of one kind."""
-
-    item: Check
-
-    @property
-    def unit(self) -> str:  # type: ignore[override]
-        return self.item.unit
-
-    def decode(self, value: Any) -> Any:
-        return None if value is None else self.item.decode(value)
-
-    def encode(self, value: Any) -> Any:
-        return None if value is None else self.item.encode(value)
-
-    def finite(self, value: Any) -> bool:
-        return value is None or self.item.finite(value)
-
-    def describe(self) -> str:
-        return self.item.describe() + ", or nil"
-
-
-@dataclass(frozen=True)
-class Tree(Check):
-    """Free content: nil, bool, number, text, bytes, arrays, and lists and maps of these, at most MAX_DEPTH deep."""
-
-    def decode(self, value: Any) -> Any:
-        return self._walk(value, 0, decode_array)
-
-    def encode(self, value: Any) -> Any:
-        return self._walk(value, 0, None)
-
-    def _walk(self, value: Any, depth: int, array: Callable[[Any], NDArray[Any]] | None) -> Any:
-        if depth > MAX_DEPTH:
-            raise Mismatch("deeper nesting", f"at most {MAX_DEPTH} levels")
-        if isinstance(value, dict):
-            if array and len(value) == 3 and value.keys() == {"dtype", "shape", "data"}:
-                return array(value)
-            out = {}
-            for key, x in value.items():
-                if type(key) is not str:
-                    raise Mismatch(f"key {brief(key)}", "text keys")
-                try:
-                    out[key] = self._walk(x, depth + 1, array)
-                except Mismatch as bad:
-                    raise bad.below(f".{key}") from None
-            return out
-        if isinstance(value, (list, tuple)):
-            return [self._walk(x, depth + 1, array) for x in value]
-        if array is None:
-            if isinstance(value, np.ndarray):
-                return encode_array(np.ascontiguousarray(value))
-            if isinstance(value, np.generic):
-                return value.item()
-        if value is None or isinstance(value, (bool, int, float, str, bytes)):
-            return value
-        raise self.refuse(value)
-
-    def describe(self) -> str:
-        return "free content"
-
-
-class Record(Check):
-    """A map with named fields, read into the dataclass `kind`.
-
-    Unknown keys are ignored, missing ones are a mismatch. The fields in its `same_length` are equally long.
-    """
-
-    def __init__(self, kind: type[Any]) -> None:
-        self.kind = kind
-        self.checks: tuple[tuple[str, Check], ...] = tuple(
-            (f.name, f.metadata["check"]) for f in dataclass_fields(kind)
-        )
-        self._same_length: tuple[str, ...] = getattr(kind, "same_length", ())
-        self._can_be_infinite = tuple((n, c) for n, c in self.checks if type(c).finite is not Check.finite)
-
-    def decode(self, value: Any) -> Any:
-        if type(value) is not dict:
-            raise self.refuse(value)
-        read = {}
-        for name, check in self.checks:
-            try:
-                read[name] = check.decode(value[name])
-            except KeyError:
-                raise Mismatch("nothing", check.describe(), f".{name}") from None
-            except Mismatch as bad:
-                raise bad.below(f".{name}") from None
-        self._check_lengths(read)
-        return self.kind(**read)
-
-    def encode(self, value: Any) -> dict[str, Any]:
-        out = {}
-        for name, check in self.checks:
-            try:
-                out[name] = check.encode(getattr(value, name))
-            except Mismatch as bad:
-                raise bad.below(f".{name}") from None
-            except (TypeError, ValueError, AttributeError) as bad:
-                raise Mismatch(f"{brief(getattr(value, name))} ({bad})", check.describe(), f".{name}") from None
-        self._check_lengths({name: getattr(value, name) for name in self._same_length})
-        return out
-
-    def _check_lengths(self, values: Mapping[str, Any]) -> None:
-        first, *others = self._same_length or ("",)
-        for name in others:
-            if len(values[name]) != len(values[first]):
-                raise Mismatch(
-                    f"length {len(values[name])}", f"length {len(values[first])}, as {first} has", f".{name}"
-                )
-
-    def finite(self, value: Any) -> bool:
-        return all(check.finite(getattr(value, name)) for name, check in self._can_be_infinite)
-
-    def describe(self) -> str:
-        return f"map {self.kind.__name__}"
 
 
 def decode_array(value: Any) -> NDArray[Any]:

@@ -15,7 +15,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .fields import UINT64_MAX, Array, Bool, Float, Int, ListOf, MapOf, Maybe, Record, Text, Tree, Vector, wire
+from .fields import UINT64_MAX, Array, Bool, Float, Int, Text, Vector, wire
+from .records import ListOf, MapOf, Maybe, Record, Tree
 
 SCHEMA = 1
 """Version of the frames' layout: raised when a field changes its meaning, goes, or is added as required."""

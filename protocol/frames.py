@@ -11,7 +11,7 @@ from typing import Any
 import msgpack
 
 from . import fields as _fields
-from .fields import Mismatch, Record, brief
+from .fields import Mismatch, brief
 from .frame_types import (
     ELECTRODE_STATES,
     INFO_KEYS,
@@ -38,6 +38,7 @@ from .frame_types import (
     Touch,
     TruthFrame,
 )
+from .records import Record
 from .topics import TOPIC_OF, TOPICS
 
 __all__ = [

@@ -15,7 +15,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
-from . import fields, frame_types, frames, link, link_messages, runtime, sockets, topics
+from . import fields, frame_types, frames, link, link_messages, records, runtime, sockets, topics
 
 WIRE_MD = Path(__file__).with_name("WIRE.md")
 
@@ -76,7 +76,7 @@ def frame_tables() -> str:
             out.append(f"\nEqually long: {', '.join(f'`{name}`' for name in same)}.\n")
         for f in dataclass_fields(topic.frame):
             item = getattr(f.metadata["check"], "item", None)
-            if isinstance(item, fields.Record):
+            if isinstance(item, records.Record):
                 out.append(f"\nEach entry of `{f.name}`:\n\n{field_table(item.kind)}")
         if topic.frame is frames.InfoFrame:
             keys = ((f"`{key}`", meaning) for key, meaning in frames.INFO_KEYS.items())

@@ -25,7 +25,14 @@ def server(runtime, context):
 
     own = ControlServer(
         "stub",
-        {"press": lambda a: {"got": a}, "fail": fail, "refuse": refuse, "slow": slow, "odd": lambda a: {"x": object()}},
+        {
+            "needs": lambda a: {"got": a["x"]},
+            "press": lambda a: {"got": a},
+            "fail": fail,
+            "refuse": refuse,
+            "slow": slow,
+            "odd": lambda a: {"x": object()},
+        },
         context=context,
     )
     stop = threading.Event()
@@ -50,10 +57,11 @@ def test_a_command_is_answered(server, context):
 @pytest.mark.parametrize(
     ("command", "kind", "says"),
     [
-        ("tear", "unknown_command", "it has: clock, fail, odd, press, refuse, slow"),
+        ("tear", "unknown_command", "it has: clock, fail, needs, odd, press, refuse, slow"),
         ("fail", "FileNotFoundError", "see models/bundles"),
         ("refuse", "busy", "taring"),
         ("odd", "TypeError", "serialize"),
+        ("needs", "KeyError", "needs the argument 'x'"),
     ],
 )
 def test_a_failing_command_is_a_typed_error_and_the_server_lives(server, context, command, kind, says):

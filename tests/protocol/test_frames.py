@@ -145,6 +145,10 @@ def test_what_is_no_frame_is_refused(data):
     refused(data)
 
 
+def test_extension_types_are_refused_wherever_they_are():
+    assert "not one msgpack value" in refused(message(contact_map(novelty=msgpack.Timestamp(1)))).found
+
+
 def test_free_content_has_a_depth_limit_and_text_keys():
     deep = None
     for _ in range(fields.MAX_DEPTH + 2):

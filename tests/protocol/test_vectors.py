@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from protocol import cobs, link
-from protocol.fields import Record
 from protocol.frames import pack, unpack
+from protocol.records import Record
 from protocol.topics import TOPICS
 
 spec = importlib.util.spec_from_file_location("make_vectors", Path(__file__).with_name("make_vectors.py"))
