@@ -41,7 +41,7 @@ def imports(path: pathlib.Path) -> set[str]:
 
 
 def sources(folder: str) -> list[pathlib.Path]:
-    return sorted(p for p in (ROOT / folder).rglob("*.py") if "work" not in p.parts)
+    return sorted(p for p in (ROOT / folder).rglob("*.py") if "work" not in p.relative_to(ROOT).parts)
 
 
 def closure(names: set[str]) -> set[str]:
