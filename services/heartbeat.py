@@ -59,6 +59,12 @@ class Heartbeat:
         what = f"{upstream}/{self.skin}" if upstream else "frames from the source"
         return f"no {what} for {int(quiet)} s" if self._heard_any and quiet >= 1 else f"no {what}"
 
+    def deadline(self, limit_s: float) -> float:
+        """When the next status is due, or the silence since the last frame becomes one to speak of."""
+        silent_at = self._heard + limit_s
+        spoken_of = self._last is not None and self._last.stamps["publish"] * 1e-9 > silent_at
+        return self._next if spoken_of else min(self._next, silent_at)
+
     def status(
         self, health: Health, silent: str, now: float, every_s: float, asleep: bool = False
     ) -> StatusFrame | None:

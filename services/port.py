@@ -77,7 +77,10 @@ def candidates(port: str, usb_serial: str | None, known_board: bool) -> Iterator
     """
     if port == "stub":
         folder = runtime_dir()
-        yield str(folder / STUB_LINK)
+        link = folder / STUB_LINK
+        # A pty's path, or the URL of a stub that listens on a socket: ptys do not cross containers.
+        target = os.readlink(link) if link.is_symlink() else ""
+        yield target if "://" in target else str(link)
         if known_board:
             yield from (str(p) for p in sorted(folder.glob(STUB_LINK + "?*")) if p.is_symlink())
         return

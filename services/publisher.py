@@ -1,11 +1,18 @@
-"""The publisher process: contacts, forces, shapes. `python -m services.publisher`; the stage is
-services/publishing.py.
-"""
+"""The publisher process: contacts, forces, shapes. `python -m services.publisher`; the stage is in publishing.py."""
 
+import importlib
 import sys
+import threading
 
 from services.publishing import Publishing
-from services.runner import main, stages
+from services.runner import Runner, main, stages
+
+
+def run(runner: Runner) -> None:
+    """Contacts flow before the first touch needs the tracker's library, which is as slow to import as all the rest."""
+    stages(Publishing)(runner)
+    threading.Thread(target=importlib.import_module, args=("scipy.optimize",), daemon=True).start()
+
 
 if __name__ == "__main__":
-    sys.exit(main("publisher", stages(Publishing)))
+    sys.exit(main("publisher", run))

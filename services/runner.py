@@ -30,7 +30,7 @@ from services.heartbeat import Heartbeat
 from services.stage import Refused, Stage
 
 HEARTBEAT_S = 1.0
-TICK_S = 0.1  # how often silence, changes of health and new subscribers are looked for
+TICK_S = 0.1  # how often at most silence, changes of health and new subscribers are looked for
 SILENT_S = 0.5  # without frames from upstream: status STALE
 OLD_S = 0.5  # a frame read longer ago is dropped: never stale as fresh
 WARM_FRAMES = 50  # frames after which what lives is taken to live for ever (garbage collection)
@@ -106,7 +106,7 @@ class Runner:
             self._poller.register(socket, zmq.POLLIN)
         next_tick = 0.0
         while not self._stop:
-            ready = self._poller.poll(max(0, int((next_tick - time.monotonic()) * 1000)))
+            ready = self._poller.poll(max(0, 1 + int((self._next_deadline() - time.monotonic()) * 1000)))
             for socket, _ in ready:
                 lane = self._by_socket.get(socket)
                 if lane is not None:
@@ -115,10 +115,15 @@ class Runner:
                     self.control.serve_once()
                 elif socket is self.publisher.socket:
                     self.publisher.poll()
+                    next_tick = 0.0
             if time.monotonic() >= next_tick:
                 self._tick()
                 next_tick = time.monotonic() + TICK_S
         self.close()
+
+    def _next_deadline(self) -> float:
+        """When there is something to do although nothing arrives: a heartbeat, or silence to be noticed."""
+        return min((lane.heartbeat.deadline(SILENT_S) for lane in self.lanes.values()), default=0.0)
 
     def close(self) -> None:
         for lane in self.lanes.values():

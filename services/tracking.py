@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 REACH_M = 0.015  # a touch that jumps further between two frames is another touch
 LOST_FRAMES = 1  # frames a touch may be missing before it ends
@@ -65,6 +64,8 @@ class Tracker:
         """Position index -> track index: least total distance to the predicted places, within reach."""
         if not positions or not self.tracks:
             return {}
+        from scipy.optimize import linear_sum_assignment  # here: slow to import, see services/publisher.py
+
         ahead = [min(max(0.0, (sample_ns - t.seen_ns) * 1e-9), LONGEST_PREDICTION_S) for t in self.tracks]
         predicted = np.array([(t.x + t.vx * s, t.y + t.vy * s) for t, s in zip(self.tracks, ahead, strict=True)])
         distance = np.linalg.norm(np.array(positions)[:, None] - predicted[None], axis=2)
