@@ -11,14 +11,16 @@ import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import zmq
 import zmq.auth
-import zmq.auth.thread
 
 from . import runtime
 from .frames import MAX_MESSAGE
+
+if TYPE_CHECKING:
+    import zmq.auth.thread
 
 RECONNECT_MS = 30
 """How soon a reader looks again for a producer that has gone."""
@@ -169,6 +171,8 @@ def _authenticate(context: Context, transport: Transport) -> None:
         )
     key = context.underlying
     if key not in _authenticators:
+        import zmq.auth.thread  # here: it imports asyncio, which most processes do without
+
         authenticator = zmq.auth.thread.ThreadAuthenticator(context)
         authenticator.start()
         _authenticators[key] = authenticator
