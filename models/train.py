@@ -18,23 +18,20 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from models import data, geometry, samples
-from models.augmentation import condition
+from models import data, geometry, manifest, samples
 from models.bundle import Bundle
-from models.data import WORK
+from models.evaluation import LEVELS, evaluate, predict
 from models.losses import losses, total
-from models.network import FAST, FULL, MMCNN, Config, compose
+from models.network import FAST, FULL, MMCNN, Config
 from models.optim import Muon
-from models.prereconstruction import Drift, PreReconstructor
+from models.prereconstruction import PreReconstructor
 
 CONFIGS = {"full": FULL, "fast": FAST}
 MUON_RATE, ADAM_RATE = 0.02, 2e-3
 AVERAGE = 0.999
-LEVELS = {"noise-free": 130.0, "70 dB": 70.0}
 
 
 class Trainer:
@@ -42,6 +39,7 @@ class Trainer:
 
     def __init__(self, config: Config, batches: samples.Batches, held_out: samples.Samples, seed: int = 0) -> None:
         torch.manual_seed(seed)
+        self.seed, self.commit = seed, manifest.commit()
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.model = MMCNN(config).to(self.device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.model)
@@ -95,7 +93,7 @@ class Trainer:
         chunks = len(data.chunk_files(folder)) if folder else 0
         budget, sums, count, saved = 60 * minutes, dict[str, float](), 0, self.elapsed
         began = time.perf_counter() - self.elapsed
-        checks = max(budget / 30, 20.0)
+        checks = max(budget / 30, 15.0)
         next_check = self.elapsed + checks
         while self.elapsed < budget:
             terms = self.step(self.elapsed / budget)
@@ -108,7 +106,7 @@ class Trainer:
                 for level, decibel in LEVELS.items():
                     row |= {
                         f"{k}, {level}": v
-                        for k, v in evaluate(self.average, self.held_out, self.batches.pre, decibel).items()
+                        for k, v in evaluate(predict(self.average), self.held_out, self.batches.pre, decibel).items()
                     }
                 row["scenes"] = len(self.batches.samples)
                 self.curve.append(row)
@@ -140,6 +138,12 @@ class Trainer:
         path.parent.mkdir(parents=True, exist_ok=True)
         state = {
             "config": self.config.to_dict(),
+            "said": {
+                "seed": self.seed,
+                "commit": self.commit,
+                "scenes": len(self.batches.samples),
+                "device": str(self.device),
+            },
             "model": self.model.state_dict(),
             "average": self.average.state_dict(),
             "best": self.best,
@@ -159,57 +163,6 @@ class Trainer:
             optimizer.load_state_dict(saved)
         for name, value in state["numbers"].items():
             setattr(self, name, value)
-
-
-@torch.no_grad()
-def evaluate(
-    model: MMCNN, held_out: samples.Samples, pre: PreReconstructor, decibel: float, limit: int = 256
-) -> dict[str, float]:
-    """Figures on the first single touches of at most `limit` held-out scenes, no drift; a touch is what exceeds
-    half its peak.
-    """
-    single = np.flatnonzero(np.isnan(held_out.shapes[:, 1, 0]) | (held_out.shapes[:, 1, 0] == 0))[:limit]
-    rng = np.random.default_rng(0)
-    sigma = np.full(pre.measurements, 10 ** (-decibel / 20))
-    batch = samples.make(held_out, single, None, condition(pre, rng, sigma, Drift()), rng)
-    device = next(model.parameters()).device
-    model.eval()
-    rows = []
-    for k in range(0, len(single), 64):
-        part = slice(k, k + 64)
-        logits, amplitude, log_sigma, classes = model.parts(
-            batch.stack[part].to(device), batch.context[part].to(device)
-        )
-        drop, log_sigma = compose(logits, amplitude, log_sigma)
-        rows.append(
-            _figures(
-                drop.cpu(), classes.cpu(), batch.target.drop[part], batch.target.mask[part], batch.target.classes[part]
-            )
-        )
-    return {k: float(torch.cat([r[k] for r in rows]).nanmean()) for k in rows[0]}
-
-
-def _figures(drop: Tensor, classes: Tensor, truth: Tensor, mask: Tensor, kinds: Tensor) -> dict[str, Tensor]:
-    axes = (1, 2, 3)
-    peak, true_peak = drop.amax(axes), truth.amax(axes)
-    seen, real = drop > 0.5 * peak[:, None, None, None], mask > 0.5
-    contact = (seen & real).sum(axes) / (seen | real).sum(axes)
-    background = (~seen & ~real).sum(axes) / (~seen | ~real).sum(axes)
-    axis = torch.linspace(-1, 1, 97)[:-1] + 1 / 96
-    where = [
-        torch.stack([(m * a).sum(axes) / m.sum(axes) for a in (axis, axis[:, None])], 1)
-        for m in (seen.float(), real.float())
-    ]
-    known = kinds < 5
-    right = ((classes.argmax(1) == kinds) & known).sum((1, 2)) / known.sum((1, 2))
-    return {
-        "mean IoU": (contact + background) / 2,
-        "contact IoU": contact,
-        "position % of side": 50 * (where[0] - where[1]).norm(dim=1),
-        "peak error": (peak / true_peak - 1).abs(),
-        "integral error": (drop.sum(axes) / truth.sum(axes) - 1).abs(),
-        "class pixels": right,
-    }
 
 
 def plot(curve: list[dict[str, Any]], path: Path) -> None:
@@ -236,6 +189,31 @@ def plot(curve: list[dict[str, Any]], path: Path) -> None:
     plt.close(figure)
 
 
+def train(
+    variant: str,
+    skin: geometry.Skin,
+    pre: PreReconstructor,
+    scenes: samples.Samples,
+    held_out: samples.Samples,
+    minutes: float,
+    checkpoint: Path,
+    seed: int = 0,
+    threads: int = 1,
+    resume: bool = False,
+    folder: Path | None = None,
+) -> Trainer:
+    """Trains a variant of CONFIGS; leaves the checkpoint and its curves (PNG) behind. folder: see Trainer.run."""
+    torch.set_num_threads(threads)
+    trainer = Trainer(CONFIGS[variant], samples.Batches(scenes, pre, skin, seed), held_out, seed)
+    if resume:
+        trainer.resume(checkpoint)
+    size = sum(p.numel() for p in trainer.model.parameters()) / 1e6
+    print(f"{variant}: {size:.2f} M parameters, {len(scenes)} scenes, {trainer.device}", flush=True)
+    trainer.run(minutes, checkpoint, folder=folder)
+    plot(trainer.curve, checkpoint.with_suffix(".png"))
+    return trainer
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m models.train", description="Train a skin's network.")
     parser.add_argument("--skin", default="square16")
@@ -248,19 +226,15 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--resume", action="store_true")
     args = parser.parse_args(argv)
-    torch.set_num_threads(args.threads)
     skin = geometry.load(args.skin)
-    folder = args.data or WORK / skin.name
-    checkpoint = args.out or WORK / skin.name / f"{args.variant}.pt"
+    folder = args.data or data.WORK / skin.name
+    checkpoint = args.out or data.WORK / skin.name / f"{args.variant}.pt"
     pre = Bundle.load(skin.name).prereconstructor()
-    train, held_out = (samples.load(folder, split, pre, args.limit) for split in ("train", "valid"))
-    trainer = Trainer(CONFIGS[args.variant], samples.Batches(train, pre, skin, args.seed), held_out, args.seed)
-    if args.resume:
-        trainer.resume(checkpoint)
-    size = sum(p.numel() for p in trainer.model.parameters()) / 1e6
-    print(f"{len(train)} scenes, {size:.2f} M parameters, {trainer.device}", flush=True)
-    trainer.run(args.minutes, checkpoint, folder=None if args.limit else folder)
-    plot(trainer.curve, checkpoint.with_suffix(".png"))
+    scenes, held_out = (samples.load(folder, split, pre, args.limit) for split in ("train", "valid"))
+    more = None if args.limit else folder
+    train(
+        args.variant, skin, pre, scenes, held_out, args.minutes, checkpoint, args.seed, args.threads, args.resume, more
+    )
 
 
 if __name__ == "__main__":
