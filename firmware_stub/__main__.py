@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import logging
 import os
+import re
 import select
 import signal
 import socket
@@ -13,12 +15,14 @@ import time
 
 import zmq
 
-from protocol.runtime import RuntimeDirError, runtime_dir
-from protocol.sockets import Publisher
+from protocol.frame_types import NAME
+from protocol.runtime import RuntimeDirError, control_endpoint, runtime_dir
+from protocol.sockets import ControlClient, ControlError, Publisher
 
 from . import scene as scenes
 from .control import Control
-from .port import Port, open_port
+from .faults import FAULTS
+from .port import Port, open_port, tcp_address
 from .rig import Rig
 from .status import Status
 from .truth import truth_frame
@@ -44,15 +48,36 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add("--port-name", default="board", help="the pty's name in the runtime folder (default: %(default)s)")
     add("--seed", type=int, help="of the noise (default: another one each time)")
     add("--detached", action="store_true", help="go on when the parent process has ended")
-    return parser.parse_args(argv)
+    add("--faults", action="store_true", help="list what can go wrong on request, and end")
+    options = parser.parse_args(argv)
+    if not re.fullmatch(NAME, options.skin):
+        parser.error(f"--skin {options.skin!r}: expected letters, digits, '.', '_' or '-'")
+    if options.rate is not None and not 0.1 <= options.rate <= 10_000:
+        parser.error(f"--rate {options.rate:g}: expected 0.1 to 10000 full scans per second")
+    for name, value, low, high in (
+        ("--snr", options.snr, 0, 200),
+        ("--floor", options.floor, 0, 1e3),
+        ("--ppm", options.ppm, -5e4, 5e4),
+        ("--baud", options.baud, 1200, 1e8),
+    ):
+        if not low <= value <= high:
+            parser.error(f"{name} {value:g}: expected {low:g} to {high:g}")
+    return options
 
 
 def main(argv: list[str] | None = None) -> int:
     options = arguments(argv)
+    if options.faults:
+        for name, row in FAULTS.items():
+            print(f"{name:20s} {row.what}  {dict(row.args) or ''}")
+        return 0
     logging.basicConfig(level=logging.INFO, format="stub: %(message)s", stream=sys.stderr)
     stop = _Stop()
     parent = None if options.detached else os.getppid()
     try:
+        if options.listen:
+            tcp_address(options.listen)
+        _alone()
         rig = Rig(
             options.geometry,
             scene=options.scene,
@@ -88,6 +113,16 @@ def main(argv: list[str] | None = None) -> int:
         rig.close()
         context.destroy(linger=0)
     return 0
+
+
+def _alone() -> None:
+    """Raises RuntimeDirError where another stub answers in this runtime folder: we would take over its sockets."""
+    with contextlib.suppress(ControlError):
+        if os.path.exists(control_endpoint("stub").removeprefix("ipc://")):
+            ControlClient("stub", 0.3).call("clock")
+            raise RuntimeDirError(
+                f"another stub runs in {runtime_dir()}: stop it, or set EITSKIN_RUNTIME to another folder"
+            )
 
 
 def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, stop: _Stop, parent: int | None) -> None:

@@ -201,5 +201,6 @@ def _register(volts: Complex, limit: float) -> tuple[NDArray[np.int32], NDArray[
     """DFT registers (K, 2), clipped at `limit` V and to 18 bits, and where the converter hit its limit (K,)."""
     size = np.abs(volts)
     hit = size > limit
-    cut = np.where(hit, clip(size, limit) / np.maximum(size, 1e-300), 1.0)
-    return dft_pair(volts * cut * (DATA_MAX / FULL_SCALE_V)), hit
+    if hit.any():
+        volts = np.where(hit, volts * clip(size, limit) / np.maximum(size, 1e-300), volts)
+    return dft_pair(volts * (DATA_MAX / FULL_SCALE_V)), hit

@@ -169,7 +169,7 @@ class TcpPort:
     """
 
     def __init__(self, url: str, folder: Path, name: str = "board") -> None:
-        self._host, self._port = _address(url)
+        self._host, self._port = tcp_address(url)
         self._link = folder / name
         self.overrun = 0
         self._server: socket.socket | None = None
@@ -187,9 +187,9 @@ class TcpPort:
         try:
             server.bind((self._host, self._port))
             server.listen(4)
-        except OSError:
+        except OSError as error:
             server.close()
-            raise
+            raise OSError(f"cannot listen at {self.url}: {error.strerror or error}") from None
         server.setblocking(False)
         self._port = server.getsockname()[1]
         self._server = server
@@ -259,7 +259,8 @@ def _publish(link: Path, target: str) -> Path:
     return link
 
 
-def _address(url: str) -> tuple[str, int]:
+def tcp_address(url: str) -> tuple[str, int]:
+    """Host and port of --listen. Raises ValueError."""
     parts = urlsplit(url if "://" in url else f"socket://{url}")
     try:
         port = parts.port

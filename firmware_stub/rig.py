@@ -49,9 +49,11 @@ class Rig:
         seed: int | None = None,
         threaded: bool = False,
     ) -> None:
+        script = scenes.load(scene)  # first, since it fails fast
         self.sheet = geometry if isinstance(geometry, Sheet) else Sheet(geometry)
         self.faults = Faults()
-        self.field = Field(self.sheet.transfer, self._timeline(scene, 0.0), threaded=threaded)
+        timeline = Timeline(script, 0.0, (), self.sheet.electrodes)
+        self.field = Field(self.sheet.transfer, timeline, threaded=threaded)
         self.scans: deque[tuple[Scan, World, float]] = deque(maxlen=64)
         self.line = Line(baud)
         self._rng = np.random.default_rng(seed)
@@ -144,7 +146,7 @@ class Rig:
 
     def play(self, name: str, now: float) -> dict[str, Any]:
         """Begin a scene. Raises SceneError."""
-        timeline = self._timeline(name, now)
+        timeline = Timeline(scenes.load(name), now, (), self.sheet.electrodes)
         self.field.play(timeline, now)
         self._cued = now
         script = timeline.script
@@ -178,9 +180,6 @@ class Rig:
         self.field.close()
 
     # --- inside ---
-
-    def _timeline(self, name: str, start: float) -> Timeline:
-        return Timeline(scenes.load(name), start, (), self.sheet.electrodes)
 
     def _scanned(self, scan: Scan) -> None:
         """Note what the scan felt: the world at its middle, as `Field.over` has it."""

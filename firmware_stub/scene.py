@@ -1,4 +1,4 @@
-"""Scenes as TOML files: read, checked, turned into scripts. `scenes/README.md` documents the keys."""
+"""Scenes as TOML files: read, checked, turned into scripts. README.md documents the keys."""
 
 from __future__ import annotations
 

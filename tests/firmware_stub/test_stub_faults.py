@@ -1,8 +1,12 @@
 """Every fault of the table: what the host gets to see."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from firmware_stub import faults, scene
 from firmware_stub.analog import PGA, clip
 from firmware_stub.faults import FAULTS
 from models.patterns import pattern
@@ -266,3 +270,12 @@ def test_clipping_is_the_describing_function_of_a_saturation():
         wave = np.clip(amplitude * np.sin(phase), -1, 1)
         fundamental = 2 * np.mean(wave * np.sin(phase))
         assert clip(np.array([amplitude]), 1.0)[0] == pytest.approx(fundamental, rel=1e-6)
+
+
+def test_the_readme_lists_every_fault_as_it_is_and_every_scene():
+    readme = (Path(faults.__file__).parent / "README.md").read_text()
+    for name, row in FAULTS.items():
+        (line,) = (line for line in readme.splitlines() if line.startswith(f"| `{name}`"))
+        assert row.what in line and all(f"`{key}={json.dumps(value)}`" in line for key, value in row.args.items())
+        assert ("(sticky)" in line) == row.sticky
+    assert [name for name in scene.names() if f"| `{name}` |" not in readme] == []
