@@ -58,7 +58,7 @@ class Tare(Section):
 
     frames: Annotated[int, Field(ge=8, le=4096)] = 64
     max_age_s: Annotated[float, Field(gt=0)] = 12 * 3600.0  # an older persisted baseline is not loaded
-    tracking_s: Annotated[float, Field(gt=0)] = 60.0  # time constant with which drift is followed while untouched
+    tracking_s: Annotated[float, Field(gt=0)] = 20.0  # time constant with which drift is followed while untouched
 
 
 class Touch(Section):

@@ -29,7 +29,7 @@ from services.touch import Hold, TouchDecision
 
 Array = NDArray[np.float64]
 
-DRIFT = Drift(scale=2e-5, contact=1e-4)  # what is allowed for since the last untouched frame
+DRIFT = Drift(scale=5e-5, contact=2e-4)  # what is allowed for since the last untouched frame
 RETRY_EVERY = 8  # frames between attempts at the first tare
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
 RENORMALISE_EVERY = 64  # untouched frames after which tracked drift enters the normalisation

@@ -1,0 +1,88 @@
+"""Fixtures of the services' tests: a runtime folder of their own, frames made by the bundle's own linear model."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import services  # noqa: F401  (one thread for the numerical libraries, before numpy starts them)
+from models.bundle import Bundle
+from protocol.frames import RawFrame
+from services.config import Skin
+
+FRAME_NS = 45_000_000
+
+
+@pytest.fixture
+def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A runtime folder with a path short enough for sockets."""
+    folder = Path(tempfile.mkdtemp(prefix="eits", dir="/tmp"))
+    monkeypatch.setenv("EITSKIN_RUNTIME", str(folder))
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def bundle() -> Bundle:
+    return Bundle.load("square16")
+
+
+@pytest.fixture
+def skin() -> Skin:
+    return Skin(port="stub", bundle="square16", frame_id="palm", network="none")
+
+
+class Board:
+    """Raw frames of a skin that obeys the bundle's linearised model."""
+
+    def __init__(self, bundle: Bundle, snr_db: float = 80.0, seed: int = 0) -> None:
+        self.m, self.rng, self.scan = bundle.matrices, np.random.default_rng(seed), 0
+        self.frame_ns, self._now = FRAME_NS, 0
+        self.sigma = 10 ** (-snr_db / 20)
+        h, w = self.m.inside.shape
+        side = -1 + 2 * (np.arange(8 * h) + 0.5) / (8 * h)
+        self._x, self._y, self._block = side[None, :], side[:, None], (h, 8, w, 8)
+
+    def disc(self, x: float, y: float, radius: float, drop: float) -> NDArray[np.floating]:
+        """(K,) relative difference of a disc; model units, S/m."""
+        inside = (self._x - x) ** 2 + (self._y - y) ** 2 < radius**2
+        pixels = inside.reshape(self._block).mean(axis=(1, 3)) * drop
+        return np.asarray(self.m.jacobian @ pixels.ravel())
+
+    def frame(self, difference: NDArray[np.floating] | float = 0.0, board: str = "b1", source: str = "board") -> RawFrame:
+        self.scan += 1
+        z = self.m.z0 * (1 + difference) * (1 + self.sigma * self.rng.standard_normal(len(self.m.z0)))
+        self._now += self.frame_ns
+        now = self._now
+        return RawFrame(
+            skin="palm",
+            scan=self.scan,
+            stamps={"sample": now, "read": now + 1_000_000},
+            source=source,
+            valid=True,
+            valid_for_s=0.135,
+            z=z.astype(np.complex64),
+            status=np.zeros(len(z), np.uint8),
+            board=board,
+        )
+
+
+@pytest.fixture
+def board(bundle: Bundle) -> Board:
+    return Board(bundle)
+
+
+@pytest.fixture(scope="session")
+def reference() -> Path:
+    """Folder of the reference data; absent: the test says so, loudly, and is skipped."""
+    folder = Path(os.environ.get("EITSKIN_REFERENCE", Path(__file__).resolve().parents[2] / ".." / "shared" / "data"))
+    if not (folder / "eidors_reference.npz").is_file():
+        pytest.skip(f"REFERENCE DATA MISSING: {folder}/eidors_reference.npz (set EITSKIN_REFERENCE)")
+    return folder

@@ -1,0 +1,232 @@
+"""Preprocessing: tare, touch decision, hold, electrodes, and what survives a crash."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from models.bundle import Bundle
+from protocol.frames import STATUS_OPEN, DeltaFrame, RawFrame
+from services.config import Skin
+from services.preprocessing import Preprocessing
+from services.stage import Refused
+from services.tare import disagreement, take
+from tests.services.conftest import Board
+
+WANTED = frozenset({"delta"})
+
+
+@pytest.fixture
+def stage(skin: Skin, bundle: Bundle) -> Preprocessing:
+    return Preprocessing("palm", skin, bundle)
+
+
+def run(stage: Preprocessing, frame: RawFrame) -> DeltaFrame:
+    (out,) = stage.process(frame, WANTED)
+    assert isinstance(out, DeltaFrame)
+    assert np.isfinite(out.difference).all()
+    return out
+
+
+def tared(stage: Preprocessing, board: Board) -> Preprocessing:
+    for _ in range(72):
+        out = run(stage, board.frame())
+    assert out.valid and not out.touched
+    return stage
+
+
+def test_frames_are_not_valid_before_the_baseline(stage: Preprocessing, board: Board) -> None:
+    outs = [run(stage, board.frame()) for _ in range(80)]
+    assert all(not o.valid and o.reasons == ["stale_baseline"] for o in outs[:60])
+    assert outs[-1].valid
+
+
+def test_a_touch_during_the_first_frames_is_no_baseline(stage: Preprocessing, board: Board) -> None:
+    touch = board.disc(0.3, 0.0, 0.2, 0.3)
+    for n in range(72):
+        out = run(stage, board.frame(touch if n > 40 else 0.0))
+    assert not out.valid
+    assert "disagree" in stage.health().messages[0]
+    for _ in range(72):
+        out = run(stage, board.frame())
+    assert out.valid
+
+
+def test_a_baseline_far_from_the_prediction_is_doubted(stage: Preprocessing, board: Board) -> None:
+    """Touched all the time: the frames agree, so the bundle's prediction must raise the doubt."""
+    touch = 3 * board.disc(0.5, -0.3, 0.3, 0.5)
+    for _ in range(80):
+        out = run(stage, board.frame(touch))
+    assert not out.valid and "stale_baseline" in out.reasons
+    assert "skin tare" in stage.health().messages[0]
+    for _ in range(64):
+        run(stage, board.frame())
+    stage.command("tare", {"force": True})
+    assert run(stage, board.frame()).valid
+
+
+def test_disagreement_keeps_its_false_alarm_rate(board: Board) -> None:
+    noise = np.random.default_rng(5)
+    ratios = []
+    for _ in range(300):
+        found, limit = disagreement(1 + 1e-3 * noise.standard_normal((64, 120)))
+        ratios.append(found / limit)
+    assert max(ratios) < 1
+    assert max(ratios) > 0.6  # the limit is not so far away that nothing would be noticed
+
+
+def test_no_false_touch_and_the_lightest_touch_is_seen(stage: Preprocessing, board: Board) -> None:
+    tared(stage, board)
+    assert not any(run(stage, board.frame()).touched for _ in range(300))
+    light = board.disc(0.0, 0.0, 0.1, 0.1)  # 1 N of the 10 mm indenter at the centre
+    assert all(run(stage, board.frame(light)).touched for _ in range(5))
+    run(stage, board.frame())
+    assert not run(stage, board.frame()).touched
+
+
+def test_untouched_frames_carry_no_stack(stage: Preprocessing, board: Board) -> None:
+    tared(stage, board)
+    assert run(stage, board.frame()).stack.size == 0
+    stage.always_reconstruct = True
+    assert run(stage, board.frame()).stack.shape[0] == len(board.m.ladder)
+
+
+def test_an_unchanged_touch_is_held_and_averaged(stage: Preprocessing, board: Board) -> None:
+    tared(stage, board)
+    touch = board.disc(0.2, 0.1, 0.2, 0.3)
+    outs = [run(stage, board.frame(touch)) for _ in range(40)]
+    reconstructed = [i + 1 for i, o in enumerate(outs) if not o.held]
+    assert reconstructed == [1, 2, 4, 8, 16, 32]
+    assert all((o.stack.size > 0) == (not o.held) for o in outs)
+    scans = [o.scan for o in outs]
+    assert [o.reconstructed for o in outs[7:10]] == [scans[7]] * 3
+    expected = touch * np.asarray(board.m.z0) / stage._normaliser
+    error = [np.sqrt(np.mean((outs[i - 1].difference - expected) ** 2)) for i in (1, 16)]
+    assert error[1] < 0.6 * error[0]  # 16 frames averaged; the tare's own noise remains
+
+
+def test_creep_is_seen(stage: Preprocessing, board: Board) -> None:
+    """Each step is far below the noise, their sum is not."""
+    tared(stage, board)
+    start = board.disc(0.2, 0.1, 0.2, 0.30)
+    end = board.disc(0.2, 0.1, 0.2, 0.33)
+    run(stage, board.frame(start))
+    last = None
+    for n in range(100):
+        out = run(stage, board.frame(start + (end - start) * n / 100))
+        last = last if out.held else out
+    assert last is not None
+    truth = (end - start) @ (last.difference - start) / ((end - start) @ (end - start))
+    assert truth > 0.7
+
+
+def test_a_dead_electrode_is_left_out(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
+    tared(stage, board)
+    frame = board.frame()
+    uses = (bundle.pattern == 5).any(axis=1)
+    frame.z[uses] = np.nan
+    frame.status[uses] = STATUS_OPEN
+    frame.valid, frame.reasons = False, ["non_finite"]  # as the reader of a message puts it
+    out = run(stage, frame)
+    assert out.valid and not out.touched
+    assert out.reasons == ["electrode_open"]
+    assert list(np.flatnonzero(out.electrodes)) == [5]
+    assert not np.isfinite(out.sigma[uses]).any() and np.isfinite(out.sigma[~uses]).all()
+    assert not run(stage, board.frame()).electrodes.any()
+
+
+def test_more_than_two_dead_electrodes_make_a_frame_invalid(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
+    tared(stage, board)
+    frame = board.frame()
+    frame.status[np.isin(bundle.pattern, (1, 6, 11)).any(axis=1)] = STATUS_OPEN
+    out = run(stage, frame)
+    assert not out.valid and "electrode_open" in out.reasons
+
+
+def test_frames_of_another_skin_are_refused(stage: Preprocessing, board: Board) -> None:
+    tared(stage, board)
+    frame = board.frame()
+    frame.z, frame.status = frame.z[:64], frame.status[:64]
+    out = run(stage, frame)
+    assert not out.valid and out.reasons == ["out_of_distribution"]
+    assert "64 measurements" in stage.health().messages[0]
+
+
+def test_tare_is_refused_while_touched(stage: Preprocessing, board: Board) -> None:
+    tared(stage, board)
+    for _ in range(70):
+        run(stage, board.frame(board.disc(0.0, 0.0, 0.2, 0.3)))
+    with pytest.raises(Refused, match="touched"):
+        stage.command("tare", {})
+    for _ in range(10):
+        run(stage, board.frame())
+    with pytest.raises(Refused, match="of 64 untouched frames"):
+        stage.command("tare", {})
+    for _ in range(70):
+        run(stage, board.frame())
+    assert stage.command("tare", {})["snr_db"] == pytest.approx(80, abs=1)
+
+
+def test_the_baseline_survives_a_crash_but_not_another_board(
+    stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board
+) -> None:
+    tared(stage, board)
+    saved = stage.saved()
+    assert saved is not None and stage.saved() is None
+    again = Preprocessing("palm", skin, bundle)
+    again.restore(saved, 60.0)
+    assert run(again, board.frame()).valid
+    assert not run(again, board.frame(board="b2")).valid
+    with pytest.raises(Refused, match="old"):
+        Preprocessing("palm", skin, bundle).restore(saved, 1e6)
+    with pytest.raises(Refused, match="another bundle"):
+        Preprocessing("palm", skin, bundle).restore(saved | {"bundle": "x"}, 1.0)
+
+
+def test_slow_drift_is_followed_while_untouched(stage: Preprocessing, board: Board) -> None:
+    tared(stage, board)
+    board.frame_ns = 1_000_000_000
+    impedances = board.m.contact @ np.random.default_rng(2).uniform(-0.02, 0.02, 16)  # of the electrodes' contacts
+    outs = [run(stage, board.frame((2e-3 + impedances) * n / 600)) for n in range(600)]
+    assert not any(o.touched for o in outs)
+    assert np.abs(outs[-1].difference).mean() < 0.1 * np.abs(2e-3 + impedances).mean()
+
+
+def test_state_continues_bit_by_bit(stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board) -> None:
+    tared(stage, board)
+    touch = board.disc(-0.3, 0.4, 0.2, 0.2)
+    for _ in range(5):
+        run(stage, board.frame(touch))
+    twin = Preprocessing("palm", skin, bundle)
+    twin.load(stage.state())
+    for n in range(20):
+        frame = board.frame(touch if n < 15 else 0.0)
+        a, b = run(stage, frame), run(twin, frame)
+        assert a.stack.tobytes() == b.stack.tobytes() and a.score == b.score and a.held == b.held
+        assert a.difference.tobytes() == b.difference.tobytes()
+
+
+def test_a_recording_never_meets_the_boards_baseline(stage: Preprocessing, board: Board) -> None:
+    tared(stage, board)
+    assert not run(stage, board.frame(source="replay")).valid
+    assert stage.saved() is None
+
+
+def test_reference_frames_are_the_baseline(stage: Preprocessing, board: Board) -> None:
+    for _ in range(72):
+        run(stage, board.frame(source="replay"))
+    shifted = 0.01 * np.cos(np.arange(120))
+    frame = board.frame(shifted, source="replay")
+    frame.kind = "reference"
+    run(stage, frame)
+    assert not run(stage, board.frame(shifted, source="replay")).touched
+    assert run(stage, board.frame(shifted + board.disc(0.0, 0.3, 0.2, 0.3), source="replay")).touched
+
+
+def test_take_refuses_noise_and_missing_measurements(bundle: Bundle) -> None:
+    pre, rng = bundle.prereconstructor(), np.random.default_rng(0)
+    with pytest.raises(Refused, match="scatter"):
+        take(bundle.z0 * (1 + 0.2 * rng.standard_normal((64, 120))), pre, "", 0)
+    half = np.where(np.arange(120) < 70, np.nan, bundle.z0 * np.ones((64, 120)))
+    with pytest.raises(Refused, match="measurements give values"):
+        take(half, pre, "", 0)
