@@ -37,7 +37,7 @@ def import_arrays(
     if not rate_hz > 0:
         raise ImportRefused(f"found --rate {rate_hz:g}, expected frames per second above 0")
     configured, bundle = find_skin(skin)
-    order = _order(arrays, bundle)
+    order = measurement_order(arrays, bundle)
     try:
         if "touched" in arrays:
             arrays = {"measurements": arrays["touched"]} | (
@@ -72,7 +72,7 @@ def _rows(measurements: NDArray[Any], untouched: NDArray[Any] | None, reference:
         yield row, "full"
 
 
-def _order(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> NDArray[np.intp]:
+def measurement_order(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> NDArray[np.intp]:
     """Where in the file each measurement of the bundle stands. Raises ImportRefused where one is not there."""
     if "pattern" not in arrays:
         return np.arange(len(bundle.pattern))

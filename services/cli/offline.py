@@ -68,16 +68,31 @@ def _bar(rows):  # type: ignore[no-untyped-def]
 
 
 def register_frame(
-    source: Annotated[Path, typer.Argument(metavar="FILE", help="Presses at known places: npz or recording.")],
-    out: Annotated[Path, typer.Option(help="Calibration to write.")] = Path("calibration.toml"),
-    skin: Annotated[str, typer.Option("--skin", metavar="NAME")] = "disc16",
+    source: Annotated[Path, typer.Argument(metavar="FILE.npz", help="touched, untouched (n, k), xy (n, 2) in metres.")],
+    out: Annotated[Path, typer.Option(help="Folder for the skin's own bundle, with a skin.toml that names its pose.")],
+    skin: Annotated[str, typer.Option("--skin", metavar="NAME", help="A configured skin, or a bundle.")] = "disc16",
     presses: Annotated[int, typer.Option(help="How many presses to use, from the first.")] = 100,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit the skin's frame to a machine's from presses at known places, and say how well it fits."""
-    from services.registration import register_file
+    """Fit the skin's frame, and its sensitivities, to presses at places that a machine knows; say how well they fit."""
+    from services.register_command import register_presses
 
-    register_file(source, out, skin, presses, as_json)
+    report = register_presses(load_npz(source), skin, presses, out)
+    if as_json:
+        emit(report)
+        return
+    x, y = report["offset_m"]
+    seen = "numbered the other way round (seen from behind)" if report["mirrored"] else "numbered as the bundle's"
+    print(
+        f"the skin lies in the machine's frame at ({x * 1e3:+.1f}, {y * 1e3:+.1f}) mm, turned by "
+        f"{report['angle_degrees']:+.1f} degrees, {report['scale']:.3f} times the bundle's size, electrodes {seen}"
+    )
+    residual = report["residual_m"]
+    print(
+        f"residual over {presses} presses, each found without itself: median {residual['median'] * 1e3:.1f} mm, "
+        f"mean {residual['mean'] * 1e3:.1f} mm"
+    )
+    print(f"wrote {out}: name it as `bundle` in skin.toml, or run with --config {out / 'skin.toml'}")
 
 
 def limits(context: typer.Context) -> None:

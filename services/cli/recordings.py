@@ -74,7 +74,7 @@ def replay(
     skin: SkinOption = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Feed a recording's raw frames through the stages, losslessly; contacts come out on the usual sockets, marked `replay`.
+    """Feed a recording's raw frames through the stages, losslessly; contacts come out as usual, marked `replay`.
 
     With `skin up --no-board` running it feeds those stages; with nothing running it brings up its own.
     """
