@@ -32,7 +32,7 @@ def import_arrays(
 ) -> dict[str, Any]:
     """Writes `target`; the report's keys: file, frames, measurements, seconds. Raises ImportRefused, RecordingError.
 
-    A file with `touched` and `untouched` of equal shape holds presses: each gets its own untouched frame just before it.
+    A file with `touched` and `untouched` of equal shape holds presses: each gets its untouched frame just before it.
     """
     if not rate_hz > 0:
         raise ImportRefused(f"found --rate {rate_hz:g}, expected frames per second above 0")

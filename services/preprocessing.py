@@ -24,7 +24,7 @@ from protocol.frames import DeltaFrame, Frame, RawFrame
 from services.config import Skin
 from services.electrodes import ElectrodeHealth
 from services.stage import Health, Refused, Stage, add_reason, inherited
-from services.tare import Baseline, take
+from services.tare import Baseline, noise_of_steps, take
 from services.touch import Hold, TouchDecision
 
 Array = NDArray[np.float64]
@@ -59,6 +59,7 @@ class Preprocessing(Stage):
 
     def reset(self) -> None:
         self._window: deque[Array] = deque(maxlen=self.config.tare.frames)
+        self._references: deque[Array] = deque(maxlen=self.config.tare.frames)  # those in a row
         self._untouched_run = 0
         self._touched = False
         self._source = ""
@@ -87,6 +88,8 @@ class Preprocessing(Stage):
             add_reason(out.reasons, reason)
         amplitude[~live] = np.nan
         self._window.append(amplitude)
+        if frame.kind != "reference":
+            self._references.clear()
         if frame.kind == "reference":
             self._refer(amplitude, frame)
         elif (
@@ -175,14 +178,17 @@ class Preprocessing(Stage):
 
     def _refer(self, amplitude: Array, frame: RawFrame) -> None:
         """An imported file says that this frame is untouched: it is the baseline until the next one."""
-        references = np.array(self._window)[-2:]
-        if self._baseline is not None and np.isfinite(amplitude).all():
+        if not np.isfinite(amplitude).all():
+            return
+        self._references.append(amplitude)
+        if len(self._references) > 1:  # several in a row: the noise is how they differ
+            sigma = noise_of_steps(np.array(self._references))
+            self.set_baseline(Baseline(amplitude, sigma, 1, frame.board, frame.stamps.get("sample", 0)))
+        elif self._baseline is not None:
             self._baseline = dataclasses.replace(self._baseline, z0=amplitude)
             self._normaliser = self.pre.normaliser(amplitude)
             self._touched = False
             self.hold.reset()
-        elif self._baseline is None and len(references) == 2 and np.isfinite(references).all():
-            self.set_baseline(take(references, self.pre, frame.board, frame.stamps.get("sample", 0)))
 
     def _untouched(self, amplitude: Array, live: NDArray[np.bool_], out: DeltaFrame) -> None:
         """Slow drift is followed while nothing touches."""

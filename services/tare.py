@@ -86,6 +86,17 @@ def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Bas
     return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
 
 
+def noise_of_steps(frames: Array) -> Array:
+    """(K,) standard deviation of one |Z|, from how consecutive untouched frames (N, K) differ: drift hardly counts.
+
+    Shrunk towards noise proportional to |Z| as in `noise_of_frames`.
+    """
+    own = 0.5 * (np.diff(frames, axis=0) ** 2).mean(axis=0)
+    mean, n = frames.mean(axis=0), len(frames)
+    pooled = np.median(own / mean**2) * mean**2
+    return np.asarray(np.sqrt((n * own + 32 * pooled) / (n + 32)))
+
+
 def disagreement(frames: Array) -> tuple[float, float]:
     """Chi-square statistic of the quarters' means against the noise within them, and the limit it keeps to when all
     is quiet.
