@@ -117,7 +117,7 @@ class Analog:
         if (broken := self.faults.active("electrode_open", now)) is not None:
             reached &= rows != broken["electrode"]
         reached &= rows < electrodes  # a stuck address bit may lead to where nothing is connected
-        return np.minimum(rows, electrodes - 1), reached[:, :2].all(1), reached[:, 2:].all(1)
+        return np.minimum(rows, electrodes - 1), np.all(reached[:, :2], axis=1), np.all(reached[:, 2:], axis=1)
 
     def _sheet(
         self, transfer: tuple[NDArray[np.float64], NDArray[np.float64]], rows: NDArray[np.int64], now: float

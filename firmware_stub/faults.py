@@ -75,7 +75,7 @@ FAULTS: dict[str, Fault] = {
     "sequence_gaps": Fault("a `fraction` of the scans is never sent", {"fraction": 0.2}),
     "line_noise": Fault(
         "`garbage` random bytes for each byte sent, and a `flips` share of bits flipped",
-        {"garbage": 0.02, "flips": 2e-5},
+        {"garbage": 0.0005, "flips": 2e-5},
     ),
     "wrong_schema": Fault(
         "the firmware is another version: another schema hash in IDENT and in every check", {"schema": 0xBAD0F00D}

@@ -84,7 +84,7 @@ class Script:
     def breaks(self) -> tuple[float, ...]:
         """Times (s) between which everything is linear."""
         curves = [*(c for _, c in self.contact), *([self.background] if self.background else [])]
-        times = {t for part in (*self.tracks, *curves) for t in part.times}
+        times = {t for keys in (*(p.times for p in self.tracks), *(c.times for c in curves)) for t in keys}
         if self.loop:
             times = {t for t in times if t < self.duration} | {self.duration}
         return tuple(sorted(times | {0.0}))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 NEWTON = 0.1  # S/m of conductivity drop a newton makes, unless a scene says otherwise
+
+MOVING = ("x", "y", "radius", "drop", "rotation", "aspect")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +37,7 @@ class World:
 
     def rounded(self) -> World:
         """To a nanometre: the same pose of a later round of a loop is the same world."""
-        touches = tuple(
-            Touch(t.kind, *(round(v, 9) for v in (t.x, t.y, t.radius, t.drop, t.rotation, t.aspect)))
-            for t in self.touches
-        )
+        touches = tuple(Touch(t.kind, *(round(getattr(t, f), 9) for f in MOVING)) for t in self.touches)
         return World(touches, round(self.background, 9), tuple(round(v, 9) for v in self.contact))
 
 
@@ -53,7 +52,7 @@ def blend(a: World, b: World, s: float) -> World:
         return p + s * (q - p)
 
     touches = tuple(
-        replace(p, **{f: mix(getattr(p, f), getattr(q, f)) for f in ("x", "y", "radius", "drop", "rotation", "aspect")})
+        Touch(p.kind, *(mix(getattr(p, f), getattr(q, f)) for f in MOVING))
         for p, q in zip(a.touches, b.touches, strict=True)
     )
     contact = tuple(mix(p, q) for p, q in zip(*_contacts(a, b), strict=True))
