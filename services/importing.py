@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.frames import pack
+from services.config import SKIN_NAME
 from services.reconstruction import InputError, find_skin, read_input
 from services.recording import RecordingWriter
 from services.source import file_frame
@@ -37,6 +38,7 @@ def import_arrays(
     if not rate_hz > 0:
         raise ImportRefused(f"found --rate {rate_hz:g}, expected frames per second above 0")
     configured, bundle = find_skin(skin)
+    skin = skin if SKIN_NAME.fullmatch(skin) else bundle.name  # a bundle given by its path
     order = measurement_order(arrays, bundle)
     try:
         if "touched" in arrays:
