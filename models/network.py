@@ -33,6 +33,7 @@ class Config:
     grid: int = 24
     channels: tuple[int, int, int] = (24, 64, 96)
     blocks: tuple[int, int, int] = (1, 3, 1)
+    lean: bool = False  # context at the stem only, no attention: each costs the fast network more time than accuracy
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -43,7 +44,7 @@ class Config:
 
 
 FULL = Config()
-FAST = Config(channels=(12, 32, 64), blocks=(1, 2, 1))
+FAST = Config(channels=(8, 24, 48), blocks=(1, 1, 1), lean=True)
 
 
 class CBAM(nn.Module):
@@ -87,14 +88,14 @@ def _convolution(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> n
 class Stage(nn.Module):
     """Residual 3x3 convolutions at one resolution; context and place come in at the first."""
 
-    def __init__(self, blocks: int, channels: int, side: int, attention: bool = False) -> None:
+    def __init__(self, blocks: int, channels: int, side: int, lean: bool, attention: bool = False) -> None:
         super().__init__()
-        self.told = Told(channels, side)
+        self.told = None if lean else Told(channels, side)
         self.blocks = nn.ModuleList(_convolution(channels, channels) for _ in range(blocks))
         self.attention = CBAM(channels) if attention else nn.Identity()
 
     def forward(self, x: Tensor, told: Tensor) -> Tensor:
-        x = F.relu(self.told(x, told))
+        x = F.relu(self.told(x, told) if self.told else x)
         for block in self.blocks:
             x = x + F.relu(block(x))
         return self.attention(x)
@@ -111,11 +112,11 @@ class MMCNN(nn.Module):
         self.context = nn.Sequential(nn.Linear(CONTEXT, TOLD), nn.ReLU(), nn.Linear(TOLD, TOLD), nn.ReLU())
         self.stem, self.told = _convolution(config.stack, a), Told(a, n)
         self.down1 = _convolution(a, b, stride=2)
-        self.stage1 = Stage(config.blocks[0], b, n // 2)
+        self.stage1 = Stage(config.blocks[0], b, n // 2, config.lean)
         self.down2 = _convolution(b, c, stride=2)
-        self.stage2 = Stage(config.blocks[1], c, n // 4, attention=True)
+        self.stage2 = Stage(config.blocks[1], c, n // 4, config.lean, attention=not config.lean)
         self.up2 = _convolution(c, 4 * b, 1)
-        self.stage3 = Stage(config.blocks[2], b, n // 2)
+        self.stage3 = Stage(config.blocks[2], b, n // 2, config.lean)
         self.up1 = _convolution(b, 4 * a, 1)
         # per pixel of 24 x 24: 16 mask logits and the amplitude; 16 log sigmas. What shape it is shows in the wider
         # features.
