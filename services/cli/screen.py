@@ -11,46 +11,57 @@ from rich.text import Text
 from services.cli.heatmap import draw
 from services.cli.monitor import Monitor
 
+WIDE = 130
+"""Columns from which the skin is drawn beside the tables instead of below them."""
 LEVELS = {"OK": "green", "WARN": "yellow", "ERROR": "bold red", "STALE": "bold red"}
 
 
-def screen(monitor: Monitor) -> RenderableType:
+def screen(monitor: Monitor, width: int) -> RenderableType:
+    """The whole page for a terminal of so many columns."""
     now = monitor.snapshot()
     if not monitor.heard:
         return Text(f"waiting for frames of skin {monitor.skin!r}; is the service running (`skin up`)?", style="yellow")
-    right = Group(_skin(monitor), _contacts(now))
+    tables = Group(_topics(now), _processes(now), _sayings(now))
+    if width < WIDE:
+        return Group(tables, _skin(monitor), _contacts(now))
     page = Table.grid(padding=(0, 2))
-    page.add_row(Group(_topics(now), _processes(now)), right)
+    page.add_row(tables, Group(_skin(monitor), _contacts(now)))
     return page
 
 
+def _table(title: str, *heads: str) -> Table:
+    table = Table(box=None, pad_edge=False)
+    table.add_column(title, no_wrap=True)
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+    return table
+
+
 def _topics(now: dict[str, Any]) -> Table:
-    table = Table(title=f"skin {now['skin']}", title_justify="left", box=None)
-    for head in ("topic", "Hz", "age ms", "p50 ms", "p99 ms", "lost", "CPU %", "says"):
-        table.add_column(head, justify="left" if head in ("topic", "says") else "right")
+    table = _table("topic", "Hz", "age ms", "p50 ms", "p99 ms", "lost", "CPU %")
+    table.add_column("is")
     for name, row in now["topics"].items():
         process = now["processes"].get(row["producer"])
         says = Text("valid", style="green") if row["valid"] else Text("invalid", style="bold red")
-        says.append(" " + ", ".join(row["reasons"]), style="yellow")
+        if row["reasons"]:
+            says.append(": " + ", ".join(row["reasons"]), style="yellow")
         table.add_row(
-            name,
+            f"{name}/{now['skin']}",
             _number(row["rate_hz"]),
             _number(row["age_ms"], 0),
             _number(row["latency_ms"]["p50"]),
             _number(row["latency_ms"]["p99"]),
             str(row["lost"]),
-            _number(process["cpu"] * 100) if process else "",
+            _number(process["cpu"] * 100 if process else None),
             says,
         )
     return table
 
 
 def _processes(now: dict[str, Any]) -> Table:
-    table = Table(box=None)
-    for head in ("process", "level", "CPU %", "p50 ms", "p99 ms", "drops", "says"):
-        table.add_column(head, justify="left" if head in ("process", "level", "says") else "right")
+    table = _table("process", "level", "CPU %", "p50 ms", "p99 ms")
+    table.add_column("dropped")
     for name, row in now["processes"].items():
-        drops = " ".join(f"{cause} {n}" for cause, n in row["drops"].items() if n)
         latency = row["latency_ms"]
         table.add_row(
             name,
@@ -58,10 +69,19 @@ def _processes(now: dict[str, Any]) -> Table:
             _number(row["cpu"] * 100),
             _number(latency.get("p50")),
             _number(latency.get("p99")),
-            drops or "0",
-            "; ".join(row["messages"]),
+            ", ".join(f"{n} {cause}" for cause, n in row["drops"].items() if n) or "0",
         )
     return table
+
+
+def _sayings(now: dict[str, Any]) -> Text:
+    """What the processes have to say, one line each."""
+    text = Text()
+    for name, row in now["processes"].items():
+        for message in row["messages"]:
+            text.append(f"{name}: ", style=LEVELS[row["level"]])
+            text.append(message + "\n")
+    return text
 
 
 def _skin(monitor: Monitor) -> RenderableType:

@@ -46,7 +46,8 @@ def top(
 
                 from services.cli.screen import screen
 
-                Console().print(screen(monitor))
+                console = Console()
+                console.print(screen(monitor, console.width))
             if once:
                 return
     _live(monitor)
@@ -58,10 +59,11 @@ def _live(monitor: Monitor) -> None:
 
     from services.cli.screen import screen
 
-    with Live(screen(monitor), console=Console(), screen=True, auto_refresh=False) as live:
+    console = Console()
+    with Live(screen(monitor, console.width), console=console, screen=True, auto_refresh=False) as live:
         while True:
             monitor.read(0.2)
-            live.update(screen(monitor), refresh=True)
+            live.update(screen(monitor, console.width), refresh=True)
 
 
 def echo(
