@@ -9,7 +9,7 @@ import logging
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from services.stage import Health
 
 POLL_S = 0.1
 REOPEN_S = 0.2  # between attempts to open a port
-INTRODUCE_S = 2.0  # for a board under another name to say who it is
+INTRODUCE_S = 0.6  # for a board under another name to say who it is
 SCANS_VALID = 3  # a frame is valid until this many scans later
 FILE_RATE_HZ = 22.0  # at which frames of a file without times are given
 
@@ -69,14 +69,16 @@ class BoardSource(Source):
 
     def frames(self) -> Iterator[RawFrame | None]:
         while True:
-            for url in ports.candidates(self.skin.port, self._usb_serial, bool(self._board)):
+            for n, url in enumerate(ports.candidates(self.skin.port, self._usb_serial, bool(self._board))):
                 try:
                     self._port = ports.Port(url)
                 except ports.PortError as why:
-                    self._trouble(str(why), first=url == next(ports.candidates(self.skin.port, None, False)))
+                    self._trouble(str(why) if n == 0 else self.problem)  # the configured name is the one to speak of
                     continue
                 try:
-                    yield from self._connection(self._port, must_be=self._board if url != self.skin.port else "")
+                    stranger = yield from self._connection(self._port, must_be=self._board if n else "")
+                    if stranger:
+                        continue
                 except ports.PortError as why:
                     self._trouble(str(why))
                     self.counts["disconnects"] += 1
@@ -91,11 +93,10 @@ class BoardSource(Source):
             self._port.close()
             self._port = None
 
-    def _connection(self, port: ports.Port, must_be: str) -> Iterator[RawFrame | None]:
-        """Until the port is gone (PortError), or turns out to be another board than `must_be`."""
+    def _connection(self, port: ports.Port, must_be: str) -> Generator[RawFrame | None, None, bool]:
+        """Until the port is gone (PortError), or turns out to be another board than `must_be` (returns True)."""
         opened = time.monotonic()
         board, clock = BoardLink(self.scanning, opened), DeviceClock()
-        stub_port = self.skin.port == "stub"
         seen: Counter[str] = Counter()
         while True:
             now = time.monotonic()
@@ -106,8 +107,8 @@ class BoardSource(Source):
             read_ns = time.monotonic_ns()
             scans = board.received(data, read_ns * 1e-9) if data else []
             self._count(board, seen)
-            if must_be and not stub_port and (board.board or now - opened > INTRODUCE_S) and board.board != must_be:
-                return  # somebody else's device
+            if must_be and (board.board or now - opened > INTRODUCE_S) and board.board != must_be:
+                return True
             if board.state == "running" and self._board != board.board:
                 self._board, self._usb_serial = board.board, ports.usb_serial_number(port.url)
             if board.problem != self.problem:
@@ -140,9 +141,9 @@ class BoardSource(Source):
             board=board.board,
         )
 
-    def _trouble(self, problem: str, first: bool = True) -> None:
+    def _trouble(self, problem: str) -> None:
         """Say what is the matter, once each time it changes."""
-        if problem == self.problem or not first:
+        if problem == self.problem:
             return
         if problem:
             log.warning("%s: %s", self.name, problem)

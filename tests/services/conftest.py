@@ -56,7 +56,10 @@ class Board:
         pixels = inside.reshape(self._block).mean(axis=(1, 3)) * drop
         return np.asarray(self.m.jacobian @ pixels.ravel())
 
-    def frame(self, difference: NDArray[np.floating] | float = 0.0, board: str = "b1", source: str = "board") -> RawFrame:
+    def frame(
+        self, difference: NDArray[np.floating] | float = 0.0, board: str = "b1", source: str = "board"
+    ) -> RawFrame:
+        """The next frame, `difference` (K,) relative to the untouched skin."""
         self.scan += 1
         z = self.m.z0 * (1 + difference) * (1 + self.sigma * self.rng.standard_normal(len(self.m.z0)))
         self._now += self.frame_ns

@@ -1,0 +1,260 @@
+"""Acquisition: the link's state machine, the clock, the port, and a board that comes and goes."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.bundle import Bundle
+from models.patterns import pattern
+from protocol import link
+from protocol.frames import RawFrame
+from services.acquisition import SourceFeed
+from services.boardlink import ANSWER_S, REFUSED_AGAIN_S, SILENT_S, BoardLink, Scanning
+from services.clock import DeviceClock
+from services.config import Skin
+from services.port import PortError, explain
+from services.source import BoardSource, FileSource, open_source, rows
+from tests.services.fake_board import FakeBoard, PtyBoard
+
+SCANNING = Scanning(pattern("pairs"), 128, 40_000.0)
+
+
+def talk(host: BoardLink, board: FakeBoard, start_s: float, seconds: float = 1.0) -> float:
+    """Let both ends exchange what they have to say; returns the time at the end."""
+    now = start_s
+    while now < start_s + seconds:
+        host.received(board.receive(host.to_send(now)), now)
+        now += 0.02
+    return now
+
+
+def test_a_board_is_asked_checked_configured_and_started() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = talk(host, board, 0.0, 0.2)
+    assert host.state == "running" and not host.problem
+    assert [type(m).__name__ for m in board.heard] == ["Hello", "Config", "Start"]
+    assert board.config is not None and (board.config.scan == SCANNING.pattern).all()
+    scans = host.received(board.scan(), now)
+    assert [s.seq for s in scans] == [0] and len(scans[0].z) == 120
+
+
+def test_lost_commands_are_sent_again() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    host.received(board.receive(host.to_send(0.0)), 0.0)
+    assert host.state == "config"
+    host.to_send(0.1)  # lost on the line
+    assert host.to_send(0.1 + ANSWER_S / 2) == b""
+    talk(host, board, 0.1 + ANSWER_S)
+    assert host.state == "running"
+
+
+@pytest.mark.parametrize(
+    ("ident", "expected"),
+    [
+        (link.Ident(schema_hash=0xDEADBEEF, firmware="other 2.0"), "'other 2.0' speaks schema deadbeef"),
+        (link.Ident(schema_hash=link.SCHEMA_HASH, chip_id=0xA0A0), "0xa0a0, expected 0x5502: power-cycle"),
+        (link.Ident(schema_hash=link.SCHEMA_HASH, electrodes=8), "has 8 electrodes"),
+    ],
+)
+def test_a_board_that_does_not_fit_is_refused_by_name_and_tried_again(ident: link.Ident, expected: str) -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    good, board.ident = board.ident, ident
+    now = talk(host, board, 0.0, 0.3)
+    assert host.state == "refused" and expected in host.problem
+    board.ident = good
+    talk(host, board, now + REFUSED_AGAIN_S, 0.5)
+    assert host.state == "running" and not host.problem
+
+
+def test_missing_scans_are_counted_across_the_wrap() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = talk(host, board, 0.0, 0.2)
+    for seq, gap in ((0, False), (1, False), (4, True), (5, False)):
+        board.seq = seq
+        host.received(board.scan(), now)
+        assert host.gap is gap
+    board.seq = 0xFFFFFFFF
+    host.received(board.scan(), now)
+    board.seq = 1
+    host.received(board.scan(), now)
+    assert host.counts["missing"] == 2 + 1  # 2, 3 and the 0 after the wrap; the jump back to 2^32 - 1 is no gap
+
+
+def test_a_reset_or_silent_board_is_configured_again() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = talk(host, board, 0.0, 0.2)
+    host.received(link.encode(link.Event(code=link.EventCode.BROWN_OUT, text="3.1 V")), now)
+    assert host.state == "hello" and "3.1 V" in host.problem
+    now = talk(host, board, now, 0.3)
+    assert host.state == "running"
+    now = talk(host, board, now + SILENT_S + 0.1, 0.3)
+    assert host.state == "running" and host.counts["restarts"] == 2
+
+
+def test_a_deaf_port_is_explained() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    board.deaf = True
+    talk(host, board, 0.0, 3.0)
+    assert "no answer to HELLO" in host.problem
+    host.received(b"\0garbage that is no message\0" * 3, 3.0)
+    host.problem = ""
+    talk(host, board, 3.0, 1.0)
+    assert "only noise" in host.problem
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.binary(max_size=200), max_size=10))
+def test_garbage_at_any_moment_does_no_harm(pieces: list[bytes]) -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = 0.0
+    for piece in pieces:
+        host.received(piece, now)
+        host.received(board.receive(host.to_send(now)), now)
+        now += 0.05
+    host.received(b"\0", now)
+    talk(host, board, now + 2.0, 2.0)
+    assert host.state == "running"
+    assert len(host.received(board.scan(), now + 4.0)) == 1
+
+
+def test_the_clock_finds_the_boards_rate_through_late_arrivals() -> None:
+    """A crystal 40 ppm fast, frames late by 1 ms and an exponential 0.5 ms: known offset and slope must come out."""
+    rng, clock = np.random.default_rng(0), DeviceClock()
+    for n in range(2000):
+        true_s = n * 0.045
+        late = 1e-3 + rng.exponential(0.5e-3)
+        clock.observe(int(true_s * (1 + 40e-6) * 1e6) + 7_000_000, int((true_s + late) * 1e9) + 10**12)
+    stamp = clock.host_ns(int(90.0 * (1 + 40e-6) * 1e6) + 7_000_000)
+    assert stamp == pytest.approx(90.0e9 + 1e6 + 10**12, abs=150_000)
+    assert clock.sigma_ns < 150_000
+
+
+def test_the_clock_starts_anew_when_the_board_does() -> None:
+    clock = DeviceClock()
+    for n in range(100):
+        clock.observe(n * 45_000, n * 45_000_000)
+    clock.observe(0, 200 * 45_000_000)
+    assert clock.resets == 1
+    assert clock.host_ns(0) == 200 * 45_000_000
+
+
+def test_failures_to_open_say_what_to_do() -> None:
+    assert "held by another program" in explain("/dev/ttyACM0", OSError("Could not exclusively lock port"))
+    assert "plug the board in" in explain("/dev/ttyACM0", FileNotFoundError(2, "No such file"))
+    assert "group" in explain("/dev/ttyACM0", PermissionError(13, "Permission denied"))
+
+
+@pytest.fixture
+def start(skin: Skin, bundle: Bundle) -> Iterator[Callable[[str], SourceFeed]]:
+    feeds: list[SourceFeed] = []
+
+    def make(port: str) -> SourceFeed:
+        feeds.append(SourceFeed(open_source("palm", skin.model_copy(update={"port": port}), bundle)))
+        return feeds[-1]
+
+    yield make
+    for feed in feeds:
+        feed.close()
+
+
+def first_frame(feed: SourceFeed, timeout_s: float = 10.0) -> RawFrame:
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        frame = feed.recv()
+        if isinstance(frame, RawFrame):
+            return frame
+        time.sleep(0.005)
+    raise AssertionError(f"no frame: {feed.source.health().messages}")
+
+
+def problem(feed: SourceFeed, text: str, timeout_s: float = 10.0) -> None:
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        if any(text in m for m in feed.source.health().messages):
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"expected {text!r}, found {feed.source.health().messages}")
+
+
+def test_a_board_is_read_unplugged_and_found_again_under_another_name(
+    start: Callable[[str], SourceFeed], tmp_path: Path
+) -> None:
+    board = PtyBoard(tmp_path / "ttyACM0", FakeBoard())
+    feed = start(str(tmp_path / "ttyACM0"))
+    frame = first_frame(feed)
+    assert frame.valid and frame.z[0] == 1 + 2j and frame.board == b"0123456789ab".hex()
+    assert frame.stamps["sample"] < frame.stamps["read"] <= time.monotonic_ns()
+    board.garbage = bytes(range(256)) * 4
+    time.sleep(0.1)
+    board.unplug()
+    problem(feed, "cable")
+    while feed.recv() is not None:
+        pass
+    assert feed.source.counts["line_bad_cobs"] + feed.source.counts["line_bad_crc"] > 0
+    stranger = PtyBoard(tmp_path / "ttyACM1", FakeBoard(unique_id=b"another one!"))
+    back = PtyBoard(tmp_path / "ttyACM2", FakeBoard())
+    began = time.monotonic()
+    frame = first_frame(feed)
+    assert frame.board == b"0123456789ab".hex()
+    assert time.monotonic() - began < 3.0  # 1 s on a machine of one's own
+    stranger.unplug()
+    back.unplug()
+
+
+def test_a_missing_or_held_port_is_said_and_tried_again(start: Callable[[str], SourceFeed], tmp_path: Path) -> None:
+    feed = start(str(tmp_path / "ttyUSB0"))
+    problem(feed, "is not there")
+    board = PtyBoard(tmp_path / "ttyUSB0", FakeBoard())
+    first_frame(feed)
+    feed.close()
+    holder = os.open(tmp_path / "ttyUSB0", os.O_RDWR | os.O_NOCTTY)
+    fcntl.flock(holder, fcntl.LOCK_EX)
+    second = start(str(tmp_path / "ttyUSB0"))
+    problem(second, "held by another program")
+    os.close(holder)
+    first_frame(second)
+    board.unplug()
+
+
+def test_a_file_is_a_source_too(tmp_path: Path, skin: Skin, bundle: Bundle) -> None:
+    values = np.arange(360, dtype=float).reshape(3, 120) + 1
+    np.savez(tmp_path / "presses.npz", untouched=values[:1], measurements=values[1:], reference=values[1:] + 0.5)
+    kinds = [(float(v[0]), kind) for v, kind in rows(tmp_path / "presses.npz", 120)]
+    assert kinds == [(1, "full"), (121.5, "reference"), (121, "full"), (241.5, "reference"), (241, "full")]
+    source = open_source("palm", skin.model_copy(update={"port": str(tmp_path / "presses.npz")}), bundle)
+    assert isinstance(source, FileSource)
+    assert not isinstance(source, BoardSource)
+    frames = [f for _, f in zip(range(8), source.frames(), strict=False) if f is not None]
+    assert [f.kind for f in frames][:2] == ["full", "reference"] and frames[0].source == "replay"
+
+
+@pytest.mark.parametrize(
+    ("arrays", "expected"),
+    [
+        ({"measurement": np.ones((2, 120))}, "no array `measurements`"),
+        ({"measurements": np.ones((2, 64))}, r"shape \(2, 64\), expected \(n, 120\)"),
+        ({"measurements": np.ones((2, 120)), "reference": np.ones((3, 120))}, "3 rows, `measurements` 2"),
+    ],
+)
+def test_a_wrong_file_is_named(tmp_path: Path, arrays: dict[str, np.ndarray], expected: str) -> None:
+    np.savez(tmp_path / "x.npz", **arrays)
+    with pytest.raises(ValueError, match=expected):
+        list(rows(tmp_path / "x.npz", 120))
+
+
+def test_port_errors_are_their_own_kind(tmp_path: Path) -> None:
+    from services.port import Port
+
+    with pytest.raises(PortError, match="is not there"):
+        Port(str(tmp_path / "nothing"))
+    with pytest.raises(PortError):
+        Port("nonsense://x")

@@ -1,0 +1,77 @@
+"""skin.toml: what it may say, and that errors name file, key, what was found and what is allowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from services.config import ROOT, ConfigError, load, parse
+
+PALM: dict[str, Any] = {"port": "stub", "bundle": "square16"}
+
+
+def test_the_shipped_configuration_is_the_demo() -> None:
+    config = load(ROOT / "skin.toml")
+    assert list(config.skins) == ["palm"]
+    assert config.skin("palm").port == "stub" and config.skin("palm").bundle == "square16"
+
+
+@pytest.mark.parametrize(
+    ("raw", "expected"),
+    [
+        ({}, "skins: is missing"),
+        ({"skins": {}}, "skins: found {}"),
+        ({"skins": {"palm": {"bundle": "square16"}}}, "skins.palm.port: is missing"),
+        ({"skins": {"palm": PALM | {"port": 5}}}, "skins.palm.port: found 5; allowed: a valid string"),
+        ({"skins": {"palm": PALM | {"port": "com1"}}}, "skins.palm.port: found 'com1'; allowed: \"stub\""),
+        ({"skins": {"palm": PALM | {"pot": "stub"}}}, "skins.palm.pot: unknown key; allowed here: port, bundle"),
+        ({"skins": {"palm": PALM | {"dft_points": 100}}}, "dft_points: found 100; allowed: 128, 256 or 512"),
+        ({"skins": {"palm": PALM | {"tare": {"frames": 2}}}}, "skins.palm.tare.frames: found 2; allowed: "),
+        ({"skins": {"palm": PALM | {"tare": {"frame": 64}}}}, "unknown key; allowed here: frames, max_age_s"),
+        ({"skins": {"palm": PALM | {"pose": {"quaternion_xyzw": [1, 1, 0, 0]}}}}, "a quaternion of length 1"),
+        ({"skins": {"Palm one": PALM}}, "found 'Palm one'"),
+        ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publsher": "tcp://*:1"}}}, "found 'publsher'"),
+        ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publisher": "here"}}}, "tcp://HOST:PORT"),
+        ({"skins": {"palm": PALM}, "loging": {}}, "unknown key; allowed here: skins, sockets, security, logging"),
+    ],
+)
+def test_errors_name_file_key_found_and_allowed(raw: dict[str, Any], expected: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        parse(raw, Path("robot.toml"))
+    assert str(error.value).startswith("robot.toml: ")
+    assert expected in str(error.value)
+
+
+def test_every_mistake_is_named_at_once() -> None:
+    with pytest.raises(ConfigError) as error:
+        parse({"skins": {"palm": {"port": 1, "typo": 2}}})
+    assert len(str(error.value).splitlines()) == 3  # port, bundle, typo
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nothing\.toml: cannot be read"):
+        load(tmp_path / "nothing.toml")
+    (tmp_path / "bad.toml").write_text("[skins\n")
+    with pytest.raises(ConfigError, match=r"bad\.toml: is not TOML"):
+        load(tmp_path / "bad.toml")
+
+
+def test_an_unknown_skin_is_told_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match="configured: palm"):
+        load(ROOT / "skin.toml").skin("plam")
+
+
+def test_addresses_and_keys_reach_the_sockets() -> None:
+    config = parse(
+        {
+            "skins": {"palm": PALM},
+            "sockets": {"addresses": {"publisher": "tcp://0.0.0.0:47600"}},
+            "security": {"secret_key": "keys/me.key_secret", "clients": "keys/clients"},
+        },
+        Path("/robot/skin.toml"),
+    )
+    transport = config.transport()
+    assert transport.data_address("publisher") == "tcp://0.0.0.0:47600"
+    assert transport.secret_key == Path("/robot/keys/me.key_secret")

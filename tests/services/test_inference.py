@@ -1,0 +1,145 @@
+"""Inference: the network's inputs and outputs, held frames, and what is done without a network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from models.bundle import Bundle, write
+from protocol.frames import DeltaFrame, ImageFrame
+from services.config import Skin
+from services.inference import Inference
+from services.preprocessing import Preprocessing
+from tests.services.conftest import Board
+
+WANTED = frozenset({"image"})
+
+
+def network() -> bytes:
+    """drop = the stack's first image; log_sigma = log of 0.5; class logits = that image for each class, 3 up by 2."""
+    inputs = [
+        helper.make_tensor_value_info("stack", TensorProto.FLOAT, ["N", 9, 24, 24]),
+        helper.make_tensor_value_info("context", TensorProto.FLOAT, ["N", 4]),
+    ]
+    outputs = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", c, 24, 24])
+        for name, c in (("drop", 1), ("log_sigma", 1), ("classes", 5))
+    ]
+    constants = [
+        helper.make_tensor("start", TensorProto.INT64, [1], [0]),
+        helper.make_tensor("end", TensorProto.INT64, [1], [1]),
+        helper.make_tensor("axis", TensorProto.INT64, [1], [1]),
+        helper.make_tensor("zero", TensorProto.FLOAT, [], [0.0]),
+        helper.make_tensor("log_half", TensorProto.FLOAT, [], [float(np.log(0.5))]),
+        helper.make_tensor("up", TensorProto.FLOAT, [1, 5, 1, 1], [0, 0, 0, 2.0, 0]),
+    ]
+    nodes = [
+        helper.make_node("Slice", ["stack", "start", "end", "axis"], ["drop"]),
+        helper.make_node("Mul", ["drop", "zero"], ["nothing"]),
+        helper.make_node("Add", ["nothing", "log_half"], ["log_sigma"]),
+        helper.make_node("Add", ["drop", "up"], ["classes"]),
+    ]
+    graph = helper.make_graph(nodes, "test", inputs, outputs, constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    return bytes(model.SerializeToString())
+
+
+@pytest.fixture(scope="module")
+def networked(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    manifest = {k: v for k, v in bundle.manifest.items() if k not in ("schema", "files")}
+    return write(tmp_path_factory.mktemp("bundle") / "b", manifest, bundle.matrices, {"full": network()})
+
+
+@pytest.fixture
+def stage(skin: Skin, networked: Bundle) -> Inference:
+    return Inference("palm", skin.model_copy(update={"network": "full"}), networked)
+
+
+def delta(scan: int, value: float = 0.0, held: bool = False, reconstructed: int = 0) -> DeltaFrame:
+    frame = DeltaFrame(skin="palm", scan=scan, valid=True, touched=True, held=held)
+    frame.reconstructed = reconstructed or scan
+    frame.scale = 0.4
+    if not held:
+        frame.stack = np.full((9, 24, 24), value, np.float32)
+        frame.stack[0, 3, 17] = 2 * value
+        frame.context = np.zeros(4, np.float32)
+    return frame
+
+
+def run(stage: Inference, frame: DeltaFrame) -> ImageFrame:
+    (out,) = stage.process(frame, WANTED)
+    assert isinstance(out, ImageFrame)
+    return out
+
+
+def test_outputs_are_scaled_to_siemens_and_classes_to_probabilities(stage: Inference) -> None:
+    out = run(stage, delta(1, 0.5))
+    assert out.image[3, 17] == pytest.approx(0.4) and out.image[0, 0] == pytest.approx(0.2)
+    assert out.sigma == pytest.approx(0.5 * 0.4)
+    assert out.classes.sum(axis=0) == pytest.approx(1)
+    assert out.classes[3, 0, 0] == pytest.approx(np.exp(2) / (np.exp(2) + 4))
+
+
+def test_pixels_lie_where_the_manifest_says(stage: Inference) -> None:
+    out = run(stage, delta(1, 0.5))
+    assert out.origin == pytest.approx([-0.05, -0.05])
+    assert out.metres_per_pixel == pytest.approx(0.1 / 96)
+
+
+def test_untouched_frames_run_no_network(stage: Inference) -> None:
+    out = run(stage, DeltaFrame(skin="palm", scan=1, valid=True))
+    assert out.image.size == 0 and out.valid
+    assert stage.health().counters["networks_run"] == 0
+
+
+def test_a_held_frame_has_the_image_of_the_one_reconstructed(stage: Inference) -> None:
+    first = run(stage, delta(1, 0.5))
+    held = run(stage, delta(2, held=True, reconstructed=1))
+    assert held.held and held.valid and (held.image == first.image).all()
+    lost = run(stage, delta(9, held=True, reconstructed=8))  # frame 8 never came
+    assert not lost.valid and lost.reasons == ["gap"] and lost.image.size == 0
+    assert stage.health().counters["networks_run"] == 1
+
+
+def test_what_nobody_wants_is_not_run_but_made_up_for(stage: Inference) -> None:
+    assert stage.process(delta(1, 0.5), frozenset()) == []
+    assert stage.process(delta(2, held=True, reconstructed=1), frozenset()) == []
+    assert stage.health().counters["networks_run"] == 0
+    assert run(stage, delta(3, held=True, reconstructed=1)).image.max() == pytest.approx(0.4)
+
+
+def test_state_carries_the_held_image(stage: Inference, skin: Skin, networked: Bundle) -> None:
+    first = run(stage, delta(1, 0.5))
+    twin = Inference("palm", skin.model_copy(update={"network": "full"}), networked)
+    twin.load(stage.state())
+    assert (run(twin, delta(2, held=True, reconstructed=1)).image == first.image).all()
+
+
+def test_without_a_network_the_one_step_image_shows_the_touch(skin: Skin, bundle: Bundle, board: Board) -> None:
+    pre, stage = Preprocessing("palm", skin, bundle), Inference("palm", skin, bundle)
+    for _ in range(72):
+        pre.process(board.frame(), WANTED)
+    (frame,) = pre.process(board.frame(board.disc(0.4, -0.2, 0.2, 0.3)), WANTED)
+    assert isinstance(frame, DeltaFrame)
+    out = run(stage, frame)
+    iy, ix = np.unravel_index(int(out.image.argmax()), out.image.shape)
+    x, y = (out.origin[i] + (v + 0.5) * out.metres_per_pixel for i, v in enumerate((ix, iy)))
+    assert (x, y) == pytest.approx((0.02, -0.01), abs=0.003)
+    assert (out.image >= 0).all() and "no network" in stage.health().messages[0]
+
+
+def test_a_bundle_that_was_tampered_with_is_refused(networked: Bundle, tmp_path: Path) -> None:
+    from models.bundle import BundleError
+
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for file in networked.path.iterdir():
+        (copy / file.name).write_bytes(file.read_bytes())
+    (copy / "network.onnx").write_bytes(network() + b" ")
+    with pytest.raises(BundleError, match="network.onnx"):
+        Bundle.load(copy)
+    assert onnx.__version__

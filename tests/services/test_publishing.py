@@ -1,0 +1,202 @@
+"""Publishing: segmentation, tracking, forces, wrenches, outlines."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from protocol.frames import ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame, pack, unpack
+from services.config import Skin
+from services.outline import outline
+from services.publishing import Publishing
+from services.segmentation import segment
+from services.tracking import LOST_FRAMES, Tracker
+
+N, M = 96, 0.1 / 96
+CONTACT = frozenset({"contact"})
+ALL = frozenset({"contact", "force", "shape"})
+NOTHING = np.zeros((0, 0), np.float32)
+AXIS = -0.05 + (np.arange(N) + 0.5) * M
+
+
+def discs(*touches: tuple[float, float, float, float]) -> NDArray[np.float32]:
+    """Image of discs (x, y, radius [m], drop [S/m]) with edges one pixel soft."""
+    image = np.zeros((N, N))
+    for x, y, radius, drop in touches:
+        distance = np.hypot(AXIS[None, :] - x, AXIS[:, None] - y)
+        image = np.maximum(image, drop * np.clip((radius - distance) / M + 0.5, 0, 1))
+    return image.astype(np.float32)
+
+
+def image_frame(image: NDArray[np.float32], scan: int = 1, **fields: Any) -> ImageFrame:
+    return ImageFrame(
+        skin="palm",
+        scan=scan,
+        valid=True,
+        stamps={"sample": scan * 45_000_000},
+        touched=True,
+        image=image,
+        metres_per_pixel=M,
+        origin=[-0.05, -0.05],
+        **fields,
+    )
+
+
+@pytest.fixture
+def stage(skin: Skin, bundle: Bundle) -> Publishing:
+    return Publishing("palm", skin, bundle)
+
+
+def contacts(stage: Publishing, frame: Frame) -> ContactFrame:
+    out = stage.process(frame, CONTACT)[0]
+    assert isinstance(out, ContactFrame)
+    unpack(pack(out))
+    return out
+
+
+def test_position_force_area_and_wrench_of_a_touch(stage: Publishing) -> None:
+    (c,) = contacts(stage, image_frame(discs((0.02, -0.01, 0.01, 0.3)))).contacts
+    assert c.position == pytest.approx([0.02, -0.01, 0], abs=M / 10)
+    assert c.force_n == pytest.approx(3.0, rel=0.01)
+    assert c.area_m2 == pytest.approx(math.pi * 0.01**2, rel=0.03)
+    assert c.wrench == pytest.approx([0, 0, -3.0, 0.01 * 3.0, 0.02 * 3.0, 0], rel=0.02, abs=1e-9)
+    assert c.normal == [0, 0, 1] and c.state == "begin"
+
+
+def test_each_touch_is_cut_at_half_its_own_peak(stage: Publishing) -> None:
+    """A 5 N and a 1 N touch side by side: one threshold for both would lose the weak one."""
+    frame = image_frame(discs((-0.02, 0.0, 0.01, 0.5), (0.02, 0.0, 0.006, 0.1)))
+    strong, weak = contacts(stage, frame).contacts
+    assert (strong.force_n, weak.force_n) == pytest.approx((5, 1), rel=0.02)
+    assert weak.position[0] == pytest.approx(0.02, abs=M / 5)
+    assert weak.area_m2 == pytest.approx(math.pi * 0.006**2, rel=0.06)
+
+
+def test_merging_touches_are_split_where_a_valley_lies_between_them() -> None:
+    gap = np.maximum(discs((-0.012, 0, 0.01, 0.3), (0.012, 0, 0.01, 0.3)), discs((0, 0, 0.004, 0.1)))
+    assert len(segment(gap, NOTHING)) == 2
+    bridge = np.maximum(gap, discs((0, 0, 0.008, 0.28)))
+    assert len(segment(bridge, NOTHING)) == 1
+
+
+def test_noise_makes_no_contacts_and_moves_none(stage: Publishing) -> None:
+    rng = np.random.default_rng(0)
+    noise = lambda s: (s * rng.standard_normal((N, N))).astype(np.float32)  # noqa: E731
+    assert contacts(stage, image_frame(noise(0.004))).contacts == []
+    for scan in range(2, 12):
+        out = contacts(stage, image_frame(discs((0.0, 0.02, 0.01, 0.3)) + noise(0.02), scan))
+        assert len([c for c in out.contacts if c.state != "end"]) == 1
+        assert out.contacts[0].position[:2] == pytest.approx([0.0, 0.02], abs=M / 2)
+
+
+def test_uncertainty_of_force_and_confidence_come_from_the_images(stage: Publishing) -> None:
+    image = discs((0, 0, 0.01, 0.1))
+    (sure,) = contacts(stage, image_frame(image, sigma=np.full((N, N), 0.02, np.float32))).contacts
+    assert sure.force_sigma_n == pytest.approx(0.2)
+    (unsure,) = contacts(stage, image_frame(image, 2, sigma=np.full((N, N), 0.1, np.float32))).contacts
+    assert unsure.confidence < 0.9 < 0.99 < sure.confidence
+
+
+def test_a_touch_begins_lasts_and_ends_once(stage: Publishing) -> None:
+    seen = []
+    for scan, there in enumerate([True] * 4 + [False] * 4):
+        image = discs((0.001 * scan, 0, 0.01, 0.3)) if there else NOTHING
+        seen.append([(c.id, c.state) for c in contacts(stage, image_frame(image, scan)).contacts])
+    assert seen == [[(1, "begin")], *[[(1, "hold")]] * 3, *[[]] * LOST_FRAMES, [(1, "end")], [], []][: len(seen)]
+    assert contacts(stage, image_frame(discs((0, 0, 0.01, 0.3)), 20)).contacts[0].id == 2
+
+
+def test_held_frames_keep_contacts_and_say_so(stage: Publishing) -> None:
+    contacts(stage, image_frame(discs((0.01, 0, 0.01, 0.3))))
+    out = contacts(stage, image_frame(discs((0.01, 0, 0.01, 0.3)), 2, held=True))
+    assert out.held and [(c.id, c.state) for c in out.contacts] == [(1, "hold")]
+
+
+def test_ids_follow_crossing_slides() -> None:
+    tracker = Tracker()
+    ids = []
+    for n in range(60):
+        x = -0.03 + 0.001 * n
+        places = [(x, 0.004), (-x, -0.004)]
+        order = places if n % 2 else places[::-1]  # the order of contacts must not matter
+        tracks, _ = tracker.update(order, n * 45_000_000)
+        by_place = dict(zip(order, [t.id for t in tracks], strict=True))
+        ids.append((by_place[places[0]], by_place[places[1]]))
+    assert len(set(ids)) == 1
+
+
+def test_velocity_is_that_of_the_slide(stage: Publishing) -> None:
+    for scan in range(40):
+        (c,) = contacts(stage, image_frame(discs((-0.02 + 0.001 * scan, 0, 0.01, 0.3)), scan)).contacts
+    assert c.velocity == pytest.approx([0.001 / 0.045, 0, 0], rel=0.05, abs=1e-3)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.lists(st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05)), max_size=4), max_size=20))
+def test_no_id_is_used_twice(frames: list[list[tuple[float, float]]]) -> None:
+    tracker, gone = Tracker(), set()
+    for n, places in enumerate(frames):
+        tracks, ended = tracker.update(places, n * 45_000_000)
+        ids = [t.id for t in tracks]
+        assert len(set(ids)) == len(places) and not gone & set(ids)
+        gone |= {t.id for t in ended}
+
+
+@settings(max_examples=50, deadline=None)
+@given(hnp.arrays(np.float32, (24, 24), elements=st.floats(width=32, allow_nan=True, allow_infinity=True)))
+def test_nothing_that_comes_in_makes_nan_come_out(image: NDArray[np.float32]) -> None:
+    for s in segment(image, NOTHING):
+        assert all(map(math.isfinite, (s.x, s.y, s.area, s.peak, s.volume, s.orientation)))
+
+
+def test_force_and_shape_are_made_only_when_wanted(stage: Publishing) -> None:
+    frame = image_frame(discs((-0.02, 0, 0.01, 0.5), (0.02, 0.01, 0.01, 0.2)))
+    assert len(stage.process(frame, CONTACT)) == 1
+    _, force, shape = stage.process(frame, ALL)
+    assert isinstance(force, ForceFrame) and isinstance(shape, ShapeFrame)
+    assert force.force_n == pytest.approx(7.0, rel=0.01)
+    assert force.wrench[2] == pytest.approx(-7.0, rel=0.01)
+    assert len(shape.outlines) == len(shape.ids) == 2
+    for polygon, area in zip(shape.outlines, (0.01, 0.01), strict=True):
+        assert _shoelace(polygon) == pytest.approx(math.pi * area**2, rel=0.04)  # positive: counter-clockwise
+
+
+def test_outline_of_a_rectangle_with_a_notch() -> None:
+    mask = np.zeros((6, 8), bool)
+    mask[1:5, 2:7] = True
+    mask[1, 2] = False
+    found = outline(mask, 1.0, [10.0, 20.0])
+    expected = [[17, 21], [17, 25], [12, 25], [12, 22], [13, 22], [13, 21]]
+    assert sorted(found) == sorted([[float(a), float(b)] for a, b in expected])
+    assert _shoelace(found) == mask.sum()
+
+
+def test_orientation_is_the_long_axis(stage: Publishing) -> None:
+    u = (AXIS[None, :] + AXIS[:, None]) / math.sqrt(2)
+    v = (-AXIS[None, :] + AXIS[:, None]) / math.sqrt(2)
+    bar = np.where((abs(u) < 0.02) & (abs(v) < 0.005), 0.3, 0).astype(np.float32)
+    shape = stage.process(image_frame(bar), ALL)[2]
+    assert isinstance(shape, ShapeFrame)
+    assert shape.orientation[0] == pytest.approx(math.pi / 4, abs=0.02)
+
+
+def test_shape_class_is_the_mean_over_the_touch(stage: Publishing) -> None:
+    classes = np.full((5, 24, 24), 0.05, np.float32)
+    classes[4] = 0.8
+    (c,) = contacts(stage, image_frame(discs((0.02, 0.01, 0.01, 0.3)), classes=classes)).contacts
+    assert c.shape == "L" and c.shape_probability == pytest.approx(0.8)
+    (c,) = contacts(stage, image_frame(discs((0.02, 0.01, 0.01, 0.3)), 2, classes=classes * 0 + 0.2)).contacts
+    assert c.shape == "unknown"
+
+
+def _shoelace(polygon: list[list[float]]) -> float:
+    x, y = np.array(polygon).T
+    return float(0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1)))

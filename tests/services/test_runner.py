@@ -1,0 +1,165 @@
+"""The runner, as a process of its own: what comes out of its sockets, what it does about silence and rubbish."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.bundle import Bundle
+from protocol.frames import DeltaFrame, Frame, InfoFrame, StatusFrame, pack
+from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
+from services.config import ROOT
+from tests.services.conftest import Board
+
+CONFIG = '[skins.palm]\nport = "stub"\nbundle = "square16"\nnetwork = "none"\n'
+
+
+class Process:
+    """preprocessing, fed by us in acquisition's place."""
+
+    def __init__(self, folder: Path) -> None:
+        (folder / "skin.toml").write_text(CONFIG)
+        self.env = dict(os.environ, EITSKIN_CONFIG=str(folder / "skin.toml"))
+        self.upstream = Publisher("acquisition")
+        self.out = AllReader(["delta", "status", "info"], "palm", endpoint=f"ipc://{folder}/preprocessing.ipc")
+        self.control = ControlClient("preprocessing", 10.0)
+        self.log = open(folder / "log", "w+")
+        self.start()
+
+    def start(self) -> None:
+        command = [sys.executable, "-m", "services.preprocessing"]
+        self.popen = subprocess.Popen(command, cwd=ROOT, env=self.env, stderr=self.log)
+
+    def feed(self, board: Board, n: int, difference: np.ndarray | float = 0.0) -> list[DeltaFrame]:
+        """Send frames, each when the one before has come out; what came out."""
+        outs = []
+        for _ in range(n):
+            frame = board.frame(difference)
+            frame.stamps["read"] = time.monotonic_ns()
+            self.upstream.send(frame)
+            outs.append(self.until(DeltaFrame, lambda f, scan=frame.scan: f.scan == scan))
+        return outs
+
+    def connect(self, board: Board) -> None:
+        """Send frames until one comes out."""
+        end = time.monotonic() + 20
+        while time.monotonic() < end:
+            frame = board.frame()
+            frame.stamps["read"] = time.monotonic_ns()
+            self.upstream.send(frame)
+            if any(isinstance(f, DeltaFrame) for f in self.take(0.1)):
+                return
+        raise AssertionError("no frame came through: " + self.logged())
+
+    def take(self, seconds: float) -> list[Frame]:
+        found, end = [], time.monotonic() + seconds
+        while (frame := self.out.recv(max(0.0, end - time.monotonic()))) is not None:
+            found.append(frame)
+        return found
+
+    def until(self, kind: type, fits=lambda frame: True, timeout_s: float = 15.0):
+        end = time.monotonic() + timeout_s
+        while time.monotonic() < end:
+            frame = self.out.recv(0.5)
+            if isinstance(frame, kind) and fits(frame):
+                return frame
+        raise AssertionError(f"no such {kind.__name__}: {self.logged()}")
+
+    def logged(self) -> str:
+        self.log.seek(0)
+        return self.log.read()
+
+    def close(self) -> None:
+        self.popen.kill()
+        self.popen.wait()
+        self.upstream.close()
+        self.out.close()
+        self.log.close()
+
+
+@pytest.fixture
+def process(runtime: Path) -> Iterator[Process]:
+    made = Process(runtime)
+    yield made
+    made.close()
+
+
+def test_frames_commands_silence_and_a_crash(process: Process, board: Board, bundle: Bundle) -> None:
+    """One process, all the way: it takes seconds to start, so what can be looked at together is."""
+    process.connect(board)
+    outs = process.feed(board, 80)
+    first, last = outs[0], outs[-1]
+    assert last.valid and not last.touched
+    assert last.session == first.session and last.seq == first.seq + 79
+    assert last.stamps["sample"] < last.stamps["read"] < last.stamps["preprocess"] <= time.monotonic_ns()
+    assert last.source == "board" and last.valid_for_s == pytest.approx(0.135)
+
+    late = AllReader(["info"], "palm")
+    info = late.recv(10)  # latched
+    late.close()
+    assert isinstance(info, InfoFrame)
+    assert info.info["bundle_hash"] == bundle.hash and len(info.info["baseline"]) == 120
+
+    for rubbish in (b"raw/palm\0", b"raw/palm\0\xc1", b"raw/palm\0" + os.urandom(300), pack(board.frame())[:-7]):
+        process.upstream.socket.send(rubbish)
+        time.sleep(0.05)
+    old = board.frame()
+    old.stamps["read"] = time.monotonic_ns() - 10**9
+    process.upstream.send(old)
+    time.sleep(0.3)  # a newer frame would overtake it
+    assert process.feed(board, 1)[0].valid
+    status = process.until(StatusFrame, lambda f: f.drops["old"] == 1 and f.drops["malformed"] > 0)
+    assert status.process == "preprocessing" and 0 < status.rates["delta"] and status.latency["work_p50"] > 0
+
+    touch = board.disc(0.0, 0.0, 0.2, 0.3)
+    assert process.feed(board, 3, touch)[-1].touched
+    with pytest.raises(ControlError, match="touched") as refused:
+        process.control.call("tare", skin="palm")
+    assert refused.value.kind == "refused"
+    with pytest.raises(ControlError, match="configured: palm"):
+        process.control.call("tare", skin="plam")
+    assert process.control.call("status")["flowing"]
+
+    silent = process.until(StatusFrame, lambda f: f.level == "STALE")
+    assert "no raw/palm" in " ".join(silent.messages)
+    assert not [f for f in process.take(0.3) if isinstance(f, DeltaFrame)]
+    assert not process.control.call("status")["flowing"]
+
+    process.popen.kill()
+    process.popen.wait()
+    process.start()
+    process.connect(board)
+    again = process.feed(board, 1, touch)[0]
+    assert again.valid and again.touched  # by the baseline of before the crash, although touched all the while
+    assert again.session != last.session
+
+    state = process.control.call("state", skin="palm")["state"]
+    session = process.control.call("reset", skin="palm", new_session=True)["session"]
+    out = process.feed(board, 1)[0]
+    assert not out.valid and out.session == session and out.seq == 0
+    process.control.call("load", skin="palm", state=state)
+    assert process.feed(board, 1)[0].valid
+    with pytest.raises(ControlError, match="does not fit"):
+        process.control.call("load", skin="palm", state={"bundle": bundle.hash, "baseline": 3})
+
+    began = time.monotonic()
+    process.popen.send_signal(signal.SIGTERM)
+    assert process.popen.wait(5) == 0 and time.monotonic() - began < 3
+    assert "Traceback" not in process.logged()
+
+
+def test_a_configuration_that_is_wrong_ends_in_one_clear_line(runtime: Path) -> None:
+    (runtime / "skin.toml").write_text(CONFIG.replace("square16", "square17"))
+    env = dict(os.environ, EITSKIN_CONFIG=str(runtime / "skin.toml"))
+    command = [sys.executable, "-m", "services.inference"]
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "square17" in done.stderr and "Traceback" not in done.stderr
