@@ -22,6 +22,7 @@ from models.bundle import Bundle
 from models.prereconstruction import Drift, Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame
 from services.config import Skin
+from services.describe import geometry
 from services.electrodes import ElectrodeHealth
 from services.stage import Health, Refused, Stage, add_reason, inherited
 from services.tare import Baseline, noise_of_steps, take
@@ -303,7 +304,7 @@ class Preprocessing(Stage):
         found: dict[str, Any] = {
             "bundle": self.bundle.name,
             "bundle_hash": self.bundle.hash,
-            "geometry": skin,
+            "geometry": geometry(self.bundle),
             "pattern": skin.get("pattern", ""),
             "frame_id": self.config.frame_id,
             "parent_frame_id": self.config.pose.parent,

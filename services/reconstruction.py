@@ -56,7 +56,7 @@ def read_input(arrays: Mapping[str, NDArray[Any]], k: int) -> Input:
     reference = np.abs(_matrix(arrays, "reference", k)).astype(float)
     if len(reference) != len(measurements):
         raise InputError(
-            f"`reference` has {len(reference)} rows, `measurements` {len(measurements)}: one is needed per row"
+            f"`reference` has {len(reference)} rows, `measurements` {len(measurements)}: expected one each"
         )
     return Input(measurements, None, reference)
 
@@ -65,7 +65,7 @@ def _matrix(arrays: Mapping[str, NDArray[Any]], name: str, k: int) -> NDArray[An
     a = arrays[name]
     if a.dtype.kind not in "iufc" or a.ndim != 2 or a.shape[1] != k or not len(a):
         raise InputError(
-            f"`{name}` is {a.dtype} of shape {a.shape}, expected numbers of shape (rows, {k}), in the skin's pattern order"
+            f"`{name}` is {a.dtype} of shape {a.shape}, expected numbers of shape (n, {k}) in the skin's pattern order"
         )
     if not np.isfinite(a).any():
         raise InputError(f"`{name}` holds no finite number")

@@ -101,16 +101,19 @@ def _pair(text: str) -> tuple[str, Any]:
 
 
 def _stub(command: str, skin: str, **args: Any) -> dict[str, Any]:
-    return control("stub", command, **args, **({"skin": skin} if skin else {}))
+    if skin:
+        args["skin"] = skin
+    return control("stub", command, **args)
 
 
-def tare(skin: SkinOption = "", as_json: JsonOption = False) -> None:
-    """Take a new baseline: nothing may touch the skin for the next seconds."""
-    answer = control("preprocessing", "tare", skin=skin_name(skin), timeout_s=10.0)
+def tare(
+    force: Annotated[bool, typer.Option("--force", help="Also where it looks touched: nothing touches it.")] = False,
+    skin: SkinOption = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Take a new baseline from the last seconds, in which nothing touched the skin."""
+    answer = control("preprocessing", "tare", skin=skin_name(skin), force=force, timeout_s=10.0)
     if as_json:
         emit(answer)
     else:
-        frames = answer.get("frames")
-        print(
-            "taking a new baseline" + (f" from the next {frames} frames" if frames else "") + ": leave the skin alone"
-        )
+        print(f"new baseline from {answer['frames']} frames, {answer['snr_db']:.1f} dB")

@@ -11,6 +11,7 @@ from rich.text import Text
 
 RAMP = ((16, 18, 32), (56, 24, 96), (150, 30, 90), (230, 90, 40), (255, 200, 60), (255, 255, 220))
 """Colours from no drop to the full one."""
+LETTERS = ".:-=+*#%@"
 OUTSIDE = (0, 0, 0)
 
 
@@ -44,8 +45,12 @@ def draw(
     outline: Sequence[Sequence[float]] | None = None,
     full_scale: float = 0.5,
     cells: int = 32,
+    coloured: bool = True,
 ) -> Text:
-    """Text of cells / 2 lines of `cells` columns, y upwards; `contacts` are (x, y) in metres, `full_scale` in S/m."""
+    """Text of cells / 2 lines of `cells` columns, y upwards; `contacts` are (x, y) in metres, `full_scale` in S/m.
+
+    Not `coloured`: one character for the stronger of each two cells.
+    """
     values = np.zeros((cells, cells)) if image is None or image.size == 0 else coarse(image, cells)
     values = values / max(full_scale, float(values.max()))
     axis = (-1 + 2 * (np.arange(cells) + 0.5) / cells) * half_width_m
@@ -55,7 +60,12 @@ def draw(
     for row in range(cells // 2 - 1, -1, -1):
         for column in range(cells):
             top, bottom = (colour(values[r, column]) if covered[r, column] else OUTSIDE for r in (2 * row + 1, 2 * row))
-            if (row, column) in marks:
+            if not coloured:
+                value = max(values[2 * row, column], values[2 * row + 1, column])
+                letter = LETTERS[min(int(value * len(LETTERS)), len(LETTERS) - 1)]
+                on = covered[2 * row, column] or covered[2 * row + 1, column]
+                text.append("X" if (row, column) in marks else letter if on else " ")
+            elif (row, column) in marks:
                 text.append("+", style=f"bold white on rgb({bottom[0]},{bottom[1]},{bottom[2]})")
             else:
                 text.append("▀", style=f"rgb({top[0]},{top[1]},{top[2]}) on rgb({bottom[0]},{bottom[1]},{bottom[2]})")

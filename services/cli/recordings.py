@@ -49,17 +49,13 @@ def record(
                 recorder.step(0.1)
                 counts = ", ".join(f"{topic} {n}" for topic, n in recorder.writer.counts.items())
                 status.update(f"recording to {file}: {counts or 'nothing yet'}  (Ctrl-C ends it)")
-    result = {
-        "file": str(file),
-        "messages": recorder.writer.counts,
-        "gaps": recorder.gaps,
-        "bytes": file.stat().st_size,
-    }
+    size = file.stat().st_size
+    result = {"file": str(file), "messages": recorder.writer.counts, "gaps": recorder.gaps, "bytes": size}
     if as_json:
         emit(result)
     else:
         counts = ", ".join(f"{topic} {n}" for topic, n in recorder.writer.counts.items())
-        print(f"{file}: {counts or 'nothing'}; {result['bytes'] / 1e6:.1f} MB; {recorder.gaps} messages missed")
+        print(f"{file}: {counts or 'nothing'}; {size / 1e6:.1f} MB; {recorder.gaps} messages missed")
     if not recorder.writer.counts:
         fail("nothing was recorded: is the service running (`skin up`)?", 3)
 

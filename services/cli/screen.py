@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -16,16 +17,16 @@ WIDE = 130
 LEVELS = {"OK": "green", "WARN": "yellow", "ERROR": "bold red", "STALE": "bold red"}
 
 
-def screen(monitor: Monitor, width: int) -> RenderableType:
+def screen(monitor: Monitor, width: int, coloured: bool = True) -> RenderableType:
     """The whole page for a terminal of so many columns."""
     now = monitor.snapshot()
     if not monitor.heard:
         return Text(f"waiting for frames of skin {monitor.skin!r}; is the service running (`skin up`)?", style="yellow")
     tables = Group(_topics(now), _processes(now), _sayings(now))
     if width < WIDE:
-        return Group(tables, _skin(monitor), _contacts(now))
+        return Group(tables, _skin(monitor, coloured), _contacts(now))
     page = Table.grid(padding=(0, 2))
-    page.add_row(tables, Group(_skin(monitor), _contacts(now)))
+    page.add_row(tables, Group(_skin(monitor, coloured), _contacts(now)))
     return page
 
 
@@ -84,16 +85,15 @@ def _sayings(now: dict[str, Any]) -> Text:
     return text
 
 
-def _skin(monitor: Monitor) -> RenderableType:
+def _skin(monitor: Monitor, coloured: bool) -> RenderableType:
     image, contact = monitor.image, monitor.contact
     geometry = monitor.info.get("geometry") or {}
-    outline = geometry.get("outline")
-    outline = outline.tolist() if hasattr(outline, "tolist") else outline
+    outline = np.asarray(geometry.get("outline", np.zeros((0, 2)))).tolist() or None
     half = max((abs(v) for point in outline for v in point), default=0.05) if outline else 0.05
     if image is not None and image.image.size:
         half = max(half, -min(image.origin))
     marks = [(c.position[0], c.position[1]) for c in contact.contacts] if contact else []
-    return draw(image.image if image is not None else None, half, marks, outline)
+    return draw(image.image if image is not None else None, half, marks, outline, coloured=coloured)
 
 
 def _contacts(now: dict[str, Any]) -> Text:

@@ -47,7 +47,7 @@ def top(
                 from services.cli.screen import screen
 
                 console = Console()
-                console.print(screen(monitor, console.width))
+                console.print(screen(monitor, console.width, coloured=console.is_terminal))
             if once:
                 return
     _live(monitor)
