@@ -202,7 +202,11 @@ class Solution:
         return np.asarray((result / self.contact_impedance[:, None] ** 2).T)
 
     def _rows(self, pattern: str | ArrayLike | None) -> NDArray[np.int64]:
-        return self.model.pattern if pattern is None else patterns.pattern(pattern, self.model.skin.n_electrodes)
+        if pattern is None:
+            return self.model.pattern
+        if isinstance(pattern, str):
+            return patterns.pattern(pattern, self.model.skin.n_electrodes)
+        return np.asarray(pattern, dtype=np.int64).reshape(-1, 4)  # any measurements, of whatever rank
 
     def _incidence(self, pattern: str | ArrayLike | None) -> tuple[Array, Array]:
         rows, n = self._rows(pattern), self.model.skin.n_electrodes

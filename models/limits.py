@@ -1,0 +1,199 @@
+"""What physics allows: floors of a touch's position, size and drop for a skin, a pattern and a noise; table and maps.
+
+    skin limits --skin square16 --snr 70 --map limits.png
+    skin limits --rank --snr inf --floor-ohm 1e-3
+
+The floors and what they mean: models/fisher.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from models import geometry, patterns
+from models.elements import Array
+from models.fisher import Floor, Noise, SizePrior, floors, mean_floor
+from models.forward import shared
+from models.prereconstruction import Drift
+from models.shapes import Shape
+
+__all__ = ["Floor", "Noise", "SizePrior", "floors", "map_floors", "mean_floor", "rank_patterns"]
+
+MAP_SIDE = 12  # positions along the side, at least, in a map
+DROPS = (0.1, 0.15, 0.3, 0.5)  # 1, 1.5, 3 and 5 N by the default force law
+
+
+@dataclass(frozen=True)
+class Case:
+    """Everything a floor depends on but the touch."""
+
+    skin: str = "square16"
+    pattern: str | None = None
+    noise: Noise = Noise()
+    prior: SizePrior = SizePrior()
+    drift: Drift = Drift()
+
+    def floor(self, x: float, y: float, radius: float, drop: float) -> dict[str, Floor]:
+        touch = Shape("circle", x, y, radius, drop)
+        return floors(self.skin, touch, self.noise, self.prior, self.pattern, self.drift)
+
+
+def positions(skin: str, radius: float, per_side: int) -> Array:
+    """(m, 2) grid points at which a touch of this radius lies wholly on the skin."""
+    line = (np.arange(per_side) + 0.5) * 2 / per_side - 1
+    points = np.array([(x, y) for y in line for x in line])
+    curve = shared(skin, "inverse").skin.curve
+    return np.asarray(points[curve.inside(points) & (curve.distance(points) >= radius)])
+
+
+def map_floors(case: Case, radius: float, drop: float, per_side: int = 9) -> tuple[Array, dict[str, list[Floor]]]:
+    """Positions (m, 2) and at each of them the floors, by kind."""
+    points = positions(case.skin, radius, per_side)
+    if not len(points):
+        raise ValueError(f"no touch of radius {radius} fits on skin '{case.skin}'")
+    both = [case.floor(x, y, radius, drop) for x, y in points]
+    return points, {kind: [f[kind] for f in both] for kind in ("cramer_rao", "bayes")}
+
+
+def rank_patterns(case: Case, radius: float = 0.2, drop: float = 0.15, per_side: int = 5) -> list[tuple[str, Floor]]:
+    """Drive patterns, best first by the Bayesian floor of position, root mean square over the skin."""
+    names = [
+        name for name in patterns.NAMES if name != "opposite" or not shared(case.skin, "inverse").skin.n_electrodes % 2
+    ]
+    found = []
+    for name in names:
+        _, by_kind = map_floors(Case(case.skin, name, case.noise, case.prior, case.drift), radius, drop, per_side)
+        found.append((name, mean_floor(by_kind["bayes"])))
+    return sorted(found, key=lambda pair: pair[1].position)
+
+
+def table(case: Case, radius: float, per_side: int) -> list[dict[str, Any]]:
+    """A row a drop: floors over the skin, root mean square."""
+    rows = []
+    for drop in DROPS:
+        _, by_kind = map_floors(case, radius, drop, per_side)
+        for kind, each in by_kind.items():
+            mean = mean_floor(each)
+            worst = max(each, key=lambda f: f.position).position_percent
+            rows.append({"drop": drop, "floor": kind, "worst_position_percent": worst} | _figures(mean))
+    return rows
+
+
+def _figures(floor: Floor) -> dict[str, float]:
+    return {
+        "position_percent": floor.position_percent,
+        "radius_percent": 100 * floor.radius,
+        "drop_percent": 100 * floor.drop,
+        "integral_percent": 100 * floor.integral,
+    }
+
+
+def draw(case: Case, radius: float, drop: float, per_side: int, path: Path) -> None:
+    """Maps of the Bayesian floors over the skin, as PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    points, by_kind = map_floors(case, radius, drop, per_side)
+    skin = shared(case.skin, "inverse").skin
+    outline = np.vstack([skin.polygon(), skin.polygon()[:1]])
+    figure, axes = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
+    panels = {"position": "position_percent", "drop": "drop_percent", "integrated drop": "integral_percent"}
+    cell = np.round((points + 1) * per_side / 2 - 0.5).astype(int)
+    edges = np.linspace(-1, 1, per_side + 1)
+    for axis, (title, key) in zip(axes, panels.items(), strict=True):
+        image = np.full((per_side, per_side), np.nan)
+        image[cell[:, 1], cell[:, 0]] = [_figures(f)[key] for f in by_kind["bayes"]]
+        unit = "% of the side" if key == "position_percent" else "%"
+        figure.colorbar(axis.pcolormesh(edges, edges, image), ax=axis, label=unit)
+        axis.plot(*outline.T, color="0.3")
+        axis.plot(*skin.point(skin.electrodes).T, "k.", markersize=8)
+        axis.set(title=title, aspect="equal", xlabel="x (model units)", ylabel="y (model units)")
+    name = case.pattern or skin.pattern_name
+    figure.suptitle(
+        f"{case.skin}, {name}, {_noise(case.noise)}: Bayesian floor of a touch, radius {radius}, drop {drop} S/m"
+    )
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _noise(noise: Noise) -> str:
+    parts = [] if np.isinf(noise.snr_db) else [f"{noise.snr_db:g} dB"]
+    return " and ".join(parts + ([f"{noise.floor_ohm:g} ohm"] if noise.floor_ohm else []))
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="skin limits", description="What physics allows: floors of a touch's errors.")
+    parser.add_argument("--skin", default="square16", help=f"one of {', '.join(geometry.shipped())}, or a .toml file")
+    parser.add_argument("--pattern", choices=patterns.NAMES, help="default: the skin's own")
+    parser.add_argument(
+        "--snr", type=float, default=70.0, metavar="DB", help="noise relative to each |Z|; inf for none"
+    )
+    parser.add_argument("--floor-ohm", type=float, default=0.0, help="noise of the converter, the same on all channels")
+    parser.add_argument(
+        "--drift", type=float, default=0.0, help="scale and contacts since the tare, relative; inf: lost"
+    )
+    parser.add_argument("--radius", type=float, default=0.2, help="of the touch, model units")
+    parser.add_argument("--drop", type=float, default=0.15, help="S/m, for --map and --rank")
+    parser.add_argument("--known-radius", action="store_true", help="the indenter's size is known")
+    parser.add_argument("--grid", type=int, default=6, help="positions along the skin's side")
+    parser.add_argument("--rank", action="store_true", help="rank the drive patterns instead")
+    parser.add_argument("--map", type=Path, metavar="PNG", help="draw the floors over the skin")
+    parser.add_argument("--json", action="store_true")
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """`skin limits`: prints a table (or JSON), draws maps. Returns the exit status."""
+    options = _arguments(argv)
+    radius = options.radius
+    case = Case(
+        options.skin,
+        options.pattern,
+        Noise(options.snr, options.floor_ohm),
+        SizePrior(radius=(radius, radius)) if options.known_radius else SizePrior(),
+        Drift(options.drift, options.drift),
+    )
+    try:
+        if options.rank:
+            ranked = rank_patterns(case, radius, options.drop, options.grid)
+            rows = [{"pattern": name} | _figures(floor) for name, floor in ranked]
+        else:
+            rows = table(case, radius, options.grid)
+        if options.map:
+            draw(case, radius, options.drop, max(options.grid, MAP_SIDE), options.map)
+    except ValueError as error:
+        print(f"skin limits: {error}")
+        return 2
+    if options.json:
+        given = json.loads(json.dumps(asdict(case)), parse_constant=str)  # infinities as words: JSON has none
+        print(json.dumps({"case": given, "radius": radius, "rows": rows}, indent=1))
+        return 0
+    size = "known" if options.known_radius else "unknown"
+    used = options.pattern or shared(options.skin, "inverse").skin.pattern_name
+    print(f"{options.skin}, {used}, {_noise(case.noise)}, touch of radius {radius}, size {size};")
+    print("standard deviations no estimator beats, root mean square over the skin, position in % of the side")
+    _print(rows)
+    if options.map:
+        print(f"maps: {options.map}")
+    return 0
+
+
+def _print(rows: list[dict[str, Any]]) -> None:
+    names = list(rows[0])
+    print("  ".join(f"{name.replace('_percent', ' %').replace('_', ' '):>16}" for name in names))
+    for row in rows:
+        cells = [f"{value:16.3g}" if isinstance(value, float) else f"{value:>16}" for value in row.values()]
+        print("  ".join(cells))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

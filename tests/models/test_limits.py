@@ -1,0 +1,142 @@
+"""Floors of a touch's errors: against simulated estimates, against facts known of this skin, and their own logic."""
+
+import json
+
+import numpy as np
+import pytest
+
+from models import limits
+from models.fisher import STEPS, Noise, SizePrior, floors, information, mean_floor, sensitivity
+from models.forward import shared
+from models.patterns import pattern
+from models.prereconstruction import Drift
+from models.shapes import Shape
+
+TOUCH = Shape("circle", 0.31, 0.27, 0.2, 0.3)
+
+
+def moved(dx=0.0, dy=0.0, grow=0.0, deepen=0.0):
+    return Shape("circle", 0.31 + dx, 0.27 + dy, 0.2 * np.exp(grow), 0.3 * np.exp(deepen))
+
+
+def test_slopes_predict_signals_of_another_mesh():
+    """A small change of the touch, solved on the training mesh, is read back through the slopes of the inverse mesh."""
+    training = shared("square16", "training")
+    _, slope, _ = sensitivity("square16", TOUCH).relative(pattern("adjacent"))
+
+    def d(shape):
+        z0 = training.solve().impedances("adjacent")
+        return training.solve(training.touched([shape])).impedances("adjacent") / z0 - 1
+
+    change = np.array([0.03, -0.02, 0.05, -0.04])
+    found = np.linalg.lstsq(slope, d(moved(*change / 2)) - d(moved(*-change / 2)), rcond=None)[0]
+    np.testing.assert_allclose(found, change, atol=0.004)
+
+
+def test_estimates_from_noisy_frames_reach_the_floor():
+    """Gauss-Newton on noisy frames, weighted by the noise, errs by what Cramer-Rao says."""
+    noise, rng = Noise(60.0), np.random.default_rng(4)
+    model = shared("square16", "inverse")
+    rows = pattern("adjacent")
+    z0, slope, _ = sensitivity("square16", TOUCH).relative(rows)
+    truth = model.solve(model.touched([TOUCH])).impedances(rows)
+    sigma = noise.sigma(z0)
+    weighted = slope * (z0 / sigma)[:, None]
+    errors = []
+    for _ in range(40):
+        measured = truth + sigma * rng.standard_normal(len(rows))
+        estimate = rng.normal(0, 0.01, 4)  # the first guess is not the truth
+        for _ in range(2):
+            now = model.solve(model.touched([moved(*estimate)])).impedances(rows)
+            estimate += np.linalg.lstsq(weighted, (measured - now) / sigma, rcond=None)[0]
+        errors.append(np.hypot(*estimate[:2]))
+    floor = floors("square16", TOUCH, noise, pattern=rows)["cramer_rao"].position
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(floor, rel=0.3)
+
+
+def test_drift_is_marginalised_not_projected():
+    """Against the whole information matrix of touch and drift, inverted."""
+    seen, noise, drift = sensitivity("square16", TOUCH), Noise(70.0), Drift(0.01, 0.05)
+    rows = pattern("pairs")
+    z0, slope, nuisance = seen.relative(rows)
+    j = np.hstack([slope, nuisance]) / (noise.sigma(z0) / np.abs(z0))[:, None]
+    prior = np.diag(np.r_[np.zeros(4), 1 / 0.01**2, np.full(16, 1 / 0.05**2)])
+    expected = np.linalg.inv(j.T @ j + prior)[:4, :4]
+    np.testing.assert_allclose(np.linalg.inv(information(seen, rows, noise, drift)), expected, rtol=1e-6)
+
+
+def test_facts_known_of_this_skin():
+    """70 dB, no drift, radius 0.2: known from a computation by others."""
+    found = [floors("square16", Shape("circle", x, y, 0.2, 0.3), 70.0)["cramer_rao"] for x, y in ((0, 0), (0.3, 0.3))]
+    for floor in found:
+        assert 0.25 < floor.position_percent < 0.6
+        assert 0.25 < floor.drop < 0.6
+        assert 0.02 < floor.integral < 0.10
+    known = floors("square16", Shape("circle", 0.3, 0.3, 0.2, 0.3), 70.0, SizePrior(radius=(0.2, 0.2)))["cramer_rao"]
+    assert 0.003 < known.drop < 0.015
+
+
+def test_patterns_rank_by_the_noise():
+    fixed = dict(limits.rank_patterns(limits.Case(noise=Noise(np.inf, 1e-4)), per_side=4))
+    assert list(fixed) == ["pairs", "opposite", "adjacent"]
+    assert 1.4 < fixed["opposite"].position / fixed["pairs"].position < 3
+    assert 4 < fixed["adjacent"].position / fixed["pairs"].position < 12
+    relative = [name for name, _ in limits.rank_patterns(limits.Case(noise=Noise(70.0)), per_side=4)]
+    assert relative == ["adjacent", "opposite", "pairs"]
+
+
+def test_more_knowledge_lowers_the_floors():
+    free = floors("square16", TOUCH, 70.0)
+    drifting = floors("square16", TOUCH, 70.0, drift=Drift(np.inf, np.inf))
+    known = floors("square16", TOUCH, 70.0, SizePrior(radius=(0.2, 0.2)))
+    for name in ("position", "radius", "drop", "integral"):
+        assert getattr(free["bayes"], name) <= getattr(free["cramer_rao"], name)
+        assert getattr(drifting["bayes"], name) >= getattr(free["bayes"], name)
+        assert getattr(drifting["cramer_rao"], name) >= getattr(free["cramer_rao"], name)
+        assert getattr(known["bayes"], name) <= getattr(free["bayes"], name)
+    assert known["bayes"].radius < 1e-4
+
+
+def test_cramer_rao_scales_with_the_noise_and_bayes_stops_at_the_prior():
+    quiet, loud = floors("square16", TOUCH, 80.0), floors("square16", TOUCH, 60.0)
+    assert loud["cramer_rao"].position == pytest.approx(10 * quiet["cramer_rao"].position, rel=1e-9)
+    deaf = floors("square16", TOUCH, -40.0)["bayes"]
+    assert deaf.radius == pytest.approx(np.log(3) / np.sqrt(12), rel=0.01)
+    assert deaf.position == pytest.approx(2 * np.sqrt(2 / 12), rel=0.01)
+
+
+def test_floors_share_the_squares_symmetry():
+    here = floors("square16", Shape("circle", 0.3, 0.5, 0.2, 0.3), 70.0)["bayes"]
+    turned = floors("square16", Shape("circle", -0.5, 0.3, 0.2, 0.3), 70.0)["bayes"]
+    assert turned.position == pytest.approx(here.position, rel=0.06)
+    assert turned.integral == pytest.approx(here.integral, rel=0.1)
+
+
+def test_another_shape_counts_as_the_circle_of_its_area():
+    square = Shape("square", 0.31, 0.27, 0.2 * np.sqrt(np.pi / 2), 0.3, 0.4)
+    assert floors("square16", square)["bayes"].drop == pytest.approx(floors("square16", TOUCH)["bayes"].drop)
+
+
+def test_mean_is_root_mean_square():
+    a, b = floors("square16", TOUCH, 70.0)["bayes"], floors("square16", TOUCH, 80.0)["bayes"]
+    assert mean_floor([a, b]).drop == pytest.approx(np.sqrt((a.drop**2 + b.drop**2) / 2))
+
+
+def test_command_line(capsys, tmp_path):
+    assert (
+        limits.main(["--skin", "disc16", "--rank", "--snr", "inf", "--floor-ohm", "1e-4", "--grid", "2", "--json"]) == 0
+    )
+    report = json.loads(capsys.readouterr().out)
+    assert report["case"]["noise"] == {"snr_db": "Infinity", "floor_ohm": 1e-4, "tare_frames": 64}
+    assert report["rows"][0]["pattern"] == "pairs" and len(report["rows"]) == 3
+    assert limits.main(["--snr", "inf"]) == 2
+    assert "without noise nothing limits a touch" in capsys.readouterr().out
+    assert limits.main(["--skin", "hexagon6"]) == 2
+    limits.draw(limits.Case(), 0.4, 0.3, 4, tmp_path / "map.png")
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_touch_off_the_skin_is_refused():
+    with pytest.raises(ValueError, match=r"a touch at \(0.9, 0.9\) is not on skin 'disc16'"):
+        floors("disc16", Shape("circle", 0.9, 0.9, 0.1, 0.3))
+    assert max(STEPS) < 0.1
