@@ -116,9 +116,10 @@ def load_npz(path: Path) -> dict[str, Any]:
     import numpy as np
 
     try:
-        with np.load(path, allow_pickle=False) as data:
-            if not hasattr(data, "files"):
-                fail(f"{path} holds one bare array, expected named ones: numpy.savez(path, name=array)", USAGE)
+        data = np.load(path, allow_pickle=False)
+        if isinstance(data, np.ndarray):
+            fail(f"{path} holds one bare array, expected named ones: numpy.savez(path, name=array)", USAGE)
+        with data:
             return {name: data[name] for name in data.files}
     except OSError as error:
         fail(f"cannot read {path}: {error.strerror or 'not a file of numpy.savez'}", USAGE)

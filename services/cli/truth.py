@@ -14,27 +14,27 @@ from services.cli.watch import nobody
 
 
 def pairs(truth: TruthFrame, contact: ContactFrame) -> list[dict[str, Any]]:
-    """Each true touch with the nearest contact not yet taken; `found` is None where none is left."""
-    left = [c for c in contact.contacts if c.state != "end"]
+    """Each true touch and the contact that is its; `found` is None where none is left. Nearest pairs go first."""
+    found = [c for c in contact.contacts if c.state != "end"]
+    near = sorted(
+        (math.dist(c.position[:2], (t.x, t.y)), i, j) for i, t in enumerate(truth.touches) for j, c in enumerate(found)
+    )
+    partner: dict[int, int] = {}
+    for _, i, j in near:
+        if i not in partner and j not in partner.values():
+            partner[i] = j
     rows = []
-    for touch in truth.touches:
-        row: dict[str, Any] = {
-            "scan": contact.scan,
-            "x": touch.x,
-            "y": touch.y,
-            "force_n": touch.force_n,
-            "shape": touch.shape,
-        }
-        best = min(left, key=lambda c: math.dist(c.position[:2], (touch.x, touch.y)), default=None)
-        row["found"] = None
-        if best is not None:
-            left.remove(best)
+    for i, touch in enumerate(truth.touches):
+        row: dict[str, Any] = {"scan": contact.scan, "x": touch.x, "y": touch.y, "force_n": touch.force_n}
+        row |= {"shape": touch.shape, "found": None}
+        if i in partner:
+            best = found[partner[i]]
             row["found"] = {
+                "id": best.id,
                 "x": best.position[0],
                 "y": best.position[1],
                 "force_n": best.force_n,
                 "shape": best.shape,
-                "id": best.id,
                 "error_mm": math.dist(best.position[:2], (touch.x, touch.y)) * 1e3,
             }
         rows.append(row)

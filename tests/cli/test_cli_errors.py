@@ -1,0 +1,112 @@
+"""Bad requests: one clear line, the right exit code, never a traceback."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+K = 120
+
+
+def npz(path: Path, **arrays: object) -> Path:
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+    return path
+
+
+GOOD = {"measurements": np.ones((2, K)), "untouched": np.ones((8, K))}
+
+
+@pytest.mark.parametrize(
+    ("arrays", "says"),
+    [
+        ({"voltages": np.ones((2, K))}, "no array `measurements`"),
+        ({"measurements": np.ones((2, K))}, "found neither"),
+        ({**GOOD, "reference": np.ones((2, K))}, "found both"),
+        ({**GOOD, "measurements": np.ones((2, 119))}, "expected numbers of shape (n, 120)"),
+        ({**GOOD, "measurements": np.ones(K)}, "expected numbers of shape (n, 120)"),
+        ({**GOOD, "measurements": np.full((2, K), "a")}, "expected numbers of shape (n, 120)"),
+        ({**GOOD, "measurements": np.full((2, K), np.nan)}, "no finite number"),
+        ({"measurements": np.ones((2, K)), "reference": np.ones((3, K))}, "expected one each"),
+    ],
+)
+def test_reconstruct_refuses_wrong_arrays(skin, tmp_path, arrays, says) -> None:  # type: ignore[no-untyped-def]
+    ran = skin("reconstruct", npz(tmp_path / "in.npz", **arrays), tmp_path / "out.npz", "--skin", "square16")
+    assert ran.code == 2 and says in ran.err and len(ran.err.splitlines()) == 1
+    assert not (tmp_path / "out.npz").exists()
+
+
+def test_reconstruct_refuses_what_is_no_npz(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "text.npz").write_text("x, y\n1, 2\n")
+    np.save(tmp_path / "one.npy", np.ones(3))
+    npz(tmp_path / "objects.npz", measurements=np.array([{}, None], dtype=object), untouched=np.ones((2, K)))
+    for name in ("text.npz", "one.npy", "objects.npz", "missing.npz", "."):
+        ran = skin("reconstruct", tmp_path / name, tmp_path / "out.npz", "--skin", "square16")
+        assert ran.code == 2 and len(ran.err.splitlines()) == 1, name
+
+
+def test_wrong_skin_names_those_there_are(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    ran = skin("reconstruct", npz(tmp_path / "in.npz", **GOOD), tmp_path / "out.npz", "--skin", "hexagon")
+    assert ran.code == 2 and "no bundle 'hexagon'" in ran.err and "square16" in ran.err
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("press", "--x", 0, "--y", 0, "--force", 1),
+        ("release",),
+        ("scene", "slide"),
+        ("fault", "hang"),
+        ("tare",),
+        ("top", "--once", "--seconds", 0.1),
+        ("top", "--once", "--json", "--seconds", 0.1),
+        ("echo", "contact", "--timeout", 0.1),
+        ("compare", "--seconds", 0.1),
+    ],
+)
+def test_no_service_is_said_at_once(skin, command) -> None:  # type: ignore[no-untyped-def]
+    ran = skin(*command)
+    assert ran.code == 3 and "skin up" in ran.err and len(ran.err.splitlines()) == 1 and ran.out == ""
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        (("press", "--x", 0, "--y", 0, "--force", 1, "--to-x", 0.01), "both --to-x and --to-y"),
+        (("echo", "voltage"), "no topic 'voltage'"),
+        (("fault", "electrode_open", "electrode"), "expected key=value"),
+        (("bench", "speed"), "no benchmark 'speed'"),
+        (("replay", "x.mcap", "--speed", 0), "above 0"),
+        (("replay", "missing.mcap"), "cannot read missing.mcap"),
+        (("record", "/nowhere/x.mcap"), "cannot write /nowhere/x.mcap"),
+        (("record", "/tmp/x.mcap", "--topics", "raw,sound"), "no topic 'sound'"),
+    ],
+)
+def test_wrong_requests(skin, command, says) -> None:  # type: ignore[no-untyped-def]
+    ran = skin(*command)
+    assert ran.code == 2 and says in ran.err
+
+
+def test_a_runtime_folder_open_to_others_is_refused(skin, runtime) -> None:  # type: ignore[no-untyped-def]
+    runtime.chmod(0o755)
+    ran = skin("press", "--x", 0, "--y", 0, "--force", 1)
+    assert ran.code == 2 and "chmod 700" in ran.err
+
+
+def test_import_refuses_another_pattern(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    pattern = np.array([[0, 1, 2, 3]] * 192)
+    source = npz(tmp_path / "in.npz", touched=np.ones((2, 192)), untouched=np.ones((2, 192)), pattern=pattern)
+    ran = skin("import", source, tmp_path / "out.mcap", "--skin", "disc16")
+    assert ran.code == 2 and "`pattern` has 192 rows, and lacks" in ran.err
+    ran = skin("import", source, tmp_path / "out.mcap", "--skin", "square16")
+    assert ran.code == 2 and not (tmp_path / "out.mcap").exists()
+
+
+def test_a_damaged_configuration_is_explained(skin, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "skin.toml").write_text("[skins.palm]\nport = 5\n")
+    monkeypatch.setenv("EITSKIN_CONFIG", str(tmp_path / "skin.toml"))
+    ran = skin("up")
+    assert ran.code == 2 and "skins.palm.port" in ran.err
+    ran = skin("doctor")
+    assert ran.code == 1 and ran.out.startswith("FAIL  configuration")
