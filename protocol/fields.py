@@ -204,15 +204,16 @@ class Array(Check):
 
     def decode(self, value: Any) -> NDArray[Any]:
         array = decode_array(value)
-        if array.dtype.str.replace("|", "<") != self.dtype.replace("|", "<"):
+        if value["dtype"] != self.dtype:
             raise Mismatch(f"dtype {array.dtype.str}", self.describe())
-        self._check_shape(array)
+        if array.size or not self.or_empty:
+            self._check_shape(array)
         return array
 
     def encode(self, value: Any) -> dict[str, Any]:
         array = np.ascontiguousarray(value, dtype=self.dtype)
         self._check_shape(array)
-        return encode_array(array)
+        return {"dtype": self.dtype, "shape": list(array.shape), "data": array.tobytes()}
 
     def _check_shape(self, array: NDArray[Any]) -> None:
         shape = array.shape
@@ -227,7 +228,7 @@ class Array(Check):
         raise Mismatch(f"shape {list(shape)}", self.describe())
 
     def finite(self, value: Any) -> bool:
-        return self.gaps or value.dtype.kind not in "fc" or bool(np.isfinite(value).all())
+        return self.gaps or not value.size or value.dtype.kind not in "fc" or bool(np.isfinite(value).all())
 
     def describe(self) -> str:
         shape = ", ".join(str(s) for s in self.shape)
@@ -251,7 +252,8 @@ def decode_array(value: Any) -> NDArray[Any]:
         size *= n
     if size != len(data):
         raise Mismatch(f"{len(data)} bytes of data", f"{size} bytes for shape {shape} of {name}")
-    return np.frombuffer(data, dtype).reshape(shape)
+    array = np.frombuffer(data, dtype)
+    return array if len(shape) == 1 else array.reshape(shape)
 
 
 def encode_array(array: NDArray[Any]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from dataclasses import fields as dataclass_fields
@@ -10,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .fields import MAX_DEPTH, MAX_LIST, Check, Mismatch, brief, decode_array, encode_array
+from .fields import MAX_DEPTH, MAX_LIST, Bool, Check, Float, Int, Mismatch, brief, decode_array, encode_array
+
+MAX_FLOAT = sys.float_info.max
 
 
 @dataclass(frozen=True)
@@ -148,32 +151,42 @@ class Record(Check):
             (f.name, f.metadata["check"]) for f in dataclass_fields(kind)
         )
         self._same_length: tuple[str, ...] = getattr(kind, "same_length", ())
-        self._can_be_infinite = tuple((n, c) for n, c in self.checks if type(c).finite is not Check.finite)
+        self._can_be_infinite = tuple((n, c.finite) for n, c in self.checks if _can_be_infinite(c))
+        self._decoders = tuple((n, c.decode, *_range(c)) for n, c in self.checks)
+        self._encoders = tuple((n, c.encode, _range(c)[0]) for n, c in self.checks)
 
     def decode(self, value: Any) -> Any:
         if type(value) is not dict:
             raise self.refuse(value)
         read = {}
-        for name, check in self.checks:
-            try:
-                read[name] = check.decode(value[name])
-            except KeyError:
-                raise Mismatch("nothing", check.describe(), f".{name}") from None
-            except Mismatch as bad:
-                raise bad.below(f".{name}") from None
-        self._check_lengths(read)
+        name = ""
+        try:
+            for name, decode, kind, low, high in self._decoders:
+                found = value[name]
+                # Plain numbers are checked here: a call for each of them costs as much as all the rest.
+                read[name] = found if type(found) is kind and low <= found <= high else decode(found)
+        except KeyError:
+            raise Mismatch("nothing", dict(self.checks)[name].describe(), f".{name}") from None
+        except Mismatch as bad:
+            raise bad.below(f".{name}") from None
+        if self._same_length:
+            self._check_lengths(read)
         return self.kind(**read)
 
     def encode(self, value: Any) -> dict[str, Any]:
         out = {}
-        for name, check in self.checks:
-            try:
-                out[name] = check.encode(getattr(value, name))
-            except Mismatch as bad:
-                raise bad.below(f".{name}") from None
-            except (TypeError, ValueError, AttributeError) as bad:
-                raise Mismatch(f"{brief(getattr(value, name))} ({bad})", check.describe(), f".{name}") from None
-        self._check_lengths({name: getattr(value, name) for name in self._same_length})
+        name = ""
+        try:
+            for name, encode, kind in self._encoders:
+                found = getattr(value, name)
+                out[name] = found if type(found) is kind else encode(found)
+        except Mismatch as bad:
+            raise bad.below(f".{name}") from None
+        except (TypeError, ValueError, AttributeError) as bad:
+            expected = dict(self.checks)[name].describe()
+            raise Mismatch(f"{brief(getattr(value, name))} ({bad})", expected, f".{name}") from None
+        if self._same_length:
+            self._check_lengths({name: getattr(value, name) for name in self._same_length})
         return out
 
     def _check_lengths(self, values: Mapping[str, Any]) -> None:
@@ -185,7 +198,25 @@ class Record(Check):
                 )
 
     def finite(self, value: Any) -> bool:
-        return all(check.finite(getattr(value, name)) for name, check in self._can_be_infinite)
+        for name, finite in self._can_be_infinite:
+            if not finite(getattr(value, name)):
+                return False
+        return True
 
     def describe(self) -> str:
         return f"map {self.kind.__name__}"
+
+
+def _range(check: Check) -> tuple[type | None, Any, Any]:
+    """(type, lowest, highest) of a plain finite number; type None for everything else."""
+    if type(check) is Int:
+        return int, check.low, check.high
+    if type(check) is Float:
+        return float, max(check.low, -MAX_FLOAT), min(check.high, MAX_FLOAT)
+    return (bool, False, True) if type(check) is Bool else (None, 0, 0)
+
+
+def _can_be_infinite(check: Check) -> bool:
+    if isinstance(check, (ListOf, MapOf, Maybe)):
+        return _can_be_infinite(check.item)
+    return type(check).finite is not Check.finite

@@ -106,7 +106,8 @@ class Runner:
             self._poller.register(socket, zmq.POLLIN)
         next_tick = 0.0
         while not self._stop:
-            ready = self._poller.poll(max(0, 1 + int((self._next_deadline() - time.monotonic()) * 1000)))
+            wait_s = max(next_tick, self._next_deadline()) - time.monotonic()
+            ready = self._poller.poll(max(0, 1 + int(wait_s * 1000)))
             for socket, _ in ready:
                 lane = self._by_socket.get(socket)
                 if lane is not None:
