@@ -35,7 +35,7 @@ USES = {
     "training": Grading(edge=4e-4, growth=0.4, interior=0.03, offset=0.0),
     "stub": Grading(edge=8e-4, growth=0.45, interior=0.036, offset=0.37),
     "inverse": Grading(edge=2e-3, growth=0.5, interior=0.045, offset=0.61),
-    "reference": Grading(edge=5e-5, growth=0.14, interior=0.0115, offset=0.23, relaxation=6),
+    "reference": Grading(edge=5e-5, growth=0.14, interior=0.0115, offset=0.23, relaxation=3),
 }
 
 
