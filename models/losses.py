@@ -25,7 +25,7 @@ class Target:
     classes: Tensor
 
 
-WEIGHTS = {"image": 1.0, "mask": 1.0, "jaccard": 1.0, "amplitude": 0.5, "integral": 0.3, "class": 0.3, "sigma": 0.02}
+WEIGHTS = {"image": 1.0, "mask": 1.0, "jaccard": 1.0, "amplitude": 0.5, "integral": 0.3, "class": 0.5, "sigma": 0.02}
 
 
 def losses(parts: tuple[Tensor, Tensor, Tensor, Tensor], target: Target) -> dict[str, Tensor]:

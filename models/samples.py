@@ -20,6 +20,7 @@ from models.shapes import from_rows
 
 N = 96
 GRID = 24
+KIND_WEIGHT = np.array([0.0, 0.85, 1.2, 1.2, 1.2, 1.2, 0.35])  # none, circle, triangle, rectangle, square, L, Hertz
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +103,20 @@ class Batches:
         self.samples, self.pre, self.size, self.groups, self.limit = samples, pre, size, groups, bank
         self.rng = np.random.default_rng(seed)
         self.symmetries = symmetries(skin)
+        self._weigh()
         self.bank: list[Condition] = [random_condition(pre, self.rng) for _ in range(groups)]
 
     def add(self, more: Samples) -> None:
         """Takes further scenes in."""
         mine = vars(self.samples)
         self.samples = Samples(**{k: np.concatenate([v, getattr(more, k)]) for k, v in mine.items()})
+        self._weigh()
+
+    def _weigh(self) -> None:
+        """Scenes are drawn by what touches in them: round contacts teach least, and Hertz contacts are circles too."""
+        kind = np.nan_to_num(self.samples.shapes[:, :, 0]).astype(int)
+        touches = np.maximum((kind > 0).sum(axis=1), 1)
+        self.cumulated = np.cumsum(KIND_WEIGHT[kind].sum(axis=1) / touches)
 
     def draw(self) -> Batch:
         fresh = random_condition(self.pre, self.rng)
@@ -118,7 +127,7 @@ class Batches:
         chosen = self.rng.choice(len(self.bank), self.groups, replace=False)
         parts = []
         for c in chosen:
-            index = self.rng.integers(len(self.samples), size=self.size // self.groups)
+            index = np.searchsorted(self.cumulated, self.rng.random(self.size // self.groups) * self.cumulated[-1])
             turned = [self.symmetries[s] for s in self.rng.integers(len(self.symmetries), size=len(index))]
             parts.append(make(self.samples, index, turned, self.bank[c], self.rng))
         return join(parts)

@@ -218,6 +218,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m models.train", description="Train a skin's network.")
     parser.add_argument("--skin", default="square16")
     parser.add_argument("--variant", choices=sorted(CONFIGS), default="full")
+    parser.add_argument("--bundle", help="whose matrices to train with (default SKIN's)")
     parser.add_argument("--data", type=Path, help="folder of samples (default models/work/SKIN)")
     parser.add_argument("--out", type=Path, help="checkpoint (default models/work/SKIN/VARIANT.pt)")
     parser.add_argument("--minutes", type=float, default=80.0)
@@ -229,7 +230,7 @@ def main(argv: list[str] | None = None) -> None:
     skin = geometry.load(args.skin)
     folder = args.data or data.WORK / skin.name
     checkpoint = args.out or data.WORK / skin.name / f"{args.variant}.pt"
-    pre = Bundle.load(skin.name).prereconstructor()
+    pre = Bundle.load(args.bundle or skin.name).prereconstructor()
     scenes, held_out = (samples.load(folder, split, pre, args.limit) for split in ("train", "valid"))
     more = None if args.limit else folder
     train(
