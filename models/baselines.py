@@ -103,21 +103,21 @@ def greit(
     cross, gram = blobs.T @ Y.T, Y @ Y.T
     middle = J @ Shape("circle", 0.0, 0.0, target, 1.0).fraction(n).ravel()
 
-    def matrix(weight: float) -> Array:
-        return np.asarray(np.linalg.solve(gram + weight * np.trace(gram) / len(gram) * np.eye(len(gram)), cross.T).T)
+    values, vectors = np.linalg.eigh(gram)
+    values = np.maximum(values / values.mean(), 0)
+    rotated, rotated_middle = cross @ vectors / np.trace(gram) * len(gram), vectors.T @ middle
 
     def figure(weight: float) -> float:
         """SNR of the measurements over SNR of the image, for white noise on d (Adler et al., section 2.3)."""
-        M = matrix(weight)
-        image = (M @ middle)[inside]
-        noise = np.sqrt((M[inside] ** 2).sum(1))
+        image = rotated[inside] @ (rotated_middle / (values + weight))
+        noise = np.sqrt(rotated[inside] ** 2 @ (values + weight) ** -2.0)
         return float(np.abs(middle).mean() / (np.abs(image).mean() / noise.mean()))
 
     low, high = 1e-9, 1e3  # more weight, lower noise figure
     for _ in range(40):
         middle_weight = np.sqrt(low * high)
         low, high = (middle_weight, high) if figure(middle_weight) > noise_figure else (low, middle_weight)
-    return LinearMethod(matrix(np.sqrt(low * high)))
+    return LinearMethod(rotated / (values + np.sqrt(low * high)) @ vectors.T)
 
 
 class TotalVariation:
