@@ -18,6 +18,7 @@ from services.source import file_frame
 
 TARE_ROWS = 64
 """Untouched rows at the start of a recording of presses, from which the noise is found."""
+ROWS_PER_CHUNK = 8
 EPOCH_NS = 1_000_000_000_000_000_000
 """A file of measurements knows no time; its recording begins here (2001-09-09), so that importing is reproducible."""
 
@@ -57,7 +58,7 @@ def import_arrays(
             frame.valid_for_s, frame.board, frame.unit = 3 / rate_hz, source.name, "counts"
             frame.session, frame.seq = "0" * 16, count - 1
             writer.write(f"raw/{skin}", pack(frame).partition(b"\0")[2], EPOCH_NS + now_ns)
-            if count % 64 == 0:
+            if count % ROWS_PER_CHUNK == 0:
                 writer.flush()
     return {"file": str(target), "frames": count, "measurements": len(order), "seconds": count / rate_hz}
 

@@ -107,10 +107,14 @@ def baseline_of(frames: Array, pipeline: Pipeline, warn: Callable[[str], None]) 
 
 
 def noise_of_references(reference: Array) -> Array:
-    """(K,) relative noise of a frame, from how neighbouring references differ; robust against steps and slow drift."""
+    """(K,) relative noise of a frame, from how neighbouring references differ.
+
+    What all measurements do together (gain) is left out, and medians let single steps and slow drift count little.
+    """
     if len(reference) < 8:
         return np.full(reference.shape[1], ASSUMED_NOISE)
     steps = np.diff(np.log(np.where(reference > 0, reference, np.nan)), axis=0)
+    steps -= np.nanmedian(steps, axis=1, keepdims=True)
     own = np.nanmedian(np.abs(steps), axis=0) / 0.6745 / np.sqrt(2)
     own = np.where(np.isfinite(own), own, ASSUMED_NOISE)
     return np.asarray(np.maximum(own, 0.1 * np.median(own) + 1e-7))

@@ -130,10 +130,14 @@ def sensitivities(bundle: Bundle, blur: float) -> Array:
 
 def sample(fields: Array, points: Array, half_width_m: float) -> Array:
     """Values (N, K) of fields (K, h, w) at (N, 2) points [m] of the skin's frame; the edge's value outside."""
-    n = fields.shape[-1]
-    place = (points / half_width_m + 1) * n / 2 - 0.5
-    at = [place[:, 1], place[:, 0]]
-    return np.stack([ndimage.map_coordinates(f, at, order=1, mode="nearest") for f in fields], 1)
+    h, w = fields.shape[1:]
+    x = np.clip((points[:, 0] / half_width_m + 1) * w / 2 - 0.5, 0, w - 1)
+    y = np.clip((points[:, 1] / half_width_m + 1) * h / 2 - 0.5, 0, h - 1)
+    left, low = np.minimum(x.astype(int), w - 2), np.minimum(y.astype(int), h - 2)
+    right, up = x - left, y - low
+    lower = (1 - right) * fields[:, low, left] + right * fields[:, low, left + 1]
+    upper = (1 - right) * fields[:, low + 1, left] + right * fields[:, low + 1, left + 1]
+    return np.asarray(((1 - up) * lower + up * upper).T)
 
 
 def half_width(bundle: Bundle) -> float:

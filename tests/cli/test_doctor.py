@@ -1,0 +1,101 @@
+"""`skin doctor` with the service down, and what it makes of electrode orders and ports."""
+
+from __future__ import annotations
+
+import os
+import pty
+import tty
+
+import numpy as np
+import pytest
+
+from models.bundle import Bundle
+from protocol import link
+from services.doctor import _key, electrode_order
+
+
+@pytest.fixture(scope="module")
+def bundle() -> Bundle:
+    return Bundle.load("square16")
+
+
+def test_the_service_being_down_is_no_failure(skin) -> None:  # type: ignore[no-untyped-def]
+    ran = skin("doctor")
+    assert ran.code == 0 and "no service runs" in ran.out and "every sha256 right" in ran.out
+
+
+def test_electrodes_in_order(bundle: Bundle) -> None:
+    noise = 1 + 1e-4 * np.random.default_rng(0).standard_normal(120)
+    assert electrode_order("palm", 3.0 * bundle.z0 * noise, bundle).level == "OK"
+
+
+@pytest.mark.parametrize(("i", "j"), [(2, 9), (0, 1)])
+def test_exchanged_wires_are_named(bundle: Bundle, i: int, j: int) -> None:
+    rows = bundle.pattern.tolist()
+    place = {_key(row): k for k, row in enumerate(rows)}
+    swapped = [place[_key([{i: j, j: i}.get(e, e) for e in row])] for row in rows]
+    finding = electrode_order("palm", bundle.z0[swapped], bundle)
+    assert finding.level == "FAIL" and f"electrodes {i} and {j} look exchanged" in finding.text
+
+
+def test_another_skin_is_no_exchange(bundle: Bundle) -> None:
+    z0 = bundle.z0 * np.random.default_rng(1).uniform(0.5, 2, 120)
+    finding = electrode_order("palm", z0, bundle)
+    assert finding.level == "WARN" and "skin tare" in finding.text
+
+
+def configured(tmp_path, port: str) -> str:  # type: ignore[no-untyped-def]
+    file = tmp_path / "skin.toml"
+    file.write_text(f'[skins.palm]\nport = "{port}"\nbundle = "square16"\n')
+    return str(file)
+
+
+def test_a_missing_port_is_named(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    ran = skin("doctor", "--config", configured(tmp_path, "/dev/ttyACM99"))
+    assert ran.code == 1 and "/dev/ttyACM99 is not there: plug the board in" in ran.out
+
+
+def test_a_damaged_bundle_is_named(skin, tmp_path, bundle) -> None:  # type: ignore[no-untyped-def]
+    import shutil
+
+    shutil.copytree(bundle.path, tmp_path / "broken")
+    with open(tmp_path / "broken" / "matrices.npz", "r+b") as file:
+        file.write(b"x")
+    file_name = tmp_path / "skin.toml"
+    file_name.write_text(f'[skins.palm]\nport = "stub"\nbundle = "{tmp_path / "broken"}"\n')
+    ran = skin("doctor", "--config", file_name)
+    assert ran.code == 1 and "was changed or damaged" in ran.out
+
+
+@pytest.mark.parametrize("schema", [link.SCHEMA_HASH, 0xBAD0F00D])
+def test_the_board_is_asked_for_its_firmware(skin, tmp_path, schema) -> None:  # type: ignore[no-untyped-def]
+    """A board behind a pty that answers HELLO with its IDENT, of our firmware version or of another."""
+    import threading
+
+    ours, theirs = pty.openpty()
+    tty.setraw(ours)
+    tty.setraw(theirs)
+    answer = link.encode(link.Ident(schema_hash=schema, unique_id=bytes(range(12)), max_scan=512, firmware="board 1.2"))
+
+    def board() -> None:
+        decoder = link.Decoder()
+        while True:
+            try:
+                data = os.read(ours, 4096)
+            except OSError:
+                return
+            if any(isinstance(message, link.Hello) for message in decoder.feed(data)):
+                os.write(ours, answer)
+                return
+
+    thread = threading.Thread(target=board, daemon=True)
+    thread.start()
+    try:
+        ran = skin("doctor", "--config", configured(tmp_path, os.ttyname(theirs)))
+    finally:
+        os.close(ours)
+        os.close(theirs)
+    if schema == link.SCHEMA_HASH:
+        assert ran.code == 0 and "firmware 'board 1.2'" in ran.out
+    else:
+        assert ran.code == 1 and "speaks schema bad0f00d" in ran.out and "flash a matching one" in ran.out

@@ -1,0 +1,140 @@
+"""`skin reconstruct` against scenes that another solver computed, and the promises about its rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.bundle import Bundle
+from services.config import Skin
+from services.reconstruction import Input, noise_of_references, read_input, reconstruct, resampled
+
+METRES = 0.05  # per model unit
+
+
+@pytest.fixture(scope="module")
+def scenes(reference: Path) -> dict[str, np.ndarray]:
+    with np.load(reference / "eidors_reference.npz") as data:
+        return dict(data)
+
+
+@pytest.fixture(scope="module")
+def noisy(scenes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """70 dB noise on the 19 scenes and on 64 untouched frames."""
+    rng, clean = np.random.default_rng(1), scenes["impedance_pairs"]
+    sigma = np.abs(clean[0]) * 10 ** (-70 / 20)
+    return {
+        "measurements": clean + sigma * rng.standard_normal(clean.shape),
+        "untouched": clean[0] + sigma * rng.standard_normal((64, 120)),
+    }
+
+
+@pytest.fixture(scope="module")
+def out(noisy: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    bundle = Bundle.load("square16")
+    return reconstruct(read_input(noisy, 120), Skin(port="stub", bundle="square16"), bundle)
+
+
+def test_keys_shapes_and_types(out: dict[str, np.ndarray]) -> None:
+    assert {name: (a.dtype.str, a.shape) for name, a in out.items()} == {
+        "image": ("<f4", (19, 96, 96)),
+        "touched": ("|b1", (19,)),
+        "valid": ("|b1", (19,)),
+        "count": ("<i8", (19,)),
+        "position": ("<f8", (19, 8, 2)),
+        "force": ("<f8", (19, 8)),
+        "shape": ("<U12", (19, 8)),
+    }
+    assert np.isfinite(out["image"]).all()
+
+
+def test_untouched_is_untouched_and_touches_are_seen(scenes, out) -> None:  # type: ignore[no-untyped-def]
+    touched = scenes["drop"].reshape(19, -1).max(axis=1) > 0
+    drifted = np.array([name.startswith("J") for name in scenes["scene"]])  # nothing touches, everything has moved
+    assert not out["touched"][~touched & ~drifted].any() and out["touched"][touched].all()
+    assert np.isnan(out["position"][0]).all() and out["count"][0] == 0
+
+
+def test_positions_and_signs_are_the_true_ones(scenes, out) -> None:  # type: ignore[no-untyped-def]
+    """Axes and signs, not accuracy: within a tenth of the side, and no mirror image does better."""
+    rows = [k for k in range(19) if np.isfinite(scenes["shapes"][k, :, 0]).sum() == 1]
+    axis = -1 + 2 * (np.arange(96) + 0.5) / 96
+    truth = np.array(
+        [
+            [(scenes["drop"][k] > 0).mean(axis=0) @ axis, (scenes["drop"][k] > 0).mean(axis=1) @ axis]
+            / np.array([(scenes["drop"][k] > 0).mean(axis=0).sum()])
+            for k in rows
+        ]
+    )
+    found = out["position"][rows, 0] / METRES
+    error = np.linalg.norm(found - truth, axis=1)
+    assert np.median(error) < 0.05 and error.max() < 0.2
+    for flip in ((-1, 1), (1, -1), (-1, -1)):
+        assert np.median(np.linalg.norm(found * flip - truth, axis=1)) > 3 * np.median(error)
+    brightest = [np.unravel_index(out["image"][k].argmax(), (96, 96)) for k in rows]
+    from_image = np.array([[axis[ix], axis[iy]] for iy, ix in brightest])
+    assert np.median(np.linalg.norm(from_image - truth, axis=1)) < 0.1
+
+
+def test_a_row_does_not_depend_on_the_others(noisy, out) -> None:  # type: ignore[no-untyped-def]
+    rows = [4, 0, 11]
+    some = {"measurements": noisy["measurements"][rows], "untouched": noisy["untouched"]}
+    alone = reconstruct(read_input(some, 120), Skin(port="stub", bundle="square16"), Bundle.load("square16"))
+    for name in out:
+        assert np.array_equal(alone[name], out[name][rows], equal_nan=out[name].dtype.kind == "f"), name
+
+
+def test_a_sequence_is_tracked(noisy) -> None:  # type: ignore[no-untyped-def]
+    """Rows of a sequence meet the state of the one before: the baseline follows slow drift there, and only there."""
+    rng = np.random.default_rng(2)
+    base = noisy["untouched"].mean(axis=0)
+    drift = 1 + 2e-3 * np.linspace(0, 1, 600)[:, None]
+    rows = base * drift * (1 + 3e-4 * rng.standard_normal((600, 120)))
+    data = Input(rows[::20], noisy["untouched"], None)
+    out = reconstruct(data, Skin(port="stub", bundle="square16"), Bundle.load("square16"), sequence=False)
+    assert out["count"].shape == (30,)
+    scans = reconstruct(data, Skin(port="stub", bundle="square16"), Bundle.load("square16"), sequence=True)
+    assert not np.array_equal(out["image"][-1], scans["image"][-1])
+
+
+def test_a_reference_of_each_row_follows_drift(noisy) -> None:  # type: ignore[no-untyped-def]
+    """Each row is compared with its own reference: gains of the rows do not matter."""
+    rng = np.random.default_rng(3)
+    gain = rng.uniform(0.5, 2.0, (19, 1))
+    before = noisy["untouched"][:19] * gain
+    skin, bundle = Skin(port="stub", bundle="square16"), Bundle.load("square16")
+    out = reconstruct(Input(noisy["measurements"] * gain, None, before), skin, bundle)
+    plain = reconstruct(Input(noisy["measurements"], None, before / gain), skin, bundle)
+    assert np.allclose(out["position"][4, 0], plain["position"][4, 0], atol=1e-4)
+    assert not out["touched"][0] and not plain["touched"][0]
+
+
+def test_failed_measurements_leave_a_finite_image(noisy) -> None:  # type: ignore[no-untyped-def]
+    rows = noisy["measurements"][4:6].copy()
+    rows[0, 7], rows[1] = np.nan, np.nan
+    data = Input(rows, noisy["untouched"], None)
+    out = reconstruct(data, Skin(port="stub", bundle="square16"), Bundle.load("square16"))
+    assert np.isfinite(out["image"]).all() and not out["valid"][1]
+
+
+def test_few_untouched_rows_are_said(noisy) -> None:  # type: ignore[no-untyped-def]
+    said: list[str] = []
+    data = Input(noisy["measurements"][:2], noisy["untouched"][:1], None)
+    reconstruct(data, Skin(port="stub", bundle="square16"), Bundle.load("square16"), warn=said.append)
+    assert len(said) == 1 and "one row" in said[0]
+
+
+def test_noise_of_references_ignores_drift() -> None:
+    rng = np.random.default_rng(4)
+    drift = np.exp(np.linspace(0, 0.5, 400))[:, None]
+    reference = 100 * drift * (1 + 2e-3 * rng.standard_normal((400, 50)))
+    assert np.allclose(noise_of_references(reference), 2e-3, rtol=0.2)
+
+
+def test_resampling_keeps_places() -> None:
+    image = np.zeros((24, 24), np.float32)
+    image[5, 17] = 1.0
+    y, x = np.unravel_index(resampled(image, 96).argmax(), (96, 96))
+    assert abs((y + 0.5) / 4 - 5.5) <= 0.2 and abs((x + 0.5) / 4 - 17.5) <= 0.2

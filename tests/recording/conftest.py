@@ -1,0 +1,19 @@
+"""Fixtures of the recording tests: a runtime folder of its own."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A runtime folder with a path short enough for sockets."""
+    folder = Path(tempfile.mkdtemp(prefix="eitr", dir="/tmp"))
+    monkeypatch.setenv("EITSKIN_RUNTIME", str(folder))
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)

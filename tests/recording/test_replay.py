@@ -1,0 +1,124 @@
+"""Replaying: the same contacts each time, from whole and cut files, through real processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+
+from models.bundle import Bundle
+from protocol.frames import RawFrame, pack, unpack
+from services.importing import ImportRefused, import_arrays
+from services.recording import RecordingReader, RecordingWriter
+from services.replay import ReplayError, steps
+from services.replay_session import replay_file
+
+
+@pytest.fixture(scope="module")
+def touches() -> dict[str, np.ndarray]:
+    """30 rows of the bundle's own physics: nothing, then a touch that moves, then nothing; 80 dB."""
+    bundle = Bundle.load("square16")
+    m, rng = bundle.matrices, np.random.default_rng(5)
+    side = -1 + 2 * (np.arange(24) + 0.5) / 24
+    rows = []
+    for k in range(30):
+        disc = np.hypot(side[None] - 0.03 * k, side[:, None] + 0.2) < 0.2
+        drop = 0.3 * disc.ravel() if 8 <= k < 24 else np.zeros(m.jacobian.shape[1])
+        rows.append(1 + m.jacobian @ drop)
+    noise = 1 + 1e-4 * rng.standard_normal((94, 120))
+    return {"untouched": m.z0 * noise[:64], "measurements": m.z0 * np.array(rows) * noise[64:]}
+
+
+@pytest.fixture
+def recording(touches: dict[str, np.ndarray], tmp_path: Path) -> Path:
+    path = tmp_path / "touches.mcap"
+    import_arrays(touches, Path("touches.npz"), path, "palm", 22.0)
+    return path
+
+
+def contacts(path: Path) -> list[dict[str, object]]:
+    """The contact frames of a recording, without what may differ between two replays."""
+    found = []
+    for message in RecordingReader(path).messages({"contact"}):
+        frame = msgpack.unpackb(message.data)
+        del frame["session"]
+        frame["stamps"] = {"sample": frame["stamps"]["sample"]}
+        found.append(frame)
+    return found
+
+
+def test_two_replays_give_identical_contacts(runtime: Path, recording: Path, tmp_path: Path) -> None:
+    """Through the real processes: one replay of the whole file, one of the same file without its end."""
+    report = replay_file(recording, None, out=tmp_path / "one.mcap")
+    assert report["frames"] == report["contacts"] == 94 and report["warnings"] == []
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(recording.read_bytes()[: int(recording.stat().st_size * 0.9)])
+    again = replay_file(cut, None, out=tmp_path / "two.mcap", private=True)
+    assert "cut short" in again["damage"] and 64 < again["frames"] < 94
+    first, second = contacts(tmp_path / "one.mcap"), contacts(tmp_path / "two.mcap")
+    assert [msgpack.packb(f) for f in second] == [msgpack.packb(f) for f in first[: len(second)]]
+    assert [f["seq"] for f in first] == list(range(94))
+    assert all(f["source"] == "replay" and "replay" in f["reasons"] for f in first)  # type: ignore[operator]
+    touched = [bool(f["contacts"]) for f in first]
+    assert not any(touched[64:72]) and all(touched[72:88]) and not any(touched[90:])
+    x = [f["contacts"][0]["position"][0] for f in first[72:88]]  # type: ignore[index]
+    assert np.corrcoef(x, 0.05 * 0.03 * np.arange(8, 24))[0, 1] > 0.99 and abs(x[0] - 0.012) < 0.004
+
+
+def test_steps_begin_with_the_recorded_state(tmp_path: Path, touches: dict[str, np.ndarray]) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        for k in range(10):
+            frame = RawFrame(skin="palm", scan=k, z=touches["untouched"][k].astype("c8"), status=np.zeros(120, "u1"))
+            writer.write("raw/palm", pack(frame).partition(b"\0")[2], k * 10**8)
+            if k in (1, 6):
+                writer.write("state/palm", msgpack.packb({"preprocessing": {"k": k}}), k * 10**8 + 1)
+        writer.write("raw/palm", b"no frame", 10**9)
+    found = [
+        step.states.get("preprocessing", {}).get("k") if step.raw is None else -step.raw.scan
+        for step in steps(RecordingReader(path))
+    ]
+    assert found == [1, 0, -1, -2, -3, -4, -5, -6, 6, -7, -8, -9]
+    found = [
+        step.states.get("preprocessing", {}).get("k") if step.raw is None else -step.raw.scan
+        for step in steps(RecordingReader(path), start_s=0.75)
+    ]
+    assert found == [6, -8, -9]
+
+
+def test_a_recording_of_another_skin_is_refused(runtime: Path, recording: Path, tmp_path: Path) -> None:
+    with pytest.raises(ReplayError, match="holds no skin 'sole', only palm"):
+        replay_file(recording, None, skin="sole")
+    with RecordingWriter(tmp_path / "empty.mcap") as writer:
+        writer.write("contact/palm", b"\x80", 1)
+    with pytest.raises(ReplayError, match="holds no raw frames"):
+        replay_file(tmp_path / "empty.mcap", None)
+
+
+def test_imported_frames_are_the_rows(recording: Path, touches: dict[str, np.ndarray]) -> None:
+    frames = [unpack(message.wire) for message in RecordingReader(recording).messages()]
+    assert all(isinstance(frame, RawFrame) for frame in frames)
+    rows = np.concatenate([touches["untouched"], touches["measurements"]]).astype("c8")
+    assert np.array_equal([frame.z for frame in frames], rows)  # type: ignore[union-attr]
+    assert [frame.kind for frame in frames] == ["reference"] * 64 + ["full"] * 30  # type: ignore[union-attr]
+
+
+def test_presses_are_put_in_the_bundle_s_order(tmp_path: Path) -> None:
+    """A file in another order of measurements, and with sense pairs the other way round, gives the same recording."""
+    pattern = np.asarray(Bundle.load("disc16").pattern, dtype=int)
+    rng = np.random.default_rng(6)
+    arrays = {"untouched": rng.uniform(1, 2, (3, 192)), "touched": rng.uniform(1, 2, (3, 192)), "pattern": pattern}
+    import_arrays(arrays, Path("a.npz"), tmp_path / "a.mcap", "disc16", 10.0)
+    order = rng.permutation(192)
+    mixed = {"untouched": arrays["untouched"][:, order], "touched": arrays["touched"][:, order]}
+    mixed["pattern"] = pattern[order][:, [0, 1, 3, 2]]
+    import_arrays(mixed, Path("a.npz"), tmp_path / "b.mcap", "disc16", 10.0)
+    assert [m.data for m in RecordingReader(tmp_path / "a.mcap").messages()] == [
+        m.data for m in RecordingReader(tmp_path / "b.mcap").messages()
+    ]
+    other = pattern.copy()
+    other[5] = [0, 1, 2, 3]
+    with pytest.raises(ImportRefused, match="lacks"):
+        import_arrays({**arrays, "pattern": other}, Path("a.npz"), tmp_path / "c.mcap", "disc16", 10.0)
