@@ -13,7 +13,8 @@ import threading
 from collections import deque
 
 from protocol.frames import Frame, RawFrame
-from services.runner import Runner, main
+from services.process import main
+from services.runner import Runner
 from services.source import Source, open_source
 from services.stage import Health, Stage
 

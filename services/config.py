@@ -57,7 +57,7 @@ class Tare(Section):
     """How the untouched baseline is taken and kept."""
 
     frames: Annotated[int, Field(ge=8, le=4096)] = 64
-    max_age_s: Annotated[float, Field(gt=0)] = 12 * 3600.0  # an older persisted baseline is not loaded
+    max_age_s: Annotated[float, Field(gt=0)] = 3600.0  # an older persisted baseline is not loaded
     tracking_s: Annotated[float, Field(gt=0)] = 20.0  # time constant with which drift is followed while untouched
 
 
@@ -187,7 +187,11 @@ def load(path: str | Path | None = None) -> Config:
 def parse(raw: dict[str, Any], file: Path = Path("skin.toml")) -> Config:
     """Check a configuration that is already a dict; `file` is named in errors."""
     try:
-        return Config.model_validate(raw | {"path": file})
+        config = Config.model_validate(raw | {"path": file})
+        skins = {
+            n: s.model_copy(update={"calibration": config.relative(s.calibration)}) for n, s in config.skins.items()
+        }
+        return config.model_copy(update={"skins": skins})
     except ValidationError as wrong:
         raise ConfigError("\n".join(_explain(file, e) for e in wrong.errors())) from None
 

@@ -1,14 +1,43 @@
-"""What info/<skin> says of a skin's geometry, in metres."""
+"""What info/<skin> says of a skin."""
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 import numpy as np
 
 from models.bundle import Bundle
+from services.config import Skin
+from services.force import ForceLaw
+from services.tare import Baseline
 
 CORNERS = 64  # of the polygon that stands for a disc
+
+
+UNITS = {"z": "ohm", "image": "S/m", "position": "m", "velocity": "m/s", "area_m2": "m^2", "force_n": "N"}
+
+
+def describe(skin: Skin, bundle: Bundle, baseline: Baseline | None) -> dict[str, Any]:
+    """The map of an InfoFrame: bundle, geometry, pose, units and, once there is one, the baseline."""
+    found: dict[str, Any] = {
+        "bundle": bundle.name,
+        "bundle_hash": bundle.hash,
+        "geometry": geometry(bundle),
+        "pattern": bundle.skin.get("pattern", ""),
+        "frame_id": skin.frame_id,
+        "parent_frame_id": skin.pose.parent,
+        "pose": [*skin.pose.position_m, *skin.pose.quaternion_xyzw],
+        "units": UNITS,
+        "force_law": ForceLaw.of(skin, bundle).describe(),
+        "calibration_hash": None
+        if skin.calibration is None
+        else hashlib.sha256(skin.calibration.read_bytes()).hexdigest(),
+    }
+    if baseline is not None:
+        found |= {"baseline": baseline.z0.copy(), "baseline_sigma": baseline.sigma, "baseline_hash": baseline.hash}
+        found |= {"tare_sample_ns": baseline.taken_ns, "tare_frames": baseline.frames, "board": baseline.board}
+    return found
 
 
 def geometry(bundle: Bundle) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 
 from models.bundle import Bundle
-from services.config import Skin
+from services.config import ConfigError, Skin
 
 NEWTONS_PER_SIEMENS = 10.0  # N per S/m: 0.1 to 0.5 S/m are 1 to 5 N
 MOST_N = 5.0
@@ -22,14 +22,31 @@ class ForceLaw:
 
     @classmethod
     def of(cls, skin: Skin, bundle: Bundle) -> ForceLaw:
-        """The law of a skin: its calibration file's, else its bundle's, else the default of bundles in S/m."""
+        """The law of a skin: its calibration file's, else its bundle's, else the default of bundles in S/m.
+
+        Raises ConfigError for a calibration file that is none.
+        """
         law = bundle.manifest.get("force_law", {})
         if skin.calibration is not None:
-            found = json.loads(skin.calibration.read_text())
-            return cls(float(found["newtons_per_siemens"]), float(found.get("most_n", MOST_N)), calibrated=True)
+            try:
+                found = json.loads(skin.calibration.read_text())
+                return cls(float(found["newtons_per_siemens"]), float(found.get("most_n", MOST_N)), calibrated=True)
+            except (OSError, ValueError, KeyError, TypeError) as why:
+                raise ConfigError(f"{skin.calibration} is no calibration of forces: {why!r}") from None
         if law is None or bundle.manifest["normalisation"] == "measured":
             return cls(None)
         return cls(float(law.get("newtons_per_siemens", NEWTONS_PER_SIEMENS)), float(law.get("most_n", MOST_N)))
+
+    def describe(self) -> dict[str, object] | None:
+        """For info/<skin>."""
+        if self.newtons_per_siemens is None:
+            return None
+        return {
+            "kind": "linear in the peak drop",
+            "newtons_per_siemens": self.newtons_per_siemens,
+            "most_n": self.most_n,
+            "calibrated": self.calibrated,
+        }
 
     def force(self, peak: float, peak_sigma: float) -> tuple[float | None, float | None]:
         """(force, its standard uncertainty) [N] of a peak drop and its standard deviation [S/m]."""

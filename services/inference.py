@@ -154,6 +154,6 @@ def softmax(logits: NDArray[np.float32]) -> NDArray[np.float32]:
 if __name__ == "__main__":
     import sys
 
-    from services.runner import main, stages
+    from services.process import main, stages
 
     sys.exit(main("inference", stages(Inference)))

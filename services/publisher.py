@@ -4,8 +4,9 @@ import importlib
 import sys
 import threading
 
+from services.process import main, stages
 from services.publishing import Publishing
-from services.runner import Runner, main, stages
+from services.runner import Runner
 
 
 def run(runner: Runner) -> None:

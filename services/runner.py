@@ -5,28 +5,25 @@ It drives one stage object for each skin. Nothing that arrives on a socket ends 
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import logging
 import os
 import signal
-import sys
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import zmq
 
-from models.bundle import Bundle, BundleError
+from models.bundle import Bundle
 from protocol import transport
 from protocol.frames import Frame, FrameError, InfoFrame
-from protocol.runtime import RuntimeDirError, host_id
-from protocol.sockets import ControlError, ControlServer, NewestReader, Publisher
+from protocol.runtime import host_id
+from protocol.sockets import ControlError, ControlServer, Publisher
 from protocol.topics import TOPIC_OF
-from protocol.transport import TransportError
 from services import persistence
-from services.config import Config, ConfigError, Skin, load
-from services.heartbeat import Heartbeat
+from services.config import Config
+from services.lane import Feed, Lane, Newest
 from services.stage import Refused, Stage
 
 HEARTBEAT_S = 1.0
@@ -36,30 +33,6 @@ OLD_S = 0.5  # a frame read longer ago is dropped: never stale as fresh
 WARM_FRAMES = 50  # frames after which what lives is taken to live for ever (garbage collection)
 
 log = logging.getLogger(__name__)
-
-
-class Feed(Protocol):
-    """Where a stage's frames come from."""
-
-    @property
-    def malformed(self) -> int: ...
-    @property
-    def skipped(self) -> int: ...
-    @property
-    def socket(self) -> Any: ...
-
-    def recv(self) -> Frame | None: ...
-    def close(self) -> None: ...
-
-
-class Lane:
-    """One skin in this process: its stage, where its frames come from, how it does."""
-
-    def __init__(self, process: str, stage: Stage, feed: Feed) -> None:
-        self.stage, self.feed = stage, feed
-        self.heartbeat = Heartbeat(process, stage.skin)
-        self.asleep = False
-        self.errors: set[str] = set()
 
 
 class Runner:
@@ -87,7 +60,7 @@ class Runner:
 
     def add(self, stage: Stage, feed: Feed | None = None) -> None:
         """Drive this stage; without a feed, from the topic that it reads."""
-        lane = Lane(self.process, stage, _Newest(stage.reads, stage.skin) if feed is None else feed)
+        lane = Lane(self.process, stage, Newest(stage.reads, stage.skin) if feed is None else feed)
         self.lanes[stage.skin] = lane
         self._by_socket[lane.feed.socket] = lane
         for command in stage.commands:
@@ -137,7 +110,7 @@ class Runner:
     def _serve(self, lane: Lane) -> None:
         while (frame := lane.feed.recv()) is not None:
             self._handle(lane, frame)
-            if isinstance(lane.feed, _Newest):
+            if isinstance(lane.feed, Newest):
                 return
 
     def _handle(self, lane: Lane, frame: Frame) -> None:
@@ -209,7 +182,7 @@ class Runner:
 
     def _sleep_or_wake(self, lane: Lane) -> None:
         """A stage whose frames nobody reads does not read either, so that upstream need not work for it."""
-        if not lane.stage.sleeps or not isinstance(lane.feed, _Newest):
+        if not lane.stage.sleeps or not isinstance(lane.feed, Newest):
             return
         idle = not self._wanted(lane.stage)
         if idle != lane.asleep:
@@ -278,32 +251,6 @@ class Runner:
         return {"session": self.publisher.session}
 
 
-class _Newest:
-    """A stage's input from a socket: the newest frame."""
-
-    def __init__(self, topic: str, skin: str) -> None:
-        self.reader = NewestReader(topic, skin)
-        self.socket = self.reader.socket
-        self._name = f"{topic}/{skin}\0".encode()
-
-    @property
-    def malformed(self) -> int:
-        return self.reader.malformed
-
-    @property
-    def skipped(self) -> int:
-        return self.reader.skipped
-
-    def recv(self) -> Frame | None:
-        return self.reader.recv()
-
-    def listen(self, on: bool) -> None:
-        (self.socket.subscribe if on else self.socket.unsubscribe)(self._name)
-
-    def close(self) -> None:
-        self.reader.close()
-
-
 def _wake_on_signals(stop: Callable[[], None]) -> int:
     """Install handlers of SIGINT and SIGTERM; the returned descriptor becomes readable when one came."""
     read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -311,31 +258,3 @@ def _wake_on_signals(stop: Callable[[], None]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop())
     return read
-
-
-def main(process: str, setup: Callable[[Runner], None]) -> int:
-    """A process's main: configuration, sockets, lanes, loop. Returns the exit status; says on stderr what stands in
-    the way.
-    """
-    logging.basicConfig(format=f"{process}: %(message)s", level=logging.INFO, stream=sys.stderr)
-    try:
-        config = load()
-        logging.getLogger().setLevel(config.logging.level.upper())
-        runner = Runner(process, config)
-        setup(runner)
-    except (ConfigError, BundleError, RuntimeDirError, TransportError) as why:
-        print(f"{process}: {why}", file=sys.stderr)
-        return 1
-    with contextlib.suppress(KeyboardInterrupt):
-        runner.run()
-    return 0
-
-
-def stages(make: Callable[[str, Skin, Bundle], Stage]) -> Callable[[Runner], None]:
-    """Set-up of a process that runs one kind of stage for every configured skin."""
-
-    def setup(runner: Runner) -> None:
-        for name, skin in runner.config.skins.items():
-            runner.add(make(name, skin, runner.bundle(name)))
-
-    return setup

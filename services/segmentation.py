@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-Image = NDArray[np.float32]
+Image = NDArray[np.floating]
 STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 EIGHT = np.ones((3, 3), dtype=bool)  # neighbours, diagonal ones too
 
@@ -45,7 +45,7 @@ def segment(image: Image, sigma: Image) -> list[Segment]:
     if not np.isfinite(top) or top < floor or not np.isfinite(image).all():
         return []
     rows, columns = _box(image > 0.5 * floor)
-    image, sigma = image[rows, columns], sigma[rows, columns]
+    image, sigma = image[rows, columns].astype(np.float64), sigma[rows, columns]
     smooth = ndimage.gaussian_filter(image, SMOOTHING)
     peaks: list[tuple[int, int]] = []
     for peak in _maxima(smooth, floor):
@@ -54,7 +54,7 @@ def segment(image: Image, sigma: Image) -> list[Segment]:
     basins = _basins(smooth, peaks)
     found = []
     for index, peak in enumerate(peaks):
-        own = smooth if basins is None else np.where(basins == index + 1, smooth, np.float32(0))
+        own = smooth if basins is None else np.where(basins == index + 1, smooth, 0.0)
         one = _measure(image, sigma, own, peak)
         if one is not None:
             found.append(_placed(one, shape, rows, columns))
@@ -136,6 +136,6 @@ def _measure(image: Image, sigma: Image, own: Image, at: tuple[int, int]) -> Seg
     return Segment(mask, height, peak_sigma, float(image[mask].sum()), cx, cy, area, orientation)
 
 
-def _plateau(values: NDArray[np.float32]) -> float:
+def _plateau(values: Image) -> float:
     """Peak drop of a touch: the mean of its pixels near the highest, which one noisy pixel does not move."""
     return float(values[values >= PLATEAU * values.max()].mean())

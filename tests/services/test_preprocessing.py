@@ -100,7 +100,7 @@ def test_an_unchanged_touch_is_held_and_averaged(stage: Preprocessing, board: Bo
     assert all((o.stack.size > 0) == (not o.held) for o in outs)
     scans = [o.scan for o in outs]
     assert [o.reconstructed for o in outs[7:10]] == [scans[7]] * 3
-    expected = touch * np.asarray(board.m.z0) / stage._normaliser
+    expected = touch * np.asarray(board.m.z0) / stage.untouched.normaliser
     error = [np.sqrt(np.mean((outs[i - 1].difference - expected) ** 2)) for i in (1, 16)]
     assert error[1] < 0.6 * error[0]  # 16 frames averaged; the tare's own noise remains
 

@@ -1,0 +1,43 @@
+"""What every process of the service does first and last."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+from collections.abc import Callable
+
+from models.bundle import Bundle, BundleError
+from protocol.runtime import RuntimeDirError
+from protocol.transport import TransportError
+from services.config import ConfigError, Skin, load
+from services.runner import Runner
+from services.stage import Stage
+
+
+def main(process: str, setup: Callable[[Runner], None]) -> int:
+    """A process's main: configuration, sockets, lanes, loop. Returns the exit status; says on stderr what stands in
+    the way.
+    """
+    logging.basicConfig(format=f"{process}: %(message)s", level=logging.INFO, stream=sys.stderr)
+    try:
+        config = load()
+        logging.getLogger().setLevel(config.logging.level.upper())
+        runner = Runner(process, config)
+        setup(runner)
+    except (ConfigError, BundleError, RuntimeDirError, TransportError) as why:
+        print(f"{process}: {why}", file=sys.stderr)
+        return 1
+    with contextlib.suppress(KeyboardInterrupt):
+        runner.run()
+    return 0
+
+
+def stages(make: Callable[[str, Skin, Bundle], Stage]) -> Callable[[Runner], None]:
+    """Set-up of a process that runs one kind of stage for every configured skin."""
+
+    def setup(runner: Runner) -> None:
+        for name, skin in runner.config.skins.items():
+            runner.add(make(name, skin, runner.bundle(name)))
+
+    return setup

@@ -1,0 +1,184 @@
+"""The untouched skin over time: the first tare, drift followed while nothing touches, tare on command, what survives a
+crash.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from protocol.frames import RawFrame
+from services.config import Tare
+from services.stage import Refused
+from services.tare import Baseline, noise_of_steps, take
+
+Array = NDArray[np.float64]
+
+RETRY_EVERY = 8  # frames between attempts at the first tare
+SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
+RENORMALISE_EVERY = 64  # untouched frames after which tracked drift enters the normalisation
+LONGEST_STEP_S = 1.0  # of baseline tracking: a longer gap between frames counts as this
+
+
+class Untouched:
+    """Baseline |Z0| (K,), what differences are divided by, and their noise."""
+
+    def __init__(self, bundle: Bundle, config: Tare) -> None:
+        self.bundle, self.config = bundle, config
+        self.pre = bundle.prereconstructor()
+        self.reset()
+
+    def reset(self) -> None:
+        self._window: deque[Array] = deque(maxlen=self.config.frames)
+        self._references: deque[Array] = deque(maxlen=self.config.frames)  # those in a row
+        self._run = 0  # untouched frames since the last touch
+        self._seen = 0
+        self._source = self._board = ""
+        self._last_sample_ns = 0
+        self._unsaved = False
+        self.problem = ""  # what stands in the way of valid frames, for a person
+        self._use(None)
+
+    # frames
+
+    def follow(self, frame: RawFrame) -> None:
+        """A baseline belongs to one board, and a recording's frames never meet the live board's baseline."""
+        if self._source and (self._source == "replay") != (frame.source == "replay"):
+            self.reset()
+        self._source, self._board = frame.source, frame.board
+        if self.baseline is not None and frame.source != "replay" and self.baseline.board != frame.board:
+            self.problem = f"the baseline was of board {self.baseline.board}, this is {frame.board}: taking a new one"
+            self._window.clear()
+            self._use(None)
+
+    def offer(self, amplitude: Array, frame: RawFrame) -> bool:
+        """A frame's |Z| (K,), NaN where a measurement failed. Whether there is another baseline now."""
+        self._seen += 1
+        self._window.append(amplitude)
+        if frame.kind == "reference":
+            return self._refer(amplitude, frame)
+        self._references.clear()
+        if self.baseline is None and len(self._window) == self.config.frames and self._seen % RETRY_EVERY == 0:
+            try:
+                self.set_baseline(take(np.array(self._window), self.pre, frame.board, frame.stamps.get("sample", 0)))
+                return True
+            except Refused as why:
+                self.problem = f"no baseline yet: {why}"
+        return False
+
+    def difference(self, amplitude: Array, live: NDArray[np.bool_]) -> Array:
+        """d (K,) = (|Z| - |Z0|) / |Z0|, 0 where a measurement does not count."""
+        assert self.baseline is not None
+        return np.where(live, (amplitude - self.baseline.z0) / self.normaliser, 0.0)
+
+    def touched(self) -> None:
+        """The last frame offered was touched."""
+        self._run = 0
+
+    def untouched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int) -> None:
+        """The last frame offered was not: slow drift is followed."""
+        assert self.baseline is not None
+        self._run += 1
+        since_s = (sample_ns - self._last_sample_ns) * 1e-9 if self._last_sample_ns else 0.0
+        step_s = min(max(0.0, since_s), LONGEST_STEP_S)
+        self._last_sample_ns = sample_ns
+        z0 = self.baseline.z0
+        z0 += np.where(live, (amplitude - z0) * (step_s / (step_s + self.config.tracking_s)), 0.0)
+        if self._run % RENORMALISE_EVERY == 0:
+            self.normaliser = self.pre.normaliser(z0)
+        if self._run % SAVE_EVERY == 0:
+            self._unsaved = True
+
+    # baselines
+
+    def set_baseline(self, baseline: Baseline) -> None:
+        """Use this baseline from the next frame on."""
+        self._run = 0
+        self._use(baseline)
+
+    def tare(self, touched: bool, force: bool) -> Baseline:
+        """A new baseline from the newest frames. Raises Refused while touched (unless forced) or if they disagree."""
+        needed = self.config.frames
+        if len(self._window) < needed:
+            raise Refused(f"only {len(self._window)} of {needed} frames came so far: wait, or look at `skin top`")
+        if touched and not force:
+            raise Refused("the skin is touched: free it and try again (or --force, if nothing touches it)")
+        if self.baseline is not None and self._run < needed and not force:
+            raise Refused(f"only {self._run} of {needed} untouched frames since the last touch: wait and try again")
+        baseline = take(np.array(self._window), self.pre, self._board, self._last_sample_ns)
+        self.set_baseline(dataclasses.replace(baseline, doubt=""))  # whoever gives the command has looked
+        return baseline
+
+    def progress(self) -> str:
+        return f"taking the baseline: {len(self._window)} of {self.config.frames} frames"
+
+    def _use(self, baseline: Baseline | None) -> None:
+        self.baseline = baseline
+        self.changed = True  # since the last `info`
+        if baseline is not None:
+            self.normaliser = self.pre.normaliser(baseline.z0)
+            self.sigma = baseline.sigma / self.normaliser
+            self._unsaved = True
+            self.problem = baseline.doubt
+
+    def _refer(self, amplitude: Array, frame: RawFrame) -> bool:
+        """An imported file says that this frame is untouched: it is the baseline until the next one."""
+        if not np.isfinite(amplitude).all():
+            return False
+        self._references.append(amplitude)
+        if len(self._references) > 1:  # several in a row: the noise is how they differ
+            sigma = noise_of_steps(np.array(self._references))
+            self.set_baseline(Baseline(amplitude, sigma, 1, frame.board, frame.stamps.get("sample", 0)))
+        elif self.baseline is not None:
+            self.baseline = dataclasses.replace(self.baseline, z0=amplitude)
+            self.normaliser = self.pre.normaliser(amplitude)
+        return self.baseline is not None
+
+    # state
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "bundle": self.bundle.hash,
+            "baseline": self.baseline.to_dict() if self.baseline else None,
+            "normaliser": self.normaliser if self.baseline else None,
+            "window": np.array(self._window),
+            "run": self._run,
+            "seen": self._seen,
+            "last_sample_ns": self._last_sample_ns,
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Raises Refused where the state is of another bundle."""
+        if state.get("bundle") != self.bundle.hash:
+            raise Refused(f"the state is of bundle {str(state.get('bundle'))[:12]}, this is {self.bundle.hash[:12]}")
+        self.reset()
+        if state["baseline"] is not None:
+            baseline = Baseline.from_dict(state["baseline"], len(self.bundle.pattern))
+            self._use(baseline)
+            self.normaliser = np.array(state["normaliser"], dtype=float)
+            self.sigma = baseline.sigma / self.normaliser
+        self._window.extend(np.array(state["window"], dtype=float))
+        self._run, self._seen = int(state["run"]), int(state["seen"])
+        self._last_sample_ns = int(state["last_sample_ns"])
+
+    def saved(self) -> dict[str, Any] | None:
+        """What is worth keeping across a crash, if it changed."""
+        if not self._unsaved or self.baseline is None or self._source == "replay":
+            return None
+        self._unsaved = False
+        return {"bundle": self.bundle.hash, "baseline": self.baseline.to_dict()}
+
+    def restore(self, saved: dict[str, Any], age_s: float) -> None:
+        """Raises Refused where it does not fit or is too old."""
+        if saved.get("bundle") != self.bundle.hash:
+            raise Refused("the saved baseline is of another bundle")
+        oldest = self.config.max_age_s
+        if age_s > oldest:
+            raise Refused(f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest / 3600:.1f} h")
+        self.set_baseline(Baseline.from_dict(saved["baseline"], len(self.bundle.pattern)))
+        self._unsaved = False
