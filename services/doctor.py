@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle, BundleError
+from protocol import transport
 from protocol.frames import InfoFrame, RawFrame
 from protocol.link import SCHEMA_HASH
 from protocol.runtime import AlreadyRunning, RuntimeDirError, lock, runtime_dir
@@ -55,6 +56,7 @@ def examine(path: Path | None = None) -> list[Finding]:
 def _examine(path: Path | None) -> Iterator[Finding]:
     try:
         config = load(path)
+        transport.configure(config.transport())
         yield Finding("OK", "configuration", f"{config_path(path)}: skin {', '.join(config.skins)}")
     except ConfigError as why:
         yield Finding("FAIL", "configuration", str(why).replace("\n", "; "))

@@ -19,10 +19,12 @@ from typing import Any
 
 import msgpack
 
+from protocol import transport
 from protocol.frames import Frame, InfoFrame
 from protocol.runtime import host_id
 from protocol.sockets import AllReader, ControlClient, ControlError, ControlServer
 from protocol.topics import TOPICS
+from services.config import ConfigError, config_path, load
 from services.recording import STATE_TOPIC, RecordingError, RecordingWriter
 
 DEFAULT_TOPICS = ("raw", "contact", "status", "info")
@@ -157,8 +159,6 @@ def stage_states(skin: str) -> dict[str, Any]:
 
 
 def _metadata(topics: list[str], skin: str | None) -> dict[str, str]:
-    from services.config import config_path
-
     try:
         configuration = config_path().read_text(encoding="utf-8")
     except OSError:
@@ -197,6 +197,11 @@ def main(argv: list[str] | None = None) -> int:
 
     signal.signal(signal.SIGINT, on_signal)
     signal.signal(signal.SIGTERM, on_signal)
+    try:
+        transport.configure(load().transport())
+    except ConfigError as error:
+        log.error("%s", error)
+        return 2
     try:
         if args.folder is not None:
             args.folder.mkdir(parents=True, exist_ok=True)

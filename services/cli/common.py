@@ -63,15 +63,26 @@ def config_file() -> Path:
     return Path(os.environ.get("EITSKIN_CONFIG") or ROOT / "skin.toml")
 
 
+def _configuration() -> dict[str, Any]:
+    """The configuration as it stands, unchecked; empty where there is none."""
+    try:
+        return tomllib.loads(config_file().read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
 def skin_name(given: str) -> str:
     """The skin meant: the one given, else the first that the configuration names."""
-    if given:
-        return given
-    try:
-        skins = tomllib.loads(config_file().read_text(encoding="utf-8")).get("skins", {})
-    except (OSError, ValueError):
-        skins = {}
-    return next(iter(skins), "palm")
+    return given or next(iter(_configuration().get("skins", {})), "palm")
+
+
+def use_configured_sockets() -> None:
+    """Our sockets where the configuration puts them; without a word on them, in the runtime folder."""
+    if _configuration().get("sockets"):
+        from protocol import transport
+        from services.config import load
+
+        transport.configure(load().transport())
 
 
 def emit(value: Any) -> None:
@@ -98,6 +109,7 @@ def control(process: str, command: str, *, timeout_s: float = 2.0, **args: Any) 
     from protocol import transport
     from protocol.sockets import ControlClient, ControlError
 
+    use_configured_sockets()
     who = "the stub board" if process == "stub" else process
     address = transport.current().control_address(process)
     if address.startswith("ipc://") and not os.path.exists(address.removeprefix("ipc://")):

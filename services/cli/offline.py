@@ -11,7 +11,6 @@ import typer
 from services.cli.common import FAILED, USAGE, JsonOption, emit, fail, load_npz
 
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
-BENCHES = ("accuracy", "latency", "real_presses")
 
 
 def register(app: typer.Typer) -> None:
@@ -69,7 +68,9 @@ def _bar(rows):  # type: ignore[no-untyped-def]
 
 def register_frame(
     source: Annotated[Path, typer.Argument(metavar="FILE.npz", help="touched, untouched (n, k), xy (n, 2) in metres.")],
-    out: Annotated[Path, typer.Option(help="Folder for the skin's own bundle, with a skin.toml that names its pose.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the skin's own bundle and a skin.toml; default: calibration/NAME.")
+    ] = None,
     skin: Annotated[str, typer.Option("--skin", metavar="NAME", help="A configured skin, or a bundle.")] = "disc16",
     presses: Annotated[int, typer.Option(help="How many presses to use, from the first.")] = 100,
     as_json: JsonOption = False,
@@ -77,6 +78,7 @@ def register_frame(
     """Fit the skin's frame, and its sensitivities, to presses at places that a machine knows; say how well they fit."""
     from services.register_command import register_presses
 
+    out = out or Path("calibration", Path(skin).name)
     report = register_presses(load_npz(source), skin, presses, out)
     if as_json:
         emit(report)
@@ -102,12 +104,12 @@ def limits(context: typer.Context) -> None:
 
 def bench(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help=f"One of {', '.join(BENCHES)}; its own options follow.")] = "",
+    name: Annotated[str, typer.Argument(help="Which one; its own options follow.")] = "",
 ) -> None:
     """Run a benchmark: `skin bench accuracy --help` shows its options."""
     from services.cli.common import ROOT
 
-    names = sorted(p.stem for p in (ROOT / "bench").glob("*.py") if not p.stem.startswith("_"))
+    names = sorted(p.stem for p in (ROOT / "bench").glob("*.py") if "\ndef main(" in p.read_text(encoding="utf-8"))
     if name in ("", "--help"):
         print("skin bench NAME [options], NAME one of: " + ", ".join(names))
         return

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from services.cli.common import USAGE, JsonOption, SkinOption, emit, fail, load_npz, skin_name
+from services.cli.common import USAGE, JsonOption, SkinOption, emit, fail, load_npz, skin_name, use_configured_sockets
 
 if TYPE_CHECKING:
     from protocol.frames import ContactFrame
@@ -38,6 +38,7 @@ def record(
 
     from services.recorder import Recorder
 
+    use_configured_sockets()
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

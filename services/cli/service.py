@@ -8,12 +8,15 @@ from typing import Annotated
 
 import typer
 
-from services.cli.common import FAILED, JsonOption, emit
+from services.cli.common import FAILED, USAGE, JsonOption, emit, fail
 
 
 def register(app: typer.Typer) -> None:
     app.command()(up)
     app.command()(doctor)
+    keys = typer.Typer(help="Key pairs for encrypted TCP sockets.", no_args_is_help=True)
+    keys.command("new")(new_keys)
+    app.add_typer(keys, name="keys")
 
 
 def up(
@@ -57,3 +60,22 @@ def doctor(
             print(finding)
     if any(finding.level == "FAIL" for finding in findings):
         raise typer.Exit(FAILED)
+
+
+def new_keys(
+    name: Annotated[str, typer.Argument(help="Whose: a process's host, or a controller.")],
+    folder: Annotated[Path, typer.Option(help="Where to write the two files.")] = Path("keys"),
+) -> None:
+    """Make a CURVE key pair. The secret file stays where it is; the other end gets the public one."""
+    from protocol.transport import write_keys
+
+    if not name.replace("-", "").replace("_", "").isalnum():
+        fail(f"found the name {name!r}, expected letters, digits, - and _", USAGE)
+    if (folder / f"{name}.key_secret").exists():
+        fail(f"{folder / name}.key_secret is there already: choose another name, or remove it first", USAGE)
+    try:
+        public, secret = write_keys(folder, name)
+    except OSError as error:
+        fail(f"cannot write to {folder}: {error.strerror}")
+    print(f"secret: {secret} (security.secret_key of this host's skin.toml)")
+    print(f"public: {public} (to the other end: security.server_keys, or the folder security.clients)")

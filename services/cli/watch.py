@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from services.cli.common import NOT_RUNNING, USAGE, JsonOption, SkinOption, emit, fail, skin_name
+from services.cli.common import (
+    NOT_RUNNING,
+    USAGE,
+    JsonOption,
+    SkinOption,
+    emit,
+    fail,
+    skin_name,
+    use_configured_sockets,
+)
 
 if TYPE_CHECKING:
     from services.cli.monitor import Monitor
@@ -33,6 +42,7 @@ def top(
     """Rates, ages, latencies, drops and CPU of every topic and process, and the skin itself, live."""
     from services.cli.monitor import Monitor
 
+    use_configured_sockets()
     monitor = Monitor(skin_name(skin))
     if once or as_json:
         while True:
@@ -81,6 +91,7 @@ def echo(
     if name not in TOPICS:
         fail(f"no topic {name!r}: expected one of {', '.join(TOPICS)}", USAGE)
     wanted = skin_name(skin or named_skin)
+    use_configured_sockets()
     reader = AllReader([name], wanted)
     shown = 0
     while not count or shown < count:
@@ -146,4 +157,5 @@ def compare(
     """Print position and force of every contact beside the stub's truth, scan by scan, and the errors at the end."""
     from services.cli.truth import compare_for
 
+    use_configured_sockets()
     compare_for(skin_name(skin), seconds, as_json)
