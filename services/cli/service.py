@@ -25,7 +25,7 @@ def up(
     no_board: Annotated[bool, typer.Option("--no-board", help="Stages only: `skin replay` is the board.")] = False,
 ) -> None:
     """Start all processes and keep them alive, in the foreground; Ctrl-C or SIGTERM stops them all."""
-    from protocol.runtime import runtime_dir
+    from protocol.runtime import lock, runtime_dir
     from services.config import load
     from services.supervision import Program, programs
     from services.supervision import up as supervise
@@ -35,7 +35,8 @@ def up(
     found = load(config)
     wanted = [p for p in programs(found) if not (no_board and p.name in ("acquisition", "stub"))]
     extra = [Program("recorder", "services.recorder", ("--folder", str(record.resolve())))] if record else []
-    names = ", ".join(found.skins)
+    with lock():  # said before anything else where a service runs here already
+        names = ", ".join(found.skins)
     print(
         f"skin {names}: contacts at ipc://{runtime_dir()}/publisher.ipc, topics contact/{next(iter(found.skins))} ..."
     )
