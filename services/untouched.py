@@ -153,15 +153,17 @@ class Untouched:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Raises Refused where the state is of another bundle."""
-        if state.get("bundle") != self.bundle.hash:
-            raise Refused(f"the state is of bundle {str(state.get('bundle'))[:12]}, this is {self.bundle.hash[:12]}")
+        """Raises Refused where the state is of another number of measurements.
+
+        A state of another bundle still says what the untouched skin measured: so old recordings replay on new bundles.
+        """
         self.reset()
         if state["baseline"] is not None:
             baseline = Baseline.from_dict(state["baseline"], len(self.bundle.pattern))
             self._use(baseline)
-            self.normaliser = np.array(state["normaliser"], dtype=float)
-            self.sigma = baseline.sigma / self.normaliser
+            if state["bundle"] == self.bundle.hash:
+                self.normaliser = np.array(state["normaliser"], dtype=float)
+                self.sigma = baseline.sigma / self.normaliser
         self._window.extend(np.array(state["window"], dtype=float))
         self._run, self._seen = int(state["run"]), int(state["seen"])
         self._last_sample_ns = int(state["last_sample_ns"])
