@@ -31,6 +31,7 @@ class Lane:
         self.stage, self.feed = stage, feed
         self.heartbeat = Heartbeat(process, stage.skin)
         self.asleep = False
+        self.wanted: frozenset[str] = frozenset()  # topics somebody subscribes to, as of the last tick
         self.errors: set[str] = set()
 
 

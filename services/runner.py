@@ -27,7 +27,7 @@ from services.lane import Feed, Lane, Newest
 from services.stage import Refused, Stage
 
 HEARTBEAT_S = 1.0
-TICK_S = 0.1  # how often at most silence, changes of health and new subscribers are looked for
+TICK_S = 0.2  # how often at most silence, changes of health and new subscribers are looked for
 SILENT_S = 0.5  # without frames from upstream: status STALE
 OLD_S = 0.5  # a frame read longer ago is dropped: never stale as fresh
 WARM_FRAMES = 50  # frames after which what lives is taken to live for ever (garbage collection)
@@ -122,7 +122,7 @@ class Runner:
             return
         beat.heard(frame, now)
         try:
-            made = stage.process(frame, self._wanted(stage))
+            made = stage.process(frame, lane.wanted)
         except Exception as why:
             self._failed(lane, why)
             return
@@ -162,6 +162,7 @@ class Runner:
         self.publisher.poll()
         now = time.monotonic()
         for lane in self.lanes.values():
+            lane.wanted = self._wanted(lane.stage)
             self._sleep_or_wake(lane)
             beat = lane.heartbeat
             beat.drops["malformed"], beat.drops["skipped"] = lane.feed.malformed, lane.feed.skipped
@@ -184,7 +185,7 @@ class Runner:
         """A stage whose frames nobody reads does not read either, so that upstream need not work for it."""
         if not lane.stage.sleeps or not isinstance(lane.feed, Newest):
             return
-        idle = not self._wanted(lane.stage)
+        idle = not lane.wanted
         if idle != lane.asleep:
             lane.asleep = idle
             lane.feed.listen(not idle)

@@ -21,7 +21,9 @@ MARGIN = 4  # pixels round the box that is looked at
 SMALLEST = 3  # pixels of a touch
 PLATEAU = 0.9  # fraction of the highest pixel above which pixels belong to the peak
 MOST = 8  # touches
-SMOOTHING = 1.0  # pixels, of the image in which peaks are looked for
+SMOOTHING = 1.0  # pixels: standard deviation of the Gaussian under which peaks are looked for
+KERNEL = np.exp(-0.5 * (np.arange(-4, 5) / SMOOTHING) ** 2)
+KERNEL /= KERNEL.sum()
 
 
 @dataclass
@@ -46,7 +48,7 @@ def segment(image: Image, sigma: Image) -> list[Segment]:
         return []
     rows, columns = _box(image > 0.5 * floor)
     image, sigma = image[rows, columns].astype(np.float64), sigma[rows, columns]
-    smooth = ndimage.gaussian_filter(image, SMOOTHING)
+    smooth = ndimage.correlate1d(ndimage.correlate1d(image, KERNEL, 0), KERNEL, 1)
     peaks: list[tuple[int, int]] = []
     for peak in _maxima(smooth, floor):
         if len(peaks) < MOST and _stands_alone(smooth, peak, peaks):
@@ -82,8 +84,7 @@ def _maxima(smooth: Image, floor: float) -> list[tuple[int, int]]:
     flat, count = ndimage.label((smooth == ndimage.maximum_filter(smooth, size=5)) & (smooth > floor), EIGHT)
     if count == 0:
         return []
-    _, first = np.unique(flat, return_index=True)
-    places = [divmod(int(index), smooth.shape[1]) for index in first if flat.flat[index]]
+    places = {flat[iy, ix]: (iy, ix) for iy, ix in np.argwhere(flat).tolist()}.values()
     return sorted(places, key=lambda p: -smooth[p])[:CANDIDATES]
 
 
@@ -127,13 +128,23 @@ def _measure(image: Image, sigma: Image, own: Image, at: tuple[int, int]) -> Seg
         return None
     height = _plateau(image[mask])
     peak_sigma = float(sigma[mask].mean()) if sigma.size else 0.0
-    y, x = np.nonzero(ndimage.binary_dilation(mask))
+    y, x = np.nonzero(_grown(mask))
     weight = np.clip(2 * own[y, x] / peak - 0.5, 0, 1)  # pixels on the edge count in part
     area = float(weight.sum())
     cx, cy = float(weight @ x) / area, float(weight @ y) / area
     mxx, myy, mxy = (float(weight @ v) / area for v in ((x - cx) ** 2, (y - cy) ** 2, (x - cx) * (y - cy)))
     orientation = 0.5 * float(np.arctan2(2 * mxy, mxx - myy))
     return Segment(mask, height, peak_sigma, float(image[mask].sum()), cx, cy, area, orientation)
+
+
+def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask and the pixels that share an edge with it."""
+    grown = mask.copy()
+    grown[1:] |= mask[:-1]
+    grown[:-1] |= mask[1:]
+    grown[:, 1:] |= mask[:, :-1]
+    grown[:, :-1] |= mask[:, 1:]
+    return grown
 
 
 def _plateau(values: Image) -> float:
