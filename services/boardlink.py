@@ -14,13 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import link
+from protocol.frames import STATUS_OPEN, STATUS_RTIA
 
 HELLO_EVERY_S = 0.2
 ANSWER_S = 0.5  # a command that is not answered in this time is sent again
 TRIES = 3  # then everything starts from HELLO
 SILENT_S = 1.0  # a running board that sends nothing for so long is asked again
 EXPLAIN_AFTER_S = 1.5  # of unanswered HELLOs
+DEAD_SCANS = 10  # in a row with all measurements out of range: the board may have lost its registers
+DEAD_AGAIN_S = 5.0  # then it is configured again, at most this often
 REFUSED_AGAIN_S = 1.0  # a refused board is tried again, for it may be power-cycled or flashed
+NO_CURRENT = STATUS_OPEN | STATUS_RTIA
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,7 @@ class BoardLink:
         self._last_seq: int | None = None
         self.state, self._since, self._due_s, self._tries = "hello", now_s, now_s, 0
         self._heard_s = self._asked_since = now_s
+        self._dead_scans, self._dead_s = 0, -DEAD_AGAIN_S
         self.gap = False  # whether scans are missing just before the last one returned
 
     @property
@@ -67,6 +72,7 @@ class BoardLink:
                 if self._is_ours(message):
                     self._heard_s = now_s
                     scans.append(message)
+                    self._watch(message, now_s)
             elif isinstance(message, link.Ident):
                 self._introduced(message, now_s)
             elif isinstance(message, link.Ack):
@@ -157,6 +163,15 @@ class BoardLink:
         self.counts["events"] += 1
         if event.code in (link.EventCode.BOOT, link.EventCode.BROWN_OUT):
             self._restart(now_s, f"the board lost its configuration ({event.text or link.EventCode(event.code).name})")
+
+    def _watch(self, scan: link.Frame, now_s: float) -> None:
+        """A brown-out may lose the registers without a word: then there is no current through anything."""
+        self._dead_scans = self._dead_scans + 1 if (scan.status & NO_CURRENT).all() else 0
+        if self._dead_scans >= DEAD_SCANS and now_s - self._dead_s >= DEAD_AGAIN_S:
+            self._dead_scans, self._dead_s = 0, now_s
+            self._restart(
+                now_s, "no current through any electrode: configuring the board again; is the skin connected?"
+            )
 
     def _is_ours(self, scan: link.Frame) -> bool:
         if self.state != "running" or scan.config != self.scanning.config or len(scan.z) != len(self.scanning.pattern):

@@ -1,4 +1,4 @@
-"""Electrode health from one frame: which measurements count, which electrodes have lost contact."""
+"""Electrode health from one frame: which measurements count, which electrodes are open or shorted."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA
 
-OK, OPEN = 0, 1
+OK, OPEN, SHORT = 0, 1, 2
 FAR = 10.0  # |Z| beyond this multiple of the baseline, or below its inverse, is no touch
 MOSTLY = 0.8  # fraction of an electrode's measurements that must have failed for the electrode to be named
 
@@ -20,7 +20,9 @@ class ElectrodeHealth:
         self.member = np.zeros((self.electrodes, len(pattern)), dtype=bool)  # (E, K) measurement uses electrode
         for column in range(pattern.shape[1]):
             self.member[pattern[:, column], np.arange(len(pattern))] = True
-        self._uses = self.member.sum(axis=1)
+        # A measurement between the two electrodes that it drives sees nothing but a short between them.
+        self._self_sensing = (pattern[:, 0] == pattern[:, 2]) & (pattern[:, 1] == pattern[:, 3])
+        self._pattern = pattern
         self._all_well = np.zeros(self.electrodes, dtype=np.uint8)
 
     def __call__(
@@ -36,7 +38,11 @@ class ElectrodeHealth:
             return ~bad, self._all_well, []
         reasons = ["saturated"] if (status & STATUS_CLIPPED).any() else []
         states = self._all_well.copy()
-        left = bad.copy()
+        if z0 is not None:
+            for k in np.flatnonzero(self._self_sensing & (z0 > 0) & (amplitude < z0 / FAR)):
+                states[self._pattern[k, :2]] = SHORT
+            bad |= self.member[states == SHORT].any(axis=0)
+        left = bad & ~self.member[states == SHORT].any(axis=0)
         while (
             left.any()
         ):  # the electrode that explains most failures first: its measurements do not count against the others
@@ -47,6 +53,8 @@ class ElectrodeHealth:
             states[worst] = OPEN
             left &= ~self.member[worst]
             bad |= self.member[worst]
+        if (states == SHORT).any():
+            reasons.append("electrode_short")
         if (states == OPEN).any():
             reasons.append("electrode_open")
         return ~bad, states, reasons

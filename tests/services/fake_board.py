@@ -26,6 +26,7 @@ class FakeBoard:
         self.running = False
         self.seq = 0
         self.deaf = False
+        self.status = 0  # of every measurement
 
     def receive(self, data: bytes) -> bytes:
         out = b""
@@ -52,7 +53,7 @@ class FakeBoard:
             duration_us=4000,
             config=self.config.config,
             z=np.full(n, 1 + 2j, np.complex64),
-            status=np.zeros(n, np.uint8),
+            status=np.full(n, self.status, np.uint8),
         )
         self.seq += 1
         return link.encode(frame)

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from models.bundle import Bundle
 from models.patterns import pattern
 from protocol import link
-from protocol.frames import RawFrame
+from protocol.frames import STATUS_OPEN, RawFrame
 from services.acquisition import SourceFeed
-from services.boardlink import ANSWER_S, REFUSED_AGAIN_S, SILENT_S, BoardLink, Scanning
+from services.boardlink import ANSWER_S, DEAD_SCANS, REFUSED_AGAIN_S, SILENT_S, BoardLink, Scanning
 from services.clock import DeviceClock
 from services.config import Skin
 from services.port import PortError, explain
@@ -98,6 +98,18 @@ def test_a_reset_or_silent_board_is_configured_again() -> None:
     assert host.state == "running"
     now = talk(host, board, now + SILENT_S + 0.1, 0.3)
     assert host.state == "running" and host.counts["restarts"] == 2
+
+
+def test_a_board_that_lost_its_registers_silently_is_configured_again() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = talk(host, board, 0.0, 0.2)
+    board.status = STATUS_OPEN
+    for _ in range(DEAD_SCANS):
+        host.received(board.scan(), now)
+    assert host.state == "hello" and "no current" in host.problem
+    board.status = 0
+    talk(host, board, now, 0.3)
+    assert host.state == "running" and sum(isinstance(m, link.Config) for m in board.heard) == 2
 
 
 def test_a_deaf_port_is_explained() -> None:

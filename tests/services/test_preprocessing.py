@@ -135,6 +135,17 @@ def test_a_dead_electrode_is_left_out(stage: Preprocessing, board: Board, bundle
     assert not run(stage, board.frame()).electrodes.any()
 
 
+def test_a_short_between_two_electrodes_is_named(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
+    tared(stage, board)
+    frame = board.frame(board.disc(0.0, 0.0, 0.2, 0.3))
+    frame.z[(bundle.pattern[:, 0] == 2) & (bundle.pattern[:, 1] == 3)] = 1e-3
+    out = run(stage, frame)
+    assert out.valid and out.touched and out.reasons == ["electrode_short"]
+    assert list(np.flatnonzero(out.electrodes == 2)) == [2, 3]
+    uses = np.isin(bundle.pattern, (2, 3)).any(axis=1)
+    assert not np.isfinite(out.sigma[uses]).any() and np.isfinite(out.sigma[~uses]).all()
+
+
 def test_more_than_two_dead_electrodes_make_a_frame_invalid(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
     tared(stage, board)
     frame = board.frame()
