@@ -124,6 +124,7 @@ def main(argv: list[str] | None = None) -> None:
     budget.add_argument("--minutes", type=float, help="any other budget, for all of it on two idle cores")
     budget.add_argument("--no-network", action="store_true", help="matrices only")
     budget.add_argument("--package", action="store_true", help="export the checkpoints there are, train nothing")
+    parser.add_argument("--matrices", type=Path, help="with --package: the bundle the checkpoints were trained with")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args(argv)
@@ -138,7 +139,7 @@ def main(argv: list[str] | None = None) -> None:
         elif not data.chunk_files(work, "valid"):
             make_scenes(args.skin, work, 0, 250, args)
     if args.package:
-        matrices = bundle.Bundle.load(out).matrices  # a checkpoint fits the matrices it was trained with
+        matrices = bundle.Bundle.load(args.matrices or out).matrices  # a checkpoint fits those it was trained with
         held_out = samples.load(work, "valid", PreReconstructor(matrices))
     else:
         matrices, held_out = physics(skin, work)
