@@ -15,7 +15,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -32,7 +32,7 @@ from models.scenes import TRAINING, random_scene
 from models.shapes import drop_image, from_rows, to_rows
 
 WORK = Path(__file__).parent / "work"
-SPLITS = {"train": "training", "valid": "training", "test": "reference"}  # and the mesh each is solved on
+SPLITS = ("test", "train", "valid")
 IMAGE = 48  # pixels a side
 SCHEMA = 1
 
@@ -51,6 +51,7 @@ class ChunkSpec:
     index: int
     size: int
     seed: int
+    mesh: str = "training"
 
     @property
     def file(self) -> str:
@@ -71,16 +72,15 @@ def make_chunk(spec: ChunkSpec) -> dict[str, NDArray[Any]]:
     shapes (S, 3, 7) float32, image (S, 48, 48) float16: drop [S/m] on a background of 1
     z0 (K,) ohm, contact_impedance (E,), background (), shift (E,) of each electrode along the outline [model units]
     """
-    rng = np.random.default_rng([spec.seed, sorted(SPLITS).index(spec.split), spec.index])
-    mesh = SPLITS[spec.split]
+    rng = np.random.default_rng([spec.seed, SPLITS.index(spec.split), spec.index])
     skin = geometry.load(spec.skin)
     n = skin.n_electrodes
     nominal = rng.random() < NOMINAL_SHARE or spec.split == "test"
     if nominal:
-        wide, shift, model = 0.0, np.zeros(n), _nominal(spec.skin, mesh)
+        wide, shift, model = 0.0, np.zeros(n), _nominal(spec.skin, spec.mesh)
     else:
         wide, shift = 1.0, np.clip(rng.standard_normal(n), -2, 2) * SHIFT_SPREAD * skin.perimeter / n
-        model = ForwardModel(skin.moved(shift), skin.pattern, mesh=mesh)
+        model = ForwardModel(skin.moved(shift), skin.pattern, mesh=spec.mesh)
     contact = skin.contact_impedance * (1 + wide * CONTACT_SPREAD * rng.uniform(-1, 1, n))
     background = 1 + wide * BACKGROUND_SPREAD * rng.uniform(-1, 1)
     z0 = np.abs(model.solve(background, contact).impedances())
@@ -104,17 +104,20 @@ def make_chunk(spec: ChunkSpec) -> dict[str, NDArray[Any]]:
     }
 
 
-def _backend(name: str, scheduler: str | None) -> AbstractContextManager[Any]:
+@contextmanager
+def _backend(name: str, scheduler: str | None) -> Iterator[None]:
     """joblib's configuration for a backend by name; "dask" joins the scheduler's cluster, "ray" the running one."""
+    client: Any = nullcontext()
     if name == "dask":
         from distributed import Client
 
-        Client(scheduler)  # becomes the default client, which joblib's backend asks for
+        client = Client(scheduler)  # becomes the default client, which joblib's backend asks for
     elif name == "ray":
         from ray.util.joblib import register_ray
 
         register_ray()
-    return joblib.parallel_config(backend=name) if name != "loky" else nullcontext()
+    with client, joblib.parallel_config(backend=name):
+        yield
 
 
 def generate(
@@ -153,8 +156,8 @@ def generate(
 
 
 def _check_same_run(folder: Path, spec: ChunkSpec) -> None:
-    """Chunks of another seed or skin must not be mixed in: the samples could repeat."""
-    wanted = {"schema": SCHEMA, "skin": spec.skin, "seed": spec.seed, "chunk": spec.size, "image": IMAGE}
+    """Chunks of another seed, skin or mesh must not be mixed in: samples could repeat, or not mean the same."""
+    wanted = {"schema": SCHEMA, "skin": spec.skin, "mesh": spec.mesh, "seed": spec.seed, "chunk": spec.size}
     path = folder / "data.json"
     if not path.exists():
         path.write_text(json.dumps(wanted, indent=1) + "\n")
@@ -205,9 +208,9 @@ def _read(folder: Path, split: str, limit: int | None, skip: int) -> Iterator[di
         yield part
 
 
-def specs(skin: str, split: str, n: int, seed: int, chunk: int = 1000) -> list[ChunkSpec]:
+def specs(skin: str, split: str, n: int, seed: int, chunk: int = 1000, mesh: str = "training") -> list[ChunkSpec]:
     """Chunks that hold at least n scenes."""
-    return [ChunkSpec(skin, split, k, chunk, seed) for k in range(-(-n // chunk))]
+    return [ChunkSpec(skin, split, k, chunk, seed, mesh) for k in range(-(-n // chunk))]
 
 
 def main(argv: list[str] | None = None) -> None:

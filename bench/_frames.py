@@ -29,6 +29,7 @@ from models.shapes import CLASSES, Array, Shape, from_rows, to_rows
 WORK = Path(__file__).parent / "work"
 REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "eidors_reference.npz"
 SKIN = "square16"
+NOISE_FREE = 1e-6
 LDCI = [(spacing, drop) for spacing in (0.2, 0.25) for drop in (0.15, 0.85)]
 
 
@@ -135,15 +136,19 @@ def _solve(wanted: list[tuple[str, list[Shape]]], mesh: str, path: Path) -> Fram
     return Frames(group, shapes, pairs, np.tile(z0, (n, 1)), adjacents, np.tile(a0, (n, 1)))
 
 
-def load(seed: int = 5, n: int = 24, mesh: str = "reference") -> Frames:
+def load(seed: int = 5, n: int = 20, mesh: str = "reference", only: tuple[str, ...] = ()) -> Frames:
     """Frames by arguments: read from bench/work, or solved now (about n * 10 + 40 solutions). EIDORS's come last.
 
     mesh: "reference" (seconds a solution) or "stub" (quick; as far from the training mesh as from the reference).
+    only: some groups, without EIDORS's.
     """
     if mesh == "training":
         raise ValueError("test frames on the training mesh would flatter whatever was trained on it")
     WORK.mkdir(exist_ok=True)
-    frames = _solve(scenes(seed, n), mesh, WORK / f"frames-{mesh}-seed{seed}-n{n}.npz")
+    wanted = [s for s in scenes(seed, n) if not only or s[0] in only]
+    frames = _solve(wanted, mesh, WORK / f"frames-{'-'.join((mesh, *only))}-seed{seed}-n{n}.npz")
+    if only:
+        return frames
     frames = _ordered(frames)
     return frames + eidors() if REFERENCE.exists() else frames
 
@@ -174,9 +179,10 @@ def eidors() -> Frames:
 def noisy(frames: Frames, decibel: float | None, seed: int = 0, tare: int = 64) -> tuple[Frames, Array]:
     """Frames with noise of |Z| 10^(-dB/20) on each measurement and on the mean of `tare` untouched frames.
 
-    Also the untouched frames themselves, (tare, 120), of the first frame's skin. None: noise-free.
+    Also the untouched frames themselves, (tare, 120), of the first frame's skin. None: noise-free (what a float32 wire
+    leaves).
     """
-    relative = 0.0 if decibel is None else 10 ** (-decibel / 20)
+    relative = NOISE_FREE if decibel is None else 10 ** (-decibel / 20)
     rng = np.random.default_rng([seed, 0 if decibel is None else round(decibel)])
 
     def spoil(z: Array, n: int = 1) -> Array:

@@ -1,0 +1,174 @@
+"""The accuracy benchmark's table, JSON and plot."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from bench._frames import REFERENCE, Frames
+from bench._scores import Row
+from models.bundle import Bundle
+
+COLUMNS = (  # heading, key, format
+    ("ms", "ms", "{:.2f}"),
+    ("IoU", "mean_iou", "{:.3f}"),
+    ("contact IoU", "contact_iou", "{:.3f}"),
+    ("LDCI", "ldci-0.2-0.15", "{:.3f}"),
+    ("wide", "ldci-0.25-0.15", "{:.3f}"),
+    ("0.15 S/m", "ldci-0.2-0.85", "{:.3f}"),
+    ("position % side", "position_%", "{:.2f}"),
+    ("p95", "position_p95_%", "{:.2f}"),
+    ("force %", "force_%", "{:.1f}"),
+    ("integral %", "integral_%", "{:.1f}"),
+    ("corr.", "correlation", "{:.3f}"),
+    ("SSIM", "ssim", "{:.3f}"),
+    ("count %", "count_%", "{:.0f}"),
+    ("shape %", "shape_%", "{:.0f}"),
+)
+# figure, key, at noise-free, at 70 dB; a negative sign: at least, else at most. "floor": times the Bayesian floor.
+TARGETS = (
+    ("mean IoU, five shapes", "mean_iou", ">= 0.94", ">= 0.88"),
+    ("contact IoU", "contact_iou", ">= 0.88", ">= 0.78"),
+    ("LDCI, 0.85 S/m inside", "ldci-0.2-0.15", "<= 0.02", ""),
+    ("force from peak %, size unknown", "force_%", "<= 3", "1.3 x floor"),
+    ("force %, known indenter", "known_force_%", "<= 2", "<= 3"),
+    ("integrated drop %", "integral_%", "<= 2", "1.3 x floor"),
+    ("position % of side", "position_%", "<= 0.3", "1.3 x floor"),
+    ("position p95 % of side", "position_p95_%", "", "<= 2"),
+    ("shape class %, radius >= 0.25", "shape_%", ">= 97", ">= 85"),
+    ("two or three touches counted right %", "count_%", ">= 97", ">= 93"),
+    ("network alone, ms", "network_ms", "<= 1", "<= 1"),
+)
+RMS = {"position_%": "position_rms_%", "force_%": "force_rms_%", "integral_%": "integral_rms_%"}
+
+
+def progress(row: Row) -> None:
+    """A line on standard error as each row is done."""
+    print(f"{row['level']:>5} {row['method']}: IoU {row['mean_iou']:.3f}, {row['ms']:.2f} ms", file=sys.stderr)
+
+
+def machine() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def text(row: Row, key: str, form: str) -> str:
+    value = row.get(key)
+    return "" if value is None or not np.isfinite(value) else form.format(value)
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    rows: list[Row]
+    floors: dict[str, Row]
+    frames: Frames
+    mesh: str
+    seed: int
+    bundle: Bundle
+
+    @property
+    def head(self) -> dict[str, object]:
+        names, counts = np.unique(self.frames.group, return_counts=True)
+        return {
+            "command": "skin bench accuracy " + " ".join(sys.argv[1:]),
+            "machine": machine(),
+            "bundle": {"name": self.bundle.name, "hash": self.bundle.hash},
+            "mesh": self.mesh,
+            "seed": self.seed,
+            "frames": {str(name): int(count) for name, count in zip(names, counts, strict=True)},
+            "eidors": REFERENCE.exists(),
+            "versions": {name: version(name) for name in ("numpy", "scipy", "onnxruntime", "pyeit")},
+            "time": "CPU time of one thread per frame, median; shipped: the whole pipeline, mean",
+        }
+
+    def print(self) -> None:
+        console = Console(width=200) if not sys.stdout.isatty() else Console()
+        for level in dict.fromkeys(row["level"] for row in self.rows):
+            title = "noise-free" if level == "none" else f"{level} dB"
+            table = Table(title=f"{title}, {self.mesh} mesh, {machine()}", title_justify="left")
+            table.add_column("method")
+            for heading, _, _ in COLUMNS:
+                table.add_column(heading, justify="right")
+            for row in (r for r in self.rows if r["level"] == level):
+                name = row["method"] + (f" ({row['value']:g})" if row["value"] is not None else "")
+                table.add_row(name, *(text(row, key, form) for _, key, form in COLUMNS))
+            floor = self.floors.get(level)
+            if floor:
+                shown = {key: floor.get(rms) for key, rms in RMS.items()}
+                table.add_row(
+                    "Bayesian floor (rms)", *(text(shown, key, form) for _, key, form in COLUMNS), style="dim"
+                )
+            console.print(table)
+        console.print(self.targets())
+
+    def targets(self) -> Table:
+        table = Table(title="shipped bundle against the targets", title_justify="left")
+        for heading in ("figure", "noise-free", "target", "70 dB", "target"):
+            table.add_column(heading, justify="left" if heading == "figure" else "right")
+        for name, key, clean, noisy in TARGETS:
+            table.add_row(name, self.reached(key, "none", clean), clean, self.reached(key, "70", noisy), noisy)
+        return table
+
+    def reached(self, key: str, level: str, target: str) -> str:
+        """The figure, with its ratio to the floor where that is the target; marked where the target is missed."""
+        row = next((r for r in self.rows if r["method"] == "shipped, full" and r["level"] == level), None)
+        if row is None or row.get(key) is None:
+            return ""
+        value, shown = row[key], f"{row[key]:.3g}"
+        if "floor" in target:
+            rms = row.get(RMS[key])
+            floor = self.floors.get(level, {}).get(RMS[key])
+            if rms is None or not floor:
+                return shown
+            shown += f" (rms {rms:.3g} = {rms / floor:.2f} x floor)"
+            missed = rms / floor > float(target.split()[0])
+        elif target:
+            sign, bound = target.split()
+            missed = value < float(bound) if sign == ">=" else value > float(bound)
+        else:
+            missed = False
+        return f"[red]{shown} missed[/red]" if missed else shown
+
+    def write(self, folder: Path) -> None:
+        """accuracy.json and accuracy.png in `folder`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        content = {**self.head, "floors": self.floors, "rows": self.rows}
+        (folder / "accuracy.json").write_text(json.dumps(content, indent=1) + "\n")
+        self.draw(folder / "accuracy.png")
+
+    def draw(self, path: Path) -> None:
+        """Run time against error: mean IoU missed and position, a panel a noise level for the first."""
+        import matplotlib
+
+        matplotlib.use("Agg")
+        import matplotlib.pyplot as plt
+
+        levels = [v for v in ("none", "70") if any(r["level"] == v for r in self.rows)]
+        panels = [(v, key, label) for v in levels for key, label in (("mean_iou", "1 - mean IoU"), ("position_%", ""))]
+        figure, axes = plt.subplots(len(levels), 2, figsize=(11, 4.2 * len(levels)), squeeze=False)
+        for axis, (level, key, _) in zip(axes.ravel(), panels, strict=True):
+            for row in (r for r in self.rows if r["level"] == level and r.get(key) is not None):
+                error = 1 - row[key] if key == "mean_iou" else row[key]
+                shipped = row["method"].startswith("shipped")
+                axis.plot(
+                    row["ms"], error, "*" if shipped else "o", ms=13 if shipped else 6, c="C3" if shipped else "C0"
+                )
+                axis.annotate(row["method"], (row["ms"], error), (4, 4), textcoords="offset points", fontsize=7)
+            axis.set(xscale="log", yscale="log", xlabel="CPU time per frame, one thread [ms]")
+            axis.set_ylabel("1 - mean IoU" if key == "mean_iou" else "position error [% of side]")
+            axis.set_title("noise-free" if level == "none" else f"{level} dB")
+            axis.grid(True, which="both", alpha=0.3)
+        figure.tight_layout()
+        figure.savefig(path, dpi=120)
+        plt.close(figure)
