@@ -41,13 +41,21 @@ def service(runtime: Path) -> Iterator[subprocess.Popen[bytes]]:
         log.close()
 
 
-def test_the_demo(service: subprocess.Popen[bytes], runtime: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def recorder(service: subprocess.Popen[bytes], tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, str(ROOT / "skin"), "record", str(tmp_path / "demo.mcap"), "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    yield process
+    process.kill()
+    process.wait(10)
+
+
+def test_the_demo(
+    service: subprocess.Popen[bytes], recorder: subprocess.Popen[bytes], runtime: Path, tmp_path: Path
+) -> None:
     second = skin("up")
     assert second.returncode == 1 and "is in use by process" in second.stderr and second.stdout == ""
 
-    recorder = subprocess.Popen(
-        [sys.executable, str(ROOT / "skin"), "record", str(tmp_path / "demo.mcap"), "--json"], stdout=subprocess.PIPE
-    )
     began = time.monotonic()
     pressed = skin("press", "--x", 0.02, "--y", -0.01, "--force", 3, "--seconds", 120, "--json")
     assert pressed.returncode == 0 and time.monotonic() - began < 10
