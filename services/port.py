@@ -109,6 +109,8 @@ def explain(url: str, why: Exception) -> str:
     if "exclusively lock" in text or number in (11, 16):
         return f"{url} is held by another program: close that one (`fuser {url}` names it)"
     if number == 2 or "No such file" in text:
+        if url == str(runtime_dir() / STUB_LINK):
+            return "the stub board is not there yet: `skin up` starts it, or `python -m firmware_stub`"
         return f"{url} is not there: plug the board in, or correct `port` in skin.toml"
     if number == 13 or "Permission denied" in text:
         return f"{url} may not be opened: add yourself to its group (`ls -l {url}`; usually dialout) and log in again"
