@@ -134,9 +134,8 @@ def write(
     mixture that passes.
     """
     path.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(
-        path / "matrices.npz", **{f.name: np.asarray(getattr(matrices, f.name)) for f in fields(Matrices)}
-    )
+    arrays: dict[str, Any] = {f.name: np.asarray(getattr(matrices, f.name)) for f in fields(Matrices)}
+    np.savez_compressed(path / "matrices.npz", **arrays)
     networks = networks or {}
     for variant, name in NETWORKS.items():
         (path / name).unlink(missing_ok=True)

@@ -241,4 +241,4 @@ def noise_of_frames(frames: Array, z0: Array) -> Array:
     own = frames.var(axis=0, ddof=1)
     pooled = np.median(own / z0**2) * z0**2
     n = len(frames)
-    return np.sqrt((n * own + 32 * pooled) / (n + 32))
+    return np.asarray(np.sqrt((n * own + 32 * pooled) / (n + 32)))

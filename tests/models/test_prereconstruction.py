@@ -95,7 +95,7 @@ def test_threshold_keeps_its_false_alarm_rate(estimated):
 
 
 def test_contact_impedance_leaves_the_model_normalised_difference():
-    """Contact impedance in series adds the same to |Z| and |Z0|: d must not see it, and a gain of the converter must cancel."""
+    """Contact impedance in series adds the same to |Z| and |Z0|: d must not see it; a converter's gain cancels."""
     pre = PreReconstructor(matrices())
     z0, change = pre.m.z0, 0.02 * RNG.standard_normal(K)
     series = 0.1 * RNG.standard_normal(K)
