@@ -32,6 +32,7 @@ COLUMNS = (  # heading, key, format
     ("SSIM", "ssim", "{:.3f}"),
     ("count %", "count_%", "{:.0f}"),
     ("shape %", "shape_%", "{:.0f}"),
+    ("frames", "frames", "{:.0f}"),
 )
 # figure, key, at noise-free, at 70 dB; a negative sign: at least, else at most. "floor": times the Bayesian floor.
 TARGETS = (

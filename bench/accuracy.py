@@ -29,7 +29,7 @@ from services.reconstruction import resampled
 
 LEVELS = ("none", "50", "60", "70", "80")
 SCORED_AT = 96
-SLOW_SHARE = 3  # a slow method sees every third frame
+SLOW_SHARE = {"full": 3, "quick": 4}  # a slow method sees every third frame, or every fourth
 
 
 def tares(noisy: Frames, untouched: Array) -> dict[str, Tare]:
@@ -60,11 +60,11 @@ def measure(method: Method, value: float | None, noisy: Frames, known: dict[str,
     return {"images": np.array(found), "seconds": float(np.median(seconds))}
 
 
-def tuned(method: Method, noisy: Frames, known: dict[str, Tare]) -> float | None:
+def tuned(method: Method, noisy: Frames, known: dict[str, Tare], share: int) -> float | None:
     """The hyperparameter of the best mean IoU on tuning frames."""
     if not method.values:
         return None
-    index = range(0, len(noisy), SLOW_SHARE if method.slow else 1)
+    index = range(0, len(noisy), share)
 
     def quality(value: float) -> float:
         images = measure(method, value, noisy, known, index)["images"]
@@ -73,14 +73,13 @@ def tuned(method: Method, noisy: Frames, known: dict[str, Tare]) -> float | None
     return max(method.values, key=quality)
 
 
-def chosen(frames: Frames, slow: bool) -> NDArray[np.int64]:
-    """Frames a method is run on: all; for a slow one every third, but of the LDCI one grid in full."""
-    if not slow:
+def chosen(frames: Frames, share: int) -> NDArray[np.int64]:
+    """Frames a method is run on: all, or for a slow one each `share`-th and, in the full run, one LDCI grid."""
+    if share == 1:
         return np.arange(len(frames))
-    ldci = np.char.startswith(frames.group, "ldci")
+    keep = np.flatnonzero(~np.char.startswith(frames.group, "ldci"))[::share]
     first = f"ldci-{_frames.LDCI[0][0]}-{_frames.LDCI[0][1]}"
-    keep = np.flatnonzero(~ldci)[::SLOW_SHARE]
-    return np.sort(np.concatenate([keep, frames.of(first)]))
+    return np.sort(np.concatenate([keep, frames.of(first)])) if share == SLOW_SHARE["full"] else keep
 
 
 def gains(method: Method, value: float | None, clean: Frames) -> tuple[float, float] | None:
@@ -95,7 +94,9 @@ def gains(method: Method, value: float | None, clean: Frames) -> tuple[float, fl
     return shape.drop / float(image.max()), shape.integral / metrics.integrated(image)
 
 
-def run(frames: Frames, tuning: Frames, methods: list[Method], levels: Iterable[str], seed: int) -> list[Row]:
+def run(
+    frames: Frames, tuning: Frames, methods: list[Method], levels: Iterable[str], seed: int, slow: int
+) -> list[Row]:
     """One row a method and level."""
     rows = []
     for level in levels:
@@ -104,8 +105,9 @@ def run(frames: Frames, tuning: Frames, methods: list[Method], levels: Iterable[
         known = tares(noisy, untouched)
         to_tune, tune_untouched = _frames.noisy(tuning, decibel, seed + 1)
         for method in methods:
-            value = tuned(method, to_tune, tares(to_tune, tune_untouched))
-            index = chosen(noisy, method.slow)
+            share = slow if method.slow else 1
+            value = tuned(method, to_tune, tares(to_tune, tune_untouched), share)
+            index = chosen(noisy, share)
             made = measure(method, value, noisy, known, index)
             figures = summarise(made["images"], noisy, index, gains(method, value, frames))
             row = {"method": method.name, "level": level, "value": value, "ms": made["seconds"] * 1e3, **figures}
@@ -131,7 +133,8 @@ def main(argv: list[str] | None = None) -> int:
     methods = _methods.classical() + _methods.peers() + _methods.published(bundle)
     wanted = [m for m in methods if args.only is None or any(o in m.name for o in args.only)]
     began = time.perf_counter()
-    rows = run(frames, tuning, wanted, levels, args.seed) + _shipped.run(frames, bundle, levels, args.seed)
+    slow = SLOW_SHARE["quick" if args.quick else "full"]
+    rows = run(frames, tuning, wanted, levels, args.seed, slow) + _shipped.run(frames, bundle, levels, args.seed)
     report = _report.Report(rows, _shipped.floors(frames, levels), frames, mesh, args.seed, bundle)
     report.print()
     report.write(args.out)
