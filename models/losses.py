@@ -25,7 +25,16 @@ class Target:
     classes: Tensor
 
 
-WEIGHTS = {"image": 1.0, "mask": 1.0, "jaccard": 1.0, "amplitude": 0.5, "integral": 0.3, "class": 0.5, "sigma": 0.02}
+WEIGHTS = {
+    "image": 1.0,
+    "mask": 1.0,
+    "jaccard": 1.0,
+    "amplitude": 0.5,
+    "peak": 0.3,
+    "integral": 0.3,
+    "class": 0.5,
+    "sigma": 0.02,
+}
 
 
 def losses(parts: tuple[Tensor, Tensor, Tensor, Tensor], target: Target) -> dict[str, Tensor]:
@@ -55,6 +64,8 @@ def losses(parts: tuple[Tensor, Tensor, Tensor, Tensor], target: Target) -> dict
         ).mean(),
         "jaccard": (1 - (both + 1) / (inside.sum(axes) + area - both + 1)).mean(),
         "amplitude": ((off * whole).sum(axes) / (whole.sum(axes) + 0.1)).mean(),
+        # Force is read off the peak, and a largest of many values is too large unless it is asked not to be.
+        "peak": F.smooth_l1_loss(torch.log(drop.amax(axes) + 1e-6), torch.log(peak[:, 0, 0, 0]), beta=0.05),
         "integral": (error.sum(axes).abs() / (target.drop / peak).sum(axes).clamp_min(1.0)).mean(),
         "class": F.cross_entropy(classes, target.classes, ignore_index=IGNORE),
         "sigma": normal.mean(),

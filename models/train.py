@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -174,8 +175,8 @@ def plot(curve: list[dict[str, Any]], path: Path) -> None:
 
     figure, axes = plt.subplots(1, 2, figsize=(10, 4))
     minutes = [row["minutes"] for row in curve]
-    for name in ("image", "mask", "jaccard", "amplitude", "integral", "class"):
-        axes[0].semilogy(minutes, [row[name] for row in curve], label=name)
+    for name in ("image", "mask", "jaccard", "amplitude", "peak", "integral", "class"):
+        axes[0].semilogy(minutes, [row.get(name, np.nan) for row in curve], label=name)
     for level in LEVELS:
         for name in ("mean IoU", "contact IoU"):
             axes[1].plot(minutes, [row[f"{name}, {level}"] for row in curve], label=f"{name}, {level}")
