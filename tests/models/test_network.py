@@ -159,27 +159,23 @@ def test_the_published_network_has_the_published_layers(attention):
 
 
 @pytest.mark.skipif(not REFERENCE.is_file(), reason="reference frames not here")
-@pytest.mark.parametrize("decibel, mean_iou", [(None, 0.90), (70, 0.83)])
-def test_the_shipped_network_on_another_solvers_frames(pre, decibel, mean_iou):
-    """EIDORS's touched scenes. The bound is below the benchmark's figure: it catches a broken bundle, not a bad day."""
+@pytest.mark.parametrize("decibel, bound", [(None, 0.90), (70, 0.84)])
+def test_the_shipped_network_on_another_solvers_frames(pre, decibel, bound):
+    """EIDORS's single touches. Bounds below the benchmark's figures: they catch a broken bundle, not a bad day."""
     z = np.load(REFERENCE)
     rng = np.random.default_rng(0)
     impedance = np.abs(z["impedance_pairs"])
+    single = np.flatnonzero(np.isfinite(z["shapes"][:, 0, 0]) & np.isnan(z["shapes"][:, 1, 0]))
     sigma = 10 ** (-(decibel or 130) / 20)
     operator = pre.condition(np.full(120, sigma))
     session = export.session(Bundle.load("square16").network_path("full"))
     scores = []
-    for scene, truth in zip(impedance, z["drop"], strict=True):
-        if truth.max() <= 0:
-            continue
-        noisy = [a * (1 + sigma * rng.standard_normal((n, 120))) for a, n in ((scene, 1), (impedance[0], 64))]
-        stack, context, scale = operator.stack(pre.difference(noisy[0][0], noisy[1].mean(axis=0)))
-        drop = export.run(session, stack[None], context[None])[0][0, 0] * scale
-        seen, real = drop > 0.5 * drop.max(), truth > 0
-        # several touches of different drops: half of one peak is not their edge
-        if np.unique(truth[truth > 0]).size > 40:
-            continue
+    for scene in np.repeat(single, 4):
+        z0 = (impedance[0] * (1 + sigma * rng.standard_normal((64, 120)))).mean(axis=0)
+        noisy = impedance[scene] * (1 + sigma * rng.standard_normal(120))
+        stack, context, _ = operator.stack(pre.difference(noisy, z0))
+        drop = export.run(session, stack[None], context[None])[0][0, 0]
+        seen, real = drop > 0.5 * drop.max(), z["drop"][scene] > 0
         contact, rest = [(a & b).sum() / (a | b).sum() for a, b in ((seen, real), (~seen, ~real))]
         scores.append((contact + rest) / 2)
-    assert len(scores) >= 8
-    assert np.mean(scores) > mean_iou
+    assert np.mean(scores) > bound
