@@ -140,3 +140,27 @@ def published(bundle: Bundle) -> list[Method]:
 
     files = {"MM-CNN as published": "mmcnn.onnx", "the same without attention": "cnn.onnx"}
     return [row(name, PUBLISHED / file) for name, file in files.items() if (PUBLISHED / file).exists()]
+
+
+def shipped(bundle: Bundle) -> list[Method]:
+    """The bundle's networks as mere images, without the stages that make contacts of them."""
+
+    def row(variant: str) -> Method:
+        path = bundle.network_path(variant)
+        assert path is not None
+        network = session(path)
+
+        def build(tare: Tare, value: float | None) -> Image:
+            pre = bundle.prereconstructor()
+            operator = pre.condition(tare.sigma)
+
+            def image(z: Array) -> Array:
+                stack, context, scale = operator.stack(pre.difference(z, tare.pairs0))
+                drop = network.run(["drop"], {"stack": stack[None], "context": context[None]})[0]
+                return np.asarray(drop[0, 0] * scale)
+
+            return image
+
+        return Method(f"shipped, {variant}: image alone", build, gain=False)
+
+    return [row(variant) for variant in ("full", "fast") if bundle.network_path(variant) is not None]

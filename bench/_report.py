@@ -166,6 +166,7 @@ class Report:
                     row["ms"], error, "*" if shipped else "o", ms=13 if shipped else 6, c="C3" if shipped else "C0"
                 )
                 axis.annotate(row["method"], (row["ms"], error), (4, 4), textcoords="offset points", fontsize=7)
+            axis.margins(x=0.25, y=0.1)
             axis.set(xscale="log", yscale="log", xlabel="CPU time per frame, one thread [ms]")
             axis.set_ylabel("1 - mean IoU" if key == "mean_iou" else "position error [% of side]")
             axis.set_title("noise-free" if level == "none" else f"{level} dB")
