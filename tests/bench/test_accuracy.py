@@ -1,0 +1,109 @@
+"""The accuracy benchmark's own parts: a benchmark that errs would err for everybody at once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pyeit")
+
+from bench import _frames, _peers, _report, _scores, accuracy  # noqa: E402
+from bench._frames import Frames  # noqa: E402
+from bench._methods import Method, Tare  # noqa: E402
+from models import metrics, patterns  # noqa: E402
+from models.bundle import Bundle  # noqa: E402
+from models.forward import shared  # noqa: E402
+from models.shapes import Shape, drop_image, to_rows  # noqa: E402
+
+
+def frames_of(groups):
+    """Frames without physics: (group, scene) pairs, impedances all one."""
+    n = len(groups)
+    rows = np.array([to_rows(scene) for _, scene in groups])
+    ones = np.ones((n, 120)), np.ones((n, 208))
+    return Frames(np.array([g for g, _ in groups]), rows, ones[0], ones[0], ones[1], ones[1])
+
+
+def test_symmetry_moves_touches_as_solving_them_does():
+    model = shared("square16", "inverse")
+    pair = patterns.pattern("pairs", 16)
+    z0 = model.solve(1.0).impedances(pair)
+    shape = Shape("circle", 0.6, 0.2, 0.2, 0.3)
+    solution, places = model.solve(model.touched([shape])), set()
+    for turn, to in _frames.symmetries():
+        x, y = turn @ (shape.x, shape.y)
+        places.add((round(x, 6), round(y, 6)))
+        back = np.argsort(to)[pair]
+        moved = solution.impedances(back) / model.solve(1.0).impedances(back) - 1
+        solved = model.solve(model.touched([replace(shape, x=x, y=y)])).impedances(pair) / z0 - 1
+        assert np.linalg.norm(moved - solved) < 5e-3 * np.linalg.norm(solved)  # the mesh is not symmetric
+    assert len(places) == 8
+
+
+def test_ldci_scenes_cover_the_papers_grid():
+    octant = [scene[0] for name, scene in _frames.scenes(1, 2) if name == "ldci-0.2-0.15"]
+    spread = {(round(x, 6), round(y, 6)) for s in octant for t, _ in _frames.symmetries() for x, y in [t @ (s.x, s.y)]}
+    assert spread == {(round(x, 6), round(y, 6)) for x, y in metrics.ldci_positions(0.2)}
+
+
+def test_noise_is_what_it_says():
+    frames = frames_of([("shapes", [Shape("circle", 0, 0, 0.3, 0.2)])] * 50)
+    noisy, untouched = _frames.noisy(frames, 60, seed=1)
+    assert noisy.pairs.std() == pytest.approx(1e-3, rel=0.05)
+    assert untouched.shape == (64, 120) and untouched.std() == pytest.approx(1e-3, rel=0.05)
+    assert (noisy.pairs0[0] - 1).std() == pytest.approx(1e-3 / 8, rel=0.2)  # the mean of 64
+    tare = accuracy.tares(noisy, untouched)[""]
+    assert np.median(tare.sigma) == pytest.approx(1e-3, rel=0.1)
+
+
+def test_perfect_images_score_perfectly_and_poor_ones_do_not():
+    groups = [("shapes", [Shape(k, 0.2, 0.1, 0.35, 0.3, 0.3)]) for k in ("circle", "triangle", "L")]
+    groups += [("force", [Shape("circle", -0.3, 0.2, 0.2, 0.25)])]
+    groups += [("two", [Shape("circle", -0.5, 0, 0.25, 0.3), Shape("square", 0.5, 0, 0.25, 0.2)])]
+    frames = frames_of(groups)
+    truth = np.array([drop_image(frames.scene(k), 96) for k in range(len(frames))])
+    index = np.arange(len(frames))
+    best = _scores.summarise(truth, frames, index, None)
+    assert best["mean_iou"] > 0.98 and best["position_%"] < 0.2 and best["count_%"] == 100
+    assert best["force_%"] < 0.1 and best["integral_%"] < 0.5
+    shifted = _scores.summarise(np.roll(truth, 6, axis=2) * 1.2, frames, index, None)
+    assert shifted["position_%"] == pytest.approx(6 / 96 * 100, rel=0.05)
+    assert shifted["force_%"] == pytest.approx(20, rel=0.01)
+    assert _scores.summarise(truth * 0.5, frames, index, (2.0, 2.0))["force_%"] < 0.1
+
+
+def test_the_hyperparameter_that_fits_is_chosen():
+    scene = [Shape("circle", 0.1, 0.1, 0.4, 0.3)]
+    frames = frames_of([("shapes", scene)] * 2)
+    truth = drop_image(scene, 48)
+
+    def build(tare, value):
+        return lambda z: truth if value == 2.0 else np.roll(truth, 9, axis=0)
+
+    method = Method("either", build, (1.0, 2.0, 3.0))
+    known = {"": Tare(np.ones((64, 120)), np.ones(120), np.ones(208))}
+    assert accuracy.tuned(method, frames, known, 1) == 2.0
+
+
+def test_pyeit_sees_a_touch_where_it_is():
+    model = shared("square16", "inverse")
+    rows = patterns.pattern("adjacent", 16)
+    z0 = np.abs(model.solve(1.0).impedances(rows))
+    d = np.abs(model.solve(model.touched([Shape("circle", -0.4, 0.3, 0.25, 0.3)])).impedances(rows)) / z0 - 1
+    image = _peers.PyEIT("jac", 1e-3, 48)(d)
+    mask = image > image.max() / 2
+    assert np.hypot(*(metrics.centroid(mask) - (-0.4, 0.3))) < 0.06
+
+
+def test_missed_targets_are_marked():
+    rows = [
+        {"method": "shipped, full", "level": "none", "mean_iou": 0.95, "position_%": 0.4},
+        {"method": "shipped, full", "level": "70", "position_%": 0.5, "position_rms_%": 0.6},
+    ]
+    frames = frames_of([("shapes", [Shape("circle", 0, 0, 0.3, 0.2)])])
+    report = _report.Report(rows, {"70": {"position_rms_%": 0.5}}, frames, "stub", 1, Bundle.load("square16"))
+    assert "missed" not in report.reached("mean_iou", "none", ">= 0.94")
+    assert "missed" in report.reached("position_%", "none", "<= 0.3")
+    assert "missed" not in report.reached("position_%", "70", "1.3 x floor")  # 1.2
+    assert "missed" in report.reached("position_%", "70", "1.1 x floor")
+    assert report.reached("shape_%", "70", ">= 85") == ""
