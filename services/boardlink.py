@@ -52,7 +52,7 @@ class BoardLink:
         self.decoder = link.Decoder()
         self.ident: link.Ident | None = None
         self.problem = ""  # what stands in the way, for a person; "" when all is well
-        self.counts: Counter[str] = Counter()  # scans, missing, foreign, events, restarts, and the decoder's bad ones
+        self.counts: Counter[str] = Counter()  # scans, missing, repeated, foreign, events, restarts, garbled
         self._last_seq: int | None = None
         self.state, self._since, self._due_s, self._tries = "hello", now_s, now_s, 0
         self._heard_s = self._asked_since = now_s
@@ -78,7 +78,7 @@ class BoardLink:
             elif isinstance(message, link.Ack):
                 self._acknowledged(message, now_s)
             elif isinstance(message, link.Nak):
-                self._refuse(f"the board refuses: {message.text or link.NakReason(message.reason).name}", now_s)
+                self._not_accepted(message, now_s)
             elif isinstance(message, link.Event):
                 self._happened(message, now_s)
         return scans
@@ -154,6 +154,17 @@ class BoardLink:
             self._last_seq = None
             self.problem = ""
             self._to(now_s, "running")
+        elif self.state == "running" and ack.of == link.Start.number:
+            self._last_seq = None  # a START sent twice, for its first answer was late: scans count from 0 again
+
+    def _not_accepted(self, nak: link.Nak, now_s: float) -> None:
+        """A NAK of nothing in particular answers noise on the line towards the board: our command is sent again anyway.
+        Only a board of another schema cannot say what it refuses.
+        """
+        if nak.of == 0 and nak.reason != link.NakReason.SCHEMA:
+            self.counts["garbled"] += 1
+            return
+        self._refuse(f"the board refuses: {nak.text or _reason(nak.reason)}", now_s)
 
     def _refuse(self, why: str, now_s: float) -> None:
         self.problem = why
@@ -177,12 +188,12 @@ class BoardLink:
         if self.state != "running" or scan.config != self.scanning.config or len(scan.z) != len(self.scanning.pattern):
             self.counts["foreign"] += 1
             return False
-        self.gap = False
-        if self._last_seq is not None:
-            missing = (scan.seq - self._last_seq - 1) & 0xFFFFFFFF
-            if missing >= 0x80000000:  # repeated or older: the board started anew
-                missing = 0
-            self.gap = missing > 0
+        missing = 0 if self._last_seq is None else (scan.seq - self._last_seq - 1) & 0xFFFFFFFF
+        if missing >= 0x80000000:  # repeated or older. If the board began anew without a word, it counts as silent
+            self.counts["repeated"] += 1
+            return False
+        self.gap = missing > 0
+        if missing:
             self.counts["missing"] += missing
         self._last_seq = scan.seq
         self.counts["scans"] += 1
@@ -194,3 +205,11 @@ class BoardLink:
                 f"no answer to HELLO, only noise ({self.decoder.last_error}): is it the board, and at this baud rate?"
             )
         return "no answer to HELLO: is it the board, and is its firmware running?"
+
+
+def _reason(number: int) -> str:
+    """A NAK's reason by name; a newer firmware may have others."""
+    try:
+        return link.NakReason(number).name
+    except ValueError:
+        return f"reason {number}"

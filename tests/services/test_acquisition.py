@@ -78,15 +78,56 @@ def test_a_board_that_does_not_fit_is_refused_by_name_and_tried_again(ident: lin
 def test_missing_scans_are_counted_across_the_wrap() -> None:
     host, board = BoardLink(SCANNING, 0.0), FakeBoard()
     now = talk(host, board, 0.0, 0.2)
-    for seq, gap in ((0, False), (1, False), (4, True), (5, False)):
+    last = 0xFFFFFFFF
+    for seq, gap in ((last - 6, False), (last - 5, False), (last - 2, True), (last - 1, False), (1, True), (2, False)):
         board.seq = seq
-        host.received(board.scan(), now)
+        assert len(host.received(board.scan(), now)) == 1
         assert host.gap is gap
-    board.seq = 0xFFFFFFFF
+    assert host.counts["missing"] == 2 + 2  # two before the wrap; the last number and the 0 after it
+
+
+def test_repeated_and_older_scans_are_dropped() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = talk(host, board, 0.0, 0.2)
+    taken = []
+    for seq in (0, 1, 1, 0, 2, 0xFFFFFFFF, 3):
+        board.seq = seq
+        taken += [scan.seq for scan in host.received(board.scan(), now)]
+    assert taken == [0, 1, 2, 3]
+    assert host.counts["repeated"] == 3 and host.counts["scans"] == 4 and host.counts["missing"] == 0
+
+
+def test_scans_that_count_from_0_again_are_taken_after_a_start() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = talk(host, board, 0.0, 0.2)
+    board.seq = 1000
     host.received(board.scan(), now)
-    board.seq = 1
+    board.seq = 0
+    host.received(link.encode(link.Ack(of=link.Start.number)), now)  # of a START that had been sent twice
+    assert [scan.seq for scan in host.received(board.scan(), now)] == [0]
+    board.seq = 500
     host.received(board.scan(), now)
-    assert host.counts["missing"] == 2 + 1  # 2, 3 and the 0 after the wrap; the jump back to 2^32 - 1 is no gap
+    board.seq = 0  # the board began anew and did not say so: what it sends is old, so that it counts as silent
+    while host.state == "running":
+        assert not host.received(board.scan(), now)
+        now += 0.1
+        host.received(board.receive(host.to_send(now)), now)
+        assert now < 2 * SILENT_S
+    now = talk(host, board, now, 0.3)
+    assert host.state == "running"
+    assert [scan.seq for scan in host.received(board.scan(), now)] == [0]
+
+
+def test_only_a_refusal_of_a_command_is_a_refusal() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = talk(host, board, 0.0, 0.2)
+    host.received(link.encode(link.Nak(of=0, reason=link.NakReason.UNKNOWN, text="what?")), now)
+    assert host.state == "running" and not host.problem and host.counts["garbled"] == 1
+    host.received(link.encode(link.Nak(of=link.Config.number, reason=99)), now)
+    assert host.state == "refused" and host.problem == "the board refuses: reason 99"
+    other = BoardLink(SCANNING, 0.0)
+    other.received(link.encode(link.Nak(of=0, reason=link.NakReason.SCHEMA)), 0.0)
+    assert other.state == "refused" and "SCHEMA" in other.problem
 
 
 def test_a_reset_or_silent_board_is_configured_again() -> None:
@@ -136,6 +177,52 @@ def test_garbage_at_any_moment_does_no_harm(pieces: list[bytes]) -> None:
     talk(host, board, now + 2.0, 2.0)
     assert host.state == "running"
     assert len(host.received(board.scan(), now + 4.0)) == 1
+
+
+u8, u16, u32, u64 = (st.integers(0, 2**bits - 1) for bits in (8, 16, 32, 64))
+texts = st.text(max_size=20)
+measured = st.integers(1, 512) | st.just(len(SCANNING.pattern))
+intact = st.one_of(
+    st.builds(link.Nak, of=u8, reason=u8, text=texts),
+    st.builds(link.Ack, of=u8 | st.sampled_from([link.Config.number, link.Start.number]), value=u32),
+    st.builds(link.Event, code=u16 | st.integers(0, 12), text=texts),
+    st.builds(
+        link.Ident,
+        link_version=u8,
+        schema_hash=u32 | st.just(link.SCHEMA_HASH),
+        chip_id=u16 | st.just(link.CHIP_ID),
+        unique_id=st.binary(min_size=12, max_size=12),
+        capabilities=u32,
+        electrodes=u8,
+        max_scan=u16,
+        firmware=texts,
+    ),
+    st.builds(
+        lambda seq, us, duration, config, n, value: link.Frame(
+            seq, us, duration, config, np.full(n, value, np.complex64), np.full(n, seq & 15, np.uint8)
+        ),
+        u32, u64, u32, u16 | st.just(SCANNING.config), measured, st.floats(width=32),
+    ),
+    st.builds(link.Hello, schema_hash=u32),
+    st.builds(link.Start, config=u16),
+)  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(intact, max_size=12), st.booleans())
+def test_intact_messages_with_any_fields_do_no_harm(messages: list[link.Message], running: bool) -> None:
+    """What a board of another make, or a broken one, may say: nothing raises, and a good board is found again."""
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now, clock = talk(host, board, 0.0, 0.2) if running else 0.0, DeviceClock()
+    for message in messages:
+        for scan in host.received(link.encode(message), now):
+            clock.observe(scan.device_us + scan.duration_us, int(now * 1e9))
+            assert -(2**63) <= clock.host_ns(scan.device_us + scan.duration_us // 2)
+        host.received(board.receive(host.to_send(now)), now)
+        now += 0.05
+    now = talk(host, board, now + 2.0, 3.0)
+    assert host.state == "running"
+    assert len(host.received(board.scan(), now)) == 1
 
 
 def test_the_clock_finds_the_boards_rate_through_late_arrivals() -> None:
