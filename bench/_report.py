@@ -46,6 +46,7 @@ TARGETS = (
     ("position p95 % of side", "position_p95_%", "", "<= 2"),
     ("shape class %, radius >= 0.25", "shape_%", ">= 97", ">= 85"),
     ("two or three touches counted right %", "count_%", ">= 97", ">= 93"),
+    ("false touches an hour", "false_touches_h", "", ""),
     ("network alone, ms", "network_ms", "<= 1", "<= 1"),
 )
 RMS = {"position_%": "position_rms_%", "force_%": "force_rms_%", "integral_%": "integral_rms_%"}

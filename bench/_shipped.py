@@ -15,12 +15,16 @@ from bench._scores import Row, gap_of, summarise
 from models import fisher, metrics
 from models.bundle import Bundle
 from models.shapes import CLASSES, Array
+from protocol.frames import RawFrame
 from services.config import Indenter, Skin
+from services.pipeline import Pipeline
 from services.reconstruction import Input, reconstruct
+from services.tare import take
 
 NEWTON_PER_DROP = 10.0  # the default force law: 0.1 S/m is 1 N
 LARGE = 0.25  # radius from which on shape classes are scored
 VARIANTS = ("full", "fast", "int8")
+RATE_HZ = 22.0  # the board's full scan
 
 
 def reconstructed(noisy: Frames, untouched: Array, skin: Skin, bundle: Bundle) -> tuple[dict[str, Array], float]:
@@ -55,7 +59,7 @@ def network_ms(bundle: Bundle, variant: str, runs: int = 200) -> float:
     return float(np.median(seconds) * 1e3)
 
 
-def run(frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int) -> list[Row]:
+def run(frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int, untouched_frames: int) -> list[Row]:
     """One row a level and network file: figures of the image, and of the contacts a controller would get."""
     variants = [v for v in VARIANTS if bundle.network_path(v) is not None] or ["none"]
     alone = {v: network_ms(bundle, v) for v in variants if v != "none"}
@@ -71,6 +75,8 @@ def run(frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int) -> lis
             row |= contacts(found, noisy)
             if variant == "full":
                 row["known_force_%"] = known_indenter(noisy, untouched, skin, bundle)
+                if level == "70":
+                    row |= false_touches(frames, level, seed, bundle, untouched_frames)
             rows.append(row)
             progress(row)
     return rows
@@ -116,6 +122,32 @@ def known_indenter(noisy: Frames, untouched: Array, skin: Skin, bundle: Bundle) 
     found, _ = reconstructed(part, untouched, known, bundle)
     newton = [part.scene(k)[0].drop * NEWTON_PER_DROP for k in range(len(part))]
     return float(metrics.relative_error(np.nan_to_num(found["force"][:, 0]), newton).mean())
+
+
+def false_touches(frames: Frames, level: str, seed: int, bundle: Bundle, n: int) -> Row:
+    """How often n frames of a skin that nobody touches become contacts, at the board's full-scan rate."""
+    relative = 10 ** (-float(level) / 20)
+    rng = np.random.default_rng([seed, 9])
+    z0 = frames.pairs0[0]
+    pipeline = Pipeline(Skin(port="stub", bundle=str(bundle.path)), bundle=bundle)
+    tare = z0 * (1 + relative * rng.standard_normal((64, len(z0))))
+    pipeline.pre.set_baseline(take(tare, pipeline.pre.pre, "bench", 0))
+    touched = []
+    for k in range(n):
+        z = z0 * (1 + relative * rng.standard_normal(len(z0)))
+        raw = RawFrame(
+            skin="skin",
+            scan=k,
+            z=z.astype(np.complex64),
+            status=np.zeros(len(z0), np.uint8),
+            stamps={"sample": round((k + 1) * 1e9 / RATE_HZ)},
+            source="replay",
+            valid=True,
+            board="bench",
+        )
+        contacts = pipeline.run(raw).contact.contacts
+        touched.append(any(c.state != "end" for c in contacts))
+    return {"false_touches_h": metrics.false_touches_per_hour(touched, RATE_HZ), "untouched_frames": n}
 
 
 def floors(frames: Frames, levels: Iterable[str]) -> dict[str, Row]:
