@@ -18,6 +18,7 @@ from services.runner import Runner
 from services.source import Source, open_source
 from services.stage import Health, Stage
 
+CLOSE_S = 0.2  # how long a stop waits for a source that blocks; its thread dies with the process
 QUEUE = 256  # frames that the runner may be behind before the oldest are dropped
 
 log = logging.getLogger(__name__)
@@ -66,11 +67,17 @@ class SourceFeed:
             return None
 
     def close(self) -> None:
+        """Tell the thread to end, which closes the source, and wait CLOSE_S for it at most."""
         self._stop.set()
-        self._thread.join(0.5)
-        self.source.close()
+        self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
+        try:
+            self._feed()
+        finally:
+            self.source.close()
+
+    def _feed(self) -> None:
         while not self._stop.is_set():
             try:
                 for frame in self.source.frames():

@@ -8,6 +8,7 @@ whatever kills us.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -26,6 +27,7 @@ from supervisor.supervisord import Supervisor
 
 from protocol.runtime import lock, runtime_dir
 from services.config import ROOT, Config
+from services.port import STUB_LINK
 
 POLL_S = 0.05
 HEALTHY_S = 3  # a process that lived this long starts its next restarts from the shortest delay
@@ -74,7 +76,21 @@ def up(config: Config, extra: Sequence[Program] = (), wanted: Sequence[Program] 
             pass
         finally:
             options.close_logger()
+            _clear(runtime, running)
     return 0
+
+
+def _clear(runtime: Path, ran: Sequence[Program]) -> None:
+    """Remove what we and the programs that ran left in the runtime folder. `lock` and `state` stay, and so do sockets
+    of others (`skin record`, `skin replay`).
+    """
+    left = [runtime / "supervisord.conf", runtime / "supervisord.pid"]
+    left += [runtime / f"{program.name}{suffix}" for program in ran for suffix in (".ipc", ".ctl")]
+    if any(program.name == "stub" for program in ran):
+        left += [path for path in runtime.glob(f"{STUB_LINK}*") if path.is_symlink()]
+    for path in left:
+        with contextlib.suppress(OSError):  # not there, mostly
+            path.unlink()
 
 
 class _Service(Supervisor):  # type: ignore[misc]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,7 +23,7 @@ from services.boardlink import ANSWER_S, DEAD_SCANS, REFUSED_AGAIN_S, SILENT_S, 
 from services.clock import DeviceClock
 from services.config import Skin
 from services.port import PortError, explain
-from services.source import BoardSource, FileSource, open_source, rows
+from services.source import BoardSource, FileSource, Source, open_source, rows
 from tests.services.fake_board import FakeBoard, PtyBoard
 
 SCANNING = Scanning(pattern("pairs"), 128, 40_000.0)
@@ -334,6 +335,30 @@ def test_a_file_is_a_source_too(tmp_path: Path, skin: Skin, bundle: Bundle) -> N
     assert not isinstance(source, BoardSource)
     frames = [f for _, f in zip(range(8), source.frames(), strict=False) if f is not None]
     assert [f.kind for f in frames][:2] == ["full", "reference"] and frames[0].source == "replay"
+
+
+def test_a_source_that_blocks_does_not_hold_up_a_stop(skin: Skin, bundle: Bundle) -> None:
+    """Neither one stuck in a read nor one stuck in its close (a socket:// port waits there)."""
+    free = threading.Event()
+
+    class Stuck(Source):
+        def frames(self) -> Iterator[RawFrame | None]:
+            if self.name == "reading":
+                free.wait(30)
+            yield None
+
+        def close(self) -> None:
+            free.wait(30)
+
+    feeds = [SourceFeed(Stuck(name, skin, bundle)) for name in ("reading", "closing")]
+    time.sleep(0.05)
+    try:
+        for feed in feeds:
+            began = time.monotonic()
+            feed.close()
+            assert time.monotonic() - began < 0.4
+    finally:
+        free.set()
 
 
 @pytest.mark.parametrize(

@@ -122,6 +122,24 @@ def test_children_do_not_outlive_a_killed_supervisor(up: Callable[..., subproces
     wait_for(lambda: not alive(pid), 5)
 
 
+def test_a_stop_leaves_only_what_is_to_stay(up: Callable[..., subprocess.Popen[str]], runtime: Path) -> None:
+    """Sockets of the programs that ran, the stub's links and supervisord's files go; others' sockets stay."""
+    log = runtime / "a"
+    ours = ["acquisition.ipc", "acquisition.ctl", "stub.ctl"]
+    others = ["recorder.ctl", "board.txt"]
+    service = up(f"acquisition,{log}", f"stub,{runtime / 's'}")
+    wait_for(lambda: starts(log) and starts(runtime / "s"))
+    for name in ours + others:
+        (runtime / name).touch()
+    (runtime / "state").mkdir()
+    for name in ("board", "board2"):
+        (runtime / name).symlink_to("/dev/pts/none")
+    assert (runtime / "supervisord.conf").exists() and (runtime / "supervisord.pid").exists()
+    service.send_signal(signal.SIGTERM)
+    assert service.wait(10) == 0
+    assert {p.name for p in runtime.iterdir()} == {"a", "s", "lock", "state", *others}
+
+
 def test_the_demo_has_a_stub_and_every_stage_names_itself() -> None:
     found = {p.name: p.module for p in programs(load(ROOT / "skin.toml"))}
     assert found.pop("stub") == "firmware_stub"
