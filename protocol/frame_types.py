@@ -56,8 +56,18 @@ def _empty(dtype: str, dimensions: int) -> Any:
     return lambda: np.zeros((0,) * dimensions, dtype)
 
 
+class Heard:
+    """What a reader notes of a frame beside its fields: not on the wire, and not set on a frame that was made here."""
+
+    __slots__ = ("valid_as_sent",)
+    valid_as_sent: bool  # by the producer, where the reader's `non_finite` hides it
+
+    def note_valid(self, valid: bool) -> None:
+        self.valid_as_sent = valid
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
-class Frame:
+class Frame(Heard):
     """The header: what every frame carries."""
 
     schema: int = wire(Int(SCHEMA, SCHEMA), "version of this layout", SCHEMA)

@@ -45,7 +45,7 @@ __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
     "Contact", "ContactFrame", "DeltaFrame", "ForceFrame", "Frame", "FrameError", "ImageFrame", "InfoFrame",
-    "RawFrame", "ShapeFrame", "StatusFrame", "Touch", "TruthFrame", "pack", "read_map", "unpack",
+    "RawFrame", "ShapeFrame", "StatusFrame", "Touch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
 ]  # fmt: skip
 
 MAX_MESSAGE = 4 * 1024 * 1024
@@ -87,7 +87,7 @@ def unpack(message: bytes) -> Frame:
     """The frame in a message. Arrays share the message's memory and are read-only.
 
     Raises FrameError where the message has another form, type, shape or range than documented. Non-finite
-    measurements are data: the frame comes back with `valid` false and the reason `non_finite`.
+    measurements are data: the frame comes back with `valid` false and the reason `non_finite`; see `as_sent`.
     """
     head, zero, body = bytes(message[:128]).partition(b"\0")
     known = _TOPIC.fullmatch(head) if zero else None
@@ -103,10 +103,20 @@ def unpack(message: bytes) -> Frame:
     if frame.skin != known[2].decode():
         raise FrameError(name, "skin", brief(frame.skin), f"{known[2].decode()!r}, as in the message's topic")
     if not record.finite(frame):
+        frame.note_valid(frame.valid)
         frame.valid = False
         if "non_finite" not in frame.reasons:
             frame.reasons.append("non_finite")
     return frame
+
+
+def as_sent(frame: Frame) -> tuple[bool, list[str]]:
+    """`valid` and `reasons` without the remark `non_finite` of `unpack`: for a reader that leaves failed measurements
+    out, or sends the frame on.
+    """
+    if not hasattr(frame, "valid_as_sent"):
+        return frame.valid, list(frame.reasons)
+    return frame.valid_as_sent, [reason for reason in frame.reasons if reason != "non_finite"]
 
 
 def read_map(packed: bytes, topic: str) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.prereconstruction import Drift, Operator
-from protocol.frames import DeltaFrame, Frame, RawFrame
+from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
 from services.config import Skin
 from services.describe import describe
 from services.electrodes import ElectrodeHealth
@@ -65,8 +65,7 @@ class Preprocessing(Stage):
         assert isinstance(frame, RawFrame)
         out = DeltaFrame(**inherited(frame))
         self._counters["frames"] += 1
-        if frame.reasons == ["non_finite"]:  # measurements that failed are left out below
-            out.valid, out.reasons = True, []
+        out.valid, out.reasons = as_sent(frame)  # measurements that failed are left out below
         if frame.kind == "sentinel" or len(frame.z) != len(self.bundle.pattern):
             return [self._no_scan(out, frame)]
         self._foreign = ""

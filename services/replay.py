@@ -16,7 +16,7 @@ from typing import Any
 
 import msgpack
 
-from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, unpack
+from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, unpack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
 from services.recording import STATE_TOPIC, Recorded, RecordingReader, RecordingWriter
 
@@ -129,7 +129,7 @@ class Replayer:
     def _send(self, step: Step, raw: RawFrame) -> ContactFrame:
         raw.source = "replay"
         raw.stamps = {"sample": raw.stamps.get("sample", 0), "read": time.monotonic_ns()}
-        raw.reasons = [r for r in raw.reasons if r != "non_finite"]  # the reader's own remark, which it will make again
+        raw.valid, raw.reasons = as_sent(raw)  # whoever reads it will remark on failed measurements again
         if "replay" not in raw.reasons:
             raw.reasons.append("replay")
         self.publisher.send(raw)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol import link
-from protocol.frames import RawFrame, unpack
+from protocol.frames import RawFrame, as_sent, unpack
 from services import port as ports
 from services.boardlink import BoardLink, Scanning
 from services.clock import UNSETTLED_NS, DeviceClock
@@ -172,6 +172,7 @@ class RecordingSource(Source):
                 frame = unpack(recorded.wire)
                 assert isinstance(frame, RawFrame)
                 frame.skin, frame.source = self.name, "replay"
+                frame.valid, frame.reasons = as_sent(frame)
                 sample = frame.stamps.get("sample", 0)
                 due += min(max(0.0, (sample - previous) * 1e-9), 1.0) if previous else 0.0
                 previous = sample

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from protocol.frames import STATUS_OPEN, DeltaFrame, RawFrame
+from protocol.frames import STATUS_OPEN, DeltaFrame, RawFrame, pack, unpack
 from services.config import Skin
 from services.preprocessing import Preprocessing
 from services.stage import Refused
@@ -26,6 +26,13 @@ def run(stage: Preprocessing, frame: RawFrame) -> DeltaFrame:
     assert isinstance(out, DeltaFrame)
     assert np.isfinite(out.difference).all()
     return out
+
+
+def received(frame: RawFrame) -> RawFrame:
+    """As a reader of the topic has it."""
+    back = unpack(pack(frame))
+    assert isinstance(back, RawFrame)
+    return back
 
 
 def tared(stage: Preprocessing, board: Board) -> Preprocessing:
@@ -126,13 +133,29 @@ def test_a_dead_electrode_is_left_out(stage: Preprocessing, board: Board, bundle
     uses = (bundle.pattern == 5).any(axis=1)
     frame.z[uses] = np.nan
     frame.status[uses] = STATUS_OPEN
-    frame.valid, frame.reasons = False, ["non_finite"]  # as the reader of a message puts it
-    out = run(stage, frame)
+    out = run(stage, received(frame))
     assert out.valid and not out.touched
     assert out.reasons == ["electrode_open"]
     assert list(np.flatnonzero(out.electrodes)) == [5]
     assert not np.isfinite(out.sigma[uses]).any() and np.isfinite(out.sigma[~uses]).all()
     assert not run(stage, board.frame()).electrodes.any()
+
+
+@pytest.mark.parametrize("reasons", [[], ["clock"], ["gap", "clock"]])
+@pytest.mark.parametrize("valid", [True, False])
+def test_failed_measurements_do_not_change_what_the_producer_says(
+    stage: Preprocessing, board: Board, valid: bool, reasons: list[str]
+) -> None:
+    tared(stage, board)
+    frame = board.frame()
+    frame.z[7] = np.nan
+    frame.valid, frame.reasons = valid, reasons
+    heard = received(frame)
+    assert not heard.valid and heard.reasons == [*reasons, "non_finite"]
+    out = run(stage, heard)
+    assert (out.valid, out.reasons) == (valid, reasons)
+    assert np.flatnonzero(~np.isfinite(out.sigma)).tolist() == [7]
+    assert run(stage, board.frame()).valid
 
 
 def test_a_short_between_two_electrodes_is_named(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
