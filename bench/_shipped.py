@@ -16,7 +16,7 @@ from models import fisher, metrics
 from models.bundle import Bundle
 from models.shapes import CLASSES, Array
 from protocol.frames import RawFrame
-from services.config import Indenter, Skin
+from services.config import Skin
 from services.pipeline import Pipeline
 from services.reconstruction import Input, reconstruct
 from services.tare import take
@@ -74,7 +74,6 @@ def run(frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int, untouc
             row |= summarise(found["image"], noisy, np.arange(len(noisy)), None)
             row |= contacts(found, noisy)
             if variant == "full":
-                row["known_force_%"] = known_indenter(noisy, untouched, skin, bundle)
                 if level == "70":
                     row |= false_touches(frames, level, seed, bundle, untouched_frames)
             rows.append(row)
@@ -112,16 +111,6 @@ def contacts(found: dict[str, Array], frames: Frames) -> Row:
         "confusion": matrix.tolist(),
         "separation": metrics.separation([gap_of(frames, k) for k in apart], [found["count"][k] == 2 for k in apart]),
     }
-
-
-def known_indenter(noisy: Frames, untouched: Array, skin: Skin, bundle: Bundle) -> float:
-    """Force error in per cent where the configuration says that everything that touches has radius 0.2."""
-    some = noisy.of("force")
-    part = Frames(*(getattr(noisy, f)[some] for f in noisy.__dataclass_fields__))
-    known = skin.model_copy(update={"indenter": Indenter(radius_m=0.2 * bundle.metres_per_unit)})
-    found, _ = reconstructed(part, untouched, known, bundle)
-    newton = [part.scene(k)[0].drop * NEWTON_PER_DROP for k in range(len(part))]
-    return float(metrics.relative_error(np.nan_to_num(found["force"][:, 0]), newton).mean())
 
 
 def false_touches(frames: Frames, level: str, seed: int, bundle: Bundle, n: int) -> Row:

@@ -19,7 +19,6 @@ from protocol.transport import Transport
 ROOT = Path(__file__).resolve().parents[1]
 SKIN_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 
-Metres = Annotated[float, Field(gt=0, le=10)]
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -47,12 +46,6 @@ class Pose(Section):
         return q
 
 
-class Indenter(Section):
-    """Known-indenter prior: everything that touches is a disc of this radius."""
-
-    radius_m: Metres
-
-
 class Tare(Section):
     """How the untouched baseline is taken and kept."""
 
@@ -76,8 +69,7 @@ class Skin(Section):
     bundle: str
     frame_id: str = ""  # default: the skin's name
     pose: Pose = Pose()
-    calibration: Path | None = None
-    indenter: Indenter | None = None
+    calibration: Path | None = None  # JSON of this very skin's force law: see services/force.py
     network: Literal["full", "fast", "int8", "none"] = "full"
     dft_points: Literal[128, 256, 512] = 128
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement

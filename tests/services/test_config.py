@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from models.bundle import Bundle
 from services.config import ROOT, ConfigError, load, parse
+from services.force import ForceLaw
 
 PALM: dict[str, Any] = {"port": "stub", "bundle": "square16"}
 
@@ -42,6 +46,24 @@ def test_errors_name_file_key_found_and_allowed(raw: dict[str, Any], expected: s
         parse(raw, Path("robot.toml"))
     assert str(error.value).startswith("robot.toml: ")
     assert expected in str(error.value)
+
+
+def test_every_key_of_the_shipped_file_is_one_that_exists() -> None:
+    """Also those that are commented out: taking one's comment sign away must give a valid file."""
+    text = (ROOT / "skin.toml").read_text()
+    with_all = re.sub(r"^# (?=[a-z]+ = |\[)", "", text, flags=re.MULTILINE)
+    assert with_all.count("#") < text.count("#")
+    config = parse(tomllib.loads(with_all))
+    assert config.skin("palm").calibration == Path("palm.json") and config.sockets.addresses
+
+
+def test_the_calibration_that_the_shipped_file_shows_is_read(tmp_path: Path) -> None:
+    shown = re.search(r"calibration = .*# .*(\{.*\})", (ROOT / "skin.toml").read_text())
+    assert shown
+    (tmp_path / "palm.json").write_text(shown[1])
+    config = parse({"skins": {"palm": PALM | {"calibration": "palm.json"}}}, tmp_path / "skin.toml")
+    law = ForceLaw.of(config.skin("palm"), Bundle.load("square16"))
+    assert (law.newtons_per_siemens, law.most_n, law.calibrated) == (10.0, 5.0, True)
 
 
 def test_every_mistake_is_named_at_once() -> None:
