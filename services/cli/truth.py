@@ -12,6 +12,8 @@ from protocol.sockets import AllReader
 from services.cli.common import NOT_RUNNING, emit, fail
 from services.cli.watch import nobody
 
+LIGHT_N = 0.5  # a lighter touch's force is left out of the relative error: presses begin and end at zero
+
 
 def pairs(truth: TruthFrame, contact: ContactFrame) -> list[dict[str, Any]]:
     """Each true touch and the contact that is its; `found` is None where none is left. Nearest pairs go first."""
@@ -85,16 +87,16 @@ def _newton(force: float | None) -> str:
 def _summary(rows: list[dict[str, Any]], as_json: bool) -> None:
     seen = [row for row in rows if row["found"] is not None]
     errors = sorted(row["found"]["error_mm"] for row in seen)
-    forces = [
+    forces = sorted(
         abs(row["found"]["force_n"] / row["force_n"] - 1) * 100
         for row in seen
-        if row["force_n"] and row["found"]["force_n"] is not None
-    ]
+        if (row["force_n"] or 0.0) >= LIGHT_N and row["found"]["force_n"] is not None
+    )
     result = {
         "touches": len(rows),
         "seen": len(seen),
-        "position_error_mm": {"median": median(errors), "max": errors[-1]} if errors else None,
-        "force_error_percent": {"median": median(forces), "max": max(forces)} if forces else None,
+        "position_error_mm": _spread(errors),
+        "force_error_percent": _spread(forces),
     }
     if as_json:
         emit({"summary": result})
@@ -103,6 +105,15 @@ def _summary(rows: list[dict[str, Any]], as_json: bool) -> None:
     else:
         print(f"{len(seen)} of {len(rows)} true touches seen")
         if errors:
-            print(f"position error: median {median(errors):.2f} mm, largest {errors[-1]:.2f} mm")
+            text = "position error: median {median:.2f} mm, p95 {p95:.2f} mm, largest {max:.2f} mm"
+            print(text.format(**_spread(errors)))
         if forces:
-            print(f"force error: median {median(forces):.1f} %, largest {max(forces):.1f} %")
+            text = "force error from {0:g} N on: median {median:.1f} %, p95 {p95:.1f} %, largest {max:.1f} %"
+            print(text.format(LIGHT_N, **_spread(forces)))
+
+
+def _spread(ordered: list[float]) -> dict[str, float]:
+    """Median, 95th percentile and largest of sorted values; empty without any."""
+    if not ordered:
+        return {}
+    return {"median": median(ordered), "p95": ordered[int(0.95 * (len(ordered) - 1))], "max": ordered[-1]}
