@@ -17,6 +17,7 @@ from protocol.topics import PRODUCERS
 from protocol.transport import Transport
 
 ROOT = Path(__file__).resolve().parents[1]
+BUNDLES, MANIFEST = ROOT / "models" / "bundles", "manifest.json"
 SKIN_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 
 Vector3 = tuple[float, float, float]
@@ -65,8 +66,8 @@ class Touch(Section):
 class Skin(Section):
     """One skin: one board on one port, one bundle."""
 
-    port: str
-    bundle: str
+    port: str  # "stub", a device path, a pyserial URL, or a file (*.mcap, *.npz)
+    bundle: str  # the name of a folder of models/bundles, else a path
     frame_id: str = ""  # default: the skin's name
     pose: Pose = Pose()
     calibration: Path | None = None  # JSON of this very skin's force law: see services/force.py
@@ -82,7 +83,8 @@ class Skin(Section):
         if port == "stub" or port.startswith("/") or "://" in port or Path(port).suffix in RECORDINGS:
             return port
         raise ValueError(
-            '"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000) or a recording (*.mcap)'
+            '"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000), a recording (*.mcap) or a file '
+            "of measurements (*.npz)"
         )
 
 
@@ -152,6 +154,17 @@ class Config(Section):
         """A path of the file: relative ones are relative to its folder."""
         return None if path is None else self.path.parent / path
 
+    def _resolved(self, skin: Skin) -> Skin:
+        """The skin with its paths relative to our folder made whole. A bundle's name stays a name."""
+        paths: dict[str, Any] = {"calibration": self.relative(skin.calibration)}
+        if Path(skin.port).suffix in RECORDINGS and "://" not in skin.port:
+            paths["port"] = str(self.relative(Path(skin.port)))
+        beside = self.path.parent / skin.bundle
+        shipped = (BUNDLES / skin.bundle / MANIFEST).is_file()
+        if "/" in skin.bundle or ((beside / MANIFEST).is_file() and not shipped):
+            paths["bundle"] = str(beside)
+        return skin.model_copy(update=paths)
+
     def skin(self, name: str) -> Skin:
         """The skin called `name`; ConfigError names those there are."""
         if name not in self.skins:
@@ -180,10 +193,7 @@ def parse(raw: dict[str, Any], file: Path = Path("skin.toml")) -> Config:
     """Check a configuration that is already a dict; `file` is named in errors."""
     try:
         config = Config.model_validate(raw | {"path": file})
-        skins = {
-            n: s.model_copy(update={"calibration": config.relative(s.calibration)}) for n, s in config.skins.items()
-        }
-        return config.model_copy(update={"skins": skins})
+        return config.model_copy(update={"skins": {n: config._resolved(s) for n, s in config.skins.items()}})
     except ValidationError as wrong:
         raise ConfigError("\n".join(_explain(file, e) for e in wrong.errors())) from None
 

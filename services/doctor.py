@@ -21,7 +21,8 @@ from protocol.runtime import AlreadyRunning, RuntimeDirError, lock, runtime_dir
 from protocol.sockets import AllReader, ControlClient, ControlError, NewestReader
 from services import port as ports
 from services.boardlink import BoardLink, Scanning
-from services.config import Config, ConfigError, Skin, config_path, load
+from services.config import RECORDINGS, Config, ConfigError, Skin, config_path, load
+from services.force import ForceLaw
 from services.supervision import STAGES
 from services.tare import implausibility
 
@@ -115,7 +116,9 @@ def _skin(name: str, skin: Skin, config: Config, running: bool) -> Iterator[Find
         "with its network" if bundle.network_path(skin.network if skin.network != "none" else "full") else "no network"
     )
     yield Finding("OK", f"{name}: bundle", f"{bundle.name}, every sha256 right ({bundle.hash[:12]}), {network}")
-    if Path(skin.port).suffix in (".mcap", ".npz"):
+    if skin.calibration is not None:
+        yield _calibration(name, skin, bundle)
+    if Path(skin.port).suffix in RECORDINGS:
         found = Path(skin.port).is_file()
         yield Finding("OK" if found else "FAIL", f"{name}: port", f"{skin.port} {'is' if found else 'is not'} there")
     elif skin.port == "stub":
@@ -126,6 +129,17 @@ def _skin(name: str, skin: Skin, config: Config, running: bool) -> Iterator[Find
         yield from _frames(name, bundle)
     else:
         yield Finding("SKIP", f"{name}: electrodes", "their order is looked at while the service runs: `skin up`")
+
+
+def _calibration(name: str, skin: Skin, bundle: Bundle) -> Finding:
+    what = f"{name}: calibration"
+    if skin.calibration is None or not skin.calibration.is_file():
+        return Finding("FAIL", what, f"{skin.calibration} is not there: correct `calibration`, or take the line away")
+    try:
+        law = ForceLaw.of(skin, bundle)
+    except ConfigError as why:
+        return Finding("FAIL", what, f'{why}; expected JSON such as {{"newtons_per_siemens": 10.0, "most_n": 5.0}}')
+    return Finding("OK", what, f"{skin.calibration}: {law.newtons_per_siemens:g} N per S/m, to {law.most_n:g} N")
 
 
 def _device(name: str, skin: Skin, bundle: Bundle, running: bool) -> Iterator[Finding]:

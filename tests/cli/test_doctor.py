@@ -44,15 +44,38 @@ def test_another_skin_is_no_exchange(bundle: Bundle) -> None:
     assert finding.level == "WARN" and "skin tare" in finding.text
 
 
-def configured(tmp_path, port: str) -> str:  # type: ignore[no-untyped-def]
+def configured(tmp_path, port: str, more: str = "") -> str:  # type: ignore[no-untyped-def]
     file = tmp_path / "skin.toml"
-    file.write_text(f'[skins.palm]\nport = "{port}"\nbundle = "square16"\n')
+    file.write_text(f'[skins.palm]\nport = "{port}"\nbundle = "square16"\n{more}')
     return str(file)
 
 
 def test_a_missing_port_is_named(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
     ran = skin("doctor", "--config", configured(tmp_path, "/dev/ttyACM99"))
     assert ran.code == 1 and "/dev/ttyACM99 is not there: plug the board in" in ran.out
+
+
+def test_a_recording_beside_the_configuration_is_found(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    ran = skin("doctor", "--config", configured(tmp_path, "one.npz"))
+    assert ran.code == 1 and f"{tmp_path / 'one.npz'} is not there" in ran.out
+    (tmp_path / "one.npz").touch()
+    ran = skin("doctor", "--config", configured(tmp_path, "one.npz"))
+    assert ran.code == 0 and f"{tmp_path / 'one.npz'} is there" in ran.out
+
+
+@pytest.mark.parametrize(
+    ("content", "code", "expected"),
+    [
+        (None, 1, "palm.json is not there: correct `calibration`"),
+        ("newtons_per_siemens = 10.0", 1, "is no calibration of forces"),
+        ('{"newtons_per_siemens": 8.5}', 0, "palm.json: 8.5 N per S/m, to 5 N"),
+    ],
+)
+def test_the_calibration_is_looked_at(skin, tmp_path, content, code, expected) -> None:  # type: ignore[no-untyped-def]
+    if content is not None:
+        (tmp_path / "palm.json").write_text(content)
+    ran = skin("doctor", "--config", configured(tmp_path, "stub", 'calibration = "palm.json"\n'))
+    assert ran.code == code and expected in ran.out
 
 
 def test_a_damaged_bundle_is_named(skin, tmp_path, bundle) -> None:  # type: ignore[no-untyped-def]

@@ -30,6 +30,7 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         ({"skins": {"palm": {"bundle": "square16"}}}, "skins.palm.port: is missing"),
         ({"skins": {"palm": PALM | {"port": 5}}}, "skins.palm.port: found 5; allowed: a valid string"),
         ({"skins": {"palm": PALM | {"port": "com1"}}}, "skins.palm.port: found 'com1'; allowed: \"stub\""),
+        ({"skins": {"palm": PALM | {"port": "com1"}}}, "*.npz"),
         ({"skins": {"palm": PALM | {"pot": "stub"}}}, "skins.palm.pot: unknown key; allowed here: port, bundle"),
         ({"skins": {"palm": PALM | {"dft_points": 100}}}, "dft_points: found 100; allowed: 128, 256 or 512"),
         ({"skins": {"palm": PALM | {"tare": {"frames": 2}}}}, "skins.palm.tare.frames: found 2; allowed: "),
@@ -64,6 +65,36 @@ def test_the_calibration_that_the_shipped_file_shows_is_read(tmp_path: Path) -> 
     config = parse({"skins": {"palm": PALM | {"calibration": "palm.json"}}}, tmp_path / "skin.toml")
     law = ForceLaw.of(config.skin("palm"), Bundle.load("square16"))
     assert (law.newtons_per_siemens, law.most_n, law.calibrated) == (10.0, 5.0, True)
+
+
+@pytest.mark.parametrize(
+    ("key", "found", "expected"),
+    [
+        ("port", "presses.npz", "/robot/presses.npz"),
+        ("port", "takes/one.mcap", "/robot/takes/one.mcap"),
+        ("port", "/data/one.mcap", "/data/one.mcap"),
+        ("port", "stub", "stub"),
+        ("port", "/dev/ttyACM0", "/dev/ttyACM0"),
+        ("port", "socket://host:4000", "socket://host:4000"),
+        ("bundle", "square16", "square16"),
+        ("bundle", "unknown", "unknown"),  # so that the error that follows speaks of names
+        ("bundle", "calibration/palm", "/robot/calibration/palm"),
+        ("bundle", "/data/palm", "/data/palm"),
+        ("calibration", "palm.json", Path("/robot/palm.json")),
+    ],
+)
+def test_paths_are_relative_to_the_file(key: str, found: str, expected: object) -> None:
+    config = parse({"skins": {"palm": PALM | {key: found}}}, Path("/robot/skin.toml"))
+    assert getattr(config.skin("palm"), key) == expected
+
+
+def test_a_bundle_beside_the_file_is_found_unless_its_name_is_a_shipped_one(tmp_path: Path) -> None:
+    for name in ("mine", "square16"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "manifest.json").write_text("{}")
+    skins = {"a": PALM | {"bundle": "mine"}, "b": PALM}
+    config = parse({"skins": skins}, tmp_path / "skin.toml")
+    assert config.skin("a").bundle == str(tmp_path / "mine") and config.skin("b").bundle == "square16"
 
 
 def test_every_mistake_is_named_at_once() -> None:
