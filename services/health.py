@@ -1,34 +1,80 @@
 """Does a process answer, and do frames flow through it? What a container's healthcheck asks.
 
 python -m services.health publisher      exit 0: yes. 1: no, and why.
+
+Stages are asked for each configured skin. The stub is well while a host has it scan and it is plugged in. A
+recorder, whose status counts the messages it has written, is well while those with frames grow in number.
 """
 
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Iterable
 
+from protocol import transport
 from protocol.runtime import RuntimeDirError
 from protocol.sockets import ControlClient, ControlError
+from protocol.transport import TransportError
+from services.config import ConfigError, load
 
 TIMEOUT_S = 2.0
+GROWING_S = 0.5  # within which a recording must grow: ten frames of a board
+BESIDES = ("status", "info", "state")  # topics of a recording that arrive without frames
 
 
-def check(process: str) -> str:
-    """What is wrong with a process: empty where frames flow through it (or nobody wants them)."""
+def check(process: str, skins: Iterable[str]) -> str:
+    """What is wrong with a process: empty where frames of all `skins` flow through it (or nobody wants them)."""
     try:
-        status = ControlClient(process, TIMEOUT_S).call("status")
-    except (ControlError, RuntimeDirError) as why:
+        client = ControlClient(process, TIMEOUT_S)
+        if process == "stub":
+            return _stub(client)
+        if process == "recorder":
+            return _recorder(client)
+        return "; ".join(filter(None, (_stage(process, client, skin) for skin in skins)))
+    except (ControlError, RuntimeDirError, TransportError) as why:
         return f"{process}: {why}"
-    if status.get("flowing", True):  # recorder and stub report what is specific to them, and are well if they answer
+
+
+def _stage(process: str, client: ControlClient, skin: str) -> str:
+    status = client.call("status", skin=skin)
+    if status.get("flowing"):
         return ""
-    return f"{process}: no frames for {status.get('quiet_s', 0):.1f} s; " + "; ".join(status.get("messages", []))
+    said = "".join(f"; {message}" for message in status.get("messages", []))
+    return f"{process}: no frames of {skin} for {status.get('quiet_s', 0):.1f} s{said}"
+
+
+def _stub(client: ControlClient) -> str:
+    status = client.call("status")
+    if not status.get("plugged"):
+        return "stub: unplugged, as a fault or a scene asked for"
+    return "" if status.get("scanning") else "stub: not scanning, no host has started it: does acquisition run?"
+
+
+def _recorder(client: ControlClient) -> str:
+    before = _recorded(client)
+    time.sleep(GROWING_S)
+    after = _recorded(client)
+    return "" if after > before else f"recorder: {after} frames recorded, none in the last {GROWING_S:g} s"
+
+
+def _recorded(client: ControlClient) -> int:
+    """Frames written so far."""
+    counts = client.call("status").get("messages", {})
+    return sum(n for topic, n in counts.items() if topic.partition("/")[0] not in BESIDES)
 
 
 def main() -> int:
     if len(sys.argv) != 2:
         print("usage: python -m services.health PROCESS", file=sys.stderr)
         return 2
-    wrong = check(sys.argv[1])
+    try:
+        config = load()
+        transport.configure(config.transport())
+    except (ConfigError, TransportError) as why:
+        print(why)
+        return 1
+    wrong = check(sys.argv[1], config.skins)
     print(wrong or f"{sys.argv[1]}: frames flow")
     return 1 if wrong else 0
 
