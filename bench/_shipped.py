@@ -17,8 +17,9 @@ from models.bundle import Bundle
 from models.shapes import CLASSES, Array
 from protocol.frames import RawFrame
 from services.config import Skin
+from services.npz_file import Input
 from services.pipeline import Pipeline
-from services.reconstruction import Input, reconstruct
+from services.reconstruction import reconstruct
 from services.tare import take
 
 NEWTON_PER_DROP = 10.0  # the default force law: 0.1 S/m is 1 N

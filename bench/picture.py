@@ -20,7 +20,8 @@ from models.bundle import Bundle
 from models.forward import ForwardModel
 from models.prereconstruction import PreReconstructor
 from models.shapes import Shape, drop_image
-from services.reconstruction import Input, find_skin, reconstruct
+from services.npz_file import Input
+from services.reconstruction import find_skin, reconstruct
 
 TOUCHES = (
     [Shape("circle", 0.0, 0.0, 0.2, 0.15)],

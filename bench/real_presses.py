@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle, BundleError
 from services.config import Skin
-from services.reconstruction import Input, reconstruct
+from services.npz_file import Input
+from services.reconstruction import reconstruct
 from services.registration import Presses, Similarity, part, read_presses, register
 from services.sensitivity import write_corrected
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +12,14 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.frames import pack
 from services.config import SKIN_NAME
-from services.reconstruction import InputError, find_skin, read_input
+from services.npz_file import InputError, frames_of, read_input
+from services.reconstruction import find_skin
 from services.recording import RecordingWriter
 from services.source import file_frame
 
-TARE_ROWS = 64
-"""Untouched rows at the start of a recording of presses, from which the noise is found."""
 ROWS_PER_CHUNK = 8
 EPOCH_NS = 1_000_000_000_000_000_000
 """A file of measurements knows no time; its recording begins here (2001-09-09), so that importing is reproducible."""
-
-Rows = Iterator[tuple[NDArray[Any], str]]
 
 
 class ImportRefused(ValueError):
@@ -52,7 +49,7 @@ def import_arrays(
     metadata = {"origin": "import", "of": source.name, "bundle": configured.bundle, "skin": skin}
     step_ns, count = int(1e9 / rate_hz), 0
     with RecordingWriter(target, metadata, overwrite) as writer:
-        for count, (values, kind) in enumerate(_rows(data.measurements, data.untouched, data.reference), start=1):
+        for count, (values, kind) in enumerate(frames_of(data), start=1):
             now_ns = count * step_ns
             frame = file_frame(skin, str(bundle.skin.get("pattern", "custom")), count, values[order], kind, now_ns)
             frame.valid_for_s, frame.board, frame.unit = 3 / rate_hz, source.name, "counts"
@@ -61,18 +58,6 @@ def import_arrays(
             if count % ROWS_PER_CHUNK == 0:
                 writer.flush()
     return {"file": str(target), "frames": count, "measurements": len(order), "seconds": count / rate_hz}
-
-
-def _rows(measurements: NDArray[Any], untouched: NDArray[Any] | None, reference: NDArray[Any] | None) -> Rows:
-    if untouched is not None:
-        yield from ((row, "reference") for row in untouched)
-        yield from ((row, "full") for row in measurements)
-        return
-    assert reference is not None
-    yield from ((row, "reference") for row in reference[:TARE_ROWS])
-    for before, row in zip(reference, measurements, strict=True):
-        yield before, "reference"
-        yield row, "full"
 
 
 def measurement_order(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> NDArray[np.intp]:

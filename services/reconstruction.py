@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from models.bundle import Bundle
 from models.prereconstruction import noise_of_frames
 from protocol.frames import RawFrame
 from services.config import ConfigError, Skin, load
+from services.npz_file import Input
 from services.pipeline import Pipeline, Result
 from services.stage import Refused
 from services.tare import Baseline, take
@@ -26,54 +26,6 @@ ROW_NS = 45_000_000
 ASSUMED_NOISE = 1e-3
 """Relative noise of a frame (60 dB) where a file holds too few untouched frames to find it."""
 FEWEST_FOR_TARE = 16
-
-
-class InputError(ValueError):
-    """The file's arrays are not what is needed; says which, what was found and what is expected."""
-
-
-@dataclass(frozen=True)
-class Input:
-    """What a file gives. N rows of K measurements."""
-
-    measurements: NDArray[Any]  # (N, K) real or complex
-    untouched: Array | None  # (M, K) |Z|
-    reference: Array | None  # (N, K) |Z|
-
-
-def read_input(arrays: Mapping[str, NDArray[Any]], k: int) -> Input:
-    """Checks keys and shapes for a skin of `k` measurements. Raises InputError."""
-    if "measurements" not in arrays:
-        raise InputError(f"no array `measurements` of shape (n, {k}); found {_found(arrays)}")
-    if ("untouched" in arrays) == ("reference" in arrays):
-        both = "both" if "untouched" in arrays else "neither"
-        raise InputError(
-            f"expected either `untouched` (m, {k}) or `reference` (n, {k}), found {both}; arrays: {_found(arrays)}"
-        )
-    measurements = _matrix(arrays, "measurements", k)
-    if "untouched" in arrays:
-        return Input(measurements, np.abs(_matrix(arrays, "untouched", k)).astype(float), None)
-    reference = np.abs(_matrix(arrays, "reference", k)).astype(float)
-    if len(reference) != len(measurements):
-        raise InputError(
-            f"`reference` has {len(reference)} rows, `measurements` {len(measurements)}: expected one each"
-        )
-    return Input(measurements, None, reference)
-
-
-def _matrix(arrays: Mapping[str, NDArray[Any]], name: str, k: int) -> NDArray[Any]:
-    a = arrays[name]
-    if a.dtype.kind not in "iufc" or a.ndim != 2 or a.shape[1] != k or not len(a):
-        raise InputError(
-            f"`{name}` is {a.dtype} of shape {a.shape}, expected numbers of shape (n, {k}) in the skin's pattern order"
-        )
-    if not np.isfinite(a).any():
-        raise InputError(f"`{name}` holds no finite number")
-    return a
-
-
-def _found(arrays: Mapping[str, NDArray[Any]]) -> str:
-    return ", ".join(f"{name} {a.shape}" for name, a in arrays.items()) or "no arrays"
 
 
 def find_skin(name: str) -> tuple[Skin, Bundle]:

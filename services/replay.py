@@ -19,6 +19,7 @@ import msgpack
 from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, unpack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
 from services.recording import STATE_TOPIC, Recorded, RecordingReader, RecordingWriter
+from services.stage import add_reason
 
 STAGES = ("preprocessing", "inference", "publisher")
 CHAIN_S = 20.0  # for the stages to start and find each other
@@ -85,6 +86,14 @@ def _step(message: Recorded) -> Step | None:
     return Step(message.log_time_ns, skin, raw=frame) if isinstance(frame, RawFrame) else None
 
 
+def mark(raw: RawFrame) -> None:
+    """Says of a recorded frame that it is one, read now."""
+    raw.source = "replay"
+    raw.stamps = {"sample": raw.stamps.get("sample", 0), "read": time.monotonic_ns()}
+    raw.valid, raw.reasons = as_sent(raw)  # whoever reads it will remark on failed measurements again
+    add_reason(raw.reasons, "replay")
+
+
 class Replayer:
     """Feeds stages that run already. `speed` None: as fast as they can."""
 
@@ -127,11 +136,7 @@ class Replayer:
             self._report()
 
     def _send(self, step: Step, raw: RawFrame) -> ContactFrame:
-        raw.source = "replay"
-        raw.stamps = {"sample": raw.stamps.get("sample", 0), "read": time.monotonic_ns()}
-        raw.valid, raw.reasons = as_sent(raw)  # whoever reads it will remark on failed measurements again
-        if "replay" not in raw.reasons:
-            raw.reasons.append("replay")
+        mark(raw)
         self.publisher.send(raw)
         self.counts["frames"] += 1
         contact = self._contact(step.skin, raw.scan, ANSWER_S)

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol import link
-from protocol.frames import RawFrame, as_sent, unpack
+from protocol.frames import FrameError, RawFrame, unpack
 from services import port as ports
 from services.boardlink import BoardLink, Scanning
 from services.clock import UNSETTLED_NS, DeviceClock
 from services.config import Skin
+from services.npz_file import InputError, frames_of, load_npz, read_input
 from services.stage import Health
 
 POLL_S = 0.1
@@ -29,6 +30,7 @@ REOPEN_S = 0.2  # between attempts to open a port
 INTRODUCE_S = 0.6  # for a board under another name to say who it is
 SCANS_VALID = 3  # a frame is valid until this many scans later
 FILE_RATE_HZ = 22.0  # at which frames of a file without times are given
+LONGEST_PAUSE_S = 1.0  # between two recorded frames
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +49,13 @@ class Source(ABC):
 
     def health(self) -> Health:
         return Health("ERROR" if self.problem else "OK", [self.problem] if self.problem else [], dict(self.counts))
+
+    def _ended(self, problem: str) -> Iterator[None]:
+        """There is nothing more to come, for this reason or for one that was found before."""
+        self.problem = self.problem or problem
+        while True:
+            time.sleep(POLL_S)
+            yield None
 
     def close(self) -> None:  # noqa: B027  (nothing to close is a valid case)
         pass
@@ -161,53 +170,61 @@ class BoardSource(Source):
 
 
 class RecordingSource(Source):
-    """The raw frames of a recording, once, at the recorded speed. (`skin replay` is the lossless way.)"""
+    """The raw frames of one skin in a recording, once, at the recorded speed. (`skin replay` is the lossless way.)"""
 
     def frames(self) -> Iterator[RawFrame | None]:
-        from services.recording import RecordingError, RecordingReader
+        from services.recording import RecordingError
 
-        previous, due = 0, time.monotonic()
         try:
-            for recorded in RecordingReader(Path(self.skin.port)).messages({"raw"}):
-                frame = unpack(recorded.wire)
-                assert isinstance(frame, RawFrame)
-                frame.skin, frame.source = self.name, "replay"
-                frame.valid, frame.reasons = as_sent(frame)
-                sample = frame.stamps.get("sample", 0)
-                due += min(max(0.0, (sample - previous) * 1e-9), 1.0) if previous else 0.0
-                previous = sample
-                yield from _wait_until(due)
-                frame.stamps = {"sample": sample, "read": time.monotonic_ns()}
-                yield frame
-        except (RecordingError, OSError, ValueError) as why:
+            yield from self._recorded(Path(self.skin.port))
+        except (RecordingError, OSError) as why:
             self.problem = str(why)
-        self.problem = self.problem or f"the recording {self.skin.port} has ended"
-        while True:
-            time.sleep(POLL_S)
-            yield None
+        yield from self._ended(f"the recording {self.skin.port} has ended")
+
+    def _recorded(self, path: Path) -> Iterator[RawFrame | None]:
+        from services.recording import RecordingReader
+        from services.replay import mark, skins_in
+
+        skins = skins_in(path)
+        theirs = self.name if self.name in skins else next(iter(skins), "")
+        if theirs != self.name and len(skins) != 1:
+            held = f"skins {', '.join(skins)}, none called {self.name}" if skins else "no raw frames"
+            self.problem = f"the recording {path} holds {held}"
+            return
+        previous, due = 0, time.monotonic()
+        for recorded in RecordingReader(path).messages({"raw"}):
+            if recorded.topic != f"raw/{theirs}":
+                continue
+            try:
+                frame = unpack(recorded.wire)
+            except FrameError:
+                self.counts["malformed"] += 1
+                continue
+            assert isinstance(frame, RawFrame)  # by its topic
+            sample = frame.stamps.get("sample", 0)
+            due += min(max(0.0, (sample - previous) * 1e-9), LONGEST_PAUSE_S) if previous else 0.0
+            previous = sample
+            yield from _wait_until(due)
+            mark(frame)
+            frame.skin = self.name
+            yield frame
 
 
 class FileSource(Source):
-    """Frames of an npz file: `untouched` (m, K) first, then `measurements` (n, K), each after its row of `reference`
-    if there is one.
-    """
+    """The rows of an npz file as frames, once; in the order that services/npz_file.py gives them."""
 
     def frames(self) -> Iterator[RawFrame | None]:
         due = time.monotonic()
         try:
-            for scan, (values, kind) in enumerate(rows(Path(self.skin.port), len(self.bundle.pattern))):
-                due += 1 / FILE_RATE_HZ
-                yield from _wait_until(due)
-                yield self.raw(scan, values, kind, time.monotonic_ns())
-        except (OSError, ValueError, KeyError) as why:
-            self.problem = f"{self.skin.port}: {why}"
-        self.problem = self.problem or f"the file {self.skin.port} has ended"
-        while True:
-            time.sleep(POLL_S)
-            yield None
-
-    def raw(self, scan: int, values: NDArray[np.generic], kind: str, now_ns: int) -> RawFrame:
-        return file_frame(self.name, self.pattern_name, scan, values, kind, now_ns)
+            data = read_input(load_npz(Path(self.skin.port)), len(self.bundle.pattern))
+        except InputError as why:
+            text = str(why)
+            yield from self._ended(text if self.skin.port in text else f"{self.skin.port}: {text}")
+        for scan, (values, kind) in enumerate(frames_of(data)):
+            due += 1 / FILE_RATE_HZ
+            yield from _wait_until(due)
+            yield file_frame(self.name, self.pattern_name, scan, values, kind, time.monotonic_ns())
+        yield from self._ended(f"the file {self.skin.port} has ended")
 
 
 def file_frame(skin: str, pattern: str, scan: int, values: NDArray[np.generic], kind: str, now_ns: int) -> RawFrame:
@@ -218,6 +235,7 @@ def file_frame(skin: str, pattern: str, scan: int, values: NDArray[np.generic], 
         stamps={"sample": now_ns, "read": now_ns},
         source="replay",
         valid=True,
+        reasons=["replay"],
         valid_for_s=SCANS_VALID / FILE_RATE_HZ,
         z=np.asarray(values, np.complex64),
         status=np.zeros(len(values), np.uint8),
@@ -225,31 +243,6 @@ def file_frame(skin: str, pattern: str, scan: int, values: NDArray[np.generic], 
         kind=kind,
         pattern=pattern,
     )
-
-
-def rows(path: Path, measurements: int) -> Iterator[tuple[NDArray[np.generic], str]]:
-    """(values (K,), kind) of an npz file's frames. Raises ValueError or KeyError naming key, shape found and shape
-    expected.
-    """
-    with np.load(path, allow_pickle=False) as data:
-        found = {key: np.asarray(data[key]) for key in ("untouched", "reference", "measurements") if key in data}
-    if "measurements" not in found:
-        raise ValueError("has no array `measurements` (n, K)")
-    for key, values in found.items():
-        if values.ndim != 2 or values.shape[1] != measurements:
-            raise ValueError(
-                f"`{key}` has shape {values.shape}, expected (n, {measurements}) in the skin's pattern order"
-            )
-    reference = found.get("reference")
-    if reference is not None and len(reference) != len(found["measurements"]):
-        raise ValueError(
-            f"`reference` has {len(reference)} rows, `measurements` {len(found['measurements'])}: expected one each"
-        )
-    yield from ((row, "full") for row in found.get("untouched", ()))
-    for index, row in enumerate(found["measurements"]):
-        if reference is not None:
-            yield reference[index], "reference"
-        yield row, "full"
 
 
 def open_source(name: str, skin: Skin, bundle: Bundle) -> Source:

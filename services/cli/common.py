@@ -123,17 +123,9 @@ def control(process: str, command: str, *, timeout_s: float = 2.0, **args: Any) 
 
 def load_npz(path: Path) -> dict[str, Any]:
     """All arrays of an npz file. CliError where it is none, or holds pickled objects."""
-    import zipfile
-
-    import numpy as np
+    from services import npz_file
 
     try:
-        data = np.load(path, allow_pickle=False)
-        if isinstance(data, np.ndarray):
-            fail(f"{path} holds one bare array, expected named ones: numpy.savez(path, name=array)", USAGE)
-        with data:
-            return {name: data[name] for name in data.files}
-    except OSError as error:
-        fail(f"cannot read {path}: {error.strerror or 'not a file of numpy.savez'}", USAGE)
-    except (ValueError, zipfile.BadZipFile, EOFError, KeyError):
-        fail(f"{path} is no npz of plain arrays (numpy.savez): found something else, or object arrays", USAGE)
+        return npz_file.load_npz(path)
+    except npz_file.InputError as error:
+        fail(str(error), USAGE)

@@ -37,7 +37,8 @@ def reconstruct(
     """
     import numpy as np
 
-    from services.reconstruction import InputError, find_skin, read_input
+    from services.npz_file import InputError, read_input
+    from services.reconstruction import find_skin
     from services.reconstruction import reconstruct as run
 
     found, bundle = find_skin(skin)

@@ -9,7 +9,8 @@ import pytest
 
 from models.bundle import Bundle
 from services.config import Skin
-from services.reconstruction import Input, noise_of_references, read_input, reconstruct, resampled
+from services.npz_file import Input, read_input
+from services.reconstruction import noise_of_references, reconstruct, resampled
 
 METRES = 0.05  # per model unit
 

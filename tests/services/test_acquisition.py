@@ -17,13 +17,14 @@ from hypothesis import strategies as st
 from models.bundle import Bundle
 from models.patterns import pattern
 from protocol import link
-from protocol.frames import STATUS_OPEN, RawFrame
+from protocol.frames import STATUS_OPEN, RawFrame, pack
 from services.acquisition import SourceFeed
 from services.boardlink import ANSWER_S, DEAD_SCANS, REFUSED_AGAIN_S, SILENT_S, BoardLink, Scanning
 from services.clock import DeviceClock
 from services.config import Skin
 from services.port import PortError, explain
-from services.source import BoardSource, FileSource, Source, open_source, rows
+from services.recording import RecordingWriter
+from services.source import FileSource, RecordingSource, Source, open_source
 from tests.services.fake_board import FakeBoard, PtyBoard
 
 SCANNING = Scanning(pattern("pairs"), 128, 40_000.0)
@@ -325,16 +326,103 @@ def test_a_missing_or_held_port_is_said_and_tried_again(start: Callable[[str], S
     board.unplug()
 
 
+def taken(source: Source, count: int) -> list[RawFrame]:
+    """The frames that come before the source has a problem, at most `count`."""
+    found: list[RawFrame] = []
+    for frame in source.frames():
+        if frame is not None:
+            found.append(frame)
+        if source.problem or len(found) == count:
+            return found
+    return found
+
+
 def test_a_file_is_a_source_too(tmp_path: Path, skin: Skin, bundle: Bundle) -> None:
     values = np.arange(360, dtype=float).reshape(3, 120) + 1
-    np.savez(tmp_path / "presses.npz", untouched=values[:1], measurements=values[1:], reference=values[1:] + 0.5)
-    kinds = [(float(v[0]), kind) for v, kind in rows(tmp_path / "presses.npz", 120)]
-    assert kinds == [(1, "full"), (121.5, "reference"), (121, "full"), (241.5, "reference"), (241, "full")]
-    source = open_source("palm", skin.model_copy(update={"port": str(tmp_path / "presses.npz")}), bundle)
-    assert isinstance(source, FileSource)
-    assert not isinstance(source, BoardSource)
-    frames = [f for _, f in zip(range(8), source.frames(), strict=False) if f is not None]
-    assert [f.kind for f in frames][:2] == ["full", "reference"] and frames[0].source == "replay"
+    np.savez(tmp_path / "one.npz", untouched=values[:1], measurements=values[1:])
+    np.savez(tmp_path / "own.npz", measurements=values[:2], reference=values[:2] + 0.5)
+    expected = {
+        "one.npz": [(1, "reference"), (121, "full"), (241, "full")],
+        "own.npz": [
+            (1.5, "reference"), (121.5, "reference"),
+            (1.5, "reference"), (1, "full"), (121.5, "reference"), (121, "full"),
+        ],
+    }  # fmt: skip
+    for name, those in expected.items():
+        source = open_source("palm", skin.model_copy(update={"port": str(tmp_path / name)}), bundle)
+        assert isinstance(source, FileSource)
+        frames = taken(source, 100)
+        assert [(f.z[0].real, f.kind) for f in frames] == those and "has ended" in source.problem
+        assert all(f.source == "replay" and f.reasons == ["replay"] for f in frames)
+
+
+def _npz(path: Path, **arrays: object) -> bytes:
+    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+    return path.read_bytes()
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, skin: Skin, bundle: Bundle) -> None:
+    path, ones = tmp_path / "x.npz", np.ones((2, 120))
+    whole = _npz(path, measurements=ones, untouched=np.random.default_rng(0).random((64, 120)))
+    broken = bytearray(whole)
+    broken[len(whole) // 2 : len(whole) // 2 + 50] = bytes(50)
+    cases = {
+        "is no npz of plain arrays": [b"", b"PK\3\4", whole[:-30], whole[: len(whole) // 2], bytes(broken), b"x" * 9],
+        "no array `measurements`": [_npz(path, measurement=ones)],
+        "shape (2, 64), expected numbers of shape (n, 120)": [
+            _npz(path, measurements=np.ones((2, 64)), untouched=ones)
+        ],
+        "3 rows, `measurements` 2": [_npz(path, measurements=ones, reference=np.ones((3, 120)))],
+        "is datetime64[s]": [_npz(path, measurements=ones.astype("M8[s]"), untouched=ones)],
+        "is <U3": [_npz(path, measurements=ones.astype("<U3"), untouched=ones)],
+        "is [('a', '<f8')]": [_npz(path, measurements=ones.view([("a", "<f8")]), untouched=ones)],
+    }
+    for text, files in cases.items():
+        for data in files:
+            path.write_bytes(data)
+            source = open_source("palm", skin.model_copy(update={"port": str(path)}), bundle)
+            assert taken(source, 1) == []
+            assert text in source.problem and str(path) in source.problem, source.problem
+
+
+def _recording(path: Path, **frames: list[RawFrame | bytes]) -> None:
+    with RecordingWriter(path, overwrite=True) as writer:
+        for name, those in frames.items():
+            for n, frame in enumerate(those):
+                data = frame if isinstance(frame, bytes) else pack(frame).partition(b"\0")[2]
+                writer.write(f"raw/{name}", data, n * 10**6)
+
+
+def _raw(skin: str, scan: int) -> RawFrame:
+    ones = np.ones(120, np.complex64)
+    status = np.zeros(120, np.uint8)
+    return RawFrame(skin=skin, scan=scan, z=ones, status=status, source="board", stamps={"sample": 1 + scan * 10**6})
+
+
+def test_a_recording_is_a_source_of_one_skin_whatever_else_it_holds(tmp_path: Path, skin: Skin, bundle: Bundle) -> None:
+    path = tmp_path / "x.mcap"
+    source = open_source("palm", skin.model_copy(update={"port": str(path)}), bundle)
+    assert isinstance(source, RecordingSource)
+    _recording(path, sole=[_raw("sole", 9)], palm=[_raw("palm", 0), b"no frame", b"\x80", _raw("palm", 1)])
+    frames = taken(source, 100)
+    assert [(f.skin, f.scan, f.source, f.reasons) for f in frames] == [
+        ("palm", 0, "replay", ["replay"]),
+        ("palm", 1, "replay", ["replay"]),
+    ]
+    assert source.counts["malformed"] == 2 and "has ended" in source.problem
+
+
+def test_a_recording_of_one_skin_serves_under_any_name(tmp_path: Path, skin: Skin, bundle: Bundle) -> None:
+    path = tmp_path / "x.mcap"
+    named = skin.model_copy(update={"port": str(path)})
+    _recording(path, sole=[_raw("sole", 9)])
+    assert [(f.skin, f.scan) for f in taken(open_source("palm", named, bundle), 9)] == [("palm", 9)]
+    _recording(path, sole=[_raw("sole", 9)], heel=[_raw("heel", 3)])
+    source = open_source("palm", named, bundle)
+    assert taken(source, 9) == [] and "skins sole, heel, none called palm" in source.problem
+    path.write_bytes(b"garbage")
+    source = open_source("palm", named, bundle)
+    assert taken(source, 9) == [] and "not a recording" in source.problem
 
 
 def test_a_source_that_blocks_does_not_hold_up_a_stop(skin: Skin, bundle: Bundle) -> None:
@@ -359,20 +447,6 @@ def test_a_source_that_blocks_does_not_hold_up_a_stop(skin: Skin, bundle: Bundle
             assert time.monotonic() - began < 0.4
     finally:
         free.set()
-
-
-@pytest.mark.parametrize(
-    ("arrays", "expected"),
-    [
-        ({"measurement": np.ones((2, 120))}, "no array `measurements`"),
-        ({"measurements": np.ones((2, 64))}, r"shape \(2, 64\), expected \(n, 120\)"),
-        ({"measurements": np.ones((2, 120)), "reference": np.ones((3, 120))}, "3 rows, `measurements` 2"),
-    ],
-)
-def test_a_wrong_file_is_named(tmp_path: Path, arrays: dict[str, np.ndarray], expected: str) -> None:
-    np.savez(tmp_path / "x.npz", **arrays)
-    with pytest.raises(ValueError, match=expected):
-        list(rows(tmp_path / "x.npz", 120))
 
 
 def test_port_errors_are_their_own_kind(tmp_path: Path) -> None:
