@@ -22,6 +22,9 @@ HARMLESS = 5e-5  # relative change of a measurement within the frames that does 
 TOO_NOISY = 0.05  # median relative noise beyond which no touch could be told from it
 IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
 QUARTERS = 4
+ASSUMED_NOISE = 1e-3  # relative (60 dB), where frames do not tell
+LEAST_NOISE = 2e-6  # relative: about half a step of the board's 18 bits
+IDENTICAL = 1e-12  # relative scatter below which frames are the same but for the arithmetic of their mean
 
 
 @dataclass(frozen=True)
@@ -79,11 +82,27 @@ def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Bas
         )
     z0, sigma = np.zeros(frames.shape[1]), np.full(frames.shape[1], np.inf)
     z0[live], sigma[live] = mean, noise_of_frames(good, mean)
+    sigma = plausible_noise(z0, sigma)
     doubt = ""
+    if noise < IDENTICAL:
+        doubt = (
+            f"the {len(frames)} untouched frames are identical, as measured ones never are: a noise of "
+            f"{ASSUMED_NOISE:g} of each measurement is assumed; check the source and run `skin tare`"
+        )
     misfit = implausibility(z0, pre)
     if misfit > IMPLAUSIBLE:
         doubt = f"the baseline is {100 * misfit:.1f} % off what the bundle predicts: free the skin and run `skin tare`"
     return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
+
+
+def plausible_noise(z0: Array, sigma: Array) -> Array:
+    """(K,) standard deviations of |Z|: at least LEAST_NOISE, and ASSUMED_NOISE where none was found (identical frames,
+    NaN); infinite ones stay.
+    """
+    found = np.isfinite(sigma) & (sigma > IDENTICAL * np.abs(z0))
+    finite = np.where(found, np.maximum(sigma, LEAST_NOISE * np.abs(z0)), ASSUMED_NOISE * np.abs(z0))
+    # A measurement that has no baseline either is not used.
+    return np.where(np.isposinf(sigma) | ~(np.abs(z0) > 0), np.inf, finite)
 
 
 def noise_of_steps(frames: Array) -> Array:

@@ -15,7 +15,7 @@ from models.bundle import Bundle
 from protocol.frames import RawFrame
 from services.config import Tare
 from services.stage import Refused
-from services.tare import Baseline, noise_of_steps, take
+from services.tare import Baseline, noise_of_steps, plausible_noise, take
 
 Array = NDArray[np.float64]
 
@@ -121,8 +121,9 @@ class Untouched:
         self.baseline = baseline
         self.changed = True  # since the last `info`
         if baseline is not None:
+            self.baseline = dataclasses.replace(baseline, sigma=plausible_noise(baseline.z0, baseline.sigma))
             self.normaliser = self.pre.normaliser(baseline.z0)
-            self.sigma = baseline.sigma / self.normaliser
+            self.sigma = self.baseline.sigma / self.normaliser
             self._unsaved = True
             self.problem = baseline.doubt
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -70,6 +72,33 @@ def test_a_baseline_far_from_the_prediction_is_doubted(stage: Preprocessing, boa
         run(stage, board.frame())
     stage.command("tare", {"force": True})
     assert run(stage, board.frame()).valid
+
+
+def test_identical_frames_tell_no_noise(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
+    """Without noise of its own a skin would be touched by anything."""
+    z = np.asarray(board.m.z0, dtype=float)
+    baseline = take(np.tile(z, (64, 1)), bundle.prereconstructor(), "b1", 0)
+    assert "identical" in baseline.doubt
+    assert baseline.sigma == pytest.approx(1e-3 * z)
+    stage.set_baseline(dataclasses.replace(baseline, sigma=np.zeros(len(z)), doubt=""))
+    assert not any(run(stage, board.frame()).touched for _ in range(20))
+    assert run(stage, board.frame(board.disc(0.3, 0.0, 0.2, 0.4))).touched
+
+
+def test_frames_nearly_without_noise_are_a_tare(board: Board, bundle: Bundle) -> None:
+    z = np.asarray(board.m.z0, dtype=float)
+    for relative in (1e-9, 1e-6, 1e-4):
+        frames = z * (1 + relative * np.random.default_rng(0).standard_normal((64, len(z))))
+        baseline = take(frames, bundle.prereconstructor(), "b1", 0)
+        assert not baseline.doubt
+        assert np.median(baseline.sigma / z) == pytest.approx(max(relative, 2e-6), rel=0.1)
+
+
+def test_a_measurement_that_failed_in_the_tare_is_left_out(board: Board, bundle: Bundle) -> None:
+    frames = np.asarray(board.m.z0) * (1 + 1e-4 * np.random.default_rng(0).standard_normal((64, 120)))
+    frames[5, 3] = np.nan
+    sigma = take(frames, bundle.prereconstructor(), "b1", 0).sigma
+    assert np.flatnonzero(~np.isfinite(sigma)).tolist() == [3]
 
 
 def test_disagreement_keeps_its_false_alarm_rate(board: Board) -> None:
