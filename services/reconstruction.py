@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -42,20 +43,27 @@ def find_skin(name: str) -> tuple[Skin, Bundle]:
 def baseline_of(frames: Array, pipeline: Pipeline, warn: Callable[[str], None]) -> Baseline:
     """The tare of (M, K) untouched |Z|; where a board's tare would refuse, the mean all the same, in doubt."""
     doubt = ""
+    if len(frames) > 1 and (frames == frames[0]).all():
+        warn("the rows of `untouched` are all equal: only the first is used")  # computed, not measured
+        frames = frames[:1]
     if len(frames) >= FEWEST_FOR_TARE:
         try:
             return take(frames, pipeline.pre.pre, "file", 0)
         except Refused as why:
             doubt = f"`untouched`: {why}"
             warn(doubt + "; using their mean")
-    mean, finite = np.nanmean(frames, axis=0), np.isfinite(frames).any(axis=0)
+    frames = np.where(np.isfinite(frames), frames, np.nan)
+    mean = np.nanmean(frames, axis=0)
+    good = mean > 0  # false where there is none
+    z0, sigma = np.zeros(len(mean)), np.full(len(mean), np.inf)
+    z0[good], mean = mean[good], mean[good]
     if len(frames) >= 2:
-        sigma = noise_of_frames(np.where(np.isfinite(frames), frames, mean), mean)
+        measured = frames[:, good]
+        sigma[good] = noise_of_frames(np.where(np.isfinite(measured), measured, mean), mean)
     else:
-        sigma = ASSUMED_NOISE * mean
+        sigma[good] = ASSUMED_NOISE * mean
         warn(f"`untouched` has one row: a noise of {ASSUMED_NOISE:g} of each measurement is assumed")
-    good = finite & (mean > 0)
-    return Baseline(np.where(good, mean, 0.0), np.where(good, sigma, np.inf), len(frames), "file", 0, doubt)
+    return Baseline(z0, sigma, len(frames), "file", 0, doubt)
 
 
 def noise_of_references(reference: Array) -> Array:
@@ -68,7 +76,7 @@ def noise_of_references(reference: Array) -> Array:
     steps = np.diff(np.log(np.where(reference > 0, reference, np.nan)), axis=0)
     steps -= np.nanmedian(steps, axis=1, keepdims=True)
     own = np.nanmedian(np.abs(steps), axis=0) / 0.6745 / np.sqrt(2)
-    own = np.where(np.isfinite(own), own, ASSUMED_NOISE)
+    own = np.where(np.isfinite(own) & (own > 0), own, ASSUMED_NOISE)
     return np.asarray(np.maximum(own, 0.1 * np.median(own) + 1e-7))
 
 
@@ -80,23 +88,44 @@ def reconstruct(
     warn: Callable[[str], None] = lambda text: None,
     progress: Callable[[Iterable[int]], Iterable[int]] = lambda rows: rows,
 ) -> dict[str, NDArray[Any]]:
-    """The arrays of OUT.npz: see `skin reconstruct --help`. Rows are independent unless `sequence`."""
+    """The arrays of OUT.npz: see `skin reconstruct --help`. Rows are independent unless `sequence`.
+
+    A row whose reference gives fewer than half the measurements stays empty: not valid, no image, no contacts.
+    """
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of numpy, for measurements that are not finite
+        return _reconstruct(data, skin, bundle, sequence, warn, progress)
+
+
+def _reconstruct(
+    data: Input,
+    skin: Skin,
+    bundle: Bundle,
+    sequence: bool,
+    warn: Callable[[str], None],
+    progress: Callable[[Iterable[int]], Iterable[int]],
+) -> dict[str, NDArray[Any]]:
     pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
-    n = len(data.measurements)
+    out = _empty(len(data.measurements))
     baseline = baseline_of(data.untouched, pipeline, warn) if data.untouched is not None else None
     noise = noise_of_references(data.reference) if data.reference is not None else None
-    out = _empty(n)
-    for row in progress(range(n)):
+    lost = 0
+    for row in progress(range(len(data.measurements))):
         if not sequence:
             pipeline.reset()
         if data.reference is not None and noise is not None:
             z0 = data.reference[row]
             good = np.isfinite(z0) & (z0 > 0)
+            if good.sum() < len(z0) / 2:
+                lost += 1
+                continue
             baseline = Baseline(np.where(good, z0, 0.0), np.where(good, noise * z0, np.inf), 1, "file", 0)
         assert baseline is not None
         if not sequence or row == 0 or data.reference is not None:
             pipeline.pre.set_baseline(Baseline(**{**baseline.to_dict(), "z0": baseline.z0.copy()}))
         _store(out, row, pipeline.run(_raw(data.measurements[row], row if sequence else 0)))
+    if lost:
+        warn(f"{lost} of {len(out['valid'])} rows are not valid: their `reference` gives too few measurements")
     return out
 
 

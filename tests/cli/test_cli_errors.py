@@ -29,12 +29,33 @@ GOOD = {"measurements": np.ones((2, K)), "untouched": np.ones((8, K))}
         ({**GOOD, "measurements": np.full((2, K), "a")}, "expected numbers of shape (n, 120)"),
         ({**GOOD, "measurements": np.full((2, K), np.nan)}, "no finite number"),
         ({"measurements": np.ones((2, K)), "reference": np.ones((3, K))}, "expected one each"),
+        ({**GOOD, "untouched": np.zeros((8, K))}, "in 0 of 120 columns, expected at least 60"),
+        ({**GOOD, "untouched": np.where(np.arange(K) < 100, np.nan, np.ones((8, K)))}, "in 20 of 120 columns"),
+        ({"measurements": np.ones((2, K)), "reference": np.full((2, K), np.inf)}, "no finite number"),
     ],
 )
 def test_reconstruct_refuses_wrong_arrays(skin, tmp_path, arrays, says) -> None:  # type: ignore[no-untyped-def]
     ran = skin("reconstruct", npz(tmp_path / "in.npz", **arrays), tmp_path / "out.npz", "--skin", "square16")
     assert ran.code == 2 and says in ran.err and len(ran.err.splitlines()) == 1
     assert not (tmp_path / "out.npz").exists()
+
+
+def test_reconstruct_says_nothing_of_numpy(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """Values out of range cost their row, with at most a line of our own."""
+    rng = np.random.default_rng(0)
+    rows, untouched = rng.uniform(1, 2, (4, K)), 1 + 1e-4 * rng.standard_normal((3, K))
+    rows[0], rows[1], rows[2, :3] = np.nan, 1e300, np.inf
+    untouched[:, :5], untouched[0, 7] = np.nan, np.inf
+    ran = skin(
+        "reconstruct",
+        npz(tmp_path / "in.npz", measurements=rows, untouched=untouched),
+        tmp_path / "out.npz",
+        "--skin",
+        "square16",
+    )
+    assert ran.code == 0 and "Warning" not in ran.err, ran.err
+    with np.load(tmp_path / "out.npz") as out:
+        assert not out["valid"][:2].any() and np.isfinite(out["image"]).all()
 
 
 def test_reconstruct_refuses_what_is_no_npz(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]

@@ -120,6 +120,42 @@ def test_failed_measurements_leave_a_finite_image(noisy) -> None:  # type: ignor
     assert np.isfinite(out["image"]).all() and not out["valid"][1]
 
 
+def test_a_bad_reference_costs_its_own_row_only(noisy) -> None:  # type: ignore[no-untyped-def]
+    bundle, skin = Bundle.load("square16"), Skin(port="stub", bundle="square16")
+    rows, reference = noisy["measurements"][[4, 5, 11]], noisy["untouched"][:3].copy()
+    whole = reconstruct(read_input({"measurements": rows, "reference": reference}, 120), skin, bundle)
+    reference[1] = np.nan
+    said: list[str] = []
+    out = reconstruct(read_input({"measurements": rows, "reference": reference}, 120), skin, bundle, warn=said.append)
+    assert out["valid"].tolist() == [True, False, True] and out["touched"].tolist() == [True, False, True]
+    assert out["count"][1] == 0 and not out["image"][1].any() and np.isnan(out["position"][1]).all()
+    for name in whole:
+        assert np.array_equal(out[name][[0, 2]], whole[name][[0, 2]], equal_nan=whole[name].dtype.kind == "f"), name
+    assert len(said) == 1 and "1 of 3 rows" in said[0]
+
+
+def test_columns_of_untouched_without_values_are_left_out(noisy) -> None:  # type: ignore[no-untyped-def]
+    """In a tare of many rows and in one of few; what remains still shows the touch where it is."""
+    bundle, skin = Bundle.load("square16"), Skin(port="stub", bundle="square16")
+    rows = noisy["measurements"][[0, 4]]
+    everything = reconstruct(Input(rows, noisy["untouched"], None), skin, bundle)
+    for count in (64, 3, 1):
+        untouched = noisy["untouched"][:count].copy()
+        untouched[:, ::8] = np.nan
+        out = reconstruct(read_input({"measurements": rows, "untouched": untouched}, 120), skin, bundle)
+        assert out["touched"].tolist() == [False, True] and np.isfinite(out["image"]).all()
+        assert np.linalg.norm(out["position"][1, 0] - everything["position"][1, 0]) < 0.1 * METRES
+
+
+def test_computed_untouched_rows_without_noise_still_show_touches(noisy) -> None:  # type: ignore[no-untyped-def]
+    bundle, skin = Bundle.load("square16"), Skin(port="stub", bundle="square16")
+    rows, mean = noisy["measurements"][[0, 4]], noisy["untouched"].mean(axis=0)
+    for arrays in ({"untouched": np.tile(mean, (64, 1))}, {"reference": np.tile(mean, (10, 1))}):
+        some = {"measurements": rows[[0, 1] * 5], **arrays}
+        out = reconstruct(read_input(some, 120), skin, bundle)
+        assert out["touched"].tolist() == [False, True] * 5 and out["valid"].all()
+
+
 def test_few_untouched_rows_are_said(noisy) -> None:  # type: ignore[no-untyped-def]
     said: list[str] = []
     data = Input(noisy["measurements"][:2], noisy["untouched"][:1], None)
