@@ -22,7 +22,7 @@ from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
 from services.config import Skin
 from services.describe import describe
 from services.electrodes import ElectrodeHealth
-from services.stage import Health, Stage, add_reason, inherited
+from services.stage import Health, Refused, Stage, add_reason, inherited
 from services.tare import Baseline
 from services.touch import Hold, TouchDecision
 from services.untouched import Untouched
@@ -167,6 +167,10 @@ class Preprocessing(Stage):
 
     def load(self, state: dict[str, Any]) -> None:
         self.untouched.load(state)
+        k, hold = len(self.bundle.pattern), state["hold"]
+        for rows in (hold["reference"], *hold["recent"]):
+            if rows is not None and np.shape(rows) != (k,):
+                raise Refused(f"the saved hold is of shape {np.shape(rows)}, expected ({k},): reset")
         self._touched = bool(state["touched"])
         self.hold.load(state["hold"])
 

@@ -235,11 +235,13 @@ class Runner:
         """Take over a state that `state` gave."""
         if not isinstance(args.get("state"), dict):
             raise ControlError("bad_request", "load needs `state`, a map as the command state gives it")
+        stage = self._lane(args).stage
         try:
-            self._lane(args).stage.load(persistence.arrays(args["state"]))
-        except (Refused, KeyError, TypeError, ValueError) as why:
-            self._lane(args).stage.reset()
-            raise ControlError("refused", f"the state does not fit: {why}") from None
+            stage.load(persistence.arrays(args["state"]))
+        except Exception as why:  # whatever was in the state, the stage goes on, with none
+            stage.reset()
+            what = str(why) if isinstance(why, Refused) else f"{type(why).__name__}: {why}"
+            raise ControlError("refused", f"the state does not fit: {what}") from None
         return {}
 
     def _reset(self, args: dict[str, Any]) -> dict[str, Any]:

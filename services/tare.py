@@ -55,6 +55,8 @@ class Baseline:
             raise Refused(f"no baseline in the saved state ({wrong}): tare again") from None
         if z0.shape != (measurements,) or sigma.shape != (measurements,):
             raise Refused(f"the saved baseline has {z0.size} measurements, this skin {measurements}: tare again")
+        if not (np.isfinite(z0).all() and (z0 >= 0).all() and (sigma > 0).all()):
+            raise Refused("the saved baseline has impedances or noises that are not possible: tare again")
         return cls(z0, sigma, *rest)
 
 

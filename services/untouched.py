@@ -154,18 +154,25 @@ class Untouched:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Raises Refused where the state is of another number of measurements.
+        """Raises Refused where the state is of another number of measurements, or not possible.
 
         A state of another bundle still says what the untouched skin measured: so old recordings replay on new bundles.
         """
         self.reset()
+        k = len(self.bundle.pattern)
         if state["baseline"] is not None:
-            baseline = Baseline.from_dict(state["baseline"], len(self.bundle.pattern))
-            self._use(baseline)
+            self._use(Baseline.from_dict(state["baseline"], k))
+            assert self.baseline is not None
             if state["bundle"] == self.bundle.hash:
-                self.normaliser = np.array(state["normaliser"], dtype=float)
-                self.sigma = baseline.sigma / self.normaliser
-        self._window.extend(np.array(state["window"], dtype=float))
+                normaliser = np.array(state["normaliser"], dtype=float)
+                if normaliser.shape != (k,) or not (np.isfinite(normaliser) & (normaliser >= 0)).all():
+                    raise Refused(f"the saved normaliser is not {k} numbers from 0 on: tare again")
+                self.normaliser = normaliser
+                self.sigma = self.baseline.sigma / normaliser
+        window = np.array(state["window"], dtype=float)
+        if window.size and (window.ndim != 2 or window.shape[1] != k):
+            raise Refused(f"the saved frames are of shape {window.shape}, expected (n, {k}): tare again")
+        self._window.extend(window if window.size else [])
         self._run, self._seen = int(state["run"]), int(state["seen"])
         self._last_sample_ns = int(state["last_sample_ns"])
 
@@ -178,10 +185,10 @@ class Untouched:
 
     def restore(self, saved: dict[str, Any], age_s: float) -> None:
         """Raises Refused where it does not fit or is too old."""
-        if saved.get("bundle") != self.bundle.hash:
+        if not isinstance(saved, dict) or saved.get("bundle") != self.bundle.hash:
             raise Refused("the saved baseline is of another bundle")
         oldest = self.config.max_age_s
         if age_s > oldest:
             raise Refused(f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest / 3600:.1f} h")
-        self.set_baseline(Baseline.from_dict(saved["baseline"], len(self.bundle.pattern)))
+        self.set_baseline(Baseline.from_dict(saved.get("baseline", {}), len(self.bundle.pattern)))
         self._unsaved = False

@@ -269,6 +269,51 @@ def test_state_continues_bit_by_bit(stage: Preprocessing, skin: Skin, bundle: Bu
         assert a.difference.tobytes() == b.difference.tobytes()
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("z0", np.nan), ("z0", -1.0), ("z0", np.inf), ("sigma", 0.0), ("sigma", -1e-3), ("sigma", np.nan)],
+)
+def test_an_impossible_baseline_is_refused(
+    stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board, key: str, value: float
+) -> None:
+    state = tared(stage, board).state()
+    state["baseline"][key] = np.where(np.arange(120) == 7, value, state["baseline"][key])
+    with pytest.raises(Refused, match="not possible"):
+        Preprocessing("palm", skin, bundle).load(state)
+    with pytest.raises(Refused, match="not possible"):
+        Preprocessing("palm", skin, bundle).restore({"bundle": bundle.hash, "baseline": state["baseline"]}, 1.0)
+    with pytest.raises(Refused):
+        Preprocessing("palm", skin, bundle).restore({"bundle": bundle.hash}, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("normaliser", np.ones(7)),
+        ("normaliser", np.full(120, np.nan)),
+        ("window", np.ones((3, 7))),
+        ("window", np.ones(120)),
+        ("hold", {"reference": np.ones(7), "recent": np.zeros((0, 120)), "averaged": 1, "count": 1, "scan": 1}),
+    ],
+)
+def test_a_state_of_another_shape_is_refused(
+    stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board, key: str, value: object
+) -> None:
+    state = tared(stage, board).state() | {key: value}
+    with pytest.raises(Refused, match="saved"):
+        Preprocessing("palm", skin, bundle).load(state)
+
+
+def test_a_measurement_without_a_baseline_is_taken_over(
+    stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board
+) -> None:
+    state = tared(stage, board).state()
+    state["baseline"]["z0"][3], state["baseline"]["sigma"][3] = 0.0, np.inf
+    twin = Preprocessing("palm", skin, bundle)
+    twin.load(state)
+    assert np.flatnonzero(~np.isfinite(run(twin, board.frame()).sigma)).tolist() == [3]
+
+
 def test_a_recording_never_meets_the_boards_baseline(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     assert not run(stage, board.frame(source="replay")).valid

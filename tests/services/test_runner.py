@@ -151,6 +151,8 @@ def test_frames_commands_silence_and_a_crash(process: Process, board: Board, bun
     assert process.feed(board, 1)[0].valid
     with pytest.raises(ControlError, match="does not fit"):
         process.control.call("load", skin="palm", state={"bundle": bundle.hash, "baseline": 3})
+    with pytest.raises(ControlError, match="does not fit"):
+        process.control.call("load", skin="palm", state=state | {"hold": 3, "window": {}, "seen": []})
 
     began = time.monotonic()
     process.popen.send_signal(signal.SIGTERM)
