@@ -186,19 +186,6 @@ class Shape:
             np.minimum(nearest, np.hypot(foot[:, 0], foot[:, 1]), out=nearest)
         return nearest
 
-    def mean_over_triangles(self, corners: Array, level: int = 8) -> Array:
-        """Mean of `profile` over triangles (m, 3, 2), from level^2 points of each that the outline may cross."""
-        mean = np.zeros(len(corners))
-        centre = corners.mean(1)
-        size = np.sqrt(((corners - centre[:, None]) ** 2).sum(-1).max(1))
-        near = np.flatnonzero(np.hypot(centre[:, 0] - self.x, centre[:, 1] - self.y) < self.radius + size)
-        crossed = self.edge_distance(centre[near]) < size[near]
-        for part, points_a_side in ((near[~crossed], 1 if self.kind != "hertz" else 3), (near[crossed], level)):
-            if part.size:
-                points = np.einsum("pc,mcd->mpd", _subpoints(points_a_side), corners[part])
-                mean[part] = self.profile(points).mean(1)
-        return mean
-
     # -- rows -------------------------------------------------------------------------------------------------------
     def as_row(self) -> Array:
         """(7,) in the order of ROW, kind 1-based."""
@@ -214,18 +201,6 @@ class Shape:
         return cls(KINDS[int(kind) - 1], *rest)
 
 
-def _subpoints(level: int) -> Array:
-    """Barycentric coordinates (level^2, 3) of the centroids of a triangle cut into level^2 equal ones."""
-    points = []
-    for i in range(level):
-        for j in range(level - i):
-            points.append((i + 1 / 3, j + 1 / 3))
-            if i + j < level - 1:
-                points.append((i + 2 / 3, j + 2 / 3))
-    ab = np.array(points) / level
-    return np.column_stack([ab, 1 - ab.sum(1)])
-
-
 # -- several shapes ---------------------------------------------------------------------------------------------------
 def drop_image(shapes: Iterable[Shape], n: int) -> Array:
     """Conductivity drop, S/m, pixel means (n, n) of touches that do not overlap (where they do, the larger drop)."""
@@ -233,14 +208,6 @@ def drop_image(shapes: Iterable[Shape], n: int) -> Array:
     for shape in shapes:
         image = np.maximum(image, shape.drop * shape.fraction(n))
     return image
-
-
-def element_drop(shapes: Iterable[Shape], corners: Array) -> Array:
-    """Mean conductivity drop of each triangle (m, 3, 2) of a mesh, so that no shape need be meshed."""
-    drop = np.zeros(len(corners))
-    for shape in shapes:
-        drop = np.maximum(drop, shape.drop * shape.mean_over_triangles(corners))
-    return drop
 
 
 def to_rows(shapes: Sequence[Shape], length: int = 3) -> Array:

@@ -13,7 +13,6 @@ from models.shapes import (
     KINDS,
     Shape,
     drop_image,
-    element_drop,
     from_rows,
     gap,
     to_rows,
@@ -79,18 +78,6 @@ def test_pixels_hold_area_integral_and_centroid(kind, x, y, radius, rotation):
     centres = -1 + 2 * (np.arange(n) + 0.5) / n
     assert (image.sum(0) @ centres) / image.sum() == pytest.approx(shape.centroid[0], abs=4e-3)
     assert (image.sum(1) @ centres) / image.sum() == pytest.approx(shape.centroid[1], abs=4e-3)
-
-
-def test_element_means_hold_the_integral():
-    from skfem import MeshTri
-
-    mesh = MeshTri.init_tensor(np.linspace(-1, 1, 41), np.linspace(-1, 1, 41))
-    corners = mesh.p.T[mesh.t.T]
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    areas = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    for kind in KINDS:
-        shape = Shape(kind, 0.21, -0.33, 0.31, 0.4, 0.7, 1.7 if kind == "rectangle" else 1.0)
-        assert element_drop([shape], corners) @ areas == pytest.approx(shape.integral, rel=0.01)
 
 
 def test_rows_round_trip_and_errors():
