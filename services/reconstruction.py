@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.bundle import Bundle
+from models.bundle import Bundle, BundleError
 from models.prereconstruction import noise_of_frames
 from protocol.frames import RawFrame
 from services.config import ConfigError, Skin, load
@@ -31,13 +31,19 @@ FEWEST_FOR_TARE = 16
 
 def find_skin(name: str) -> tuple[Skin, Bundle]:
     """A configured skin by its name, else a bundle by name or path. Raises ConfigError or BundleError."""
+    unusable: ConfigError | None = None
     try:
         config = load()
         if name in config.skins:
             return config.skins[name], Bundle.load(config.skins[name].bundle)
-    except ConfigError:
-        pass  # a bundle can be used with no configuration at all
-    return Skin(port="stub", bundle=name, frame_id=name), Bundle.load(name)
+    except ConfigError as why:
+        unusable = why  # a bundle can be used with no configuration at all
+    try:
+        return Skin(port="stub", bundle=name, frame_id=name), Bundle.load(name)
+    except BundleError as why:
+        if unusable is None:
+            raise
+        raise BundleError(f"{why}\nnor a configured skin, for the configuration cannot be used: {unusable}") from None
 
 
 def baseline_of(frames: Array, pipeline: Pipeline, warn: Callable[[str], None]) -> Baseline:

@@ -11,7 +11,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -234,6 +233,6 @@ def _primer(skin: str) -> RawFrame:
     )
 
 
-def skins_in(path: Path) -> dict[str, int]:
-    """The skins whose raw frames a recording holds, and how many. Raises RecordingError."""
-    return dict(Counter(message.topic.partition("/")[2] for message in RecordingReader(path).messages({"raw"})))
+def skins_in(reader: RecordingReader) -> dict[str, int]:
+    """The skins whose raw frames a recording holds, and how many. The reader's `damage` is complete then."""
+    return dict(Counter(message.topic.partition("/")[2] for message in reader.messages({"raw"})))

@@ -42,9 +42,10 @@ def replay_file(
     Raises RecordingError, ConfigError, ReplayError.
     """
     reader = RecordingReader(file)
-    skins = skins_in(file)
+    skins = skins_in(reader)
     if not skins:
-        raise ReplayError(f"{file} holds no raw frames ({reader.damage}): nothing to replay")
+        damage = "" if str(reader.damage) == "whole" else f"; it is damaged ({reader.damage})"
+        raise ReplayError(f"{file} holds no raw frames: nothing to replay{damage}")
     if skin and skin not in skins:
         raise ReplayError(f"{file} holds no skin {skin!r}, only {', '.join(skins)}")
     wanted = {skin: skins[skin]} if skin else skins

@@ -185,14 +185,14 @@ class RecordingSource(Source):
         from services.recording import RecordingReader
         from services.replay import mark, skins_in
 
-        skins = skins_in(path)
+        skins = skins_in(reader := RecordingReader(path))
         theirs = self.name if self.name in skins else next(iter(skins), "")
         if theirs != self.name and len(skins) != 1:
-            held = f"skins {', '.join(skins)}, none called {self.name}" if skins else "no raw frames"
+            held = f"skins {', '.join(skins)}, none called {self.name}" if skins else f"no raw frames ({reader.damage})"
             self.problem = f"the recording {path} holds {held}"
             return
         previous, due = 0, time.monotonic()
-        for recorded in RecordingReader(path).messages({"raw"}):
+        for recorded in reader.messages({"raw"}):
             if recorded.topic != f"raw/{theirs}":
                 continue
             try:

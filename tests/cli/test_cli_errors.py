@@ -72,6 +72,15 @@ def test_wrong_skin_names_those_there_are(skin, tmp_path) -> None:  # type: igno
     assert ran.code == 2 and "no bundle 'hexagon'" in ran.err and "square16" in ran.err
 
 
+def test_a_broken_configuration_is_named_where_the_skin_is_not_found(skin, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "skin.toml").write_text("[skins.palm\n")
+    monkeypatch.setenv("EITSKIN_CONFIG", str(tmp_path / "skin.toml"))
+    ran = skin("reconstruct", npz(tmp_path / "in.npz", **GOOD), tmp_path / "out.npz", "--skin", "palm")
+    assert ran.code == 2 and "no bundle 'palm'" in ran.err and "skin.toml: is not TOML" in ran.err
+    ran = skin("reconstruct", npz(tmp_path / "in.npz", **GOOD), tmp_path / "out.npz", "--skin", "square16")
+    assert ran.code == 0  # a bundle needs no configuration
+
+
 @pytest.mark.parametrize(
     "command",
     [

@@ -93,8 +93,21 @@ def test_a_recording_of_another_skin_is_refused(runtime: Path, recording: Path, 
         replay_file(recording, None, skin="sole")
     with RecordingWriter(tmp_path / "empty.mcap") as writer:
         writer.write("contact/palm", b"\x80", 1)
-    with pytest.raises(ReplayError, match="holds no raw frames"):
+    with pytest.raises(ReplayError, match="holds no raw frames: nothing to replay$"):
         replay_file(tmp_path / "empty.mcap", None)
+
+
+def test_what_is_damaged_is_said_where_nothing_can_be_replayed(runtime: Path, recording: Path, tmp_path: Path) -> None:
+    whole, path = recording.read_bytes(), tmp_path / "damaged.mcap"
+    path.write_bytes(whole[:8] + b"garbage!" * 50)
+    with pytest.raises(ReplayError, match="no raw frames.*cut short: the last 400 bytes"):
+        replay_file(path, None)
+    chunks = bytearray(whole)
+    for at in range(2000, len(chunks), 200):
+        chunks[at] ^= 0xFF
+    path.write_bytes(bytes(chunks))
+    with pytest.raises(ReplayError, match="no raw frames.*wrong checksum"):
+        replay_file(path, None)
 
 
 def test_imported_frames_are_the_rows(recording: Path, touches: dict[str, np.ndarray]) -> None:
