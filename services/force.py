@@ -10,6 +10,8 @@ from services.config import ConfigError, Skin
 
 NEWTONS_PER_SIEMENS = 10.0  # N per S/m: 0.1 to 0.5 S/m are 1 to 5 N
 MOST_N = 5.0
+BACKGROUND = 1.0  # S/m, of the untouched sheet that the bundles' model has: no drop can be larger
+FAR_BEYOND = 2.0  # times most_n: what nobody measured at half of it is no force any more
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,12 @@ class ForceLaw:
             "most_n": self.most_n,
             "calibrated": self.calibrated,
         }
+
+    def impossible(self, peak: float) -> bool:
+        """Whether no touch can have this peak drop [S/m]. Without a law the drop has no scale: anything goes."""
+        if self.newtons_per_siemens is None:
+            return False
+        return peak >= BACKGROUND or self.newtons_per_siemens * peak > FAR_BEYOND * self.most_n
 
     def force(self, peak: float, peak_sigma: float) -> tuple[float | None, float | None]:
         """(force, its standard uncertainty) [N] of a peak drop and its standard deviation [S/m]."""

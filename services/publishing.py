@@ -60,6 +60,9 @@ class Publishing(Stage):
         out.contacts = self._contacts
         if any((c.force_n or 0.0) > self.law.most_n for c in out.contacts):
             add_reason(out.reasons, "extrapolated")
+        if any(self.law.impossible(s.peak) for s in self._segments):
+            out.valid = False
+            add_reason(out.reasons, "out_of_distribution")
         frames: list[Frame] = [out]
         if "force" in wanted:
             frames.append(self._force(frame))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,33 @@ def test_position_force_area_and_wrench_of_a_touch(stage: Publishing) -> None:
     assert c.area_m2 == pytest.approx(math.pi * 0.01**2, rel=0.03)
     assert c.wrench == pytest.approx([0, 0, -3.0, 0.01 * 3.0, 0.02 * 3.0, 0], rel=0.02, abs=1e-9)
     assert c.normal == [0, 0, 1] and c.state == "begin"
+
+
+@pytest.mark.parametrize(
+    ("drop", "valid", "reason"),
+    [
+        (0.45, True, None),
+        (0.7, True, "extrapolated"),
+        (0.97, True, "extrapolated"),
+        (1.05, False, "out_of_distribution"),
+    ],
+)
+def test_what_no_touch_can_be_is_not_valid(stage: Publishing, drop: float, valid: bool, reason: str | None) -> None:
+    image = discs((0.02, -0.01, 0.01, drop))
+    out = contacts(stage, image_frame(image))
+    assert out.valid == valid
+    assert reason is None or reason in out.reasons
+    held = contacts(stage, image_frame(image, scan=2, held=True))
+    assert held.valid == valid
+    assert contacts(stage, image_frame(discs((0.02, -0.01, 0.01, 0.3)), scan=3)).valid
+
+
+def test_a_force_far_beyond_the_calibration_is_not_valid(skin: Skin, bundle: Bundle, tmp_path: Path) -> None:
+    (tmp_path / "law.json").write_text('{"newtons_per_siemens": 10, "most_n": 2}')
+    stage = Publishing("palm", skin.model_copy(update={"calibration": tmp_path / "law.json"}), bundle)
+    for drop, valid in ((0.35, True), (0.45, False)):
+        out = contacts(stage, image_frame(discs((0.0, 0.0, 0.01, drop))))
+        assert out.valid == valid and "extrapolated" in out.reasons
 
 
 def test_each_touch_is_cut_at_half_its_own_peak(stage: Publishing) -> None:
