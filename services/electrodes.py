@@ -21,7 +21,7 @@ class ElectrodeHealth:
         for column in range(pattern.shape[1]):
             self.member[pattern[:, column], np.arange(len(pattern))] = True
         # A measurement between the two electrodes that it drives sees nothing but a short between them.
-        self._self_sensing = (pattern[:, 0] == pattern[:, 2]) & (pattern[:, 1] == pattern[:, 3])
+        self.self_sensing = (pattern[:, 0] == pattern[:, 2]) & (pattern[:, 1] == pattern[:, 3])
         self._pattern = pattern
         self._all_well = np.zeros(self.electrodes, dtype=np.uint8)
 
@@ -39,7 +39,7 @@ class ElectrodeHealth:
         reasons = ["saturated"] if (status & STATUS_CLIPPED).any() else []
         states = self._all_well.copy()
         if z0 is not None:
-            for k in np.flatnonzero(self._self_sensing & (z0 > 0) & (amplitude < z0 / FAR)):
+            for k in np.flatnonzero(self.self_sensing & (z0 > 0) & (amplitude < z0 / FAR)):
                 states[self._pattern[k, :2]] = SHORT
             bad |= self.member[states == SHORT].any(axis=0)
         left = bad & ~self.member[states == SHORT].any(axis=0)

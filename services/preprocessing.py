@@ -22,6 +22,7 @@ from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
 from services.config import Skin
 from services.describe import describe
 from services.electrodes import ElectrodeHealth
+from services.plausibility import impossible
 from services.stage import Health, Refused, Stage, add_reason, inherited
 from services.tare import Baseline
 from services.touch import Hold, TouchDecision
@@ -96,6 +97,12 @@ class Preprocessing(Stage):
             amplitude = np.where(np.isfinite(amplitude), amplitude, self.untouched.baseline.z0)  # type: ignore[union-attr]
         operator, decision = self._operator(live)
         d = self.untouched.difference(amplitude, live)
+        # Of a measured bundle it is not known which way its material goes.
+        if self.bundle.matrices.normalisation == "model" and impossible(
+            d, self.untouched.sigma, live & self.electrodes.self_sensing
+        ):
+            out.valid = False
+            add_reason(out.reasons, "out_of_distribution")
         self._touched, out.score, out.threshold = decision(d, self._touched)
         out.touched = self._touched
         out.difference = d.astype(np.float32)

@@ -1,0 +1,98 @@
+"""Gross faults of the stub's board give no valid contact; the hardest touches on the same sheet stay valid."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from firmware_stub.analog import Analog, Noise
+from firmware_stub.faults import Faults
+from firmware_stub.sheet import Sheet
+from models.bundle import Bundle
+from models.shapes import Shape
+from protocol.frames import RawFrame
+from services.pipeline import Pipeline, Result
+
+PRESS = (Shape("circle", 0.3, -0.2, 0.2, 0.3),)
+HARD = [
+    (Shape("circle", 0.0, 0.0, 0.45, 0.5),),
+    (Shape("circle", 0.3, 0.2, 0.2, 0.85),),
+    (Shape("square", -0.7, 0.7, 0.3, 0.5),),
+    (Shape("circle", 0.5, 0.5, 0.2, 0.5), Shape("L", -0.5, 0.4, 0.3, 0.4), Shape("triangle", 0.0, -0.6, 0.25, 0.3)),
+]
+
+
+@cache
+def transfer(shapes: tuple[Shape, ...]) -> NDArray[np.float64]:
+    sheet = _sheet()
+    return sheet.model.solve(sheet.model.touched(list(shapes)), sheet.skin.contact_impedance).transfer
+
+
+@cache
+def _sheet() -> Sheet:
+    return Sheet("square16")
+
+
+class Skin:
+    """The stages behind the stub's analog part: sheet and multiplexers, converter and firmware's arithmetic."""
+
+    def __init__(self, bundle: Bundle, snr_db: float) -> None:
+        self.pattern, self.faults, self.scan = np.asarray(bundle.pattern), Faults(), 0
+        self.analog = Analog(Noise.of_db(snr_db), self.faults, np.random.default_rng(3))
+        self.pipeline = Pipeline("square16", name="palm")
+        for _ in range(72):
+            result = self.feel(())
+        assert result.contact.valid and not result.delta.touched
+
+    def feel(self, shapes: tuple[Shape, ...]) -> Result:
+        self.scan += 1
+        t = transfer(shapes)
+        z, status = self.analog.measure((t, t), self.pattern, 128, 200.0, 0.0)
+        stamps = {"sample": self.scan * 45_000_000, "read": self.scan * 45_000_000 + 1}
+        return self.pipeline.run(
+            RawFrame(skin="palm", scan=self.scan, stamps=stamps, source="board", valid=True, z=z, status=status)
+        )
+
+
+@pytest.fixture(scope="module")
+def tared() -> dict[float, Skin]:
+    return {snr_db: Skin(Bundle.load("square16"), snr_db) for snr_db in (60.0, 80.0)}
+
+
+FAULTS: list[tuple[str, dict[str, Any]]] = [
+    *(("mux_stuck", {"mux": mux, "bit": bit, "value": v}) for mux, bit, v in (
+        ("drive+", 2, 0), ("drive+", 0, 1), ("drive-", 3, 0), ("sense+", 1, 1), ("sense-", 0, 0)
+    )),
+    *(("electrodes_swapped", {"electrodes": list(pair)}) for pair in ((0, 1), (2, 9), (7, 8), (4, 15))),
+    *(("stale_rtia", {"gain": gain}) for gain in (0.9, 0.95, 1.05, 1.2)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("snr_db", [60.0, 80.0])
+@pytest.mark.parametrize("shapes", [(), PRESS], ids=["free", "pressed"])
+@pytest.mark.parametrize(("name", "args"), FAULTS, ids=[f"{n}-{'-'.join(map(str, a.values()))}" for n, a in FAULTS])
+def test_a_gross_fault_gives_no_valid_contact(
+    tared: dict[float, Skin], name: str, args: dict[str, Any], shapes: tuple[Shape, ...], snr_db: float
+) -> None:
+    skin = tared[snr_db]
+    skin.faults.inject(name, args, 0.0, 1.0)
+    try:
+        found = [skin.feel(shapes) for _ in range(4)]
+    finally:
+        skin.faults.clear()
+    assert not any(r.contact.valid for r in found)
+    assert all({"out_of_distribution", "electrode_open"} & set(r.contact.reasons) for r in found)
+    assert all(skin.feel(()).contact.valid for _ in range(3))  # and when it is over, all is well
+
+
+@pytest.mark.parametrize("snr_db", [60.0, 80.0])
+@pytest.mark.parametrize("shapes", HARD)
+def test_the_hardest_touches_are_no_fault(tared: dict[float, Skin], shapes: tuple[Shape, ...], snr_db: float) -> None:
+    skin = tared[snr_db]
+    found = [skin.feel(shapes) for _ in range(4)]
+    assert all(r.delta.touched and r.delta.valid for r in found)
+    skin.feel(())
