@@ -176,26 +176,57 @@ def eidors() -> Frames:
     )
 
 
-def noisy(frames: Frames, decibel: float | None, seed: int = 0, tare: int = 64) -> tuple[Frames, Array]:
-    """Frames with noise of |Z| 10^(-dB/20) on each measurement and on the mean of `tare` untouched frames.
+@dataclass(frozen=True)
+class Level:
+    """A noise level by name: "none", "70" (dB: relative to each |Z|) or "70f" (fixed).
 
-    Also the untouched frames themselves, (tare, 120), of the first frame's skin. None: noise-free (what a float32 wire
-    leaves).
+    Fixed is the noise of a converter, the same ohm on every measurement of either pattern: so many dB under the root
+    mean square |Z| of `pairs`. It matters when patterns are compared: relative noise favours `adjacent`, whose voltages
+    are tiny and would, as no converter does, have tiny noise.
     """
-    relative = NOISE_FREE if decibel is None else 10 ** (-decibel / 20)
-    rng = np.random.default_rng([seed, 0 if decibel is None else round(decibel)])
 
-    def spoil(z: Array, n: int = 1) -> Array:
-        return np.asarray(z * (1 + relative / np.sqrt(n) * rng.standard_normal(z.shape)))
+    name: str
 
-    untouched = frames.pairs0[0] * (1 + relative * rng.standard_normal((tare, frames.pairs0.shape[1])))
-    # one tare for all frames of a skin, as on a bench; the mean of the untouched frames just drawn
-    gain = untouched.mean(0) / frames.pairs0[0]
-    gain_adjacent = spoil(np.ones(frames.adjacent0.shape[1]), tare)
+    @property
+    def title(self) -> str:
+        if self.name == "none":
+            return "noise-free"
+        return f"{self.name[:-1]} dB, fixed in ohm" if self.fixed else f"{self.name} dB"
+
+    @property
+    def fixed(self) -> bool:
+        return self.name.endswith("f")
+
+    @property
+    def share(self) -> float:
+        return NOISE_FREE if self.name == "none" else float(10 ** (-float(self.name.rstrip("f")) / 20))
+
+    def parts(self, pairs0: Array) -> tuple[float, float]:
+        """(relative, floor in ohm)."""
+        return (0.0, self.share * float(np.sqrt((pairs0**2).mean()))) if self.fixed else (self.share, 0.0)
+
+    def sigma(self, z: Array, pairs0: Array) -> Array:
+        relative, floor = self.parts(pairs0)
+        return np.asarray(np.sqrt((relative * z) ** 2 + floor**2))
+
+
+def noisy(frames: Frames, level: str, seed: int = 0, tare: int = 64) -> tuple[Frames, Array]:
+    """Frames with noise on each measurement and on the mean of `tare` untouched frames.
+
+    Also the untouched frames themselves, (tare, 120), of the first frame's skin. "none" leaves what a float32 wire
+    does.
+    """
+    noise, pairs0, adjacent0 = Level(level), frames.pairs0[0], frames.adjacent0[0]
+    rng = np.random.default_rng([seed, *level.encode()])
+    untouched = pairs0 + noise.sigma(pairs0, pairs0) * rng.standard_normal((tare, len(pairs0)))
+    # one tare for all frames of a skin, as on a bench: the mean of the untouched frames just drawn
+    gain = untouched.mean(0) / pairs0
+    spread = noise.sigma(adjacent0, pairs0) / adjacent0 / np.sqrt(tare)
+    gain_adjacent = 1 + spread * rng.standard_normal(len(adjacent0))
     return replace(
         frames,
-        pairs=spoil(frames.pairs),
+        pairs=frames.pairs + noise.sigma(frames.pairs, pairs0) * rng.standard_normal(frames.pairs.shape),
         pairs0=frames.pairs0 * gain,
-        adjacent=spoil(frames.adjacent),
+        adjacent=frames.adjacent + noise.sigma(frames.adjacent, pairs0) * rng.standard_normal(frames.adjacent.shape),
         adjacent0=frames.adjacent0 * gain_adjacent,
     ), untouched

@@ -110,7 +110,7 @@ def peers() -> list[Method]:
 
         return Method(f"{_peers.name()} {label}", build, values, pattern="adjacent")
 
-    return [row("JAC", "jac", (1e-4, 1e-3, 0.01)), row("GREIT", "greit", (1e-3, 0.01)), row("BP", "bp")]
+    return [row("JAC", "jac", (1e-3, 0.01, 0.1, 1.0)), row("GREIT", "greit", (1e-3, 0.01, 0.1)), row("BP", "bp")]
 
 
 def session(path: Path) -> onnxruntime.InferenceSession:

@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bench._frames import REFERENCE, Frames
+from bench._frames import REFERENCE, Frames, Level
 from bench._scores import Row
 from models.bundle import Bundle
 
@@ -97,8 +97,7 @@ class Report:
     def print(self) -> None:
         console = Console(width=200) if not sys.stdout.isatty() else Console()
         for level in dict.fromkeys(row["level"] for row in self.rows):
-            title = "noise-free" if level == "none" else f"{level} dB"
-            table = Table(title=f"{title}, {self.mesh} mesh, {machine()}", title_justify="left")
+            table = Table(title=f"{Level(level).title}, {self.mesh} mesh, {machine()}", title_justify="left")
             table.add_column("method")
             for heading, _, _ in COLUMNS:
                 table.add_column(heading, justify="right")
@@ -170,7 +169,7 @@ class Report:
             axis.margins(x=0.25, y=0.1)
             axis.set(xscale="log", yscale="log", xlabel="CPU time per frame, one thread [ms]")
             axis.set_ylabel("1 - mean IoU" if key == "mean_iou" else "position error [% of side]")
-            axis.set_title("noise-free" if level == "none" else f"{level} dB")
+            axis.set_title(Level(level).title)
             axis.grid(True, which="both", alpha=0.3)
         figure.tight_layout()
         figure.savefig(path, dpi=120)

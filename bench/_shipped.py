@@ -66,7 +66,7 @@ def run(frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int, untouc
     alone = {v: network_ms(bundle, v) for v in variants if v != "none"}
     rows = []
     for level in levels:
-        noisy, untouched = _frames.noisy(frames, None if level == "none" else float(level), seed)
+        noisy, untouched = _frames.noisy(frames, level, seed)
         for variant in variants:
             skin = Skin(port="stub", bundle=str(bundle.path), network=variant)
             found, seconds = reconstructed(noisy, untouched, skin, bundle)
@@ -116,7 +116,7 @@ def contacts(found: dict[str, Array], frames: Frames) -> Row:
 
 def false_touches(frames: Frames, level: str, seed: int, bundle: Bundle, n: int) -> Row:
     """How often n frames of a skin that nobody touches become contacts, at the board's full-scan rate."""
-    relative = 10 ** (-float(level) / 20)
+    relative = _frames.Level(level).share
     rng = np.random.default_rng([seed, 9])
     z0 = frames.pairs0[0]
     pipeline = Pipeline(Skin(port="stub", bundle=str(bundle.path)), bundle=bundle)
@@ -146,7 +146,9 @@ def floors(frames: Frames, levels: Iterable[str]) -> dict[str, Row]:
     for level in levels:
         if level == "none":
             continue
-        noise = fisher.Noise(float(level))
+        relative, floor_ohm = _frames.Level(level).parts(frames.pairs0[0])
+        decibel = -20 * np.log10(relative) if relative else np.inf
+        noise = fisher.Noise(decibel, floor_ohm)
 
         def mean(index: Iterable[int], noise: fisher.Noise = noise) -> fisher.Floor:
             return fisher.mean_floor(

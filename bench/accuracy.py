@@ -1,11 +1,11 @@
 """Every method on the same frames in one run: run time per frame against each error.
 
-    skin bench accuracy [--quick] [--levels none 50 60 70 80] [--out bench/reports]
+    skin bench accuracy [--quick] [--levels none 50 60 70 80 70f] [--out bench/reports]
 
 Frames are solved on the reference mesh, which no training and no inverse uses, and read from bench/work where they are
 there (bench/_frames.py says what they are). Noise: |Z| 10^(-dB/20) on each measurement, and on the 64 untouched frames
-of the tare. Hyperparameters of the classical methods are chosen for each noise level on frames of their own. Prints
-tables, writes accuracy.json and draws accuracy.png.
+of the tare; "70f" is the same ohm on all. Hyperparameters of the classical methods are chosen for each noise level on
+frames of their own. Prints tables, writes accuracy.json and draws accuracy.png.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from models.bundle import Bundle
 from models.shapes import Array
 from services.reconstruction import resampled
 
-LEVELS = ("none", "50", "60", "70", "80")
+LEVELS = ("none", "50", "60", "70", "80", "70f")
 SCORED_AT = 96
 SLOW_SHARE = {"full": 3, "quick": 4}  # a slow method sees every third frame, or every fourth
 UNTOUCHED = {"full": 79_200, "quick": 4_000}  # frames nobody touches: an hour at 22 a second, or three minutes
@@ -101,10 +101,9 @@ def run(
     """One row a method and level."""
     rows = []
     for level in levels:
-        decibel = None if level == "none" else float(level)
-        noisy, untouched = _frames.noisy(frames, decibel, seed)
+        noisy, untouched = _frames.noisy(frames, level, seed)
         known = tares(noisy, untouched)
-        to_tune, tune_untouched = _frames.noisy(tuning, decibel, seed + 1)
+        to_tune, tune_untouched = _frames.noisy(tuning, level, seed + 1)
         for method in methods:
             share = slow if method.slow else 1
             value = tuned(method, to_tune, tares(to_tune, tune_untouched), share)
@@ -120,7 +119,9 @@ def run(
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench accuracy", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--quick", action="store_true", help="a few hundred frames of a coarser mesh, two noise levels")
-    parser.add_argument("--levels", nargs="+", default=None, choices=LEVELS, help="dB, or none for noise-free")
+    parser.add_argument(
+        "--levels", nargs="+", default=None, choices=LEVELS, help="dB; none: noise-free; 70f: fixed in ohm"
+    )
     parser.add_argument("--bundle", default="square16", help="the bundle that stands for what is shipped")
     parser.add_argument("--seed", type=int, default=5, help="of the frames and the noise")
     parser.add_argument("--only", nargs="*", default=None, help="methods whose name contains one of these")

@@ -48,12 +48,15 @@ def test_ldci_scenes_cover_the_papers_grid():
 
 def test_noise_is_what_it_says():
     frames = frames_of([("shapes", [Shape("circle", 0, 0, 0.3, 0.2)])] * 50)
-    noisy, untouched = _frames.noisy(frames, 60, seed=1)
+    noisy, untouched = _frames.noisy(frames, "60", seed=1)
     assert noisy.pairs.std() == pytest.approx(1e-3, rel=0.05)
     assert untouched.shape == (64, 120) and untouched.std() == pytest.approx(1e-3, rel=0.05)
     assert (noisy.pairs0[0] - 1).std() == pytest.approx(1e-3 / 8, rel=0.2)  # the mean of 64
     tare = accuracy.tares(noisy, untouched)[""]
     assert np.median(tare.sigma) == pytest.approx(1e-3, rel=0.1)
+    weak = replace(frames, adjacent=frames.adjacent * 0.01, adjacent0=frames.adjacent0 * 0.01)
+    assert (_frames.noisy(weak, "60", 1)[0].adjacent / 0.01).std() == pytest.approx(1e-3, rel=0.05)
+    assert (_frames.noisy(weak, "60f", 1)[0].adjacent / 0.01).std() == pytest.approx(0.1, rel=0.05)
 
 
 def test_perfect_images_score_perfectly_and_poor_ones_do_not():
