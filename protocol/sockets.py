@@ -29,6 +29,9 @@ SEND_QUEUE = 100
 ALL_QUEUE = 10_000
 """Messages held in a reader of all."""
 
+EVENTS_AT_ONCE = 1000
+"""Subscriptions taken in by one call of `Publisher.poll`, after which a flood of them cannot hold the producer."""
+
 GARBAGE_AT_ONCE = 1000
 """Malformed messages dropped in one call, after which a flood of them cannot hold the reader."""
 
@@ -95,10 +98,11 @@ class Publisher:
         """Take in new and ended subscriptions, and send latched values to who has just come. Call it at least once a
         second.
 
-        A latched value goes to all who subscribe to it, not only to the newcomer: readers know it by its seq.
+        A latched value goes to all who subscribe to it, not only to the newcomer: readers know it by its seq. Takes in
+        EVENTS_AT_ONCE at most; the rest waits for the next call.
         """
         newcomers = []
-        while self.socket.poll(0):
+        for _ in range(EVENTS_AT_ONCE):
             try:
                 event = self.socket.recv(zmq.NOBLOCK)
             except zmq.Again:

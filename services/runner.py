@@ -207,7 +207,7 @@ class Runner:
 
     def _lane(self, args: dict[str, Any]) -> Lane:
         name = args.get("skin") or next(iter(self.lanes))
-        if name not in self.lanes:
+        if not isinstance(name, str) or name not in self.lanes:
             raise ControlError("bad_request", f"no skin called {name!r}; configured: {', '.join(self.lanes)}")
         return self.lanes[name]
 

@@ -84,6 +84,21 @@ def test_subscribers_are_counted_by_prefix_also_the_second_of_the_same(publisher
     assert not publisher.wanted("force", "palm")
 
 
+def test_a_flood_of_subscriptions_does_not_hold_the_publisher(publisher, context, monkeypatch):
+    monkeypatch.setattr("protocol.sockets.EVENTS_AT_ONCE", 10)
+    socket = context.socket(zmq.SUB)
+    socket.connect(endpoint("publisher"))
+    for n in range(35):
+        socket.subscribe(b"contact/palm\0%d" % n)
+    time.sleep(0.3)
+    counts = []
+    for _ in range(5):
+        publisher.poll()
+        counts.append(publisher.subscribers("contact", "palm"))
+    assert counts == [10, 20, 30, 35, 35]
+    socket.close(0)
+
+
 def test_a_killed_subscriber_is_no_longer_counted(publisher, runtime):
     code = (
         "import time; from protocol.sockets import NewestReader; r = NewestReader('force', 'palm')\n"

@@ -128,6 +128,10 @@ def test_frames_commands_silence_and_a_crash(process: Process, board: Board, bun
     assert refused.value.kind == "refused"
     with pytest.raises(ControlError, match="configured: palm"):
         process.control.call("tare", skin="plam")
+    for no_name in ([1], {"palm": 1}, 7):
+        with pytest.raises(ControlError, match="configured: palm") as refused:
+            process.control.call("status", skin=no_name)
+        assert refused.value.kind == "bad_request"
     assert process.control.call("status")["flowing"]
 
     silent = process.until(StatusFrame, lambda f: f.level == "STALE")
