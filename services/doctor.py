@@ -23,7 +23,7 @@ from services import port as ports
 from services.boardlink import BoardLink, Scanning
 from services.config import RECORDINGS, Config, ConfigError, Skin, config_path, load
 from services.force import ForceLaw
-from services.supervision import STAGES
+from services.supervision import PROCESSES
 from services.tare import implausibility
 
 BOARD_S = 2.5  # for a board to say who it is
@@ -96,7 +96,7 @@ def _clock() -> Finding:
 
 
 def _processes() -> Iterator[Finding]:
-    for name in STAGES:
+    for name in PROCESSES:
         try:
             status = ControlClient(name, 1.0).call("status")
         except ControlError as why:

@@ -26,9 +26,9 @@ from protocol.sockets import AllReader, ControlClient, ControlError, ControlServ
 from protocol.topics import TOPICS
 from services.config import ConfigError, config_path, load
 from services.recording import STATE_TOPIC, RecordingError, RecordingWriter
+from services.stage import STAGES
 
 DEFAULT_TOPICS = ("raw", "contact", "status", "info")
-STAGES = ("preprocessing", "inference", "publisher")
 POLL_S = 0.05
 STATE_TIMEOUT_S = 0.5
 MOST_SKINS = 64

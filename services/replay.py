@@ -18,9 +18,8 @@ import msgpack
 from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, unpack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
 from services.recording import STATE_TOPIC, Recorded, RecordingReader, RecordingWriter
-from services.stage import add_reason
+from services.stage import STAGES, add_reason
 
-STAGES = ("preprocessing", "inference", "publisher")
 CHAIN_S = 20.0  # for the stages to start and find each other
 ANSWER_S = 5.0  # for the contacts of one frame
 PRIME_EVERY_S = 0.25

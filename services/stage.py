@@ -10,6 +10,10 @@ from typing import Any, ClassVar
 
 from protocol.frames import Frame
 
+STAGES = ("preprocessing", "inference", "publisher")
+"""The processes whose stages keep state, in the order of the chain. Acquisition, or a replay in its place, feeds them.
+"""
+
 
 class Refused(Exception):
     """A command that the stage will not carry out now. The text says why and what to do."""

@@ -28,6 +28,7 @@ from supervisor.supervisord import Supervisor
 from protocol.runtime import lock, runtime_dir
 from services.config import ROOT, Config
 from services.port import STUB_LINK
+from services.stage import STAGES
 
 POLL_S = 0.05
 HEALTHY_S = 3  # a process that lived this long starts its next restarts from the shortest delay
@@ -35,7 +36,7 @@ FIRST_RETRY_S, LONGEST_RETRY_S = 0.1, 5.0
 STOP_S = 1  # from SIGTERM to SIGKILL
 PR_SET_PDEATHSIG = 1
 
-STAGES = ("acquisition", "preprocessing", "inference", "publisher")
+PROCESSES = ("acquisition", *STAGES)
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Program:
 
 def programs(config: Config) -> list[Program]:
     """What a configuration needs: the stages, and the stub where a skin's port is "stub"."""
-    found = [Program(name, f"services.{name}") for name in STAGES]
+    found = [Program(name, f"services.{name}") for name in PROCESSES]
     if any(skin.port == "stub" for skin in config.skins.values()):
         found.insert(0, Program("stub", "firmware_stub"))
     return found
