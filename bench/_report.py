@@ -8,6 +8,7 @@ import sys
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -63,6 +64,15 @@ def machine() -> str:
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
+
+
+def _strict(value: Any) -> Any:
+    """JSON knows no infinity (touches never told apart) and no NaN: null."""
+    if isinstance(value, dict):
+        return {k: _strict(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_strict(v) for v in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def text(row: Row, key: str, form: str) -> str:
@@ -125,7 +135,7 @@ class Report:
         """The figure, with its ratio to the floor where that is the target; marked where the target is missed."""
         row = next((r for r in self.rows if r["method"] == "shipped, full" and r["level"] == level), None)
         if row is None or row.get(key) is None:
-            return ""
+            return "not measured" if target else ""
         value, shown = row[key], f"{row[key]:.3g}"
         if "floor" in target:
             rms = row.get(RMS[key])
@@ -144,8 +154,8 @@ class Report:
     def write(self, folder: Path) -> None:
         """accuracy.json and accuracy.png in `folder`."""
         folder.mkdir(parents=True, exist_ok=True)
-        content = {**self.head, "floors": self.floors, "rows": self.rows}
-        (folder / "accuracy.json").write_text(json.dumps(content, indent=1) + "\n")
+        content = _strict({**self.head, "floors": self.floors, "rows": self.rows})
+        (folder / "accuracy.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
         self.draw(folder / "accuracy.png")
 
     def draw(self, path: Path) -> None:

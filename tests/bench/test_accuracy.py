@@ -1,5 +1,6 @@
 """The accuracy benchmark's own parts: a benchmark that errs would err for everybody at once."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -109,4 +110,13 @@ def test_missed_targets_are_marked():
     assert "missed" in report.reached("position_%", "none", "<= 0.3")
     assert "missed" not in report.reached("position_%", "70", "1.3 x floor")  # 1.2
     assert "missed" in report.reached("position_%", "70", "1.1 x floor")
-    assert report.reached("shape_%", "70", ">= 85") == ""
+    assert report.reached("shape_%", "70", ">= 85") == "not measured"
+
+
+def test_reports_are_strict_json(tmp_path):
+    rows = [{"method": "one", "level": "none", "ms": 1.0, "mean_iou": 0.8, "position_%": 1.0, "separation": np.inf}]
+    frames = frames_of([("shapes", [Shape("circle", 0, 0, 0.3, 0.2)])])
+    _report.Report(rows, {}, frames, "stub", 1, Bundle.load("square16")).write(tmp_path)
+    text = (tmp_path / "accuracy.json").read_text()
+    assert json.loads(text, parse_constant=pytest.fail)["rows"][0]["separation"] is None
+    assert (tmp_path / "accuracy.png").stat().st_size > 10_000
