@@ -1,12 +1,10 @@
-"""Fixtures of the command line's tests: `skin` run in this process, a runtime folder of its own, the reference data."""
+"""Fixtures of the command line's tests: `skin` run in this process, the reference data."""
 
 from __future__ import annotations
 
 import os
-import shutil
 import sys
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,15 +18,6 @@ class Ran:
     code: int
     out: str
     err: str
-
-
-@pytest.fixture
-def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A runtime folder with a path short enough for sockets."""
-    folder = Path(tempfile.mkdtemp(prefix="eitc", dir="/tmp"))
-    monkeypatch.setenv("EITSKIN_RUNTIME", str(folder))
-    yield folder
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture

@@ -1,11 +1,8 @@
-"""Fixtures of the services' tests: a runtime folder of their own, frames made by the bundle's own linear model."""
+"""Fixtures of the services' tests: frames made by the bundle's own linear model."""
 
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +15,6 @@ from protocol.frames import RawFrame
 from services.config import Skin
 
 FRAME_NS = 45_000_000
-
-
-@pytest.fixture
-def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A runtime folder with a path short enough for sockets."""
-    folder = Path(tempfile.mkdtemp(prefix="eits", dir="/tmp"))
-    monkeypatch.setenv("EITSKIN_RUNTIME", str(folder))
-    yield folder
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="session")

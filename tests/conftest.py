@@ -1,4 +1,4 @@
-"""Fixtures of the recording tests: a runtime folder of its own."""
+"""Fixtures that more than one folder of tests uses."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pytest
 
 @pytest.fixture
 def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A runtime folder with a path short enough for sockets."""
-    folder = Path(tempfile.mkdtemp(prefix="eitr", dir="/tmp"))
+    """A runtime folder of the test's own, with a path short enough for sockets."""
+    folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
     monkeypatch.setenv("EITSKIN_RUNTIME", str(folder))
     yield folder
     shutil.rmtree(folder, ignore_errors=True)
