@@ -31,6 +31,14 @@ def fail(message: str, code: int = FAILED) -> NoReturn:
     raise CliError(message, code)
 
 
+def nobody(skin: str, seconds: float) -> str:
+    """What to say where a service was listened to and nothing came."""
+    from protocol.runtime import runtime_dir
+
+    found = f"no frame of skin {skin!r} came within {seconds:g} s at {runtime_dir()}"
+    return f"{found}: start the service with `skin up`, or set EITSKIN_RUNTIME"
+
+
 EXPECTED = {
     ("protocol.runtime", "RuntimeDirError"): USAGE,
     ("protocol.runtime", "AlreadyRunning"): FAILED,

@@ -9,8 +9,7 @@ from typing import Any
 
 from protocol.frames import ContactFrame, TruthFrame
 from protocol.sockets import AllReader
-from services.cli.common import NOT_RUNNING, emit, fail
-from services.cli.watch import nobody
+from services.cli.common import NOT_RUNNING, emit, fail, nobody
 
 LIGHT_N = 0.5  # a lighter touch's force is left out of the relative error: presses begin and end at zero
 

@@ -13,6 +13,7 @@ from services.cli.common import (
     SkinOption,
     emit,
     fail,
+    nobody,
     skin_name,
     use_configured_sockets,
 )
@@ -24,13 +25,6 @@ if TYPE_CHECKING:
 def register(app: typer.Typer) -> None:
     for command in (top, echo, compare):
         app.command()(command)
-
-
-def nobody(skin: str, seconds: float) -> str:
-    from protocol.runtime import runtime_dir
-
-    found = f"no frame of skin {skin!r} came within {seconds:g} s at {runtime_dir()}"
-    return f"{found}: start the service with `skin up`, or set EITSKIN_RUNTIME"
 
 
 def top(
