@@ -5,7 +5,8 @@
 
 The budget sets the schedule: the learning rate rises over the first percent and falls to zero at the last minute,
 whatever the machine's speed. What is kept is the running average of the weights; the best on held-out scenes is kept
-aside, and training stops early where the average has not become better for a quarter of the budget.
+aside, and training stops early where the average has not become better for a quarter of the budget; not before half
+of it, because a resumed run with a longer budget takes its learning rate up again.
 """
 
 from __future__ import annotations
@@ -121,7 +122,7 @@ class Trainer:
                 if score > self.best_score:
                     self.best_score, self.best_at = score, self.elapsed
                     self.best = copy.deepcopy(self.average.state_dict())
-                elif self.elapsed - self.best_at > 0.25 * budget:
+                elif self.elapsed - max(self.best_at, 0.5 * budget) > 0.25 * budget:
                     print(f"no better on held-out scenes since minute {self.best_at / 60:.1f}: stopped")
                     break
             if self.elapsed - saved > 120:
