@@ -28,6 +28,10 @@ REASONS = {
     "saturated": "a measurement's converter was clipped",
     "electrode_open": "an electrode has no contact with the skin",
     "electrode_short": "two electrodes are connected to each other",
+    "electrode_swapped": "two electrodes' wires are exchanged",
+    "electrode_drift": "an electrode's contact with the skin is changing: its measurements do not count",
+    "multiplexer": "the board's multiplexer does not switch to the electrodes it is told to",
+    "degraded": "several electrodes are missing: positions and forces are less certain than they say",
     "gap": "scans are missing just before this one",
     "low_snr": "the measurements are too noisy for the stated uncertainty",
     "out_of_distribution": "the measurements look like nothing the model was trained on",
@@ -41,7 +45,7 @@ REASONS = {
 """The reasons in use and what they mean; a reader accepts others too."""
 
 SHAPES = ("circle", "triangle", "rectangle", "square", "L")
-ELECTRODE_STATES = ("ok", "open", "short", "unknown")
+ELECTRODE_STATES = ("ok", "open", "short", "unknown", "drifting", "swapped", "stuck")
 STATUS_CLIPPED, STATUS_OPEN, STATUS_RTIA, STATUS_FIFO = 1, 2, 4, 8
 """Bits of a measurement's status: converter clipped (ADCMIN/ADCMAX); current out of range (open electrode); RTIA
 overrange; FIFO error or missed interrupt.
@@ -137,7 +141,9 @@ class DeltaFrame(Frame):
     )
     scale: float = wire(Float(unit="S/m"), "the network's output times this is in S/m", 1.0)
     electrodes: NDArray[np.uint8] = wire(
-        Array("|u1", ("E",)), "state of each electrode: 0 ok, 1 open, 2 short, 3 unknown", lambda: np.zeros(16, "u1")
+        Array("|u1", ("E",)),
+        "state of each electrode: " + ", ".join(f"{k} {state}" for k, state in enumerate(ELECTRODE_STATES)),
+        lambda: np.zeros(16, "u1"),
     )
 
 
@@ -162,7 +168,9 @@ class ImageFrame(Frame):
     )
     metres_per_pixel: float = wire(Float(0, unit="m"), "side of a pixel of `image`", 0.0)
     origin: list[float] = wire(Vector(2, "m"), "x, y of the image's lower left corner", lambda: [0.0, 0.0])
-    residual: float | None = wire(Maybe(Float(0)), "misfit of the reconstruction, in standard deviations, or nil", None)
+    residual: float | None = wire(
+        Maybe(Float(0)), "share of the measured change that the image does not explain, or nil", None
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -174,6 +182,7 @@ class Contact:
     position: list[float] = wire(Vector(3, "m"), "centroid of the contact patch, in the skin's frame")
     velocity: list[float] = wire(Vector(3, "m/s"), "of `position`", lambda: [0.0] * 3)
     normal: list[float] = wire(Vector(3), "unit vector out of the skin", lambda: [0.0, 0.0, 1.0])
+    orientation: float = wire(Float(unit="rad"), "angle of the patch's longest axis to x, -pi/2 to pi/2", 0.0)
     area_m2: float = wire(Float(0, unit="m^2"), "area of the contact patch", 0.0)
     force_n: float | None = wire(Maybe(Float(unit="N")), "normal force; nil where the skin has no force law", None)
     force_sigma_n: float | None = wire(Maybe(Float(0, unit="N")), "its standard uncertainty, or nil", None)
@@ -192,6 +201,9 @@ class ContactFrame(Frame):
     held: bool = wire(Bool(), "the contacts are those of an earlier frame: nothing changed since", False)
     frame_id: str = wire(Text(128), "name of the coordinate frame of positions and wrenches", "")
     force_calibrated: bool = wire(Bool(), "whether forces come from a calibration of this skin", False)
+    quality: float | None = wire(
+        Maybe(Float(0, 1)), "share of the measured change that the image explains; nil while untouched", None
+    )
     contacts: list[Contact] = wire(ListOf(Record(Contact), 256), "the touches, strongest first", list)
 
 
