@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import platform
 import sys
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -15,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bench._frames import REFERENCE, Frames, Level
+from bench._machine import machine
 from bench._scores import Row
 from models.bundle import Bundle
 
@@ -56,14 +56,6 @@ RMS = {"position_%": "position_rms_%", "force_%": "force_rms_%", "integral_%": "
 def progress(row: Row) -> None:
     """A line on standard error as each row is done."""
     print(f"{row['level']:>5} {row['method']}: IoU {row['mean_iou']:.3f}, {row['ms']:.2f} ms", file=sys.stderr)
-
-
-def machine() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
 
 
 def _strict(value: Any) -> Any:

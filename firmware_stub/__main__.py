@@ -128,7 +128,7 @@ def _alone() -> None:
 def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, stop: _Stop, parent: int | None) -> None:
     """Until a signal, or the parent's end: hand bytes to and fro, publish what was true."""
     name, gone = "", False
-    checked = 0.0
+    checked, written_ns = 0.0, begin_ns
     status = Status(skin)
     while not stop.asked:
         now = (time.monotonic_ns() - begin_ns) * 1e-9
@@ -136,6 +136,7 @@ def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, s
             rig.feed(data, now)
         if sent := rig.pull(now):
             port.write(sent)
+            written_ns = time.monotonic_ns()
         if (rig.unplugged is not None) != gone:
             gone = not gone
             if gone:
@@ -146,9 +147,11 @@ def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, s
             else:
                 port.plug(name)
                 log.info("plugged in again as %s %s", port.url, name)
-        while rig.scans:
+        # A scan's last byte has left when the line has nothing left to send, or has gone on to the scans after it.
+        while rig.scans and (not rig.line.backlog or len(rig.scans) > 1):
             scan, world, middle = rig.scans.popleft()
-            publisher.send(truth_frame(skin, rig.sheet, scan, world, begin_ns + round(middle * 1e9)))
+            stamps = {"sample": begin_ns + round(middle * 1e9), "publish": written_ns}
+            publisher.send(truth_frame(skin, rig.sheet, scan, world, stamps))
             status.scanned()
         if (due := status.due(rig, port, now)) is not None:
             publisher.send(due)

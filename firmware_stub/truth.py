@@ -10,12 +10,14 @@ from .sheet import Sheet
 from .world import NEWTON, Touch, World
 
 
-def truth_frame(skin: str, sheet: Sheet, scan: Scan, world: World, sample_ns: int) -> TruthFrame:
-    """The truth at the middle of a scan, `sample_ns` on the host's monotonic clock: there it is exact."""
+def truth_frame(skin: str, sheet: Sheet, scan: Scan, world: World, stamps: dict[str, int]) -> TruthFrame:
+    """The truth at the middle of a scan. stamps [ns] on the host's monotonic clock, where both are exact: `sample`, and
+    `publish`, when the scan's last byte had left the board.
+    """
     return TruthFrame(
         skin=skin,
         scan=scan.seq,
-        stamps={"sample": sample_ns},
+        stamps=stamps,
         source="stub",
         valid=True,
         touches=[_touch(sheet, touch) for touch in world.touches if touch.drop > 0],

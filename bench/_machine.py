@@ -1,0 +1,25 @@
+"""What a report says about where it was made."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import version
+from pathlib import Path
+
+PACKAGES = ("numpy", "scipy", "onnxruntime", "pyzmq", "msgpack")
+
+
+def machine() -> str:
+    """The processor's name and how many of it there are."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        name = platform.processor() or platform.machine()
+    return f"{os.cpu_count()} x {name}"
+
+
+def versions() -> dict[str, str]:
+    """Of Python and of what the service runs on."""
+    return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
