@@ -58,12 +58,12 @@ def progress(row: Row) -> None:
     print(f"{row['level']:>5} {row['method']}: IoU {row['mean_iou']:.3f}, {row['ms']:.2f} ms", file=sys.stderr)
 
 
-def _strict(value: Any) -> Any:
+def strict(value: Any) -> Any:
     """JSON knows no infinity (touches never told apart) and no NaN: null."""
     if isinstance(value, dict):
-        return {k: _strict(v) for k, v in value.items()}
+        return {k: strict(v) for k, v in value.items()}
     if isinstance(value, list):
-        return [_strict(v) for v in value]
+        return [strict(v) for v in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
@@ -146,7 +146,7 @@ class Report:
     def write(self, folder: Path) -> None:
         """accuracy.json and accuracy.png in `folder`."""
         folder.mkdir(parents=True, exist_ok=True)
-        content = _strict({**self.head, "floors": self.floors, "rows": self.rows})
+        content = strict({**self.head, "floors": self.floors, "rows": self.rows})
         (folder / "accuracy.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
         self.draw(folder / "accuracy.png")
 

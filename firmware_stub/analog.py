@@ -115,7 +115,7 @@ class Analog:
             wires[[a, b]] = wires[[b, a]]
             rows = wires[rows]
         if (broken := self.faults.active("electrode_open", now)) is not None:
-            reached &= rows != broken["electrode"]
+            reached &= (rows != broken["electrode"]) & (rows != broken["second"])
         reached &= rows < electrodes  # a stuck address bit may lead to where nothing is connected
         return np.minimum(rows, electrodes - 1), np.all(reached[:, :2], axis=1), np.all(reached[:, 2:], axis=1)
 

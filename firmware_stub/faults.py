@@ -61,7 +61,8 @@ FAULTS: dict[str, Fault] = {
     ),
     # electrodes and multiplexers
     "electrode_open": Fault(
-        "the wire of `electrode` (0-based) is broken: no current, a floating voltage", {"electrode": 0}
+        "the wire of `electrode` (0-based; and of `second`) is broken: no current, a floating voltage",
+        {"electrode": 0, "second": -1},
     ),
     "electrodes_shorted": Fault("the wires of two `electrodes` touch each other", {"electrodes": [0, 1]}),
     "electrodes_swapped": Fault("the wires of two `electrodes` are exchanged", {"electrodes": [0, 1]}),

@@ -40,10 +40,11 @@ def load(name: str | Path) -> Script:
 
 
 def parse(data: Mapping[str, Any], name: str = "scene") -> Script:
-    known = {"about", "duration", "loop", "touch", "grid", "drift", "fault"}
+    known = {"about", "duration", "loop", "touch", "press", "grid", "drift", "fault", "section"}
     if unknown := set(data) - known:
         raise ValueError(f"unknown key {', '.join(sorted(unknown))}: allowed are {', '.join(sorted(known))}")
     tracks = [_track(touch) for touch in data.get("touch", [])]
+    tracks += [_press(**press) for press in data.get("press", [])]
     tracks += [track for grid in data.get("grid", []) for track in _grid(**grid)]
     drift = data.get("drift", {})
     loop = bool(data.get("loop", False))
@@ -64,6 +65,7 @@ def parse(data: Mapping[str, Any], name: str = "scene") -> Script:
         ),
         duration=duration,
         loop=loop,
+        sections=tuple((float(s["t"]), str(s["name"])) for s in data.get("section", [])),
     )
 
 
@@ -102,6 +104,14 @@ def _track(values: Mapping[str, Any]) -> Track:
     if len(times) < 2 or times[0] < 0 or sorted(times) != times or times[0] == times[-1]:
         raise ValueError(f"a touch's keys at {times}: expected at least two times, from 0 on, not decreasing")
     return Track(tuple(times), tuple(poses))
+
+
+def _press(*, t: float, seconds: float, force: float, ramp: float = 0.15, **pose: Any) -> Track:
+    """The short form of a touch: there for `seconds` from `t` on, its two ramps included; may slide to to_x, to_y."""
+    to = {key.removeprefix("to_"): pose.pop(key) for key in ("to_x", "to_y") if key in pose}
+    end = round(t + seconds, 6)
+    keys = [{"t": t, "force": 0.0}, {"t": t + ramp, "force": force}, {"t": end - ramp, **to}, {"t": end, "force": 0.0}]
+    return _track({**pose, "keys": keys})
 
 
 def _curve(keys: list[Mapping[str, float]]) -> Curve:

@@ -77,6 +77,7 @@ class Script:
     background: Curve | None = None
     contact: tuple[tuple[int | None, Curve], ...] = ()  # electrode (None: all) and the factor on its impedance
     cues: tuple[Cue, ...] = ()
+    sections: tuple[tuple[float, str], ...] = ()  # (from when on [s], name), for whoever keeps the score
     duration: float = 0.0
     loop: bool = False
 

@@ -123,11 +123,12 @@ class BoardSource(Source):
             if board.problem != self.problem:
                 self._trouble(board.problem)
             for scan in scans:
-                yield self._raw(scan, board, clock, read_ns)
+                yield self.raw_frame(scan, board, clock, read_ns)
             if not scans:
                 yield None
 
-    def _raw(self, scan: link.Frame, board: BoardLink, clock: DeviceClock, read_ns: int) -> RawFrame:
+    def raw_frame(self, scan: link.Frame, board: BoardLink, clock: DeviceClock, read_ns: int) -> RawFrame:
+        """A scan of the board with this host's stamps; `read_ns`: when its last byte was read."""
         clock.observe(scan.device_us + scan.duration_us, read_ns)
         reasons = ["gap"] if board.gap else []
         if clock.sigma_ns >= UNSETTLED_NS:

@@ -1,0 +1,192 @@
+"""A scripted scene through the stub board and the host's end of its line in simulated time: raw frames, their truth.
+
+Only the operating system is left out: the board's bytes go through the link's decoder, its state machine and the clock
+regression of acquisition; they are read at most READ_LATE_S late. What comes out is kept in bench/work, by a hash of
+the scene and of the code that made it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+import time
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_stub import scene as scenes
+from firmware_stub.rig import Rig
+from firmware_stub.sheet import Sheet
+from firmware_stub.timeline import Script
+from firmware_stub.world import NEWTON, World
+from models.bundle import Bundle
+from protocol.frames import RawFrame
+from services.boardlink import BoardLink
+from services.clock import DeviceClock
+from services.config import Skin
+from services.source import BoardSource
+
+ROOT = Path(__file__).resolve().parents[1]
+WORK = Path(__file__).with_name("work")
+MADE_BY = (
+    *(f"firmware_stub/{n}.py" for n in ("analog", "board", "faults", "field", "rig", "scene", "sheet", "timeline")),
+    *(f"models/{n}.py" for n in ("elements", "forward", "geometry", "meshing", "patterns", "shapes")),
+    "services/clock.py",
+)
+READ_LATE_S = 0.002  # a scheduler's doing
+CONTACT_CHANGED = 0.05  # of its impedance within a second: a contact that drifts, not one that ages
+ELECTRODE_FAULTS = ("electrode_open", "electrodes_shorted", "electrodes_swapped", "mux_stuck", "mux_disabled")
+TOUCHES = ("track", "x", "y", "force", "radius", "area")  # of one true touch; x, y: its area's centroid [m], area [m^2]
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """N scans that reached the host."""
+
+    z: NDArray[np.complex64]  # (N, K) ohm
+    status: NDArray[np.uint8]  # (N, K)
+    scan: NDArray[np.int64]  # (N,) the board's number
+    seconds: NDArray[np.float64]  # (N,) true middle of the scan since the scene began
+    sample_ns: NDArray[np.int64]  # (N,) what the clock regression makes of it
+    sigma_ns: NDArray[np.int64]
+    read_ns: NDArray[np.int64]
+    device_us: NDArray[np.int64]
+    gap: NDArray[np.bool_]  # scans are missing just before
+    touches: NDArray[np.float64]  # (M, 1 + len(TOUCHES)): index of the frame, then TOUCHES
+    faults: NDArray[np.str_]  # (N,) JSON: electrode faults in force, name -> arguments
+    sections: NDArray[np.str_]  # (N,) name of the scene's section
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def frame(self, k: int, board: str = "stub") -> RawFrame:
+        return RawFrame(
+            skin="palm",
+            scan=int(self.scan[k]),
+            stamps={"sample": int(self.sample_ns[k]), "read": int(self.read_ns[k])},
+            sample_sigma_ns=int(self.sigma_ns[k]),
+            source="stub",
+            valid=True,
+            reasons=["gap"] if self.gap[k] else [],
+            valid_for_s=0.13,
+            z=self.z[k],
+            status=self.status[k],
+            device_us=int(self.device_us[k]),
+            board=board,
+        )
+
+    def truth(self, k: int) -> list[dict[str, float]]:
+        """The true touches of frame k."""
+        return [dict(zip(TOUCHES, row[1:], strict=True)) for row in self._of(k)]
+
+    def _of(self, k: int) -> NDArray[np.float64]:
+        low, high = np.searchsorted(self.touches[:, 0], [k, k + 1])
+        return self.touches[low:high]
+
+
+def record(name: str, snr_db: float, seed: int, seconds: float | None = None) -> tuple[Recorded, float]:
+    """The scene's frames, from bench/work where they are there; and the seconds that simulating them took."""
+    path = WORK / f"tracking-{_key(name, snr_db, seed, seconds)}.npz"
+    if path.is_file():
+        with np.load(path) as kept:
+            return Recorded(**{f.name: kept[f.name] for f in fields(Recorded)}), 0.0
+    began = time.perf_counter()
+    found = simulate(name, snr_db, seed, seconds)
+    WORK.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, **{f.name: getattr(found, f.name) for f in fields(Recorded)})
+    return found, time.perf_counter() - began
+
+
+def simulate(name: str, snr_db: float, seed: int, seconds: float | None = None, sheet: Sheet | None = None) -> Recorded:
+    """Play a scene (name or path) to its end, or for so many seconds."""
+    rig = Rig(sheet or "square16", scene=name, snr_db=snr_db, seed=seed)
+    script = rig.field.timeline.script
+    host = _Host(rig, seed)
+    end = min(seconds or script.duration, script.duration)
+    said = 0.0
+    while host.now < end:
+        host.step()
+        if host.now > said + 30:
+            said = host.now
+            print(f"simulated {said:.0f} of {end:.0f} s, {rig.field.solves} solves", file=sys.stderr)
+    rig.close()
+    return host.recorded(script)
+
+
+class _Host:
+    """Acquisition without threads: a rig, the link to it, and what came of it."""
+
+    def __init__(self, rig: Rig, seed: int) -> None:
+        self.rig, self.now = rig, 0.0
+        skin, bundle = Skin(port="stub", bundle="square16"), Bundle.load("square16")
+        self.source = BoardSource("palm", skin, bundle)
+        self.link, self.clock = BoardLink(self.source.scanning, 0.0), DeviceClock()
+        self._rng = np.random.default_rng([seed, 7])
+        self._felt: dict[int, tuple[float, float, World, dict[str, object]]] = {}
+        self._frames: list[RawFrame] = []
+
+    def step(self) -> None:
+        """To when the board has something to do next, and a little later."""
+        self.now += max(1e-3, min(self.rig.wake_s(self.now), 0.02)) + READ_LATE_S * float(self._rng.random()) ** 2
+        if due := self.link.to_send(self.now):
+            self.rig.feed(due, self.now)
+        data = self.rig.pull(self.now)
+        while self.rig.scans:
+            scan, world, middle = self.rig.scans.popleft()
+            in_force = {k: v for k, v in self.rig.faults.listing(scan.start).items() if k in ELECTRODE_FAULTS}
+            self._felt[scan.seq] = scan.start, middle, world, in_force
+        read_ns = round(self.now * 1e9)
+        for scan in self.link.received(data, self.now) if data else []:
+            self._frames.append(self.source.raw_frame(scan, self.link, self.clock, read_ns))
+
+    def recorded(self, script: Script) -> Recorded:
+        felt = [self._felt[frame.scan] for frame in self._frames]
+        faults = [dict(in_force) | _drifting(script, start) for start, _, _, in_force in felt]
+        rows = [row for k, (start, _, world, _) in enumerate(felt) for row in self._touches(script, k, start, world)]
+        names = [([name for t, name in script.sections if t <= middle] or [""])[-1] for _, middle, _, _ in felt]
+        column = lambda of: np.array([of(frame) for frame in self._frames])  # noqa: E731
+        return Recorded(
+            z=column(lambda f: f.z),
+            status=column(lambda f: f.status),
+            scan=column(lambda f: f.scan),
+            seconds=np.array([middle for _, middle, _, _ in felt]),
+            sample_ns=column(lambda f: f.stamps["sample"]),
+            sigma_ns=column(lambda f: f.sample_sigma_ns),
+            read_ns=column(lambda f: f.stamps["read"]),
+            device_us=column(lambda f: f.device_us),
+            gap=column(lambda f: "gap" in f.reasons),
+            touches=np.array(rows).reshape(-1, 1 + len(TOUCHES)),
+            faults=np.array([json.dumps(f, sort_keys=True) for f in faults]),
+            sections=np.array(names),
+        )
+
+    def _touches(self, script: Script, k: int, start: float, world: World) -> list[list[float]]:
+        """Rows of `Recorded.touches`: the world lists its touches in the order of the script's tracks."""
+        there = [n for n, track in enumerate(script.tracks) if track.times[0] <= start < track.times[-1]]
+        rows = []
+        for n, touch in zip(there, world.touches, strict=True):
+            if touch.drop > 0:
+                shape, scale = self.rig.sheet.shape(touch), self.rig.sheet.skin.metres_per_unit
+                x, y = shape.centroid * scale
+                rows.append([k, n, x, y, touch.drop / NEWTON, touch.radius, shape.area * scale**2])
+        return rows
+
+
+def _drifting(script: Script, t: float) -> dict[str, object]:
+    """A contact that changes fast is a fault too."""
+    for electrode, curve in script.contact:
+        now, before = curve.value(t, t), curve.value(max(0.0, t - 1), max(0.0, t - 1))
+        if electrode is not None and abs(now / before - 1) > CONTACT_CHANGED:
+            return {"contact_drifts": {"electrode": electrode}}
+    return {}
+
+
+def _key(name: str, snr_db: float, seed: int, seconds: float | None) -> str:
+    digest = hashlib.sha256(f"{snr_db} {seed} {seconds}".encode())
+    path = Path(name) if name.endswith(".toml") else scenes.FOLDER / f"{name}.toml"
+    for file in (Path(__file__), path, *(ROOT / name for name in MADE_BY)):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
