@@ -1,97 +1,134 @@
 """What a robot controller uses: the newest contacts, or an error, never old data.
 
 with ContactSubscriber("palm") as skin:
-    frame = skin.latest(max_age=0.05)
+    frame = skin.latest(max_age=0.05, valid=True)    # else Stale: stop
     for contact in frame.contacts: ...
+
+with ContactSubscriber("palm") as skin:
+    for frame in skin: ...                           # each new frame; Stale when none comes
+
+In the background: `listener.ContactListener`; with asyncio: `aio.AsyncContactSubscriber`. A skin on another host:
+
+transport.configure(Transport(
+    addresses={"publisher": "tcp://robot:47600"},
+    secret_key=Path("me.key_secret"), server_keys={"publisher": Path("publisher.key")}))
 """
 
 from __future__ import annotations
 
+import math
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import TracebackType
 
 from .frames import ContactFrame
-from .runtime import host_id
-from .sockets import NewestReader
+from .freshness import WAIT_SLICE_S, NewestContacts, NotValid, Stale
 
+__all__ = ["SILENCE_S", "ContactSubscriber", "NotValid", "Stale"]
 
-class Stale(RuntimeError):
-    """There is no contact frame that is new enough: stop, or fall back.
-
-    `age_s` is the age of the newest one, None where there was none.
-    """
-
-    def __init__(self, message: str, age_s: float | None = None) -> None:
-        super().__init__(message)
-        self.age_s = age_s
+SILENCE_S = 0.25
+"""So long without a frame is silence, unless said otherwise: five frames of the demo's 22 a second."""
 
 
 class ContactSubscriber:
-    """The contacts of one skin.
+    """The contacts of one skin. Belongs to one thread.
 
-    Reconnects by itself; ignores replayed frames unless `replay`. Belongs to one thread.
+    A service that was restarted is found again by itself. Replayed frames are ignored unless `replay`. `endpoint`
+    overrides the publisher's address (tcp://HOST:PORT or ipc://PATH); keys come from `transport.configure`.
+
+    A frame with `valid` false is given out, with its `reasons`, to who asks for any frame; `valid=True` asks for one
+    to act on, and raises NotValid, a kind of Stale, instead.
+
+    Ages count from a frame's `publish` stamp; on another host from its reception, and a frame that waited for us to
+    ask counts from when we last asked. Ask there at least every `max_age`, or wait for a frame with `wait_s`.
     """
 
     def __init__(self, skin: str, endpoint: str | None = None, *, replay: bool = False) -> None:
-        self.skin, self.replay = skin, replay
-        self.replayed = 0
+        self.skin = skin
+        self._newest = NewestContacts(skin, endpoint, replay=replay)
+
+    @property
+    def replayed(self) -> int:
         """Replayed frames that were ignored."""
-        self._reader = NewestReader("contact", skin, endpoint)
-        self._newest: ContactFrame | None = None
-        self._received_ns = 0
+        return self._newest.replayed
 
-    def latest(self, max_age: float = 0.05, wait_s: float = 0.0) -> ContactFrame:
-        """The newest frame, at most `max_age` seconds old and within its own `valid_for_s`.
+    def latest(self, max_age: float = 0.05, wait_s: float = 0.0, *, valid: bool = False) -> ContactFrame:
+        """The newest frame, at most `max_age` seconds old and within its own `valid_for_s`; the same one again until
+        there is a newer one.
 
-        Waits up to `wait_s` for one. Age counts from `publish`, or on another host, whose clock is not ours, from
-        reception. Raises Stale. Look at `frame.valid` before acting on the contacts.
+        Waits up to `wait_s` for one. Raises Stale. Without `valid=True`, look at `frame.valid` before acting on it.
         """
-        self._take(0.0)
         deadline = time.monotonic() + wait_s
         while True:
-            age = self._age()
-            limit = max_age
-            if self._newest is not None and self._newest.valid_for_s > 0:
-                limit = min(max_age, self._newest.valid_for_s)
-            if self._newest is not None and age is not None and age <= limit:
-                return self._newest
-            left = deadline - time.monotonic()
-            if left <= 0:
-                break
-            self._take(left)
-        if age is None:
-            raise Stale(f"no contact frame of {self.skin} yet: is the service running (skin up)?")
-        raise Stale(f"the newest contact frame of {self.skin} is {age:.3f} s old, expected at most {limit:.3f} s", age)
+            self._newest.take()
+            try:
+                return self._newest.judge(max_age, valid)
+            except Stale:
+                if not self._wait(deadline):
+                    raise
+
+    def next_frame(self, max_age: float = SILENCE_S, *, valid: bool = False) -> ContactFrame:
+        """A frame not given out before, the newest one where several have come; waits for it.
+
+        Raises Stale where none has come within `max_age` seconds.
+        """
+        deadline = time.monotonic() + max_age
+        while True:
+            if self._newest.take():
+                try:
+                    return self._newest.judge(max_age, valid)
+                except NotValid:
+                    raise
+                except Stale:
+                    pass  # it lay in the socket while nobody asked
+            if not self._wait(deadline):
+                raise self._newest.stale(max_age)
+
+    def frames(self, max_age: float = SILENCE_S, *, valid: bool = False) -> Iterator[ContactFrame]:
+        """`next_frame` for ever. Silence ends it with Stale, so that a loop that moves a robot never just hangs;
+        begin a new one to go on.
+        """
+        while True:
+            yield self.next_frame(max_age, valid=valid)
 
     def __iter__(self) -> Iterator[ContactFrame]:
-        """Each frame as it comes, the newest one where several have; blocks in between."""
-        while True:
-            if self._take(1.0):
-                assert self._newest is not None
-                yield self._newest
+        return self.frames()
 
-    def _take(self, timeout_s: float) -> bool:
-        frame = self._reader.recv(timeout_s)
-        if not isinstance(frame, ContactFrame):
+    def run(
+        self,
+        on_contact: Callable[[ContactFrame], object],
+        on_stale: Callable[[Stale], object],
+        max_age: float = SILENCE_S,
+        stop: threading.Event | None = None,
+    ) -> None:
+        """Call `on_contact` with each new valid frame, also when nothing touches, and `on_stale` for each frame that
+        is not valid (NotValid, with the frame) and for every `max_age` seconds of silence; until `stop` is set.
+
+        So one of the two is called at least every `max_age` seconds. An exception in either ends `run` and reaches
+        the caller.
+        """
+        while stop is None or not stop.is_set():
+            try:
+                frame = self.next_frame(max_age, valid=True)
+            except Stale as why:
+                on_stale(why)
+            else:
+                on_contact(frame)
+
+    def _wait(self, deadline: float) -> bool:
+        """Wait for something to arrive, WAIT_SLICE_S at most; False when the deadline is over."""
+        left = deadline - time.monotonic()
+        if left <= 0:
             return False
-        if frame.source == "replay" and not self.replay:
-            self.replayed += 1
-            return False
-        self._newest, self._received_ns = frame, time.monotonic_ns()
+        since = time.monotonic_ns()
+        if self._newest.reader.socket.poll(math.ceil(min(left, WAIT_SLICE_S) * 1000)):
+            self._newest.woken(since)
         return True
-
-    def _age(self) -> float | None:
-        if self._newest is None:
-            return None
-        born = self._received_ns
-        if self._newest.host == host_id():
-            born = self._newest.stamps.get("publish", born)
-        return (time.monotonic_ns() - born) / 1e9
 
     def close(self) -> None:
         """Close the subscription."""
-        self._reader.close()
+        self._newest.reader.close()
 
     def __enter__(self) -> ContactSubscriber:
         return self

@@ -25,6 +25,11 @@ if TYPE_CHECKING:
 RECONNECT_MS = 30
 """How soon a reader looks again for a producer that has gone."""
 
+PATIENCE_MS = 2000
+"""A TCP peer that says nothing for so long, not even an answer to a heartbeat (host gone, cable out), is looked for
+anew; without that, a reader that never sends would wait for it for ever.
+"""
+
 Context = zmq.Context[zmq.Socket[bytes]]
 Socket = zmq.Socket[bytes]
 
@@ -102,6 +107,10 @@ def connect(context: Context, kind: int, addresses: Mapping[str, str], options: 
     """
     transport = _current
     socket = _open(context, kind, options)
+    if any(address.startswith("tcp://") for address in addresses.values()):
+        socket.setsockopt(zmq.HEARTBEAT_IVL, PATIENCE_MS // 2)
+        for option in (zmq.HEARTBEAT_TIMEOUT, zmq.CONNECT_TIMEOUT):
+            socket.setsockopt(option, PATIENCE_MS)
     for name, address in addresses.items():
         if address.startswith("tcp://") and name in transport.server_keys:
             socket.curve_publickey, socket.curve_secretkey = _read_keys(transport.secret_key)
