@@ -21,6 +21,7 @@ from models.prereconstruction import Array
 OPSET = 17  # onnxruntime 1.20 and later read it
 INPUTS, OUTPUTS = ("stack", "context"), ("drop", "log_sigma", "classes")
 PARITY = 1e-5
+FLOAT = ("/stem/", "/stage2/attention", "/up2/", "/stage3/", "/classes/", "/up1/", "/out/", "/aside/")  # not in int8
 
 
 class ParityError(Exception):
@@ -61,17 +62,18 @@ def to_onnx(model: MMCNN, stack: Array, context: Array) -> bytes:
 
 
 def to_int8(content: bytes, stack: Array, context: Array) -> bytes:
-    """The network with its convolutions in int8 (per channel, QDQ), calibrated on stacks (N, C, h, w) and contexts
-    (N, n).
+    """The network with most of its encoder's convolutions in int8 (per channel, QDQ), calibrated on stacks (N, C, h, w)
+    and contexts (N, n).
 
-    The two output convolutions stay float32: their logits and log amplitudes are the result's own resolution.
+    The decoder and the outputs stay float32: their logits and log amplitudes are the result's own resolution, and so
+    small a network gains nothing there, since what int8 saves goes into converting to and fro.
     """
     with tempfile.TemporaryDirectory() as folder:
         source, prepared, target = (Path(folder, name) for name in ("float.onnx", "prepared.onnx", "int8.onnx"))
         source.write_bytes(content)
         quantization.quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
         nodes = [n for n in onnx.load(str(prepared)).graph.node if n.op_type == "Conv"]
-        keep = [n.name for n in nodes if n.name.startswith(("/out/", "/aside/", "/stem/"))]
+        keep = [n.name for n in nodes if n.name.startswith(FLOAT)]
         quantization.quantize_static(
             str(prepared),
             str(target),
