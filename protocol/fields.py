@@ -23,6 +23,7 @@ MAX_LIST = 4096
 MAX_MAP = 1024
 MAX_TEXT = 65536
 MAX_DEPTH = 8
+REMEMBERED = 64  # texts that a checker has accepted and need not look at again
 
 
 class Mismatch(Exception):
@@ -144,15 +145,22 @@ class Text(Check):
     most: int = 256
     choices: tuple[str, ...] = ()
     form: str = ""
+    _accepted: set[str] = dataclass_field(default_factory=set, repr=False, compare=False)
 
     def decode(self, value: Any) -> str:
-        if type(value) is str and len(value) <= self.most:
-            if self.choices:
-                if value in self.choices:
-                    return value
-            elif not self.form or re.fullmatch(self.form, value):
+        if type(value) is str:
+            if value in self._accepted:  # names and hosts come with every frame: a regular expression is slow when cold
+                return value
+            if len(value) <= self.most and self._is_allowed(value):
+                if len(self._accepted) < REMEMBERED:
+                    self._accepted.add(value)
                 return value
         raise self.refuse(value)
+
+    def _is_allowed(self, value: str) -> bool:
+        if self.choices:
+            return value in self.choices
+        return not self.form or re.fullmatch(self.form, value) is not None
 
     def describe(self) -> str:
         if self.choices:
@@ -213,7 +221,7 @@ class Array(Check):
     def encode(self, value: Any) -> dict[str, Any]:
         array = np.ascontiguousarray(value, dtype=self.dtype)
         self._check_shape(array)
-        return {"dtype": self.dtype, "shape": list(array.shape), "data": array.tobytes()}
+        return {"dtype": self.dtype, "shape": list(array.shape), "data": array.data if array.size else b""}
 
     def _check_shape(self, array: NDArray[Any]) -> None:
         shape = array.shape

@@ -6,6 +6,7 @@ A message is one ZeroMQ part: the topic ("contact/palm"), a 0 byte, a msgpack ma
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from typing import Any
 
 import msgpack
@@ -89,25 +90,31 @@ def unpack(message: bytes) -> Frame:
     Raises FrameError where the message has another form, type, shape or range than documented. Non-finite
     measurements are data: the frame comes back with `valid` false and the reason `non_finite`; see `as_sent`.
     """
-    head, zero, body = bytes(message[:128]).partition(b"\0")
-    known = _TOPIC.fullmatch(head) if zero else None
-    name = known[1].decode() if known else ""
-    if known is None or name not in _RECORDS:
+    head, zero, _ = bytes(message[:128]).partition(b"\0")
+    name, skin = _place(head) if zero else ("", "")
+    if name not in _RECORDS:
         raise FrameError("", "", f"a message beginning {brief(bytes(message[:24]))}", "topic/skin, a 0 byte, msgpack")
     record = _RECORDS[name]
-    fields_read = read_map(message[len(head) + 1 :], name)
+    fields_read = read_map(memoryview(message)[len(head) + 1 :], name)
     try:
         frame: Frame = record.decode(fields_read)
     except Mismatch as bad:
         raise FrameError(name, bad.path.lstrip("."), bad.found, bad.expected) from None
-    if frame.skin != known[2].decode():
-        raise FrameError(name, "skin", brief(frame.skin), f"{known[2].decode()!r}, as in the message's topic")
+    if frame.skin != skin:
+        raise FrameError(name, "skin", brief(frame.skin), f"{skin!r}, as in the message's topic")
     if not record.finite(frame):
         frame.note_valid(frame.valid)
         frame.valid = False
         if "non_finite" not in frame.reasons:
             frame.reasons.append("non_finite")
     return frame
+
+
+@lru_cache(maxsize=1024)
+def _place(head: bytes) -> tuple[str, str]:
+    """(topic, skin) of "topic/skin"; empty where it is none."""
+    known = _TOPIC.fullmatch(head)
+    return (known[1].decode(), known[2].decode()) if known else ("", "")
 
 
 def as_sent(frame: Frame) -> tuple[bool, list[str]]:
@@ -119,7 +126,7 @@ def as_sent(frame: Frame) -> tuple[bool, list[str]]:
     return frame.valid_as_sent, [reason for reason in frame.reasons if reason != "non_finite"]
 
 
-def read_map(packed: bytes, topic: str) -> dict[str, Any]:
+def read_map(packed: bytes | memoryview, topic: str) -> dict[str, Any]:
     """Read a msgpack map within the limits that bound time and memory. Raises FrameError, and nothing else, whatever
     the bytes.
     """
