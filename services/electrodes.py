@@ -1,21 +1,81 @@
-"""Electrode health from one frame: which measurements count, which electrodes are open or shorted."""
+"""Electrode health from the frames: which measurements count, which electrodes are at fault, and what to do about it.
+
+A fault is named in the frame that shows it and taken back once the electrode has been well for some frames, so that
+neither a loose wire flaps nor the baseline follows a fault: what is at fault has weight zero throughout. Electrodes are
+numbered from 0, as on the board's link (protocol/WIRE.md).
+"""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA
+from models.bundle import Bundle
+from protocol.frames import ELECTRODE_STATES, STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA
+from services.contact_drift import ContactDrift
+from services.wiring import Exchanged, StuckBit, Wiring
 
-OK, OPEN, SHORT = 0, 1, 2
+Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(len(ELECTRODE_STATES))
+REASONS = {
+    OPEN: "electrode_open",
+    SHORT: "electrode_short",
+    UNKNOWN: "stale_baseline",
+    DRIFTING: "electrode_drift",
+    SWAPPED: "electrode_swapped",
+    STUCK: "multiplexer",
+}
+ADVICE = {
+    OPEN: "electrode {}: no contact; look at its wire and press it on",
+    SHORT: "electrodes {}: connected to each other; part their wires",
+    UNKNOWN: "electrode {}: no baseline, it was at fault when that was taken; run `skin tare`",
+    DRIFTING: "electrode {}: its contact with the skin changed; press it on, then run `skin tare`",
+    SWAPPED: "electrodes {}: their wires are exchanged; put them right",
+    STUCK: "the multiplexers do not reach electrode {}",
+}
 FAR = 10.0  # |Z| beyond this multiple of the baseline, or below its inverse, is no touch
 MOSTLY = 0.8  # fraction of an electrode's measurements that must have failed for the electrode to be named
+NOTHING_ANSWERS = 0.7  # fraction of all measurements that failed where it is not the electrodes
+TOO_MANY = 2  # electrodes at fault with which contacts can still be given
+WELL_FRAMES = 3  # in a row, after which an electrode counts again
+WELL = 0.005  # relative: how near its baseline a measurement of a well electrode is, and within 6 sigma more
+FALLS = 0.03  # relative fall that no touch, warmth or noise makes: the wiring is looked at
+FALLS_UNTARED = 0.06  # against the bundle's prediction, contacts unknown
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What is known of the untouched skin, each (K,): |Z0| (0 where unknown), what differences are divided by, and
+    their standard deviation (infinite where unknown).
+    """
+
+    z0: Array
+    normaliser: Array
+    sigma: Array
+
+
+@dataclass
+class Verdict:
+    """On one frame. live (K,): counts; failed (K,): no value for a baseline either; states (E,): ELECTRODE_STATES."""
+
+    live: Mask
+    failed: Mask
+    states: NDArray[np.uint8]
+    reasons: list[str]
+    usable: bool  # whether contacts can be given
 
 
 class ElectrodeHealth:
-    """For one drive pattern (K, 4)."""
+    """For one bundle: K measurements between E electrodes. Keeps which are at fault."""
 
-    def __init__(self, pattern: NDArray[np.integer]) -> None:
+    def __init__(self, bundle: Bundle) -> None:
+        pattern = np.asarray(bundle.pattern)
         self.electrodes = int(pattern.max()) + 1
         self.member = np.zeros((self.electrodes, len(pattern)), dtype=bool)  # (E, K) measurement uses electrode
         for column in range(pattern.shape[1]):
@@ -23,38 +83,206 @@ class ElectrodeHealth:
         # A measurement between the two electrodes that it drives sees nothing but a short between them.
         self.self_sensing = (pattern[:, 0] == pattern[:, 2]) & (pattern[:, 1] == pattern[:, 3])
         self._pattern = pattern
-        self._all_well = np.zeros(self.electrodes, dtype=np.uint8)
+        self._predicted = np.asarray(bundle.z0, dtype=float) if bundle.matrices.normalisation == "model" else None
+        self._wiring = Wiring(pattern)
+        self._drift = ContactDrift(bundle, self.member)
+        self.reset()
 
-    def __call__(
-        self, amplitude: NDArray[np.floating], status: NDArray[np.uint8], z0: NDArray[np.floating] | None
-    ) -> tuple[NDArray[np.bool_], NDArray[np.uint8], list[str]]:
-        """(K,) |Z|, (K,) status bits, (K,) baseline -> (K,) measurement counts, (E,) electrode states, reasons."""
-        bad = ~np.isfinite(amplitude) | ((status & (STATUS_OPEN | STATUS_RTIA | STATUS_FIFO | STATUS_CLIPPED)) != 0)
-        bad |= amplitude <= 0
-        if z0 is not None:
-            known = z0 > 0
-            bad |= known & ((amplitude > FAR * z0) | (amplitude < z0 / FAR))
-        if not bad.any():
-            return ~bad, self._all_well, []
+    def reset(self) -> None:
+        self._states = np.zeros(self.electrodes, dtype=np.uint8)
+        self._well = np.zeros(self.electrodes, dtype=np.int64)  # frames in a row
+        self._shown = self._states
+        self._fault = ""  # of the board as a whole
+
+    def tared(self) -> None:
+        """There is a new baseline: what changed against the old one is forgotten."""
+        self._states[(self._states == DRIFTING) | (self._states == UNKNOWN)] = OK
+
+    def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
+        """(K,) |Z| and status bits of a frame."""
+        trouble = (status & (STATUS_OPEN | STATUS_RTIA | STATUS_FIFO | STATUS_CLIPPED)) != 0
+        failed = ~np.isfinite(amplitude) | (amplitude <= 0) | trouble
+        reference = self._reference(amplitude, failed, untouched)
+        self._fault = ""
+        seen = self._look(amplitude, status, failed, reference, untouched)
+        self._remember(seen, amplitude, failed, untouched)
+        known = np.isfinite(untouched.sigma) if untouched else np.ones(len(amplitude), dtype=bool)
+        states = self._states.copy()
+        lost = (self.member & ~known).sum(axis=1) >= MOSTLY * self.member.sum(axis=1)
+        states[(states == OK) & lost] = UNKNOWN
+        self._shown = states
+        at_fault = self.member[(states != OK) & (states != UNKNOWN)].any(axis=0)
+        wrong = self.member[(states != OK) & (states != UNKNOWN) & (states != DRIFTING)].any(axis=0)
+        live = ~failed & ~at_fault & known
         reasons = ["saturated"] if (status & STATUS_CLIPPED).any() else []
-        states = self._all_well.copy()
-        if z0 is not None:
-            for k in np.flatnonzero(self.self_sensing & (z0 > 0) & (amplitude < z0 / FAR)):
-                states[self._pattern[k, :2]] = SHORT
-            bad |= self.member[states == SHORT].any(axis=0)
-        left = bad & ~self.member[states == SHORT].any(axis=0)
-        while (
-            left.any()
-        ):  # the electrode that explains most failures first: its measurements do not count against the others
-            failed = (self.member & left).sum(axis=1) / np.maximum(1, (self.member & (left | ~bad)).sum(axis=1))
-            worst = int(failed.argmax())
-            if failed[worst] < MOSTLY or (self.member[worst] & left).sum() < 2:
-                break
+        reasons += [reason for state, reason in REASONS.items() if (states == state).any()]
+        bad = int((states != OK).sum())
+        usable = bad <= TOO_MANY and bool(live.sum() >= len(live) / 2)
+        if bad >= TOO_MANY:
+            reasons.append("degraded")
+        if not usable and not reasons:
+            reasons.append("out_of_distribution")
+        return Verdict(live, failed | wrong, states, reasons, usable)
+
+    def problems(self) -> list[str]:
+        """For a person: which electrodes, and what to do."""
+        if self._fault:
+            return [self._fault]
+        found = []
+        for state, text in ADVICE.items():
+            named = np.flatnonzero(self._shown == state).tolist()
+            if named:
+                found.append(text.format(_listed(named)) + " (electrodes are numbered from 0)")
+        return found
+
+    # one frame
+
+    def _look(
+        self,
+        amplitude: Array,
+        status: NDArray[np.uint8],
+        failed: Mask,
+        reference: Array | None,
+        untouched: Reference | None,
+    ) -> NDArray[np.uint8]:
+        """(E,) what this frame alone shows."""
+        states = np.zeros(self.electrodes, dtype=np.uint8)
+        no_current = ((status & STATUS_OPEN) != 0) | (failed & (status == 0))
+        low = np.zeros_like(failed)
+        if reference is not None:
+            known = ~failed & (reference > 0)
+            low = known & (amplitude < reference / FAR)
+            no_current |= known & (amplitude > FAR * reference)
+        failed |= low | no_current
+        if (low | no_current).mean() > NOTHING_ANSWERS:
+            states[:] = STUCK
+            self._fault = (
+                "no electrode answers: the multiplexers are not enabled, nothing is excited (power-cycle the board), "
+                "or the skin's cable is off"
+            )
+            return states
+        shorted = self._short(low & self.self_sensing)
+        if (
+            reference is not None
+            and self._predicted is not None
+            and self._miswired(amplitude, failed, low, shorted, reference, untouched, states)
+        ):
+            return states
+        states[shorted] = SHORT
+        self._open(failed & (low | no_current), failed, states)
+        if untouched is not None and not states.any():
+            live = ~failed & np.isfinite(untouched.sigma) & ~self.member[self._states != OK].any(axis=0)
+            d = np.where(live, (amplitude - untouched.z0) / untouched.normaliser, 0.0)
+            changed = self._drift(d, untouched.sigma, live)
+            if changed is not None:
+                states[changed] = DRIFTING
+        return states
+
+    def _short(self, low: Mask) -> list[int]:
+        """Electrodes all joined to each other, by their pairs that measure next to nothing."""
+        if not low.any():
+            return []
+        joined = sorted(set(self._pattern[low, :2].ravel().tolist()))
+        if low.sum() < len(joined) * (len(joined) - 1) / 2:
+            return []  # not each of them with each other: that is no short
+        return joined
+
+    def _miswired(
+        self,
+        amplitude: Array,
+        failed: Mask,
+        low: Mask,
+        shorted: list[int],
+        reference: Array,
+        untouched: Reference | None,
+        states: NDArray[np.uint8],
+    ) -> bool:
+        """Whether wires are exchanged or a multiplexer is stuck; sets `states`."""
+        if shorted:
+            return False
+        known = ~failed & (reference > 0)
+        noise = 6 * untouched.sigma if untouched else np.zeros(len(amplitude))
+        limit = FALLS if untouched else FALLS_UNTARED
+        fell = known & (amplitude < (1 - limit) * reference - np.where(known, noise, 0.0) * reference)
+        if fell.sum() < 2 and low.sum() < 2:
+            return False
+        fault = self._wiring(np.where(failed & ~low, np.nan, amplitude), reference)
+        if isinstance(fault, Exchanged):
+            states[fault.electrodes] = SWAPPED
+        elif isinstance(fault, StuckBit):
+            states[fault.electrodes] = STUCK
+            self._fault = (
+                f"an address bit of a multiplexer is stuck: bit {fault.bit} of drive{fault.side} or sense{fault.side} "
+                f"stays {fault.value}, so electrodes {_listed(fault.electrodes)} (numbered from 0) are never reached; "
+                "look at the board's address lines"
+            )
+        return fault is not None
+
+    def _open(self, left: Mask, failed: Mask, states: NDArray[np.uint8]) -> None:
+        """Sets `states`: the electrode that explains most failures first; its measurements do not count against the
+        others.
+        """
+        gone = self.member[states != OK].any(axis=0)
+        left = left & ~gone
+        while left.any():
+            whole = (self.member & (left | ~failed) & ~gone).sum(axis=1)
+            share = (self.member & left).sum(axis=1) / np.maximum(1, whole)
+            worst = int(share.argmax())
+            if share[worst] < MOSTLY or (self.member[worst] & left).sum() < 2:
+                return
             states[worst] = OPEN
-            left &= ~self.member[worst]
-            bad |= self.member[worst]
-        if (states == SHORT).any():
-            reasons.append("electrode_short")
-        if (states == OPEN).any():
-            reasons.append("electrode_open")
-        return ~bad, states, reasons
+            gone |= self.member[worst]
+            left &= ~gone
+
+    # over time
+
+    def _remember(self, seen: NDArray[np.uint8], amplitude: Array, failed: Mask, untouched: Reference | None) -> None:
+        """Faults at once, recovery after WELL_FRAMES."""
+        faulty = seen != OK
+        self._states[faulty] = seen[faulty]
+        self._well[faulty] = 0
+        ailing = (self._states != OK) & ~faulty
+        for k in np.flatnonzero(ailing):
+            self._well[k] = self._well[k] + 1 if self._is_well(int(k), amplitude, failed, untouched) else 0
+            if self._well[k] >= WELL_FRAMES:
+                self._states[k] = OK
+
+    def _is_well(self, k: int, amplitude: Array, failed: Mask, untouched: Reference | None) -> bool:
+        """An open wire or a short is seen directly; the others must measure what they did before, untouched."""
+        if self._states[k] not in (DRIFTING, SWAPPED) or untouched is None:
+            return True
+        rows = self.member[k] & ~failed & np.isfinite(untouched.sigma)
+        if not rows.any():
+            return True
+        off = np.abs(amplitude[rows] - untouched.z0[rows]) / untouched.normaliser[rows]
+        return bool((off <= WELL + 6 * untouched.sigma[rows]).mean() >= MOSTLY)
+
+    def _reference(self, amplitude: Array, failed: Mask, untouched: Reference | None) -> Array | None:
+        """|Z| that a well, untouched skin has: its baseline, else the bundle's prediction times the frame's gain."""
+        if self._predicted is None:
+            return None if untouched is None else untouched.z0
+        if untouched is not None:
+            lost = ~(untouched.z0 > 0)
+            gain = untouched.normaliser / self._predicted
+            return np.where(lost, self._predicted * np.where(np.isfinite(gain), gain, 1.0), untouched.z0)
+        if failed.all():
+            return self._predicted
+        return np.asarray(self._predicted * np.median(amplitude[~failed] / self._predicted[~failed]))
+
+    # state
+
+    def state(self) -> dict[str, Any]:
+        return {"states": self._states.copy(), "well": self._well.copy()}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Raises ValueError where it is of other electrodes."""
+        states, well = np.array(state["states"], dtype=np.uint8), np.array(state["well"], dtype=np.int64)
+        if states.shape != self._states.shape or well.shape != self._well.shape:
+            raise ValueError(f"the saved health is of {states.size} electrodes, expected {self.electrodes}")
+        self.reset()
+        self._states, self._well = states, well
+
+
+def _listed(numbers: Iterable[int]) -> str:
+    texts = [str(n) for n in numbers]
+    return texts[0] if len(texts) == 1 else ", ".join(texts[:-1]) + " and " + texts[-1]

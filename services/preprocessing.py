@@ -21,7 +21,7 @@ from models.prereconstruction import Drift, Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
 from services.config import Skin
 from services.describe import describe
-from services.electrodes import ElectrodeHealth
+from services.electrodes import ElectrodeHealth, Reference, Verdict
 from services.plausibility import impossible
 from services.stage import Health, Refused, Stage, add_reason, inherited
 from services.tare import Baseline
@@ -31,7 +31,6 @@ from services.untouched import Untouched
 Array = NDArray[np.float64]
 
 DRIFT = Drift(scale=5e-5, contact=2e-4)  # what is allowed for since the last untouched frame
-TOO_MANY_DEAD = 2  # electrodes with which contacts can still be given
 OPERATORS = 8  # sets of live measurements whose operator is kept
 
 
@@ -47,7 +46,7 @@ class Preprocessing(Stage):
     def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
         super().__init__(name)
         self.config, self.bundle = skin, bundle
-        self.electrodes = ElectrodeHealth(bundle.pattern)
+        self.electrodes = ElectrodeHealth(bundle)
         self.untouched = Untouched(bundle, skin.tare)
         self.pre = self.untouched.pre
         self.hold = Hold()
@@ -60,6 +59,7 @@ class Preprocessing(Stage):
         self._counters = {"frames": 0, "touched": 0, "reconstructed": 0, "held": 0, "foreign": 0}
         self._foreign = ""
         self.hold.reset()
+        self.electrodes.reset()
         self.untouched.reset()
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
@@ -73,10 +73,12 @@ class Preprocessing(Stage):
         self.untouched.follow(frame)
         amplitude = np.abs(frame.z.astype(np.complex128))
         known = self.untouched.baseline
-        live, out.electrodes, reasons = self.electrodes(amplitude, frame.status, known.z0 if known else None)
-        for reason in reasons:
+        reference = Reference(known.z0, self.untouched.normaliser, self.untouched.sigma) if known else None
+        found = self.electrodes(amplitude, frame.status, reference)
+        out.electrodes = found.states
+        for reason in found.reasons:
             add_reason(out.reasons, reason)
-        amplitude[~live] = np.nan
+        amplitude[found.failed] = np.nan
         if self.untouched.offer(amplitude, frame):
             self._begin_anew()
         if self.untouched.baseline is None:
@@ -84,15 +86,14 @@ class Preprocessing(Stage):
         if self.untouched.baseline.doubt:
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
-        return [self._compare(out, amplitude, live)]
+        return [self._compare(out, amplitude, found)]
 
-    def _compare(self, out: DeltaFrame, amplitude: Array, live: NDArray[np.bool_]) -> DeltaFrame:
+    def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict) -> DeltaFrame:
         """Difference, decision, and the stack where one is needed."""
         measured = np.isfinite(self.untouched.sigma)
-        live &= measured
-        if (out.electrodes != 0).sum() > TOO_MANY_DEAD or live.sum() < len(live) / 2:
+        live = found.live & measured
+        if not found.usable or live.sum() < len(live) / 2:
             out.valid = False
-            add_reason(out.reasons, "electrode_open")
             live = measured & np.isfinite(amplitude) if np.isfinite(amplitude).sum() > len(live) / 2 else measured
             amplitude = np.where(np.isfinite(amplitude), amplitude, self.untouched.baseline.z0)  # type: ignore[union-attr]
         operator, decision = self._operator(live)
@@ -153,6 +154,7 @@ class Preprocessing(Stage):
 
     def _begin_anew(self) -> None:
         """There is another baseline."""
+        self.electrodes.tared()
         self._touched = False
         self.hold.reset()
 
@@ -170,7 +172,12 @@ class Preprocessing(Stage):
         return {"frames": baseline.frames, "snr_db": -20 * np.log10(max(relative, 1e-12)), "hash": baseline.hash}
 
     def state(self) -> dict[str, Any]:
-        return {"touched": self._touched, "hold": self.hold.state(), **self.untouched.state()}
+        return {
+            "touched": self._touched,
+            "hold": self.hold.state(),
+            "electrodes": self.electrodes.state(),
+            **self.untouched.state(),
+        }
 
     def load(self, state: dict[str, Any]) -> None:
         self.untouched.load(state)
@@ -180,6 +187,8 @@ class Preprocessing(Stage):
                 raise Refused(f"the saved hold is of shape {np.shape(rows)}, expected ({k},): reset")
         self._touched = bool(state["touched"])
         self.hold.load(state["hold"])
+        if "electrodes" in state:  # older recordings have none
+            self.electrodes.load(state["electrodes"])
 
     def saved(self) -> dict[str, Any] | None:
         return self.untouched.saved()
@@ -204,7 +213,8 @@ class Preprocessing(Stage):
         problem = self._foreign or self.untouched.problem
         if not problem and self.untouched.baseline is None:
             problem = self.untouched.progress()
-        return Health("WARN" if problem else "OK", [problem] if problem else [], dict(self._counters))
+        problems = [*([problem] if problem else []), *self.electrodes.problems()]
+        return Health("WARN" if problems else "OK", problems, dict(self._counters))
 
 
 def _unusable(out: DeltaFrame, reason: str, measurements: int) -> DeltaFrame:

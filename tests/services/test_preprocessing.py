@@ -167,7 +167,8 @@ def test_a_dead_electrode_is_left_out(stage: Preprocessing, board: Board, bundle
     assert out.reasons == ["electrode_open"]
     assert list(np.flatnonzero(out.electrodes)) == [5]
     assert not np.isfinite(out.sigma[uses]).any() and np.isfinite(out.sigma[~uses]).all()
-    assert not run(stage, board.frame()).electrodes.any()
+    after = [run(stage, board.frame()).electrodes.any() for _ in range(4)]
+    assert after == [True, True, False, False]  # no flapping
 
 
 @pytest.mark.parametrize("reasons", [[], ["clock"], ["gap", "clock"]])
@@ -192,7 +193,7 @@ def test_a_short_between_two_electrodes_is_named(stage: Preprocessing, board: Bo
     frame = board.frame(board.disc(0.0, 0.0, 0.2, 0.3))
     frame.z[(bundle.pattern[:, 0] == 2) & (bundle.pattern[:, 1] == 3)] = 1e-3
     out = run(stage, frame)
-    assert out.valid and out.touched and out.reasons == ["electrode_short"]
+    assert out.valid and out.touched and out.reasons == ["electrode_short", "degraded"]
     assert list(np.flatnonzero(out.electrodes == 2)) == [2, 3]
     uses = np.isin(bundle.pattern, (2, 3)).any(axis=1)
     assert not np.isfinite(out.sigma[uses]).any() and np.isfinite(out.sigma[~uses]).all()
