@@ -171,6 +171,9 @@ class ImageFrame(Frame):
     residual: float | None = wire(
         Maybe(Float(0)), "share of the measured change that the image does not explain, or nil", None
     )
+    noise: float | None = wire(
+        Maybe(Float(0)), "rms `sigma` of the delta frame that the image was made of (relative), or nil", None
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -263,7 +266,9 @@ INFO_KEYS = {
     "baseline": "array (K,): |Z0|",
     "baseline_sigma": "array (K,): standard deviation of the frames that the baseline was taken from",
     "baseline_hash": "sha256 of the baseline's bytes",
+    "tare_sample_ns": "stamp `sample` of the newest frame of the tare, or what it would be by this host's clock",
     "tare_age_s": "seconds since the tare when this frame was made",
+    "tare": "map: taken_by (start, command, file), restored (by a later process), frames, board, bundle_hash, doubt",
     "state": "map: the stages' temporal state, for lossless replay",
 }
 """Keys in use in InfoFrame.info; a process leaves out what it does not know and may add others."""

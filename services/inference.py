@@ -15,7 +15,8 @@ from models.bundle import Bundle
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, ImageFrame
 from services.config import Skin
-from services.stage import Health, Refused, Stage, inherited
+from services.quality import REFUSED, Residual
+from services.stage import Health, Refused, Stage, add_reason, inherited
 
 WARM_UP_RUNS = 5
 FEWEST_SIGMA = 2  # finite measurements without which there is nothing to reconstruct
@@ -33,6 +34,9 @@ class Inference(Stage):
         self.config, self.bundle = skin, bundle
         path = None if skin.network == "none" else bundle.network_path(skin.network) or bundle.network_path("full")
         self._network = Network(str(path)) if path else OneStep(bundle)
+        # Only a network's image is meant to explain a frame: a one-step image shows where, not how much.
+        self._refuses = isinstance(self._network, Network)
+        self._residual = Residual(bundle, to_scale=self._refuses)
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
@@ -42,7 +46,7 @@ class Inference(Stage):
         self._last: ImageFrame | None = None  # of the touch that is being held
         self._last_scan = 0  # of the frame that it was reconstructed from
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
-        self._counters = {"networks_run": 0, "held": 0, "untouched": 0, "unwanted": 0, "missed": 0}
+        self._counters = {"networks_run": 0, "held": 0, "untouched": 0, "unwanted": 0, "missed": 0, "refused": 0}
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, DeltaFrame)
@@ -65,16 +69,28 @@ class Inference(Stage):
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
         out.image, out.sigma, out.classes = self._network.run(frame)
+        out.noise = _rms(frame.sigma)
+        out.residual = self._residual(frame.difference, frame.sigma, out.image)
+        self._judge(out)
         self._counters["networks_run"] += 1
         self._last, self._unseen = out, None
         self._last_scan = frame.scan
+
+    def _judge(self, out: ImageFrame) -> None:
+        """An image that does not explain the measurements is of no touch."""
+        if self._refuses and out.touched and out.residual is not None and out.residual > REFUSED:
+            out.valid = False
+            add_reason(out.reasons, "out_of_distribution")
+            self._counters["refused"] += 1
 
     def _hold(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """The image of the frame last reconstructed, if we have seen that one."""
         last = self._last
         if last is not None and self._last_scan == frame.reconstructed:
             out.held = True
-            out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
+            out.image, out.sigma, out.classes, out.noise = last.image, last.sigma, last.classes, last.noise
+            out.residual = last.residual
+            self._judge(out)
             self._counters["held"] += 1
         else:  # skipped, or before we started: not valid until the next reconstruction, at most 16 frames on
             out.valid = False
@@ -85,7 +101,9 @@ class Inference(Stage):
         last = self._last
         if last is None:
             return {"last": None}
-        return {"last": {"scan": self._last_scan, "image": last.image, "sigma": last.sigma, "classes": last.classes}}
+        kept = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
+        kept["residual"] = last.residual
+        return {"last": {"scan": self._last_scan, **kept}}
 
     def load(self, state: dict[str, Any]) -> None:
         self.reset()
@@ -94,7 +112,8 @@ class Inference(Stage):
             return
         try:
             self._last = ImageFrame(skin=self.skin, image=last["image"], sigma=last["sigma"], classes=last["classes"])
-            self._last_scan = int(last["scan"])
+            self._last.noise, self._last_scan = last.get("noise"), int(last["scan"])
+            self._last.residual = last.get("residual")
         except (KeyError, TypeError) as wrong:
             raise Refused(f"no image in the saved state ({wrong})") from None
 
@@ -143,6 +162,12 @@ class OneStep:
             self._operator = self.pre.condition(sigma, weights=live.astype(float))
             self._sigma = sigma.tobytes()
         return np.asarray(self._operator.one_step(frame.difference, self.n), np.float32), *empty
+
+
+def _rms(sigma: NDArray[np.float32]) -> float | None:
+    """Of what is finite; None where nothing is."""
+    finite = sigma[np.isfinite(sigma)].astype(float)
+    return float(np.sqrt((finite**2).mean())) if finite.size else None
 
 
 def softmax(logits: NDArray[np.float32]) -> NDArray[np.float32]:

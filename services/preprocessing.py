@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from models.prereconstruction import Drift, Operator
+from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
 from services.config import Skin
 from services.describe import describe
 from services.electrodes import ElectrodeHealth, Reference, Verdict
+from services.judging import Judge, Judgement, Noise
 from services.plausibility import impossible
 from services.stage import Health, Refused, Stage, add_reason, inherited
 from services.tare import Baseline
@@ -29,9 +30,6 @@ from services.touch import Hold, TouchDecision
 from services.untouched import Untouched
 
 Array = NDArray[np.float64]
-
-DRIFT = Drift(scale=5e-5, contact=2e-4)  # what is allowed for since the last untouched frame
-OPERATORS = 8  # sets of live measurements whose operator is kept
 
 
 class Preprocessing(Stage):
@@ -49,9 +47,9 @@ class Preprocessing(Stage):
         self.electrodes = ElectrodeHealth(bundle)
         self.untouched = Untouched(bundle, skin.tare)
         self.pre = self.untouched.pre
+        self.judge = Judge(self.pre, skin)
         self.hold = Hold()
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
-        self._operators: dict[tuple[bytes, bytes, int], tuple[Operator, TouchDecision]] = {}
         self.reset()
 
     def reset(self) -> None:
@@ -60,6 +58,7 @@ class Preprocessing(Stage):
         self._foreign = ""
         self.hold.reset()
         self.electrodes.reset()
+        self.judge.reset()
         self.untouched.reset()
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
@@ -96,7 +95,6 @@ class Preprocessing(Stage):
             out.valid = False
             live = measured & np.isfinite(amplitude) if np.isfinite(amplitude).sum() > len(live) / 2 else measured
             amplitude = np.where(np.isfinite(amplitude), amplitude, self.untouched.baseline.z0)  # type: ignore[union-attr]
-        operator, decision = self._operator(live)
         d = self.untouched.difference(amplitude, live)
         # Of a measured bundle it is not known which way its material goes.
         if self.bundle.matrices.normalisation == "model" and impossible(
@@ -104,19 +102,38 @@ class Preprocessing(Stage):
         ):
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
-        self._touched, out.score, out.threshold = decision(d, self._touched)
-        out.touched = self._touched
+        d, found_now = self._decide(d, amplitude, live, out.stamps.get("sample", 0))
+        out.touched, out.score, out.threshold = self._touched, found_now.score, found_now.threshold
         out.difference = d.astype(np.float32)
         out.sigma = np.where(live, self.untouched.sigma, np.inf).astype(np.float32)
         if self._touched:
-            self.untouched.touched()
             self._counters["touched"] += 1
         else:
             self.hold.reset()
             self.untouched.untouched(amplitude, live, out.stamps.get("sample", 0))
         if self._touched or self.always_reconstruct or not self.config.touch.skip_untouched:
-            self._reconstruct(out, d, operator, decision)
+            self._reconstruct(out, d, found_now.operator, found_now.decision)
         return out
+
+    def _decide(self, d: Array, amplitude: Array, live: NDArray[np.bool_], now_ns: int) -> tuple[Array, Judgement]:
+        """Touched or not, and the difference, which a touch that begins has against an older baseline."""
+        noise, step = self._noise(), self.judge.step
+        found = self.judge(d, live, noise, self.untouched.since_s(now_ns), now_ns, self._touched)
+        if found.touched and not self._touched:
+            self.untouched.touched()
+            d = self.untouched.difference(amplitude, live)
+            found = self.judge.begin(d, live, noise, self.untouched.since_s(now_ns), now_ns)
+        elif self.judge.step != step:
+            self.hold.reset()  # the same frames make another image now
+        self._touched = found.touched
+        return d, found
+
+    def _noise(self) -> Noise:
+        assert self.untouched.baseline is not None
+        return Noise(self.untouched.sigma, self.untouched.baseline.frames)
+
+    def prepare(self) -> bool:
+        return self.untouched.baseline is not None and self.judge.prepare(self._noise())
 
     def _reconstruct(self, out: DeltaFrame, d: Array, operator: Operator, decision: TouchDecision) -> None:
         if self._touched and self.config.touch.hold and not self.always_reconstruct:
@@ -128,21 +145,10 @@ class Preprocessing(Stage):
                 return
             d = mean
             out.difference = d.astype(np.float32)
+            out.sigma = (out.sigma / np.sqrt(self.hold.averaged)).astype(np.float32)
         out.reconstructed = out.scan
         out.stack, out.context, out.scale = operator.stack(d)
         self._counters["reconstructed"] += 1
-
-    def _operator(self, live: NDArray[np.bool_]) -> tuple[Operator, TouchDecision]:
-        """RM and the touch decision for these measurements and this noise: made once, then kept."""
-        assert self.untouched.baseline is not None
-        frames, sigma = self.untouched.baseline.frames, self.untouched.sigma
-        key = live.tobytes(), sigma.astype(np.float32).tobytes(), frames
-        if key not in self._operators:
-            if len(self._operators) >= OPERATORS:
-                self._operators.pop(next(iter(self._operators)))
-            operator = self.pre.condition(sigma, drift=DRIFT, weights=live.astype(float), tare_frames=frames)
-            self._operators[key] = operator, TouchDecision(operator, self.config.touch.false_alarms, frames)
-        return self._operators[key]
 
     def _no_scan(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
         """A frame that cannot be compared with the baseline: a sentinel's short list, or another skin's."""
@@ -155,12 +161,13 @@ class Preprocessing(Stage):
     def _begin_anew(self) -> None:
         """There is another baseline."""
         self.electrodes.tared()
+        self.judge.reset()
         self._touched = False
         self.hold.reset()
 
-    def set_baseline(self, baseline: Baseline) -> None:
-        """Use this baseline from the next frame on."""
-        self.untouched.set_baseline(baseline)
+    def set_baseline(self, baseline: Baseline, age_s: float = 0.0) -> None:
+        """Use this baseline, which is age_s older than the next frame, from that frame on."""
+        self.untouched.set_baseline(baseline, age_s=age_s)
         self._begin_anew()
 
     def command(self, name: str, args: dict[str, Any]) -> dict[str, Any]:
@@ -176,6 +183,7 @@ class Preprocessing(Stage):
             "touched": self._touched,
             "hold": self.hold.state(),
             "electrodes": self.electrodes.state(),
+            "judge": self.judge.state(),
             **self.untouched.state(),
         }
 
@@ -187,6 +195,12 @@ class Preprocessing(Stage):
                 raise Refused(f"the saved hold is of shape {np.shape(rows)}, expected ({k},): reset")
         self._touched = bool(state["touched"])
         self.hold.load(state["hold"])
+        self.judge.reset()
+        if "judge" in state:  # older recordings have none
+            try:
+                self.judge.load(state["judge"])
+            except (KeyError, TypeError, ValueError) as wrong:
+                raise Refused(f"the saved decision on drift does not fit ({wrong}): reset") from None
         if "electrodes" in state:  # older recordings have none
             self.electrodes.load(state["electrodes"])
 
@@ -198,7 +212,7 @@ class Preprocessing(Stage):
 
     def warm_up(self) -> None:
         if self.untouched.baseline is not None:
-            operator, decision = self._operator(np.isfinite(self.untouched.sigma))
+            operator, decision = self.judge.operator(np.isfinite(self.untouched.sigma), self._noise(), 0)
             nothing = np.zeros(len(self.bundle.pattern))
             operator.stack(nothing)
             decision(nothing, False)

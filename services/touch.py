@@ -49,7 +49,7 @@ class Hold:
 
     def reset(self) -> None:
         self._reference: Array | None = None  # the difference last reconstructed
-        self._averaged = 0  # frames in it
+        self.averaged = 0  # frames in it
         self._recent: deque[Array] = deque(maxlen=LONGEST_MEAN)
         self._count = 0  # frames since the last change
         self.scan = 0  # of the frame last reconstructed
@@ -57,7 +57,7 @@ class Hold:
     def __call__(self, d: Array, scan: int, decision: TouchDecision) -> Array | None:
         """The difference (K,) to reconstruct now, or None to hold."""
         if self._reference is not None:
-            variance = 1 + 1 / self._averaged  # of the change, in units of one frame's
+            variance = 1 + 1 / self.averaged  # of the change, in units of one frame's
             if decision.operator.score(d - self._reference) > variance * decision.changed:
                 self._recent.clear()
                 self._count = 0
@@ -66,14 +66,14 @@ class Hold:
         if self._reference is not None and not _due(self._count):
             return None
         self._reference = np.mean(self._recent, axis=0)
-        self._averaged = len(self._recent)
+        self.averaged = len(self._recent)
         self.scan = scan
         return self._reference
 
     def state(self) -> dict[str, Any]:
         return {
             "reference": self._reference,
-            "averaged": self._averaged,
+            "averaged": self.averaged,
             "recent": np.array(self._recent),
             "count": self._count,
             "scan": self.scan,
@@ -83,7 +83,7 @@ class Hold:
         self.reset()
         reference = state["reference"]
         self._reference = None if reference is None else np.array(reference, dtype=float)
-        self._averaged, self._count, self.scan = int(state["averaged"]), int(state["count"]), int(state["scan"])
+        self.averaged, self._count, self.scan = int(state["averaged"]), int(state["count"]), int(state["scan"])
         self._recent.extend(np.array(state["recent"], dtype=float))
 
 
