@@ -88,7 +88,7 @@ def rows(recorded: Recorded, seen: Sequence[Seen]) -> list[dict[str, Any]]:
                 "named": _first(event.named(s) for s in during),
                 "named_%": 100 * sum(event.named(s) for s in during) / len(during),
                 "marked": _first(event.marked(s) for s in during),
-                "well_again": _first(not any(s.electrodes) and s.valid for s in after),
+                "well_again": _first(s.valid and not any(s.electrodes) for s in after),
                 "others_named_frames": sum(any(s.electrodes[e] != OK for e in others) for s in during),
                 "valid_%": 100 * sum(s.valid for s in during) / len(during),
                 "electrodes_said": _said(during),

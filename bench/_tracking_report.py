@@ -46,6 +46,7 @@ FAULTS = (
     ("valid %", "valid_%", "{:.0f}"),
 )
 NAMED_WITHIN = 3  # frames
+KEPT_NOTES = 100  # in the report
 
 
 def targets(found: dict[str, Any]) -> list[dict[str, Any]]:
@@ -107,7 +108,7 @@ def show(head: dict[str, Any], found: dict[str, Any], notes: bool) -> None:
 def write(folder: Path, head: dict[str, Any], found: dict[str, Any]) -> None:
     """tracking.json in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    content = strict({**head, "targets": targets(found), **found})
+    content = strict({**head, "targets": targets(found), **found, "notes": found["notes"][:KEPT_NOTES]})
     (folder / "tracking.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
     print(f"wrote {folder / 'tracking.json'}")
 

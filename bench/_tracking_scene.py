@@ -36,6 +36,7 @@ MADE_BY = (
     *(f"models/{n}.py" for n in ("elements", "forward", "geometry", "meshing", "patterns", "shapes")),
     "services/clock.py",
 )
+KEPT = 6  # recorded scenes
 READ_LATE_S = 0.002  # a scheduler's doing
 CONTACT_CHANGED = 0.05  # of its impedance within a second: a contact that drifts, not one that ages
 ELECTRODE_FAULTS = ("electrode_open", "electrodes_shorted", "electrodes_swapped", "mux_stuck", "mux_disabled")
@@ -96,6 +97,8 @@ def record(name: str, snr_db: float, seed: int, seconds: float | None = None) ->
     began = time.perf_counter()
     found = simulate(name, snr_db, seed, seconds)
     WORK.mkdir(parents=True, exist_ok=True)
+    for old in sorted(WORK.glob("tracking-*.npz"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
+        old.unlink()
     np.savez_compressed(path, **{f.name: getattr(found, f.name) for f in fields(Recorded)})
     return found, time.perf_counter() - began
 
@@ -144,7 +147,8 @@ class _Host:
 
     def recorded(self, script: Script) -> Recorded:
         felt = [self._felt[frame.scan] for frame in self._frames]
-        faults = [dict(in_force) | _drifting(script, start) for start, _, _, in_force in felt]
+        drifting = _drifting(script, [start for start, *_ in felt])
+        faults = [in_force | drifts for (*_, in_force), drifts in zip(felt, drifting, strict=True)]
         rows = [row for k, (start, _, world, _) in enumerate(felt) for row in self._touches(script, k, start, world)]
         names = [([name for t, name in script.sections if t <= middle] or [""])[-1] for _, middle, _, _ in felt]
         column = lambda of: np.array([of(frame) for frame in self._frames])  # noqa: E731
@@ -175,13 +179,18 @@ class _Host:
         return rows
 
 
-def _drifting(script: Script, t: float) -> dict[str, object]:
-    """A contact that changes fast is a fault too."""
+def _drifting(script: Script, starts: list[float]) -> list[dict[str, object]]:
+    """A contact whose impedance changes fast is a fault too, until it is what it was: for each scan."""
+    found: list[dict[str, object]] = [{} for _ in starts]
     for electrode, curve in script.contact:
-        now, before = curve.value(t, t), curve.value(max(0.0, t - 1), max(0.0, t - 1))
-        if electrode is not None and abs(now / before - 1) > CONTACT_CHANGED:
-            return {"contact_drifts": {"electrode": electrode}}
-    return {}
+        well, drifts = 0.0, False  # when it was last known to be right
+        for fault, t in zip(found, starts, strict=True):
+            drifted, drifts = drifts, abs(curve.value(t, t) / curve.value(well, well) - 1) > CONTACT_CHANGED
+            if not drifts:
+                well = t if drifted else max(well, t - 1)
+            elif electrode is not None:
+                fault["contact_drifts"] = {"electrode": electrode}
+    return found
 
 
 def _key(name: str, snr_db: float, seed: int, seconds: float | None) -> str:

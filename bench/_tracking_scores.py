@@ -50,7 +50,7 @@ class Tally:
     valid: int = 0
     wrong: int = 0  # valid frames that say something wrong for more than a moment
     touches: int = 0
-    unseen: int = 0  # touches never matched
+    unseen: int = 0  # touches never matched, although frames were valid
     switches: int = 0
     false_touches: int = 0
     present: int = 0  # true touches in all frames, from LIGHT_N on
@@ -61,7 +61,7 @@ class Tally:
     force: list[float] = field(default_factory=list)  # relative errors
     steady: list[float] = field(default_factory=list)  # those of settled, unchanging forces
     sigmas: list[float] = field(default_factory=list)  # steady errors in standard uncertainties
-    begin: list[int] = field(default_factory=list)  # frames from LIGHT_N until matched
+    begin: list[int] = field(default_factory=list)  # valid frames from LIGHT_N until matched
     end: list[int] = field(default_factory=list)  # frames a contact outlasts its touch
 
     def row(self) -> dict[str, Any]:
@@ -113,8 +113,9 @@ class _Touch:
     last: int = 0  # frame in which it was there
     force: float = 0.0
     id: int | None = None  # contact it was last matched with
-    matched: int | None = None  # first frame
-    missing: int = 0  # frames in a row
+    matched: bool = False  # ever
+    waited: int = 0  # valid frames with LIGHT_N until then
+    missing: int = 0  # valid frames in a row
 
 
 class Scorer:
@@ -146,6 +147,7 @@ class Scorer:
         for n in loaded:
             touch = self._touches[n]
             touch.missing = 0 if n in pairs else touch.missing + 1
+            touch.waited += not touch.matched
             tally.missed += n not in pairs
             wrong.append(touch.missing > SETTLED)
         wrong += [self._extra(k, section, tally, c) for i, c in enumerate(seen.contacts) if i not in pairs.values()]
@@ -157,9 +159,9 @@ class Scorer:
     def finish(self) -> None:
         """After the last frame."""
         for touch in self._touches.values():
-            if touch.loaded is not None and touch.matched is None:
+            if not touch.matched and touch.waited >= SETTLED:
                 self.tallies[touch.section].unseen += 1
-                self.notes.append((touch.first, touch.section, "touch never seen in a valid frame"))
+                self.notes.append((touch.first, touch.section, "touch never seen"))
 
     def _begin(self, k: int, section: str, truth: dict[int, dict[str, float]]) -> set[int]:
         """Keep the book of true touches; those that are settled and press steadily."""
@@ -181,10 +183,9 @@ class Scorer:
         """A touch and its contact; whether the contact is wrong."""
         contact_id, x, y, force, sigma = contact
         touch = self._touches[int(t["track"])]
-        if touch.matched is None:
-            touch.matched = k
-            if touch.loaded is not None:
-                tally.begin.append(k - touch.loaded)
+        if not touch.matched:
+            touch.matched = True
+            tally.begin.append(touch.waited)
         if touch.id is not None and touch.id != contact_id:
             tally.switches += 1
             self.notes.append((k, touch.section, f"id switch: {touch.id} becomes {contact_id}"))

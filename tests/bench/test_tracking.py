@@ -9,8 +9,9 @@ import pytest
 from bench import _tracking_faults as faults
 from bench import _tracking_report as report
 from bench import tracking
-from bench._tracking_scene import TOUCHES, Recorded, simulate
+from bench._tracking_scene import TOUCHES, Recorded, _drifting, simulate
 from bench._tracking_scores import GRACE, LIGHT_N, Scorer, Seen, all_of
+from firmware_stub.timeline import Curve, Script
 from protocol.frames import ELECTRODE_STATES
 from services.config import Skin
 
@@ -116,7 +117,12 @@ def test_an_invalid_frame_is_not_scored_but_not_available_either():
     seen = [replace(s, valid=False, contacts=((5, 0.04, 0.04, 9.0, 1.0),)) for s in perfect(crossing())]
     row = scored(crossing(), seen)
     assert row["false_touches"] == 0 and row["valid_%"] == 0
-    assert row["available_%"] == 0 and row["unseen"] == 2 and row["position_%"] is None
+    assert row["available_%"] == 0 and row["unseen"] == 0 and row["position_%"] is None
+
+
+def test_touches_that_valid_frames_never_show_are_unseen():
+    row = scored(crossing(), changed(perfect(crossing()), 0, N, lambda cs: []))
+    assert row["unseen"] == 2 and row["seen_%"] == 0 and row["wrong_%"] > 50
 
 
 def test_ramps_are_no_steady_forces_and_a_light_touch_need_not_be_seen():
@@ -212,3 +218,13 @@ def test_the_command_prints_tables_and_writes_strict_json(short, monkeypatch, tm
     assert "position error, median" in printed and "electrode_open" in printed
     content = json.loads((tmp_path / "tracking.json").read_text())
     assert content["sections"]["press"]["touches"] == 1 and len(content["targets"]) == 6
+
+
+def test_a_contact_drifts_from_its_fast_change_until_it_is_what_it_was():
+    ageing, loose = Curve((0.0, 60.0), (1.0, 1.2)), Curve((10.0, 12.0, 20.0, 21.0), (1.0, 1.5, 1.5, 1.0))
+    script = Script("drift", contact=((3, ageing), (9, loose)))
+    times = [k / 20 for k in range(20 * 30)]
+    on = [t for t, fault in zip(times, _drifting(script, times), strict=True) if fault]
+    assert on[0] == pytest.approx(10.25, abs=0.1) and on[-1] == pytest.approx(20.9, abs=0.1)
+    assert len(on) == round((on[-1] - on[0]) * 20) + 1
+    assert _drifting(script, [15.0, 15.05]) == [{}, {}]  # nobody saw it change
