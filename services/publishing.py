@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,15 @@ from models.bundle import Bundle
 from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame
 from services.config import Skin
 from services.force import ForceLaw
+from services.motion import Seen, Track
 from services.outline import outline
-from services.segmentation import Segment, segment
+from services.segmentation import Segment, readable, segment
 from services.stage import Health, Stage, add_reason, inherited
-from services.tracking import Track, Tracker
+from services.tracking import Tracker
 
+EXPLAINED = 0.9  # quality from which an image counts although its peak is beyond the sheet's or the law's
 UNKNOWN_BELOW = 0.4  # probability of the best class below which a shape is "unknown"
+LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 
 class Publishing(Stage):
@@ -37,14 +41,19 @@ class Publishing(Stage):
 
     def reset(self) -> None:
         self.tracker.reset()
-        self._contacts: list[Contact] = []
-        self._segments: list[Segment] = []
-        self._classes: list[list[float]] = []
-        self._geometry = (0.0, [0.0, 0.0])  # metres per pixel, origin of the segments' image
-        self._counters = {"frames": 0, "contacts": 0}
+        self._forget()
+        self._counters = {"frames": 0, "contacts": 0, "unknown": 0}
 
     def new_session(self) -> None:
         self.tracker = Tracker()
+
+    def _forget(self) -> None:
+        """Nothing is known of what touches."""
+        self._known = False
+        self._contacts: list[Contact] = []  # of the frame made last, strongest first; those that ended come last
+        self._segments: list[Segment] = []  # of the contacts that did not end, in their order
+        self._classes: list[list[float]] = []
+        self._geometry = (0.0, [0.0, 0.0])  # metres per pixel, origin of the segments' image
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, ImageFrame)
@@ -52,15 +61,22 @@ class Publishing(Stage):
         out = ContactFrame(**inherited(frame), frame_id=self.config.frame_id, force_calibrated=self.law.calibrated)
         if self.law.newtons_per_siemens is None:
             add_reason(out.reasons, "uncalibrated_force")
-        if frame.held:
+        if frame.held and self._known:
             self._keep(frame)
             out.held = True
+        elif not frame.image.size and (frame.touched or not frame.valid):
+            self._miss(out, "gap")
+        elif not _sound(frame):
+            self._miss(out, "non_finite")
         else:
             self._see(frame)
-        out.contacts = self._contacts
+        out.contacts = list(self._contacts)
         if any((c.force_n or 0.0) > self.law.most_n for c in out.contacts):
             add_reason(out.reasons, "extrapolated")
-        if any(self.law.impossible(s.peak) for s in self._segments):
+        if frame.touched and frame.residual is not None:
+            out.quality = max(0.0, 1.0 - frame.residual)
+        explained = out.quality is not None and out.quality >= EXPLAINED
+        if any(self.law.impossible(s.peak) for s in self._segments) and not explained:
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
         frames: list[Frame] = [out]
@@ -72,42 +88,56 @@ class Publishing(Stage):
 
     def _see(self, frame: ImageFrame) -> None:
         """Contacts of a new image."""
-        segments = segment(frame.image, frame.sigma) if frame.image.size and frame.touched else []
-        m = frame.metres_per_pixel
-        places = [(frame.origin[0] + (s.x + 0.5) * m, frame.origin[1] + (s.y + 0.5) * m) for s in segments]
-        tracks, ended = self.tracker.update(places, frame.stamps.get("sample", 0))
-        self._segments, self._geometry = segments, (m, frame.origin)
-        self._classes = [_class_probabilities(s, frame.classes) for s in segments]
-        now = [self._contact(t, s, p, m) for t, s, p in zip(tracks, segments, self._classes, strict=True)]
-        self._contacts = now + [_ended(track) for track in ended]
+        m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
+        segments: list[Segment] = []
+        if frame.touched and frame.image.size:
+            expected = [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in self.tracker.expected(now)]
+            segments = segment(frame.image, frame.sigma, expected)
+        seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
+        tracks, ended = self.tracker.update(seen, now)
+        classes = [_class_probabilities(s, frame.classes) for s in segments]
+        self._segments, self._classes, self._geometry, self._known = segments, classes, (m, [x0, y0]), True
+        present = [self._contact(*each, m) for each in zip(tracks, seen, segments, classes, strict=True)]
+        self._contacts = present + self._ends(ended)
         self._counters["contacts"] += sum(track.age == 1 for track in tracks)
 
     def _keep(self, frame: ImageFrame) -> None:
         """The same contacts a frame later."""
-        kept = [c for c in self._contacts if c.state != "end"]
-        self.tracker.update([(c.position[0], c.position[1]) for c in kept], frame.stamps.get("sample", 0))
-        for contact in kept:
-            contact.state = "hold"
-            contact.velocity = [0.0, 0.0, 0.0]
-        self._contacts = kept
+        ended = self.tracker.still(frame.stamps.get("sample", 0))
+        present = [c for c in self._contacts if c.state != "end"]
+        self._contacts = [replace(c, state="hold", velocity=[0.0, 0.0, 0.0]) for c in present] + self._ends(ended)
 
-    def _contact(self, track: Track, s: Segment, classes: list[float], metres_per_pixel: float) -> Contact:
+    def _miss(self, out: ContactFrame, reason: str) -> None:
+        """A frame that says nothing of what touches: not even that a contact ended."""
+        out.valid = False
+        if not out.reasons:
+            add_reason(out.reasons, reason)
+        self._forget()
+        self._counters["unknown"] += 1
+
+    def _contact(self, track: Track, seen: Seen, s: Segment, classes: list[float], metres_per_pixel: float) -> Contact:
         force, sigma = self.law.force(s.peak, s.peak_sigma)
         best = int(np.argmax(classes)) if classes else -1
         known = bool(classes) and classes[best] >= UNKNOWN_BELOW
         return Contact(
             id=track.id,
             state="begin" if track.age == 1 else "hold",
-            position=[track.x, track.y, 0.0],
+            position=[seen.x, seen.y, 0.0],
             velocity=[track.vx, track.vy, 0.0],
+            orientation=s.orientation,
             area_m2=s.area * metres_per_pixel**2,
             force_n=force,
             force_sigma_n=sigma,
-            wrench=_wrench(track.x, track.y, force or 0.0),
+            wrench=_wrench(seen.x, seen.y, force or 0.0),
             shape=SHAPES[best] if known else "unknown",
             shape_probability=classes[best] if classes else None,
             confidence=_confidence(s),
         )
+
+    def _ends(self, tracks: list[Track]) -> list[Contact]:
+        """The last word on touches that ended: where they were; they do not press any more."""
+        force = None if self.law.newtons_per_siemens is None else 0.0
+        return [Contact(id=t.id, state="end", position=[t.x, t.y, 0.0], force_n=force, confidence=0.0) for t in tracks]
 
     def _force(self, frame: Frame) -> ForceFrame:
         present = [c for c in self._contacts if c.state != "end"]
@@ -127,21 +157,39 @@ class Publishing(Stage):
         )
 
     def state(self) -> dict[str, Any]:
-        return {"tracker": self.tracker.state()}
+        return {
+            "tracker": self.tracker.state(),
+            "known": self._known,
+            "contacts": [asdict(c) for c in self._contacts],
+            "segments": [{**asdict(s), "mask": s.mask.astype(np.uint8)} for s in self._segments],
+            "classes": self._classes,
+            "geometry": [self._geometry[0], *self._geometry[1]],
+        }
 
     def load(self, state: dict[str, Any]) -> None:
-        self.reset()
         self.tracker.load(state["tracker"])
+        self._known = bool(state["known"])
+        self._contacts = [Contact(**c) for c in state["contacts"]]
+        self._segments = [Segment(**{**s, "mask": np.array(s["mask"], dtype=bool)}) for s in state["segments"]]
+        self._classes = [list(p) for p in state["classes"]]
+        metres_per_pixel, *origin = state["geometry"]
+        self._geometry = (metres_per_pixel, origin)
 
     def health(self) -> Health:
         return Health("OK", [], dict(self._counters))
+
+
+def _sound(frame: ImageFrame) -> bool:
+    """Whether image and geometry are numbers that can be those of a skin."""
+    places = np.abs([frame.metres_per_pixel, *frame.origin])
+    return readable(frame.image) and frame.metres_per_pixel > 0 and bool((places < LARGEST_M).all())
 
 
 def _class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float]:
     """Mean over the touch of the per-pixel class probabilities (5, h, w), which are on a coarser grid; [] where there
     are none.
     """
-    if not classes.size:
+    if not classes.size or not np.isfinite(classes).all():
         return []
     y, x = np.nonzero(s.mask)
     h, w = classes.shape[1:]
@@ -158,7 +206,3 @@ def _wrench(x: float, y: float, force: float) -> list[float]:
 def _confidence(s: Segment) -> float:
     """Probability that the peak is no noise, from its own standard deviation."""
     return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))
-
-
-def _ended(track: Track) -> Contact:
-    return Contact(id=track.id, state="end", position=[track.x, track.y, 0.0], force_n=None, confidence=0.0)

@@ -1,26 +1,28 @@
-"""Touches in an image of the conductivity drop: each thresholded at half its own peak."""
+"""Touches in an image of the conductivity drop: each thresholded at half its own peak.
+
+Where touches merge they are told apart by the valley between their peaks (services/splitting.py says which part of the
+image is whose). What a tracker expects counts as evidence: two touches that are known to be there are kept apart at a
+shallower valley than two that would be new. Every pixel above the floor belongs to exactly one touch, so that the
+integrated drop is the same however a patch is split.
+"""
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-Image = NDArray[np.floating]
-STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
-EIGHT = np.ones((3, 3), dtype=bool)  # neighbours, diagonal ones too
+from services.splitting import Image, Labels, Place, cut, peaks_of, territories
 
 FLOOR = 0.02  # S/m: a weaker peak is no touch (0.2 N by the default law)
 RELATIVE_FLOOR = 0.12  # of the strongest peak: weaker ones are side lobes of it
-SADDLE = 0.75  # two peaks are two touches where the ridge between them sinks below this fraction of the lower one
-CANDIDATES = 32  # local maxima looked at
+LARGEST = 1e6  # S/m: beyond it a number is no conductivity
 MARGIN = 4  # pixels round the box that is looked at
 SMALLEST = 3  # pixels of a touch
 PLATEAU = 0.9  # fraction of the highest pixel above which pixels belong to the peak
-MOST = 8  # touches
 SMOOTHING = 1.0  # pixels: standard deviation of the Gaussian under which peaks are looked for
 KERNEL = np.exp(-0.5 * (np.arange(-4, 5) / SMOOTHING) ** 2)
 KERNEL /= KERNEL.sum()
@@ -33,33 +35,44 @@ class Segment:
     mask: NDArray[np.bool_]
     peak: float
     peak_sigma: float
-    volume: float  # sum of the drop over the mask, S/m * pixels
+    volume: float  # sum of the drop over all pixels that are this touch's, S/m * pixels: conserved under splitting
     x: float
     y: float
     area: float  # pixels
-    orientation: float  # rad, of the longest axis to x
+    orientation: float  # rad, of the longest axis to x, -pi/2 to pi/2
+    reach: float  # pixels from the centroid to the farthest of the mask
 
 
-def segment(image: Image, sigma: Image) -> list[Segment]:
-    """Touches of a drop image (H, W) [S/m] with its standard deviation (H, W) or (0, 0); strongest first."""
-    shape, top = image.shape, float(image.max(initial=0.0))
-    floor = max(FLOOR, RELATIVE_FLOOR * top)
-    if not np.isfinite(top) or top < floor or not np.isfinite(image).all():
+def readable(image: Image) -> bool:
+    """Whether every pixel is a number that a conductivity can be."""
+    return image.ndim == 2 and bool((np.abs(image) < LARGEST).all())  # NaN compares false
+
+
+def segment(image: Image, sigma: Image, expected: Sequence[Place] = ()) -> list[Segment]:
+    """Touches of a drop image (H, W) [S/m] with its standard deviation (H, W) or (0, 0); strongest first.
+
+    expected: (x, y) [pixels] of touches that were there a moment ago. An image that is not `readable` has no touches.
+    """
+    if not image.size or not readable(image):
         return []
-    rows, columns = _box(image > 0.5 * floor)
-    image, sigma = image[rows, columns].astype(np.float64), sigma[rows, columns]
-    smooth = ndimage.correlate1d(ndimage.correlate1d(image, KERNEL, 0), KERNEL, 1)
-    peaks: list[tuple[int, int]] = []
-    for peak in _maxima(smooth, floor):
-        if len(peaks) < MOST and _stands_alone(smooth, peak, peaks):
-            peaks.append(peak)
-    basins = _basins(smooth, peaks)
+    floor = max(FLOOR, RELATIVE_FLOOR * float(image.max()))
+    high = image > 0.5 * floor
+    if not (image > floor).any():
+        return []
+    rows, columns = _box(high)
+    part = image[rows, columns].astype(np.float64)
+    smooth = ndimage.correlate1d(ndimage.correlate1d(part, KERNEL, 0), KERNEL, 1)
+    near = [(x - columns.start, y - rows.start) for x, y in expected]
+    labels = _labels(smooth, floor, near)
+    volumes = np.bincount(labels.ravel(), (part * (smooth > 0.5 * floor)).ravel())
+    noise = sigma[rows, columns] if sigma.shape == image.shape else np.zeros((0, 0))
     found = []
-    for index, peak in enumerate(peaks):
-        own = smooth if basins is None else np.where(basins == index + 1, smooth, 0.0)
-        one = _measure(image, sigma, own, peak)
-        if one is not None:
-            found.append(_placed(one, shape, rows, columns))
+    for label in range(1, len(volumes)):
+        own = np.where(labels == label, smooth, 0.0) if len(volumes) > 2 else smooth
+        mask = _half(own)
+        whole = np.zeros(image.shape, dtype=bool)
+        whole[rows, columns] = mask
+        found.append(_measured(part, noise, own, mask, whole, (columns.start, rows.start), float(volumes[label])))
     return sorted(found, key=lambda s: -s.peak)
 
 
@@ -72,69 +85,65 @@ def _box(high: NDArray[np.bool_]) -> tuple[slice, slice]:
     return spans[0], spans[1]
 
 
-def _placed(s: Segment, shape: tuple[int, ...], rows: slice, columns: slice) -> Segment:
-    """A segment of the box as one of the whole image."""
-    mask = np.zeros(shape, dtype=bool)
-    mask[rows, columns] = s.mask
-    return dataclasses.replace(s, mask=mask, x=s.x + columns.start, y=s.y + rows.start)
+def _labels(smooth: Image, floor: float, expected: Sequence[Place]) -> Labels:
+    """Which touch each pixel belongs to, 1, 2, ...; all 0 where there is none."""
+    peaks = peaks_of(smooth, floor, expected)
+    while True:
+        labels = territories(smooth, peaks)
+        small = [p for k, p in enumerate(peaks) if _half(np.where(labels == k + 1, smooth, 0.0)).sum() < SMALLEST]
+        if not small or len(peaks) < 2:
+            break
+        peaks.remove(small[-1])  # a speck: its pixels go to a neighbour
+    if small:
+        return np.zeros(smooth.shape, dtype=np.intp)
+    label, count = 1, len(peaks)
+    while label <= count:
+        side = cut(np.where(labels == label, smooth, 0.0), expected)
+        if side is None:
+            label += 1
+        else:
+            count += 1
+            labels[side] = count
+    return labels
 
 
-def _maxima(smooth: Image, floor: float) -> list[tuple[int, int]]:
-    """Local maxima above the floor, highest first; a flat top counts once."""
-    flat, count = ndimage.label((smooth == ndimage.maximum_filter(smooth, size=5)) & (smooth > floor), EIGHT)
-    if count == 0:
-        return []
-    places = {flat[iy, ix]: (iy, ix) for iy, ix in np.argwhere(flat).tolist()}.values()
-    return sorted(places, key=lambda p: -smooth[p])[:CANDIDATES]
-
-
-def _stands_alone(smooth: Image, peak: tuple[int, int], stronger: list[tuple[int, int]]) -> bool:
-    """Whether a valley lies between this peak and every stronger one."""
-    if not stronger:
-        return True
-    labels, _ = ndimage.label(smooth > SADDLE * smooth[peak])
-    return all(labels[peak] != labels[other] for other in stronger)
-
-
-def _basins(smooth: Image, peaks: list[tuple[int, int]]) -> NDArray[np.integer] | None:
-    """Which peak each pixel belongs to, 1, 2, ...: where steepest ascent leads to. None where there is only one."""
-    if len(peaks) < 2:
-        return None
-    h, w = smooth.shape
-    padded = np.pad(smooth, 1, constant_values=-np.inf)
-    best, top = smooth.copy(), np.arange(h * w).reshape(h, w)
-    for dy, dx in STEPS:
-        neighbour = padded[1 + dy : 1 + dy + h, 1 + dx : 1 + dx + w]
-        higher = neighbour > best
-        best[higher] = neighbour[higher]
-        top[higher] = np.flatnonzero(higher) + dy * w + dx
-    end = top.ravel()
-    while not np.array_equal(end, further := end[end]):
-        end = further
-    ends, belongs = np.unique(end, return_inverse=True)
-    # Ascent may end at a maximum that does not stand alone: it goes to the nearest one that does.
-    away = np.linalg.norm(np.array(np.divmod(ends, w)).T[:, None] - np.array(peaks)[None], axis=2)
-    return np.asarray(away.argmin(axis=1)[belongs].reshape(h, w) + 1)
-
-
-def _measure(image: Image, sigma: Image, own: Image, at: tuple[int, int]) -> Segment | None:
-    """The touch whose peak is at `at` in its own part of the smoothed image."""
-    peak = own[at]
-    mask = own > 0.5 * peak
+def _half(own: Image) -> NDArray[np.bool_]:
+    """The pixels above half the peak that hang together with it."""
+    top = int(own.argmax())
+    mask = own > 0.5 * own.flat[top]
     labels, count = ndimage.label(mask)
-    if count > 1:
-        mask = labels == labels[at]
-    if mask.sum() < SMALLEST:
-        return None
-    height = _plateau(image[mask])
-    peak_sigma = float(sigma[mask].mean()) if sigma.size else 0.0
+    return mask if count == 1 else np.asarray(labels == labels.flat[top]) & mask
+
+
+def _measured(
+    image: Image,
+    sigma: Image,
+    own: Image,
+    mask: NDArray[np.bool_],
+    whole: NDArray[np.bool_],
+    corner: tuple[int, int],
+    volume: float,
+) -> Segment:
+    """The touch in numbers; own: its part of the smoothed image, corner: of the box in the whole image."""
+    noise = sigma[mask] if sigma.size else sigma
+    peak_sigma = float(noise.mean()) if noise.size and np.isfinite(noise).all() else 0.0
     y, x = np.nonzero(_grown(mask))
-    weight = np.clip(2 * own[y, x] / peak - 0.5, 0, 1)  # pixels on the edge count in part
+    weight = np.clip(2 * own[y, x] / own.max() - 0.5, 0, 1)  # pixels on the edge count in part
     area = float(weight.sum())
     cx, cy = float(weight @ x) / area, float(weight @ y) / area
-    mxx, myy, mxy = (float(weight @ v) / area for v in ((x - cx) ** 2, (y - cy) ** 2, (x - cx) * (y - cy)))
-    orientation = 0.5 * float(np.arctan2(2 * mxy, mxx - myy))
-    return Segment(mask, height, peak_sigma, float(image[mask].sum()), cx, cy, area, orientation)
+    dx, dy = x - cx, y - cy
+    mxx, myy, mxy = (float(weight @ v) / area for v in (dx * dx, dy * dy, dx * dy))
+    return Segment(
+        mask=whole,
+        peak=_plateau(image[mask]),
+        peak_sigma=peak_sigma,
+        volume=volume,
+        x=cx + corner[0],
+        y=cy + corner[1],
+        area=area,
+        orientation=0.5 * float(np.arctan2(2 * mxy, mxx - myy)),
+        reach=float(np.sqrt((dx * dx + dy * dy).max())),
+    )
 
 
 def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

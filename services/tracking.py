@@ -1,90 +1,163 @@
-"""Contacts over time: a touch keeps its id, through crossings and one lost frame; no id is used twice in a session."""
+"""Contacts over time: a touch keeps its id while it lasts; no id is used twice in a session.
+
+Each touch is where its velocity takes it until it is seen (services/motion.py); what is seen is given to the touches by
+the assignment of least total cost. Touches that grow into one patch, and come out of it, are services/merging.py's.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
-import numpy as np
+from services.merging import MERGED_S, absorb, follow, host_of, is_part, others, part
+from services.motion import Seen, Track, cost
 
 REACH_M = 0.015  # a touch that jumps further between two frames is another touch
 LOST_FRAMES = 1  # frames a touch may be missing before it ends
-VELOCITY_S = 0.1  # time constant of the velocity's smoothing
-LONGEST_PREDICTION_S = 0.2  # a velocity says nothing about longer gaps
-
-
-@dataclass
-class Track:
-    """One touch that lasts."""
-
-    id: int
-    x: float
-    y: float
-    vx: float
-    vy: float
-    seen_ns: int  # sample time of the frame in which it was last seen
-    missing: int  # frames since then
-    age: int  # frames in which it was seen
+FORGOTTEN_S = 1.0  # after so long without a frame, nobody knows whether a touch is the same
+NEVER = 1e6  # cost of what is out of reach
 
 
 class Tracker:
+    """`tracks`: one for each patch that is there, or was LOST_FRAMES ago."""
+
     def __init__(self) -> None:
         self._next_id = 1
+        self._looked_ns = 0  # sample time of the last frame that said anything
+        self._untold: list[Track] = []  # ended by a reset
         self.tracks: list[Track] = []
 
     def reset(self) -> None:
-        """End everything. Ids go on counting: none is used again in a session."""
+        """End everything; the next frame tells. Ids go on counting: none is used again in a session."""
+        self._untold += [one for track in self.tracks for one in (track, *others(track))]
         self.tracks = []
 
-    def update(self, positions: list[tuple[float, float]], sample_ns: int) -> tuple[list[Track], list[Track]]:
-        """Positions [m] of one frame -> (the track of each position, in their order; tracks that ended)."""
-        pairs = self._assign(positions, sample_ns)
+    def expected(self, sample_ns: int) -> list[tuple[float, float]]:
+        """Where each touch should be then [m], those inside one patch one by one."""
+        return [one.ahead(sample_ns) for track in self.tracks for one in (track.inside or [track])]
+
+    def update(self, seen: Sequence[Seen], sample_ns: int) -> tuple[list[Track], list[Track]]:
+        """What one frame shows -> (the track of each entry, in their order; tracks that ended)."""
+        ended = self._begin_frame(sample_ns)
+        owners = self._assign(seen, sample_ns)
+        self._merge(owners, seen, sample_ns)
+        self._part(owners, seen, sample_ns)
         found: list[Track] = []
-        kept: set[int] = set()
-        for index, (x, y) in enumerate(positions):
-            track = self.tracks[pairs[index]] if index in pairs else None
+        for entry, track in zip(seen, owners, strict=True):
             if track is None:
-                track = Track(self._next_id, x, y, 0.0, 0.0, sample_ns, 0, 0)
+                track = Track(self._next_id, entry.x, entry.y, sample_ns, entry.size, entry.reach)
                 self._next_id += 1
             else:
-                kept.add(track.id)
-                _move(track, x, y, sample_ns)
-            track.age += 1
+                track.move(entry, sample_ns)
+                if track.inside:
+                    follow(track, entry, sample_ns)
             found.append(track)
-        ended: list[Track] = []
-        coasting: list[Track] = []
-        for track in self.tracks:
-            if track.id not in kept:
-                track.missing += 1
-                (ended if track.missing > LOST_FRAMES else coasting).append(track)
+        coasting = [t for t in self.tracks if not any(t is f for f in found)]
         self.tracks = found + coasting
-        return found, ended
+        return found, ended + self._lose(coasting) + self._give_up(sample_ns)
 
-    def _assign(self, positions: list[tuple[float, float]], sample_ns: int) -> dict[int, int]:
-        """Position index -> track index: least total distance to the predicted places, within reach."""
-        if not positions or not self.tracks:
-            return {}
+    def still(self, sample_ns: int) -> list[Track]:
+        """A frame that shows the same as the one before -> tracks that ended."""
+        ended = self._begin_frame(sample_ns)
+        for track in self.tracks:
+            for one in track.inside:
+                one.seen_ns = sample_ns  # it did not go on
+        return ended + self._lose([t for t in self.tracks if t.missing]) + self._give_up(sample_ns)
+
+    def _begin_frame(self, sample_ns: int) -> list[Track]:
+        """Tracks that ended before this frame: by a reset, or since nobody looked."""
+        if sample_ns - self._looked_ns > FORGOTTEN_S * 1e9:
+            self.reset()
+        self._looked_ns = sample_ns
+        ended, self._untold = self._untold, []
+        return ended
+
+    def _assign(self, seen: Sequence[Seen], sample_ns: int) -> list[Track | None]:
+        """The track of each entry: least total cost, within reach; or None."""
+        owners: list[Track | None] = [None] * len(seen)
+        if not seen or not self.tracks:
+            return owners
         from scipy.optimize import linear_sum_assignment  # here: slow to import, see services/publisher.py
 
-        ahead = [min(max(0.0, (sample_ns - t.seen_ns) * 1e-9), LONGEST_PREDICTION_S) for t in self.tracks]
-        predicted = np.array([(t.x + t.vx * s, t.y + t.vy * s) for t, s in zip(self.tracks, ahead, strict=True)])
-        distance = np.linalg.norm(np.array(positions)[:, None] - predicted[None], axis=2)
-        rows, columns = linear_sum_assignment(np.minimum(distance, REACH_M))
-        return {int(r): int(c) for r, c in zip(rows, columns, strict=True) if distance[r, c] < REACH_M}
+        costs = []
+        for entry in seen:
+            pairs = [cost(track, entry, sample_ns) for track in self.tracks]
+            costs.append([chi2 if distance < REACH_M else NEVER for distance, chi2 in pairs])
+        for row, column in zip(*(v.tolist() for v in linear_sum_assignment(costs)), strict=True):
+            if costs[row][column] < NEVER:
+                owners[row] = self.tracks[column]
+        return owners
+
+    def _merge(self, owners: list[Track | None], seen: Sequence[Seen], sample_ns: int) -> None:
+        """Where a lost touch should be there is another one's patch: it is inside."""
+        hosts = [(track, entry) for track, entry in zip(owners, seen, strict=True) if track is not None]
+        for track in [t for t in self.tracks if not any(t is host for host, _ in hosts)]:
+            host = host_of(track, hosts, sample_ns)
+            if host is not None:
+                absorb(host, track, sample_ns)
+                self.tracks.remove(track)
+
+    def _part(self, owners: list[Track | None], seen: Sequence[Seen], sample_ns: int) -> None:
+        """A patch with several touches inside has fallen apart: they come out where they should be."""
+        for host in [t for t in self.tracks if t.inside]:
+            parts = [
+                k
+                for k, owner in enumerate(owners)
+                if owner is host or (owner is None and is_part(host, seen[k], sample_ns))
+            ]
+            if len(parts) < 2:
+                continue
+            touches = part(host, [seen[k] for k in parts], sample_ns)
+            self.tracks = [t for t in self.tracks if t is not host] + [t for t in touches if t is not None]
+            for k, touch in zip(parts, touches, strict=True):
+                owners[k] = touch
+
+    def _lose(self, unseen: list[Track]) -> list[Track]:
+        """Count one more frame in which these were not seen -> those that ended."""
+        ended = []
+        for track in unseen:
+            track.missing += 1
+            if track.missing > LOST_FRAMES:
+                self.tracks = [t for t in self.tracks if t is not track]
+                ended += [track, *others(track)]
+        return ended
+
+    def _give_up(self, sample_ns: int) -> list[Track]:
+        """Touches that were inside another one's patch for too long."""
+        ended = []
+        for track in self.tracks:
+            if track.inside and sample_ns - track.since_ns > MERGED_S * 1e9:
+                ended += others(track)
+                track.inside = []
+        return ended
 
     def state(self) -> dict[str, Any]:
-        return {"next_id": self._next_id, "tracks": [asdict(t) for t in self.tracks]}
+        return {
+            "next_id": self._next_id,
+            "looked_ns": self._looked_ns,
+            "untold": [asdict(t) for t in self._untold],
+            "tracks": [asdict(t) for t in self.tracks],
+        }
 
     def load(self, state: dict[str, Any]) -> None:
-        self._next_id = int(state["next_id"])
-        self.tracks = [Track(**t) for t in state["tracks"]]
+        """Go on where `state` was taken. Touches whose ids ended here since then get new ones."""
+        here = {one.id: one for track in self.tracks for one in (track, *others(track))}
+        here |= {track.id: track for track in self._untold}
+        renamed: dict[int, int] = {}
+        used, self._next_id = self._next_id, max(self._next_id, int(state["next_id"]))
+        self.tracks = [_track(t) for t in state["tracks"]]
+        for one in [one for track in self.tracks for one in (track, *track.inside)]:
+            if one.id < used and one.id not in here and one.id not in renamed:
+                renamed[one.id] = self._next_id
+                self._next_id += 1
+            one.id = renamed.get(one.id, one.id)
+        going_on = {one.id for track in self.tracks for one in (track, *track.inside)}
+        told = [_track(t) for t in state["untold"]]
+        untold = here | {t.id: t for t in told if t.id >= used}
+        self._untold = [track for track in untold.values() if track.id not in going_on]
+        self._looked_ns = int(state["looked_ns"])
 
 
-def _move(track: Track, x: float, y: float, sample_ns: int) -> None:
-    seconds = (sample_ns - track.seen_ns) * 1e-9
-    if seconds > 1e-6:
-        weight = seconds / (seconds + VELOCITY_S)
-        track.vx += weight * ((x - track.x) / seconds - track.vx)
-        track.vy += weight * ((y - track.y) / seconds - track.vy)
-        track.seen_ns = sample_ns
-    track.x, track.y, track.missing = x, y, 0
+def _track(values: dict[str, Any]) -> Track:
+    return Track(**{**values, "inside": [Track(**one) for one in values["inside"]]})

@@ -8,9 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
@@ -18,8 +15,7 @@ from protocol.frames import ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFr
 from services.config import Skin
 from services.outline import outline
 from services.publishing import Publishing
-from services.segmentation import segment
-from services.tracking import LOST_FRAMES, Tracker
+from services.tracking import LOST_FRAMES
 
 N, M = 96, 0.1 / 96
 CONTACT = frozenset({"contact"})
@@ -43,7 +39,7 @@ def image_frame(image: NDArray[np.float32], scan: int = 1, **fields: Any) -> Ima
         scan=scan,
         valid=True,
         stamps={"sample": scan * 45_000_000},
-        touched=True,
+        touched=bool(image.size),
         image=image,
         metres_per_pixel=M,
         origin=[-0.05, -0.05],
@@ -108,13 +104,6 @@ def test_each_touch_is_cut_at_half_its_own_peak(stage: Publishing) -> None:
     assert weak.area_m2 == pytest.approx(math.pi * 0.006**2, rel=0.06)
 
 
-def test_merging_touches_are_split_where_a_valley_lies_between_them() -> None:
-    gap = np.maximum(discs((-0.012, 0, 0.01, 0.3), (0.012, 0, 0.01, 0.3)), discs((0, 0, 0.004, 0.1)))
-    assert len(segment(gap, NOTHING)) == 2
-    bridge = np.maximum(gap, discs((0, 0, 0.008, 0.28)))
-    assert len(segment(bridge, NOTHING)) == 1
-
-
 def test_noise_makes_no_contacts_and_moves_none(stage: Publishing) -> None:
     rng = np.random.default_rng(0)
     noise = lambda s: (s * rng.standard_normal((N, N))).astype(np.float32)  # noqa: E731
@@ -148,41 +137,10 @@ def test_held_frames_keep_contacts_and_say_so(stage: Publishing) -> None:
     assert out.held and [(c.id, c.state) for c in out.contacts] == [(1, "hold")]
 
 
-def test_ids_follow_crossing_slides() -> None:
-    tracker = Tracker()
-    ids = []
-    for n in range(60):
-        x = -0.03 + 0.001 * n
-        places = [(x, 0.004), (-x, -0.004)]
-        order = places if n % 2 else places[::-1]  # the order of contacts must not matter
-        tracks, _ = tracker.update(order, n * 45_000_000)
-        by_place = dict(zip(order, [t.id for t in tracks], strict=True))
-        ids.append((by_place[places[0]], by_place[places[1]]))
-    assert len(set(ids)) == 1
-
-
 def test_velocity_is_that_of_the_slide(stage: Publishing) -> None:
     for scan in range(40):
         (c,) = contacts(stage, image_frame(discs((-0.02 + 0.001 * scan, 0, 0.01, 0.3)), scan)).contacts
     assert c.velocity == pytest.approx([0.001 / 0.045, 0, 0], rel=0.05, abs=1e-3)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.lists(st.lists(st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05)), max_size=4), max_size=20))
-def test_no_id_is_used_twice(frames: list[list[tuple[float, float]]]) -> None:
-    tracker, gone = Tracker(), set()
-    for n, places in enumerate(frames):
-        tracks, ended = tracker.update(places, n * 45_000_000)
-        ids = [t.id for t in tracks]
-        assert len(set(ids)) == len(places) and not gone & set(ids)
-        gone |= {t.id for t in ended}
-
-
-@settings(max_examples=50, deadline=None)
-@given(hnp.arrays(np.float32, (24, 24), elements=st.floats(width=32, allow_nan=True, allow_infinity=True)))
-def test_nothing_that_comes_in_makes_nan_come_out(image: NDArray[np.float32]) -> None:
-    for s in segment(image, NOTHING):
-        assert all(map(math.isfinite, (s.x, s.y, s.area, s.peak, s.volume, s.orientation)))
 
 
 def test_force_and_shape_are_made_only_when_wanted(stage: Publishing) -> None:

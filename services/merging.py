@@ -1,0 +1,99 @@
+"""Touches that grow into one patch and come out of it again.
+
+A merged patch is one contact; its track keeps its id. The touches in it (`Track.inside`) go on with the velocities they
+had, as far as the patch lets them: together they stay where the patch is. When it falls apart each part is the touch
+that should be there and has its size, so that two fingers that slide through each other keep their ids.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from services.motion import Seen, Track, size_cost
+
+MERGED_S = 5.0  # a touch inside another's patch is waited for so long
+MARGIN_M = 0.004  # beyond the patch's reach, where a part of it may come out
+INSIDE_SIGMA_M = 0.003  # of where a touch inside a patch should be, at first
+INSIDE_SIGMA_M_S = 0.010  # by how much it grows: fingers stop and turn back
+
+
+def host_of(track: Track, hosts: Sequence[tuple[Track, Seen]], sample_ns: int) -> Track | None:
+    """Whose patch covers the place where a lost touch should be."""
+    x, y = track.ahead(sample_ns)
+    covering = [(math.hypot(x - s.x, y - s.y) - s.reach, host) for host, s in hosts]
+    nearest = min(covering, key=lambda c: c[0], default=None)
+    return nearest[1] if nearest is not None and nearest[0] < 0 else None
+
+
+def absorb(host: Track, track: Track, sample_ns: int) -> None:
+    """The track is inside the host's patch from now on."""
+    if not host.inside:
+        host.inside = [host.ghost()]
+    host.inside += track.inside or [track]
+    host.since_ns, track.inside = sample_ns, []
+
+
+def others(host: Track) -> list[Track]:
+    """The touches inside a patch that it does not have its id from."""
+    return [t for t in host.inside if t.id != host.id]
+
+
+def follow(host: Track, patch: Seen, sample_ns: int) -> None:
+    """The touches inside go on, and with the patch, and not out of it."""
+    _advance(host.inside, (patch.x, patch.y), sample_ns)
+    for t in host.inside:
+        away = math.hypot(t.x - patch.x, t.y - patch.y)
+        if away > patch.reach:
+            t.x = patch.x + (t.x - patch.x) * patch.reach / away
+            t.y = patch.y + (t.y - patch.y) * patch.reach / away
+
+
+def is_part(host: Track, seen: Seen, sample_ns: int) -> bool:
+    """Whether this can be a part of the host's patch, as it was."""
+    x, y = host.ahead(sample_ns)
+    return math.hypot(seen.x - x, seen.y - y) < host.reach + MARGIN_M
+
+
+def part(host: Track, parts: Sequence[Seen], sample_ns: int) -> list[Track | None]:
+    """The touch that each of at least two parts is, or None for more parts than there are touches.
+
+    Where there are more touches than parts, some parts have several inside.
+    """
+    from scipy.optimize import linear_sum_assignment  # here: slow to import, see services/publisher.py
+
+    total = sum(p.size for p in parts)
+    weights = [p.size / total if total > 0 else 1 / len(parts) for p in parts]
+    centre = (
+        sum(w * p.x for w, p in zip(weights, parts, strict=True)),
+        sum(w * p.y for w, p in zip(weights, parts, strict=True)),
+    )
+    _advance(host.inside, centre, sample_ns)
+    sigma = math.hypot(INSIDE_SIGMA_M, INSIDE_SIGMA_M_S * (sample_ns - host.since_ns) * 1e-9)
+    costs = [[_cost(t, p, sigma) for p in parts] for t in host.inside]
+    rows, columns = linear_sum_assignment(costs)
+    found: list[Track | None] = [None] * len(parts)
+    for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
+        found[column] = host.inside[row]
+    left = [k for k in range(len(host.inside)) if k not in rows]
+    for k in left:
+        owner = found[min(range(len(parts)), key=lambda c: costs[k][c])]
+        assert owner is not None  # more touches than parts: every part has one
+        absorb(owner, host.inside[k], host.since_ns)
+    return found
+
+
+def _advance(inside: Sequence[Track], centre: tuple[float, float], sample_ns: int) -> None:
+    """Each with its velocity, then all together to where their common centre is."""
+    for t in inside:
+        (t.x, t.y), t.seen_ns = t.ahead(sample_ns), sample_ns
+    total = sum(t.size for t in inside)
+    weights = [t.size / total if total > 0 else 1 / len(inside) for t in inside]
+    dx = centre[0] - sum(w * t.x for w, t in zip(weights, inside, strict=True))
+    dy = centre[1] - sum(w * t.y for w, t in zip(weights, inside, strict=True))
+    for t in inside:
+        t.x, t.y = t.x + dx, t.y + dy
+
+
+def _cost(track: Track, seen: Seen, sigma: float) -> float:
+    return (math.hypot(track.x - seen.x, track.y - seen.y) / sigma) ** 2 + size_cost(track, seen)

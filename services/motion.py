@@ -1,0 +1,99 @@
+"""One touch in motion: seen now and then, in between where its velocity takes it (a Kalman filter, the same for x and
+y: constant velocity, random acceleration).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+ACCELERATION = 0.3  # m/s^2, standard deviation: how a finger changes its mind
+PLACE_SIGMA_M = 0.0007  # of a centroid from one image
+FIRST_SPEED = 0.1  # m/s, standard deviation of a velocity of which nothing is known
+LONGEST_PREDICTION_S = 0.2  # a velocity says nothing about longer gaps
+SIZE_SIGMA = 0.4  # of the logarithm of an integrated drop, from frame to frame
+SIZE_SHARE = 0.3  # of what is seen, in the running mean of the size
+MOST_FOR_SIZE = 9.0  # a touch may grow quickly: its size alone makes it no other touch
+
+
+class Seen(NamedTuple):
+    """One patch in one image."""
+
+    x: float  # m, area centroid
+    y: float
+    size: float = 0.0  # integrated drop, any unit; 0: unknown
+    reach: float = 0.0  # m from the centroid to the patch's farthest point
+
+
+@dataclass
+class Track:
+    """One touch that lasts. `inside`: the touches that have grown into its patch, itself included; else empty."""
+
+    id: int
+    x: float  # m, filtered
+    y: float
+    seen_ns: int  # sample time of the frame in which it was last seen
+    size: float
+    reach: float
+    vx: float = 0.0  # m/s
+    vy: float = 0.0
+    pp: float = PLACE_SIGMA_M**2  # variances of place and velocity, and their covariance
+    pv: float = 0.0
+    vv: float = FIRST_SPEED**2
+    missing: int = 0  # frames since it was seen
+    age: int = 1  # frames in which it was seen
+    since_ns: int = 0  # when the last one of `inside` came
+    inside: list[Track] = field(default_factory=list)
+
+    def seconds_to(self, sample_ns: int) -> float:
+        return min(max(0.0, (sample_ns - self.seen_ns) * 1e-9), LONGEST_PREDICTION_S)
+
+    def ahead(self, sample_ns: int) -> tuple[float, float]:
+        """Where it should be then [m]."""
+        seconds = self.seconds_to(sample_ns)
+        return self.x + self.vx * seconds, self.y + self.vy * seconds
+
+    def move(self, seen: Seen, sample_ns: int) -> None:
+        """It was seen there."""
+        real = max(0.0, (sample_ns - self.seen_ns) * 1e-9)
+        if real > 1e-6:
+            self._filter(seen, real)
+            self.seen_ns = sample_ns
+        else:  # the same sample again, or a clock that went back
+            self.x, self.y = seen.x, seen.y
+        if seen.size > 0:
+            self.size = self.size ** (1 - SIZE_SHARE) * seen.size**SIZE_SHARE if self.size > 0 else seen.size
+        self.reach, self.missing = seen.reach, 0
+        self.age += 1
+
+    def _filter(self, seen: Seen, seconds: float) -> None:
+        noise = ACCELERATION**2 * seconds**2
+        pp = self.pp + 2 * seconds * self.pv + seconds**2 * self.vv + noise * seconds**2 / 4
+        pv = self.pv + seconds * self.vv + noise * seconds / 2
+        vv = self.vv + noise
+        place, speed = pp / (pp + PLACE_SIGMA_M**2), pv / (pp + PLACE_SIGMA_M**2)
+        x, y = self.x + self.vx * seconds, self.y + self.vy * seconds
+        dx, dy = seen.x - x, seen.y - y
+        self.x, self.y = x + place * dx, y + place * dy
+        self.vx, self.vy = self.vx + speed * dx, self.vy + speed * dy
+        self.pp, self.pv, self.vv = (1 - place) * pp, (1 - place) * pv, vv - speed * pv
+
+    def ghost(self) -> Track:
+        """Itself as one of its own `inside`: what it was before others came."""
+        return replace(self, inside=[])
+
+
+def cost(track: Track, seen: Seen, sample_ns: int) -> tuple[float, float]:
+    """(distance [m] from where the track should be, how unlikely it is that this is the track: chi-squared)."""
+    x, y = track.ahead(sample_ns)
+    distance = math.hypot(seen.x - x, seen.y - y)
+    s = track.seconds_to(sample_ns)
+    variance = track.pp + 2 * s * track.pv + s * s * track.vv + (ACCELERATION * s * s) ** 2 / 4 + PLACE_SIGMA_M**2
+    return distance, distance**2 / variance + size_cost(track, seen)
+
+
+def size_cost(track: Track, seen: Seen) -> float:
+    if track.size <= 0 or seen.size <= 0:
+        return 0.0
+    return min((math.log(seen.size / track.size) / SIZE_SIGMA) ** 2, MOST_FOR_SIZE)

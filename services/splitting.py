@@ -1,0 +1,132 @@
+"""Which part of a smoothed image belongs to which touch, where several lie side by side or merge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Image = NDArray[np.floating]
+Labels = NDArray[np.intp]
+Place = tuple[float, float]  # x, y in pixels
+
+STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+EIGHT = np.ones((3, 3), dtype=bool)  # neighbours, diagonal ones too
+
+SADDLE = 0.75  # two peaks are two touches where the ridge between them sinks below this fraction of the lower one
+SADDLE_KNOWN = 0.95  # the same where two touches are expected: only a plateau makes them one
+NEAR = 6.0  # pixels within which a peak is the one that was expected
+WAIST_KNOWN = 0.92  # two touches are expected in one patch: they are two where it narrows to this fraction
+WAIST_NEW = 0.6  # the same where one is expected, or none
+SLIMMEST = 0.15  # share of a patch that a part of it must have
+CANDIDATES = 32  # local maxima looked at
+MOST = 8  # touches
+
+
+def peaks_of(smooth: Image, floor: float, expected: Sequence[Place]) -> list[tuple[int, int]]:
+    """(row, column) of the maxima above the floor that are a touch's, highest first."""
+    peaks: list[tuple[int, int]] = []
+    free = list(expected)
+    for peak in _maxima(smooth, floor):
+        own = min(free, key=lambda p: _distance(p, peak), default=None)
+        known = own is not None and _distance(own, peak) < NEAR and len(free) < len(expected)
+        if len(peaks) < MOST and _stands_alone(smooth, peak, peaks, SADDLE_KNOWN if known else SADDLE):
+            peaks.append(peak)
+            if own is not None:
+                free.remove(own)
+    return peaks
+
+
+def _distance(place: Place, peak: tuple[int, int]) -> float:
+    return float(np.hypot(place[0] - peak[1], place[1] - peak[0]))
+
+
+def _maxima(smooth: Image, floor: float) -> list[tuple[int, int]]:
+    """Local maxima above the floor, highest first; a flat top counts once."""
+    flat, count = ndimage.label((smooth == ndimage.maximum_filter(smooth, size=5)) & (smooth > floor), EIGHT)
+    if count == 0:
+        return []
+    places = {flat[iy, ix]: (iy, ix) for iy, ix in np.argwhere(flat).tolist()}.values()
+    return sorted(places, key=lambda p: -smooth[p])[:CANDIDATES]
+
+
+def _stands_alone(smooth: Image, peak: tuple[int, int], stronger: list[tuple[int, int]], saddle: float) -> bool:
+    """Whether a valley lies between this peak and every stronger one."""
+    if not stronger:
+        return True
+    labels, _ = ndimage.label(smooth > saddle * smooth[peak])
+    return all(labels[peak] != labels[other] for other in stronger)
+
+
+def territories(smooth: Image, peaks: list[tuple[int, int]]) -> Labels:
+    """Which peak each pixel belongs to, 1, 2, ...: where steepest ascent leads to; 0 where there is no peak."""
+    if len(peaks) < 2:
+        return np.full(smooth.shape, len(peaks), dtype=np.intp)
+    h, w = smooth.shape
+    padded = np.pad(smooth, 1, constant_values=-np.inf)
+    best, top = smooth.copy(), np.arange(h * w).reshape(h, w)
+    for dy, dx in STEPS:
+        neighbour = padded[1 + dy : 1 + dy + h, 1 + dx : 1 + dx + w]
+        higher = neighbour > best
+        best[higher] = neighbour[higher]
+        top[higher] = np.flatnonzero(higher) + dy * w + dx
+    end = top.ravel()
+    while not np.array_equal(end, further := end[end]):
+        end = further
+    ends, belongs = np.unique(end, return_inverse=True)
+    # Ascent may end at a maximum that does not stand alone: it goes to the nearest one that does.
+    away = np.linalg.norm(np.array(np.divmod(ends, w)).T[:, None] - np.array(peaks)[None], axis=2)
+    return np.asarray(away.argmin(axis=1)[belongs].reshape(h, w) + 1, dtype=np.intp)
+
+
+def cut(own: Image, expected: Sequence[Place]) -> NDArray[np.bool_] | None:
+    """The smaller side (h, w) of a patch that is two touches grown together, or None where it is one.
+
+    own: the smoothed image where it is this patch's, 0 elsewhere. The patch's profile along its longest axis (the drop
+    summed across) has a waist where two touches meet, also where their peaks have become one plateau.
+    """
+    y, x = np.nonzero(own > 0.5 * own.max())
+    weight = own[y, x]
+    total = float(weight.sum())
+    cx, cy = float(weight @ x) / total, float(weight @ y) / total
+    dx, dy = x - cx, y - cy
+    mxx, myy, mxy = float(weight @ (dx * dx)), float(weight @ (dy * dy)), float(weight @ (dx * dy))
+    angle = 0.5 * np.arctan2(2 * mxy, mxx - myy)
+    c, s = np.cos(angle), np.sin(angle)
+    along = c * dx + s * dy
+    start = float(along.min())
+    profile = _profile(along - start, weight)
+    depth = profile / np.minimum(np.maximum.accumulate(profile), np.maximum.accumulate(profile[::-1])[::-1])
+    waist = int(depth.argmin())
+    if depth[waist] > WAIST_KNOWN:
+        return None
+    share = float(weight[along - start < waist].sum()) / total
+    if not SLIMMEST < share < 1 - SLIMMEST:
+        return None
+    inside = _expected_inside(own, expected)
+    if depth[waist] > (WAIST_KNOWN if inside > 1 else WAIST_NEW):
+        return None
+    rows, columns = np.indices(own.shape)
+    beyond = c * (columns - cx) + s * (rows - cy) - start >= waist
+    return np.asarray((beyond if share > 0.5 else ~beyond) & (own > 0))
+
+
+def _profile(along: Image, weight: Image) -> Image:
+    """Weights by place along an axis, one bin a pixel, each weight shared between its two bins; lightly smoothed."""
+    low = along.astype(int)
+    share = along - low
+    n = int(low.max()) + 2
+    profile = np.bincount(low, weight * (1 - share), n) + np.bincount(low + 1, weight * share, n)
+    return np.convolve(profile, [0.25, 0.5, 0.25], mode="same")
+
+
+def _expected_inside(own: Image, expected: Sequence[Place]) -> int:
+    """How many of the expected touches lie in this patch."""
+    h, w = own.shape
+    inside = 0
+    for x, y in expected:
+        column, row = round(x), round(y)
+        inside += 0 <= column < w and 0 <= row < h and bool(own[row, column] > 0.25 * own.max())
+    return inside

@@ -1,0 +1,197 @@
+"""Tracking: ids through crossings, merged patches, lost frames and holds; velocities; state."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from services.merging import MERGED_S
+from services.motion import Seen, Track
+from services.tracking import FORGOTTEN_S, LOST_FRAMES, Tracker
+
+FRAME_NS = 45_000_000
+RADIUS = 0.009  # m, of the touches in here
+SIZE = 1e-4  # integrated drop of one
+
+
+def touch(x: float, y: float = 0.0, size: float = SIZE) -> Seen:
+    return Seen(x, y, size, RADIUS)
+
+
+def image_of(places: list[tuple[float, float]], sizes: list[float]) -> list[Seen]:
+    """What a segmentation sees of two discs: one patch while they overlap by more than half."""
+    (ax, ay), (bx, by) = places
+    apart = math.hypot(ax - bx, ay - by)
+    if apart > 1.5 * RADIUS:
+        return [touch(*place, size) for place, size in zip(places, sizes, strict=True)]
+    total = sum(sizes)
+    x, y = ((sizes[0] * a + sizes[1] * b) / total for a, b in zip(*places, strict=True))
+    return [Seen(x, y, total, RADIUS + apart / 2)]
+
+
+def play(tracker: Tracker, frames: list[list[Seen]], start: int = 1) -> tuple[list[list[int]], list[int]]:
+    """Ids of each frame's entries, and of what ended, in order."""
+    ids, ended = [], []
+    for n, seen in enumerate(frames, start):
+        tracks, gone = tracker.update(seen, n * FRAME_NS)
+        ids.append([t.id for t in tracks])
+        ended += [t.id for t in gone]
+    return ids, ended
+
+
+def test_ids_follow_slides_past_each_other_in_any_order() -> None:
+    tracker, ids = Tracker(), []
+    for n in range(60):
+        x = -0.03 + 0.001 * n
+        places = [touch(x, 0.004), touch(-x, -0.004)]
+        order = places if n % 2 else places[::-1]
+        tracks, _ = tracker.update(order, n * FRAME_NS)
+        by_place = dict(zip(order, [t.id for t in tracks], strict=True))
+        ids.append((by_place[places[0]], by_place[places[1]]))
+    assert len(set(ids)) == 1
+
+
+@pytest.mark.parametrize("degrees", [35, 60, 90, 135, 180])
+@pytest.mark.parametrize("speed", [0.02, 0.06])
+def test_ids_come_out_of_a_crossing_on_the_other_side(degrees: float, speed: float) -> None:
+    """Two equal touches slide through each other and are one patch meanwhile: only their momentum tells them apart."""
+    rng = np.random.default_rng(int(degrees))
+    directions = [(1.0, 0.0), (math.cos(math.radians(degrees)), math.sin(math.radians(degrees)))]
+    seconds = np.arange(-0.035 / speed, 0.035 / speed, 0.045)
+    frames = []
+    for t in seconds:
+        noise = 0.0004 * rng.standard_normal((2, 2))
+        places = [(speed * t * c + e[0], speed * t * s + e[1]) for (c, s), e in zip(directions, noise, strict=True)]
+        frames.append(image_of(places, [SIZE, SIZE]))
+    ids, ended = play(Tracker(), frames)
+    assert ids[0] == ids[-1] == [1, 2] and not ended
+    merged = [i for i in ids if len(i) == 1]
+    assert merged and {i for one in merged for i in one} <= {1, 2}
+
+
+def test_sizes_tell_two_touches_apart_that_turn_back() -> None:
+    """They meet, stand, and go back where they came from: what their momentum says is wrong, their sizes are right."""
+    gaps = [*np.linspace(0.03, 0.006, 16), *[0.006] * 6, *np.linspace(0.006, 0.03, 16)]
+    frames = [image_of([(-gap / 2, 0), (gap / 2, 0)], [SIZE, 4 * SIZE]) for gap in gaps]
+    ids, ended = play(Tracker(), frames)
+    assert ids[0] == ids[-1] == [1, 2] and not ended
+
+
+def test_three_touches_in_one_patch_come_out_with_their_ids() -> None:
+    def at(spread: float) -> list[Seen]:
+        places = [(spread * math.cos(a), spread * math.sin(a)) for a in (0.0, 2.1, 4.2)]
+        if spread > 0.012:
+            return [touch(x, y) for x, y in places]
+        if spread > 0.008:  # the last two are one patch
+            x, y = (places[1][0] + places[2][0]) / 2, (places[1][1] + places[2][1]) / 2
+            return [touch(*places[0]), Seen(x, y, 2 * SIZE, RADIUS + spread)]
+        return [Seen(0, 0, 3 * SIZE, RADIUS + spread)]
+
+    way_in = np.linspace(0.024, 0.004, 20)
+    frames = [at(float(s)) for s in way_in]
+    tracker = Tracker()
+    ids, _ = play(tracker, frames)
+    assert len(ids[-1]) == 1
+    for track in tracker.tracks:
+        for one in track.inside:
+            one.vx = one.vy = 0.0  # they stand: then they come out where they went in
+    back, ended = play(tracker, frames[::-1], 21)
+    assert back[-1] == ids[0] == [1, 2, 3] and not ended
+
+
+def test_a_touch_inside_another_ones_patch_is_waited_for_only_so_long() -> None:
+    tracker = Tracker()
+    together = [Seen(0.0, 0.0, 2 * SIZE, 1.5 * RADIUS)]
+    play(tracker, [[touch(-0.008), touch(0.008)], [touch(-0.006), touch(0.006)], together])
+    ended = []
+    for n in range(4, 4 + math.ceil(2 * MERGED_S / 0.045)):
+        tracks, gone = tracker.update(together, n * FRAME_NS)
+        ended += [(n, t.id) for t in gone]
+    assert [i for _, i in ended] == [{1: 2, 2: 1}[tracks[0].id]]
+    assert ended[0][0] * 0.045 == pytest.approx(MERGED_S, abs=0.2)
+
+
+def test_what_is_inside_ends_with_its_patch() -> None:
+    tracker = Tracker()
+    _, ended = play(tracker, [[touch(-0.007), touch(0.007)], [Seen(0, 0, 2 * SIZE, 0.015)], *[[]] * (LOST_FRAMES + 1)])
+    assert sorted(ended) == [1, 2] and not tracker.tracks
+
+
+def test_a_touch_that_is_lifted_beside_another_is_not_inside_it() -> None:
+    tracker = Tracker()
+    frames = [[touch(-0.011), touch(0.011)]] * 4 + [[touch(-0.011)]] * 4
+    ids, ended = play(tracker, frames)
+    assert ids[-1] == [1] and ended == [2]
+
+
+def test_a_lost_frame_ends_nothing_and_two_do() -> None:
+    tracker = Tracker()
+    slide = [[touch(0.001 * n)] for n in range(8)]
+    ids, ended = play(tracker, [*slide[:4], [], *slide[5:]])
+    assert ids == [[1]] * 4 + [[]] + [[1]] * 3 and not ended
+    ids, ended = play(tracker, [[]] * (LOST_FRAMES + 1) + [[touch(0.008)]], 9)
+    assert ids[-1] == [2] and ended == [1]
+
+
+def test_frames_without_news_end_nothing_for_a_while() -> None:
+    tracker = Tracker()
+    play(tracker, [[touch(0.0)]] * 3)
+    assert tracker.still(4 * FRAME_NS) == []
+    later = 4 * FRAME_NS + int(0.5 * FORGOTTEN_S * 1e9)
+    assert [t.id for t in tracker.update([touch(0.0)], later)[0]] == [1]
+    later += int(1.1 * FORGOTTEN_S * 1e9)  # nobody looked: it may have been lifted and come back
+    tracks, ended = tracker.update([touch(0.0)], later)
+    assert [t.id for t in tracks] == [2] and [t.id for t in ended] == [1]
+
+
+def test_a_touch_that_was_lost_is_still_lost_in_frames_that_show_the_same() -> None:
+    tracker = Tracker()
+    play(tracker, [[touch(-0.02), touch(0.02)], [touch(-0.02)]])
+    assert [t.id for t in tracker.still(3 * FRAME_NS)] == [2]
+    assert tracker.still(4 * FRAME_NS) == []
+
+
+def test_velocity_starts_at_zero_and_finds_that_of_the_slide() -> None:
+    rng, tracker, speeds = np.random.default_rng(1), Tracker(), []
+    for n in range(60):
+        (track,), _ = tracker.update([touch(0.0015 * n + 0.0003 * rng.standard_normal())], n * FRAME_NS)
+        speeds.append(track.vx)
+    assert speeds[0] == 0.0
+    assert np.mean(speeds[20:]) == pytest.approx(0.0015 / 0.045, rel=0.03)
+    assert np.std(speeds[20:]) < 0.0003 / 0.045  # less than of differences of two frames, which is sqrt(2) of this
+
+
+def test_a_reset_ends_every_touch_once_and_no_id_comes_back() -> None:
+    tracker = Tracker()
+    play(tracker, [[touch(-0.007), touch(0.007), touch(0.03)], [Seen(0, 0, 2 * SIZE, 0.015), touch(0.03)]])
+    tracker.reset()
+    tracker.reset()
+    tracks, ended = tracker.update([touch(0.03)], 3 * FRAME_NS)
+    assert [t.id for t in tracks] == [4] and sorted(t.id for t in ended) == [1, 2, 3]
+
+
+def test_a_state_from_before_brings_no_id_back_that_ended() -> None:
+    tracker = Tracker()
+    play(tracker, [[touch(0.0)]] * 2)
+    before = tracker.state()
+    assert play(tracker, [[]] * (LOST_FRAMES + 1), 3)[1] == [1]
+    tracker.load(before)
+    assert play(tracker, [[touch(0.0)]], 5)[0] == [[2]]
+
+
+def test_a_state_of_another_tracker_ends_what_was_there() -> None:
+    tracker, other = Tracker(), Tracker()
+    play(other, [[touch(0.0)]])
+    play(tracker, [[touch(0.0), touch(0.03)]])
+    tracker.load(other.state())
+    tracks, ended = tracker.update([touch(0.0)], 2 * FRAME_NS)
+    assert [t.id for t in tracks] == [1] and [t.id for t in ended] == [2]
+
+
+def test_a_track_is_plain_numbers() -> None:
+    """What is saved goes through msgpack."""
+    values = asdict(Track(1, 0.0, 0.0, 0, SIZE, RADIUS))
+    assert all(isinstance(v, int | float | list) for v in values.values())
