@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
+import signal
+import subprocess
+import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+START_S = 60
 
 
 @pytest.fixture
@@ -16,4 +25,43 @@ def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
     monkeypatch.setenv("EITSKIN_RUNTIME", str(folder))
     yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def serving(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """`skin up` with the stub board in this runtime folder, once valid contact frames come; ended afterwards."""
+    from protocol.sockets import NewestReader  # here: numpy's threads are still to be limited by who needs it first
+
+    with open(folder / "log.txt", "wb") as log:
+        command = [sys.executable, str(ROOT / "skin"), "up"]
+        environment = {**os.environ, "EITSKIN_RUNTIME": str(folder)}
+        process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+        try:
+            reader = NewestReader("contact", "palm", f"ipc://{folder}/publisher.ipc")
+            end = time.monotonic() + START_S
+            while (frame := reader.recv(1.0)) is None or not frame.valid:
+                assert time.monotonic() < end and process.poll() is None, (folder / "log.txt").read_text()
+            reader.close()
+            yield process
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(10)
+
+
+@pytest.fixture
+def service(runtime: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """The whole service, in a runtime folder of the test's own."""
+    with serving(runtime) as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def shared_service() -> Iterator[Path]:
+    """The whole service, one for all tests of a file; gives its runtime folder, which $EITSKIN_RUNTIME names."""
+    folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EITSKIN_RUNTIME", str(folder))
+        with serving(folder):
+            yield folder
     shutil.rmtree(folder, ignore_errors=True)

@@ -13,32 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from protocol.sockets import NewestReader
-
 ROOT = Path(__file__).resolve().parents[2]
-START_S = 60
 
 
 def skin(*arguments: object, timeout: float = 60) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(ROOT / "skin"), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout)
-
-
-@pytest.fixture
-def service(runtime: Path) -> Iterator[subprocess.Popen[bytes]]:
-    log = open(runtime / "log.txt", "wb")
-    process = subprocess.Popen([sys.executable, str(ROOT / "skin"), "up"], stdout=log, stderr=log)
-    try:
-        reader = NewestReader("contact", "palm")
-        end = time.monotonic() + START_S
-        while (frame := reader.recv(1.0)) is None or not frame.valid:
-            assert time.monotonic() < end and process.poll() is None, (runtime / "log.txt").read_text()
-        reader.close()
-        yield process
-    finally:
-        process.send_signal(signal.SIGTERM)
-        process.wait(10)
-        log.close()
 
 
 @pytest.fixture

@@ -1,0 +1,160 @@
+// The contacts of a skin, in C++: written from protocol/WIRE.md, with nothing of eitskin's code.
+//
+//   g++ -std=c++17 -O2 -Wall -Wextra -Werror -DMSGPACK_NO_BOOST examples/cpp/subscribe.cpp -lzmq -o subscribe
+//   ./subscribe palm          (Debian: g++ cppzmq-dev libmsgpack-cxx-dev)
+//
+// Usage: subscribe SKIN [FRAMES [ENDPOINT]]. Prints each new frame and its contacts, until FRAMES have come.
+// Exit status: 0 all came, 1 silence or an old frame (stop the robot), 2 wrong arguments or no such socket.
+
+#include <time.h>
+#include <unistd.h>
+
+#include <chrono>
+#include <cstdarg>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <fstream>
+#include <map>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include <msgpack.hpp>
+#include <zmq.hpp>
+
+namespace {
+
+using Map = std::map<std::string, msgpack::object>;
+
+constexpr int kSchema = 1;
+constexpr double kSilenceS = 1.0;  // a controller would take less: the demo sends a frame every 45 ms
+
+struct NoFrame : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+std::string endpoint() {
+  if (const char* folder = std::getenv("EITSKIN_RUNTIME"); folder && *folder)
+    return "ipc://" + std::string(folder) + "/publisher.ipc";
+  if (const char* folder = std::getenv("XDG_RUNTIME_DIR"); folder && *folder)
+    return "ipc://" + std::string(folder) + "/eitskin/publisher.ipc";
+  return "ipc:///tmp/eitskin-" + std::to_string(geteuid()) + "/publisher.ipc";
+}
+
+// The boot id, which says whose monotonic clock the stamps are of.
+std::string this_host() {
+  std::string id, plain;
+  std::ifstream("/proc/sys/kernel/random/boot_id") >> id;
+  for (char c : id)
+    if (c != '-') plain += c;
+  return plain;
+}
+
+std::int64_t monotonic_ns() {
+  timespec now{};
+  clock_gettime(CLOCK_MONOTONIC, &now);
+  return now.tv_sec * 1'000'000'000LL + now.tv_nsec;
+}
+
+const msgpack::object& field(const Map& map, const char* key) {
+  const auto found = map.find(key);
+  if (found == map.end()) throw NoFrame(std::string("no field ") + key);
+  return found->second;
+}
+
+// Whether the frame may still be acted on: `valid_for_s` after its `publish` stamp. Another host's stamps say nothing
+// about our clock; its frames were waited for, and have just come.
+bool is_fresh(const Map& frame) {
+  static const std::string host = this_host();
+  const double valid_for_s = field(frame, "valid_for_s").as<double>();
+  if (valid_for_s <= 0.0 || field(frame, "host").as<std::string>() != host) return true;
+  const auto stamps = field(frame, "stamps").as<std::map<std::string, std::int64_t>>();
+  const auto publish = stamps.find("publish");
+  return publish != stamps.end() && 1e-9 * static_cast<double>(monotonic_ns() - publish->second) <= valid_for_s;
+}
+
+[[gnu::format(printf, 1, 2)]] std::string text(const char* form, ...) {
+  char line[256];
+  va_list values;
+  va_start(values, form);
+  std::vsnprintf(line, sizeof line, form, values);
+  va_end(values);
+  return line;
+}
+
+std::string describe(const Map& contact) {
+  const auto position = field(contact, "position").as<std::vector<double>>();
+  if (position.size() != 3) throw NoFrame("a position is three numbers");
+  std::string line = text("  contact %llu %s at %+.6f %+.6f %+.6f m", field(contact, "id").as<unsigned long long>(),
+                          field(contact, "state").as<std::string>().c_str(), position[0], position[1], position[2]);
+  const auto& force = field(contact, "force_n");
+  if (force.is_nil()) return line + " force unknown\n";  // a skin that nobody calibrated
+  line += text(" force %.6f", force.as<double>());
+  const auto& sigma = field(contact, "force_sigma_n");
+  return line + (sigma.is_nil() ? " N\n" : text(" +- %.6f N\n", sigma.as<double>()));
+}
+
+// Prints a message's frame and its contacts; whether they are fresh. Throws for what is no frame.
+bool print(const std::string& message) {
+  const auto body = message.find('\0');
+  if (body == std::string::npos) throw NoFrame("no topic");
+  const auto unpacked = msgpack::unpack(message.data() + body + 1, message.size() - body - 1);
+  const auto frame = unpacked.get().as<Map>();
+  if (field(frame, "schema").as<int>() != kSchema) throw NoFrame("of another schema than this program knows");
+  const bool fresh = is_fresh(frame), replay = field(frame, "source").as<std::string>() == "replay";
+  const bool valid = field(frame, "valid").as<bool>();
+  std::string out = text("frame %llu ", field(frame, "seq").as<unsigned long long>());
+  out += !fresh ? "STALE" : replay ? "REPLAY" : valid ? "valid" : "INVALID";
+  for (const auto& reason : field(frame, "reasons").as<std::vector<std::string>>()) out += " " + reason;
+  out += "\n";
+  for (const auto& contact : field(frame, "contacts").as<std::vector<Map>>()) out += describe(contact);
+  std::fputs(out.c_str(), stdout);
+  std::fflush(stdout);
+  return fresh;
+}
+
+int subscribe(const std::string& skin, long frames, const std::string& address) {
+  zmq::context_t context;
+  zmq::socket_t socket(context, zmq::socket_type::sub);
+  socket.set(zmq::sockopt::linger, 0);
+  socket.set(zmq::sockopt::conflate, true);  // the newest frame only; before connect
+  socket.set(zmq::sockopt::subscribe, "contact/" + skin + std::string(1, '\0'));
+  socket.connect(address);  // a service that comes later, or back, is found by itself
+  zmq::pollitem_t waiting[] = {{socket.handle(), 0, ZMQ_POLLIN, 0}};
+  auto last = monotonic_ns();
+  for (long seen = 0; frames < 0 || seen < frames;) {
+    zmq::poll(waiting, 1, std::chrono::milliseconds(100));
+    zmq::message_t message;
+    if (socket.recv(message, zmq::recv_flags::dontwait)) {
+      try {
+        if (!print(message.to_string())) return 1;
+        last = monotonic_ns();
+        ++seen;
+      } catch (const std::exception& bad) {  // anything may arrive: dropped, and never a reason to stop
+        std::fprintf(stderr, "dropped what is no frame: %s\n", bad.what());
+      }
+    }
+    if (1e-9 * static_cast<double>(monotonic_ns() - last) > kSilenceS) {
+      std::fprintf(stderr, "no contact frame of %s for %g s at %s: is the service running?\n", skin.c_str(), kSilenceS,
+                   address.c_str());
+      return 1;
+    }
+  }
+  return 0;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  if (argc < 2 || argc > 4) {
+    std::fprintf(stderr, "usage: %s SKIN [FRAMES [ENDPOINT]]\n", argv[0]);
+    return 2;
+  }
+  try {
+    return subscribe(argv[1], argc > 2 ? std::atol(argv[2]) : -1, argc > 3 ? argv[3] : endpoint());
+  } catch (const zmq::error_t& bad) {
+    std::fprintf(stderr, "cannot subscribe: %s; expected ipc://PATH or tcp://HOST:PORT\n", bad.what());
+    return 2;
+  }
+}

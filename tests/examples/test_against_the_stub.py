@@ -1,0 +1,233 @@
+"""The examples as they are, against the running service: real processes, the stub board, a press by its control socket.
+
+Python's three controllers and the C++ subscriber share one service.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgpack
+import pytest
+import zmq
+
+from protocol.client import ContactSubscriber, Stale
+from protocol.control import ControlClient
+from protocol.frames import Contact, ContactFrame
+from protocol.sockets import AllReader
+
+ROOT = Path(__file__).resolve().parents[2]
+CPP = ROOT / "examples" / "cpp" / "subscribe.cpp"
+PATIENT_S = "1.5"  # what counts as silence here: a busy machine that runs tests is no fault of the skin
+
+pytestmark = pytest.mark.usefixtures("untouched")
+Start = Callable[..., subprocess.Popen[str]]
+
+
+def stub(command: str, **args: object) -> None:
+    ControlClient("stub", 5.0).call(command, **args)
+
+
+def press(x: float, y: float, newtons: float) -> None:
+    stub("press", x=x, y=y, force=newtons, seconds=60.0)
+
+
+@pytest.fixture
+def untouched(shared_service: Path) -> None:
+    """Nothing touches, and the skin says so."""
+    stub("release")
+    end, quiet = time.monotonic() + 30, 0
+    with ContactSubscriber("palm") as skin:
+        while quiet < 5:
+            assert time.monotonic() < end, "no untouched frames"
+            try:
+                quiet = 0 if skin.next_frame(1.0, valid=True).contacts else quiet + 1
+            except Stale:
+                quiet = 0
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Start an example as a user would."""
+    running: list[subprocess.Popen[str]] = []
+
+    def begin(*command: str) -> subprocess.Popen[str]:
+        running.append(subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True))
+        return running[-1]
+
+    yield begin
+    for process in running:
+        process.kill()
+        process.communicate()
+
+
+def example(name: str, max_age: str = PATIENT_S) -> tuple[str, ...]:
+    return sys.executable, "-m", f"examples.{name}", "--max-age", max_age
+
+
+def line_with(process: subprocess.Popen[str], words: str) -> str:
+    """Read on until a line holds the words."""
+    assert process.stdout is not None
+    seen = []
+    for line in process.stdout:
+        seen.append(line)
+        if words in line:
+            return line
+    raise AssertionError(f"no {words!r} in {seen}")
+
+
+def pid_of(module: str) -> int:
+    """The process of this test's own service: the one with its runtime folder."""
+    wanted = f"EITSKIN_RUNTIME={os.environ['EITSKIN_RUNTIME']}".encode()
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if module.encode() in (folder / "cmdline").read_bytes() and wanted in (folder / "environ").read_bytes():
+                return int(folder.name)
+        except OSError:
+            continue
+    raise AssertionError(f"no process of {module}")
+
+
+def test_stop_on_contact_stops_with_the_first_frame_that_has_one(start: Start) -> None:
+    every = AllReader(["contact"], "palm")
+    robot = start(*example("stop_on_contact"))
+    line_with(robot, "robot moves")
+    press(0.02, -0.01, 3.0)
+    line_with(robot, "robot stands")
+    stopped = re.search(r"frame (\d+): contact at \(([-+.\d]+), ([-+.\d]+)\) mm", line_with(robot, "stopped by frame"))
+    assert robot.wait(10) == 0 and stopped
+    first = next(f.seq for f in iter(lambda: every.recv(1.0), None) if isinstance(f, ContactFrame) and f.contacts)
+    assert first <= int(stopped[1]) <= first + 1, "at most one later, where the machine let it be overtaken"
+    assert float(stopped[2]) == pytest.approx(20, abs=4) and float(stopped[3]) == pytest.approx(-10, abs=4)
+    every.close()
+
+
+def test_stop_on_contact_stops_when_the_service_falls_silent(start: Start) -> None:
+    robot = start(*example("stop_on_contact", "0.4"))
+    line_with(robot, "robot moves")
+    publisher = pid_of("services.publisher")
+    os.kill(publisher, signal.SIGSTOP)
+    try:
+        line_with(robot, "robot stands")
+        assert "cannot be trusted: the newest contact frame of palm is" in line_with(robot, "stopped")
+        assert robot.wait(10) == 1
+    finally:
+        os.kill(publisher, signal.SIGCONT)
+
+
+def test_guarded_move_reaches_its_force(start: Start) -> None:
+    robot = start(*example("guarded_move"), "--newtons", "2")
+    line_with(robot, "robot moves")
+    press(0.0, 0.0, 4.0)
+    assert "force reached" in line_with(robot, "force")
+    assert robot.wait(10) == 0
+
+
+def test_guarded_move_backs_off_where_no_contact_is_expected(start: Start) -> None:
+    robot = start(*example("guarded_move"), "--newtons", "20")
+    assert "-20.0) mm/s" in line_with(robot, "robot moves")
+    press(0.035, 0.0, 3.0)
+    line_with(robot, "contact where none is expected")
+    line_with(robot, "backed off")
+    assert robot.wait(10) == 2
+
+
+def test_follow_the_finger_follows_holds_still_and_goes_on(start: Start) -> None:
+    robot = start(*example("follow_the_finger", "0.4"))
+    press(0.03, -0.02, 3.0)
+    moves = re.search(r"moves at \(([-+.\d]+), ([-+.\d]+), ([-+.\d]+)\) mm/s", line_with(robot, "robot moves"))
+    assert moves
+    x, y, z = map(float, moves.groups())
+    assert x > 0 > y and z < 0 and x * x + y * y + z * z <= 100.5**2
+    publisher = pid_of("services.publisher")
+    os.kill(publisher, signal.SIGSTOP)
+    line_with(robot, "holding still")
+    line_with(robot, "robot stands")
+    os.kill(publisher, signal.SIGKILL)  # the service starts another one, and the controller finds it
+    line_with(robot, "robot moves")
+    stub("release")
+    line_with(robot, "robot stands")
+
+
+@pytest.fixture(scope="module")
+def cpp_subscriber(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The C++ subscriber, compiled; without compiler and headers the tests say so, loudly."""
+    missing = [] if shutil.which("g++") else ["g++"]
+    headers = {"zmq.hpp": "cppzmq-dev", "msgpack.hpp": "libmsgpack-cxx-dev"}
+    missing += [package for header, package in headers.items() if not Path("/usr/include", header).is_file()]
+    if missing:
+        message = f"C++ SUBSCRIBER NOT TRIED: apt-get install {' '.join(missing)}"
+        if os.environ.get("EITSKIN_REQUIRE_CPP"):
+            pytest.fail(message)
+        pytest.skip(message)
+    program = tmp_path_factory.mktemp("cpp") / "subscribe"
+    flags = ["-std=c++17", "-Wall", "-Wextra", "-Werror", "-DMSGPACK_NO_BOOST"]
+    done = subprocess.run(["g++", *flags, str(CPP), "-lzmq", "-o", str(program)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def test_the_cpp_subscriber_sees_the_same_contacts(cpp_subscriber: Path, start: Start) -> None:
+    press(0.02, -0.01, 3.0)
+    press(-0.025, 0.02, 4.0)
+    with ContactSubscriber("palm") as skin:
+        while len(skin.next_frame(5.0).contacts) < 2:
+            pass
+    every = AllReader(["contact"], "palm")
+    assert isinstance(every.recv(5.0), ContactFrame)
+    program = start(str(cpp_subscriber), "palm", "30")
+    printed = program.communicate(timeout=60)[0]
+    assert program.returncode == 0
+    blocks = re.findall(r"^frame (\d+) (\w+)(.*)\n((?:  .*\n)*)", printed, re.MULTILINE)
+    assert len(blocks) == 30
+    sent = {f.seq: f for f in frames_until(every, int(blocks[-1][0]))}
+    for seq, word, reasons, contacts in blocks:
+        frame = sent[int(seq)]
+        assert (word, reasons.split()) == ("valid" if frame.valid else "INVALID", frame.reasons)
+        assert contacts == "".join(map(as_printed, frame.contacts))
+    assert contacts.count("\n") == 2
+    every.close()
+
+
+def frames_until(every: AllReader, seq: int) -> Iterator[ContactFrame]:
+    while isinstance(frame := every.recv(5.0), ContactFrame):
+        yield frame
+        if frame.seq >= seq:
+            return
+    raise AssertionError(f"no frame {seq}")
+
+
+def as_printed(contact: Contact) -> str:
+    x, y, z = contact.position
+    force = "unknown" if contact.force_n is None else f"{contact.force_n:.6f} +- {contact.force_sigma_n:.6f} N"
+    return f"  contact {contact.id} {contact.state} at {x:+.6f} {y:+.6f} {z:+.6f} m force {force}\n"
+
+
+def test_the_cpp_subscriber_survives_what_is_no_frame_and_tells_of_silence(
+    cpp_subscriber: Path, runtime: Path, start: Start
+) -> None:
+    topic, _, body = (ROOT / "protocol" / "vectors" / "frames" / "contact_empty.bin").read_bytes().partition(b"\0")
+    vector = topic + b"\0" + msgpack.packb(msgpack.unpackb(body) | {"host": "another"})
+    with zmq.Context() as context, context.socket(zmq.PUB) as publisher:
+        publisher.bind(f"ipc://{runtime}/publisher.ipc")
+        program = start(str(cpp_subscriber), "palm", "2")
+        end = time.monotonic() + 30
+        while program.poll() is None and time.monotonic() < end:
+            for message in (b"contact/palm\0\xc1", b"contact/palm\0\x80", b"contact/palm\0", vector):
+                publisher.send(message)
+                time.sleep(0.02)
+        assert (
+            program.communicate(timeout=10)[0].splitlines()
+            == ["frame 41 INVALID stale_baseline uncalibrated_force"] * 2
+        )
+        assert program.returncode == 0
+        silent = start(str(cpp_subscriber), "palm", "2")
+        assert silent.communicate(timeout=30)[0] == "" and silent.returncode == 1

@@ -1,0 +1,134 @@
+"""What the example controllers make of frames, known beforehand: no service needed."""
+
+import math
+
+import pytest
+
+from examples.follow_the_finger import DAMPING, FASTEST, answer, follow, push
+from examples.guarded_move import guarded_move
+from examples.robot import Robot
+from examples.stop_on_contact import stop_on_contact
+from protocol.client import NotValid, Stale
+from protocol.frames import Contact, ContactFrame
+
+
+class Skin:
+    """Gives out the frames of a list; silence after them."""
+
+    def __init__(self, *frames):
+        self.frames = list(frames)
+
+    def next_frame(self, max_age, *, valid):
+        assert valid, "a controller asks for frames to act on"
+        if not self.frames:
+            raise Stale("silence", 1.0)
+        frame = self.frames.pop(0)
+        if not frame.valid:
+            raise NotValid(frame, 0.0)
+        return frame
+
+
+class Drive(Robot):
+    """A robot that counts its commands."""
+
+    def __init__(self):
+        super().__init__()
+        self.told = []
+
+    def move(self, velocity):
+        self.told.append(velocity)
+        super().move(velocity)
+
+
+def frame(*contacts, valid=True):
+    return ContactFrame(skin="palm", valid=valid, contacts=list(contacts))
+
+
+def contact(x, y, force, state="hold"):
+    return Contact(id=1, state=state, position=[x, y, 0.0], force_n=force)
+
+
+STILL = (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("last", "status"), [([frame(contact(0.0, 0.0, 0.1))], 0), ([], 1), ([frame(valid=False)], 1)])
+def test_the_very_frame_stops_it(last, status, capsys):
+    robot = Drive()
+    assert stop_on_contact(robot, Skin(frame(), frame(), *last, frame()), 0.1) == status
+    moved, stopped = robot.told[:-1], robot.told[-1]
+    assert stopped == STILL and all(v[0] > 0 for v in moved)
+    assert len(moved) == (2 if last else 3), "one command for each frame that allowed it"
+
+
+def test_it_does_not_begin_to_move_before_the_skin_is_trusted():
+    robot = Drive()
+    assert stop_on_contact(robot, Skin(frame(valid=False)), 0.1) == 1
+    assert robot.told == [STILL]
+
+
+def test_guarded_move_stops_at_its_force_and_not_before():
+    robot = Drive()
+    skin = Skin(frame(), frame(contact(0.01, 0.0, 1.9)), frame(contact(0.01, 0, 9.0, "end")), frame(contact(0, 0, 2.1)))
+    assert guarded_move(robot, skin, 2.0, 0.1) == 0
+    assert [v[2] < 0 for v in robot.told] == [True, True, True, False] and robot.told[-1] == STILL
+
+
+@pytest.mark.parametrize("touch", [contact(0.04, 0.0, 0.2), contact(0.0, 0.0, None)])
+def test_guarded_move_backs_off_or_stops_where_it_cannot_know(touch, monkeypatch):
+    robot = Drive()
+    ticks = iter(range(10_000))
+    monkeypatch.setattr("examples.robot.time.monotonic", lambda: next(ticks) * 0.02)
+    status = guarded_move(robot, Skin(*[frame()] * 2, *[frame(touch)] * 40), 2.0, 0.1)
+    if touch.force_n is None:
+        assert status == 0, "an unknown force counts as enough"
+    else:
+        assert status == 2 and robot.told[-2][2] > 0
+    assert robot.told[-1] == STILL
+
+
+def test_guarded_move_does_not_back_off_blindly():
+    robot = Drive()
+    assert guarded_move(robot, Skin(frame(contact(0.04, 0.0, 0.2))), 2.0, 0.1) == 1
+    assert robot.told[-1] == STILL
+
+
+def test_a_push_to_the_side_moves_to_that_side_and_away():
+    x, y, z = push([contact(0.03, -0.02, 3.0)])
+    assert x > 0 and z < 0 and y / x == pytest.approx(-2 / 3)
+    assert push([contact(0.001, 0.002, 3.0)])[:2] == (0.0, 0.0), "dead band of position"
+    assert push([contact(0.03, 0.0, 0.2)]) == (0.0, 0.0, 0.0), "dead band of force"
+    assert push([contact(0.03, 0.0, None)]) == push([contact(0.03, 0.0, 3.0, "end")]) == (0.0, 0.0, 0.0)
+
+
+def test_the_answer_has_the_mass_the_damping_and_the_limit():
+    v = STILL
+    for _ in range(100):
+        v = answer(v, (2.0, 0.0, 0.0), 0.05)
+    assert v == pytest.approx((2.0 / DAMPING, 0.0, 0.0), rel=1e-6), "D v = F in the end"
+    assert answer(STILL, (2.0, 0.0, 0.0), 0.1)[0] == pytest.approx((1 - math.exp(-1)) * 2.0 / DAMPING)
+    for _ in range(100):
+        v = answer(v, (40.0, 30.0, 0.0), 0.05)
+    assert math.hypot(*v) == pytest.approx(FASTEST) and v[1] / v[0] == pytest.approx(0.75)
+    for _ in range(100):
+        v = answer(v, STILL, 0.05)
+    assert v == STILL, "and it comes to rest"
+
+
+def test_following_holds_still_as_soon_as_the_skin_is_not_trusted(monkeypatch, capsys):
+    ticks = iter(range(10_000))
+    monkeypatch.setattr("examples.follow_the_finger.time.monotonic", lambda: next(ticks) * 0.02)
+    robot, touch = Drive(), frame(contact(0.03, 0.0, 3.0))
+    follow(robot, Skin(touch, touch, frame(valid=False), touch), 0.1, 0.3)
+    assert [any(v) for v in robot.told[:5]] == [True, True, False, True, False]
+    assert "holding still" in capsys.readouterr().out
+
+
+def test_a_robot_that_is_told_nothing_more_stops_by_itself(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("examples.robot.time.monotonic", lambda: now[0])
+    robot = Robot()
+    robot.move((1.0, 0.0, 0.0))
+    now[0] = 0.2
+    assert robot.position[0] == pytest.approx(0.2)
+    now[0] = 60.0
+    assert robot.position[0] == pytest.approx(0.5)
