@@ -227,4 +227,3 @@ def test_a_contact_drifts_from_its_fast_change_until_it_is_what_it_was():
     on = [t for t, fault in zip(times, _drifting(script, times), strict=True) if fault]
     assert on[0] == pytest.approx(10.25, abs=0.1) and on[-1] == pytest.approx(20.9, abs=0.1)
     assert len(on) == round((on[-1] - on[0]) * 20) + 1
-    assert _drifting(script, [15.0, 15.05]) == [{}, {}]  # nobody saw it change
