@@ -1,0 +1,228 @@
+"""What each skip rule saves and what it costs: CPU per frame and error, with the rule and without.
+
+    skin bench skip [--seconds 20] [--live 15]
+
+Part one runs the stages in one process, every frame packed and unpacked between them as on the wire, on three scenes
+of the stub in simulated time; variants take turns. Part two brings up the real processes and reads their CPU time
+while the skin is untouched, touched and still, touched and moving. Prints tables, writes skip.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from bench._machine import machine, versions
+from bench._service import PROCESSES, Outside, Service, running
+from bench._tracking_scene import Recorded, record
+from models.bundle import Bundle
+from protocol.frames import ContactFrame, Frame, pack, unpack
+from services.config import Skin, Touch
+from services.pipeline import build_stages
+
+QUIET_S = 5.0  # of each scene, before it begins: the tare
+ROUNDS = 3
+TARGETS = {"untouched": 0.25, "still": 0.5}  # of a moving touch's CPU
+TOUCH = {"shape": "circle", "x": 0.008, "y": -0.012, "force": 2.0, "radius": 0.01}
+ENDS_S = 0.5  # before the scene's end the touch is gone, so that its release is seen too
+EVERYTHING = frozenset({"delta", "image", "contact", "force", "shape"})
+PLAIN = frozenset({"delta", "image", "contact"})
+AFTER_S = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # edges of the times since a still touch began
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A configuration of the switches, and the topics somebody subscribes to."""
+
+    touch: Touch = Touch()
+    wanted: frozenset[str] = PLAIN
+
+    def skin(self) -> Skin:
+        return Skin(port="stub", bundle="square16", frame_id="palm", touch=self.touch)
+
+
+VARIANTS = {
+    "all rules": Variant(),
+    "untouched frames reconstructed too": Variant(Touch(skip_untouched=False)),
+    "no hold": Variant(Touch(hold=False)),
+    "force and shape subscribed": Variant(wanted=EVERYTHING),
+    "no rule": Variant(Touch(skip_untouched=False, hold=False), EVERYTHING),
+}
+
+
+def scenes(seconds: float) -> dict[str, Recorded]:
+    """The three scenes in simulated time."""
+    end = QUIET_S + seconds
+    keys = {
+        "untouched": [],
+        "still": [{"t": QUIET_S, **TOUCH}, {"t": end - ENDS_S, **TOUCH}],
+        "moving": [
+            {"t": QUIET_S + s, **TOUCH, "x": 0.03 * float(np.cos(1.3 * s)), "y": 0.03 * float(np.sin(1.3 * s))}
+            for s in np.arange(0, seconds - ENDS_S + 1e-9, 0.25)
+        ],
+    }
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, points in keys.items():
+            path = Path(folder, f"{name}.toml")
+            path.write_text(_toml(points, end))
+            found[name] = record(str(path), 80.0, 3, end)[0]
+    return found
+
+
+def _toml(points: list[dict[str, Any]], end: float) -> str:
+    lines = [f"duration = {end}"]
+    if points:
+        lines.append("[[touch]]\nkeys = [")
+        for point in points:
+            lines.append("  { " + ", ".join(f"{key} = {json.dumps(value)}" for key, value in point.items()) + " },")
+        lines.append("]")
+    return "\n".join(lines) + "\n"
+
+
+def run(recorded: Recorded, variant: Variant, bundle: Bundle) -> tuple[list[ContactFrame], float]:
+    """(contact frames, CPU seconds per frame after the quiet time) of a scene through the stages and their wire."""
+    stages = build_stages("palm", variant.skin(), bundle)
+    contacts, used, counted = [], 0.0, 0
+    for k in range(len(recorded)):
+        message = pack(recorded.frame(k))
+        began = time.thread_time()
+        frames: list[Frame] = []
+        for stage in stages:
+            frames = stage.process(unpack(message), variant.wanted)
+            for frame in frames:
+                frame.stamps.setdefault(stage.stamp, time.monotonic_ns())
+            messages = [pack(frame) for frame in frames]
+            message = messages[0]
+        used += (time.thread_time() - began) * (recorded.seconds[k] > QUIET_S)
+        counted += int(recorded.seconds[k] > QUIET_S)
+        assert isinstance(frames[0], ContactFrame)
+        contacts.append(frames[0])
+    return contacts, used / counted
+
+
+def errors(recorded: Recorded, contacts: list[ContactFrame]) -> dict[str, Any]:
+    """Position error [mm] and force error [%] of the frames with a touch, and what was seen how late [frames]."""
+    truth = {int(row[0]): row[1:] for row in recorded.touches}
+    position, force, since = [], [], []
+    for k, frame in enumerate(contacts):
+        if k in truth and frame.contacts and frame.contacts[0].state != "end":
+            _, x, y, newton, *_ = truth[k]
+            found = frame.contacts[0]
+            position.append(1e3 * float(np.hypot(found.position[0] - x, found.position[1] - y)))
+            force.append(100 * abs((found.force_n or 0.0) / newton - 1))
+            since.append(float(recorded.seconds[k]) - QUIET_S)
+    if not position:
+        return {"seen": sum(bool(frame.contacts) for frame in contacts)}
+    here = [bool(frame.contacts) and frame.contacts[0].state != "end" for frame in contacts]
+    first, last = min(truth), max(truth)
+    of = np.digitize(since, AFTER_S)
+    return {
+        "position_mm": float(np.sqrt(np.mean(np.square(position)))),
+        "force_%": float(np.sqrt(np.mean(np.square(force)))),
+        "seen_after_frames": here.index(True, first) - first,
+        "released_after_frames": here.index(False, last + 1) - last - 1 if False in here[last + 1 :] else None,
+        "position_mm_after_s": {
+            str(AFTER_S[i - 1]): float(np.sqrt(np.mean(np.square(np.array(position)[of == i])))) for i in np.unique(of)
+        },
+    }
+
+
+def stages_alone(seconds: float) -> dict[str, Any]:
+    """variant -> scene -> CPU per frame [ms] and errors."""
+    recorded, bundle = scenes(seconds), Bundle.load("square16")
+    cpu: dict[tuple[str, str], list[float]] = {}
+    found: dict[str, Any] = {name: {} for name in VARIANTS}
+    gc.collect()
+    gc.freeze()
+    for _ in range(ROUNDS):
+        for name, variant in VARIANTS.items():
+            for scene, frames in recorded.items():
+                contacts, used = run(frames, variant, bundle)
+                cpu.setdefault((name, scene), []).append(used * 1e3)
+                found[name][scene] = errors(frames, contacts)
+    for (name, scene), used_ms in cpu.items():
+        found[name][scene]["cpu_ms"] = min(used_ms)
+    return found
+
+
+def live(seconds: float) -> dict[str, Any]:
+    """scene -> CPU per frame [ms] of each process, one controller on contact; and of all of them."""
+    begin: dict[str, Callable[[Service], Any]] = {
+        "untouched": lambda s: s.stub("release"),
+        "still": lambda s: s.stub("press", x=0.01, y=0.0, force=3.0, seconds=600.0),
+        "moving": lambda s: s.stub("scene", name="slide"),
+    }
+    found: dict[str, Any] = {}
+    with running() as service:
+        contacts = Outside("contact", "palm", service.folder)
+        for scene, start in begin.items():
+            start(service)
+            time.sleep(3.0)
+            before, frames, end = service.cpu_s(), 0, time.monotonic() + seconds
+            while time.monotonic() < end:
+                frames += contacts.recv(0.2) is not None
+            used = service.cpu_s()
+            each = {name: 1e3 * (used[name] - before[name]) / frames for name in PROCESSES}
+            found[scene] = {"cpu_ms": sum(each.values()), "processes_ms": each, "frames": frames}
+        contacts.close()
+    return found
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="skin bench skip", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each scene, simulated")
+    parser.add_argument("--live", type=float, default=15.0, help="seconds of each scene with the real processes")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
+    args = parser.parse_args(argv)
+    variants, processes = stages_alone(args.seconds), live(args.live)
+    console = Console(width=140)
+    console.print(_variants_table(variants))
+    console.print(_live_table(processes))
+    ratios = {scene: processes[scene]["cpu_ms"] / processes["moving"]["cpu_ms"] for scene in TARGETS}
+    for scene, ratio in ratios.items():
+        print(f"{scene}: {ratio:.2f} of a moving touch's CPU (target at most {TARGETS[scene]})")
+    args.out.mkdir(parents=True, exist_ok=True)
+    report = {"machine": machine(), "versions": versions(), "stages": variants, "live": processes, "ratios": ratios}
+    (args.out / "skip.json").write_text(json.dumps(report | {"targets": TARGETS}, indent=1) + "\n")
+    print(f"wrote {args.out / 'skip.json'}")
+    return 0
+
+
+def _variants_table(variants: dict[str, Any]) -> Table:
+    table = Table(title=f"stages with their wire in one process, {machine()}", title_justify="left")
+    for head in ("", *(f"CPU ms, {scene}" for scene in ("untouched", "still", "moving"))):
+        table.add_column(head, justify="right" if head else "left")
+    for head in ("still: mm", "force %", "moving: mm", "force %", "seen after", "released after"):
+        table.add_column(head, justify="right")
+    for name, of in variants.items():
+        cells = [f"{of[scene]['cpu_ms']:.2f}" for scene in ("untouched", "still", "moving")]
+        for scene in ("still", "moving"):
+            cells += [f"{of[scene]['position_mm']:.3f}", f"{of[scene]['force_%']:.1f}"]
+        cells += [str(of["moving"][key]) for key in ("seen_after_frames", "released_after_frames")]
+        table.add_row(name, *cells)
+    return table
+
+
+def _live_table(processes: dict[str, Any]) -> Table:
+    table = Table(title="real processes, CPU ms per frame", title_justify="left")
+    for head in ("", "all four", *PROCESSES):
+        table.add_column(head, justify="right" if head else "left")
+    for scene, row in processes.items():
+        table.add_row(scene, f"{row['cpu_ms']:.2f}", *(f"{row['processes_ms'][p]:.2f}" for p in PROCESSES))
+    return table
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
