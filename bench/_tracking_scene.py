@@ -36,6 +36,7 @@ MADE_BY = (
     *(f"models/{n}.py" for n in ("elements", "forward", "geometry", "meshing", "patterns", "shapes")),
     "services/clock.py",
 )
+LAYOUT = 1  # of what is kept: raised when Recorded or what fills it changes
 KEPT = 6  # recorded scenes
 READ_LATE_S = 0.002  # a scheduler's doing
 CONTACT_CHANGED = 0.05  # of its impedance within a second: a contact that drifts, not one that ages
@@ -79,6 +80,12 @@ class Recorded:
             board=board,
         )
 
+    def beginning(self, seconds: float) -> Recorded:
+        n = int(np.searchsorted(self.seconds, seconds))
+        m = int(np.searchsorted(self.touches[:, 0], n))
+        cut = {f.name: getattr(self, f.name)[: m if f.name == "touches" else n] for f in fields(self)}
+        return Recorded(**cut)
+
     def truth(self, k: int) -> list[dict[str, float]]:
         """The true touches of frame k."""
         return [dict(zip(TOUCHES, row[1:], strict=True)) for row in self._of(k)]
@@ -89,17 +96,21 @@ class Recorded:
 
 
 def record(name: str, snr_db: float, seed: int, seconds: float | None = None) -> tuple[Recorded, float]:
-    """The scene's frames, from bench/work where they are there; and the seconds that simulating them took."""
-    path = WORK / f"tracking-{_key(name, snr_db, seed, seconds)}.npz"
+    """The scene's frames, or those of its beginning, from bench/work where they are there; and the seconds that
+    simulating them took.
+    """
+    path = WORK / f"tracking-{_key(name, snr_db, seed)}.npz"
     if path.is_file():
         with np.load(path) as kept:
-            return Recorded(**{f.name: kept[f.name] for f in fields(Recorded)}), 0.0
+            found = Recorded(**{f.name: kept[f.name] for f in fields(Recorded)})
+        return (found if seconds is None else found.beginning(seconds)), 0.0
     began = time.perf_counter()
     found = simulate(name, snr_db, seed, seconds)
-    WORK.mkdir(parents=True, exist_ok=True)
-    for old in sorted(WORK.glob("tracking-*.npz"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
-        old.unlink()
-    np.savez_compressed(path, **{f.name: getattr(found, f.name) for f in fields(Recorded)})
+    if seconds is None:
+        WORK.mkdir(parents=True, exist_ok=True)
+        for old in sorted(WORK.glob("tracking-*.npz"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
+            old.unlink()
+        np.savez_compressed(path, **{f.name: getattr(found, f.name) for f in fields(Recorded)})
     return found, time.perf_counter() - began
 
 
@@ -193,9 +204,9 @@ def _drifting(script: Script, starts: list[float]) -> list[dict[str, object]]:
     return found
 
 
-def _key(name: str, snr_db: float, seed: int, seconds: float | None) -> str:
-    digest = hashlib.sha256(f"{snr_db} {seed} {seconds}".encode())
+def _key(name: str, snr_db: float, seed: int) -> str:
+    digest = hashlib.sha256(f"{LAYOUT} {snr_db} {seed}".encode())
     path = Path(name) if name.endswith(".toml") else scenes.FOLDER / f"{name}.toml"
-    for file in (Path(__file__), path, *(ROOT / name for name in MADE_BY)):
+    for file in (path, *(ROOT / name for name in MADE_BY)):
         digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
