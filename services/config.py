@@ -52,7 +52,11 @@ class Tare(Section):
 
     frames: Annotated[int, Field(ge=8, le=4096)] = 64
     max_age_s: Annotated[float, Field(gt=0)] = 3600.0  # an older persisted baseline is not loaded
-    tracking_s: Annotated[float, Field(gt=0)] = 20.0  # time constant with which drift is followed while untouched
+    tracking_s: Annotated[float, Field(gt=0)] = 20.0  # time constant of what drift does not explain, while untouched
+    # How fast an untouched skin may change, relative; see services/drift.py. A foam that dries by 6 %, electrodes whose
+    # contacts change by a quarter, within five minutes.
+    scale_per_s: Annotated[float, Field(gt=0, le=1e-2)] = 2e-4  # the sheet's conductivity
+    contact_per_s: Annotated[float, Field(gt=0, le=1e-1)] = 8e-4  # each electrode's contact impedance
 
 
 class Touch(Section):
@@ -63,6 +67,13 @@ class Touch(Section):
     skip_untouched: bool = True  # switch of the rule "nothing touches: do not reconstruct"
 
 
+class Indenter(Section):
+    """What presses this skin, where that is always the same: its known area fixes the drop, see services/force.py."""
+
+    radius_m: Annotated[float, Field(gt=0, le=1)]
+    shape: Literal["circle"] = "circle"
+
+
 class Skin(Section):
     """One skin: one board on one port, one bundle."""
 
@@ -70,7 +81,8 @@ class Skin(Section):
     bundle: str  # the name of a folder of models/bundles, else a path
     frame_id: str = ""  # default: the skin's name
     pose: Pose = Pose()
-    calibration: Path | None = None  # JSON of this very skin's force law: see services/force.py
+    calibration: Path | None = None  # JSON of this very skin's force law: see services/calibration.py
+    indenter: Indenter | None = None
     network: Literal["full", "fast", "int8", "none"] = "full"
     dft_points: Literal[128, 256, 512] = 128
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement

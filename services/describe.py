@@ -36,8 +36,20 @@ def describe(skin: Skin, bundle: Bundle, baseline: Baseline | None) -> dict[str,
     }
     if baseline is not None:
         found |= {"baseline": baseline.z0.copy(), "baseline_sigma": baseline.sigma, "baseline_hash": baseline.hash}
-        found |= {"tare_sample_ns": baseline.taken_ns, "tare_frames": baseline.frames, "board": baseline.board}
+        found |= {"tare_sample_ns": baseline.taken_ns, "tare": provenance(baseline, bundle)}
     return found
+
+
+def provenance(baseline: Baseline, bundle: Bundle) -> dict[str, Any]:
+    """Where the baseline comes from."""
+    return {
+        "taken_by": baseline.taken_by,
+        "restored": baseline.restored,
+        "frames": baseline.frames,
+        "board": baseline.board,
+        "bundle_hash": bundle.hash,
+        "doubt": baseline.doubt,
+    }
 
 
 def geometry(bundle: Bundle) -> dict[str, Any]:

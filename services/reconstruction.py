@@ -24,6 +24,8 @@ IMAGE_SIZE = 96
 MOST_CONTACTS = 8
 ROW_NS = 45_000_000
 """Time between rows of a --sequence: the board's nominal scan."""
+UNKNOWN_AGE_S = 300.0
+"""Between the untouched rows of a file and its measurements, where nobody says: all the drift that is allowed for."""
 ASSUMED_NOISE = 1e-3
 """Relative noise of a frame (60 dB) where a file holds too few untouched frames to find it."""
 FEWEST_FOR_TARE = 16
@@ -93,14 +95,17 @@ def reconstruct(
     sequence: bool = False,
     warn: Callable[[str], None] = lambda text: None,
     progress: Callable[[Iterable[int]], Iterable[int]] = lambda rows: rows,
+    age_s: float = UNKNOWN_AGE_S,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of OUT.npz: see `skin reconstruct --help`. Rows are independent unless `sequence`.
+
+    age_s: of the untouched rows when the measurements, or the first of a sequence, were taken. A reference has none.
 
     A row whose reference gives fewer than half the measurements stays empty: not valid, no image, no contacts.
     """
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of numpy, for measurements that are not finite
-        return _reconstruct(data, skin, bundle, sequence, warn, progress)
+        return _reconstruct(data, skin, bundle, sequence, warn, progress, age_s)
 
 
 def _reconstruct(
@@ -110,6 +115,7 @@ def _reconstruct(
     sequence: bool,
     warn: Callable[[str], None],
     progress: Callable[[Iterable[int]], Iterable[int]],
+    age_s: float,
 ) -> dict[str, NDArray[Any]]:
     pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
     out = _empty(len(data.measurements))
@@ -128,7 +134,8 @@ def _reconstruct(
             baseline = Baseline(np.where(good, z0, 0.0), np.where(good, noise * z0, np.inf), 1, "file", 0)
         assert baseline is not None
         if not sequence or row == 0 or data.reference is not None:
-            pipeline.pre.set_baseline(Baseline(**{**baseline.to_dict(), "z0": baseline.z0.copy()}))
+            fresh = Baseline(**{**baseline.to_dict(), "z0": baseline.z0.copy()})
+            pipeline.pre.set_baseline(fresh, age_s=age_s if data.reference is None else 0.0)
         _store(out, row, pipeline.run(_raw(data.measurements[row], row if sequence else 0)))
     if lost:
         warn(f"{lost} of {len(out['valid'])} rows are not valid: their `reference` gives too few measurements")

@@ -93,6 +93,8 @@ class Runner:
             if time.monotonic() >= next_tick:
                 self._tick()
                 next_tick = time.monotonic() + TICK_S
+            if ready and not self._poller.poll(0):
+                any(lane.stage.prepare() for lane in self.lanes.values())  # one piece of work, while nobody waits
         self.close()
 
     def _next_deadline(self) -> float:

@@ -78,6 +78,12 @@ class Stage(ABC):
     def health(self) -> Health:
         return Health()
 
+    def prepare(self) -> bool:
+        """Called after frames were sent while none is waiting: do one bounded piece of work that later frames will need, and say whether
+        there was one. Changes nothing but how soon a result is there.
+        """
+        return False
+
     def warm_up(self) -> None:  # noqa: B027
         """Do once what is slow the first time."""
 

@@ -37,6 +37,8 @@ class Baseline:
     board: str  # unique id of the board
     taken_ns: int  # `sample` of the newest frame in it
     doubt: str = ""  # why the skin may have been touched meanwhile; empty: no doubt
+    taken_by: str = "start"  # or "command", "file"
+    restored: bool = False  # an earlier process took it
 
     @property
     def hash(self) -> str:
@@ -51,13 +53,14 @@ class Baseline:
         try:
             z0, sigma = np.array(saved["z0"], dtype=float), np.array(saved["sigma"], dtype=float)
             rest = int(saved["frames"]), str(saved["board"]), int(saved["taken_ns"]), str(saved["doubt"])
+            provenance = str(saved.get("taken_by", "start")), bool(saved.get("restored", False))
         except (KeyError, TypeError, ValueError) as wrong:
             raise Refused(f"no baseline in the saved state ({wrong}): tare again") from None
         if z0.shape != (measurements,) or sigma.shape != (measurements,):
             raise Refused(f"the saved baseline has {z0.size} measurements, this skin {measurements}: tare again")
         if not (np.isfinite(z0).all() and (z0 >= 0).all() and (sigma > 0).all()):
             raise Refused("the saved baseline has impedances or noises that are not possible: tare again")
-        return cls(z0, sigma, *rest)
+        return cls(z0, sigma, *rest, *provenance)
 
 
 def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Baseline:

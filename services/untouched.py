@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.frames import RawFrame
 from services.config import Tare
+from services.following import Follower
 from services.stage import Refused
 from services.tare import Baseline, noise_of_steps, plausible_noise, take
 
@@ -21,8 +22,6 @@ Array = NDArray[np.float64]
 
 RETRY_EVERY = 8  # frames between attempts at the first tare
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
-RENORMALISE_EVERY = 64  # untouched frames after which tracked drift enters the normalisation
-LONGEST_STEP_S = 1.0  # of baseline tracking: a longer gap between frames counts as this
 
 
 class Untouched:
@@ -31,6 +30,7 @@ class Untouched:
     def __init__(self, bundle: Bundle, config: Tare) -> None:
         self.bundle, self.config = bundle, config
         self.pre = bundle.prereconstructor()
+        self.follower = Follower(self.pre, config)
         self.reset()
 
     def reset(self) -> None:
@@ -40,6 +40,7 @@ class Untouched:
         self._seen = 0
         self._source = self._board = ""
         self._last_sample_ns = 0
+        self._restored_s = 0.0  # age of a baseline that an earlier process took, until the first frame
         self._unsaved = False
         self.problem = ""  # what stands in the way of valid frames, for a person
         self._use(None)
@@ -59,13 +60,16 @@ class Untouched:
     def offer(self, amplitude: Array, frame: RawFrame) -> bool:
         """A frame's |Z| (K,), NaN where a measurement failed. Whether there is another baseline now."""
         self._seen += 1
+        self._last_sample_ns = frame.stamps.get("sample", 0)
+        self._date()
         self._window.append(amplitude)
         if frame.kind == "reference":
             return self._refer(amplitude, frame)
         self._references.clear()
         if self.baseline is None and len(self._window) == self.config.frames and self._seen % RETRY_EVERY == 0:
             try:
-                self.set_baseline(take(np.array(self._window), self.pre, frame.board, frame.stamps.get("sample", 0)))
+                sample_ns = frame.stamps.get("sample", 0)
+                self.set_baseline(take(np.array(self._window), self.pre, frame.board, sample_ns), sample_ns)
                 return True
             except Refused as why:
                 self.problem = f"no baseline yet: {why}"
@@ -76,29 +80,35 @@ class Untouched:
         assert self.baseline is not None
         return np.where(live, (amplitude - self.baseline.z0) / self.normaliser, 0.0)
 
+    def since_s(self, sample_ns: int) -> float:
+        """Seconds since the baseline last knew the skin as untouched."""
+        return self.follower.since_s(sample_ns)
+
     def touched(self) -> None:
         """The last frame offered was touched."""
+        if self._run and self.baseline is not None:
+            self.follower.touched(self.baseline.z0)
+            self.normaliser = self.pre.normaliser(self.baseline.z0)
         self._run = 0
 
     def untouched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int) -> None:
         """The last frame offered was not: slow drift is followed."""
         assert self.baseline is not None
         self._run += 1
-        since_s = (sample_ns - self._last_sample_ns) * 1e-9 if self._last_sample_ns else 0.0
-        step_s = min(max(0.0, since_s), LONGEST_STEP_S)
-        self._last_sample_ns = sample_ns
         z0 = self.baseline.z0
-        z0 += np.where(live, (amplitude - z0) * (step_s / (step_s + self.config.tracking_s)), 0.0)
-        if self._run % RENORMALISE_EVERY == 0:
+        if self.follower.untouched(z0, amplitude, live, self.sigma, sample_ns):
             self.normaliser = self.pre.normaliser(z0)
         if self._run % SAVE_EVERY == 0:
             self._unsaved = True
 
     # baselines
 
-    def set_baseline(self, baseline: Baseline) -> None:
-        """Use this baseline from the next frame on."""
-        self._run = 0
+    def set_baseline(self, baseline: Baseline, sample_ns: int = 0, age_s: float = 0.0) -> None:
+        """Use this baseline from the next frame on. Its newest frame is age_s older than the stamp sample_ns (0: than
+        the next frame).
+        """
+        self._run, self._restored_s = 0, 0.0
+        self.follower.begin(sample_ns, age_s)
         self._use(baseline)
 
     def tare(self, touched: bool, force: bool) -> Baseline:
@@ -111,7 +121,8 @@ class Untouched:
         if self.baseline is not None and self._run < needed and not force:
             raise Refused(f"only {self._run} of {needed} untouched frames since the last touch: wait and try again")
         baseline = take(np.array(self._window), self.pre, self._board, self._last_sample_ns)
-        self.set_baseline(dataclasses.replace(baseline, doubt=""))  # whoever gives the command has looked
+        # Whoever gives the command has looked: no doubt.
+        self.set_baseline(dataclasses.replace(baseline, doubt="", taken_by="command"), self._last_sample_ns)
         return baseline
 
     def progress(self) -> str:
@@ -134,10 +145,12 @@ class Untouched:
         self._references.append(amplitude)
         if len(self._references) > 1:  # several in a row: the noise is how they differ
             sigma = noise_of_steps(np.array(self._references))
-            self.set_baseline(Baseline(amplitude, sigma, 1, frame.board, frame.stamps.get("sample", 0)))
+            sample_ns = frame.stamps.get("sample", 0)
+            self.set_baseline(Baseline(amplitude, sigma, 1, frame.board, sample_ns, taken_by="file"), sample_ns)
         elif self.baseline is not None:
             self.baseline = dataclasses.replace(self.baseline, z0=amplitude)
             self.normaliser = self.pre.normaliser(amplitude)
+            self.follower.begin(frame.stamps.get("sample", 0))
         return self.baseline is not None
 
     # state
@@ -147,6 +160,8 @@ class Untouched:
             "bundle": self.bundle.hash,
             "baseline": self.baseline.to_dict() if self.baseline else None,
             "normaliser": self.normaliser if self.baseline else None,
+            "sigma": self.sigma if self.baseline else None,
+            "follower": self.follower.state(),
             "window": np.array(self._window),
             "run": self._run,
             "seen": self._seen,
@@ -168,20 +183,32 @@ class Untouched:
                 if normaliser.shape != (k,) or not (np.isfinite(normaliser) & (normaliser >= 0)).all():
                     raise Refused(f"the saved normaliser is not {k} numbers from 0 on: tare again")
                 self.normaliser = normaliser
-                self.sigma = self.baseline.sigma / normaliser
+                self.sigma = np.array(state.get("sigma", self.baseline.sigma / normaliser), dtype=float)
+                self.sigma = np.where(np.isfinite(self.baseline.sigma), self.sigma, np.inf)
+                if self.sigma.shape != (k,) or not (self.sigma > 0).all():
+                    raise Refused(f"the saved noise is not {k} numbers above 0: tare again")
         window = np.array(state["window"], dtype=float)
         if window.size and (window.ndim != 2 or window.shape[1] != k):
             raise Refused(f"the saved frames are of shape {window.shape}, expected (n, {k}): tare again")
         self._window.extend(window if window.size else [])
         self._run, self._seen = int(state["run"]), int(state["seen"])
         self._last_sample_ns = int(state["last_sample_ns"])
+        self.follower.begin(self._last_sample_ns)
+        if "follower" in state and state["bundle"] == self.bundle.hash:
+            try:
+                self.follower.load(state["follower"])
+            except (KeyError, TypeError, ValueError) as wrong:
+                raise Refused(f"the saved state of what follows drift does not fit ({wrong}): tare again") from None
 
     def saved(self) -> dict[str, Any] | None:
         """What is worth keeping across a crash, if it changed."""
         if not self._unsaved or self.baseline is None or self._source == "replay":
             return None
         self._unsaved = False
-        return {"bundle": self.bundle.hash, "baseline": self.baseline.to_dict()}
+        taken_s = self._restored_s or max(0.0, (self._last_sample_ns - self.baseline.taken_ns) * 1e-9)
+        quiet_s = self.since_s(self._last_sample_ns)
+        saved = {"bundle": self.bundle.hash, "baseline": self.baseline.to_dict()}
+        return saved | {"taken_s": taken_s, "quiet_s": quiet_s}
 
     def restore(self, saved: dict[str, Any], age_s: float) -> None:
         """Raises Refused where it does not fit or is too old."""
@@ -190,5 +217,19 @@ class Untouched:
         oldest = self.config.max_age_s
         if age_s > oldest:
             raise Refused(f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest / 3600:.1f} h")
-        self.set_baseline(Baseline.from_dict(saved.get("baseline", {}), len(self.bundle.pattern)))
+        baseline = Baseline.from_dict(saved.get("baseline", {}), len(self.bundle.pattern))
+        try:
+            taken_s, quiet_s = (max(0.0, float(saved.get(key, 0.0))) for key in ("taken_s", "quiet_s"))
+        except (TypeError, ValueError) as wrong:
+            raise Refused(f"the saved baseline has no age ({wrong}): tare again") from None
+        self.set_baseline(dataclasses.replace(baseline, restored=True), age_s=age_s + quiet_s)
+        self._restored_s = age_s + taken_s
         self._unsaved = False
+
+    def _date(self) -> None:
+        """Stamps begin anew with a boot: with the first frame it is known when a restored baseline was taken."""
+        if self._restored_s and self.baseline is not None:
+            taken_ns = self._last_sample_ns - round(self._restored_s * 1e9)
+            self.baseline = dataclasses.replace(self.baseline, taken_ns=taken_ns)
+            self._restored_s = 0.0
+            self.changed = True
