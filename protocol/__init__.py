@@ -2,7 +2,7 @@
 
 Needs numpy, pyzmq and msgpack only. WIRE.md documents every byte of it. Where to look:
 
-    client.py, listener.py, aio.py     for a robot controller: the newest contacts, never old ones; by callback, by await
+    client.py, listener.py, aio.py     for a robot controller: the newest contacts, never old ones; callbacks; asyncio
     freshness.py                       what is new enough, and valid, to be acted on
     topics.py, frame_types.py          the table of topics; the frames' fields with types, ranges and units
     frames.py, fields.py, records.py   frames as messages and back, checked
