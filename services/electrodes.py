@@ -118,7 +118,7 @@ class ElectrodeHealth:
         reasons += [reason for state, reason in REASONS.items() if (states == state).any()]
         bad = int((states != OK).sum())
         usable = bad <= TOO_MANY and bool(live.sum() >= len(live) / 2)
-        if bad >= TOO_MANY:
+        if bad == TOO_MANY:
             reasons.append("degraded")
         if not usable and not reasons:
             reasons.append("out_of_distribution")

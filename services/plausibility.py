@@ -12,17 +12,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 LIMIT = 0.03  # relative: a few kelvin on the sheet, or a contact that wears, are left to the tare
 SIGMAS = 6.0
+DRIFTED = 1e-3  # relative fall that a touched skin's drift may come to
+FALLEN = 0.3  # share of a change's energy that is of falls, beyond which it is no touch
 
 
-def impossible(d: Array, sigma: Array, pairs: NDArray[np.bool_]) -> bool:
+def impossible(d: Array, sigma: Array, pairs: NDArray[np.bool_], touched: bool) -> bool:
     """Whether (K,) differences d with standard deviations sigma are of no touch. pairs (K,): live measurements between
-    the very two electrodes that they drive; too few of them tell nothing.
+    the very two electrodes that they drive; too few of them tell nothing. touched: they are taken for a touch's.
     """
     if pairs.sum() < len(d) / 2:
         return False
-    least = d[pairs]
-    return bool((least + SIGMAS * sigma[pairs]).min() < -LIMIT or least.min() > LIMIT)
+    change, noise = d[pairs], SIGMAS * sigma[pairs]
+    if (change + noise).min() < -LIMIT or change.min() > LIMIT:
+        return True
+    falls = np.minimum(change + np.maximum(noise, DRIFTED), 0.0)
+    return touched and bool(falls @ falls > FALLEN * (change @ change))

@@ -57,6 +57,7 @@ class Preprocessing(Stage):
         self._counters = {"frames": 0, "touched": 0, "reconstructed": 0, "held": 0, "foreign": 0}
         self._foreign = ""
         self.hold.reset()
+        self._live: NDArray[np.bool_] | None = None  # measurements that counted in the last frame
         self.electrodes.reset()
         self.judge.reset()
         self.untouched.reset()
@@ -95,14 +96,17 @@ class Preprocessing(Stage):
             out.valid = False
             live = measured & np.isfinite(amplitude) if np.isfinite(amplitude).sum() > len(live) / 2 else measured
             amplitude = np.where(np.isfinite(amplitude), amplitude, self.untouched.baseline.z0)  # type: ignore[union-attr]
+        if self._live is not None and (self._live != live).any():
+            self.hold.reset()  # its frames had other measurements
+        self._live = live
         d = self.untouched.difference(amplitude, live)
+        d, found_now = self._decide(d, amplitude, live, out.stamps.get("sample", 0))
         # Of a measured bundle it is not known which way its material goes.
         if self.bundle.matrices.normalisation == "model" and impossible(
-            d, self.untouched.sigma, live & self.electrodes.self_sensing
+            d, self.untouched.sigma, live & self.electrodes.self_sensing, self._touched
         ):
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
-        d, found_now = self._decide(d, amplitude, live, out.stamps.get("sample", 0))
         out.touched, out.score, out.threshold = self._touched, found_now.score, found_now.threshold
         out.difference = d.astype(np.float32)
         out.sigma = np.where(live, self.untouched.sigma, np.inf).astype(np.float32)

@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from firmware_stub.analog import Analog, Noise
-from firmware_stub.faults import Faults
-from firmware_stub.sheet import Sheet
-from models.bundle import Bundle
 from models.shapes import Shape
-from protocol.frames import RawFrame
-from services.pipeline import Pipeline, Result
+from tests.services.stub_skin import StubSkin
 
 PRESS = (Shape("circle", 0.3, -0.2, 0.2, 0.3),)
 HARD = [
@@ -26,41 +19,9 @@ HARD = [
 ]
 
 
-@cache
-def transfer(shapes: tuple[Shape, ...]) -> NDArray[np.float64]:
-    sheet = _sheet()
-    return sheet.model.solve(sheet.model.touched(list(shapes)), sheet.skin.contact_impedance).transfer
-
-
-@cache
-def _sheet() -> Sheet:
-    return Sheet("square16")
-
-
-class Skin:
-    """The stages behind the stub's analog part: sheet and multiplexers, converter and firmware's arithmetic."""
-
-    def __init__(self, bundle: Bundle, snr_db: float) -> None:
-        self.pattern, self.faults, self.scan = np.asarray(bundle.pattern), Faults(), 0
-        self.analog = Analog(Noise.of_db(snr_db), self.faults, np.random.default_rng(3))
-        self.pipeline = Pipeline("square16", name="palm")
-        for _ in range(72):
-            result = self.feel(())
-        assert result.contact.valid and not result.delta.touched
-
-    def feel(self, shapes: tuple[Shape, ...]) -> Result:
-        self.scan += 1
-        t = transfer(shapes)
-        z, status = self.analog.measure((t, t), self.pattern, 128, 200.0, 0.0)
-        stamps = {"sample": self.scan * 45_000_000, "read": self.scan * 45_000_000 + 1}
-        return self.pipeline.run(
-            RawFrame(skin="palm", scan=self.scan, stamps=stamps, source="board", valid=True, z=z, status=status)
-        )
-
-
 @pytest.fixture(scope="module")
-def tared() -> dict[float, Skin]:
-    return {snr_db: Skin(Bundle.load("square16"), snr_db) for snr_db in (60.0, 80.0)}
+def tared() -> dict[float, StubSkin]:
+    return {snr_db: StubSkin(snr_db) for snr_db in (60.0, 80.0)}
 
 
 FAULTS: list[tuple[str, dict[str, Any]]] = [
@@ -83,7 +44,7 @@ NAMED = {
 @pytest.mark.parametrize("shapes", [(), PRESS], ids=["free", "pressed"])
 @pytest.mark.parametrize(("name", "args"), FAULTS, ids=[f"{n}-{'-'.join(map(str, a.values()))}" for n, a in FAULTS])
 def test_a_gross_fault_gives_no_valid_contact(
-    tared: dict[float, Skin], name: str, args: dict[str, Any], shapes: tuple[Shape, ...], snr_db: float
+    tared: dict[float, StubSkin], name: str, args: dict[str, Any], shapes: tuple[Shape, ...], snr_db: float
 ) -> None:
     skin = tared[snr_db]
     skin.faults.inject(name, args, 0.0, 1.0)
@@ -99,14 +60,16 @@ def test_a_gross_fault_gives_no_valid_contact(
             for contact, shape in zip(r.contact.contacts, shapes, strict=True):
                 away = np.hypot(contact.position[0] - 0.05 * shape.x, contact.position[1] - 0.05 * shape.y)
                 assert away < 0.005
-    after = [skin.feel(()) for _ in range(5)]
+    after = [skin.feel() for _ in range(5)]
     assert all(r.contact.valid and not r.delta.electrodes.any() for r in after[3:])  # and when it is over, all is well
 
 
 @pytest.mark.parametrize("snr_db", [60.0, 80.0])
 @pytest.mark.parametrize("shapes", HARD)
-def test_the_hardest_touches_are_no_fault(tared: dict[float, Skin], shapes: tuple[Shape, ...], snr_db: float) -> None:
+def test_the_hardest_touches_are_no_fault(
+    tared: dict[float, StubSkin], shapes: tuple[Shape, ...], snr_db: float
+) -> None:
     skin = tared[snr_db]
     found = [skin.feel(shapes) for _ in range(4)]
     assert all(r.delta.touched and r.delta.valid for r in found)
-    skin.feel(())
+    skin.feel()
