@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from models import bundle, data, export, geometry, manifest, samples, train
+from models import bundle, calibrate, data, export, geometry, manifest, samples, train
 from models.augmentation import random_condition
 from models.evaluation import LEVELS, evaluate, predict
 from models.forward import ForwardModel
@@ -151,6 +151,9 @@ def main(argv: list[str] | None = None) -> None:
             for variant, minutes in (("full", plan.full), ("fast", plan.fast)):
                 train.train(variant, skin, pre, scenes, held_out, minutes, work / f"{variant}.pt", args.seed, args.jobs)
         made, said = networks(work, pre, held_out)
+        presses = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4
+        for variant, found in calibrate.uncertainty(skin, pre, made, presses, work / "presses.npz").items():
+            said[variant]["uncertainty"] = found
     written = bundle.write(out, manifest.describe(skin.name, skin, matrices, network=said or None), matrices, made)
     for curve in work.glob("*.png") if made else ():
         shutil.copy(curve, out / f"training_{curve.name}")

@@ -147,7 +147,13 @@ def write(
         raise BundleError(
             f"{path}: {size / 2**20:.1f} MB, a bundle may have {MAX_BYTES // 2**20} MB: ship a smaller network"
         )
-    full = {"schema": SCHEMA, **manifest, "files": {name: sha256(path / name) for name in names}}
+    return replace_manifest(
+        path, {"schema": SCHEMA, **manifest, "files": {name: sha256(path / name) for name in names}}
+    )
+
+
+def replace_manifest(path: Path, full: Mapping[str, Any]) -> Bundle:
+    """Another manifest for the files that are there, at once, and loads the bundle back."""
     handle, temporary = tempfile.mkstemp(dir=path, prefix=".manifest")
     with os.fdopen(handle, "w") as out:
         json.dump(full, out, indent=2)

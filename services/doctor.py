@@ -136,10 +136,10 @@ def _calibration(name: str, skin: Skin, bundle: Bundle) -> Finding:
     if skin.calibration is None or not skin.calibration.is_file():
         return Finding("FAIL", what, f"{skin.calibration} is not there: correct `calibration`, or take the line away")
     try:
-        law = ForceLaw.of(skin, bundle)
+        law = ForceLaw.of(skin, bundle, name)
     except ConfigError as why:
         return Finding("FAIL", what, f'{why}; expected JSON such as {{"newtons_per_siemens": 10.0, "most_n": 5.0}}')
-    return Finding("OK", what, f"{skin.calibration}: {law.newtons_per_siemens:g} N per S/m, to {law.most_n:g} N")
+    return Finding("OK", what, f"{skin.calibration}: {law}")
 
 
 def _device(name: str, skin: Skin, bundle: Bundle, running: bool) -> Iterator[Finding]:

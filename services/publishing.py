@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame
 from services.config import Skin
-from services.force import ForceLaw
+from services.force import ForceLaw, Look
 from services.motion import Seen, Track
 from services.outline import outline
 from services.segmentation import Segment, readable, segment
 from services.stage import Health, Stage, add_reason, inherited
 from services.tracking import Tracker
 
-EXPLAINED = 0.9  # quality from which an image counts although its peak is beyond the sheet's or the law's
+EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
 UNKNOWN_BELOW = 0.4  # probability of the best class below which a shape is "unknown"
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
@@ -35,7 +35,7 @@ class Publishing(Stage):
     def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
         super().__init__(name)
         self.config = skin
-        self.law = ForceLaw.of(skin, bundle)
+        self.law = ForceLaw.of(skin, bundle, name)
         self.tracker = Tracker()
         self.reset()
 
@@ -59,7 +59,7 @@ class Publishing(Stage):
         assert isinstance(frame, ImageFrame)
         self._counters["frames"] += 1
         out = ContactFrame(**inherited(frame), frame_id=self.config.frame_id, force_calibrated=self.law.calibrated)
-        if self.law.newtons_per_siemens is None:
+        if not self.law.exists:
             add_reason(out.reasons, "uncalibrated_force")
         if frame.held and self._known:
             self._keep(frame)
@@ -76,7 +76,7 @@ class Publishing(Stage):
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)
         explained = out.quality is not None and out.quality >= EXPLAINED
-        if any(self.law.impossible(s.peak) for s in self._segments) and not explained:
+        if any(self.law.impossible(*each) for each in self._drops()) and not explained:
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
         frames: list[Frame] = [out]
@@ -97,7 +97,7 @@ class Publishing(Stage):
         tracks, ended = self.tracker.update(seen, now)
         classes = [_class_probabilities(s, frame.classes) for s in segments]
         self._segments, self._classes, self._geometry, self._known = segments, classes, (m, [x0, y0]), True
-        present = [self._contact(*each, m) for each in zip(tracks, seen, segments, classes, strict=True)]
+        present = [self._contact(*each, frame) for each in zip(tracks, seen, segments, classes, strict=True)]
         self._contacts = present + self._ends(ended)
         self._counters["contacts"] += sum(track.age == 1 for track in tracks)
 
@@ -115,8 +115,8 @@ class Publishing(Stage):
         self._forget()
         self._counters["unknown"] += 1
 
-    def _contact(self, track: Track, seen: Seen, s: Segment, classes: list[float], metres_per_pixel: float) -> Contact:
-        force, sigma = self.law.force(s.peak, s.peak_sigma)
+    def _contact(self, track: Track, seen: Seen, s: Segment, classes: list[float], frame: ImageFrame) -> Contact:
+        force, sigma = self.law.force(Look.of(s, frame))
         best = int(np.argmax(classes)) if classes else -1
         known = bool(classes) and classes[best] >= UNKNOWN_BELOW
         return Contact(
@@ -125,7 +125,7 @@ class Publishing(Stage):
             position=[seen.x, seen.y, 0.0],
             velocity=[track.vx, track.vy, 0.0],
             orientation=s.orientation,
-            area_m2=s.area * metres_per_pixel**2,
+            area_m2=s.area * frame.metres_per_pixel**2,
             force_n=force,
             force_sigma_n=sigma,
             wrench=_wrench(seen.x, seen.y, force or 0.0),
@@ -134,14 +134,18 @@ class Publishing(Stage):
             confidence=_confidence(s),
         )
 
+    def _drops(self) -> list[tuple[float, float | None]]:
+        """(peak drop, force) of each touch."""
+        return [(s.peak, c.force_n) for s, c in zip(self._segments, self._contacts, strict=False)]
+
     def _ends(self, tracks: list[Track]) -> list[Contact]:
         """The last word on touches that ended: where they were; they do not press any more."""
-        force = None if self.law.newtons_per_siemens is None else 0.0
+        force = None if not self.law.exists else 0.0
         return [Contact(id=t.id, state="end", position=[t.x, t.y, 0.0], force_n=force, confidence=0.0) for t in tracks]
 
     def _force(self, frame: Frame) -> ForceFrame:
         present = [c for c in self._contacts if c.state != "end"]
-        total = None if self.law.newtons_per_siemens is None else sum(c.force_n or 0.0 for c in present)
+        total = None if not self.law.exists else sum(c.force_n or 0.0 for c in present)
         wrench = np.sum([c.wrench for c in present], axis=0).tolist() if present else [0.0] * 6
         return ForceFrame(**inherited(frame), wrench=wrench, force_n=total)
 

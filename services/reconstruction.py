@@ -136,13 +136,13 @@ def _reconstruct(
         if not sequence or row == 0 or data.reference is not None:
             fresh = Baseline(**{**baseline.to_dict(), "z0": baseline.z0.copy()})
             pipeline.pre.set_baseline(fresh, age_s=age_s if data.reference is None else 0.0)
-        _store(out, row, pipeline.run(_raw(data.measurements[row], row if sequence else 0)))
+        _store(out, row, pipeline.run(raw_frame(data.measurements[row], row if sequence else 0)))
     if lost:
         warn(f"{lost} of {len(out['valid'])} rows are not valid: their `reference` gives too few measurements")
     return out
 
 
-def _raw(measurement: NDArray[Any], scan: int) -> RawFrame:
+def raw_frame(measurement: NDArray[Any], scan: int) -> RawFrame:
     return RawFrame(
         skin="file",
         scan=scan,

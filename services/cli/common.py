@@ -49,6 +49,7 @@ EXPECTED = {
     ("services.replay", "ReplayError"): FAILED,
     ("services.importing", "ImportRefused"): USAGE,
     ("services.registration", "RegistrationError"): USAGE,
+    ("services.calibration_fit", "CalibrationError"): USAGE,
     ("protocol.transport", "TransportError"): FAILED,
     ("models.bundle", "BundleError"): USAGE,
 }

@@ -12,6 +12,7 @@ import pytest
 from models.bundle import Bundle
 from services.config import ROOT, ConfigError, load, parse
 from services.force import ForceLaw
+from services.force_curve import Curve
 
 PALM: dict[str, Any] = {"port": "stub", "bundle": "square16"}
 
@@ -64,7 +65,7 @@ def test_the_calibration_that_the_shipped_file_shows_is_read(tmp_path: Path) -> 
     (tmp_path / "palm.json").write_text(shown[1])
     config = parse({"skins": {"palm": PALM | {"calibration": "palm.json"}}}, tmp_path / "skin.toml")
     law = ForceLaw.of(config.skin("palm"), Bundle.load("square16"))
-    assert (law.newtons_per_siemens, law.most_n, law.calibrated) == (10.0, 5.0, True)
+    assert (law.curve, law.most_n, law.calibrated) == (Curve(10.0), 5.0, True)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,137 @@
+"""`skin calibrate force`: a skin's own force law from a handful of presses of known force."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from services.cli.common import USAGE, JsonOption, SkinOption, emit, fail, skin_name, use_configured_sockets
+
+if TYPE_CHECKING:
+    from services.calibration_fit import Press
+
+PLAN = ((0, 0, 1), (0, 0, 3), (0, 0, 5), (1, 1, 2), (-1, 1, 4), (-1, -1, 2), (1, -1, 4))
+"""Where to press (halves of the way to the edge), and about how firmly [N]; then again from the first."""
+
+
+def register(app: typer.Typer) -> None:
+    calibrate = typer.Typer(help="Teach a skin from what is known.", no_args_is_help=True)
+    calibrate.callback()(lambda: None)  # so that `force` stays a command of its own
+    calibrate.command("force")(force)
+    app.add_typer(calibrate, name="calibrate")
+
+
+def force(
+    skin: SkinOption = "",
+    csv: Annotated[Path | None, typer.Option(help="Presses from a file instead of by prompts; see below.")] = None,
+    measurements: Annotated[
+        Path | None, typer.Option(help="With --csv: FILE.npz whose rows its column `row` names.")
+    ] = None,
+    save: Annotated[Path | None, typer.Option(help="Also keep the presses, as a CSV that --csv reads.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The calibration; default: calibration/SKIN-force.json.")] = None,
+    most: Annotated[float, typer.Option(help="Newtons beyond which it is extrapolated; default: the firmest.")] = 0.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit the skin's force law to presses of known force and say how well it foretells each press from the others.
+
+    By prompts: type the force, press and hold still, release; an empty line ends. CSV: a line of names, then a press a
+    line: force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2[,noise] as --save writes it; or, with --measurements:
+    force_n,row (from 0).
+    """
+    from models.bundle import Bundle
+    from services import calibration, calibration_csv, calibration_presses
+    from services.calibration_fit import CalibrationError, fit
+    from services.config import load
+
+    name = skin_name(skin)
+    configured = load().skin(name)
+    bundle = Bundle.load(configured.bundle)
+    if measurements is not None and csv is None:
+        fail(
+            "--measurements needs --csv FILE with columns force_n,row: which row was measured under which force", USAGE
+        )
+    if csv is None:
+        presses = _prompted(name, bundle)
+    elif measurements is None:
+        presses = calibration_csv.read(csv)
+    else:
+        warn = lambda text: print(f"skin: {text}", file=sys.stderr)  # noqa: E731
+        presses = calibration_csv.read(csv, calibration_presses.of_file(measurements, configured, bundle, warn))
+    out = out or Path("calibration", f"{name}-force.json")
+    try:
+        if save is not None:
+            save.parent.mkdir(parents=True, exist_ok=True)
+            calibration_csv.write(save, presses)
+        found = fit(presses, calibration_presses.laws(configured, bundle), most or None)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        digest = calibration.save(out, found, name, configured, bundle)
+    except OSError as why:
+        fail(f"cannot write {why.filename}: {why.strerror}")
+    except CalibrationError:
+        if save is not None:
+            print(f"skin: the presses are kept in {save}", file=sys.stderr)
+        raise
+    report = {"file": str(out), "sha256": digest, "of": found.reads, "most_n": found.most_n, **found.said}
+    report["curve"] = found.curve.to_dict()
+    if as_json:
+        emit(report)
+        return
+    _say(report)
+
+
+def _say(report: dict[str, Any]) -> None:
+    curve, error, of = report["curve"], report["error"], "peak drop" if report["of"] == "peak" else "integrated drop"
+    place = "" if curve["correction"] == "none" else f", corrected for the place ({curve['correction']})"
+    print(f"force = {curve['scale']:.4g} * ({of})^{curve['exponent']:.3f}{place}, to {report['most_n']:g} N")
+    print(
+        f"each of the {report['presses']} presses foretold by the others: off by "
+        f"{100 * error['left_out_median']:.1f} % (median), {100 * error['left_out_rms']:.1f} % (root mean square)"
+    )
+    print(
+        f"wrote {report['file']} ({report['sha256'][:12]}): name it as `calibration` in skin.toml, restart the service"
+    )
+
+
+def _prompted(name: str, bundle: Any) -> list[Press]:
+    """Presses on the live service, one prompt each."""
+    import time
+
+    from protocol.sockets import AllReader
+    from services.calibration_fit import CalibrationError, Press
+    from services.calibration_presses import wait_for_press, wait_for_release
+
+    use_configured_sockets()
+    quarter = 0.25e3 * bundle.image_size * bundle.metres_per_pixel  # mm, half the way to the edge
+    presses: list[Press] = []
+    print("type the force in newtons, then press and hold still until told; an empty line ends", file=sys.stderr)
+    while True:
+        x, y, about = PLAN[len(presses) % len(PLAN)]
+        hint = f"press {len(presses) + 1}, say at ({x * quarter:+.0f}, {y * quarter:+.0f}) mm with about {about} N"
+        try:
+            print(f"{hint}: newtons? ", end="", file=sys.stderr, flush=True)
+            text = input().strip()
+        except EOFError:
+            text = ""
+        if not text:
+            return presses
+        try:
+            newton = float(text)
+        except ValueError:
+            print(f"found {text!r}, expected a number of newtons", file=sys.stderr)
+            continue
+        reader = AllReader(["image"], name)  # a new one each time: nothing of before the prompt is in it
+        try:
+            look = wait_for_press(reader, time.monotonic)
+            print(
+                f"  {newton:g} N at ({look.x * 1e3:+.1f}, {look.y * 1e3:+.1f}) mm, peak {look.peak:.3f} S/m: release",
+                file=sys.stderr,
+            )
+            presses.append(Press(newton, look, f"press {len(presses) + 1}"))
+            wait_for_release(reader, time.monotonic)
+        except CalibrationError as why:
+            print(f"  {why}; this press does not count", file=sys.stderr)
+        finally:
+            reader.close()

@@ -1,0 +1,145 @@
+"""Force and its uncertainty, through the real stages, on presses solved on a mesh that no training uses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("skfem")
+
+from models import geometry  # noqa: E402
+from models.bundle import Bundle  # noqa: E402
+from models.calibrate import Presses, solve  # noqa: E402
+from models.forward import shared  # noqa: E402
+from models.shapes import Shape  # noqa: E402
+from protocol.frames import Contact, RawFrame  # noqa: E402
+from services.config import ConfigError, Indenter, Skin  # noqa: E402
+from services.force import ForceLaw, Look  # noqa: E402
+from services.force_curve import Curve  # noqa: E402
+from services.pipeline import Pipeline  # noqa: E402
+from services.tare import take  # noqa: E402
+
+FRAME_NS = 45_000_000
+
+
+@pytest.fixture(scope="module")
+def presses() -> Presses:
+    return solve(geometry.load("square16"), 150, seed=99)
+
+
+class Skinny:
+    """A skin under noise: |Z| in, contacts out."""
+
+    def __init__(self, skin: Skin, bundle: Bundle, z0: np.ndarray, decibel: float, hold: bool = False) -> None:
+        self.z0, self.noise, self.rng, self.scan = z0, 10 ** (-decibel / 20), np.random.default_rng(5), 0
+        self.pipeline = Pipeline(skin, bundle=bundle, always_reconstruct=not hold)
+        tare = z0 * (1 + self.noise * self.rng.standard_normal((64, len(z0))))
+        self.baseline = take(tare, self.pipeline.pre.pre, "b", 0)
+        self.release()
+
+    def release(self) -> None:
+        self.pipeline.reset()
+        self.pipeline.pre.set_baseline(replace(self.baseline, z0=self.baseline.z0.copy()))
+
+    def press(self, d: np.ndarray) -> Contact | None:
+        self.scan += 1
+        z = self.z0 * (1 + d) * (1 + self.noise * self.rng.standard_normal(len(d)))
+        raw = RawFrame(
+            skin="skin",
+            scan=self.scan,
+            z=z.astype(np.complex64),
+            status=np.zeros(len(z), np.uint8),
+            stamps={"sample": self.scan * FRAME_NS},
+            source="replay",
+            valid=True,
+            board="b",
+        )
+        out = self.pipeline.run(raw)
+        found = [c for c in out.contact.contacts if c.state != "end"]
+        return found[0] if out.delta.touched and len(found) == 1 else None
+
+
+def configured(**more: object) -> Skin:
+    return Skin.model_validate({"port": "stub", "bundle": "square16", "frame_id": "palm", **more})
+
+
+def scored(skinny: Skinny, presses: Presses, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """(error / sigma, relative error) of the presses that are seen."""
+    z, errors = [], []
+    for shape, d in zip(presses.touches(), presses.difference, strict=True):
+        skinny.release()
+        for _ in range(frames):
+            c = skinny.press(d)
+        if c is not None:
+            assert c.force_n is not None and c.force_sigma_n is not None
+            z.append((c.force_n - 10 * shape.drop) / c.force_sigma_n)
+            errors.append(c.force_n / (10 * shape.drop) - 1)
+    return np.array(z), np.array(errors)
+
+
+def test_two_thirds_of_presses_fall_within_one_sigma(presses: Presses, bundle: Bundle) -> None:
+    z = np.concatenate([scored(Skinny(configured(), bundle, presses.z0, db), presses)[0] for db in (62.0, 75.0, 120.0)])
+    assert len(z) > 400 and 0.61 < (np.abs(z) < 1).mean() < 0.76
+    assert (np.abs(z) < 3).mean() > 0.95
+
+
+def test_held_presses_are_no_worse_than_they_say(presses: Presses, bundle: Bundle) -> None:
+    some = Presses(presses.shapes[:60], presses.difference[:60], presses.z0)
+    z, _ = scored(Skinny(configured(), bundle, presses.z0, 66.0, hold=True), some, frames=8)
+    assert 0.5 < (np.abs(z) < 1).mean() < 0.9
+
+
+def test_a_known_indenter_takes_the_trade_off_away(bundle: Bundle) -> None:
+    model = shared("square16", "stub")
+    z0 = np.abs(model.solve(1.0).impedances())
+    rng = np.random.default_rng(3)
+    shapes = [Shape("circle", *rng.uniform(-0.75, 0.75, 2), 0.2, rng.uniform(0.1, 0.5)) for _ in range(30)]
+    d = np.array([np.abs(model.solve(model.touched([s])).impedances()) / z0 - 1 for s in shapes])
+    presses = Presses(np.array([s.as_row() for s in shapes]), d, z0)
+    prior = configured(indenter={"radius_m": 0.01})
+    z, known = scored(Skinny(prior, bundle, z0, 70.0), presses)
+    _, unknown = scored(Skinny(configured(), bundle, z0, 70.0), presses)
+    assert np.abs(known).mean() < 0.035 < 0.07 < np.abs(unknown).mean()
+    assert 0.45 < (np.abs(z) < 1).mean() < 0.9
+
+
+def look(**more: float | None) -> Look:
+    values = {"peak": 0.3, "peak_sigma": 0.03, "integral": 1e-4, "area": 3e-4, "x": 0.0, "y": 0.0, "noise": None}
+    return Look(**{**values, **more})  # type: ignore[arg-type]
+
+
+def test_the_kinds_law_is_ten_newtons_per_siemens_and_says_it_is_no_calibration(bundle: Bundle) -> None:
+    law = ForceLaw.of(configured(), bundle)
+    assert law.force(look()).newton == pytest.approx(3.0)
+    assert not law.calibrated and law.exists and law.describe()["calibrated"] is False  # type: ignore[index]
+    assert not ForceLaw.of(Skin(port="stub", bundle="disc16"), Bundle.load("disc16")).exists
+
+
+def test_a_law_may_read_the_integral(bundle: Bundle) -> None:
+    manifest = {**bundle.manifest, "force_law": {"of": "integral", "newtons_per_siemens_metre": 3e4, "most_n": 4}}
+    law = ForceLaw.of(configured(), replace(bundle, manifest=manifest))
+    assert law.force(look(peak=0.1)).newton == pytest.approx(3.0) and law.most_n == 4
+    del manifest["force_law"]["newtons_per_siemens_metre"]
+    with pytest.raises(ConfigError, match="newtons_per_siemens_metre"):
+        ForceLaw.of(configured(), replace(bundle, manifest=manifest))
+
+
+def test_without_figures_of_its_own_the_networks_word_is_passed_on(bundle: Bundle) -> None:
+    law = replace(ForceLaw.of(configured(), bundle), maps={})
+    assert law.force(look()).sigma == pytest.approx(0.3)
+    assert law.force(look(peak_sigma=0.0)).sigma is None
+
+
+def test_the_calibrations_own_error_adds_to_the_images(bundle: Bundle) -> None:
+    law = replace(ForceLaw.of(configured(), bundle), maps={}, curve=Curve(10.0, 2.0), own_error=0.15)
+    force = law.force(look())
+    assert force.newton == pytest.approx(0.9) and force.sigma == pytest.approx(0.9 * 0.25)  # hypot(2 * 10 %, 15 %)
+
+
+def test_an_indenter_is_checked(tmp_path: Path) -> None:
+    assert Indenter(radius_m=0.01).shape == "circle"
+    with pytest.raises(ValueError, match="greater than 0"):
+        Indenter(radius_m=0.0)
