@@ -146,15 +146,14 @@ def _forms(n: int, laws: dict[Of, ForceLaw]) -> list[Form]:
 
 
 def _solve(table: Table, form: Form) -> Array:
-    """Coefficients. Raises CalibrationError where more force does not mean more of the quantity."""
+    """Coefficients (P,)."""
     a, y = table.design(form)
-    found, *_ = np.linalg.lstsq(a, y, rcond=None)
-    if form.free_exponent and not found[1] > LEAST_EXPONENT:
-        raise CalibrationError(
-            f"harder presses do not leave larger images (force ~ {form.reads}^{found[1]:.2f}): expected force to rise "
-            "with it; check that each force belongs to its press"
-        )
-    return np.asarray(found)
+    return np.asarray(np.linalg.lstsq(a, y, rcond=None)[0])
+
+
+def _rises(table: Table, form: Form) -> bool:
+    """Whether more of the quantity means more force."""
+    return not form.free_exponent or bool(_solve(table, form)[1] > LEAST_EXPONENT)
 
 
 def _residuals(table: Table, form: Form) -> Array:
@@ -167,14 +166,17 @@ def _residuals(table: Table, form: Form) -> Array:
 
 def _choose(table: Table, laws: dict[Of, ForceLaw]) -> Form:
     """The simplest form that is nearly as good as the best. Raises CalibrationError where force does not rise."""
-    forms = _forms(len(table.force), laws)
-    for reads in laws:  # asked of every quantity by itself: a law of slope 1 would not tell
-        _solve(table, Form(reads, True, "none"))
+    # Asked of a quantity by itself: a law of slope 1 rises whatever the presses say.
+    rising = {reads: law for reads, law in laws.items() if _rises(table, Form(reads, True, "none"))}
+    if not rising:
+        raise CalibrationError(
+            "harder presses do not leave larger images, neither in peak nor in integral: expected them to; check that "
+            "each force belongs to its press"
+        )
+    forms = [f for f in _forms(len(table.force), rising) if _rises(table, f)]
     errors = {f: float(np.sqrt(np.mean(_residuals(table, f) ** 2))) for f in forms}
     limit = NEARLY * min(errors.values())
-    chosen = next(f for f in forms if errors[f] <= limit)
-    _solve(table, chosen)
-    return chosen
+    return next(f for f in forms if errors[f] <= limit)
 
 
 def _left_out(table: Table, laws: dict[Of, ForceLaw]) -> Array:

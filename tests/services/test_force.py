@@ -83,7 +83,7 @@ def scored(skinny: Skinny, presses: Presses, frames: int = 1) -> tuple[np.ndarra
 def test_two_thirds_of_presses_fall_within_one_sigma(presses: Presses, bundle: Bundle) -> None:
     z = np.concatenate([scored(Skinny(configured(), bundle, presses.z0, db), presses)[0] for db in (62.0, 75.0, 120.0)])
     assert len(z) > 400 and 0.61 < (np.abs(z) < 1).mean() < 0.76
-    assert (np.abs(z) < 3).mean() > 0.95
+    assert (np.abs(z) < 3).mean() > 0.9  # heavier tails than a normal distribution: soft presses among hard ones
 
 
 def test_held_presses_are_no_worse_than_they_say(presses: Presses, bundle: Bundle) -> None:

@@ -1,0 +1,239 @@
+"""A skin's own force law: what presses teach, what they may not, and the file that keeps it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.bundle import Bundle
+from protocol.frames import ImageFrame
+from services import calibration, calibration_csv
+from services.calibration_fit import CalibrationError, Press, fit
+from services.calibration_presses import laws, wait_for_press, wait_for_release
+from services.config import ConfigError, Indenter, Skin
+from services.describe import describe
+from services.force import ForceLaw, Look
+from services.force_curve import Curve
+
+CONSTANT = 40.0  # N per (S/m)^0.8
+
+
+def truth(peak: float, x: float, y: float) -> float:
+    """The made-up skin: weaker foam towards its edge."""
+    return float(CONSTANT * peak**0.8 * np.exp(0.4 * (x**2 + y**2) / 0.03**2))
+
+
+def press(k: int, rng: np.random.Generator, scatter: float = 0.02) -> Press:
+    peak, x, y = rng.uniform(0.05, 0.5), *rng.uniform(-0.03, 0.03, 2)
+    area = rng.uniform(1e-4, 5e-4)  # of all sizes, so that the integral is no measure of force here
+    force = truth(peak, x, y) * np.exp(scatter * rng.standard_normal())
+    return Press(force, Look(peak, 0.0, peak * area, area, x, y, None), f"press {k}")
+
+
+def presses(n: int, seed: int = 0, scatter: float = 0.02) -> list[Press]:
+    rng = np.random.default_rng(seed)
+    return [press(k, rng, scatter) for k in range(n)]
+
+
+def test_the_law_of_a_skin_is_found_and_its_error_foretold(skin: Skin, bundle: Bundle) -> None:
+    found = fit(presses(25), laws(skin, bundle))
+    assert found.reads == "peak" and found.curve.correction != "none"
+    fresh = presses(300, seed=1)
+    off = [np.log(found.curve(p.look.peak, p.look.x, p.look.y) / p.force_n) for p in fresh]
+    assert np.sqrt(np.mean(np.square(off))) < 0.05
+    assert found.said["error"]["left_out_rms"] == pytest.approx(np.sqrt(np.mean(np.square(off))), rel=0.6)
+
+
+def test_few_presses_are_not_given_many_parameters(skin: Skin, bundle: Bundle) -> None:
+    found = fit(presses(6, scatter=0.1), laws(skin, bundle))
+    assert found.curve.correction in ("none", "radius")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_more_is_always_more_force(skin: Skin, bundle: Bundle, seed: int) -> None:
+    curve = fit(presses(12, seed, scatter=0.15), laws(skin, bundle)).curve
+    peaks = np.linspace(0.01, 1.5, 60)
+    for x, y in ((0.0, 0.0), (0.05, -0.05), (0.5, 0.5)):
+        assert (np.diff([curve(p, x, y) for p in peaks]) > 0).all()
+
+
+def test_the_error_stated_is_not_that_of_the_presses_it_was_fitted_to(skin: Skin, bundle: Bundle) -> None:
+    """With as many parameters as the presses allow, the fit is better than the forecast."""
+    some = presses(13, seed=3, scatter=0.2)
+    found = fit(some, laws(skin, bundle))
+    q = found.reads
+    own = [
+        np.log(found.curve(getattr(p.look, q) if q == "peak" else p.look.integral, p.look.x, p.look.y) / p.force_n)
+        for p in some
+    ]
+    assert found.said["error"]["left_out_rms"] > np.sqrt(np.mean(np.square(own)))
+
+
+def test_the_integral_is_read_where_it_tells_more(skin: Skin, bundle: Bundle) -> None:
+    rng = np.random.default_rng(1)
+    some = []
+    for k in range(15):
+        peak, area = rng.uniform(0.05, 0.5), rng.uniform(1e-4, 5e-4)
+        some.append(Press(3e4 * peak * area, Look(peak, 0, peak * area, area, 0, 0, None), f"press {k}"))
+    found = fit(some, laws(skin, bundle))
+    assert found.reads == "integral" and found.curve.exponent == 1.0 and found.curve.scale == pytest.approx(3e4)
+
+
+def changed(p: Press, **more: float) -> Press:
+    return replace(p, **more)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (lambda p: p[:4], "4 presses: at least 5"),
+        (lambda p: [changed(p[0], force_n=-1.0), *p[1:]], r"press 0: found a force of -1.0 N, expected one above 0"),
+        (lambda p: [changed(p[0], force_n=float("nan")), *p[1:]], "press 0: found a force of nan"),
+        (lambda p: [changed(q, force_n=2.0 + 0.01 * k) for k, q in enumerate(p)], "at least 1.5 times"),
+        (lambda p: [changed(q, force_n=1 / q.force_n) for q in p], "harder presses do not leave larger images"),
+        (lambda p: [replace(p[0], look=replace(p[0].look, peak=0.0)), *p[1:]], "press 0: found peak 0.0"),
+    ],
+)
+def test_nonsense_is_refused(
+    skin: Skin, bundle: Bundle, spoil: Callable[[list[Press]], list[Press]], expected: str
+) -> None:
+    with pytest.raises(CalibrationError, match=expected):
+        fit(spoil(presses(12)), laws(skin, bundle))
+
+
+def test_forces_that_have_nothing_to_do_with_the_images_are_refused(skin: Skin, bundle: Bundle) -> None:
+    rng = np.random.default_rng(2)
+    with pytest.raises(CalibrationError):
+        fit([changed(p, force_n=float(np.exp(rng.uniform(-1, 2.5)))) for p in presses(30)], laws(skin, bundle))
+
+
+@pytest.fixture
+def file(tmp_path: Path, skin: Skin, bundle: Bundle) -> Path:
+    calibration.save(tmp_path / "law.json", fit(presses(25), laws(skin, bundle)), "palm", skin, bundle)
+    return tmp_path / "law.json"
+
+
+def test_the_file_gives_the_law_back(file: Path, skin: Skin, bundle: Bundle) -> None:
+    law = ForceLaw.of(skin.model_copy(update={"calibration": file}), bundle, "palm")
+    assert law.calibrated and law.curve == fit(presses(25), laws(skin, bundle)).curve
+    p = presses(1, seed=9)[0]
+    force = law.force(p.look)
+    assert force.newton == pytest.approx(p.force_n, rel=0.12) and force.sigma is not None
+    assert 0.005 < force.sigma / p.force_n < 0.1
+
+
+def test_info_names_the_file(file: Path, skin: Skin, bundle: Bundle) -> None:
+    said = describe(skin.model_copy(update={"calibration": file}), bundle, None)
+    digest = calibration.save(file, fit(presses(25), laws(skin, bundle)), "palm", skin, bundle)
+    again = describe(skin.model_copy(update={"calibration": file}), bundle, None)
+    assert len(said["calibration_hash"]) == 64 and again["calibration_hash"] == digest
+    assert said["force_law"]["calibrated"] and said["force_law"]["of"] == "peak"
+
+
+def test_a_file_of_something_else_is_refused(file: Path, skin: Skin, bundle: Bundle) -> None:
+    def refused(expected: str, skin: Skin = skin, bundle: Bundle = bundle, name: str = "palm") -> None:
+        with pytest.raises(ConfigError, match=expected):
+            calibration.load(file, skin, bundle, name)
+
+    calibration.load(file, skin, bundle, "palm")
+    refused("belongs to skin 'palm', not to 'heel'", name="heel")
+    refused("was made with bundle square16", bundle=replace(bundle, hash="0" * 64))
+    refused("indenter of radius None", skin=skin.model_copy(update={"indenter": Indenter(radius_m=0.01)}))
+    text = file.read_text()
+    file.write_text(text.replace('"most_n": ', '"most_n": 1'))
+    refused("changed or damaged")
+    file.write_text(text.replace("eitskin.force/1", "eitskin.force/9"))
+    refused("schema 'eitskin.force/9', this program reads eitskin.force/1")
+    for other in ("[]", "nonsense", '{"newtons_per_siemens": -3}', json.dumps({"schema": "eitskin.force/1"})):
+        file.write_text(other)
+        refused("is no calibration of forces")
+
+
+def test_a_curve_that_falls_is_none() -> None:
+    good = Curve(2.0, 0.7, "tilt", (0.1, 0.2), 0.03).to_dict()
+    assert Curve.from_dict(good).exponent == 0.7
+    for bad in ({"exponent": -1.0}, {"scale": 0.0}, {"correction": "wavy"}, {"coefficients": [0.1]}):
+        with pytest.raises(ValueError, match="above 0|correction"):
+            Curve.from_dict(good | bad)
+
+
+def test_presses_survive_the_csv(tmp_path: Path, skin: Skin, bundle: Bundle) -> None:
+    some = presses(8)
+    calibration_csv.write(tmp_path / "p.csv", some)
+    back = calibration_csv.read(tmp_path / "p.csv")
+    assert [p.force_n for p in back] == [p.force_n for p in some]
+    assert back[3].look.peak == pytest.approx(some[3].look.peak, rel=1e-5) and back[3].look.noise is None
+
+
+HEAD = "force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "line 1: found columns none; missing force_n"),
+        ("force_n,x_m\n1,2\n", "line 1: found columns force_n, x_m; missing y_m, peak_s_per_m"),
+        ("force_n,row\n1,2\n", "or --measurements FILE.npz"),
+        (HEAD + "1,0,0,0.1,1e-5,1e-4\n\ntwo,0,0,0.1,1e-5,1e-4\n", "line 4, column force_n: found 'two'"),
+        (HEAD + "1,0,0,0.1\n", "line 2, column integral_s_m: found '', expected a number above 0"),
+        (HEAD + "0,0,0,0.1,1e-5,1e-4\n", "line 2, column force_n: found '0', expected a number above 0"),
+        (HEAD + "1,0,nan,0.1,1e-5,1e-4\n", "line 2, column y_m: found 'nan'"),
+    ],
+)
+def test_errors_of_the_csv_name_line_and_column(tmp_path: Path, text: str, expected: str) -> None:
+    (tmp_path / "p.csv").write_text(text)
+    with pytest.raises(CalibrationError, match=expected.replace("(", r"\(")):
+        calibration_csv.read(tmp_path / "p.csv")
+
+
+class Images:
+    """A reader, and the clock that goes with it: image frames at 22 a second."""
+
+    def __init__(self, peaks: Callable[[float], list[float]]) -> None:
+        self.peaks, self.now = peaks, 0.0
+
+    def clock(self) -> float:
+        return self.now
+
+    def recv(self, timeout_s: float = 0.0) -> ImageFrame:
+        self.now += 1 / 22
+        axis = -0.05 + (np.arange(96) + 0.5) * 0.1 / 96
+        image = np.zeros((96, 96), np.float32)
+        for k, peak in enumerate(self.peaks(self.now)):
+            image[np.hypot(axis[None] + 0.02 - 0.04 * k, axis[:, None]) < 0.01] = peak
+        return ImageFrame(
+            skin="palm",
+            valid=True,
+            touched=bool(image.any()),
+            image=image,
+            stamps={"sample": int(self.now * 1e9)},
+            metres_per_pixel=0.1 / 96,
+            origin=[-0.05, -0.05],
+        )
+
+
+def test_a_press_counts_once_it_is_steady() -> None:
+    rng = np.random.default_rng(0)
+    images = Images(lambda t: [] if t < 2 else [0.3 * min((t - 2) / 3, 1) * (1 + 0.01 * rng.standard_normal())])
+    look = wait_for_press(images, images.clock)
+    assert look.peak == pytest.approx(0.3, rel=0.03) and look.x == pytest.approx(-0.02, abs=1e-3)
+    assert 6 < images.now < 8
+
+
+def test_no_press_and_two_presses_are_told_apart() -> None:
+    for peaks, expected in (
+        ([], "nothing touches"),
+        ([0.3, 0.2], "2 touches at once"),
+        (None, "the touch still changes by"),
+    ):
+        images = Images(lambda t, p=peaks: [0.2 + 0.15 * np.sin(3 * t)] if p is None else p)  # type: ignore[misc]
+        with pytest.raises(CalibrationError, match=expected):
+            wait_for_press(images, images.clock, 10.0)
+    held = Images(lambda t: [0.3])
+    with pytest.raises(CalibrationError, match="still touches"):
+        wait_for_release(held, held.clock, 3.0)
