@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-START_S = 60
+START_S = 120
 
 
 @pytest.fixture
@@ -60,8 +60,10 @@ def service(runtime: Path) -> Iterator[subprocess.Popen[bytes]]:
 def shared_service() -> Iterator[Path]:
     """The whole service, one for all tests of a file; gives its runtime folder, which $EITSKIN_RUNTIME names."""
     folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("EITSKIN_RUNTIME", str(folder))
-        with serving(folder):
-            yield folder
-    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("EITSKIN_RUNTIME", str(folder))
+            with serving(folder):
+                yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

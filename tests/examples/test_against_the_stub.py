@@ -42,16 +42,24 @@ def press(x: float, y: float, newtons: float) -> None:
 
 @pytest.fixture
 def untouched(shared_service: Path) -> None:
-    """Nothing touches, and the skin says so."""
+    release()
+
+
+def release() -> int:
+    """Nothing touches, and the skin says so; gives the number of the last frame."""
     stub("release")
     end, quiet = time.monotonic() + 30, 0
     with ContactSubscriber("palm") as skin:
-        while quiet < 5:
+        while True:
             assert time.monotonic() < end, "no untouched frames"
             try:
-                quiet = 0 if skin.next_frame(1.0, valid=True).contacts else quiet + 1
+                frame = skin.next_frame(1.0, valid=True)
             except Stale:
                 quiet = 0
+                continue
+            quiet = 0 if frame.contacts else quiet + 1
+            if quiet == 5:
+                return frame.seq
 
 
 @pytest.fixture
@@ -74,14 +82,24 @@ def example(name: str, max_age: str = PATIENT_S) -> tuple[str, ...]:
 
 
 def line_with(process: subprocess.Popen[str], words: str) -> str:
-    """Read on until a line holds the words."""
+    """Read on until a line holds the words; empty where the process ends before."""
     assert process.stdout is not None
-    seen = []
-    for line in process.stdout:
-        seen.append(line)
-        if words in line:
-            return line
-    raise AssertionError(f"no {words!r} in {seen}")
+    return next((line for line in process.stdout if words in line), "")
+
+
+def moved_until_pressed(start: Start, at: tuple[float, float, float], *command: str) -> tuple[int, str, int]:
+    """Start an example, press (x, y, newtons) once it moves: its exit status, what it printed then, and the last frame
+    before. Begun anew where a busy machine loses frames, for which it rightly stops.
+    """
+    for _ in range(5):
+        before = release()
+        robot = start(*command)
+        if line_with(robot, "robot moves"):
+            press(*at)
+        printed = robot.communicate(timeout=60)[0]
+        if robot.returncode != 1:
+            return robot.returncode, printed, before
+    raise AssertionError(f"five times: {printed}")
 
 
 def pid_of(module: str) -> int:
@@ -98,46 +116,37 @@ def pid_of(module: str) -> int:
 
 def test_stop_on_contact_stops_with_the_first_frame_that_has_one(start: Start) -> None:
     every = AllReader(["contact"], "palm")
-    robot = start(*example("stop_on_contact"))
-    line_with(robot, "robot moves")
-    press(0.02, -0.01, 3.0)
-    line_with(robot, "robot stands")
-    stopped = re.search(r"frame (\d+): contact at \(([-+.\d]+), ([-+.\d]+)\) mm", line_with(robot, "stopped by frame"))
-    assert robot.wait(10) == 0 and stopped
-    first = next(f.seq for f in iter(lambda: every.recv(1.0), None) if isinstance(f, ContactFrame) and f.contacts)
-    assert first <= int(stopped[1]) <= first + 1, "at most one later, where the machine let it be overtaken"
+    status, printed, before = moved_until_pressed(start, (0.02, -0.01, 3.0), *example("stop_on_contact"))
+    assert status == 0 and "robot stands" in printed
+    stopped = re.search(r"stopped by frame (\d+): contact at \(([-+.\d]+), ([-+.\d]+)\) mm", printed)
+    assert stopped
+    touched = [f.seq for f in frames_until(every, int(stopped[1])) if f.seq > before and f.contacts]
+    assert len(touched) in (1, 2), "one frame later at most, where the machine let it be overtaken"
     assert float(stopped[2]) == pytest.approx(20, abs=4) and float(stopped[3]) == pytest.approx(-10, abs=4)
     every.close()
 
 
 def test_stop_on_contact_stops_when_the_service_falls_silent(start: Start) -> None:
     robot = start(*example("stop_on_contact", "0.4"))
-    line_with(robot, "robot moves")
+    assert line_with(robot, "robot moves")
     publisher = pid_of("services.publisher")
     os.kill(publisher, signal.SIGSTOP)
     try:
-        line_with(robot, "robot stands")
-        assert "cannot be trusted: the newest contact frame of palm is" in line_with(robot, "stopped")
+        assert line_with(robot, "robot stands")
+        assert re.search(r"the newest contact frame of palm is \S+ s old", line_with(robot, "cannot be trusted"))
         assert robot.wait(10) == 1
     finally:
         os.kill(publisher, signal.SIGCONT)
 
 
 def test_guarded_move_reaches_its_force(start: Start) -> None:
-    robot = start(*example("guarded_move"), "--newtons", "2")
-    line_with(robot, "robot moves")
-    press(0.0, 0.0, 4.0)
-    assert "force reached" in line_with(robot, "force")
-    assert robot.wait(10) == 0
+    status, printed, _ = moved_until_pressed(start, (0.0, 0.0, 4.0), *example("guarded_move"), "--newtons", "2")
+    assert status == 0 and "force reached: (" in printed
 
 
 def test_guarded_move_backs_off_where_no_contact_is_expected(start: Start) -> None:
-    robot = start(*example("guarded_move"), "--newtons", "20")
-    assert "-20.0) mm/s" in line_with(robot, "robot moves")
-    press(0.035, 0.0, 3.0)
-    line_with(robot, "contact where none is expected")
-    line_with(robot, "backed off")
-    assert robot.wait(10) == 2
+    status, printed, _ = moved_until_pressed(start, (0.035, 0.0, 3.0), *example("guarded_move"), "--newtons", "20")
+    assert status == 2 and "contact where none is expected" in printed and "backed off by 10 mm" in printed
 
 
 def test_follow_the_finger_follows_holds_still_and_goes_on(start: Start) -> None:
@@ -149,12 +158,12 @@ def test_follow_the_finger_follows_holds_still_and_goes_on(start: Start) -> None
     assert x > 0 > y and z < 0 and x * x + y * y + z * z <= 100.5**2
     publisher = pid_of("services.publisher")
     os.kill(publisher, signal.SIGSTOP)
-    line_with(robot, "holding still")
-    line_with(robot, "robot stands")
+    assert line_with(robot, "holding still")
+    assert line_with(robot, "robot stands")
     os.kill(publisher, signal.SIGKILL)  # the service starts another one, and the controller finds it
-    line_with(robot, "robot moves")
+    assert line_with(robot, "robot moves")
     stub("release")
-    line_with(robot, "robot stands")
+    assert line_with(robot, "robot stands")
 
 
 @pytest.fixture(scope="module")
@@ -179,8 +188,7 @@ def test_the_cpp_subscriber_sees_the_same_contacts(cpp_subscriber: Path, start: 
     press(0.02, -0.01, 3.0)
     press(-0.025, 0.02, 4.0)
     with ContactSubscriber("palm") as skin:
-        while len(skin.next_frame(5.0).contacts) < 2:
-            pass
+        assert any(len(skin.next_frame(5.0).contacts) == 2 for _ in range(500))
     every = AllReader(["contact"], "palm")
     assert isinstance(every.recv(5.0), ContactFrame)
     program = start(str(cpp_subscriber), "palm", "30")
@@ -193,7 +201,7 @@ def test_the_cpp_subscriber_sees_the_same_contacts(cpp_subscriber: Path, start: 
         frame = sent[int(seq)]
         assert (word, reasons.split()) == ("valid" if frame.valid else "INVALID", frame.reasons)
         assert contacts == "".join(map(as_printed, frame.contacts))
-    assert contacts.count("\n") == 2
+    assert any(contacts.count("\n") == 2 for *_, contacts in blocks)
     every.close()
 
 
