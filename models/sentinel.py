@@ -40,7 +40,7 @@ MEASUREMENT_S = 363e-6  # voltage and current, 128 DFT points at 800 kSPS, settl
 SAMPLES = 500  # of the importance sampling: c to about 0.01
 SHARPNESS = 8.0  # of the smooth minimum that the exchange climbs
 
-# Standard deviations of what is known before measuring: x, y (model units), log of drop times area; as models/fisher.py.
+# Standard deviations before measuring: x, y (model units), log of drop times area; as models/fisher.py.
 PRIOR = np.array([2.0, 2.0, np.hypot(np.log(5), 2 * np.log(3))]) / np.sqrt(12)
 
 
@@ -96,7 +96,7 @@ class Sentinel:
         return len(self.rows) * MEASUREMENT_S
 
     def filters(self, sigma: Array) -> Array:
-        """(M, n) matched filters for noise sigma (n,) of d: `max(filters @ d)` is the statistic, in standard deviations."""
+        """(M, n) matched filters for noise sigma (n,) of d; `max(filters @ d)` is the statistic, in sigmas."""
         whitened = self.response / sigma
         size = np.linalg.norm(whitened, axis=1, keepdims=True)
         return np.asarray(whitened / np.maximum(size, 1e-12) / sigma)
@@ -105,7 +105,7 @@ class Sentinel:
 def design(
     m: Matrices, length: int = LENGTH, half_width: float = 1.0, snr_db: float = SNR_DB, reference: int = 64
 ) -> Sentinel:
-    """The list for a bundle: the shortest that detects, continued for place. `reference`: scans in the mean compared to.
+    """The list for a bundle: the shortest that detects, continued for place. reference: scans in the mean compared to.
 
     A skin on which no list of `length` detects gets the best one of that length.
     """
@@ -226,4 +226,4 @@ def _slopes(grid: Touches, judged: npt.NDArray[np.bool_], sigma: float) -> Array
 
 def _smooth_minimum(totals: Array, sharpness: float) -> Array:
     """(M, K) -> (K,), larger where the smallest of a column is larger; the near-smallest count too."""
-    return -(np.maximum(totals, 1e-2) ** -sharpness).sum(axis=0)
+    return np.asarray(-(np.maximum(totals, 1e-2) ** -sharpness).sum(axis=0))

@@ -18,6 +18,7 @@ from protocol.frames import STATUS_OPEN, STATUS_RTIA
 
 HELLO_EVERY_S = 0.2
 ANSWER_S = 0.5  # a command that is not answered in this time is sent again
+SWITCH_S = 0.1  # a running board that does not answer to a START in this time is told again
 TRIES = 3  # then everything starts from HELLO
 SILENT_S = 1.0  # a running board that sends nothing for so long is asked again
 EXPLAIN_AFTER_S = 1.5  # of unanswered HELLOs
@@ -45,10 +46,16 @@ class Scanning:
 
 
 class BoardLink:
-    """One connection. `state` is hello, config, start, running or refused."""
+    """One connection. `state` is hello, config, start, running or refused.
 
-    def __init__(self, scanning: Scanning, now_s: float) -> None:
-        self.scanning = scanning
+    idle: a second configuration that a running board may be switched to (`switch`), where its firmware can.
+    """
+
+    def __init__(self, scanning: Scanning, now_s: float, idle: Scanning | None = None) -> None:
+        self.scanning, self._idle = scanning, idle
+        self._pending: list[Scanning] = []  # configurations to send before START
+        self._started = scanning  # what the board was last told to scan
+        self._wanted = scanning
         self.decoder = link.Decoder()
         self.ident: link.Ident | None = None
         self.problem = ""  # what stands in the way, for a person; "" when all is well
@@ -63,6 +70,15 @@ class BoardLink:
     def board(self) -> str:
         """Unique id of the board, hexadecimal; "" until it has introduced itself."""
         return self.ident.unique_id.hex() if self.ident else ""
+
+    @property
+    def switches(self) -> bool:
+        """Whether this board can be switched to the idle configuration while it runs."""
+        return self._idle is not None and bool(self.ident and self.ident.capabilities & link.Capability.SENTINEL)
+
+    def switch(self, to: Scanning) -> None:
+        """Have the running board scan this one of the configurations; `to_send` tells it."""
+        self._wanted = to
 
     def received(self, data: bytes, now_s: float) -> list[link.Frame]:
         """Scans that `data` completes, in order; everything else is dealt with here."""
@@ -87,7 +103,7 @@ class BoardLink:
         """What is due now."""
         if self.state == "running":
             if now_s - self._heard_s <= SILENT_S:
-                return b""
+                return self._switching(now_s)
             self._restart(now_s, f"the board went silent for {SILENT_S:g} s: asking it again")
         if self.state == "refused" and now_s - self._since >= REFUSED_AGAIN_S:
             self._to(now_s, "hello")
@@ -104,7 +120,7 @@ class BoardLink:
                 self._restart(now_s, f"the board does not answer {self.state.upper()}: asking it again")
                 return b""
             self._due_s = now_s + ANSWER_S
-            s = self.scanning
+            s = self._pending[0] if self._pending else self.scanning
             if self.state == "config":
                 return link.encode(
                     link.Config(
@@ -113,6 +129,14 @@ class BoardLink:
                 )
             return link.encode(link.Start(config=s.config))
         return b""
+
+    def _switching(self, now_s: float) -> bytes:
+        """START of another configuration, again until it is answered."""
+        answered = not self._tries
+        if self._wanted is self._started and (answered or now_s < self._due_s):
+            return b""
+        self._started, self._due_s, self._tries = self._wanted, now_s + SWITCH_S, 1
+        return link.encode(link.Start(config=self._wanted.config))
 
     def _to(self, now_s: float, state: str) -> None:
         self.state, self._since, self._due_s, self._tries = state, now_s, now_s, 0
@@ -145,17 +169,25 @@ class BoardLink:
                 now_s,
             )
         elif self.state in ("hello", "refused"):
+            self._pending = [self.scanning, *([self._idle] if self._idle and self.switches else [])]
             self._to(now_s, "config")
 
     def _acknowledged(self, ack: link.Ack, now_s: float) -> None:
         if self.state == "config" and ack.of == link.Config.number:
-            self._to(now_s, "start")
+            if self._pending and ack.value != self._pending[0].config:
+                return  # a late answer to the one before
+            self._pending = self._pending[1:]
+            self._to(now_s, "config" if self._pending else "start")
         elif self.state == "start" and ack.of == link.Start.number:
             self._last_seq = None
             self.problem = ""
+            self._started = self._wanted = self.scanning
             self._to(now_s, "running")
         elif self.state == "running" and ack.of == link.Start.number:
-            self._last_seq = None  # a START sent twice, for its first answer was late: scans count from 0 again
+            if self._tries:  # of a switch: scans go on being counted
+                self._tries = 0
+            else:
+                self._last_seq = None  # a START sent twice, for its first answer was late: scans count from 0 again
 
     def _not_accepted(self, nak: link.Nak, now_s: float) -> None:
         """A NAK of nothing in particular answers noise on the line towards the board: our command is sent again anyway.
@@ -185,7 +217,9 @@ class BoardLink:
             )
 
     def _is_ours(self, scan: link.Frame) -> bool:
-        if self.state != "running" or scan.config != self.scanning.config or len(scan.z) != len(self.scanning.pattern):
+        known = (self.scanning, self._idle) if self.switches else (self.scanning,)
+        ours = any(s is not None and scan.config == s.config and len(scan.z) == len(s.pattern) for s in known)
+        if self.state != "running" or not ours:
             self.counts["foreign"] += 1
             return False
         missing = 0 if self._last_seq is None else (scan.seq - self._last_seq - 1) & 0xFFFFFFFF

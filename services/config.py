@@ -85,6 +85,7 @@ class Skin(Section):
     indenter: Indenter | None = None
     network: Literal["full", "fast", "int8", "none"] = "full"
     dft_points: Literal[128, 256, 512] = 128
+    scan: Literal["full", "adaptive"] = "full"  # adaptive: a short list while nothing touches, see services/adaptive.py
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
     tare: Tare = Tare()
     touch: Touch = Touch()

@@ -16,6 +16,7 @@ from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, ImageFrame
 from services.config import Skin
 from services.quality import REFUSED, Residual
+from services.sentinel import CoarseImage
 from services.stage import Health, Refused, Stage, add_reason, inherited
 
 WARM_UP_RUNS = 5
@@ -39,6 +40,7 @@ class Inference(Stage):
         self._residual = Residual(bundle, to_scale=self._refuses)
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
+        self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
 
@@ -62,6 +64,8 @@ class Inference(Stage):
             self._run(self._unseen, out)
         elif frame.held:
             self._hold(frame, out)
+        elif frame.touched and "coarse" in frame.reasons:
+            self._roughly(frame, out)
         else:
             self._counters["untouched"] += 1
             self._last = None
@@ -73,6 +77,13 @@ class Inference(Stage):
         out.residual = self._residual(frame.difference, frame.sigma, out.image)
         self._judge(out)
         self._counters["networks_run"] += 1
+        self._last, self._unseen = out, None
+        self._last_scan = frame.scan
+
+    def _roughly(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        """The image of a few measurements, which no network was trained on."""
+        self._coarse = self._coarse or CoarseImage(self.bundle)
+        out.image, out.sigma, out.classes = self._coarse.run(frame)
         self._last, self._unseen = out, None
         self._last_scan = frame.scan
 

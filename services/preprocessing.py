@@ -24,6 +24,7 @@ from services.describe import describe
 from services.electrodes import ElectrodeHealth, Reference, Verdict
 from services.judging import Judge, Judgement, Noise
 from services.plausibility import impossible
+from services.sentinel import Coarse
 from services.stage import Health, Refused, Stage, add_reason, inherited
 from services.tare import Baseline
 from services.touch import Hold, TouchDecision
@@ -49,11 +50,13 @@ class Preprocessing(Stage):
         self.pre = self.untouched.pre
         self.judge = Judge(self.pre, skin)
         self.hold = Hold()
+        self._coarse: Coarse | None = None  # made with the first sentinel scan
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
         self.reset()
 
     def reset(self) -> None:
         self._touched = False
+        self._coarse_scan = 0  # of the coarse touch that no full scan has answered yet
         self._counters = {"frames": 0, "touched": 0, "reconstructed": 0, "held": 0, "foreign": 0}
         self._foreign = ""
         self.hold.reset()
@@ -67,7 +70,10 @@ class Preprocessing(Stage):
         out = DeltaFrame(**inherited(frame))
         self._counters["frames"] += 1
         out.valid, out.reasons = as_sent(frame)  # measurements that failed are left out below
-        if frame.kind == "sentinel" or len(frame.z) != len(self.bundle.pattern):
+        if frame.kind == "sentinel":
+            return [self._sentinel(out, frame)]
+        self._coarse_scan = 0
+        if len(frame.z) != len(self.bundle.pattern):
             return [self._no_scan(out, frame)]
         self._foreign = ""
         self.untouched.follow(frame)
@@ -86,7 +92,7 @@ class Preprocessing(Stage):
         if self.untouched.baseline.doubt:
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
-        return [self._compare(out, amplitude, found)]
+        return [self._compare(out, amplitude - found.shift, found)]
 
     def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict) -> DeltaFrame:
         """Difference, decision, and the stack where one is needed."""
@@ -155,12 +161,29 @@ class Preprocessing(Stage):
         self._counters["reconstructed"] += 1
 
     def _no_scan(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
-        """A frame that cannot be compared with the baseline: a sentinel's short list, or another skin's."""
-        if frame.kind != "sentinel":
-            self._counters["foreign"] += 1
-            found, expected = len(frame.z), len(self.bundle.pattern)
-            self._foreign = f"frames of {found} measurements, the bundle {self.bundle.name} has {expected}"
-        return _unusable(out, "coarse" if frame.kind == "sentinel" else "out_of_distribution", len(self.bundle.pattern))
+        """A frame that cannot be compared with the baseline: another skin's."""
+        self._counters["foreign"] += 1
+        found, expected = len(frame.z), len(self.bundle.pattern)
+        self._foreign = f"frames of {found} measurements, the bundle {self.bundle.name} has {expected}"
+        return _unusable(out, "out_of_distribution", len(self.bundle.pattern))
+
+    def _sentinel(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
+        """A scan of the short list: whether something begins to touch. What touched before goes on until a full one."""
+        valid, known = out.valid, self.untouched.baseline
+        _unusable(out, "coarse", len(self.bundle.pattern))
+        if self._coarse is None:
+            self._coarse = Coarse(self.bundle, self.config)
+        if known is None or known.doubt or not self._coarse.fits(frame):
+            return out
+        out.valid = valid
+        if self._touched:
+            out.touched = out.held = True
+            out.reconstructed = self.hold.scan
+        else:
+            self._coarse_scan = self._coarse(
+                out, frame, known.z0, self.untouched.normaliser, self.untouched.sigma, self._coarse_scan
+            )
+        return out
 
     def _begin_anew(self) -> None:
         """There is another baseline."""
@@ -185,6 +208,7 @@ class Preprocessing(Stage):
     def state(self) -> dict[str, Any]:
         return {
             "touched": self._touched,
+            "coarse": self._coarse_scan,
             "hold": self.hold.state(),
             "electrodes": self.electrodes.state(),
             "judge": self.judge.state(),
@@ -198,6 +222,7 @@ class Preprocessing(Stage):
             if rows is not None and np.shape(rows) != (k,):
                 raise Refused(f"the saved hold is of shape {np.shape(rows)}, expected ({k},): reset")
         self._touched = bool(state["touched"])
+        self._coarse_scan = int(state.get("coarse", 0))
         self.hold.load(state["hold"])
         self.judge.reset()
         if "judge" in state:  # older recordings have none
@@ -215,6 +240,8 @@ class Preprocessing(Stage):
         self.untouched.restore(saved, age_s)
 
     def warm_up(self) -> None:
+        if self.config.scan == "adaptive":
+            self._coarse = Coarse(self.bundle, self.config)
         if self.untouched.baseline is not None:
             operator, decision = self.judge.operator(np.isfinite(self.untouched.sigma), self._noise(), 0)
             nothing = np.zeros(len(self.bundle.pattern))

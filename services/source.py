@@ -17,12 +17,15 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol import link
-from protocol.frames import FrameError, RawFrame, unpack
+from protocol.frames import DeltaFrame, FrameError, RawFrame, unpack
+from protocol.sockets import NewestReader
 from services import port as ports
+from services.adaptive import AdaptiveScan
 from services.boardlink import BoardLink, Scanning
 from services.clock import UNSETTLED_NS, DeviceClock
 from services.config import Skin
 from services.npz_file import InputError, frames_of, load_npz, read_input
+from services.sentinel import sentinel_of
 from services.stage import Health
 
 POLL_S = 0.1
@@ -71,10 +74,15 @@ class BoardSource(Source):
     def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
         super().__init__(name, skin, bundle)
         self.scanning = Scanning(bundle.pattern, skin.dft_points, skin.rtia_ohm)
+        self.idling: Scanning | None = None
+        self._verdicts: NewestReader | None = None  # what preprocessing makes of the frames
+        if skin.scan == "adaptive":
+            self.idling = Scanning(bundle.pattern[sentinel_of(bundle).rows], skin.dft_points, skin.rtia_ohm)
         self._port: ports.Port | None = None
         self._board = ""  # unique id of the board that we know
         self._usb_serial: str | None = None
         self._lost = ""
+        self._full_s = 0.0  # duration of the last full scan
 
     def frames(self) -> Iterator[RawFrame | None]:
         while True:
@@ -98,6 +106,9 @@ class BoardSource(Source):
             yield None
 
     def close(self) -> None:
+        if self._verdicts is not None:
+            self._verdicts.close()
+            self._verdicts = None
         if self._port is not None:
             self._port.close()
             self._port = None
@@ -105,14 +116,23 @@ class BoardSource(Source):
     def _connection(self, port: ports.Port, must_be: str) -> Generator[RawFrame | None, None, bool]:
         """Until the port is gone (PortError), or turns out to be another board than `must_be` (returns True)."""
         opened = time.monotonic()
-        board, clock = BoardLink(self.scanning, opened), DeviceClock()
+        board, clock = BoardLink(self.scanning, opened, self.idling), DeviceClock()
+        adaptive = self.adaptive()
         seen: Counter[str] = Counter()
         while True:
             now = time.monotonic()
+            wait_s = POLL_S if board.state == "running" else 0.02
+            if adaptive is not None:
+                self._listen(adaptive, now)
+                if board.state != "running" or not board.switches:
+                    adaptive.interrupted()
+                else:
+                    self.steer(board, adaptive, now)
+                    wait_s = min(wait_s, adaptive.due_s(now))
             due = board.to_send(now)
             if due:
                 port.write(due)
-            data = port.read(POLL_S if board.state == "running" else 0.02)
+            data = port.read(wait_s)
             read_ns = time.monotonic_ns()
             scans = board.received(data, read_ns * 1e-9) if data else []
             self._count(board, seen)
@@ -123,13 +143,39 @@ class BoardSource(Source):
             if board.problem != self.problem:
                 self._trouble(board.problem)
             for scan in scans:
-                yield self.raw_frame(scan, board, clock, read_ns)
+                passed = adaptive.scanned(scan, read_ns * 1e-9) if adaptive else [(scan, "full")]
+                for what, kind in passed:
+                    yield self.raw_frame(what, board, clock, read_ns, kind)
             if not scans:
                 yield None
 
-    def raw_frame(self, scan: link.Frame, board: BoardLink, clock: DeviceClock, read_ns: int) -> RawFrame:
-        """A scan of the board with this host's stamps; `read_ns`: when its last byte was read."""
-        clock.observe(scan.device_us + scan.duration_us, read_ns)
+    def adaptive(self) -> AdaptiveScan | None:
+        """What decides which list a new connection's board scans, where skin.toml wants that."""
+        return AdaptiveScan(sentinel_of(self.bundle), self.idling.config) if self.idling else None
+
+    def steer(self, board: BoardLink, adaptive: AdaptiveScan, now_s: float) -> None:
+        """Have the board scan what `adaptive` wants."""
+        assert self.idling is not None
+        board.switch(self.scanning if adaptive.wants(now_s) == "full" else self.idling)
+
+    def _listen(self, adaptive: AdaptiveScan, now_s: float) -> None:
+        """Preprocessing's newest verdict, in the thread that the socket belongs to."""
+        if self._verdicts is None:
+            self._verdicts = NewestReader("delta", self.name)
+        while (delta := self._verdicts.recv()) is not None:
+            if isinstance(delta, DeltaFrame):
+                adaptive.heard(delta, now_s)
+
+    def raw_frame(
+        self, scan: link.Frame, board: BoardLink, clock: DeviceClock, read_ns: int, kind: str = "full"
+    ) -> RawFrame:
+        """A scan of the board with this host's stamps; `read_ns`: when its last byte was read.
+
+        Only full scans set the clock: one that is shorter on the line arrives sooner.
+        """
+        if kind == "full":
+            clock.observe(scan.device_us + scan.duration_us, read_ns)
+            self._full_s = scan.duration_us * 1e-6
         reasons = ["gap"] if board.gap else []
         if clock.sigma_ns >= UNSETTLED_NS:
             reasons.append("clock")
@@ -142,8 +188,9 @@ class BoardSource(Source):
             source="stub" if "stub" in board.ident.firmware.lower() else "board",
             valid=True,
             reasons=reasons,
-            valid_for_s=max(0.05, SCANS_VALID * scan.duration_us * 1e-6),
+            valid_for_s=max(0.05, SCANS_VALID * self._full_s),
             z=scan.z,
+            kind=kind,
             status=scan.status,
             device_us=scan.device_us,
             config=scan.config,

@@ -21,7 +21,13 @@ WIRE_NEEDS = {"numpy", "zmq", "msgpack"}
 RUNTIME_NEEDS = WIRE_NEEDS | {"serial", "onnxruntime", "scipy", "pydantic", "typer", "rich", "supervisor", "mcap"}
 # The command line hands these over to the offline tools on demand.
 OFFLINE_DOORS = {"services/cli"}
-SERVICES_USE_OF_MODELS = {"models.bundle", "models.prereconstruction", "models.patterns", "models.uncertainty"}
+SERVICES_USE_OF_MODELS = {
+    "models.bundle",
+    "models.prereconstruction",
+    "models.patterns",
+    "models.sentinel",
+    "models.uncertainty",
+}
 
 
 def imports(path: pathlib.Path) -> set[str]:

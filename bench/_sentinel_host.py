@@ -1,0 +1,88 @@
+"""Board, acquisition and the stages in one process and in simulated time, with or without adaptive scanning."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from firmware_stub.rig import Rig
+from firmware_stub.timeline import Script, Timeline
+from models.bundle import Bundle
+from protocol.frames import ContactFrame, DeltaFrame
+from services.boardlink import BoardLink
+from services.clock import DeviceClock
+from services.config import Skin
+from services.pipeline import Pipeline
+from services.source import BoardSource
+
+CHAIN_S = 0.002  # from a frame read to what preprocessing says of it, and to its contacts
+STEP_S = 2e-4  # of the host's loop
+
+
+@dataclass
+class Host:
+    """A skin that nothing touches until `press` says so; `contacts` (when, frame) as a controller would get them."""
+
+    scan: str = "adaptive"
+    snr_db: float = 70.0
+    seed: int = 0
+    now: float = 0.0
+    contacts: list[tuple[float, ContactFrame]] = field(default_factory=list)
+    deaf: bool = False  # preprocessing is down
+
+    def __post_init__(self) -> None:
+        self.rig = Rig("square16", snr_db=self.snr_db, seed=self.seed)
+        self.rig.field.play(Timeline(Script("nothing"), 0.0, (), self.rig.sheet.electrodes), 0.0)
+        skin, bundle = Skin(port="stub", bundle="square16", scan=self.scan), Bundle.load("square16")
+        self.source = BoardSource("palm", skin, bundle)
+        self.adaptive = self.source.adaptive()
+        self.link = BoardLink(self.source.scanning, 0.0, self.source.idling)
+        self.clock = DeviceClock()
+        self.pipeline = Pipeline(skin, "palm", bundle)
+        self.pipeline.pre.warm_up()
+        self.kinds: Counter[str] = Counter()
+        self._verdicts: list[tuple[float, int, DeltaFrame]] = []
+
+    def press(self, **values: Any) -> None:
+        self.rig.press(values, self.now)
+
+    def release(self) -> None:
+        self.rig.release(self.now)
+
+    def until(self, end: float) -> None:
+        while self.now < end:
+            self.step(end)
+
+    def step(self, end: float = np.inf) -> None:
+        """To when something is to be done next."""
+        wait = max(STEP_S, self.rig.wake_s(self.now))
+        if self.adaptive is not None:
+            wait = min(wait, self.adaptive.due_s(self.now), *(due - self.now for due, *_ in self._verdicts[:1]))
+        self.now = min(end, self.now + max(wait, STEP_S))
+        while self._verdicts and self._verdicts[0][0] <= self.now:
+            delta = heapq.heappop(self._verdicts)[2]
+            if self.adaptive is not None:
+                self.adaptive.heard(delta, self.now)
+        if self.adaptive is not None and self.link.state == "running":
+            self.source.steer(self.link, self.adaptive, self.now)
+        if due := self.link.to_send(self.now):
+            self.rig.feed(due, self.now)
+        data = self.rig.pull(self.now)
+        self.rig.scans.clear()
+        for scan in self.link.received(data, self.now) if data else []:
+            passed = self.adaptive.scanned(scan, self.now) if self.adaptive is not None else [(scan, "full")]
+            for what, kind in passed:
+                self._hand_on(what, kind)
+
+    def _hand_on(self, scan: Any, kind: str) -> None:
+        self.kinds[kind] += 1
+        if self.deaf:
+            return
+        raw = self.source.raw_frame(scan, self.link, self.clock, round(self.now * 1e9), kind)
+        delta, _, contact = self.pipeline.run(raw)
+        heapq.heappush(self._verdicts, (self.now + CHAIN_S, len(self.contacts), delta))
+        self.contacts.append((self.now + CHAIN_S, contact))
