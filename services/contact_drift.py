@@ -22,6 +22,7 @@ Array = NDArray[np.floating]
 
 MODEL_ERROR = 1.5e-3  # of |d|: what a contact's change may be off the formula
 TELLING = 1500.0  # |d| over the noise of one measurement from which a touch on an electrode would show
+UNTOUCHED = 0.03  # of |d|, what a changed contact leaves of it where nothing else changed
 LEAST_RISE = 0.5  # of the nominal contact impedance
 FALL = 0.004  # relative: a pair that fell by more, and by 6 sigma
 SIGMAS = 6.0
@@ -70,11 +71,27 @@ class ContactDrift:
         k = int(strength.argmax())
         if strength[k] < 2 * np.partition(strength, -2)[-2]:
             return None  # the next electrode shares one pair only
-        columns = np.column_stack([self._u[k], self._n[k], np.ones(len(d))])[live]
-        (a, b, _), *_ = np.linalg.lstsq(columns, d[live], rcond=None)
-        left = d[live] - columns @ np.linalg.lstsq(columns, d[live], rcond=None)[0]
+        a, b, left = self._fit(k, d, live)
         count = int(live.sum())
         expected = count * noise**2 * (1 + 4 * np.sqrt(2 / count)) + (MODEL_ERROR * size) ** 2
-        if a >= LEAST_RISE and -0.1 * a <= b <= 1.3 * a and float(left @ left) <= expected:
+        if a >= LEAST_RISE and -0.1 * a <= b <= 1.3 * a and left <= expected:
             return k
         return None
+
+    def _fit(self, k: int, d: Array, live: NDArray[np.bool_]) -> tuple[float, float, float]:
+        """a, b, and the energy that u a + n b + s leaves."""
+        columns = np.column_stack([self._u[k], self._n[k], np.ones(len(d))])[live]
+        found, *_ = np.linalg.lstsq(columns, d[live], rcond=None)
+        left = d[live] - columns @ found
+        return float(found[0]), float(found[1]), float(left @ left)
+
+    def felt_by_others(self, k: int, d: Array, live: NDArray[np.bool_]) -> Array | None:
+        """(K,) what the change at electrode k does to the pairs that do not use it; None while something else changes
+        too.
+        """
+        if not self.knows:
+            return None
+        _, b, left = self._fit(k, d, live)
+        if left > UNTOUCHED**2 * float(d[live] @ d[live]):
+            return None
+        return np.where(self.members[k], 0.0, b * self._n[k])

@@ -69,6 +69,7 @@ class Verdict:
     states: NDArray[np.uint8]
     reasons: list[str]
     usable: bool  # whether contacts can be given
+    shift: Array  # (K,) of |Z|: what a changed contact does to pairs of other electrodes; not pressing's
 
 
 class ElectrodeHealth:
@@ -93,6 +94,7 @@ class ElectrodeHealth:
         self._well = np.zeros(self.electrodes, dtype=np.int64)  # frames in a row
         self._shown = self._states
         self._fault = ""  # of the board as a whole
+        self._felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
 
     def tared(self) -> None:
         """There is a new baseline: what changed against the old one is forgotten."""
@@ -122,7 +124,7 @@ class ElectrodeHealth:
             reasons.append("degraded")
         if not usable and not reasons:
             reasons.append("out_of_distribution")
-        return Verdict(live, failed | wrong, states, reasons, usable)
+        return Verdict(live, failed | wrong, states, reasons, usable, self._shift(amplitude, failed, untouched))
 
     def problems(self) -> list[str]:
         """For a person: which electrodes, and what to do."""
@@ -257,6 +259,19 @@ class ElectrodeHealth:
         off = np.abs(amplitude[rows] - untouched.z0[rows]) / untouched.normaliser[rows]
         return bool((off <= WELL + 6 * untouched.sigma[rows]).mean() >= MOSTLY)
 
+    def _shift(self, amplitude: Array, failed: Mask, untouched: Reference | None) -> Array:
+        """Followed while nothing touches."""
+        drifting = np.flatnonzero(self._states == DRIFTING).tolist()
+        self._felt = {k: felt for k, felt in self._felt.items() if k in drifting}
+        if untouched is None or not drifting:
+            return np.zeros(len(amplitude))
+        known = ~failed & np.isfinite(untouched.sigma)
+        d = np.where(known, (amplitude - untouched.z0) / untouched.normaliser, 0.0)
+        for k in drifting:
+            if (felt := self._drift.felt_by_others(k, d, known)) is not None:
+                self._felt[k] = felt
+        return np.asarray(untouched.normaliser * np.sum([*self._felt.values(), np.zeros(len(d))], axis=0))
+
     def _reference(self, amplitude: Array, failed: Mask, untouched: Reference | None) -> Array | None:
         """|Z| that a well, untouched skin has: its baseline, else the bundle's prediction times the frame's gain."""
         if self._predicted is None:
@@ -272,7 +287,8 @@ class ElectrodeHealth:
     # state
 
     def state(self) -> dict[str, Any]:
-        return {"states": self._states.copy(), "well": self._well.copy()}
+        felt = [[k, list(values)] for k, values in self._felt.items()]
+        return {"states": self._states.copy(), "well": self._well.copy(), "felt": felt}
 
     def load(self, state: dict[str, Any]) -> None:
         """Raises ValueError where it is of other electrodes."""
@@ -281,6 +297,7 @@ class ElectrodeHealth:
             raise ValueError(f"the saved health is of {states.size} electrodes, expected {self.electrodes}")
         self.reset()
         self._states, self._well = states, well
+        self._felt = {int(k): np.array(values, dtype=float) for k, values in state.get("felt", [])}
 
 
 def _listed(numbers: Iterable[int]) -> str:
