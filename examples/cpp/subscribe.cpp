@@ -3,8 +3,8 @@
 //   g++ -std=c++17 -O2 -Wall -Wextra -Werror -DMSGPACK_NO_BOOST examples/cpp/subscribe.cpp -lzmq -o subscribe
 //   ./subscribe palm          (Debian: g++ cppzmq-dev libmsgpack-cxx-dev)
 //
-// Usage: subscribe SKIN [FRAMES [ENDPOINT]]. Prints each new frame and its contacts, until FRAMES have come.
-// Exit status: 0 all came, 1 silence or an old frame (stop the robot), 2 wrong arguments or no such socket.
+// Usage: subscribe SKIN [FRAMES [SILENCE_S [ENDPOINT]]]. Prints each new frame and its contacts, until FRAMES came.
+// Exit status: 0 all came, 1 no fresh frame for SILENCE_S (stop the robot), 2 wrong arguments or no such socket.
 
 #include <time.h>
 #include <unistd.h>
@@ -28,7 +28,7 @@ namespace {
 using Map = std::map<std::string, msgpack::object>;
 
 constexpr int kSchema = 1;
-constexpr double kSilenceS = 1.0;  // a controller would take less: the demo sends a frame every 45 ms
+constexpr double kSilenceS = 0.25;  // five frames of the demo
 
 struct NoFrame : std::runtime_error {
   using std::runtime_error::runtime_error;
@@ -114,7 +114,7 @@ bool print(const std::string& message) {
   return fresh;
 }
 
-int subscribe(const std::string& skin, long frames, const std::string& address) {
+int subscribe(const std::string& skin, long frames, double silence_s, const std::string& address) {
   zmq::context_t context;
   zmq::socket_t socket(context, zmq::socket_type::sub);
   socket.set(zmq::sockopt::linger, 0);
@@ -124,20 +124,21 @@ int subscribe(const std::string& skin, long frames, const std::string& address) 
   zmq::pollitem_t waiting[] = {{socket.handle(), 0, ZMQ_POLLIN, 0}};
   auto last = monotonic_ns();
   for (long seen = 0; frames < 0 || seen < frames;) {
-    zmq::poll(waiting, 1, std::chrono::milliseconds(100));
+    zmq::poll(waiting, 1, std::chrono::milliseconds(50));
     zmq::message_t message;
     if (socket.recv(message, zmq::recv_flags::dontwait)) {
       try {
-        if (!print(message.to_string())) return 1;
-        last = monotonic_ns();
-        ++seen;
+        if (print(message.to_string())) {
+          last = monotonic_ns();
+          ++seen;
+        }
       } catch (const std::exception& bad) {  // anything may arrive: dropped, and never a reason to stop
         std::fprintf(stderr, "dropped what is no frame: %s\n", bad.what());
       }
     }
-    if (1e-9 * static_cast<double>(monotonic_ns() - last) > kSilenceS) {
-      std::fprintf(stderr, "no contact frame of %s for %g s at %s: is the service running?\n", skin.c_str(), kSilenceS,
-                   address.c_str());
+    if (1e-9 * static_cast<double>(monotonic_ns() - last) > silence_s) {
+      std::fprintf(stderr, "no fresh contact frame of %s for %g s at %s: is the service running?\n", skin.c_str(),
+                   silence_s, address.c_str());
       return 1;
     }
   }
@@ -147,12 +148,13 @@ int subscribe(const std::string& skin, long frames, const std::string& address) 
 }  // namespace
 
 int main(int argc, char** argv) {
-  if (argc < 2 || argc > 4) {
-    std::fprintf(stderr, "usage: %s SKIN [FRAMES [ENDPOINT]]\n", argv[0]);
+  if (argc < 2 || argc > 5) {
+    std::fprintf(stderr, "usage: %s SKIN [FRAMES [SILENCE_S [ENDPOINT]]]\n", argv[0]);
     return 2;
   }
   try {
-    return subscribe(argv[1], argc > 2 ? std::atol(argv[2]) : -1, argc > 3 ? argv[3] : endpoint());
+    return subscribe(argv[1], argc > 2 ? std::atol(argv[2]) : -1, argc > 3 ? std::atof(argv[3]) : kSilenceS,
+                     argc > 4 ? argv[4] : endpoint());
   } catch (const zmq::error_t& bad) {
     std::fprintf(stderr, "cannot subscribe: %s; expected ipc://PATH or tcp://HOST:PORT\n", bad.what());
     return 2;

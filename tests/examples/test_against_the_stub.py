@@ -191,10 +191,11 @@ def test_the_cpp_subscriber_sees_the_same_contacts(cpp_subscriber: Path, start: 
         assert any(len(skin.next_frame(5.0).contacts) == 2 for _ in range(500))
     every = AllReader(["contact"], "palm")
     assert isinstance(every.recv(5.0), ContactFrame)
-    program = start(str(cpp_subscriber), "palm", "30")
+    program = start(str(cpp_subscriber), "palm", "30", "20")
     printed = program.communicate(timeout=60)[0]
     assert program.returncode == 0
     blocks = re.findall(r"^frame (\d+) (\w+)(.*)\n((?:  .*\n)*)", printed, re.MULTILINE)
+    blocks = [block for block in blocks if block[1] != "STALE"]  # the machine was too slow for it to be acted on
     assert len(blocks) == 30
     sent = {f.seq: f for f in frames_until(every, int(blocks[-1][0]))}
     for seq, word, reasons, contacts in blocks:
@@ -226,7 +227,7 @@ def test_the_cpp_subscriber_survives_what_is_no_frame_and_tells_of_silence(
     vector = topic + b"\0" + msgpack.packb(msgpack.unpackb(body) | {"host": "another"})
     with zmq.Context() as context, context.socket(zmq.PUB) as publisher:
         publisher.bind(f"ipc://{runtime}/publisher.ipc")
-        program = start(str(cpp_subscriber), "palm", "2")
+        program = start(str(cpp_subscriber), "palm", "2", "20")
         end = time.monotonic() + 30
         while program.poll() is None and time.monotonic() < end:
             for message in (b"contact/palm\0\xc1", b"contact/palm\0\x80", b"contact/palm\0", vector):
