@@ -16,7 +16,7 @@ from models import fisher, metrics
 from models.bundle import Bundle
 from models.shapes import CLASSES, Array
 from protocol.frames import RawFrame
-from services.config import Skin
+from services.config import Indenter, Skin
 from services.npz_file import Input
 from services.pipeline import Pipeline
 from services.reconstruction import reconstruct
@@ -37,7 +37,7 @@ def reconstructed(noisy: Frames, untouched: Array, skin: Skin, bundle: Bundle) -
             continue
         tare = untouched / untouched.mean(0) * noisy.pairs0[index[0]]
         began = time.process_time()
-        parts.append(reconstruct(Input(noisy.pairs[index], tare, None), skin, bundle))
+        parts.append(reconstruct(Input(noisy.pairs[index], tare, None), skin, bundle, age_s=0.0))
         seconds += time.process_time() - began
         order.append(index)
     back = np.argsort(np.concatenate(order))
@@ -74,6 +74,7 @@ def run(frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int, untouc
             row["network_ms"] = alone.get(variant)
             row |= summarise(found["image"], noisy, np.arange(len(noisy)), None)
             row |= contacts(found, noisy)
+            row |= known_indenter(noisy, untouched, skin, bundle)
             if variant == "full":
                 if level == "70":
                     row |= false_touches(frames, level, seed, bundle, untouched_frames)
@@ -91,6 +92,10 @@ def contacts(found: dict[str, Array], frames: Frames) -> Row:
     force = [k for k in frames.of("force") if np.isfinite(found["force"][k, 0])]
     newton = [frames.scene(k)[0].drop * NEWTON_PER_DROP for k in force]
     errors = metrics.relative_error([found["force"][k, 0] for k in force], newton)
+    within = [
+        abs(found["force"][k, 0] - frames.scene(k)[0].drop * NEWTON_PER_DROP) <= found["force_sigma"][k, 0]
+        for k in singles
+    ]
     wanted = {"two": 2, "three": 3}
     several = frames.of(*wanted)
     large = [k for k in frames.of("shapes") if frames.scene(k)[0].radius >= LARGE and found["count"][k] >= 1]
@@ -106,11 +111,31 @@ def contacts(found: dict[str, Array], frames: Frames) -> Row:
         "position_p95_%": float(np.percentile(distance, 95)),
         "force_%": float(errors.mean()),
         "force_rms_%": float(np.sqrt((errors**2).mean())),
+        "force_within_%": float(100 * np.mean(within)),
         "count_%": float(100 * np.mean([found["count"][k] == wanted[frames.group[k]] for k in several])),
         "single_%": float(100 * np.mean([found["count"][k] == 1 for k in frames.of("shapes", "hertz", "force")])),
         "shape_%": float(100 * np.trace(matrix) / max(len(named), 1)),
         "confusion": matrix.tolist(),
         "separation": metrics.separation([gap_of(frames, k) for k in apart], [found["count"][k] == 2 for k in apart]),
+    }
+
+
+def known_indenter(noisy: Frames, untouched: Array, skin: Skin, bundle: Bundle) -> Row:
+    """Force of the touches of one radius where the configuration says that radius; a touch not seen counts whole."""
+    index = noisy.of("force")
+    if not index.size:
+        return {}
+    shapes = [noisy.scene(int(k))[0] for k in index]
+    prior = Indenter(radius_m=shapes[0].radius * bundle.metres_per_unit)
+    some = Frames(*(getattr(noisy, f)[index] for f in noisy.__dataclass_fields__))
+    found, _ = reconstructed(some, untouched, skin.model_copy(update={"indenter": prior}), bundle)
+    force, sigma = np.nan_to_num(found["force"][:, 0]), found["force_sigma"][:, 0]
+    newton = np.array([s.drop * NEWTON_PER_DROP for s in shapes])
+    errors = metrics.relative_error(force, newton)
+    return {
+        "known_force_%": float(errors.mean()),
+        "known_force_rms_%": float(np.sqrt((errors**2).mean())),
+        "known_force_within_%": float(100 * np.mean(np.abs(force - newton) <= sigma)),
     }
 
 
@@ -155,10 +180,14 @@ def floors(frames: Frames, levels: Iterable[str]) -> dict[str, Row]:
                 fisher.floors("square16", frames.scene(k)[0], noise, fisher.SizePrior())["bayes"] for k in index
             )
 
+        shapes = [frames.scene(int(k))[0] for k in frames.of("force")]
+        known = fisher.SizePrior(radius=(shapes[0].radius, shapes[0].radius)) if shapes else fisher.SizePrior()
+        indenter = fisher.mean_floor(fisher.floors("square16", s, noise, known)["bayes"] for s in shapes)
         everywhere, force = mean(frames.of("shapes", "hertz", "force")), mean(frames.of("force"))
         found[level] = {
             "position_rms_%": float(metrics.of_side(everywhere.position)),
             "force_rms_%": 100 * force.drop,
             "integral_rms_%": 100 * force.integral,
+            "known_force_rms_%": 100 * indenter.drop,
         }
     return found

@@ -163,6 +163,7 @@ def _empty(n: int) -> dict[str, NDArray[Any]]:
         "count": np.zeros(n, np.int64),
         "position": np.full((n, MOST_CONTACTS, 2), np.nan),
         "force": np.full((n, MOST_CONTACTS), np.nan),
+        "force_sigma": np.full((n, MOST_CONTACTS), np.nan),
         "shape": np.full((n, MOST_CONTACTS), "", "<U12"),
     }
 
@@ -178,6 +179,7 @@ def _store(out: dict[str, NDArray[Any]], row: int, result: Result) -> None:
     for place, contact in enumerate(contacts[:MOST_CONTACTS]):
         out["position"][row, place] = contact.position[:2]
         out["force"][row, place] = np.nan if contact.force_n is None else contact.force_n
+        out["force_sigma"][row, place] = np.nan if contact.force_sigma_n is None else contact.force_sigma_n
         out["shape"][row, place] = contact.shape
 
 

@@ -32,8 +32,8 @@ def reconstruct(
     """Run the runtime stages over the rows of a file, without sockets.
 
     IN: measurements (n, k), and untouched (m, k) or reference (n, k). OUT: image (n, 96, 96) float32 conductivity drop
-    [S/m], row 0 at the lowest y; touched, valid, count (n,); position (n, 8, 2) [m] and force (n, 8) [N], strongest
-    first, padded with NaN; shape (n, 8).
+    [S/m], row 0 at the lowest y; touched, valid, count (n,); position (n, 8, 2) [m], force and force_sigma (n, 8) [N],
+    strongest first, padded with NaN; shape (n, 8).
     """
     import numpy as np
 
