@@ -21,7 +21,7 @@ SLIDE_MM = 0.5
 def pairs(setting: Setting) -> Iterator[Row]:
     """Two frames of one touch that differ by noise alone; Lipschitz constants of position and force."""
     runner = Runner(setting.bundle)
-    draws = 4 if setting.quick else 60
+    draws = 4 if setting.quick else 30
     for decibel in LEVELS if not setting.quick else LEVELS[1:]:
         rng, relative = setting.rng("pairs"), share(decibel)
         for k, scene in enumerate(setting.scenes()):
@@ -42,7 +42,7 @@ def ways(setting: Setting) -> Iterator[Row]:
         lost = 0
         for scene in setting.scenes()[:: 4 if setting.quick else 1]:
             baseline = runner.tare(scene.z0, relative, rng)
-            for _ in range(1 if setting.quick else 6):
+            for _ in range(1 if setting.quick else 3):
                 a, b = noisy(scene.z, relative, rng, 2)
                 steps = np.linspace(0, 1, STEPS + 1)[:, None]
                 seen = [runner.once(baseline, z) for z in a + steps * (b - a)]

@@ -43,7 +43,12 @@ LAMBDAS = 10.0 ** np.arange(-8, 1.01, 0.5)
 
 
 def answers(
-    runner: Runner, scenes: Sequence[Scene], relative: float, rng: np.random.Generator, draws: int, scale: float = 1.0
+    runner: Runner,
+    scenes: Sequence[Scene],
+    relative: float | Array,
+    rng: np.random.Generator,
+    draws: int,
+    scale: float = 1.0,
 ) -> list[tuple[Answer, Shape | None]]:
     """`draws` noisy frames of each scene against a noisy tare of its own skin; a tare refused is a frame not valid."""
     found: list[tuple[Answer, Shape | None]] = []
@@ -61,10 +66,23 @@ def answers(
 def snr(setting: Setting) -> Iterator[Row]:
     """Noise on each measurement and on the tare."""
     runner, rng = Runner(setting.bundle), setting.rng("snr")
-    draws = 2 if setting.quick else 25
+    draws = 2 if setting.quick else 12
     for decibel in (30, 40, 50, 60, 70, 80, 90, 100) if not setting.quick else (30, 50, 70, 100):
         found = answers(runner, setting.scenes(), share(decibel), rng, draws)
         yield {"case": f"{decibel} dB", "value": decibel, **summary(found)}
+
+
+def few(setting: Setting) -> Iterator[Row]:
+    """A few measurements far noisier than the others, in the tare too: they should count for little, and cost little."""
+    runner, rng = Runner(setting.bundle), setting.rng("few")
+    for count in (0, 1, 5, 20) if not setting.quick else (1, 5):
+        for factor in (10.0, 100.0, 1000.0) if count and not setting.quick else (100.0,):
+            found = []
+            for scene in setting.scenes():
+                relative = np.full(len(scene.z), share(USUAL_DB))
+                relative[rng.permutation(len(relative))[:count]] *= factor
+                found += answers(runner, [scene], relative, rng, 1 if setting.quick else 4)
+            yield {"case": f"{count} x {factor:g}", "value": factor, "kind": f"{count} measurements", **summary(found)}
 
 
 def scale(setting: Setting) -> Iterator[Row]:
@@ -107,7 +125,7 @@ def electrodes(setting: Setting) -> Iterator[Row]:
     skin = geometry.load(SKIN)
     for percent in (1, 2, 3, 5) if not setting.quick else (5,):
         found = []
-        for _ in range(1 if setting.quick else 3):
+        for _ in range(1 if setting.quick else 2):
             moved = skin.moved(0.01 * percent * SPACING * rng.standard_normal(skin.n_electrodes))
             model = ForwardModel(moved, mesh="stub" if not setting.quick else "inverse")
             found += answers(runner, solved(model), share(USUAL_DB), rng, 1)
@@ -217,6 +235,7 @@ def _decibel(decibel: float) -> str:
 PARTS: dict[str, Callable[[Setting], Iterator[Row]]] = {
     "lambda": lambdas,
     "signal over noise": snr,
+    "a few noisy measurements": few,
     "measurement scale": scale,
     "background": background,
     "contact impedance": contact,

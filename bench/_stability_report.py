@@ -109,6 +109,7 @@ def write(folder: Path, top: Mapping[str, Any], found: Found) -> None:
 PANELS = (  # part, x axis, log x, curves (key, label), log y
     ("lambda", "lambda", True, ("position_%", "force_%"), True),
     ("signal over noise", "dB", False, ("position_%", "force_%"), True),
+    ("a few noisy measurements", "times the others' noise", True, ("position_%", "force_%"), True),
     ("measurement scale", "factor", True, ("position_%", "force_%"), True),
     ("background", "S/m", True, ("position_%", "force_%"), True),
     ("contact impedance", "factor", True, ("position_%", "force_%"), True),

@@ -98,8 +98,8 @@ def share(decibel: float) -> float:
     return max(10 ** (-decibel / 20), NOISE_FREE)
 
 
-def noisy(z: Array, relative: float, rng: np.random.Generator, n: int | None = None) -> Array:
-    """|Z| with noise relative to each; n: (n, K) frames."""
+def noisy(z: Array, relative: float | Array, rng: np.random.Generator, n: int | None = None) -> Array:
+    """|Z| with noise relative to each (one share, or K of them); n: (n, K) frames."""
     return np.asarray(z * (1 + relative * rng.standard_normal(z.shape if n is None else (n, *z.shape))))
 
 
@@ -130,7 +130,7 @@ class Runner:
         self.pipeline = Pipeline(skin, bundle=bundle)
         self.scan = 0
 
-    def tare(self, z0: Array, relative: float, rng: np.random.Generator) -> Baseline:
+    def tare(self, z0: Array, relative: float | Array, rng: np.random.Generator) -> Baseline:
         """Of TARE_FRAMES frames of the untouched skin. Raises services.stage.Refused."""
         return take(noisy(z0, relative, rng, TARE_FRAMES), self.pipeline.pre.pre, "bench", 0)
 

@@ -1,0 +1,217 @@
+"""The worst of `skin bench stability` as tests: what holds whatever a board sends; and that the benchmark can fail."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench import _stability_garbage as garbage
+from bench import _stability_report as report
+from bench._stability_matrices import solved_long
+from bench._stability_run import (
+    METRES,
+    NEWTONS_PER_DROP,
+    TOUCHES,
+    Answer,
+    Runner,
+    Scene,
+    Setting,
+    judged,
+    noisy,
+    summary,
+)
+from models.bundle import Bundle
+from models.forward import shared
+from models.shapes import Array
+from protocol.frames import Contact
+from services.tare import Baseline
+
+RELATIVE = 10 ** (-80 / 20)  # the board's noise
+
+
+@pytest.fixture(scope="module")
+def setting() -> Setting:
+    return Setting(Bundle.load("square16"), quick=True, seed=3)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A touch of 3 N solved on the coarsest of the project's meshes."""
+    model, touch = shared("square16", "inverse"), TOUCHES[1]
+    z0 = np.abs(model.solve(1.0).impedances())
+    return Scene(touch, np.abs(model.solve(model.touched([touch])).impedances()), z0)
+
+
+@pytest.fixture(scope="module")
+def runner(setting: Setting) -> Runner:
+    return Runner(setting.bundle)
+
+
+@pytest.fixture
+def baseline(runner: Runner, scene: Scene) -> Baseline:
+    return runner.tare(scene.z0, RELATIVE, np.random.default_rng(0))
+
+
+def distance_mm(answer: Answer, other: Array) -> float:
+    place = answer.place()
+    assert place is not None, answer.reasons
+    return 1e3 * float(np.hypot(*(place - other)))
+
+
+@pytest.mark.parametrize("exponent", [-9, 9])
+def test_the_unit_of_the_measurements_divides_out(runner: Runner, scene: Scene, exponent: int) -> None:
+    factor, noise = 10.0**exponent, np.random.default_rng(1)
+    z = noisy(scene.z, RELATIVE, noise)
+    answers = []
+    for scale in (1.0, factor):
+        tare = runner.tare(scale * scene.z0, RELATIVE, np.random.default_rng(0))
+        answers.append(runner.once(tare, scale * z))
+    assert all(a.valid for a in answers)
+    place = answers[0].place()
+    assert place is not None and distance_mm(answers[1], place) < 0.05
+    assert answers[1].force() == pytest.approx(answers[0].force(), rel=0.01)
+
+
+@pytest.mark.parametrize("name", [*garbage.NOT_NUMBERS, *garbage.ODD_NUMBERS])
+def test_what_is_no_measurement_is_left_out(runner: Runner, scene: Scene, baseline: Baseline, name: str) -> None:
+    """In 1, 10 or 40 of 120 channels the touch is still where it is; in all of them nothing is valid."""
+    value = (garbage.NOT_NUMBERS | garbage.ODD_NUMBERS)[name]
+    rng = np.random.default_rng(2)
+    for count in (1, 10, 40, 119, 120):
+        z = noisy(scene.z, RELATIVE, rng).astype(complex)
+        z[rng.permutation(120)[:count]] = value
+        answer = runner.once(baseline, z)
+        assert not answer.broken
+        if count <= 40:
+            assert answer.valid
+            assert distance_mm(answer, METRES * scene.touch.centroid) < 3
+        else:
+            assert not answer.valid
+
+
+@pytest.mark.parametrize("family", garbage.FAMILIES)
+def test_frames_that_no_skin_made_are_never_valid(
+    runner: Runner, scene: Scene, baseline: Baseline, family: str
+) -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        answer = runner.once(baseline, *garbage.FAMILIES[family](scene.z0, rng))
+        assert not answer.broken and not answer.valid, answer
+
+
+def test_a_stream_of_garbage_leaves_nothing_behind(runner: Runner, scene: Scene, baseline: Baseline) -> None:
+    rng = np.random.default_rng(5)
+    runner.begin(baseline)
+    for _ in range(6):
+        for family in garbage.FAMILIES.values():
+            assert not runner.see(*family(scene.z0, rng)).broken
+    for _ in range(100):
+        answer = runner.see(noisy(scene.z0, RELATIVE, rng))
+    assert answer.valid and not answer.contacts
+    for _ in range(3):
+        answer = runner.see(noisy(scene.z, RELATIVE, rng))
+    assert answer.valid and distance_mm(answer, METRES * scene.touch.centroid) < 2
+
+
+@pytest.mark.parametrize("dead", [1, 2, 3, 8, 15])
+def test_dead_electrodes_cost_accuracy_or_validity_never_truth(
+    setting: Setting, runner: Runner, scene: Scene, baseline: Baseline, dead: int
+) -> None:
+    pattern, rng = np.asarray(setting.bundle.pattern), np.random.default_rng(dead)
+    for _ in range(4):
+        lost = np.isin(pattern, rng.permutation(16)[:dead]).any(axis=1)
+        z = noisy(scene.z, RELATIVE, rng)
+        z[lost] = np.nan
+        answer = runner.once(baseline, z)
+        assert not judged(answer, scene.touch)
+        assert answer.valid == (dead <= 2)
+
+
+def test_no_jump_within_noise(runner: Runner, scene: Scene, baseline: Baseline) -> None:
+    """At the board's noise, and on the whole way from one noisy frame to the next."""
+    rng = np.random.default_rng(6)
+    a, b = noisy(scene.z, RELATIVE, rng, 2)
+    places = [runner.once(baseline, a + t * (b - a)).place() for t in np.linspace(0, 1, 21)]
+    assert all(p is not None for p in places)
+    steps = 1e3 * np.linalg.norm(np.diff(np.array(places), axis=0), axis=1)
+    assert steps.max() < 0.3 and steps.sum() < 2
+
+
+def test_extended_precision_solves_what_double_cannot() -> None:
+    """The Hilbert matrix of order 12, condition 1.7e16: its inverse times known numbers."""
+    n = 12
+    hilbert = 1 / (np.arange(n)[:, None] + np.arange(n)[None] + np.longdouble(1))
+    exact = np.ones(n, np.longdouble)
+    longer = np.abs(solved_long(hilbert, hilbert @ exact) - exact).max()
+    double = np.abs(np.linalg.solve(hilbert.astype(float), (hilbert @ exact).astype(float)) - 1).max()
+    assert longer < 0.02 and longer < double
+
+
+def test_pytorch_evaluates_a_shipped_file_as_onnx_runtime_does(setting: Setting, scene: Scene) -> None:
+    pytest.importorskip("torch")
+    pytest.importorskip("onnx")
+    from bench import _stability_precision as precision
+
+    path = setting.bundle.network_path("full")
+    if path is None:
+        pytest.skip("this bundle has no network")
+    import torch
+
+    from bench._stability_graph import Graph
+
+    pre = setting.bundle.prereconstructor()
+    stack, context, scale = pre.condition(np.full(120, RELATIVE)).stack(pre.difference(scene.z, scene.z0))
+    feeds = [({"stack": stack[None], "context": context[None]}, scale, scene.touch)]
+    ours = precision._run(path, feeds)
+    for dtype in (torch.float32, torch.float64):
+        graph = Graph(path, dtype)
+        theirs = [[graph.run(feeds[0][0])[name] for name in precision.OUTPUTS]]
+        assert not precision._compared(ours, theirs, feeds, precision.PARITY_MM)["broken"]
+    theirs[0][0] = np.roll(theirs[0][0], 3, axis=-1)  # three pixels are 3 mm
+    assert precision._compared(ours, theirs, feeds, precision.PARITY_MM)["broken"]
+
+
+# the benchmark's own judgement
+
+
+def answer_at(x: float, y: float, force: float, valid: bool = True) -> Answer:
+    contact = Contact(id=1, position=[x, y, 0.0], force_n=force)
+    return Answer(valid=valid, touched=True, contacts=[contact])
+
+
+def test_a_valid_contact_far_away_breaks_the_promise_and_fails_the_run() -> None:
+    touch = TOUCHES[1]
+    x, y = METRES * touch.centroid
+    right = answer_at(x + 0.001, y, NEWTONS_PER_DROP * touch.drop * 1.1)
+    wrong = answer_at(x + 0.011, y, 3.0)
+    assert not judged(right, touch) and judged(right, None) == ["valid on garbage, with contacts"]
+    assert judged(wrong, touch) == ["valid contact far from the touch"]
+    assert not judged(replace(wrong, valid=False), touch)
+    row = summary([(right, touch), (wrong, touch), (Answer(broken=["crash: boom"]), touch)])
+    assert row["position_max_%"] == pytest.approx(11) and row["valid_%"] == pytest.approx(200 / 3)
+    assert row["broken"] == {"valid contact far from the touch": 1, "crash: boom": 1}
+    assert len(report.broken({"part": [{"case": "case", **row}]})) == 2
+
+
+def test_errors_are_those_of_valid_frames_with_a_contact() -> None:
+    touch = TOUCHES[0]
+    seen = answer_at(0.001, 0.0, 1.8)
+    row = summary([(seen, touch), (Answer(valid=True), touch), (answer_at(0.03, 0.0, 9.0, valid=False), touch)])
+    assert row["position_%"] == pytest.approx(1) and row["force_%"] == pytest.approx(20) and row["missed"] == 1
+
+
+def test_a_stage_that_lets_infinity_out_is_found(runner: Runner, scene: Scene, baseline: Baseline, monkeypatch) -> None:
+    network = runner.pipeline.inference._network
+    real = network.run
+
+    def spoiled(frame):
+        image, *rest = real(frame)
+        image = image.copy()
+        image[3, 4] = np.inf
+        return image, *rest
+
+    monkeypatch.setattr(network, "run", spoiled)
+    answer = runner.once(baseline, scene.z)
+    assert "not finite: image.image" in answer.broken and not answer.valid
