@@ -73,7 +73,7 @@ def snr(setting: Setting) -> Iterator[Row]:
 
 
 def few(setting: Setting) -> Iterator[Row]:
-    """A few measurements far noisier than the others, in the tare too: they should count for little, and cost little."""
+    """A few measurements far noisier than the others, in the tare too: they should cost little."""
     runner, rng = Runner(setting.bundle), setting.rng("few")
     for count in (0, 1, 5, 20) if not setting.quick else (1, 5):
         for factor in (10.0, 100.0, 1000.0) if count and not setting.quick else (100.0,):
