@@ -31,7 +31,7 @@ ODD_NUMBERS = {
     "huge": complex(1e20, 0.0),
     "largest float": complex(3.4e38, 3.4e38),
 }
-RANDOM = {"quick": 800, "full": 10_000}
+RANDOM = {"quick": 400, "full": 10_000}
 ELECTRODES = 16
 STRAY_OHM = 1e6  # an open input: next to no current
 
@@ -140,7 +140,7 @@ def random_frames(setting: Setting) -> Iterator[Row]:
     if not answers[-1].valid or not answers[-1].contacts:
         well["broken"]["not well again after 200 good frames"] = 1
     yield {"case": "a touch, 200 good frames later", **well}
-    yield {"case": "random tares", **_random_tares(runner, z0, rng, n // 400)}
+    yield {"case": "random tares", **_random_tares(runner, z0, rng, max(2 * len(FAMILIES), n // 400))}
 
 
 def _random_tares(runner: Runner, z0: Array, rng: np.random.Generator, n: int) -> Row:

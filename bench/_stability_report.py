@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -144,9 +144,15 @@ def draw(found: Found, path: Path) -> None:
         if not label:
             _bars(axis, rows)
         else:
-            _curves(axis, rows, keys)
+            _curves(axis, rows, [key for key in keys if key != "valid_%"])
+            if "valid_%" in keys:  # its errors have another scale
+                other = axis.twinx()
+                _curves(other, rows, ["valid_%"], "C2")
+                other.legend(fontsize=7, loc="lower right")
+                axis.set_ylim(bottom=0)
             axis.set_xlabel(label)
-            axis.legend(fontsize=7)
+            if axis.lines:
+                axis.legend(fontsize=7)
         if log_x:
             axis.set_xscale("log")
         if log_y and label:
@@ -158,7 +164,7 @@ def draw(found: Found, path: Path) -> None:
     plt.close(figure)
 
 
-def _curves(axis: Any, rows: list[Row], keys: tuple[str, ...]) -> None:
+def _curves(axis: Any, rows: list[Row], keys: Sequence[str], own_colour: str = "") -> None:
     """One curve a figure; a part's noise levels in their own line styles."""
     levels = list(dict.fromkeys(row.get("dB") for row in rows))
     kinds = list(dict.fromkeys(row.get("kind") for row in rows))
@@ -179,8 +185,8 @@ def _curves(axis: Any, rows: list[Row], keys: tuple[str, ...]) -> None:
                 marker="o",
                 ms=3,
                 ls="-" if len(set(x)) == len(x) else "",
-                c=f"C{colour}",
-                alpha=1 - 0.3 * style,
+                c=own_colour or f"C{colour}",
+                alpha=max(0.3, 1 - 0.3 * style),
                 label=name,
             )
 
