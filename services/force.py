@@ -122,9 +122,10 @@ class ForceLaw:
         if self.curve is None:
             return "no force law"
         unit = "S/m" if self.reads == "peak" else "S/m m^2"
-        power = "" if self.curve.exponent == 1 else f"^{self.curve.exponent:.2f}"
+        if self.curve.exponent != 1:
+            unit = f"({unit})^{self.curve.exponent:.2f}"
         located = "" if self.curve.correction == "none" else ", corrected for the place"
-        return f"{self.curve.scale:.4g} N per {unit}{power}, to {self.most_n:g} N{located}"
+        return f"{self.curve.scale:.4g} N per {unit}, to {self.most_n:g} N{located}"
 
     def impossible(self, peak: float, newton: float | None) -> bool:
         """Whether no touch can have this peak drop [S/m] or force. Without a law drops have no scale: anything goes."""
