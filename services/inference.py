@@ -5,22 +5,19 @@ ONNX Runtime on one thread, warmed up before the stage is ready. A bundle withou
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, ImageFrame
 from services.config import Skin
+from services.networks import Network, OneStep, Pictures, network
 from services.quality import REFUSED, Residual
 from services.sentinel import CoarseImage
 from services.stage import Health, Refused, Stage, add_reason, inherited
-
-WARM_UP_RUNS = 5
-FEWEST_SIGMA = 2  # finite measurements without which there is nothing to reconstruct
 
 
 class Inference(Stage):
@@ -34,7 +31,7 @@ class Inference(Stage):
         super().__init__(name)
         self.config, self.bundle = skin, bundle
         path = None if skin.network == "none" else bundle.network_path(skin.network) or bundle.network_path("full")
-        self._network = Network(str(path)) if path else OneStep(bundle)
+        self._network = network(str(path)) if path else OneStep(bundle)
         # Only a network's image is meant to explain a frame: a one-step image shows where, not how much.
         self._refuses = isinstance(self._network, Network)
         self._residual = Residual(bundle, to_scale=self._refuses)
@@ -48,6 +45,7 @@ class Inference(Stage):
         self._last: ImageFrame | None = None  # of the touch that is being held
         self._last_scan = 0  # of the frame that it was reconstructed from
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
+        self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
         self._counters = {"networks_run": 0, "held": 0, "untouched": 0, "unwanted": 0, "missed": 0, "refused": 0}
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
@@ -71,8 +69,24 @@ class Inference(Stage):
             self._last = None
         return [out]
 
+    @classmethod
+    def together(cls, work: Sequence[tuple[Stage, Frame]]) -> None:
+        """Frames of several skins that wait at once: one run of the network for those that share it."""
+        groups: dict[Network, list[tuple[Inference, DeltaFrame]]] = {}
+        for stage, frame in work:
+            if isinstance(stage, Inference) and isinstance(frame, DeltaFrame) and frame.stack.size:
+                if isinstance(stage._network, Network):
+                    groups.setdefault(stage._network, []).append((stage, frame))
+        for shared, members in groups.items():
+            if len(members) > 1:
+                made = shared.run_many([frame for _, frame in members])
+                for (stage, frame), pictures in zip(members, made, strict=True):
+                    stage._ahead = frame, pictures
+
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        out.image, out.sigma, out.classes = self._network.run(frame)
+        ahead, self._ahead = self._ahead, None
+        ready = ahead is not None and ahead[0] is frame
+        out.image, out.sigma, out.classes = ahead[1] if ahead and ready else self._network.run(frame)
         out.noise = _rms(frame.sigma)
         out.residual = self._residual(frame.difference, frame.sigma, out.image)
         self._judge(out)
@@ -134,57 +148,10 @@ class Inference(Stage):
         return Health("OK", [], dict(self._counters))
 
 
-class Network:
-    """The bundle's ONNX file. Output: drop (H, W) and its sigma [S/m], class probabilities (5, h, w)."""
-
-    def __init__(self, path: str) -> None:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-        inputs = {i.name: [d if isinstance(d, int) else 1 for d in i.shape] for i in self.session.get_inputs()}
-        for _ in range(WARM_UP_RUNS):
-            self.session.run(None, {name: np.zeros(shape, np.float32) for name, shape in inputs.items()})
-
-    def run(self, frame: DeltaFrame) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        drop, log_sigma, logits = self.session.run(
-            ["drop", "log_sigma", "classes"], {"stack": frame.stack[None], "context": frame.context[None]}
-        )
-        scale = np.float32(frame.scale)
-        return drop[0, 0] * scale, np.exp(log_sigma[0, 0]) * scale, softmax(logits[0])
-
-
-class OneStep:
-    """The paper's one-step image, conditioned on the noise that the frames state."""
-
-    def __init__(self, bundle: Bundle) -> None:
-        self.pre, self.n = bundle.prereconstructor(), bundle.image_size
-        self._operator: Operator | None = None
-        self._sigma = b""
-
-    def run(self, frame: DeltaFrame) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        empty = np.zeros((0, 0), np.float32), np.zeros((0, 0, 0), np.float32)
-        sigma = frame.sigma.astype(float)
-        live = np.isfinite(sigma)
-        if live.sum() < FEWEST_SIGMA:
-            return np.zeros((self.n, self.n), np.float32), *empty
-        if self._operator is None or sigma.tobytes() != self._sigma:
-            self._operator = self.pre.condition(sigma, weights=live.astype(float))
-            self._sigma = sigma.tobytes()
-        return np.asarray(self._operator.one_step(frame.difference, self.n), np.float32), *empty
-
-
 def _rms(sigma: NDArray[np.float32]) -> float | None:
     """Of what is finite; None where nothing is."""
     finite = sigma[np.isfinite(sigma)].astype(float)
     return float(np.sqrt((finite**2).mean())) if finite.size else None
-
-
-def softmax(logits: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Over the first axis."""
-    e = np.exp(logits - logits.max(axis=0))
-    return np.asarray(e / e.sum(axis=0), np.float32)
 
 
 if __name__ == "__main__":

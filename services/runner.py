@@ -10,7 +10,7 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import zmq
@@ -50,6 +50,7 @@ class Runner:
         self._by_socket: dict[Any, Lane] = {}
         self._stop = False
         self._frames = 0
+        self._settled = False  # what was made while warming up is out of the garbage collector's sight
 
     def bundle(self, skin: str) -> Bundle:
         """The bundle of a skin, loaded once."""
@@ -77,15 +78,14 @@ class Runner:
         self._poller.register(self.publisher.socket, zmq.POLLIN)
         for socket in self._by_socket:
             self._poller.register(socket, zmq.POLLIN)
+        _settle()
         next_tick = 0.0
         while not self._stop:
             wait_s = max(next_tick, self._next_deadline()) - time.monotonic()
             ready = self._poller.poll(max(0, 1 + int(wait_s * 1000)))
+            self._serve([self._by_socket[socket] for socket, _ in ready if socket in self._by_socket])
             for socket, _ in ready:
-                lane = self._by_socket.get(socket)
-                if lane is not None:
-                    self._serve(lane)
-                elif socket is self.control.socket:
+                if socket is self.control.socket:
                     self.control.serve_once()
                 elif socket is self.publisher.socket:
                     self.publisher.poll()
@@ -94,7 +94,7 @@ class Runner:
                 self._tick()
                 next_tick = time.monotonic() + TICK_S
             if ready and not self._poller.poll(0):
-                any(lane.stage.prepare() for lane in self.lanes.values())  # one piece of work, while nobody waits
+                self._prepare()
         self.close()
 
     def _next_deadline(self) -> float:
@@ -109,19 +109,32 @@ class Runner:
 
     # frames
 
-    def _serve(self, lane: Lane) -> None:
-        while (frame := lane.feed.recv()) is not None:
+    def _serve(self, lanes: list[Lane]) -> None:
+        """What waits at these lanes, newest frames of several skins together."""
+        work = [(lane, frame) for lane in lanes for frame in self._waiting(lane)]
+        if len(work) > 1:
+            try:
+                type(work[0][0].stage).together([(lane.stage, frame) for lane, frame in work])
+            except Exception as why:  # each frame is still processed by itself
+                self._failed(work[0][0], why)
+        for lane, frame in work:
             self._handle(lane, frame)
+
+    def _waiting(self, lane: Lane) -> Iterator[Frame]:
+        """Frames to process; those that waited too long are counted."""
+        while (frame := lane.feed.recv()) is not None:
+            read = frame.stamps.get("read", 0)
+            mine = frame.source != "replay" and frame.host in ("", host_id())
+            if mine and time.monotonic_ns() - read > OLD_S * 1e9:
+                lane.heartbeat.drops["old"] += 1
+            else:
+                yield frame
             if isinstance(lane.feed, Newest):
                 return
 
     def _handle(self, lane: Lane, frame: Frame) -> None:
         beat, stage = lane.heartbeat, lane.stage
         now = time.monotonic_ns()
-        read = frame.stamps.get("read", 0)
-        if frame.source != "replay" and frame.host in ("", host_id()) and now - read > OLD_S * 1e9:
-            beat.drops["old"] += 1
-            return
         beat.heard(frame, now)
         try:
             made = stage.process(frame, lane.wanted)
@@ -134,10 +147,14 @@ class Runner:
             self._send(lane, out)
         beat.done(frame, now, time.monotonic_ns())
         self._frames += 1
-        if self._frames == WARM_FRAMES:
-            gc.collect()
-            gc.freeze()
-            gc.set_threshold(20_000, 50, 50)
+
+    def _prepare(self) -> None:
+        """One piece of work for later, while nobody waits."""
+        if self._frames >= WARM_FRAMES and not self._settled:
+            self._settled = True
+            _settle()
+        else:
+            any(lane.stage.prepare() for lane in self.lanes.values())
 
     def _send(self, lane: Lane, frame: Frame) -> None:
         try:
@@ -254,6 +271,15 @@ class Runner:
             stage.new_session()
             self.publisher.renew()
         return {"session": self.publisher.session}
+
+
+def _settle() -> None:
+    """What lives now is taken to live for ever: the garbage collector never walks it again, and seldom the rest. The
+    first call takes some ten milliseconds, a later one a fraction.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 50, 50)
 
 
 def _wake_on_signals(stop: Callable[[], None]) -> int:

@@ -5,6 +5,7 @@ reset, saved and loaded. services/runner.py drives stages over sockets, services
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -78,9 +79,15 @@ class Stage(ABC):
     def health(self) -> Health:
         return Health()
 
+    @classmethod  # noqa: B027
+    def together(cls, work: Sequence[tuple[Stage, Frame]]) -> None:
+        """Called before the stages process frames of several skins that wait at once: do what is cheaper for all of
+        them than for each. Changes nothing but how soon a result is there.
+        """
+
     def prepare(self) -> bool:
-        """Called after frames were sent while none is waiting: do one bounded piece of work that later frames will need, and say whether
-        there was one. Changes nothing but how soon a result is there.
+        """Called after frames were sent, while none is waiting: do one bounded piece of work that later frames will
+        need, and say whether there was one. Changes nothing but how soon a result is there.
         """
         return False
 

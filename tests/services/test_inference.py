@@ -112,6 +112,24 @@ def test_what_nobody_wants_is_not_run_but_made_up_for(stage: Inference) -> None:
     assert run(stage, delta(3, held=True, reconstructed=1)).image.max() == pytest.approx(0.4)
 
 
+def test_skins_that_wait_together_share_a_run_and_keep_their_own(
+    skin: Skin, networked: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alike = [Inference(name, skin.model_copy(update={"network": "full"}), networked) for name in ("palm", "arm")]
+    frames = [delta(1, 0.5), delta(1, 0.25)]
+    alone = [run(stage, frame).image for stage, frame in zip(alike, frames, strict=True)]
+    runs: list[int] = []
+    session = alike[0]._network.session  # type: ignore[union-attr]
+    counted = lambda names, feed: runs.append(len(feed["stack"])) or session.run(names, feed)  # noqa: E731
+    monkeypatch.setattr(alike[0]._network, "session", type("Counted", (), {"run": staticmethod(counted)}))
+    Inference.together(list(zip(alike, frames, strict=True)))
+    for stage, frame, image in zip(alike, frames, alone, strict=True):
+        assert run(stage, frame).image == pytest.approx(image)
+    assert runs == [2]
+    assert run(alike[0], frames[1]).image == pytest.approx(alone[1])  # not what lay ready for another frame
+    assert runs == [2, 1]
+
+
 def test_state_carries_the_held_image(stage: Inference, skin: Skin, networked: Bundle) -> None:
     first = run(stage, delta(1, 0.5))
     twin = Inference("palm", skin.model_copy(update={"network": "full"}), networked)
