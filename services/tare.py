@@ -60,6 +60,9 @@ class Baseline:
             raise Refused(f"the saved baseline has {z0.size} measurements, this skin {measurements}: tare again")
         if not (np.isfinite(z0).all() and (z0 >= 0).all() and (sigma > 0).all()):
             raise Refused("the saved baseline has impedances or noises that are not possible: tare again")
+        known = int(((z0 > 0) & np.isfinite(sigma)).sum())
+        if known < 0.5 * measurements:
+            raise Refused(f"the saved baseline knows only {known} of {measurements} measurements: tare again")
         return cls(z0, sigma, *rest, *provenance)
 
 

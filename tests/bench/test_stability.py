@@ -26,6 +26,7 @@ from models.bundle import Bundle
 from models.forward import shared
 from models.shapes import Array
 from protocol.frames import Contact
+from services.stage import Refused
 from services.tare import Baseline
 
 RELATIVE = 10 ** (-80 / 20)  # the board's noise
@@ -113,6 +114,20 @@ def test_a_stream_of_garbage_leaves_nothing_behind(runner: Runner, scene: Scene,
     for _ in range(3):
         answer = runner.see(noisy(scene.z, RELATIVE, rng))
     assert answer.valid and distance_mm(answer, METRES * scene.touch.centroid) < 2
+
+
+@pytest.mark.parametrize("lost", [1, 59, 61, 119, 120])
+def test_a_saved_baseline_of_too_few_measurements_is_refused(
+    runner: Runner, scene: Scene, baseline: Baseline, lost: int
+) -> None:
+    saved = baseline.to_dict()
+    saved["z0"] = np.where(np.arange(120) < lost, 0.0, baseline.z0)
+    if lost > 60:
+        with pytest.raises(Refused, match=f"only {120 - lost} of 120"):
+            Baseline.from_dict(saved, 120)
+        return
+    answer = runner.once(Baseline.from_dict(saved, 120), noisy(scene.z, RELATIVE, np.random.default_rng(8)))
+    assert not judged(answer, scene.touch)
 
 
 @pytest.mark.parametrize("dead", [1, 2, 3, 8, 15])
