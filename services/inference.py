@@ -15,7 +15,7 @@ from models.bundle import Bundle
 from protocol.frames import DeltaFrame, Frame, ImageFrame
 from services.config import Skin
 from services.networks import Network, OneStep, Pictures, network
-from services.quality import REFUSED, Residual
+from services.quality import Residual
 from services.sentinel import CoarseImage
 from services.stage import Health, Refused, Stage, add_reason, inherited
 
@@ -43,6 +43,7 @@ class Inference(Stage):
 
     def reset(self) -> None:
         self._last: ImageFrame | None = None  # of the touch that is being held
+        self._refused = False  # whether it explains its frame too badly to be of a touch
         self._last_scan = 0  # of the frame that it was reconstructed from
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
         self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
@@ -89,6 +90,7 @@ class Inference(Stage):
         out.image, out.sigma, out.classes = ahead[1] if ahead and ready else self._network.run(frame)
         out.noise = _rms(frame.sigma)
         out.residual = self._residual(frame.difference, frame.sigma, out.image)
+        self._refused = self._refuses and frame.touched and out.residual is not None and self._residual.refused
         self._judge(out)
         self._counters["networks_run"] += 1
         self._last, self._unseen = out, None
@@ -103,7 +105,7 @@ class Inference(Stage):
 
     def _judge(self, out: ImageFrame) -> None:
         """An image that does not explain the measurements is of no touch."""
-        if self._refuses and out.touched and out.residual is not None and out.residual > REFUSED:
+        if self._refused:
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
             self._counters["refused"] += 1
@@ -127,7 +129,7 @@ class Inference(Stage):
         if last is None:
             return {"last": None}
         kept = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
-        kept["residual"] = last.residual
+        kept |= {"residual": last.residual, "refused": self._refused}
         return {"last": {"scan": self._last_scan, **kept}}
 
     def load(self, state: dict[str, Any]) -> None:
@@ -138,7 +140,7 @@ class Inference(Stage):
         try:
             self._last = ImageFrame(skin=self.skin, image=last["image"], sigma=last["sigma"], classes=last["classes"])
             self._last.noise, self._last_scan = last.get("noise"), int(last["scan"])
-            self._last.residual = last.get("residual")
+            self._last.residual, self._refused = last.get("residual"), bool(last.get("refused", False))
         except (KeyError, TypeError) as wrong:
             raise Refused(f"no image in the saved state ({wrong})") from None
 

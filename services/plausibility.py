@@ -16,6 +16,7 @@ Array = NDArray[np.floating]
 
 LIMIT = 0.03  # relative: a few kelvin on the sheet, or a contact that wears, are left to the tare
 SIGMAS = 6.0
+RISEN = 0.006  # relative: all pairs risen by more are no touch either, where drift was not what made the change
 DRIFTED = 1e-3  # relative fall that a touched skin's drift may come to
 FALLEN = 0.3  # share of a change's energy that is of falls, beyond which it is no touch
 
@@ -28,6 +29,8 @@ def impossible(d: Array, sigma: Array, pairs: NDArray[np.bool_], touched: bool) 
         return False
     change, noise = d[pairs], SIGMAS * sigma[pairs]
     if (change + noise).min() < -LIMIT or change.min() > LIMIT:
+        return True
+    if touched and change.min() > RISEN:
         return True
     falls = np.minimum(change + np.maximum(noise, DRIFTED), 0.0)
     return touched and bool(falls @ falls > FALLEN * (change @ change))

@@ -19,6 +19,8 @@ MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through
 DRIFT = Drift(scale=2e-3, contact=1e-2)  # a change that drift of this size explains is not held against the image
 CHANCE = 4.0  # standard deviations of chi-square that the noise may come to
 REFUSED = 0.5  # share not explained from which an image is none of a touch
+FAINT = 100.0  # energy over the noise's below which it is refused from REFUSED_FAINT on:
+REFUSED_FAINT = 0.15  # of a faint touch noise hides what the image gets wrong, of a faint anything-else it does not
 
 
 class Residual:
@@ -28,6 +30,8 @@ class Residual:
         """to_scale: images are in S/m; else only their form counts, not their size."""
         self.pre, self.to_scale = bundle.prereconstructor(), to_scale
         self.shape: tuple[int, int] = bundle.matrices.inside.shape
+        self.refused = False  # whether the last image that was given a share is of no touch
+        self._sizes = (0, 0)
         self._sigma, self._noise = b"", 0.0  # noise: the energy that it may leave; 0 where nothing can be told
 
     def __call__(
@@ -41,16 +45,31 @@ class Residual:
             return None
         if len(difference) != self.pre.measurements or not self._condition(sigma):
             return None
-        drop = np.clip(image, 0.0, MOST_DROP)
-        y = -np.log1p(-drop) if self.to_scale else drop
-        coarse = y.reshape(h, image.shape[0] // h, w, image.shape[1] // w).mean(axis=(1, 3)).ravel()
+        y = np.clip(image, np.float32(0.0), np.float32(MOST_DROP))
+        if self.to_scale:
+            np.subtract(np.float32(1.0), y, out=y)
+            np.log(y, out=y)
+            np.negative(y, out=y)
+        down, across = self._means(*image.shape)
+        coarse = (down @ y @ across).ravel()
         seen, expected = self._whiten @ difference, self._forward @ coarse
         if not self.to_scale:
             expected *= max(0.0, float(expected @ seen)) / max(float(expected @ expected), 1e-30)
         left = seen - expected
         beyond = float(left @ left) - self._noise
-        share = max(0.0, beyond) / max(float(seen @ seen), self._noise)
+        energy = max(float(seen @ seen), self._noise)
+        share = max(0.0, beyond) / energy
+        self.refused = not share <= (REFUSED if energy > FAINT * self._noise else REFUSED_FAINT)
         return share if np.isfinite(share) else None
+
+    def _means(self, rows: int, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(h, rows) and (columns, w): the mean over the pixels of each coarse one (a product is faster than `mean`)."""
+        if self._sizes != (rows, columns):
+            (h, w), self._sizes = self.shape, (rows, columns)
+            down = np.repeat(np.eye(h, dtype=np.float32), rows // h, axis=1) * np.float32(h / rows)
+            across = np.repeat(np.eye(w, dtype=np.float32), columns // w, axis=0) * np.float32(w / columns)
+            self._matrices = np.ascontiguousarray(down), np.ascontiguousarray(across)
+        return self._matrices
 
     def _condition(self, sigma: NDArray[np.float32]) -> bool:
         key = sigma.tobytes()
