@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 from models.prereconstruction import PreReconstructor
 from services.config import Tare
 from services.drift import REST_S
+from services.holding import Holding, shaped
 
 Array = NDArray[np.float64]
 
 BLOCK_S = 0.5  # frames are taken in by their means over so long
 BACK_S = 2.0  # how far back the baseline goes when a touch begins
+TREND_S = 8.0  # before that: how it drifted over so long, it is taken to have gone on
 LONGEST_STEP_S = 1.0  # of the slow part: a longer gap counts as this
 MOST_S = 600.0  # of drift: a longer gap counts as this
 
@@ -36,6 +38,7 @@ class Follower:
         self.pre, self.config = pre, config
         self._columns = np.column_stack([np.ones(pre.measurements), pre.m.contact])  # d per relative change
         self._rates = np.array([config.scale_per_s] + [config.contact_per_s] * pre.m.contact.shape[1])
+        self.holding = Holding(pre, self._columns, self._rates)
         self.begin(0)
 
     def begin(self, at_ns: int, age_s: float = 0.0) -> None:
@@ -44,6 +47,7 @@ class Follower:
         self._age_s = age_s
         self._covariance = np.diag((self._rates * REST_S) ** 2)
         self._past: deque[tuple[int, Array, Array]] = deque()  # (when, |Z0|, covariance) of the last BACK_S
+        self.holding.reset()
         self._clear()
 
     def _clear(self) -> None:
@@ -62,6 +66,7 @@ class Follower:
         True where z0 changed.
         """
         if not self._since_ns:
+            self.holding.reset()
             since_s = self.since_s(now_ns)
             assert self._at_ns is not None
             self._since_ns = self._at_ns if 0 < since_s < 2 * BLOCK_S else now_ns
@@ -73,22 +78,29 @@ class Follower:
             return False
         self._take_in(z0, sigma, now_ns)
         self._past.append((now_ns, z0.copy(), self._covariance.copy()))
-        while len(self._past) > 1 and (now_ns - self._past[1][0]) * 1e-9 >= BACK_S:
+        while len(self._past) > 1 and (now_ns - self._past[1][0]) * 1e-9 >= BACK_S + TREND_S:
             self._past.popleft()
         self._clear()
         return True
 
-    def touched(self, z0: Array) -> None:
+    def begin_touch(self, z0: Array) -> None:
         """A touch: frames not taken in yet are forgotten, and the baseline is what it was BACK_S ago."""
         self._clear()
-        if self._past:
-            self._at_ns, past, covariance = self._past[0]
-            self._covariance = covariance
-            z0[:] = past
-            self._past.clear()
+        if not self._past:
+            return
+        newest_ns, (first_ns, first, _) = self._past[-1][0], self._past[0]
+        back = [entry for entry in self._past if (newest_ns - entry[0]) * 1e-9 >= BACK_S]
+        self._at_ns, before, self._covariance = (back or [self._past[0]])[-1]
+        z0[:] = before
+        trend_s = (self._at_ns - first_ns) * 1e-9
+        if trend_s >= TREND_S / 2:
+            z0 += (before - first) * (newest_ns - self._at_ns) * 1e-9 / trend_s
+        self._past.clear()
 
     def _take_in(self, z0: Array, sigma: Array, now_ns: int) -> None:
         gap_s = min(self.since_s(now_ns), MOST_S)
+        if gap_s > BACK_S:
+            self._past.clear()  # what is caught up with is no trend
         self._at_ns = now_ns
         live = (self._count > 0) & np.isfinite(sigma) & (z0 > 0)
         normaliser = np.asarray(self.pre.normaliser(z0), dtype=float)
@@ -116,6 +128,7 @@ class Follower:
             "sum": self._sum.copy(),
             "count": self._count.copy(),
             "since_ns": self._since_ns,
+            "holding": self.holding.state(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -123,14 +136,8 @@ class Follower:
         k, n = self._columns.shape
         self._at_ns = None if state["at_ns"] is None else int(state["at_ns"])
         self._age_s = float(state["age_s"])
-        self._covariance = _shaped(state["covariance"], (n, n))
-        self._past = deque((int(at), _shaped(z0, (k,)), _shaped(c, (n, n))) for at, z0, c in state["past"])
-        self._sum, self._count = _shaped(state["sum"], (k,)), _shaped(state["count"], (k,))
+        self._covariance = shaped(state["covariance"], (n, n))
+        self._past = deque((int(at), shaped(z0, (k,)), shaped(c, (n, n))) for at, z0, c in state["past"])
+        self._sum, self._count = shaped(state["sum"], (k,)), shaped(state["count"], (k,))
         self._since_ns = int(state["since_ns"])
-
-
-def _shaped(values: Any, shape: tuple[int, ...]) -> Array:
-    found = np.array(values, dtype=float)
-    if found.shape != shape or not np.isfinite(found).all():
-        raise ValueError(f"found an array of shape {found.shape}, expected {shape} finite numbers")
-    return np.asarray(found, dtype=np.float64)
+        self.holding.load(state["holding"])

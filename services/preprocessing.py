@@ -118,6 +118,7 @@ class Preprocessing(Stage):
         out.sigma = np.where(live, self.untouched.sigma, np.inf).astype(np.float32)
         if self._touched:
             self._counters["touched"] += 1
+            self.untouched.touched(amplitude, live, out.stamps.get("sample", 0))
         else:
             self.hold.reset()
             self.untouched.untouched(amplitude, live, out.stamps.get("sample", 0))
@@ -130,7 +131,7 @@ class Preprocessing(Stage):
         noise, step = self._noise(), self.judge.step
         found = self.judge(d, live, noise, self.untouched.since_s(now_ns), now_ns, self._touched)
         if found.touched and not self._touched:
-            self.untouched.touched()
+            self.untouched.begin_touch()
             d = self.untouched.difference(amplitude, live)
             found = self.judge.begin(d, live, noise, self.untouched.since_s(now_ns), now_ns)
         elif self.judge.step != step:

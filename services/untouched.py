@@ -84,12 +84,17 @@ class Untouched:
         """Seconds since the baseline last knew the skin as untouched."""
         return self.follower.since_s(sample_ns)
 
-    def touched(self) -> None:
-        """The last frame offered was touched."""
-        if self._run and self.baseline is not None:
-            self.follower.touched(self.baseline.z0)
-            self.normaliser = self.pre.normaliser(self.baseline.z0)
+    def begin_touch(self) -> None:
+        """The last frame offered was touched, the one before was not."""
+        assert self.baseline is not None
+        self.follower.begin_touch(self.baseline.z0)
+        self.normaliser = self.pre.normaliser(self.baseline.z0)
         self._run = 0
+
+    def touched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int) -> None:
+        """The last frame offered was touched: drift is taken out as far as a held touch shows it."""
+        assert self.baseline is not None
+        self.follower.holding(self.baseline.z0, amplitude, live, self.sigma, self.normaliser, sample_ns)
 
     def untouched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int) -> None:
         """The last frame offered was not: slow drift is followed."""
