@@ -145,8 +145,9 @@ def random_frames(setting: Setting) -> Iterator[Row]:
 def _random_tares(runner: Runner, z0: Array, rng: np.random.Generator, n: int) -> Row:
     """Tares of frames that no skin made: refused, or in doubt, or at least nothing valid against them."""
     answers: list[tuple[Answer, Shape | None]] = []
+    families = [draw for name, draw in FAMILIES.items() if name != GAIN]  # another gain is another skin, and a good one
     for k in range(n):
-        draw = list(FAMILIES.values())[k % len(FAMILIES)]
+        draw = families[k % len(families)]
         with np.errstate(all="ignore"):
             z, status = draw(z0, rng)
             frames = np.abs(z) * (1 + 1e-4 * rng.standard_normal((64, len(z0))))
@@ -194,6 +195,7 @@ def _bits(z0: Array, rng: np.random.Generator) -> Made:
         return _plain(words[0::2] + 1j * words[1::2].astype(complex))
 
 
+GAIN = "|Z0| x one factor"
 FAMILIES: dict[str, Callable[[Array, np.random.Generator], Made]] = {
     "random bits": _bits,
     "any magnitude": lambda z0, rng: _plain(
@@ -205,7 +207,7 @@ FAMILIES: dict[str, Callable[[Array, np.random.Generator], Made]] = {
     "|Z0| x e^N(0, 0.3)": lambda z0, rng: _plain(z0 * np.exp(0.3 * rng.standard_normal(len(z0)))),
     "|Z0| + 10 % noise": lambda z0, rng: _plain(z0 * (1 + 0.1 * rng.standard_normal(len(z0)))),
     "|Z0| + up to 20 %": lambda z0, rng: _plain(z0 * (1 + 0.2 * rng.random(len(z0)))),
-    "|Z0| x one factor": lambda z0, rng: _plain(z0 * 10.0 ** rng.uniform(-3, 3)),
+    GAIN: lambda z0, rng: _plain(z0 * 10.0 ** rng.uniform(-3, 3)),
     "|Z0| with random status": lambda z0, rng: (z0.astype(complex), rng.integers(0, 16, len(z0)).astype(np.uint8)),
 }
 
