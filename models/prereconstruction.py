@@ -210,15 +210,16 @@ class PreReconstructor:
         # The ladder is relative to measurement noise of the same size in every channel, so that its images stay the
         # same combinations of d whatever the level; drift and unequal noise change the metric, not the rungs.
         mean = float(np.trace(m.gram[np.ix_(live, live)]) / live.sum() / noise.mean())
-        gains = [1.0 / (values + lam * mean) for lam in m.ladder]
-        images = [(back * gain) for gain in gains]
-        matrix = np.concatenate([image @ whiten for image in images])
-        step = (back / (values + ONE_STEP_LAMBDA**2 * mean)) @ whiten
+        # What follows is well conditioned: single precision does, and half the time.
+        gains = [*(1.0 / (values + lam * mean) for lam in m.ladder), 1.0 / (values + ONE_STEP_LAMBDA**2 * mean)]
+        images = np.concatenate([(back * gain).astype(np.float32) for gain in gains])
+        matrix = images @ whiten.astype(np.float32)
+        pixels = len(m.ladder) * len(back)
         return Operator(
             shape=(m.inside.shape[0], m.inside.shape[1]),
             inside=m.inside,
-            matrix=np.ascontiguousarray(matrix, dtype=np.float32),
-            variance=np.concatenate([(image**2).sum(axis=1) for image in images]).astype(np.float32),
+            matrix=matrix[:pixels],
+            variance=np.einsum("pk,pk->p", images[:pixels], images[:pixels]),
             level=m.level.astype(np.float32),
             scale_index=m.scale_index,
             noise=float(np.sqrt(noise.mean())),
@@ -226,7 +227,7 @@ class PreReconstructor:
             live=float(live.mean()),
             whiten=whiten,
             detection=values / (values + mean * 1e-3),
-            step=step.astype(np.float32),
+            step=matrix[pixels:],
             jacobian=m.jacobian,
         )
 
