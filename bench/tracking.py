@@ -10,6 +10,7 @@ kept in bench/work; scoring them takes about two minutes. Prints the tables and 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ def follow(recorded: Recorded, skin: Skin, bundle: Bundle | None = None) -> list
     for k in range(len(recorded)):
         result = pipeline.run(recorded.frame(k))
         seen.append(Seen.of(result.delta, result.contact))
+        if k % 1000 == 999:
+            print(f"followed {recorded.seconds[k]:.0f} of {recorded.seconds[-1]:.0f} s", file=sys.stderr)
     return seen
 
 
