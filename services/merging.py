@@ -13,25 +13,46 @@ from collections.abc import Sequence
 from services.motion import Seen, Track, size_cost
 
 MERGED_S = 5.0  # a touch inside another's patch is waited for so long
-MARGIN_M = 0.004  # beyond the patch's reach, where a part of it may come out
+DROWNED_S = 1.0  # one that drowns beside it, or was lifted there
+WEAK = 0.5  # of the size of a patch: a touch that drowns beside it
+BESIDE_M = 0.010  # from the patch's edge, where it does
+MARGIN_M = 0.012  # from the patch's edge, where a part of it may come out
 INSIDE_SIGMA_M = 0.003  # of where a touch inside a patch should be, at first
 INSIDE_SIGMA_M_S = 0.010  # by how much it grows: fingers stop and turn back
 
 
-def host_of(track: Track, hosts: Sequence[tuple[Track, Seen]], sample_ns: int) -> Track | None:
-    """Whose patch covers the place where a lost touch should be."""
+def host_of(track: Track, hosts: Sequence[tuple[Track, Seen]], sample_ns: int) -> tuple[Track, float] | None:
+    """Whose patch covers the place where a lost touch should be, or drowns it; and for how long to wait for it [s]."""
     x, y = track.ahead(sample_ns)
-    covering = [(math.hypot(x - s.x, y - s.y) - s.reach, host) for host, s in hosts]
-    nearest = min(covering, key=lambda c: c[0], default=None)
-    return nearest[1] if nearest is not None and nearest[0] < 0 else None
+    distance = [math.hypot(x - s.x, y - s.y) - s.reach for _, s in hosts]
+    nearest = min(range(len(hosts)), key=lambda k: distance[k], default=None)
+    if nearest is None:
+        return None
+    host, patch = hosts[nearest]
+    if distance[nearest] < 0:
+        return host, MERGED_S
+    drowns = distance[nearest] < BESIDE_M and track.size < WEAK * patch.size
+    return (host, DROWNED_S) if drowns else None
 
 
-def absorb(host: Track, track: Track, sample_ns: int) -> None:
-    """The track is inside the host's patch from now on."""
+def absorb(host: Track, tracks: Sequence[Track], since_ns: int, wait_s: float) -> None:
+    """The tracks are inside the host's patch from then on, and are waited for so long."""
     if not host.inside:
         host.inside = [host.ghost()]
-    host.inside += track.inside or [track]
-    host.since_ns, track.inside = sample_ns, []
+    host.inside += tracks
+    host.since_ns = since_ns
+    for track in tracks:
+        track.until_ns = since_ns + int(wait_s * 1e9)
+
+
+def give_up(host: Track, sample_ns: int) -> list[Track]:
+    """Touches that were inside for too long: they leave."""
+    late = [t for t in others(host) if sample_ns > t.until_ns]
+    if late:
+        host.inside = [t for t in host.inside if not any(t is one for one in late)]
+    if len(host.inside) == 1:
+        host.inside = []
+    return late
 
 
 def others(host: Track) -> list[Track]:
@@ -79,7 +100,7 @@ def part(host: Track, parts: Sequence[Seen], sample_ns: int) -> list[Track | Non
     for k in left:
         owner = found[min(range(len(parts)), key=lambda c: costs[k][c])]
         assert owner is not None  # more touches than parts: every part has one
-        absorb(owner, host.inside[k], host.since_ns)
+        absorb(owner, [host.inside[k]], host.since_ns, MERGED_S)
     return found
 
 

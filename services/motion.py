@@ -30,7 +30,7 @@ class Seen(NamedTuple):
 class Track:
     """One touch that lasts. `inside`: the touches that have grown into its patch, itself included; else empty."""
 
-    id: int
+    id: int  # 0: not yet confirmed
     x: float  # m, filtered
     y: float
     seen_ns: int  # sample time of the frame in which it was last seen
@@ -44,6 +44,7 @@ class Track:
     missing: int = 0  # frames since it was seen
     age: int = 1  # frames in which it was seen
     since_ns: int = 0  # when the last one of `inside` came
+    until_ns: int = 0  # how long it is waited for while it is inside another one's patch
     inside: list[Track] = field(default_factory=list)
 
     def seconds_to(self, sample_ns: int) -> float:

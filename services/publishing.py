@@ -21,6 +21,7 @@ from services.tracking import Tracker
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
 UNKNOWN_BELOW = 0.4  # probability of the best class below which a shape is "unknown"
+SURE = 0.08  # residual above which what appears in an image has to appear in the next one too
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 
@@ -61,7 +62,9 @@ class Publishing(Stage):
         out = ContactFrame(**inherited(frame), frame_id=self.config.frame_id, force_calibrated=self.law.calibrated)
         if not self.law.exists:
             add_reason(out.reasons, "uncalibrated_force")
-        if frame.held and self._known:
+        if not frame.valid and "out_of_distribution" in frame.reasons:
+            self._miss(out, "out_of_distribution")
+        elif frame.held and self._known:
             self._keep(frame)
             out.held = True
         elif not frame.image.size and (frame.touched or not frame.valid):
@@ -94,12 +97,17 @@ class Publishing(Stage):
             expected = [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in self.tracker.expected(now)]
             segments = segment(frame.image, frame.sigma, expected)
         seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
-        tracks, ended = self.tracker.update(seen, now)
-        classes = [_class_probabilities(s, frame.classes) for s in segments]
-        self._segments, self._classes, self._geometry, self._known = segments, classes, (m, [x0, y0]), True
-        present = [self._contact(*each, frame) for each in zip(tracks, seen, segments, classes, strict=True)]
-        self._contacts = present + self._ends(ended)
-        self._counters["contacts"] += sum(track.age == 1 for track in tracks)
+        tracks, ended = self.tracker.update(seen, now, (frame.residual or 0.0) <= SURE)
+        present = []
+        for track, place, s in zip(tracks, seen, segments, strict=True):
+            if track is not None:
+                classes = _class_probabilities(s, frame.classes)
+                present.append((self._contact(track, place, s, classes, frame), s, classes))
+        present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
+        self._segments, self._classes = [s for _, s, _ in present], [classes for _, _, classes in present]
+        self._geometry, self._known = (m, [x0, y0]), True
+        self._contacts = [contact for contact, _, _ in present] + self._ends(ended)
+        self._counters["contacts"] += sum(contact.state == "begin" for contact, _, _ in present)
 
     def _keep(self, frame: ImageFrame) -> None:
         """The same contacts a frame later."""
@@ -193,13 +201,13 @@ def _class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float
     """Mean over the touch of the per-pixel class probabilities (5, h, w), which are on a coarser grid; [] where there
     are none.
     """
-    if not classes.size or not np.isfinite(classes).all():
+    if not classes.size or not ((classes >= 0) & (classes <= 1.001)).all():
         return []
     y, x = np.nonzero(s.mask)
     h, w = classes.shape[1:]
     coarse = classes[:, y * h // s.mask.shape[0], x * w // s.mask.shape[1]]
     mean = coarse.mean(axis=1)
-    return [float(p) for p in mean / max(float(mean.sum()), 1e-9)]
+    return [min(1.0, float(p)) for p in mean / max(float(mean.sum()), 1e-9)]
 
 
 def _wrench(x: float, y: float, force: float) -> list[float]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from services.splitting import Image, Labels, Place, cut, peaks_of, territories
+from services.splitting import FOUR, Image, Labels, Place, cut, peaks_of, territories
 
 FLOOR = 0.02  # S/m: a weaker peak is no touch (0.2 N by the default law)
 RELATIVE_FLOOR = 0.12  # of the strongest peak: weaker ones are side lobes of it
@@ -55,20 +55,21 @@ def segment(image: Image, sigma: Image, expected: Sequence[Place] = ()) -> list[
     """
     if not image.size or not readable(image):
         return []
-    floor = max(FLOOR, RELATIVE_FLOOR * float(image.max()))
-    high = image > 0.5 * floor
-    if not (image > floor).any():
+    top = float(image.max())
+    floor = max(FLOOR, RELATIVE_FLOOR * top)
+    if top <= floor:
         return []
+    high = image > 0.5 * floor
     rows, columns = _box(high)
     part = image[rows, columns].astype(np.float64)
     smooth = ndimage.correlate1d(ndimage.correlate1d(part, KERNEL, 0), KERNEL, 1)
     near = [(x - columns.start, y - rows.start) for x, y in expected]
-    labels = _labels(smooth, floor, near)
-    volumes = np.bincount(labels.ravel(), (part * (smooth > 0.5 * floor)).ravel())
+    labels, count = _labels(smooth, floor, near)
+    volumes = np.bincount(labels.ravel(), part.ravel(), count + 1)
     noise = sigma[rows, columns] if sigma.shape == image.shape else np.zeros((0, 0))
     found = []
-    for label in range(1, len(volumes)):
-        own = np.where(labels == label, smooth, 0.0) if len(volumes) > 2 else smooth
+    for label in range(1, count + 1):
+        own = np.where(labels == label, smooth, 0.0)
         mask = _half(own)
         whole = np.zeros(image.shape, dtype=bool)
         whole[rows, columns] = mask
@@ -85,17 +86,15 @@ def _box(high: NDArray[np.bool_]) -> tuple[slice, slice]:
     return spans[0], spans[1]
 
 
-def _labels(smooth: Image, floor: float, expected: Sequence[Place]) -> Labels:
-    """Which touch each pixel belongs to, 1, 2, ...; all 0 where there is none."""
+def _labels(smooth: Image, floor: float, expected: Sequence[Place]) -> tuple[Labels, int]:
+    """Which touch each pixel belongs to, 1, 2, ..., or 0; and how many there are."""
     peaks = peaks_of(smooth, floor, expected)
     while True:
-        labels = territories(smooth, peaks)
-        small = [p for k, p in enumerate(peaks) if _half(np.where(labels == k + 1, smooth, 0.0)).sum() < SMALLEST]
-        if not small or len(peaks) < 2:
+        labels = territories(smooth, 0.5 * floor, peaks)
+        small = [p for k, p in enumerate(peaks) if ((labels == k + 1) & (smooth > 0.5 * smooth[p])).sum() < SMALLEST]
+        if not small or len(peaks) == 1:
             break
         peaks.remove(small[-1])  # a speck: its pixels go to a neighbour
-    if small:
-        return np.zeros(smooth.shape, dtype=np.intp)
     label, count = 1, len(peaks)
     while label <= count:
         side = cut(np.where(labels == label, smooth, 0.0), expected)
@@ -104,14 +103,14 @@ def _labels(smooth: Image, floor: float, expected: Sequence[Place]) -> Labels:
         else:
             count += 1
             labels[side] = count
-    return labels
+    return labels, count
 
 
 def _half(own: Image) -> NDArray[np.bool_]:
     """The pixels above half the peak that hang together with it."""
     top = int(own.argmax())
     mask = own > 0.5 * own.flat[top]
-    labels, count = ndimage.label(mask)
+    labels, count = ndimage.label(mask, FOUR)
     return mask if count == 1 else np.asarray(labels == labels.flat[top]) & mask
 
 

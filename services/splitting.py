@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,13 +14,16 @@ Labels = NDArray[np.intp]
 Place = tuple[float, float]  # x, y in pixels
 
 STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
-EIGHT = np.ones((3, 3), dtype=bool)  # neighbours, diagonal ones too
+FOUR = ndimage.generate_binary_structure(2, 1)  # neighbours that share an edge
+EIGHT = ndimage.generate_binary_structure(2, 2)  # diagonal ones too
 
 SADDLE = 0.75  # two peaks are two touches where the ridge between them sinks below this fraction of the lower one
 SADDLE_KNOWN = 0.95  # the same where two touches are expected: only a plateau makes them one
 NEAR = 6.0  # pixels within which a peak is the one that was expected
 WAIST_KNOWN = 0.92  # two touches are expected in one patch: they are two where it narrows to this fraction
 WAIST_NEW = 0.6  # the same where one is expected, or none
+LONG = 1.2  # times as long as wide: a rounder patch is one touch
+LONG_KNOWN = 1.6  # or where it is so many times as long as wide
 SLIMMEST = 0.15  # share of a patch that a part of it must have
 CANDIDATES = 32  # local maxima looked at
 MOST = 8  # touches
@@ -31,10 +35,10 @@ def peaks_of(smooth: Image, floor: float, expected: Sequence[Place]) -> list[tup
     free = list(expected)
     for peak in _maxima(smooth, floor):
         own = min(free, key=lambda p: _distance(p, peak), default=None)
-        known = own is not None and _distance(own, peak) < NEAR and len(free) < len(expected)
+        known = own is not None and _distance(own, peak) < NEAR
         if len(peaks) < MOST and _stands_alone(smooth, peak, peaks, SADDLE_KNOWN if known else SADDLE):
             peaks.append(peak)
-            if own is not None:
+            if own is not None and known:
                 free.remove(own)
     return peaks
 
@@ -56,14 +60,26 @@ def _stands_alone(smooth: Image, peak: tuple[int, int], stronger: list[tuple[int
     """Whether a valley lies between this peak and every stronger one."""
     if not stronger:
         return True
-    labels, _ = ndimage.label(smooth > saddle * smooth[peak])
+    labels, _ = ndimage.label(smooth > saddle * smooth[peak], FOUR)
     return all(labels[peak] != labels[other] for other in stronger)
 
 
-def territories(smooth: Image, peaks: list[tuple[int, int]]) -> Labels:
-    """Which peak each pixel belongs to, 1, 2, ...: where steepest ascent leads to; 0 where there is no peak."""
+def territories(smooth: Image, floor: float, peaks: list[tuple[int, int]]) -> Labels:
+    """Which peak each pixel above the floor belongs to, 1, 2, ...: where steepest ascent leads to; 0 below it."""
+    above = smooth > floor
     if len(peaks) < 2:
-        return np.full(smooth.shape, len(peaks), dtype=np.intp)
+        return above.astype(np.intp) * len(peaks)
+    islands, count = ndimage.label(above, FOUR)
+    order = [int(islands[peak]) for peak in peaks]
+    if sorted(order) == list(range(1, count + 1)):  # far apart: one peak on each
+        names = np.zeros(count + 1, dtype=np.intp)
+        names[order] = range(1, count + 1)
+        return np.asarray(names[islands])
+    return np.asarray(_uphill(smooth, peaks) * above)
+
+
+def _uphill(smooth: Image, peaks: list[tuple[int, int]]) -> Labels:
+    """Which peak each pixel belongs to: steepest ascent from pixel to neighbour."""
     h, w = smooth.shape
     padded = np.pad(smooth, 1, constant_values=-np.inf)
     best, top = smooth.copy(), np.arange(h * w).reshape(h, w)
@@ -85,28 +101,36 @@ def cut(own: Image, expected: Sequence[Place]) -> NDArray[np.bool_] | None:
     """The smaller side (h, w) of a patch that is two touches grown together, or None where it is one.
 
     own: the smoothed image where it is this patch's, 0 elsewhere. The patch's profile along its longest axis (the drop
-    summed across) has a waist where two touches meet, also where their peaks have become one plateau.
+    summed across) has a waist where two touches meet, also where their peaks have become one plateau. Where two are
+    expected, a patch that is long without a waist is two as well.
     """
-    y, x = np.nonzero(own > 0.5 * own.max())
+    top = float(own.max())
+    y, x = np.nonzero(own > 0.5 * top)
     weight = own[y, x]
     total = float(weight.sum())
     cx, cy = float(weight @ x) / total, float(weight @ y) / total
     dx, dy = x - cx, y - cy
-    mxx, myy, mxy = float(weight @ (dx * dx)), float(weight @ (dy * dy)), float(weight @ (dx * dy))
-    angle = 0.5 * np.arctan2(2 * mxy, mxx - myy)
-    c, s = np.cos(angle), np.sin(angle)
+    mxx, myy, mxy = (float(weight @ v) / total for v in (dx * dx, dy * dy, dx * dy))
+    spread = math.hypot(mxx - myy, 2 * mxy)  # of the squared lengths of the two axes
+    if mxx + myy + spread < LONG**2 * (mxx + myy - spread):
+        return None
+    angle = 0.5 * math.atan2(2 * mxy, mxx - myy)
+    c, s = math.cos(angle), math.sin(angle)
     along = c * dx + s * dy
     start = float(along.min())
     profile = _profile(along - start, weight)
     depth = profile / np.minimum(np.maximum.accumulate(profile), np.maximum.accumulate(profile[::-1])[::-1])
-    waist = int(depth.argmin())
-    if depth[waist] > WAIST_KNOWN:
-        return None
+    waist = float(depth.argmin())
+    if depth[int(waist)] > WAIST_NEW:
+        inside = sorted(c * (px - cx) + s * (py - cy) - start for px, py in expected if _covers(own, px, py))
+        if len(inside) < 2:
+            return None
+        if depth[int(waist)] > WAIST_KNOWN:
+            if mxx + myy + spread < LONG_KNOWN**2 * (mxx + myy - spread):
+                return None
+            waist = (inside[0] + inside[-1]) / 2
     share = float(weight[along - start < waist].sum()) / total
     if not SLIMMEST < share < 1 - SLIMMEST:
-        return None
-    inside = _expected_inside(own, expected)
-    if depth[waist] > (WAIST_KNOWN if inside > 1 else WAIST_NEW):
         return None
     rows, columns = np.indices(own.shape)
     beyond = c * (columns - cx) + s * (rows - cy) - start >= waist
@@ -122,11 +146,8 @@ def _profile(along: Image, weight: Image) -> Image:
     return np.convolve(profile, [0.25, 0.5, 0.25], mode="same")
 
 
-def _expected_inside(own: Image, expected: Sequence[Place]) -> int:
-    """How many of the expected touches lie in this patch."""
+def _covers(own: Image, x: float, y: float) -> bool:
+    """Whether a patch covers a place."""
     h, w = own.shape
-    inside = 0
-    for x, y in expected:
-        column, row = round(x), round(y)
-        inside += 0 <= column < w and 0 <= row < h and bool(own[row, column] > 0.25 * own.max())
-    return inside
+    column, row = round(x), round(y)
+    return 0 <= column < w and 0 <= row < h and bool(own[row, column] > 0.25 * own.max())

@@ -2,6 +2,10 @@
 
 Each touch is where its velocity takes it until it is seen (services/motion.py); what is seen is given to the touches by
 the assignment of least total cost. Touches that grow into one patch, and come out of it, are services/merging.py's.
+
+The first touch begins at once, if its image is good. What appears beside others, or in an image that does not explain
+what was measured, begins when a second frame shows it too: while a touch comes or goes during a scan, the image of that
+scan may show more than there is, or something else.
 """
 
 from __future__ import annotations
@@ -10,13 +14,15 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from services.merging import MERGED_S, absorb, follow, host_of, is_part, others, part
+from services.merging import absorb, follow, give_up, host_of, is_part, others, part
 from services.motion import Seen, Track, cost
 
 REACH_M = 0.015  # a touch that jumps further between two frames is another touch
-LOST_FRAMES = 1  # frames a touch may be missing before it ends
+LOST_FRAMES = 2  # frames a touch may be missing in before it ends; bad images do not count
+UNSEEN_S = 0.25  # it ends after so long at the latest, however bad the images
 FORGOTTEN_S = 1.0  # after so long without a frame, nobody knows whether a touch is the same
 NEVER = 1e6  # cost of what is out of reach
+UNCONFIRMED = 0  # id of what was seen once, beside others
 
 
 class Tracker:
@@ -30,15 +36,18 @@ class Tracker:
 
     def reset(self) -> None:
         """End everything; the next frame tells. Ids go on counting: none is used again in a session."""
-        self._untold += [one for track in self.tracks for one in (track, *others(track))]
+        self._untold += [one for track in self.tracks for one in (track, *others(track)) if one.id != UNCONFIRMED]
         self.tracks = []
 
     def expected(self, sample_ns: int) -> list[tuple[float, float]]:
         """Where each touch should be then [m], those inside one patch one by one."""
-        return [one.ahead(sample_ns) for track in self.tracks for one in (track.inside or [track])]
+        sure = [track for track in self.tracks if track.id != UNCONFIRMED]
+        return [one.ahead(sample_ns) for track in sure for one in (track.inside or [track])]
 
-    def update(self, seen: Sequence[Seen], sample_ns: int) -> tuple[list[Track], list[Track]]:
-        """What one frame shows -> (the track of each entry, in their order; tracks that ended)."""
+    def update(self, seen: Sequence[Seen], sample_ns: int, sure: bool = True) -> tuple[list[Track | None], list[Track]]:
+        """What one frame shows -> (the track of each entry, in their order, None for one to be confirmed; tracks that
+        ended). sure: whether what this frame shows can be believed at once.
+        """
         ended = self._begin_frame(sample_ns)
         owners = self._assign(seen, sample_ns)
         self._merge(owners, seen, sample_ns)
@@ -46,24 +55,36 @@ class Tracker:
         found: list[Track] = []
         for entry, track in zip(seen, owners, strict=True):
             if track is None:
-                track = Track(self._next_id, entry.x, entry.y, sample_ns, entry.size, entry.reach)
-                self._next_id += 1
+                track = Track(UNCONFIRMED, entry.x, entry.y, sample_ns, entry.size, entry.reach)
             else:
                 track.move(entry, sample_ns)
                 if track.inside:
                     follow(track, entry, sample_ns)
             found.append(track)
-        coasting = [t for t in self.tracks if not any(t is f for f in found)]
+        self._confirm(found, sure)
+        coasting = [t for t in self.tracks if t.id != UNCONFIRMED and not any(t is f for f in found)]
         self.tracks = found + coasting
-        return found, ended + self._lose(coasting) + self._give_up(sample_ns)
+        if not sure:
+            coasting = [t for t in coasting if sample_ns - t.seen_ns > UNSEEN_S * 1e9]
+        return [t if t.id != UNCONFIRMED else None for t in found], ended + self._lose(coasting, sample_ns)
+
+    def _confirm(self, found: list[Track], sure: bool) -> None:
+        """Give ids to what begins: what was seen before, or the largest where nothing else is."""
+        new = [t for t in found if t.id == UNCONFIRMED]
+        begin = [t for t in new if t.age > 1]
+        if sure and new and not begin and len(new) == len(found):
+            begin = [max(new, key=lambda t: t.size)]
+        for track in begin:
+            track.id, track.age = self._next_id, 1
+            self._next_id += 1
 
     def still(self, sample_ns: int) -> list[Track]:
-        """A frame that shows the same as the one before -> tracks that ended."""
+        """A frame that shows the same as the one before: nothing is lost for longer by it -> tracks that ended."""
         ended = self._begin_frame(sample_ns)
         for track in self.tracks:
             for one in track.inside:
                 one.seen_ns = sample_ns  # it did not go on
-        return ended + self._lose([t for t in self.tracks if t.missing]) + self._give_up(sample_ns)
+        return ended + self._lose([], sample_ns)
 
     def _begin_frame(self, sample_ns: int) -> list[Track]:
         """Tracks that ended before this frame: by a reset, or since nobody looked."""
@@ -91,12 +112,14 @@ class Tracker:
 
     def _merge(self, owners: list[Track | None], seen: Sequence[Seen], sample_ns: int) -> None:
         """Where a lost touch should be there is another one's patch: it is inside."""
-        hosts = [(track, entry) for track, entry in zip(owners, seen, strict=True) if track is not None]
-        for track in [t for t in self.tracks if not any(t is host for host, _ in hosts)]:
-            host = host_of(track, hosts, sample_ns)
-            if host is not None:
-                absorb(host, track, sample_ns)
-                self.tracks.remove(track)
+        matched = [(track, entry) for track, entry in zip(owners, seen, strict=True) if track is not None]
+        hosts = [(track, entry) for track, entry in matched if track.id != UNCONFIRMED]
+        for track in [t for t in self.tracks if t.id != UNCONFIRMED and not any(t is one for one, _ in matched)]:
+            found = host_of(track, hosts, sample_ns)
+            if found is not None:
+                host, wait_s = found
+                absorb(host, track.inside or [track], sample_ns, wait_s)
+                self.tracks = [t for t in self.tracks if t is not track]
 
     def _part(self, owners: list[Track | None], seen: Sequence[Seen], sample_ns: int) -> None:
         """A patch with several touches inside has fallen apart: they come out where they should be."""
@@ -113,24 +136,15 @@ class Tracker:
             for k, touch in zip(parts, touches, strict=True):
                 owners[k] = touch
 
-    def _lose(self, unseen: list[Track]) -> list[Track]:
-        """Count one more frame in which these were not seen -> those that ended."""
+    def _lose(self, unseen: list[Track], sample_ns: int) -> list[Track]:
+        """Count one more frame in which these were not seen -> what ended: after too many, or inside for too long."""
         ended = []
         for track in unseen:
             track.missing += 1
-            if track.missing > LOST_FRAMES:
+            if track.missing > LOST_FRAMES or sample_ns - track.seen_ns > UNSEEN_S * 1e9:
                 self.tracks = [t for t in self.tracks if t is not track]
                 ended += [track, *others(track)]
-        return ended
-
-    def _give_up(self, sample_ns: int) -> list[Track]:
-        """Touches that were inside another one's patch for too long."""
-        ended = []
-        for track in self.tracks:
-            if track.inside and sample_ns - track.since_ns > MERGED_S * 1e9:
-                ended += others(track)
-                track.inside = []
-        return ended
+        return ended + [one for track in self.tracks for one in give_up(track, sample_ns)]
 
     def state(self) -> dict[str, Any]:
         return {
@@ -141,21 +155,20 @@ class Tracker:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Go on where `state` was taken. Touches whose ids ended here since then get new ones."""
-        here = {one.id: one for track in self.tracks for one in (track, *others(track))}
-        here |= {track.id: track for track in self._untold}
-        renamed: dict[int, int] = {}
-        used, self._next_id = self._next_id, max(self._next_id, int(state["next_id"]))
-        self.tracks = [_track(t) for t in state["tracks"]]
-        for one in [one for track in self.tracks for one in (track, *track.inside)]:
-            if one.id < used and one.id not in here and one.id not in renamed:
-                renamed[one.id] = self._next_id
-                self._next_id += 1
-            one.id = renamed.get(one.id, one.id)
+        """Go on where `state` was taken. Touches whose ids ended here since then would have to begin anew."""
+        self.reset()
+        here = {track.id: track for track in self._untold}
+
+        def usable(track: Track) -> bool:
+            return track.id >= self._next_id or track.id in here or track.id == UNCONFIRMED
+
+        self.tracks = [track for track in map(_track, state["tracks"]) if usable(track)]
+        for track in self.tracks:
+            track.inside = [one for one in track.inside if usable(one)]
         going_on = {one.id for track in self.tracks for one in (track, *track.inside)}
-        told = [_track(t) for t in state["untold"]]
-        untold = here | {t.id: t for t in told if t.id >= used}
-        self._untold = [track for track in untold.values() if track.id not in going_on]
+        told = [track for track in map(_track, state["untold"]) if track.id >= self._next_id]
+        self._untold = [t for t in (here | {t.id: t for t in told}).values() if t.id not in going_on]
+        self._next_id = max(self._next_id, int(state["next_id"]))
         self._looked_ns = int(state["looked_ns"])
 
 
