@@ -207,7 +207,7 @@ FAMILIES: dict[str, Callable[[Array, np.random.Generator], Made]] = {
     "|Z0| x e^N(0, 0.3)": lambda z0, rng: _plain(z0 * np.exp(0.3 * rng.standard_normal(len(z0)))),
     "|Z0| + 10 % noise": lambda z0, rng: _plain(z0 * (1 + 0.1 * rng.standard_normal(len(z0)))),
     "|Z0| + up to 20 %": lambda z0, rng: _plain(z0 * (1 + 0.2 * rng.random(len(z0)))),
-    GAIN: lambda z0, rng: _plain(z0 * 10.0 ** rng.uniform(-3, 3)),
+    GAIN: lambda z0, rng: _plain(z0 * 10.0 ** (rng.choice([-1, 1]) * rng.uniform(0.05, 3))),
     "|Z0| with random status": lambda z0, rng: (z0.astype(complex), rng.integers(0, 16, len(z0)).astype(np.uint8)),
 }
 
