@@ -26,8 +26,10 @@ PROCESSES = ("acquisition", *STAGES)
 
 
 @contextmanager
-def running(*arguments: str) -> Iterator[Service]:
-    """`skin up ARGUMENTS` until the block ends; valid contact frames come when it begins. Raises RuntimeError."""
+def running(*arguments: str, skin: str = "palm") -> Iterator[Service]:
+    """`skin up ARGUMENTS` until the block ends; valid contact frames of `skin` come when it begins. Raises
+    RuntimeError.
+    """
     folder = Path(tempfile.mkdtemp(prefix="eitskin-bench", dir="/tmp"))  # short: a socket's path has 107 bytes
     before = os.environ.get("EITSKIN_RUNTIME")
     os.environ["EITSKIN_RUNTIME"] = str(folder)
@@ -35,7 +37,7 @@ def running(*arguments: str) -> Iterator[Service]:
     process = subprocess.Popen([sys.executable, str(ROOT / "skin"), "up", *arguments], stdout=log, stderr=log)
     try:
         service = Service(folder, process)
-        service.wait_until_valid()
+        service.wait_until_valid(skin)
         yield service
     finally:
         process.send_signal(signal.SIGTERM)
@@ -56,7 +58,7 @@ class Service:
     def __init__(self, folder: Path, process: subprocess.Popen[bytes]) -> None:
         self.folder, self.process = folder, process
 
-    def wait_until_valid(self, skin: str = "palm") -> None:
+    def wait_until_valid(self, skin: str) -> None:
         contacts = Outside("contact", skin, self.folder)
         end = time.monotonic() + START_S
         while time.monotonic() < end and self.process.poll() is None:
@@ -86,6 +88,13 @@ class Service:
                 module = next((c.decode() for c in command if c.startswith((b"services.", b"firmware_stub"))), "")
                 found[module.removeprefix("services.").replace("firmware_stub", "stub")] = int(entry.name)
         return found
+
+    def memory_bytes(self) -> dict[str, int]:
+        """Resident memory of each process."""
+        page = os.sysconf("SC_PAGE_SIZE")
+        return {
+            name: int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * page for name, pid in self.pids().items()
+        }
 
     def cpu_s(self) -> dict[str, float]:
         """CPU seconds that each process has used."""

@@ -14,7 +14,7 @@ import gc
 import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,10 @@ from bench._machine import machine, versions
 from bench._service import PROCESSES, Outside, Service, running
 from bench._tracking_scene import Recorded, record
 from models.bundle import Bundle
-from protocol.frames import ContactFrame, Frame, pack, unpack
+from protocol.frames import ContactFrame, Frame, RawFrame, pack, unpack
 from services.config import Skin, Touch
 from services.pipeline import build_stages
+from services.stage import Stage
 
 QUIET_S = 5.0  # of each scene, before it begins: the tare
 ROUNDS = 3
@@ -96,20 +97,26 @@ def run(recorded: Recorded, variant: Variant, bundle: Bundle) -> tuple[list[Cont
     stages = build_stages("palm", variant.skin(), bundle)
     contacts, used, counted = [], 0.0, 0
     for k in range(len(recorded)):
-        message = pack(recorded.frame(k))
-        began = time.thread_time()
-        frames: list[Frame] = []
-        for stage in stages:
-            frames = stage.process(unpack(message), variant.wanted)
-            for frame in frames:
-                frame.stamps.setdefault(stage.stamp, time.monotonic_ns())
-            messages = [pack(frame) for frame in frames]
-            message = messages[0]
-        used += (time.thread_time() - began) * (recorded.seconds[k] > QUIET_S)
-        counted += int(recorded.seconds[k] > QUIET_S)
-        assert isinstance(frames[0], ContactFrame)
-        contacts.append(frames[0])
+        contact, seconds = run_once(stages, recorded.frame(k), variant.wanted)
+        if recorded.seconds[k] > QUIET_S:
+            used, counted = used + seconds, counted + 1
+        contacts.append(contact)
     return contacts, used / counted
+
+
+def run_once(stages: Sequence[Stage], raw: RawFrame, wanted: frozenset[str] = PLAIN) -> tuple[ContactFrame, float]:
+    """(contact frame, CPU seconds) of a raw frame through the stages, packed and unpacked between them."""
+    message = pack(raw)
+    began = time.thread_time()
+    frames: list[Frame] = []
+    for stage in stages:
+        frames = stage.process(unpack(message), wanted)
+        for frame in frames:
+            frame.stamps.setdefault(stage.stamp, time.monotonic_ns())
+        message = [pack(frame) for frame in frames][0]
+    used = time.thread_time() - began
+    assert isinstance(frames[0], ContactFrame)
+    return frames[0], used
 
 
 def errors(recorded: Recorded, contacts: list[ContactFrame]) -> dict[str, Any]:

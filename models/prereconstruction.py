@@ -25,6 +25,8 @@ Array = npt.NDArray[np.floating]
 ONE_STEP_LAMBDA = 0.15  # the paper's, section II; relative to the mean eigenvalue of the whitened Gram matrix
 THRESHOLD_T = 0.35  # t of equation 5; the paper chose it by trial and does not state it, and so did we
 TARE_FRAMES = 64
+OUTLIER = 16.0  # times the median: variances beyond it do not raise the level of the others (a converter's stay below)
+NOTHING = 1e4  # times the median: a measurement of such noise says nothing, and its numbers would overflow
 
 
 @dataclass(frozen=True)
@@ -191,10 +193,14 @@ class PreReconstructor:
         """
         m, k = self.m, self.measurements
         weights = np.ones(k) if weights is None else np.asarray(weights, dtype=float)
+        sigma = np.asarray(sigma, dtype=float)
         live = (weights > 0) & np.isfinite(sigma)
+        if live.any():
+            live &= sigma <= NOTHING * max(float(np.median(sigma[live])), m.model_error)
         if live.sum() < 2:
             raise ValueError(f"only {int(live.sum())} of {k} measurements are live: nothing can be reconstructed")
-        noise = (np.asarray(sigma, dtype=float)[live] ** 2 * (1 + 1 / tare_frames) + m.model_error**2) / weights[live]
+        noise = (sigma[live] ** 2 * (1 + 1 / tare_frames) + m.model_error**2) / weights[live]
+        typical = float(np.minimum(noise, OUTLIER * np.median(noise)).mean())  # one noisy channel is no noisy frame
         cov = np.diag(noise)
         drift = drift or Drift()
         if drift.scale or drift.contact:
@@ -209,7 +215,7 @@ class PreReconstructor:
         back = m.back[:, live] @ inverse.T @ vectors  # (P, K')
         # The ladder is relative to measurement noise of the same size in every channel, so that its images stay the
         # same combinations of d whatever the level; drift and unequal noise change the metric, not the rungs.
-        mean = float(np.trace(m.gram[np.ix_(live, live)]) / live.sum() / noise.mean())
+        mean = float(np.trace(m.gram[np.ix_(live, live)]) / live.sum() / typical)
         # What follows is well conditioned: single precision does, and half the time.
         gains = [*(1.0 / (values + lam * mean) for lam in m.ladder), 1.0 / (values + ONE_STEP_LAMBDA**2 * mean)]
         images = np.concatenate([(back * gain).astype(np.float32) for gain in gains])
@@ -222,7 +228,7 @@ class PreReconstructor:
             variance=np.einsum("pk,pk->p", images[:pixels], images[:pixels]),
             level=m.level.astype(np.float32),
             scale_index=m.scale_index,
-            noise=float(np.sqrt(noise.mean())),
+            noise=float(np.sqrt(typical)),
             drift=float(np.sqrt(np.trace(cov) / len(cov) - noise.mean())) if (drift.scale or drift.contact) else 0.0,
             live=float(live.mean()),
             whiten=whiten,

@@ -132,3 +132,18 @@ def test_noise_of_frames_is_steadier_than_a_channels_own_estimate():
         errors.append((noise_of_frames(frames, z0) / (1e-3 * z0) - 1, frames.std(axis=0, ddof=1) / (1e-3 * z0) - 1))
     shrunk, own = np.sqrt((np.array(errors) ** 2).mean(axis=(0, 2)))
     assert shrunk < 0.75 * own
+
+
+def test_one_noisy_measurement_does_not_blur_the_others() -> None:
+    """Its weight falls; what the rest gives stays as sharp as without it, and nothing overflows."""
+    pre = PreReconstructor(matrices())
+    sigma, others = np.full(K, 3e-4), np.arange(K) != 5
+    without = pre.condition(sigma, weights=others.astype(float))
+    d = J[:, 14] * 0.3
+    for noisy in (3e-2, 1.0, 1e10):
+        sigma[5] = noisy
+        with_it = pre.condition(sigma)
+        assert np.isfinite(with_it.variance).all() and np.isfinite(with_it.matrix).all()
+        assert with_it.noise < 1.6 * without.noise  # the mean of the variances would make it 20 times
+        one, other = images(with_it, d), images(without, d)
+        assert np.linalg.norm(one - other) < 0.15 * np.linalg.norm(other)

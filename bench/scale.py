@@ -1,0 +1,220 @@
+"""Many skins on one set of processes: frames lost, latency, CPU and memory against their number.
+
+    skin bench scale [--skins 1 4 16 32 64] [--seconds 15] [--touched 0.25 1.0]
+    skin bench scale --memory 1000000          frames through the stages: what memory does
+
+Every skin is a recording of the stub's board, played at its own 22 frames a second and phase through the real
+processes. `touched`: the share of the skins that a moving touch is on all the time; the others have none. Latency is
+from a frame read by acquisition to one controller's recv, which takes the contacts of all skins. Prints a table,
+writes scale.json and draws scale.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import zmq
+from rich.console import Console
+from rich.table import Table
+
+from bench._machine import machine, versions
+from bench._service import PROCESSES, Service, running
+from bench._tracking_scene import Recorded
+from bench.skip import QUIET_S, run_once, scenes
+from models.bundle import Bundle
+from protocol.frames import pack
+from services.config import Skin
+from services.pipeline import build_stages
+from services.recording import RecordingWriter
+
+RATE_HZ = 22.0
+TARGET = {"skins": 32, "p99_ms": 20.0}
+MARGIN_S = 2.0  # of a recording, beyond what is measured
+STATUS_S = 1.5  # for the last status frames to tell what was dropped
+GROWTH = 0.01  # of memory, over a long run
+
+
+def recordings(folder: Path, n: int, touched: float, seconds: float) -> Path:
+    """n recordings and the skin.toml that plays them; returns the latter."""
+    of = scenes(seconds)
+    lines = []
+    for k in range(n):
+        recorded = of["moving" if (k + 0.5) * touched % 1 < touched and touched > 0 else "untouched"]
+        name = f"s{k:02d}"
+        _write(folder / f"{name}.mcap", name, recorded, phase_s=(k * 0.618) % 1 / RATE_HZ)
+        lines.append(f'[skins.{name}]\nport = "{folder / name}.mcap"\nbundle = "square16"\n')
+    path = folder / "skin.toml"
+    path.write_text("\n".join(lines))
+    return path
+
+
+def _write(path: Path, skin: str, recorded: Recorded, phase_s: float) -> None:
+    with RecordingWriter(path) as writer:
+        for k in range(len(recorded)):
+            frame = recorded.frame(k)
+            frame.skin = skin
+            frame.stamps["sample"] += round(phase_s * 1e9) * (k > 0)
+            writer.write("raw/" + skin, pack(frame), frame.stamps["sample"])
+
+
+def measure(service: Service, n: int, seconds: float) -> dict[str, Any]:
+    """What one controller that takes everything sees of n skins."""
+    socket = zmq.Context.instance().socket(zmq.SUB)
+    socket.setsockopt(zmq.RCVHWM, 100_000)
+    socket.connect(f"ipc://{service.folder}/publisher.ipc")
+    socket.subscribe(b"contact/")
+    for process in PROCESSES:
+        socket.connect(f"ipc://{service.folder}/{process}.ipc")
+    socket.subscribe(b"status/")
+    latency, seen = [], Counter[str]()
+    dropped: dict[tuple[str, str], list[int]] = {}
+    cpu = service.cpu_s()
+    began = time.monotonic()
+    while (now := time.monotonic()) < began + seconds + STATUS_S:
+        if not socket.poll(100):
+            continue
+        message = socket.recv()
+        at = time.monotonic_ns()
+        name, _, body = message.partition(b"\0")
+        frame = msgpack.unpackb(body)
+        if name.startswith(b"status/"):
+            key = frame["process"], frame["skin"]
+            drops = sum(count for cause, count in frame["drops"].items())
+            dropped.setdefault(key, []).append(drops)
+        elif now < began + seconds:
+            seen[frame["skin"]] += 1
+            latency.append((at - frame["stamps"]["read"]) * 1e-6)
+    used = {name: seconds_used - cpu[name] for name, seconds_used in service.cpu_s().items()}
+    socket.close(0)
+    expected = RATE_HZ * seconds
+    return {
+        "skins": n,
+        "skins_seen": len(seen),
+        "frames": sum(seen.values()),
+        "lost": sum(max(0.0, expected - seen[f"s{k:02d}"]) for k in range(n)) / (n * expected),
+        "reported_dropped": sum(counts[-1] - counts[0] for counts in dropped.values()),
+        "p50_ms": float(np.percentile(latency, 50)),
+        "p99_ms": float(np.percentile(latency, 99)),
+        "cores": sum(used.values()) / (time.monotonic() - began),
+        "cores_by_process": {k: v / (time.monotonic() - began) for k, v in used.items()},
+        "memory_mb": {k: v / 1e6 for k, v in service.memory_bytes().items()},
+    }
+
+
+def scaled(n: int, touched: float, seconds: float) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(prefix="eitskin-scale") as folder:
+        path = recordings(Path(folder), n, touched, QUIET_S + seconds + STATUS_S + MARGIN_S)
+        before = os.environ.get("EITSKIN_CONFIG")
+        os.environ["EITSKIN_CONFIG"] = str(path)
+        try:
+            with running(skin="s00") as service:
+                time.sleep(QUIET_S / 2)
+                return {"touched": touched, **measure(service, n, seconds)}
+        finally:
+            os.environ.pop("EITSKIN_CONFIG")
+            if before is not None:
+                os.environ["EITSKIN_CONFIG"] = before
+
+
+def memory(frames: int) -> dict[str, float]:
+    """Resident memory [MB] of the stages after a tenth of the frames and after all of them, half of them touched."""
+    recorded, bundle = scenes(20.0), Bundle.load("square16")
+    stages = build_stages("palm", Skin(port="stub", bundle="square16", frame_id="palm"), bundle)
+    turns = [recorded["untouched"], recorded["moving"]]
+    found: dict[str, float] = {}
+    done = 0
+    while done < frames:
+        for scene in turns:
+            for k in range(len(scene)):
+                run_once(stages, scene.frame(k))
+                done += 1
+                if done == frames // 10:
+                    found["first_mb"] = _resident_mb()
+    found["last_mb"] = _resident_mb()
+    found["growth"] = found["last_mb"] / found["first_mb"] - 1
+    found["frames"] = done
+    return found
+
+
+def _resident_mb() -> float:
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def table(rows: list[dict[str, Any]]) -> Table:
+    made = Table(title=f"skins at {RATE_HZ:g} frames/s from recordings, {machine()}", title_justify="left")
+    for head in ("skins", "touched", "frames", "lost %", "said", "p50 ms", "p99 ms", "cores", "memory MB"):
+        made.add_column(head, justify="right")
+    for row in rows:
+        made.add_row(
+            str(row["skins"]),
+            f"{100 * row['touched']:.0f} %",
+            str(row["frames"]),
+            f"{100 * row['lost']:.2f}",
+            str(row["reported_dropped"]),
+            f"{row['p50_ms']:.2f}",
+            f"{row['p99_ms']:.2f}",
+            f"{row['cores']:.2f}",
+            f"{sum(row['memory_mb'].values()):.0f}",
+        )
+    return made
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    for k, share in enumerate(sorted({row["touched"] for row in rows})):
+        mine = [row for row in rows if row["touched"] == share]
+        skins, label = [row["skins"] for row in mine], f"{100 * share:.0f} % touched"
+        left.plot(skins, [row["p50_ms"] for row in mine], "o-", color=f"C{k}", label=f"p50, {label}")
+        left.plot(skins, [row["p99_ms"] for row in mine], "o:", color=f"C{k}", label=f"p99, {label}")
+        right.plot(skins, [row["cores"] for row in mine], "o-", color=f"C{k}", label=label)
+    left.axhline(TARGET["p99_ms"], color="0.7", lw=0.8)
+    left.set(xlabel="skins", ylabel="ms", xscale="log", yscale="log", title="frame read to controller's recv")
+    right.set(xlabel="skins", ylabel="cores used", xscale="log", yscale="log", title="CPU of all processes")
+    for axis in (left, right):
+        axis.legend(fontsize=8)
+        axis.grid(alpha=0.3, which="both")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="skin bench scale", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--skins", type=int, nargs="+", default=[1, 4, 16, 32, 64])
+    parser.add_argument("--seconds", type=float, default=15.0, help="of each measurement")
+    parser.add_argument("--touched", type=float, nargs="+", default=[0.25, 1.0], help="shares of the skins")
+    parser.add_argument("--memory", type=int, metavar="FRAMES", help="watch memory over so many frames instead")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
+    args = parser.parse_args(argv)
+    if args.memory:
+        found = memory(args.memory)
+        print("{frames:.0f} frames: {first_mb:.1f} MB after a tenth, {last_mb:.1f} MB at the end".format(**found))
+        print(f"growth {100 * found['growth']:.2f} %, allowed {100 * GROWTH:.0f} %")
+        return int(found["growth"] > GROWTH)
+    rows = [scaled(n, share, args.seconds) for share in args.touched for n in args.skins]
+    Console(width=120).print(table(rows))
+    args.out.mkdir(parents=True, exist_ok=True)
+    report = {"machine": machine(), "versions": versions(), "target": TARGET, "rows": rows}
+    (args.out / "scale.json").write_text(json.dumps(report, indent=1) + "\n")
+    draw(rows, args.out / "scale.png")
+    print(f"wrote {args.out / 'scale.json'} and scale.png")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
