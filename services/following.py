@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from models.prereconstruction import PreReconstructor
 from services.config import Tare
+from services.creep import SHARE, Creep
 from services.drift import REST_S
 from services.holding import Holding, shaped
 
@@ -60,10 +61,18 @@ class Follower:
             self._at_ns = now_ns - round(self._age_s * 1e9)
         return max(0.0, (now_ns - self._at_ns) * 1e-9)
 
-    def untouched(self, z0: Array, amplitude: Array, live: NDArray[np.bool_], sigma: Array, now_ns: int) -> bool:
+    def untouched(
+        self,
+        z0: Array,
+        amplitude: Array,
+        live: NDArray[np.bool_],
+        sigma: Array,
+        now_ns: int,
+        creep: Creep | None = None,
+    ) -> bool:
         """Take in an untouched frame's |Z| (K,); z0 (K,) is changed in place. sigma (K,): noise of d.
 
-        True where z0 changed.
+        creep: what the last touch may have left behind. True where z0 changed.
         """
         if not self._since_ns:
             self.holding.reset()
@@ -76,7 +85,7 @@ class Follower:
         self._count += live
         if (now_ns - self._since_ns) * 1e-9 < BLOCK_S:
             return False
-        self._take_in(z0, sigma, now_ns)
+        self._take_in(z0, sigma, now_ns, creep)
         self._past.append((now_ns, z0.copy(), self._covariance.copy()))
         while len(self._past) > 1 and (now_ns - self._past[1][0]) * 1e-9 >= BACK_S + TREND_S:
             self._past.popleft()
@@ -97,7 +106,7 @@ class Follower:
             z0 += (before - first) * (newest_ns - self._at_ns) * 1e-9 / trend_s
         self._past.clear()
 
-    def _take_in(self, z0: Array, sigma: Array, now_ns: int) -> None:
+    def _take_in(self, z0: Array, sigma: Array, now_ns: int, creep: Creep | None) -> None:
         gap_s = min(self.since_s(now_ns), MOST_S)
         if gap_s > BACK_S:
             self._past.clear()  # what is caught up with is no trend
@@ -109,10 +118,19 @@ class Follower:
         weight = np.zeros(len(z0))
         weight[live] = 1 / (sigma[live] ** 2 / self._count[live] + self.pre.m.model_error**2)
         prior = self._covariance + np.diag((self._rates * gap_s) ** 2)
-        gathered = self._columns.T * weight
-        precision = np.linalg.inv(prior) + gathered @ self._columns
-        self._covariance = np.asarray(np.linalg.inv(precision), dtype=np.float64)
-        drift = self._columns @ (self._covariance @ (gathered @ d))
+        columns, precision = self._columns, np.linalg.inv(prior)
+        n, touch = len(precision), None if creep is None else creep.direction(now_ns)
+        if touch is not None:
+            columns = np.column_stack([columns, touch])
+            precision = np.pad(precision, (0, 1))
+            precision[n, n] = SHARE**-2
+        gathered = columns.T * weight
+        covariance = np.linalg.inv(precision + gathered @ columns)
+        found = covariance @ (gathered @ d)
+        if touch is not None and creep is not None:
+            found[n] = creep.follow(float(found[n]))
+        self._covariance = np.asarray(covariance[:n, :n], dtype=np.float64)
+        drift = columns @ found
         step_s = min(gap_s, LONGEST_STEP_S)
         slow = np.where(live, d - drift, 0.0) * (step_s / (step_s + self.config.tracking_s))
         z0 += np.where(z0 > 0, normaliser * (drift + slow), 0.0)

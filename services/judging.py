@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from models.prereconstruction import Operator, PreReconstructor
 from services.config import Skin
+from services.creep import Creep
 from services.drift import Allowance, Evidence
 from services.touch import TouchDecision
 
@@ -47,6 +48,7 @@ class Judge:
         self.pre, self.config = pre, skin.touch
         self.allowance = Allowance(skin.tare)
         self._evidence: Evidence | None = None
+        self.creep = Creep(pre.measurements)
         self._operators: dict[tuple[bytes, bytes, int, int], tuple[Operator, TouchDecision]] = {}
         self.reset()
 
@@ -54,6 +56,7 @@ class Judge:
         self.step = 0  # of the allowance
         self._look_ns, self._again_s = 0, AGAIN_S  # when next, how long after that
         self._permitted = 0
+        self.creep.reset()
         self._live = np.ones(self.pre.measurements, dtype=bool)
         self._gather(0)
         self._question: tuple[Array, Array, NDArray[np.bool_], list[int]] | None = None
@@ -78,6 +81,8 @@ class Judge:
                 self._look_ns = now_ns + round(self._again_s * 1e9)
                 self._again_s = min(2 * self._again_s, AGAIN_MOST_S)
                 found = self._drift_or_touch(d, live, noise, touched) or found
+        if found.touched and (rest := self.creep.taken_out(d, found.operator, now_ns)) is not None:
+            found = self._judge(rest, live, noise, touched)
         if found.touched:
             self._follow(d, live, noise, now_ns)
         else:
@@ -125,6 +130,7 @@ class Judge:
         self._count += 1
         if now_ns - self._since_ns < ASK_S * 1e9:
             return
+        self.creep.begin(self._sum / self._count, now_ns)
         if self._question is not None:
             while self._answer_one():
                 pass
@@ -203,6 +209,7 @@ class Judge:
             "count": self._count,
             "since_ns": self._since_ns,
             "question": question,
+            "creep": self.creep.state(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -212,6 +219,7 @@ class Judge:
         self._look_ns, self._count, self._since_ns = (int(state[k]) for k in ("look_ns", "count", "since_ns"))
         self._again_s = float(state["again_s"])
         self._live, self._sum = self._row(state["live"]) > 0, self._row(state["sum"])
+        self.creep.load(state["creep"])
         asked = state["question"]
         if asked is not None:
             steps = [self._checked(int(step)) for step in asked["steps"]]

@@ -121,7 +121,7 @@ class Preprocessing(Stage):
             self.untouched.touched(amplitude, live, out.stamps.get("sample", 0))
         else:
             self.hold.reset()
-            self.untouched.untouched(amplitude, live, out.stamps.get("sample", 0))
+            self.untouched.untouched(amplitude, live, out.stamps.get("sample", 0), self.judge.creep)
         if self._touched or self.always_reconstruct or not self.config.touch.skip_untouched:
             self._reconstruct(out, d, found_now.operator, found_now.decision)
         return out

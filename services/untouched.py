@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.frames import RawFrame
 from services.config import Tare
+from services.creep import Creep
 from services.following import Follower
 from services.stage import Refused
 from services.tare import Baseline, noise_of_steps, plausible_noise, take
@@ -96,12 +97,12 @@ class Untouched:
         assert self.baseline is not None
         self.follower.holding(self.baseline.z0, amplitude, live, self.sigma, self.normaliser, sample_ns)
 
-    def untouched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int) -> None:
+    def untouched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int, creep: Creep | None = None) -> None:
         """The last frame offered was not: slow drift is followed."""
         assert self.baseline is not None
         self._run += 1
         z0 = self.baseline.z0
-        if self.follower.untouched(z0, amplitude, live, self.sigma, sample_ns):
+        if self.follower.untouched(z0, amplitude, live, self.sigma, sample_ns, creep):
             self.normaliser = self.pre.normaliser(z0)
         if self._run % SAVE_EVERY == 0:
             self._unsaved = True

@@ -27,6 +27,10 @@ def reconstruct(
     sequence: Annotated[
         bool, typer.Option("--sequence", help="Rows are one recording: keep what the stages know.")
     ] = False,
+    age: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", min=0, help="From `untouched` to the measurements; not given: minutes."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run the runtime stages over the rows of a file, without sockets.
@@ -38,7 +42,7 @@ def reconstruct(
     import numpy as np
 
     from services.npz_file import InputError, read_input
-    from services.reconstruction import find_skin
+    from services.reconstruction import UNKNOWN_AGE_S, find_skin
     from services.reconstruction import reconstruct as run
 
     found, bundle = find_skin(skin)
@@ -50,7 +54,15 @@ def reconstruct(
         fail(f"found {target.name}, expected a name ending in .npz", USAGE)
     if not target.parent.is_dir():
         fail(f"no folder {target.parent} to write {target.name} to: make it first", USAGE)
-    out = run(data, found, bundle, sequence, warn=lambda text: print(f"skin: {text}", file=sys.stderr), progress=_bar)
+    out = run(
+        data,
+        found,
+        bundle,
+        sequence,
+        warn=lambda text: print(f"skin: {text}", file=sys.stderr),
+        progress=_bar,
+        age_s=UNKNOWN_AGE_S if age is None else age,
+    )
     try:
         np.savez(target, **out)  # type: ignore[arg-type]
     except OSError as error:
