@@ -135,7 +135,7 @@ def shortest_list(deflection: Array, longest: int, signed: bool = True) -> Rows:
 
 
 def exchange(power: Array, n: int) -> list[int]:
-    """n columns of power (M, K) with the largest smallest row sum: greedy, then swaps while any helps."""
+    """n columns of power (M, K), squared deflections, with the largest smallest row sum: greedy, then swaps."""
     chosen: list[int] = []
     total = np.zeros(len(power))
     for step in range(n):

@@ -19,7 +19,7 @@ from protocol.frames import DeltaFrame
 from services.sentinel import Verdict, Watch
 
 QUIET_FRAMES = 64  # 3 s: a tare's worth, so that one can be taken while the board idles
-FULL_EVERY_S = 1.0
+FULL_EVERY_S = 0.5  # as often as preprocessing follows drift: longer gaps would widen what it allows for
 DEAF_S = 0.4  # without a verdict: preprocessing is down, or far behind
 LOST_S = 0.5  # a full scan asked for that does not come is asked for again
 SWITCH_S = 0.01  # for a command to reach the board, beyond the scan under way there

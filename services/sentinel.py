@@ -3,8 +3,8 @@
 Three judges look at it, each with the largest matched filter of all touches of a grid as its statistic:
 
 - `Watch` (acquisition) holds each scan, and the mean of the last few, against the mean of the skin's own last second. A
-  *hit* (once a minute on an untouched skin) ends the idling; a *suspicion* (every two seconds) merely has the next
-  full scan made at once, so that what is too light for a hit is not seen later than by full scans.
+  *hit* (at most once a minute on an untouched skin) ends the idling; a *suspicion* (every two seconds) merely has the
+  next full scan made at once, so that what is too light for a hit is not seen later than by full scans.
 - `Coarse` (preprocessing) holds what was forwarded against the baseline, as strictly as full frames are judged: only
   that makes a contact, which is marked `coarse`.
 - `CoarseImage` (inference) gives the mean and the standard deviation of the drop over all touches that the few
@@ -37,6 +37,9 @@ BLOCKS = 5
 WIDER = 1.03  # noise is estimated from a few dozen scans: one more part in thirty of it
 DRIFT = 1e-4  # relative, of the baseline since the last full scan
 EXPLAINED = 0.5  # share of the whitened difference that one touch must explain to be called one
+BETWEEN = 0.35  # of a drop: sizes between RADII are told from none of them, and strong touches are not linear
+DROPS = 0.05, 0.6  # S/m, of touches that are likely
+FALL_OFF = 0.15  # of the logarithm
 LINEAR = 0.1  # of d: by so much the linear picture of a touch on a grid may be wrong
 
 
@@ -64,7 +67,7 @@ class Watch:
         self.sentinel = sentinel
         directions = sentinel.filters(np.ones(len(sentinel.rows)))
         per_scan = sentinel.seconds / len(WINDOWS)
-        self.hit = designs.threshold(directions, designs.FALSE_ALARMS_HZ * per_scan)
+        self.hit = designs.threshold(directions, designs.FALSE_ALARMS_HZ / 2 * per_scan)  # half: there is drift too
         self.suspect = designs.threshold(directions, SUSPICIONS_HZ * per_scan)
         self._recent: deque[Array] = deque(maxlen=max(WINDOWS))
         self.score, self.window = 0.0, 1  # of the scan judged last: the statistic, and the scans it is the mean of
@@ -79,6 +82,10 @@ class Watch:
         }
         self._blocks: deque[Array] = deque([self._reference] * BLOCKS, maxlen=BLOCKS)
         self._sum, self._count = np.zeros_like(self._reference), 0
+        self._recent.clear()
+
+    def begin_again(self) -> None:
+        """The scan to come follows none: only the reference stays."""
         self._recent.clear()
 
     def __call__(self, amplitude: Array) -> Verdict:
@@ -178,13 +185,16 @@ class CoarseImage:
         z = whitened @ (d / noise) / size
         if not self.sentinel.signed:
             z = np.abs(z)
-        drop = np.clip(z / size, 0.0, 0.99)
-        log = np.where(z > 0, 0.5 * z**2, 0.0) + np.log(self._prior / size)
+        drop = np.maximum(z / size, 1e-6)
+        # The drop is marginalised under a prior that is even in its logarithm and falls off outside DROPS.
+        beyond = np.maximum(np.log(DROPS[0] / drop), np.log(drop / DROPS[1])).clip(0.0) / FALL_OFF
+        log = np.where(z > 0, 0.5 * z**2, 0.0) + np.log(self._prior / (size * drop)) - 0.5 * beyond**2
+        drop = np.minimum(drop, 0.99)
         p = np.exp(log - log.max())
         p /= p.sum()
         mean = (p * drop) @ touches.coverage
         square = (p * (drop**2 + size**-2)) @ touches.coverage**2
-        return mean, np.maximum(square - mean**2, 0.0)
+        return mean, np.maximum(square - mean**2, 0.0) + (BETWEEN * mean) ** 2
 
 
 def _with_misfit(d: Array, sigma: Array) -> Array:
