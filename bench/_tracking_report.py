@@ -70,7 +70,8 @@ def targets(found: dict[str, Any]) -> list[dict[str, Any]]:
 
 def head(args: argparse.Namespace, bundle: Bundle, recorded: Recorded, simulated_s: float, scored_s: float) -> Any:
     return {
-        "command": "skin bench tracking " + " ".join(sys.argv[1:]),
+        "command": f"skin bench tracking --scene {args.scene} --snr {args.snr:g} --seed {args.seed}"
+        + (f" --seconds {args.seconds:g}" if args.seconds else ""),
         "machine": machine(),
         "bundle": {"name": bundle.name, "hash": bundle.hash, "network": args.network},
         "scene": args.scene,
