@@ -208,7 +208,7 @@ def test_a_few_seconds_of_the_real_thing(short):
     assert press["seen_%"] > 95 and press["position_%"] <= 1.5 and press["switches"] == 0
     assert row["position_%"] <= 1.5 and row["force_%"] < 20
     assert found["faults"][0]["named"] <= report.NAMED_WITHIN
-    assert found["sections"]["press"]["valid_%"] == 100
+    assert press["valid_%"] > 90  # frames in which it begins or ends may be refused
 
 
 def test_the_command_prints_tables_and_writes_strict_json(short, monkeypatch, tmp_path, capsys):
