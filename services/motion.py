@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 ACCELERATION = 0.3  # m/s^2, standard deviation: how a finger changes its mind
-PLACE_SIGMA_M = 0.0007  # of a centroid from one image
+PLACE_SIGMA_M = 0.0012  # of a centroid from one image
 FIRST_SPEED = 0.1  # m/s, standard deviation of a velocity of which nothing is known
 LONGEST_PREDICTION_S = 0.2  # a velocity says nothing about longer gaps
 SIZE_SIGMA = 0.4  # of the logarithm of an integrated drop, from frame to frame

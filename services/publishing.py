@@ -20,7 +20,7 @@ from services.stage import Health, Stage, add_reason, inherited
 from services.tracking import Tracker
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
-UNKNOWN_BELOW = 0.4  # probability of the best class below which a shape is "unknown"
+UNKNOWN_BELOW = 0.6  # probability of the best class below which a shape is "unknown": there half of them are wrong
 SURE = 0.08  # residual above which what appears in an image has to appear in the next one too
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 

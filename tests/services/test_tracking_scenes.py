@@ -1,0 +1,123 @@
+"""Id switches in scenes of synthetic images: sliding, crossing, passing, meeting touches; no network, no board.
+
+The images are as blurred, as uneven from frame to frame, and as noisy as the network's at 80 dB.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage, optimize
+
+from models.bundle import Bundle
+from models.shapes import KINDS, Shape, drop_image
+from protocol.frames import ContactFrame, ImageFrame
+from services.config import Skin
+from services.publishing import Publishing
+
+N = 64
+UNIT_M = 0.05  # metres per model unit
+FRAME_S = 0.0455
+GATE_M = 0.015  # further away a contact is not the touch's
+LOST = 0.02  # share of frames that do not arrive
+
+Scene = list[list[Shape]]  # frame by frame, each touch at its place in the list
+
+
+def touches(rng: np.random.Generator) -> Callable[[int, NDArray[np.floating]], Shape]:
+    radius, drop = rng.uniform(0.14, 0.22, 2), rng.uniform(0.2, 0.45, 2)
+    kind = [KINDS[k] for k in rng.choice([0, 1, 3, 5], 2)]  # round, triangular, square
+    return lambda n, at: Shape(kind[n], float(at[0]), float(at[1]), float(radius[n]), float(drop[n]))
+
+
+def direction(angle: float) -> NDArray[np.floating]:
+    return np.array([math.cos(angle), math.sin(angle)])
+
+
+def crossing(rng: np.random.Generator) -> Iterator[list[Shape]]:
+    """Two slide through the same place at an angle."""
+    make, first, speed = touches(rng), rng.uniform(0, 6), rng.uniform(0.5, 1.1)
+    second = first + rng.uniform(0.7, math.pi)
+    for t in np.arange(-0.65 / speed, 0.65 / speed, FRAME_S):
+        yield [make(n, direction(a) * speed * t) for n, a in enumerate((first, second))]
+
+
+def passing(rng: np.random.Generator) -> Iterator[list[Shape]]:
+    """One stays, another one slides past it, edge to edge."""
+    make, angle, speed = touches(rng), rng.uniform(0, 6), rng.uniform(0.5, 1.1)
+    aside = direction(angle + math.pi / 2) * (make(0, np.zeros(2)).radius + make(1, np.zeros(2)).radius + 0.05)
+    for t in np.arange(-0.65 / speed, 0.65 / speed, FRAME_S):
+        yield [make(0, np.zeros(2)), make(1, aside + direction(angle) * speed * t)]
+
+
+def meeting(rng: np.random.Generator) -> Iterator[list[Shape]]:
+    """Two slide towards each other until they touch, and back."""
+    make, angle, speed = touches(rng), rng.uniform(0, 6), rng.uniform(0.4, 0.8)
+    least = (make(0, np.zeros(2)).radius + make(1, np.zeros(2)).radius) / 2
+    for t in np.arange(-0.9 / speed, 0.9 / speed, FRAME_S):
+        half = least + speed * abs(t) / 2
+        yield [make(0, -direction(angle) * half), make(1, direction(angle) * half)]
+
+
+def image(shapes: list[Shape], rng: np.random.Generator) -> NDArray[np.float32]:
+    """The sharp image, with each touch's own peak and width as uncertain as the network's, blurred, noisy."""
+    seen = [
+        Shape(s.kind, s.x + d[0], s.y + d[1], s.radius * g, min(0.95, s.drop / g**2))
+        for s, d, g in zip(shapes, rng.normal(0, 0.012, (2, 2)), np.exp(rng.normal(0, 0.1, 2)), strict=True)
+    ]
+    noise = ndimage.gaussian_filter(rng.standard_normal((N, N)), 2.0)
+    blurred = ndimage.gaussian_filter(drop_image(seen, N), 2.0)
+    return np.maximum(blurred + 0.004 * noise / noise.std(), 0).astype(np.float32)
+
+
+def switches(stage: Publishing, scene: Scene, rng: np.random.Generator) -> tuple[int, int]:
+    """(changes of a true touch's id, ids given)."""
+    stage.reset()
+    stage.new_session()
+    ids: dict[int, int] = {}
+    given: set[int] = set()
+    count = 0
+    for scan, shapes in enumerate(scene, 1):
+        if rng.random() < LOST:
+            continue
+        frame = ImageFrame(
+            skin="palm",
+            scan=scan,
+            valid=True,
+            stamps={"sample": int(scan * FRAME_S * 1e9)},
+            touched=True,
+            image=image(shapes, rng),
+            metres_per_pixel=2 * UNIT_M / N,
+            origin=[-UNIT_M, -UNIT_M],
+        )
+        (out,) = stage.process(frame, frozenset({"contact"}))
+        assert isinstance(out, ContactFrame)
+        present = {c.id: np.array(c.position[:2]) for c in out.contacts if c.state != "end"}
+        given |= set(present)
+        truth = {n: s.centroid * UNIT_M for n, s in enumerate(shapes)}
+        near = {n: i for n, i in ids.items() if i in present and np.linalg.norm(present[i] - truth[n]) < GATE_M}
+        open_, free = [n for n in truth if n not in near], [i for i in present if i not in near.values()]
+        if open_ and free:
+            away = np.array([[np.linalg.norm(present[i] - truth[n]) for i in free] for n in open_])
+            for row, column in zip(*optimize.linear_sum_assignment(away), strict=True):
+                if away[row, column] < GATE_M:
+                    count += ids.get(open_[row], free[column]) != free[column]
+                    ids[open_[row]] = free[column]
+    return count, len(given)
+
+
+@pytest.mark.parametrize(("kind", "most"), [(crossing, 1), (passing, 0), (meeting, 0)])
+def test_ids_are_kept(bundle: Bundle, kind: Callable[[np.random.Generator], Iterator[list[Shape]]], most: int) -> None:
+    """At most so many switches in 12 touches. Where touches inside a patch are not followed, every crossing has one."""
+    stage = Publishing("palm", Skin(port="stub", bundle="square16", frame_id="palm", network="none"), bundle)
+    changed = made = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        count, given = switches(stage, list(kind(rng)), rng)
+        changed, made = changed + count, made + given
+    assert changed <= most, f"{changed} switches"
+    assert made <= 12 + most, f"{made} ids for 12 touches"
