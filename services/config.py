@@ -52,7 +52,7 @@ class Tare(Section):
 
     frames: Annotated[int, Field(ge=8, le=4096)] = 64
     max_age_s: Annotated[float, Field(gt=0)] = 3600.0  # an older persisted baseline is not loaded
-    tracking_s: Annotated[float, Field(gt=0)] = 20.0  # time constant of what drift does not explain, while untouched
+    tracking_s: Annotated[float, Field(gt=0)] = 120.0  # time constant of what drift does not explain, while untouched
     # How fast an untouched skin may change, relative; see services/drift.py. A foam that dries by 6 %, electrodes whose
     # contacts change by a quarter, within five minutes.
     scale_per_s: Annotated[float, Field(gt=0, le=1e-2)] = 2e-4  # the sheet's conductivity

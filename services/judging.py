@@ -183,7 +183,8 @@ class Judge:
     def prepare(self, noise: Noise) -> bool:
         """Do one piece of what will be needed next; False where nothing is left. Changes no result."""
         live = self._live & np.isfinite(noise.sigma)
-        for step in sorted({self.step, self._permitted, min(self._permitted + 1, self.allowance.widest)}):
+        near = {self.step, max(self.step - 1, 0), self._permitted, min(self._permitted + 1, self.allowance.widest)}
+        for step in sorted(near):
             if (live.tobytes(), noise.sigma.tobytes(), noise.frames, step) not in self._operators:
                 self.operator(live, noise, step)
                 return True

@@ -219,6 +219,13 @@ def test_a_slow_press_is_not_swallowed(time: Time, solved: Callable[..., Array])
     assert whole @ last / (whole @ whole) > 0.8
 
 
+def test_a_slow_light_press_is_noticed(time: Time, solved: Callable[..., Array]) -> None:
+    """1 N of the 10 mm indenter within twenty seconds: two thirds of it look like drift, the rest does not."""
+    free, pressed = solved(), solved(Touch("circle", 0.0, 0.0, 0.005, 0.1))
+    outs = list(time.frames(lambda t: free + (pressed - free) * t / 20, 20.0))
+    assert all(out.touched for out in outs[-20:])
+
+
 def test_frames_that_only_drifted_are_untouched_offline(
     bundle: Bundle, skin: Skin, solved: Callable[..., Array]
 ) -> None:
