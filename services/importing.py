@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.frames import pack
 from services.config import SKIN_NAME
+from services.file_source import file_frame
 from services.npz_file import InputError, frames_of, read_input
 from services.reconstruction import find_skin
 from services.recording import RecordingWriter
-from services.source import file_frame
 
 ROWS_PER_CHUNK = 8
 EPOCH_NS = 1_000_000_000_000_000_000

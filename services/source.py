@@ -12,19 +12,15 @@ from collections import Counter
 from collections.abc import Generator, Iterator
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from models.bundle import Bundle
 from protocol import link
-from protocol.frames import DeltaFrame, FrameError, RawFrame, unpack
+from protocol.frames import DeltaFrame, RawFrame
 from protocol.sockets import NewestReader
 from services import port as ports
 from services.adaptive import AdaptiveScan
 from services.boardlink import BoardLink, Scanning
 from services.clock import UNSETTLED_NS, DeviceClock
 from services.config import Skin
-from services.npz_file import InputError, frames_of, load_npz, read_input
 from services.sentinel import sentinel_of
 from services.stage import Health
 
@@ -32,8 +28,6 @@ POLL_S = 0.1
 REOPEN_S = 0.2  # between attempts to open a port
 INTRODUCE_S = 0.6  # for a board under another name to say who it is
 SCANS_VALID = 3  # a frame is valid until this many scans later
-FILE_RATE_HZ = 22.0  # at which frames of a file without times are given
-LONGEST_PAUSE_S = 1.0  # between two recorded frames
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +129,7 @@ class BoardSource(Source):
             data = port.read(wait_s)
             read_ns = time.monotonic_ns()
             scans = board.received(data, read_ns * 1e-9) if data else []
-            self._count(board, seen)
+            self._count(board, seen, adaptive)
             if must_be and (board.board or now - opened > INTRODUCE_S) and board.board != must_be:
                 return True
             if board.state == "running" and self._board != board.board:
@@ -208,99 +202,20 @@ class BoardSource(Source):
             log.info("%s: the board is running", self.name)
         self.problem = problem
 
-    def _count(self, board: BoardLink, seen: Counter[str]) -> None:
+    def _count(self, board: BoardLink, seen: Counter[str], adaptive: AdaptiveScan | None) -> None:
         """Add what is new in the connection's counts to ours."""
         now = board.counts + Counter({f"line_{what}": n for what, n in board.decoder.counts.items() if what != "good"})
+        if adaptive is not None:
+            now += adaptive.counts
         if now != seen:
             self.counts += now - seen
             seen.clear()
             seen.update(now)
 
 
-class RecordingSource(Source):
-    """The raw frames of one skin in a recording, once, at the recorded speed. (`skin replay` is the lossless way.)"""
-
-    def frames(self) -> Iterator[RawFrame | None]:
-        from services.recording import RecordingError
-
-        try:
-            yield from self._recorded(Path(self.skin.port))
-        except (RecordingError, OSError) as why:
-            self.problem = str(why)
-        yield from self._ended(f"the recording {self.skin.port} has ended")
-
-    def _recorded(self, path: Path) -> Iterator[RawFrame | None]:
-        from services.recording import RecordingReader
-        from services.replay import mark, skins_in
-
-        skins = skins_in(reader := RecordingReader(path))
-        theirs = self.name if self.name in skins else next(iter(skins), "")
-        if theirs != self.name and len(skins) != 1:
-            held = f"skins {', '.join(skins)}, none called {self.name}" if skins else f"no raw frames ({reader.damage})"
-            self.problem = f"the recording {path} holds {held}"
-            return
-        previous, due = 0, time.monotonic()
-        for recorded in reader.messages({"raw"}):
-            if recorded.topic != f"raw/{theirs}":
-                continue
-            try:
-                frame = unpack(recorded.wire)
-            except FrameError:
-                self.counts["malformed"] += 1
-                continue
-            assert isinstance(frame, RawFrame)  # by its topic
-            sample = frame.stamps.get("sample", 0)
-            due += min(max(0.0, (sample - previous) * 1e-9), LONGEST_PAUSE_S) if previous else 0.0
-            previous = sample
-            yield from _wait_until(due)
-            mark(frame)
-            frame.skin = self.name
-            yield frame
-
-
-class FileSource(Source):
-    """The rows of an npz file as frames, once; in the order that services/npz_file.py gives them."""
-
-    def frames(self) -> Iterator[RawFrame | None]:
-        due = time.monotonic()
-        try:
-            data = read_input(load_npz(Path(self.skin.port)), len(self.bundle.pattern))
-        except InputError as why:
-            text = str(why)
-            yield from self._ended(text if self.skin.port in text else f"{self.skin.port}: {text}")
-        for scan, (values, kind) in enumerate(frames_of(data)):
-            due += 1 / FILE_RATE_HZ
-            yield from _wait_until(due)
-            yield file_frame(self.name, self.pattern_name, scan, values, kind, time.monotonic_ns())
-        yield from self._ended(f"the file {self.skin.port} has ended")
-
-
-def file_frame(skin: str, pattern: str, scan: int, values: NDArray[np.generic], kind: str, now_ns: int) -> RawFrame:
-    """A raw frame of one row (K,) of a file."""
-    return RawFrame(
-        skin=skin,
-        scan=scan,
-        stamps={"sample": now_ns, "read": now_ns},
-        source="replay",
-        valid=True,
-        reasons=["replay"],
-        valid_for_s=SCANS_VALID / FILE_RATE_HZ,
-        z=np.asarray(values, np.complex64),
-        status=np.zeros(len(values), np.uint8),
-        device_us=now_ns // 1000,
-        kind=kind,
-        pattern=pattern,
-    )
-
-
 def open_source(name: str, skin: Skin, bundle: Bundle) -> Source:
     """The source that a skin's `port` names."""
+    from services.file_source import FileSource, RecordingSource  # here: they are sources themselves
+
     kind = {".mcap": RecordingSource, ".npz": FileSource}.get(Path(skin.port).suffix, BoardSource)
     return kind(name, skin, bundle)
-
-
-def _wait_until(due: float) -> Iterator[None]:
-    while (left := due - time.monotonic()) > 0:
-        time.sleep(min(left, POLL_S))
-        if left > POLL_S:
-            yield None

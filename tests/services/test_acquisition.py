@@ -22,9 +22,10 @@ from services.acquisition import SourceFeed
 from services.boardlink import ANSWER_S, DEAD_SCANS, REFUSED_AGAIN_S, SILENT_S, BoardLink, Scanning
 from services.clock import DeviceClock
 from services.config import Skin
+from services.file_source import FileSource, RecordingSource
 from services.port import PortError, explain
 from services.recording import RecordingWriter
-from services.source import FileSource, RecordingSource, Source, open_source
+from services.source import Source, open_source
 from tests.services.fake_board import FakeBoard, PtyBoard
 
 SCANNING = Scanning(pattern("pairs"), 128, 40_000.0)
