@@ -22,7 +22,7 @@ QUIET_FRAMES = 64  # 3 s: a tare's worth, so that one can be taken while the boa
 FULL_EVERY_S = 0.5  # as often as preprocessing follows drift: longer gaps would widen what it allows for
 DEAF_S = 0.4  # without a verdict: preprocessing is down, or far behind
 LOST_S = 0.5  # a full scan asked for that does not come is asked for again
-SWITCH_S = 0.01  # for a command to reach the board, beyond the scan under way there
+BEGUN_S = 0.005  # after the scan under way, by when the next one has begun
 
 Passed = tuple[link.Frame, str]  # a scan and its kind
 
@@ -40,24 +40,35 @@ class AdaptiveScan:
         self._quiet = 0  # full scans in a row that preprocessing found untouched
         self._heard_s = 0.0
         self._full_s = self._passed_s = 0.0  # when the last full scan came; when the last scan was passed on
-        self._asked_s: float | None = None  # since when a full scan is under way
+        self._asked_s: float | None = None  # when a full scan was asked for that has not come
+        self._promised_s: float | None = None  # when the board said that it would make it
         self._long_s = self._short_s = 0.05  # seconds of a full and of a sentinel scan
         self._block: list[link.Frame] = []  # sentinel scans not passed on yet
 
-    def wants(self, now_s: float) -> str:
-        """What the board should scan now."""
+    def wants(self, now_s: float, confirmed: str = "") -> str:
+        """What the board should scan now. confirmed: what it has said that it scans, after the scan under way."""
         if not self.idle:
             return "full"
         if now_s - self._heard_s > DEAF_S:
             self._wake("deaf")
             return "full"
         if self._asked_s is not None and now_s - self._asked_s > LOST_S + self._long_s:
+            self.counts["unanswered"] += 1
             self._asked_s = None
         if self._asked_s is None and now_s - self._full_s > FULL_EVERY_S:
             self._ask(now_s)
-        # The full scan has begun by then, and the board changes over after it.
-        asked = self._asked_s is not None and now_s < self._asked_s + 2 * self._short_s + SWITCH_S
-        return "full" if asked else "sentinel"
+        if self._asked_s is None:
+            return "sentinel"
+        if self._promised_s is None:
+            self._promised_s = now_s if confirmed == "full" and now_s > self._asked_s else None
+            return "full"
+        return "full" if now_s < self._promised_s + self._short_s + BEGUN_S else "sentinel"
+
+    def due_s(self, now_s: float) -> float:
+        """Seconds until `wants` changes by itself."""
+        if not self.idle or self._asked_s is None or self._promised_s is None:
+            return FULL_EVERY_S
+        return max(0.001, self._promised_s + self._short_s + BEGUN_S - now_s)
 
     def interrupted(self) -> None:
         """The board does not scan: it begins with full scans, and nothing is known of them."""
@@ -65,12 +76,6 @@ class AdaptiveScan:
             self._wake("interrupted")
         self._quiet = 0
         self._untouched.clear()
-
-    def due_s(self, now_s: float) -> float:
-        """Seconds until `wants` changes by itself."""
-        if not self.idle or self._asked_s is None:
-            return FULL_EVERY_S
-        return max(0.001, self._asked_s + 2 * self._short_s + SWITCH_S - now_s)
 
     def scanned(self, scan: link.Frame, now_s: float) -> list[Passed]:
         """A scan of the board -> what goes on to preprocessing."""
@@ -98,7 +103,8 @@ class AdaptiveScan:
         if verdict is Verdict.SUSPECT and self._asked_s is None:
             self.counts["suspicions"] += 1
             self._ask(now_s)
-        soon = self._asked_s is not None  # nothing more can come until the full scan has been measured and sent
+        soon = self._asked_s is not None and now_s - self._asked_s < 3 * self._short_s
+        # After those nothing comes until the full scan has been measured and sent.
         if not soon and now_s - self._passed_s < self._long_s - self._short_s / 2:
             return []
         mean, self._block, self._passed_s = _mean(self._block), [], now_s
@@ -132,7 +138,7 @@ class AdaptiveScan:
         self._untouched.clear()
 
     def _ask(self, now_s: float) -> None:
-        self._asked_s = now_s
+        self._asked_s, self._promised_s = now_s, None
 
 
 def _mean(scans: list[link.Frame]) -> link.Frame:

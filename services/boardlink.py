@@ -76,6 +76,11 @@ class BoardLink:
         """Whether this board can be switched to the idle configuration while it runs."""
         return self._idle is not None and bool(self.ident and self.ident.capabilities & link.Capability.SENTINEL)
 
+    @property
+    def confirmed(self) -> Scanning | None:
+        """What the running board has said that it scans, after the scan under way; None while it has not."""
+        return self._started if self.state == "running" and not self._tries else None
+
     def switch(self, to: Scanning) -> None:
         """Have the running board scan this one of the configurations; `to_send` tells it."""
         self._wanted = to

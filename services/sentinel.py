@@ -69,7 +69,8 @@ class Watch:
         per_scan = sentinel.seconds / len(WINDOWS)
         self.hit = designs.threshold(directions, designs.FALSE_ALARMS_HZ / 2 * per_scan)  # half: there is drift too
         self.suspect = designs.threshold(directions, SUSPICIONS_HZ * per_scan)
-        self._recent: deque[Array] = deque(maxlen=max(WINDOWS))
+        self._recent = np.zeros((max(WINDOWS), len(sentinel.rows)), np.float32)  # a ring
+        self._judged = 0  # scans since the ring was empty
         self.score, self.window = 0.0, 1  # of the scan judged last: the statistic, and the scans it is the mean of
 
     def begin(self, frames: Array) -> None:
@@ -82,20 +83,21 @@ class Watch:
         }
         self._blocks: deque[Array] = deque([self._reference] * BLOCKS, maxlen=BLOCKS)
         self._sum, self._count = np.zeros_like(self._reference), 0
-        self._recent.clear()
+        self._judged = 0
 
     def begin_again(self) -> None:
         """The scan to come follows none: only the reference stays."""
-        self._recent.clear()
+        self._judged = 0
 
     def __call__(self, amplitude: Array) -> Verdict:
-        d = amplitude / self._reference - 1
-        self._recent.append(d)
+        size = len(self._recent)
+        self._recent[self._judged % size] = amplitude / self._reference - 1
+        self._judged += 1
         self.score = 0.0
         for window, filters in self._filters.items():
-            if len(self._recent) >= window:
-                mean = d if window == 1 else np.mean([*self._recent][-window:], axis=0)
-                score = float((filters @ mean.astype(np.float32)).max())
+            if self._judged >= window:
+                last = np.arange(self._judged - window, self._judged) % size
+                score = float((filters @ self._recent[last].mean(axis=0)).max())
                 if score > self.score:
                     self.score, self.window = score, window
         if self.score > self.hit:

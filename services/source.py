@@ -27,6 +27,7 @@ from services.stage import Health
 POLL_S = 0.1
 REOPEN_S = 0.2  # between attempts to open a port
 INTRODUCE_S = 0.6  # for a board under another name to say who it is
+COUNT_EVERY_S = 0.1
 SCANS_VALID = 3  # a frame is valid until this many scans later
 
 log = logging.getLogger(__name__)
@@ -113,6 +114,7 @@ class BoardSource(Source):
         board, clock = BoardLink(self.scanning, opened, self.idling), DeviceClock()
         adaptive = self.adaptive()
         seen: Counter[str] = Counter()
+        counted_ns = 0
         while True:
             now = time.monotonic()
             wait_s = POLL_S if board.state == "running" else 0.02
@@ -129,7 +131,9 @@ class BoardSource(Source):
             data = port.read(wait_s)
             read_ns = time.monotonic_ns()
             scans = board.received(data, read_ns * 1e-9) if data else []
-            self._count(board, seen, adaptive)
+            if read_ns - counted_ns > COUNT_EVERY_S * 1e9 or not scans:
+                counted_ns = read_ns
+                self._count(board, seen, adaptive)
             if must_be and (board.board or now - opened > INTRODUCE_S) and board.board != must_be:
                 return True
             if board.state == "running" and self._board != board.board:
@@ -150,7 +154,8 @@ class BoardSource(Source):
     def steer(self, board: BoardLink, adaptive: AdaptiveScan, now_s: float) -> None:
         """Have the board scan what `adaptive` wants."""
         assert self.idling is not None
-        board.switch(self.scanning if adaptive.wants(now_s) == "full" else self.idling)
+        confirmed = "full" if board.confirmed is self.scanning else "sentinel"
+        board.switch(self.scanning if adaptive.wants(now_s, confirmed) == "full" else self.idling)
 
     def _listen(self, adaptive: AdaptiveScan, now_s: float) -> None:
         """Preprocessing's newest verdict, in the thread that the socket belongs to."""
