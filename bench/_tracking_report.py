@@ -19,6 +19,7 @@ COLUMNS = (  # heading, key, format
     ("frames", "frames", "{:.0f}"),
     ("touches", "touches", "{:.0f}"),
     ("valid %", "valid_%", "{:.1f}"),
+    ("rough %", "rough_%", "{:.1f}"),
     ("seen %", "seen_%", "{:.1f}"),
     ("position % side", "position_%", "{:.2f}"),
     ("p95", "position_p95_%", "{:.2f}"),

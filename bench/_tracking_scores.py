@@ -48,6 +48,7 @@ class Tally:
 
     frames: int = 0
     valid: int = 0
+    rough: int = 0  # valid frames that say that the touch changed while it was scanned: not scored further
     wrong: int = 0  # valid frames that say something wrong for more than a moment
     touches: int = 0
     unseen: int = 0  # touches never matched, although frames were valid
@@ -72,6 +73,7 @@ class Tally:
             "frames": self.frames,
             "touches": self.touches,
             "valid_%": _share(self.valid, self.frames),
+            "rough_%": _share(self.rough, self.frames),
             "seen_%": _share(self.scored - self.missed, self.scored),
             "available_%": _share(self.scored - self.missed, self.present),
             "position_%": _quantile(position, 50),
@@ -141,6 +143,9 @@ class Scorer:
         if not seen.valid:
             return
         tally.valid += 1
+        if "changing" in seen.reasons:  # it says itself that it knows only roughly where
+            tally.rough += 1
+            return
         tally.scored += len(loaded)
         pairs = match(truth, seen, self._pairs)
         wrong = [self._pair(k, tally, truth[n], seen.contacts[i], n in steady) for n, i in pairs.items()]

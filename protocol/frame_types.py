@@ -36,6 +36,7 @@ REASONS = {
     "low_snr": "the measurements are too noisy for the stated uncertainty",
     "out_of_distribution": "the measurements look like nothing the model was trained on",
     "coarse": "from the short sentinel scan: that something touches, roughly where",
+    "changing": "the touch came, went or changed while it was scanned: that something touches, but only roughly where",
     "extrapolated": "a force beyond the calibrated range",
     "clock": "the sample time is uncertain: the clock regression has not settled, or the board's clock jumped",
     "uncalibrated_force": "the skin has no force law: forces are nil",

@@ -21,7 +21,7 @@ from services.tracking import Tracker
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
 UNKNOWN_BELOW = 0.6  # probability of the best class below which a shape is "unknown": there half of them are wrong
-SURE = 0.08  # residual above which what appears in an image has to appear in the next one too
+SURE = 0.04  # residual above which the touch changed during the scan; of steady touches one in a hundred has it
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 
@@ -50,7 +50,7 @@ class Publishing(Stage):
 
     def _forget(self) -> None:
         """Nothing is known of what touches."""
-        self._known = False
+        self._known = self._touched = False
         self._contacts: list[Contact] = []  # of the frame made last, strongest first; those that ended come last
         self._segments: list[Segment] = []  # of the contacts that did not end, in their order
         self._classes: list[list[float]] = []
@@ -78,6 +78,9 @@ class Publishing(Stage):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)
+        if frame.touched and not frame.held and (not self._touched or not _explained(frame)):
+            add_reason(out.reasons, "changing")
+        self._touched = frame.touched
         explained = out.quality is not None and out.quality >= EXPLAINED
         if any(self.law.impossible(*each) for each in self._drops()) and not explained:
             out.valid = False
@@ -97,7 +100,7 @@ class Publishing(Stage):
             expected = [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in self.tracker.expected(now)]
             segments = segment(frame.image, frame.sigma, expected)
         seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
-        tracks, ended = self.tracker.update(seen, now, (frame.residual or 0.0) <= SURE)
+        tracks, ended = self.tracker.update(seen, now, _explained(frame))
         present = []
         for track, place, s in zip(tracks, seen, segments, strict=True):
             if track is not None:
@@ -172,6 +175,7 @@ class Publishing(Stage):
         return {
             "tracker": self.tracker.state(),
             "known": self._known,
+            "touched": self._touched,
             "contacts": [asdict(c) for c in self._contacts],
             "segments": [{**asdict(s), "mask": s.mask.astype(np.uint8)} for s in self._segments],
             "classes": self._classes,
@@ -180,7 +184,7 @@ class Publishing(Stage):
 
     def load(self, state: dict[str, Any]) -> None:
         self.tracker.load(state["tracker"])
-        self._known = bool(state["known"])
+        self._known, self._touched = bool(state["known"]), bool(state.get("touched", False))
         self._contacts = [Contact(**c) for c in state["contacts"]]
         self._segments = [Segment(**{**s, "mask": np.array(s["mask"], dtype=bool)}) for s in state["segments"]]
         self._classes = [list(p) for p in state["classes"]]
@@ -195,6 +199,11 @@ def _sound(frame: ImageFrame) -> bool:
     """Whether image and geometry are numbers that can be those of a skin."""
     places = np.abs([frame.metres_per_pixel, *frame.origin])
     return readable(frame.image) and frame.metres_per_pixel > 0 and bool((places < LARGEST_M).all())
+
+
+def _explained(frame: ImageFrame) -> bool:
+    """Whether the image explains what was measured as one that held still does."""
+    return (frame.residual or 0.0) <= SURE
 
 
 def _class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float]:

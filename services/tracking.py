@@ -69,10 +69,14 @@ class Tracker:
         return [t if t.id != UNCONFIRMED else None for t in found], ended + self._lose(coasting, sample_ns)
 
     def _confirm(self, found: list[Track], sure: bool) -> None:
-        """Give ids to what begins: what was seen before, or the largest where nothing else is."""
+        """Give ids to what begins: what was seen before in an image to believe, or the largest of it where no other
+        touch is known; at once, where none was lately.
+        """
         new = [t for t in found if t.id == UNCONFIRMED]
         begin = [t for t in new if t.age > 1]
-        if sure and new and not begin and len(new) == len(found):
+        if not sure:
+            begin = [max(begin, key=lambda t: t.size)] if begin and len(new) == len(found) else []
+        elif new and all(t.id == UNCONFIRMED for t in self.tracks) and not begin and len(new) == len(found):
             begin = [max(new, key=lambda t: t.size)]
         for track in begin:
             track.id, track.age = self._next_id, 1
