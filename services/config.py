@@ -83,7 +83,7 @@ class Skin(Section):
     pose: Pose = Pose()
     calibration: Path | None = None  # JSON of this very skin's force law: see services/calibration.py
     indenter: Indenter | None = None
-    network: Literal["full", "fast", "int8", "none"] = "full"
+    network: Literal["full", "fast", "int8", "none"] = "int8"
     dft_points: Literal[128, 256, 512] = 128
     scan: Literal["full", "adaptive"] = "full"  # adaptive: a short list while nothing touches, see services/adaptive.py
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
