@@ -1,9 +1,9 @@
 """Which list the board scans, and which of its scans go on: the whole pattern, or the sentinel's while nothing touches.
 
 A state machine without I/O, told the time. *full*: the whole pattern, over and over. *idle*: the sentinel list, and a
-full scan every FULL_EVERY_S, at once on a suspicion. The judge of "nothing touches" is preprocessing, whose delta frames are
-heard: the board idles after QUIET_FRAMES full scans in a row that were valid, untouched and without an electrode in
-doubt, and no longer than such verdicts come. Where they stop, every scan is a full one.
+full scan every FULL_EVERY_S, at once on a suspicion. The judge of "nothing touches" is preprocessing, whose delta
+frames are heard: the board idles after QUIET_FRAMES full scans in a row that were valid, untouched and without an
+electrode in doubt, and no longer than such verdicts come. Where they stop, every scan is a full one.
 """
 
 from __future__ import annotations
