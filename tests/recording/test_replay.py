@@ -61,8 +61,9 @@ def test_two_replays_give_identical_contacts(runtime: Path, recording: Path, tmp
     assert [msgpack.packb(f) for f in second] == [msgpack.packb(f) for f in first[: len(second)]]
     assert [f["seq"] for f in first] == list(range(94))
     assert all(f["source"] == "replay" and "replay" in f["reasons"] for f in first)  # type: ignore[operator]
-    touched = [bool(f["contacts"]) for f in first]
-    assert not any(touched[64:72]) and all(touched[72:88]) and not any(touched[90:])
+    states = [[c["state"] for c in f["contacts"]] for f in first]  # type: ignore[attr-defined]
+    assert states[64:72] == [[]] * 8 and states[72] == ["begin"] and states[73:88] == [["hold"]] * 15
+    assert [s for s in states[88:] if s] == [["end"]], "it ends once, and is not there any more"
     x = [f["contacts"][0]["position"][0] for f in first[72:88]]  # type: ignore[index]
     assert np.corrcoef(x, 0.05 * 0.03 * np.arange(8, 24))[0, 1] > 0.99 and abs(x[0] - 0.012) < 0.004
 
