@@ -13,11 +13,11 @@ from firmware_stub.rig import Rig
 from firmware_stub.timeline import Script, Timeline
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame
-from services.boardlink import BoardLink
-from services.clock import DeviceClock
+from services.board.boardlink import BoardLink
+from services.board.clock import DeviceClock
+from services.board.source import BoardSource
 from services.config import Skin
 from services.pipeline import Pipeline
-from services.source import BoardSource
 
 CHAIN_S = 0.002  # from a frame read to what preprocessing says of it, and to its contacts
 STEP_S = 2e-4  # of the host's loop

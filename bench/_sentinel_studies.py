@@ -17,9 +17,9 @@ from models.limits import positions
 from models.prereconstruction import Drift
 from models.shapes import Shape
 from protocol.frames import DeltaFrame
+from services.contacts.segmentation import segment
 from services.inference import Network
-from services.segmentation import segment
-from services.sentinel import Verdict, Watch
+from services.touches.sentinel import Verdict, Watch
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from bench._stability_run import METRES, NOISE_FREE, Row, Runner, Setting, mean_
 from models import metrics
 from models.prereconstruction import Array, Drift, PreReconstructor
 from models.shapes import Shape
-from services.segmentation import segment
+from services.contacts.segmentation import segment
 
 USUAL_DB = 70.0
 PARITY_MM = 0.05  # what ONNX Runtime and PyTorch may differ by in position

@@ -19,9 +19,9 @@ from models.bundle import Bundle
 from models.forward import ForwardModel, shared
 from models.shapes import Array, Shape
 from protocol.frames import Contact, FrameError, RawFrame, pack, unpack
+from services.baseline.tare import Baseline, take
 from services.config import Skin
 from services.pipeline import Pipeline, Result
-from services.tare import Baseline, take
 
 Row = dict[str, Any]
 

@@ -24,17 +24,17 @@ from firmware_stub.timeline import Script
 from firmware_stub.world import NEWTON, World
 from models.bundle import Bundle
 from protocol.frames import RawFrame
-from services.boardlink import BoardLink
-from services.clock import DeviceClock
+from services.board.boardlink import BoardLink
+from services.board.clock import DeviceClock
+from services.board.source import BoardSource
 from services.config import Skin
-from services.source import BoardSource
 
 ROOT = Path(__file__).resolve().parents[1]
 WORK = Path(__file__).with_name("work")
 MADE_BY = (
     *(f"firmware_stub/{n}.py" for n in ("analog", "board", "faults", "field", "rig", "scene", "sheet", "timeline")),
     *(f"models/{n}.py" for n in ("elements", "forward", "geometry", "meshing", "patterns", "shapes")),
-    "services/clock.py",
+    "services/board/clock.py",
 )
 LAYOUT = 1  # of what is kept: raised when Recorded or what fills it changes
 KEPT = 6  # recorded scenes

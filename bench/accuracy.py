@@ -25,7 +25,7 @@ from bench._scores import Row, score_mask, summarise
 from models import metrics
 from models.bundle import Bundle
 from models.shapes import Array
-from services.reconstruction import resampled
+from services.recordings.reconstruction import resampled
 
 LEVELS = ("none", "50", "60", "70", "80", "70f")
 SCORED_AT = 96

@@ -20,8 +20,8 @@ from models.bundle import Bundle
 from models.forward import ForwardModel
 from models.prereconstruction import PreReconstructor
 from models.shapes import Shape, drop_image
-from services.npz_file import Input
-from services.reconstruction import find_skin, reconstruct
+from services.recordings.npz_file import Input
+from services.recordings.reconstruction import find_skin, reconstruct
 
 TOUCHES = (
     [Shape("circle", 0.0, 0.0, 0.2, 0.15)],

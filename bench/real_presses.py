@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle, BundleError
+from services.calibrating.registration import Presses, Similarity, part, read_presses, register
+from services.calibrating.sensitivity import write_corrected
 from services.config import Skin
-from services.npz_file import Input
-from services.reconstruction import reconstruct
-from services.registration import Presses, Similarity, part, read_presses, register
-from services.sensitivity import write_corrected
+from services.recordings.npz_file import Input
+from services.recordings.reconstruction import reconstruct
 
 Array = NDArray[np.float64]
 

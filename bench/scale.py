@@ -35,7 +35,7 @@ from models.bundle import Bundle
 from protocol.frames import pack
 from services.config import Skin
 from services.pipeline import build_stages
-from services.recording import RecordingWriter
+from services.recordings.recording import RecordingWriter
 
 RATE_HZ = 22.0
 TARGET = {"skins": 32, "p99_ms": 20.0}

@@ -135,7 +135,7 @@ def see(
 
 
 def look(image: Array, sigma: Array, noise: float) -> tuple[float, ...] | None:
-    """The numbers of a Seen, for the strongest touch of an image, as services/segmentation.py measures it."""
+    """The numbers of a Seen, for the strongest touch of an image, as services/contacts/segmentation.py measures it."""
     n, smooth = len(image), ndimage.gaussian_filter(image, 1.0)
     top = float(smooth.max())
     if not top > FLOOR:

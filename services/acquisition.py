@@ -13,9 +13,9 @@ import threading
 from collections import deque
 
 from protocol.frames import Frame, RawFrame
+from services.board.source import Source, open_source
 from services.process import main
 from services.runner import Runner
-from services.source import Source, open_source
 from services.stage import Health, Stage
 
 CLOSE_S = 0.2  # how long a stop waits for a source that blocks; its thread dies with the process

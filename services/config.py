@@ -53,14 +53,14 @@ class Tare(Section):
     frames: Annotated[int, Field(ge=8, le=4096)] = 64
     max_age_s: Annotated[float, Field(gt=0)] = 3600.0  # an older persisted baseline is not loaded
     tracking_s: Annotated[float, Field(gt=0)] = 120.0  # time constant of what drift does not explain, while untouched
-    # How fast an untouched skin may change, relative; see services/drift.py. A foam that dries by 6 %, electrodes whose
-    # contacts change by a quarter, within five minutes.
+    # How fast an untouched skin may change, relative; see services/baseline/drift.py. A foam that dries by 6 %,
+    # electrodes whose contacts change by a quarter, within five minutes.
     scale_per_s: Annotated[float, Field(gt=0, le=1e-2)] = 2e-4  # the sheet's conductivity
     contact_per_s: Annotated[float, Field(gt=0, le=1e-1)] = 8e-4  # each electrode's contact impedance
 
 
 class Touch(Section):
-    """The touch decision: see services/touch.py."""
+    """The touch decision: see services/touches/touch.py."""
 
     false_alarms: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
     hold: bool = True  # switch of the rule "nothing changed: do not reconstruct again"
@@ -68,7 +68,7 @@ class Touch(Section):
 
 
 class Indenter(Section):
-    """What presses this skin, where that is always the same: its known area fixes the drop, see services/force.py."""
+    """What presses this skin, where that is always the same: its area fixes the drop (contacts/force.py)."""
 
     radius_m: Annotated[float, Field(gt=0, le=1)]
     shape: Literal["circle"] = "circle"
@@ -81,11 +81,11 @@ class Skin(Section):
     bundle: str  # the name of a folder of models/bundles, else a path
     frame_id: str = ""  # default: the skin's name
     pose: Pose = Pose()
-    calibration: Path | None = None  # JSON of this very skin's force law: see services/calibration.py
+    calibration: Path | None = None  # JSON of this very skin's force law: see services/calibrating/calibration.py
     indenter: Indenter | None = None
     network: Literal["full", "fast", "int8", "none"] = "int8"
     dft_points: Literal[128, 256, 512] = 128
-    scan: Literal["full", "adaptive"] = "full"  # adaptive: a short list while nothing touches, see services/adaptive.py
+    scan: Literal["full", "adaptive"] = "full"  # a short list while nothing touches: board/adaptive.py
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
     tare: Tare = Tare()
     touch: Touch = Touch()

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from models.bundle import Bundle
+from services.baseline.tare import Baseline
 from services.config import Skin
-from services.force import ForceLaw
-from services.tare import Baseline
+from services.contacts.force import ForceLaw
 
 CORNERS = 64  # of the polygon that stands for a disc
 

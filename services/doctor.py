@@ -19,12 +19,12 @@ from protocol.frames import InfoFrame, RawFrame
 from protocol.link import SCHEMA_HASH
 from protocol.runtime import AlreadyRunning, RuntimeDirError, lock, runtime_dir
 from protocol.sockets import AllReader, ControlClient, ControlError, NewestReader
-from services import port as ports
-from services.boardlink import BoardLink, Scanning
+from services.baseline.tare import implausibility
+from services.board import port as ports
+from services.board.boardlink import BoardLink, Scanning
 from services.config import RECORDINGS, Config, ConfigError, Skin, config_path, load
-from services.force import ForceLaw
+from services.contacts.force import ForceLaw
 from services.supervision import PROCESSES
-from services.tare import implausibility
 
 BOARD_S = 2.5  # for a board to say who it is
 FRAME_S = 1.5

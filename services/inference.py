@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame, Frame, ImageFrame
 from services.config import Skin
+from services.faults.quality import Residual
 from services.networks import Network, OneStep, Pictures, network
-from services.quality import Residual
-from services.sentinel import CoarseImage
 from services.stage import Health, Refused, Stage, add_reason, inherited
+from services.touches.sentinel import CoarseImage
 
 
 class Inference(Stage):

@@ -1,8 +1,8 @@
 """Preprocessing: from impedances to the network's input, following the paper's equations, and only where something
 touches.
 
-    d = (|Z| - |Z0|) / |Z0|                     against the untouched baseline (services/untouched.py)
-    touched = d^T C^-1 d > threshold            C: noise, model error, drift (services/touch.py)
+    d = (|Z| - |Z0|) / |Z0|                     against the untouched baseline (services/baseline/untouched.py)
+    touched = d^T C^-1 d > threshold            C: noise, model error, drift (services/touches/touch.py)
     stack = RM d for a ladder of lambda         equation 1, RM = (J^T W J + lambda^2 R)^-1 J^T W, W = C^-1
     I_thresh = MReLU(H(I_pre) * I_pre)          equations 2 to 5, where the bundle has no network that does better
 
@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
+from services.baseline.tare import Baseline
+from services.baseline.untouched import Untouched
 from services.config import Skin
 from services.describe import describe
-from services.electrodes import ElectrodeHealth, Reference, Verdict
-from services.judging import Judge, Judgement, Noise
-from services.plausibility import impossible
-from services.sentinel import Coarse
+from services.faults.electrodes import ElectrodeHealth, Reference, Verdict
+from services.faults.plausibility import impossible
 from services.stage import Health, Refused, Stage, add_reason, inherited
-from services.tare import Baseline
-from services.touch import Hold, TouchDecision
-from services.untouched import Untouched
+from services.touches.judging import Judge, Judgement, Noise
+from services.touches.sentinel import Coarse
+from services.touches.touch import Hold, TouchDecision
 
 Array = NDArray[np.float64]
 

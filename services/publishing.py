@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame
 from services.config import Skin
-from services.force import ForceLaw, Look
-from services.motion import Seen, Track
-from services.outline import outline
-from services.segmentation import Segment, readable, segment
+from services.contacts.force import ForceLaw, Look
+from services.contacts.motion import Seen, Track
+from services.contacts.outline import outline
+from services.contacts.segmentation import Segment, readable, segment
+from services.contacts.tracking import Tracker
 from services.stage import Health, Stage, add_reason, inherited
-from services.tracking import Tracker
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
 UNKNOWN_BELOW = 0.6  # probability of the best class below which a shape is "unknown": there half of them are wrong

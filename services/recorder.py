@@ -25,7 +25,7 @@ from protocol.runtime import host_id
 from protocol.sockets import AllReader, ControlClient, ControlError, ControlServer
 from protocol.topics import TOPICS
 from services.config import ConfigError, config_path, load
-from services.recording import STATE_TOPIC, RecordingError, RecordingWriter
+from services.recordings.recording import STATE_TOPIC, RecordingError, RecordingWriter
 from services.stage import STAGES
 
 DEFAULT_TOPICS = ("raw", "contact", "status", "info")

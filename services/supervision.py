@@ -26,8 +26,8 @@ from supervisor.states import ProcessStates
 from supervisor.supervisord import Supervisor
 
 from protocol.runtime import lock, runtime_dir
+from services.board.port import STUB_LINK
 from services.config import ROOT, Config
-from services.port import STUB_LINK
 from services.stage import STAGES
 
 POLL_S = 0.05

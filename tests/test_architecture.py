@@ -16,6 +16,7 @@ ALLOWED = {
     "models": {"protocol", "models"},
     "services": {"protocol", "models", "services"},
     "firmware_stub": {"protocol", "models", "firmware_stub"},
+    "examples": {"protocol", "examples"},
 }
 WIRE_NEEDS = {"numpy", "zmq", "msgpack"}
 RUNTIME_NEEDS = WIRE_NEEDS | {"serial", "onnxruntime", "scipy", "pydantic", "typer", "rich", "supervisor", "mcap"}
@@ -41,7 +42,7 @@ def imports(path: pathlib.Path) -> set[str]:
             base = package[: len(package) - node.level + 1] if node.level else ()
             module = ".".join([*base, *([node.module] if node.module else [])])
             found.add(module)
-            if module in FOLDERS:
+            if module.split(".")[0] in FOLDERS and (ROOT / module.replace(".", "/")).is_dir():
                 found |= {f"{module}.{alias.name}" for alias in node.names}
     return found
 

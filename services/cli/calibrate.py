@@ -11,7 +11,7 @@ import typer
 from services.cli.common import USAGE, JsonOption, SkinOption, emit, fail, skin_name, use_configured_sockets
 
 if TYPE_CHECKING:
-    from services.calibration_fit import Press
+    from services.calibrating.calibration_fit import Press
 
 PLAN = ((0, 0, 1), (0, 0, 3), (0, 0, 5), (1, 1, 2), (-1, 1, 4), (-1, -1, 2), (1, -1, 4))
 """Where to press (halves of the way to the edge), and about how firmly [N]; then again from the first."""
@@ -42,8 +42,8 @@ def force(
     force_n,row (from 0).
     """
     from models.bundle import Bundle
-    from services import calibration, calibration_csv, calibration_presses
-    from services.calibration_fit import CalibrationError, fit
+    from services.calibrating import calibration, calibration_csv, calibration_presses
+    from services.calibrating.calibration_fit import CalibrationError, fit
     from services.config import load
 
     name = skin_name(skin)
@@ -100,8 +100,8 @@ def _prompted(name: str, bundle: Any) -> list[Press]:
     import time
 
     from protocol.sockets import AllReader
-    from services.calibration_fit import CalibrationError, Press
-    from services.calibration_presses import wait_for_press, wait_for_release
+    from services.calibrating.calibration_fit import CalibrationError, Press
+    from services.calibrating.calibration_presses import wait_for_press, wait_for_release
 
     use_configured_sockets()
     quarter = 0.25e3 * bundle.image_size * bundle.metres_per_pixel  # mm, half the way to the edge

@@ -45,11 +45,11 @@ EXPECTED = {
     ("protocol.frames", "FrameError"): FAILED,
     ("protocol.sockets", "ControlError"): FAILED,
     ("services.config", "ConfigError"): USAGE,
-    ("services.recording", "RecordingError"): USAGE,
-    ("services.replay", "ReplayError"): FAILED,
-    ("services.importing", "ImportRefused"): USAGE,
-    ("services.registration", "RegistrationError"): USAGE,
-    ("services.calibration_fit", "CalibrationError"): USAGE,
+    ("services.recordings.recording", "RecordingError"): USAGE,
+    ("services.recordings.replay", "ReplayError"): FAILED,
+    ("services.recordings.importing", "ImportRefused"): USAGE,
+    ("services.calibrating.registration", "RegistrationError"): USAGE,
+    ("services.calibrating.calibration_fit", "CalibrationError"): USAGE,
     ("protocol.transport", "TransportError"): FAILED,
     ("models.bundle", "BundleError"): USAGE,
 }
@@ -132,7 +132,7 @@ def control(process: str, command: str, *, timeout_s: float = 2.0, **args: Any) 
 
 def load_npz(path: Path) -> dict[str, Any]:
     """All arrays of an npz file. CliError where it is none, or holds pickled objects."""
-    from services import npz_file
+    from services.recordings import npz_file
 
     try:
         return npz_file.load_npz(path)

@@ -41,9 +41,9 @@ def reconstruct(
     """
     import numpy as np
 
-    from services.npz_file import InputError, read_input
-    from services.reconstruction import UNKNOWN_AGE_S, find_skin
-    from services.reconstruction import reconstruct as run
+    from services.recordings.npz_file import InputError, read_input
+    from services.recordings.reconstruction import UNKNOWN_AGE_S, find_skin
+    from services.recordings.reconstruction import reconstruct as run
 
     found, bundle = find_skin(skin)
     try:
@@ -89,7 +89,7 @@ def register_frame(
     as_json: JsonOption = False,
 ) -> None:
     """Fit the skin's frame, and its sensitivities, to presses at places that a machine knows; say how well they fit."""
-    from services.register_command import register_presses
+    from services.calibrating.register_command import register_presses
 
     out = out or Path("calibration", Path(skin).name)
     report = register_presses(load_npz(source), skin, presses, out)

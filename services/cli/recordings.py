@@ -77,7 +77,7 @@ def replay(
     """
     if speed <= 0:
         fail(f"found --speed {speed:g}, expected a number above 0 (or --fast)", USAGE)
-    from services.replay_session import replay_file
+    from services.recordings.replay_session import replay_file
 
     report = replay_file(file, None if fast else speed, start, skin, out, private, progress=_bar)
     for warning in report["warnings"]:
@@ -115,7 +115,7 @@ def import_file(
     Either measurements (n, k) with untouched (m, k) or reference (n, k); or presses as published with the hydrogel
     skin: untouched (n, k), touched (n, k) and optionally pattern (k, 4).
     """
-    from services.importing import import_arrays
+    from services.recordings.importing import import_arrays
 
     report = import_arrays(load_npz(source), source, target, skin_name(skin), rate, overwrite)
     if as_json:

@@ -9,8 +9,8 @@ import pytest
 
 from models.bundle import Bundle
 from services.config import Skin
-from services.npz_file import Input, read_input
-from services.reconstruction import noise_of_references, reconstruct, resampled
+from services.recordings.npz_file import Input, read_input
+from services.recordings.reconstruction import noise_of_references, reconstruct, resampled
 
 METRES = 0.05  # per model unit
 

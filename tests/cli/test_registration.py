@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from services.registration import (
+from services.calibrating.registration import (
     RegistrationError,
     Similarity,
     half_width,
@@ -18,7 +18,7 @@ from services.registration import (
     sample,
     sensitivities,
 )
-from services.sensitivity import corrected, locate, response
+from services.calibrating.sensitivity import corrected, locate, response
 
 
 @pytest.fixture(scope="module")

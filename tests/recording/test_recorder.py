@@ -18,7 +18,7 @@ import pytest
 from protocol.frames import ContactFrame, InfoFrame, RawFrame
 from protocol.sockets import ControlServer, Publisher
 from services.recorder import Recorder
-from services.recording import Recorded, RecordingError, RecordingReader
+from services.recordings.recording import Recorded, RecordingError, RecordingReader
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from services.recording import FLUSH_S, Recorded, RecordingError, RecordingReader, RecordingWriter
+from services.recordings.recording import FLUSH_S, Recorded, RecordingError, RecordingReader, RecordingWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -122,7 +122,7 @@ def test_kill_9_loses_at_most_two_tenths_of_a_second(tmp_path: Path) -> None:
     program = textwrap.dedent("""
         import sys, time
         from pathlib import Path
-        from services.recording import RecordingWriter
+        from services.recordings.recording import RecordingWriter
         writer = RecordingWriter(Path(sys.argv[1]))
         for k in range(10**6):
             writer.write("raw/palm", bytes(500), time.time_ns())

@@ -10,10 +10,10 @@ import pytest
 
 from models.bundle import Bundle
 from protocol.frames import RawFrame, pack, unpack
-from services.importing import ImportRefused, import_arrays
-from services.recording import RecordingReader, RecordingWriter
-from services.replay import ReplayError, steps
-from services.replay_session import replay_file
+from services.recordings.importing import ImportRefused, import_arrays
+from services.recordings.recording import RecordingReader, RecordingWriter
+from services.recordings.replay import ReplayError, steps
+from services.recordings.replay_session import replay_file
 
 
 @pytest.fixture(scope="module")

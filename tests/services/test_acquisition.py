@@ -19,13 +19,13 @@ from models.patterns import pattern
 from protocol import link
 from protocol.frames import STATUS_OPEN, RawFrame, pack
 from services.acquisition import SourceFeed
-from services.boardlink import ANSWER_S, DEAD_SCANS, REFUSED_AGAIN_S, SILENT_S, BoardLink, Scanning
-from services.clock import DeviceClock
+from services.board.boardlink import ANSWER_S, DEAD_SCANS, REFUSED_AGAIN_S, SILENT_S, BoardLink, Scanning
+from services.board.clock import DeviceClock
+from services.board.file_source import FileSource, RecordingSource
+from services.board.port import PortError, explain
+from services.board.source import Source, open_source
 from services.config import Skin
-from services.file_source import FileSource, RecordingSource
-from services.port import PortError, explain
-from services.recording import RecordingWriter
-from services.source import Source, open_source
+from services.recordings.recording import RecordingWriter
 from tests.services.fake_board import FakeBoard, PtyBoard
 
 SCANNING = Scanning(pattern("pairs"), 128, 40_000.0)
@@ -451,7 +451,7 @@ def test_a_source_that_blocks_does_not_hold_up_a_stop(skin: Skin, bundle: Bundle
 
 
 def test_port_errors_are_their_own_kind(tmp_path: Path) -> None:
-    from services.port import Port
+    from services.board.port import Port
 
     with pytest.raises(PortError, match="is not there"):
         Port(str(tmp_path / "nothing"))

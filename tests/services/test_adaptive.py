@@ -8,8 +8,8 @@ import pytest
 from bench._sentinel_host import CHAIN_S, Host
 from protocol import link
 from protocol.frames import DeltaFrame
-from services.adaptive import DEAF_S, FULL_EVERY_S, AdaptiveScan
-from services.boardlink import SWITCH_S, BoardLink, Scanning
+from services.board.adaptive import DEAF_S, FULL_EVERY_S, AdaptiveScan
+from services.board.boardlink import SWITCH_S, BoardLink, Scanning
 
 REST_S = 6.6  # from power-up to an idling board
 

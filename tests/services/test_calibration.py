@@ -12,13 +12,13 @@ import pytest
 
 from models.bundle import Bundle
 from protocol.frames import ImageFrame
-from services import calibration, calibration_csv
-from services.calibration_fit import CalibrationError, Press, fit
-from services.calibration_presses import laws, wait_for_press, wait_for_release
+from services.calibrating import calibration, calibration_csv
+from services.calibrating.calibration_fit import CalibrationError, Press, fit
+from services.calibrating.calibration_presses import laws, wait_for_press, wait_for_release
 from services.config import ConfigError, Indenter, Skin
+from services.contacts.force import ForceLaw, Look
+from services.contacts.force_curve import Curve
 from services.describe import describe
-from services.force import ForceLaw, Look
-from services.force_curve import Curve
 
 CONSTANT = 40.0  # N per (S/m)^0.8
 

@@ -11,8 +11,8 @@ import pytest
 
 from models.bundle import Bundle
 from services.config import ROOT, ConfigError, load, parse
-from services.force import ForceLaw
-from services.force_curve import Curve
+from services.contacts.force import ForceLaw
+from services.contacts.force_curve import Curve
 
 PALM: dict[str, Any] = {"port": "stub", "bundle": "square16"}
 

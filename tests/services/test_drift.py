@@ -12,12 +12,12 @@ from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame, RawFrame
+from services.baseline.following import Follower
+from services.baseline.tare import take
 from services.config import Skin
-from services.following import Follower
-from services.judging import Judge, Noise
 from services.preprocessing import Preprocessing
-from services.reconstruction import reconstruct
-from services.tare import take
+from services.recordings.reconstruction import reconstruct
+from services.touches.judging import Judge, Noise
 from tests.services.conftest import FRAME_NS, Board
 
 Array = NDArray[np.float64]
@@ -230,7 +230,7 @@ def test_frames_that_only_drifted_are_untouched_offline(
     bundle: Bundle, skin: Skin, solved: Callable[..., Array]
 ) -> None:
     """`skin reconstruct` knows no times: contacts +-30 % and a sheet of 2 % less are drift, with a touch or without."""
-    from services.npz_file import Input
+    from services.recordings.npz_file import Input
 
     rng = np.random.default_rng(4)
     worn = {"background": 0.98, "contact": 1 + 0.2 * rng.standard_normal(16).clip(-1.5, 1.5)}

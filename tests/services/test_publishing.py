@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame, pack, unpack
 from services.config import Skin
-from services.outline import outline
+from services.contacts.outline import outline
+from services.contacts.tracking import LOST_FRAMES
 from services.publishing import Publishing
-from services.tracking import LOST_FRAMES
 
 N, M = 96, 0.1 / 96
 CONTACT = frozenset({"contact"})

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from models.shapes import Shape, drop_image
-from services.segmentation import FLOOR, segment
+from services.contacts.segmentation import FLOOR, segment
 
 N = 96
 NOTHING = np.zeros((0, 0), np.float32)

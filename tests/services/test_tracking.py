@@ -8,9 +8,9 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from services.merging import MERGED_S
-from services.motion import Seen, Track
-from services.tracking import FORGOTTEN_S, LOST_FRAMES, Tracker
+from services.contacts.merging import MERGED_S
+from services.contacts.motion import Seen, Track
+from services.contacts.tracking import FORGOTTEN_S, LOST_FRAMES, Tracker
 
 FRAME_NS = 45_000_000
 RADIUS = 0.009  # m, of the touches in here

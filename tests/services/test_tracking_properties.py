@@ -19,10 +19,10 @@ from models.shapes import KINDS, Shape, drop_image
 from protocol.frames import SHAPES, ContactFrame, ImageFrame, pack, unpack
 from services import persistence
 from services.config import Skin
-from services.motion import Seen
+from services.contacts.motion import Seen
+from services.contacts.segmentation import FLOOR, RELATIVE_FLOOR, segment
+from services.contacts.tracking import Tracker
 from services.publishing import Publishing
-from services.segmentation import FLOOR, RELATIVE_FLOOR, segment
-from services.tracking import Tracker
 
 FRAME_NS = 45_000_000
 N = 48

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.frames import RawFrame
+from services.baseline.creep import Creep
+from services.baseline.following import Follower
+from services.baseline.tare import Baseline, noise_of_steps, plausible_noise, take
 from services.config import Tare
-from services.creep import Creep
-from services.following import Follower
 from services.stage import Refused
-from services.tare import Baseline, noise_of_steps, plausible_noise, take
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from services.calibration_fit import CalibrationError, Press
-from services.force import Look
+from services.calibrating.calibration_fit import CalibrationError, Press
+from services.contacts.force import Look
 
 SHOWN = ("x_m", "y_m", "peak_s_per_m", "integral_s_m", "area_m2")
 COLUMNS = ("force_n", *SHOWN, "noise")

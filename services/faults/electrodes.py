@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.frames import ELECTRODE_STATES, STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA
-from services.contact_drift import ContactDrift
-from services.wiring import Exchanged, StuckBit, Wiring
+from services.faults.contact_drift import ContactDrift
+from services.faults.wiring import Exchanged, StuckBit, Wiring
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]

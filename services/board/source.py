@@ -16,13 +16,13 @@ from models.bundle import Bundle
 from protocol import link
 from protocol.frames import DeltaFrame, RawFrame
 from protocol.sockets import NewestReader
-from services import port as ports
-from services.adaptive import AdaptiveScan
-from services.boardlink import BoardLink, Scanning
-from services.clock import UNSETTLED_NS, DeviceClock
+from services.board import port as ports
+from services.board.adaptive import AdaptiveScan
+from services.board.boardlink import BoardLink, Scanning
+from services.board.clock import UNSETTLED_NS, DeviceClock
 from services.config import Skin
-from services.sentinel import sentinel_of
 from services.stage import Health
+from services.touches.sentinel import sentinel_of
 
 POLL_S = 0.1
 REOPEN_S = 0.2  # between attempts to open a port
@@ -220,7 +220,7 @@ class BoardSource(Source):
 
 def open_source(name: str, skin: Skin, bundle: Bundle) -> Source:
     """The source that a skin's `port` names."""
-    from services.file_source import FileSource, RecordingSource  # here: they are sources themselves
+    from services.board.file_source import FileSource, RecordingSource  # here: they are sources themselves
 
     kind = {".mcap": RecordingSource, ".npz": FileSource}.get(Path(skin.port).suffix, BoardSource)
     return kind(name, skin, bundle)

@@ -17,7 +17,7 @@ import msgpack
 
 from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, unpack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
-from services.recording import STATE_TOPIC, Recorded, RecordingReader, RecordingWriter
+from services.recordings.recording import STATE_TOPIC, Recorded, RecordingReader, RecordingWriter
 from services.stage import STAGES, add_reason
 
 CHAIN_S = 20.0  # for the stages to start and find each other

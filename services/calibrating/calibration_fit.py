@@ -17,9 +17,9 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from services.calibration import Calibration, Of
-from services.force import ForceLaw, Look
-from services.force_curve import TERMS, Curve, columns
+from services.calibrating.calibration import Calibration, Of
+from services.contacts.force import ForceLaw, Look
+from services.contacts.force_curve import TERMS, Curve, columns
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from services.reconstruction import find_skin
-from services.registration import FEWEST, RegistrationError, Similarity, part, read_presses, register
-from services.sensitivity import out_of_fold, write_corrected
+from services.calibrating.registration import FEWEST, RegistrationError, Similarity, part, read_presses, register
+from services.calibrating.sensitivity import out_of_fold, write_corrected
+from services.recordings.reconstruction import find_skin
 
 
 def register_presses(arrays: Mapping[str, NDArray[Any]], skin: str, count: int, out: Path) -> dict[str, Any]:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import FrameError, RawFrame, unpack
-from services.npz_file import InputError, frames_of, load_npz, read_input
-from services.source import POLL_S, SCANS_VALID, Source
+from services.board.source import POLL_S, SCANS_VALID, Source
+from services.recordings.npz_file import InputError, frames_of, load_npz, read_input
 
 FILE_RATE_HZ = 22.0  # at which frames of a file without times are given
 LONGEST_PAUSE_S = 1.0  # between two recorded frames
@@ -21,7 +21,7 @@ class RecordingSource(Source):
     """The raw frames of one skin in a recording, once, at the recorded speed. (`skin replay` is the lossless way.)"""
 
     def frames(self) -> Iterator[RawFrame | None]:
-        from services.recording import RecordingError
+        from services.recordings.recording import RecordingError
 
         try:
             yield from self._recorded(Path(self.skin.port))
@@ -30,8 +30,8 @@ class RecordingSource(Source):
         yield from self._ended(f"the recording {self.skin.port} has ended")
 
     def _recorded(self, path: Path) -> Iterator[RawFrame | None]:
-        from services.recording import RecordingReader
-        from services.replay import mark, skins_in
+        from services.recordings.recording import RecordingReader
+        from services.recordings.replay import mark, skins_in
 
         skins = skins_in(reader := RecordingReader(path))
         theirs = self.name if self.name in skins else next(iter(skins), "")
@@ -59,7 +59,7 @@ class RecordingSource(Source):
 
 
 class FileSource(Source):
-    """The rows of an npz file as frames, once; in the order that services/npz_file.py gives them."""
+    """The rows of an npz file as frames, once; in the order that services/recordings/npz_file.py gives them."""
 
     def frames(self) -> Iterator[RawFrame | None]:
         due = time.monotonic()

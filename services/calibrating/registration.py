@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 from models.bundle import Bundle
-from services.importing import ImportRefused, measurement_order
-from services.reconstruction import noise_of_references
+from services.recordings.importing import ImportRefused, measurement_order
+from services.recordings.reconstruction import noise_of_references
 
 Array = NDArray[np.float64]
 

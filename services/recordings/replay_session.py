@@ -19,8 +19,8 @@ from protocol.frames import ContactFrame
 from protocol.runtime import AlreadyRunning, lock, runtime_dir
 from protocol.sockets import ControlClient, ControlError
 from services.config import ROOT, ConfigError, config_path, load
-from services.recording import RecordingReader, RecordingWriter
-from services.replay import Replayer, ReplayError, skins_in, steps
+from services.recordings.recording import RecordingReader, RecordingWriter
+from services.recordings.replay import Replayer, ReplayError, skins_in, steps
 from services.stage import STAGES
 
 PR_SET_PDEATHSIG = 1

@@ -1,6 +1,6 @@
 """Touches in an image of the conductivity drop: each thresholded at half its own peak.
 
-Where touches merge they are told apart by the valley between their peaks (services/splitting.py says which part of the
+Where touches merge they are told apart by the valley between their peaks (splitting.py says which part of the
 image is whose). What a tracker expects counts as evidence: two touches that are known to be there are kept apart at a
 shallower valley than two that would be new. Every pixel above the floor belongs to exactly one touch, so that the
 integrated drop is the same however a patch is split.
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from services.splitting import FOUR, Image, Labels, Place, cut, peaks_of, territories
+from services.contacts.splitting import FOUR, Image, Labels, Place, cut, peaks_of, territories
 
 FLOOR = 0.02  # S/m: a weaker peak is no touch (0.2 N by the default law)
 RELATIVE_FLOOR = 0.12  # of the strongest peak: weaker ones are side lobes of it

@@ -1,7 +1,7 @@
 """The untouched baseline followed through drift: a Kalman filter of what drifts, and slowly of what does not explain.
 
 State: the sheet's factor and each electrode's contact impedance, relative, as steps of the baseline itself. Their
-variance grows with the time since frames were last taken in (services/drift.py), so that after a touch of ten minutes
+variance grows with the time since frames were last taken in (drift.py), so that after a touch of ten minutes
 the first half second of untouched frames is believed almost wholly, and in between each changes little. What those
 directions do not explain (creep of the foam) follows with one time constant.
 
@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import PreReconstructor
+from services.baseline.creep import SHARE, Creep
+from services.baseline.drift import REST_S
+from services.baseline.holding import Holding, shaped
 from services.config import Tare
-from services.creep import SHARE, Creep
-from services.drift import REST_S
-from services.holding import Holding, shaped
 
 Array = NDArray[np.float64]
 

@@ -24,9 +24,9 @@ from models.bundle import Bundle
 from models.prereconstruction import noise_of_frames
 from models.sentinel import Sentinel
 from protocol.frames import DeltaFrame, RawFrame
-from services.boardlink import Scanning
+from services.board.boardlink import Scanning
 from services.config import Skin
-from services.plausibility import impossible
+from services.faults.plausibility import impossible
 
 Array = NDArray[np.floating]
 

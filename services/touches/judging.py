@@ -1,8 +1,8 @@
 """Touched or not, and by how much drift the frame is to be explained: the operators for it, made ahead of need.
 
-`Judge` compares a difference under the step of the drift allowance (services/drift.py) that explains it best, of those
-that the time since the last untouched frame permits. A touch keeps its step until another one explains it clearly
-better: a held touch must not fade because time goes on.
+`Judge` compares a difference under the step of the drift allowance (services/baseline/drift.py) that explains it best,
+of those that the time since the last untouched frame permits. A touch keeps its step until another one explains it
+clearly better: a held touch must not fade because time goes on.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import Operator, PreReconstructor
+from services.baseline.creep import Creep
+from services.baseline.drift import Allowance, Evidence
 from services.config import Skin
-from services.creep import Creep
-from services.drift import Allowance, Evidence
-from services.touch import TouchDecision
+from services.touches.touch import TouchDecision
 
 Array = NDArray[np.float64]
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.frames import pack
+from services.board.file_source import file_frame
 from services.config import SKIN_NAME
-from services.file_source import file_frame
-from services.npz_file import InputError, frames_of, read_input
-from services.reconstruction import find_skin
-from services.recording import RecordingWriter
+from services.recordings.npz_file import InputError, frames_of, read_input
+from services.recordings.reconstruction import find_skin
+from services.recordings.recording import RecordingWriter
 
 ROWS_PER_CHUNK = 8
 EPOCH_NS = 1_000_000_000_000_000_000

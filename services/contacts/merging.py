@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from services.motion import Seen, Track, size_cost
+from services.contacts.motion import Seen, Track, size_cost
 
 MERGED_S = 5.0  # a touch inside another's patch is waited for so long
 DROWNED_S = 1.0  # one that drowns beside it, or was lifted there

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle, write
 from models.prereconstruction import Matrices, PreReconstructor
-from services.registration import Presses, Similarity, half_width, sample, sensitivities
-from services.segmentation import segment
+from services.calibrating.registration import Presses, Similarity, half_width, sample, sensitivities
+from services.contacts.segmentation import segment
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Contacts over time: a touch keeps its id while it lasts; no id is used twice in a session.
 
-Each touch is where its velocity takes it until it is seen (services/motion.py); what is seen is given to the touches by
-the assignment of least total cost. Touches that grow into one patch, and come out of it, are services/merging.py's.
+Each touch is where its velocity takes it until it is seen (motion.py); what is seen is given to the touches by
+the assignment of least total cost. Touches that grow into one patch, and come out of it, are merging.py's.
 
 The first touch begins at once, if its image is good. What appears beside others, or in an image that does not explain
 what was measured, begins when a second frame shows it too: while a touch comes or goes during a scan, the image of that
@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from services.merging import absorb, follow, give_up, host_of, is_part, others, part
-from services.motion import Seen, Track, cost
+from services.contacts.merging import absorb, follow, give_up, host_of, is_part, others, part
+from services.contacts.motion import Seen, Track, cost
 
 REACH_M = 0.015  # a touch that jumps further between two frames is another touch
 LOST_FRAMES = 2  # frames a touch may be missing in before it ends; bad images do not count

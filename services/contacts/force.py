@@ -4,7 +4,7 @@
 
 The quantity is the touch's peak conductivity drop [S/m] or its integral over the patch [S/m m^2]. The curve is the
 kind's default (0.1 to 0.5 S/m are 1 to 5 N), the bundle's own, or the one that a calibration of this very skin fitted
-(services/calibration.py). Where the configuration knows the indenter, the peak is not read off the image, which
+(calibrating/calibration.py). Where the configuration knows the indenter, the peak is not read off the image, which
 confounds peak and area, but follows from the integral and the known area (models/uncertainty.py). How certain the
 quantity is was found on presses that the bundle's network never saw, and is kept in the bundle.
 """
@@ -21,11 +21,11 @@ from models import uncertainty
 from models.bundle import NETWORKS, Bundle
 from models.uncertainty import Map
 from protocol.frames import ImageFrame
-from services import calibration
-from services.calibration import Of
+from services.calibrating import calibration
+from services.calibrating.calibration import Of
 from services.config import ConfigError, Skin
-from services.force_curve import Curve
-from services.segmentation import Segment
+from services.contacts.force_curve import Curve
+from services.contacts.segmentation import Segment
 
 NEWTONS_PER_SIEMENS = 10.0  # N per S/m: 0.1 to 0.5 S/m are 1 to 5 N
 MOST_N = calibration.MOST_N

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from models.bundle import Bundle, BundleError
 from models.prereconstruction import noise_of_frames
 from protocol.frames import RawFrame
+from services.baseline.tare import Baseline, take
 from services.config import ConfigError, Skin, load
-from services.npz_file import Input
 from services.pipeline import Pipeline, Result
+from services.recordings.npz_file import Input
 from services.stage import Refused
-from services.tare import Baseline, take
 
 Array = NDArray[np.float64]
 

@@ -13,14 +13,14 @@ import numpy as np
 
 from models.bundle import Bundle
 from protocol.frames import Frame, ImageFrame
-from services.calibration import Of
-from services.calibration_fit import CalibrationError
+from services.calibrating.calibration import Of
+from services.calibrating.calibration_fit import CalibrationError
 from services.config import Skin
-from services.force import ForceLaw, Look
-from services.npz_file import InputError, load_npz, read_input
+from services.contacts.force import ForceLaw, Look
+from services.contacts.segmentation import segment
 from services.pipeline import Pipeline
-from services.reconstruction import baseline_of, raw_frame
-from services.segmentation import segment
+from services.recordings.npz_file import InputError, load_npz, read_input
+from services.recordings.reconstruction import baseline_of, raw_frame
 
 STEADY_S = 1.5  # how long a press must have been steady
 STEADY = 0.05  # relative standard deviation of the peak within that time

@@ -1,0 +1,1 @@
+"""From an image to contacts: where each is, which one it is, how hard it presses."""

@@ -1,0 +1,1 @@
+"""Frames kept, played again, and files of measurements."""

@@ -1,0 +1,1 @@
+"""Whether something touches, and whether it changed."""
