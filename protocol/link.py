@@ -83,6 +83,11 @@ class Decoder:
         """How many pieces were dropped."""
         return sum(n for what, n in self.counts.items() if what != "good")
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a message has begun and not ended."""
+        return bool(self._rest) or self._skipping
+
     def feed(self, data: bytes) -> list[Message]:
         """The messages that `data` completes. Never raises, whatever the bytes."""
         *pieces, self._rest = (self._rest + data).split(b"\0")

@@ -20,6 +20,8 @@ HELLO_EVERY_S = 0.2
 ANSWER_S = 0.5  # a command that is not answered in this time is sent again
 SWITCH_S = 0.1  # a running board that does not answer to a START in this time is told again
 TRIES = 3  # then everything starts from HELLO
+EARLY_S = 0.0015  # before a scan's last byte is expected it is waited for byte by byte
+LONGEST_LINE_S = 0.02  # that a scan is expected to take on the line: slower ones are listened to all the time
 SILENT_S = 1.0  # a running board that sends nothing for so long is asked again
 EXPLAIN_AFTER_S = 1.5  # of unanswered HELLOs
 DEAD_SCANS = 10  # in a row with all measurements out of range: the board may have lost its registers
@@ -57,6 +59,10 @@ class BoardLink:
         self._started = scanning  # what the board was last told to scan
         self._wanted = scanning
         self.decoder = link.Decoder()
+        self.began_s: dict[int, float] = {}  # of the scans received last: when the first byte came
+        self._began_s = now_s  # when the first byte of what is not complete came
+        self._line_s = 0.0  # from the first byte of the last scan to its last
+        self._paused = False  # since the last look at the line
         self.ident: link.Ident | None = None
         self.problem = ""  # what stands in the way, for a person; "" when all is well
         self.counts: Counter[str] = Counter()  # scans, missing, repeated, foreign, events, restarts, garbled
@@ -88,8 +94,21 @@ class BoardLink:
     def received(self, data: bytes, now_s: float) -> list[link.Frame]:
         """Scans that `data` completes, in order; everything else is dealt with here."""
         scans = []
-        for message in self.decoder.feed(data):
+        began_s, dropped = self._began_s if self.decoder.waiting else now_s, self.decoder.bad
+        messages = self.decoder.feed(data)
+        if self.decoder.bad > dropped:  # whose first byte that was is not known
+            began_s = now_s
+        if messages or not self.decoder.waiting:
+            self._began_s = now_s
+        else:
+            self._began_s = began_s
+        self._paused = self._paused and bool(messages)
+        self.began_s = {}
+        for n, message in enumerate(messages):
             if isinstance(message, link.Frame):
+                self.began_s[message.seq] = began_s if n == 0 else now_s
+                # Complete at the first look after a pause: the pause was too long.
+                self._line_s = self._line_s / 2 if self._paused else now_s - self.began_s[message.seq]
                 if self._is_ours(message):
                     self._heard_s = now_s
                     scans.append(message)
@@ -103,6 +122,14 @@ class BoardLink:
             elif isinstance(message, link.Event):
                 self._happened(message, now_s)
         return scans
+
+    def pause_s(self, now_s: float) -> float:
+        """How long the next byte is not worth waking up for: the rest of a scan comes as slowly as that of the last."""
+        if self.state != "running" or not self.decoder.waiting:
+            return 0.0
+        pause_s = min(self._line_s, LONGEST_LINE_S) - EARLY_S - (now_s - self._began_s)
+        self._paused = pause_s > 0
+        return max(0.0, pause_s)
 
     def to_send(self, now_s: float) -> bytes:
         """What is due now."""

@@ -128,6 +128,8 @@ class BoardSource(Source):
             due = board.to_send(now)
             if due:
                 port.write(due)
+            if adaptive is None:  # its lists differ in length, and it cannot wait
+                time.sleep(board.pause_s(time.monotonic()))
             data = port.read(wait_s)
             read_ns = time.monotonic_ns()
             scans = board.received(data, read_ns * 1e-9) if data else []
@@ -173,7 +175,9 @@ class BoardSource(Source):
         Only full scans set the clock: one that is shorter on the line arrives sooner.
         """
         if kind == "full":
-            clock.observe(scan.device_us + scan.duration_us, read_ns)
+            # The first byte leaves as the scan ends; the last one as much later as the line is slow.
+            arrived_ns = round(board.began_s.get(scan.seq, read_ns * 1e-9) * 1e9)
+            clock.observe(scan.device_us + scan.duration_us, min(arrived_ns, read_ns))
             self._full_s = scan.duration_us * 1e-6
         reasons = ["gap"] if board.gap else []
         if clock.sigma_ns >= UNSETTLED_NS:

@@ -50,6 +50,33 @@ def test_a_board_is_asked_checked_configured_and_started() -> None:
     assert [s.seq for s in scans] == [0] and len(scans[0].z) == 120
 
 
+def test_a_slow_line_does_not_make_a_scan_younger() -> None:
+    """What counts is when its first byte came; garbage before it says nothing about that."""
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = talk(host, board, 0.0, 0.2)
+    data = board.scan()
+    assert not host.received(data[:400], now) and not host.received(data[400:800], now + 0.004)
+    (scan,) = host.received(data[800:], now + 0.010)
+    assert host.began_s[scan.seq] == now
+    assert not host.received(b"\x07garbage", now + 0.02)
+    (scan,) = host.received(b"\0" + board.scan(), now + 0.045)
+    assert host.began_s[scan.seq] == now + 0.045
+
+
+def test_a_slow_line_is_looked_at_late_but_never_too_late() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = talk(host, board, 0.0, 0.2)
+    assert host.pause_s(now) == 0
+    host.received((data := board.scan())[:100], now)
+    assert host.pause_s(now) == 0  # nothing is known of the line yet
+    host.received(data[100:], now + 0.011)
+    host.received((data := board.scan())[:100], now + 0.045)
+    assert 0.008 < (pause_s := host.pause_s(now + 0.045)) < 0.011
+    assert len(host.received(data[100:], now + 0.045 + pause_s)) == 1  # it had come sooner:
+    host.received(board.scan()[:100], now + 0.090)
+    assert host.pause_s(now + 0.090) < pause_s / 2
+
+
 def test_lost_commands_are_sent_again() -> None:
     host, board = BoardLink(SCANNING, 0.0), FakeBoard()
     host.received(board.receive(host.to_send(0.0)), 0.0)
