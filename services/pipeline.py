@@ -33,14 +33,14 @@ class Pipeline:
     def __init__(
         self, skin: Skin | str, name: str = "skin", bundle: Bundle | None = None, always_reconstruct: bool = False
     ):
-        """skin: a configured one, or the name or path of a bundle. always_reconstruct: an image of untouched frames
-        too.
+        """skin: a configured one, or the name or path of a bundle. always_reconstruct: each frame by itself, an
+        image of untouched ones too.
         """
         if isinstance(skin, str):
             skin = Skin(port="stub", bundle=skin, frame_id=name)
         self.name = name
         self.pre, self.inference, self.publishing = build_stages(name, skin, bundle)
-        self.pre.always_reconstruct = always_reconstruct
+        self.pre.always_reconstruct = self.publishing.each_alone = always_reconstruct
 
     def run(self, raw: RawFrame) -> Result:
         """What the processes would publish for one raw frame; stamps are filled in."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -20,7 +21,7 @@ from services.contacts.tracking import Tracker
 from services.stage import Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
-UNKNOWN_BELOW = 0.6  # probability of the best class below which a shape is "unknown": there half of them are wrong
+UNKNOWN_BELOW = 0.4  # probability of the best class, of five, below which a shape is "unknown"
 SURE = 0.04  # residual above which the touch changed during the scan; of steady touches one in a hundred has it
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
@@ -38,6 +39,7 @@ class Publishing(Stage):
         self.config = skin
         self.law = ForceLaw.of(skin, bundle, name)
         self.tracker = Tracker()
+        self.each_alone = False  # offline: frames that do not follow each other
         self.reset()
 
     def reset(self) -> None:
@@ -78,7 +80,8 @@ class Publishing(Stage):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)
-        if frame.touched and not frame.held and (not self._touched or not _explained(frame)):
+        begins = not self._touched and not self.each_alone
+        if frame.touched and not frame.held and (begins or not _explained(frame)):
             add_reason(out.reasons, "changing")
         self._touched = frame.touched
         explained = out.quality is not None and out.quality >= EXPLAINED
@@ -96,11 +99,18 @@ class Publishing(Stage):
         """Contacts of a new image."""
         m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
         segments: list[Segment] = []
-        if frame.touched and frame.image.size:
+        if frame.touched and frame.image.size and self.each_alone:
+            segments = segment(frame.image, frame.sigma)
+        elif frame.touched and frame.image.size:
             expected = [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in self.tracker.expected(now)]
             segments = segment(frame.image, frame.sigma, expected)
         seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
-        tracks, ended = self.tracker.update(seen, now, _explained(frame))
+        tracks: Sequence[Track | None]
+        ended: list[Track] = []
+        if self.each_alone:
+            tracks = self.tracker.alone(seen, now)
+        else:
+            tracks, ended = self.tracker.update(seen, now, _explained(frame))
         present = []
         for track, place, s in zip(tracks, seen, segments, strict=True):
             if track is not None:

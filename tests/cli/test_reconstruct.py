@@ -176,3 +176,11 @@ def test_resampling_keeps_places() -> None:
     image[5, 17] = 1.0
     y, x = np.unravel_index(resampled(image, 96).argmax(), (96, 96))
     assert abs((y + 0.5) / 4 - 5.5) <= 0.2 and abs((x + 0.5) / 4 - 17.5) <= 0.2
+
+
+def test_rows_stand_alone_so_that_all_their_touches_count(  # type: ignore[no-untyped-def]
+    scenes, out
+) -> None:
+    """No row is the one before the next: nothing waits to be confirmed by it. G0 and G1: two and three touches."""
+    several = [k for k, name in enumerate(scenes["scene"]) if name.startswith("G")]
+    assert [int(out["count"][k]) for k in several] == [2, 3]
