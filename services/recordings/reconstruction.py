@@ -118,6 +118,7 @@ def _reconstruct(
     age_s: float,
 ) -> dict[str, NDArray[Any]]:
     pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
+    pipeline.publishing.each_alone = not sequence
     out = _empty(len(data.measurements))
     baseline = baseline_of(data.untouched, pipeline, warn) if data.untouched is not None else None
     noise = noise_of_references(data.reference) if data.reference is not None else None
