@@ -18,6 +18,7 @@ from services.contacts.merging import absorb, follow, give_up, host_of, is_part,
 from services.contacts.motion import Seen, Track, cost
 
 REACH_M = 0.015  # a touch that jumps further between two frames is another touch
+STAYS_M = 0.006  # what begins is near where it was seen first; what an image of a changing touch shows is not
 LOST_FRAMES = 2  # frames a touch may be missing in before it ends; bad images do not count
 UNSEEN_S = 0.25  # it ends after so long at the latest, however bad the images
 FORGOTTEN_S = 1.0  # after so long without a frame, nobody knows whether a touch is the same
@@ -115,11 +116,14 @@ class Tracker:
 
         costs = []
         for entry in seen:
-            pairs = [cost(track, entry, sample_ns) for track in self.tracks]
-            costs.append([chi2 if distance < REACH_M else NEVER for distance, chi2 in pairs])
-        for row, column in zip(*(v.tolist() for v in linear_sum_assignment(costs)), strict=True):
-            if costs[row][column] < NEVER:
-                owners[row] = self.tracks[column]
+            row = []
+            for track in self.tracks:
+                distance, chi2 = cost(track, entry, sample_ns)
+                row.append(chi2 if distance < (REACH_M if track.id != UNCONFIRMED else STAYS_M) else NEVER)
+            costs.append(row)
+        for k, column in zip(*(v.tolist() for v in linear_sum_assignment(costs)), strict=True):
+            if costs[k][column] < NEVER:
+                owners[k] = self.tracks[column]
         return owners
 
     def _merge(self, owners: list[Track | None], seen: Sequence[Seen], sample_ns: int) -> None:
