@@ -81,7 +81,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=None, help="only the scene's beginning")
     parser.add_argument("--snr", type=float, default=80.0, help="the stub's signal over noise, dB")
     parser.add_argument("--bundle", default="square16")
-    parser.add_argument("--network", default="full", choices=("full", "fast", "int8", "none"))
+    parser.add_argument("--network", default="int8", choices=("full", "fast", "int8", "none"))
     parser.add_argument("--seed", type=int, default=4, help="of the noise")
     parser.add_argument("--notes", action="store_true", help="also say what went wrong when")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")

@@ -138,10 +138,11 @@ class Inference(Stage):
         if last is None:
             return
         try:
-            self._last = ImageFrame(skin=self.skin, image=last["image"], sigma=last["sigma"], classes=last["classes"])
+            image, sigma, classes = (np.asarray(last[name], np.float32) for name in ("image", "sigma", "classes"))
+            self._last = ImageFrame(skin=self.skin, image=image, sigma=sigma, classes=classes)
             self._last.noise, self._last_scan = last.get("noise"), int(last["scan"])
             self._last.residual, self._refused = last.get("residual"), bool(last.get("refused", False))
-        except (KeyError, TypeError) as wrong:
+        except (KeyError, TypeError, ValueError) as wrong:
             raise Refused(f"no image in the saved state ({wrong})") from None
 
     def health(self) -> Health:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -53,6 +54,7 @@ class Publishing(Stage):
     def _forget(self) -> None:
         """Nothing is known of what touches."""
         self._known = self._touched = False
+        self._image = 0  # fingerprint of the image that the contacts were seen in
         self._contacts: list[Contact] = []  # of the frame made last, strongest first; those that ended come last
         self._segments: list[Segment] = []  # of the contacts that did not end, in their order
         self._classes: list[list[float]] = []
@@ -66,7 +68,7 @@ class Publishing(Stage):
             add_reason(out.reasons, "uncalibrated_force")
         if not frame.valid and "out_of_distribution" in frame.reasons:
             self._miss(out, "out_of_distribution")
-        elif frame.held and self._known:
+        elif frame.held and self._knows(frame):
             self._keep(frame)
             out.held = True
         elif not frame.image.size and (frame.touched or not frame.valid):
@@ -90,9 +92,9 @@ class Publishing(Stage):
             add_reason(out.reasons, "out_of_distribution")
         frames: list[Frame] = [out]
         if "force" in wanted:
-            frames.append(self._force(frame))
+            frames.append(self._force(out))
         if "shape" in wanted:
-            frames.append(self._shape(frame))
+            frames.append(self._shape(out))
         return frames
 
     def _see(self, frame: ImageFrame) -> None:
@@ -118,9 +120,14 @@ class Publishing(Stage):
                 present.append((self._contact(track, place, s, classes, frame), s, classes))
         present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
         self._segments, self._classes = [s for _, s, _ in present], [classes for _, _, classes in present]
-        self._geometry, self._known = (m, [x0, y0]), True
+        self._geometry, self._known, self._image = (m, [x0, y0]), True, _fingerprint(frame)
         self._contacts = [contact for contact, _, _ in present] + self._ends(ended)
         self._counters["contacts"] += sum(contact.state == "begin" for contact, _, _ in present)
+
+    def _knows(self, frame: ImageFrame) -> bool:
+        """Whether our contacts are those of this held image: frames in between may have passed us by."""
+        recent = not self.tracker.forgotten(frame.stamps.get("sample", 0))
+        return self._known and recent and _fingerprint(frame) == self._image
 
     def _keep(self, frame: ImageFrame) -> None:
         """The same contacts a frame later."""
@@ -164,13 +171,14 @@ class Publishing(Stage):
         force = None if not self.law.exists else 0.0
         return [Contact(id=t.id, state="end", position=[t.x, t.y, 0.0], force_n=force, confidence=0.0) for t in tracks]
 
-    def _force(self, frame: Frame) -> ForceFrame:
+    def _force(self, frame: ContactFrame) -> ForceFrame:
+        """As valid as the contacts are."""
         present = [c for c in self._contacts if c.state != "end"]
         total = None if not self.law.exists else sum(c.force_n or 0.0 for c in present)
         wrench = np.sum([c.wrench for c in present], axis=0).tolist() if present else [0.0] * 6
         return ForceFrame(**inherited(frame), wrench=wrench, force_n=total)
 
-    def _shape(self, frame: Frame) -> ShapeFrame:
+    def _shape(self, frame: ContactFrame) -> ShapeFrame:
         metres, origin = self._geometry
         present = [c for c in self._contacts if c.state != "end"]
         return ShapeFrame(
@@ -186,6 +194,7 @@ class Publishing(Stage):
             "tracker": self.tracker.state(),
             "known": self._known,
             "touched": self._touched,
+            "image": self._image,
             "contacts": [asdict(c) for c in self._contacts],
             "segments": [{**asdict(s), "mask": s.mask.astype(np.uint8)} for s in self._segments],
             "classes": self._classes,
@@ -195,6 +204,7 @@ class Publishing(Stage):
     def load(self, state: dict[str, Any]) -> None:
         self.tracker.load(state["tracker"])
         self._known, self._touched = bool(state["known"]), bool(state.get("touched", False))
+        self._image = int(state.get("image", 0))
         self._contacts = [Contact(**c) for c in state["contacts"]]
         self._segments = [Segment(**{**s, "mask": np.array(s["mask"], dtype=bool)}) for s in state["segments"]]
         self._classes = [list(p) for p in state["classes"]]
@@ -209,6 +219,10 @@ def _sound(frame: ImageFrame) -> bool:
     """Whether image and geometry are numbers that can be those of a skin."""
     places = np.abs([frame.metres_per_pixel, *frame.origin])
     return readable(frame.image) and frame.metres_per_pixel > 0 and bool((places < LARGEST_M).all())
+
+
+def _fingerprint(frame: ImageFrame) -> int:
+    return zlib.crc32(np.ascontiguousarray(frame.image).data)
 
 
 def _explained(frame: ImageFrame) -> bool:

@@ -116,7 +116,7 @@ class Runner:
             try:
                 type(work[0][0].stage).together([(lane.stage, frame) for lane, frame in work])
             except Exception as why:  # each frame is still processed by itself
-                self._failed(work[0][0], why)
+                log.exception("%d frames could not be processed together", len(work), exc_info=why)
         for lane, frame in work:
             self._handle(lane, frame)
 
@@ -154,7 +154,12 @@ class Runner:
             self._settled = True
             _settle()
         else:
-            any(lane.stage.prepare() for lane in self.lanes.values())
+            for lane in self.lanes.values():
+                try:
+                    if lane.stage.prepare():
+                        return
+                except Exception as why:  # what could not be made ahead is made when it is needed, or fails then
+                    log.exception("%s: could not prepare", lane.stage.skin, exc_info=why)
 
     def _send(self, lane: Lane, frame: Frame) -> None:
         try:

@@ -108,7 +108,8 @@ class BoardLink:
             if isinstance(message, link.Frame):
                 self.began_s[message.seq] = began_s if n == 0 else now_s
                 # Complete at the first look after a pause: the pause was too long.
-                self._line_s = self._line_s / 2 if self._paused else now_s - self.began_s[message.seq]
+                took_s = now_s - self.began_s[message.seq]
+                self._line_s = self._line_s / 2 if self._paused else (took_s if took_s < LONGEST_LINE_S else 0.0)
                 if self._is_ours(message):
                     self._heard_s = now_s
                     scans.append(message)
@@ -127,7 +128,7 @@ class BoardLink:
         """How long the next byte is not worth waking up for: the rest of a scan comes as slowly as that of the last."""
         if self.state != "running" or not self.decoder.waiting:
             return 0.0
-        pause_s = min(self._line_s, LONGEST_LINE_S) - EARLY_S - (now_s - self._began_s)
+        pause_s = self._line_s - EARLY_S - (now_s - self._began_s)
         self._paused = pause_s > 0
         return max(0.0, pause_s)
 

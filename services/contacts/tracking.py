@@ -99,9 +99,13 @@ class Tracker:
                 one.seen_ns = sample_ns  # it did not go on
         return ended + self._lose([], sample_ns)
 
+    def forgotten(self, sample_ns: int) -> bool:
+        """Whether nobody looked for so long that no touch can be known to be the same."""
+        return sample_ns - self._looked_ns > FORGOTTEN_S * 1e9
+
     def _begin_frame(self, sample_ns: int) -> list[Track]:
         """Tracks that ended before this frame: by a reset, or since nobody looked."""
-        if sample_ns - self._looked_ns > FORGOTTEN_S * 1e9:
+        if self.forgotten(sample_ns):
             self.reset()
         self._looked_ns = sample_ns
         ended, self._untold = self._untold, []

@@ -225,6 +225,8 @@ class Judge:
         if asked is not None:
             steps = [self._checked(int(step)) for step in asked["steps"]]
             sigma = np.array(asked["sigma"], dtype=float)  # infinite where nothing is measured
+            if sigma.shape != (self.pre.measurements,) or not (sigma > 0).all():
+                raise ValueError(f"found {sigma.shape} standard deviations, expected {self.pre.measurements} above 0")
             self._question = self._row(asked["d"]), sigma, self._row(asked["live"]) > 0, steps
 
     def _row(self, values: Any) -> Array:

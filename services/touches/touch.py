@@ -85,6 +85,8 @@ class Hold:
         self._reference = None if reference is None else np.array(reference, dtype=float)
         self.averaged, self._count, self.scan = int(state["averaged"]), int(state["count"]), int(state["scan"])
         self._recent.extend(np.array(state["recent"], dtype=float))
+        if self.scan < 0 or (self._reference is not None and self.averaged < 1):
+            raise ValueError(f"a hold of {self.averaged} frames since scan {self.scan}: expected 1 or more, from 0 on")
 
 
 def _due(count: int) -> bool:

@@ -145,6 +145,30 @@ def test_held_frames_keep_contacts_and_say_so(stage: Publishing) -> None:
     assert out.held and [(c.id, c.state) for c in out.contacts] == [(1, "hold")]
 
 
+def test_a_held_image_that_was_never_seen_is_looked_at(stage: Publishing) -> None:
+    """The publisher may have slept, or been passed by, while a touch began: no "nothing touches" for as long as it
+    is held.
+    """
+    assert contacts(stage, image_frame(NOTHING, 1)).contacts == []
+    (c,) = contacts(stage, image_frame(discs((0.02, 0.0, 0.01, 0.3)), 9, held=True)).contacts
+    assert c.position[0] == pytest.approx(0.02, abs=1e-3)
+    moved = settled(stage, image_frame(discs((-0.02, 0.0, 0.01, 0.3)), 12, held=True)).contacts
+    assert [c.position[0] for c in moved if c.state != "end"] == [pytest.approx(-0.02, abs=1e-3)]
+
+
+def test_an_id_never_holds_and_ends_in_one_frame(stage: Publishing) -> None:
+    image = discs((0.02, 0.0, 0.01, 0.3))
+    (before,) = contacts(stage, image_frame(image, 1)).contacts
+    after = contacts(stage, image_frame(image, 100, held=True)).contacts  # nobody looked for four seconds
+    assert [c.state for c in after if c.id == before.id] == ["end"] and len({c.id for c in after}) == len(after)
+
+
+def test_force_and_shape_are_no_more_valid_than_the_contacts(stage: Publishing) -> None:
+    for image in (np.full((N, N), np.nan, np.float32), discs((0.0, 0.0, 0.02, 1.2))):
+        out = stage.process(image_frame(image), ALL)
+        assert [frame.valid for frame in out] == [False] * 3 and all(frame.reasons == out[0].reasons for frame in out)
+
+
 def test_velocity_is_that_of_the_slide(stage: Publishing) -> None:
     for scan in range(40):
         (c,) = contacts(stage, image_frame(discs((-0.02 + 0.001 * scan, 0, 0.01, 0.3)), scan)).contacts
