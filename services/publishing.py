@@ -125,9 +125,11 @@ class Publishing(Stage):
         self._counters["contacts"] += sum(contact.state == "begin" for contact, _, _ in present)
 
     def _knows(self, frame: ImageFrame) -> bool:
-        """Whether our contacts are those of this held image: frames in between may have passed us by."""
+        """Whether our contacts are those of this held image: frames in between may have passed us by, and what waits
+        to be seen twice is seen again in it.
+        """
         recent = not self.tracker.forgotten(frame.stamps.get("sample", 0))
-        return self._known and recent and _fingerprint(frame) == self._image
+        return self._known and recent and not self.tracker.waits and _fingerprint(frame) == self._image
 
     def _keep(self, frame: ImageFrame) -> None:
         """The same contacts a frame later."""

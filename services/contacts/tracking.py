@@ -99,6 +99,11 @@ class Tracker:
                 one.seen_ns = sample_ns  # it did not go on
         return ended + self._lose([], sample_ns)
 
+    @property
+    def waits(self) -> bool:
+        """Whether something waits to be confirmed."""
+        return any(track.id == UNCONFIRMED for track in self.tracks)
+
     def forgotten(self, sample_ns: int) -> bool:
         """Whether nobody looked for so long that no touch can be known to be the same."""
         return sample_ns - self._looked_ns > FORGOTTEN_S * 1e9
