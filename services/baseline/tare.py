@@ -131,7 +131,9 @@ def disagreement(frames: Array) -> tuple[float, float]:
     n = len(frames) // QUARTERS * QUARTERS
     quarters = frames[-n:].reshape(QUARTERS, n // QUARTERS, -1)
     mean = frames.mean(axis=0)
-    within = quarters.var(axis=1, ddof=1).mean(axis=0) / (n // QUARTERS) + (HARMLESS * mean) ** 2
+    # Presses that come and go make the quarters scatter within as well; from frame to frame they seldom do.
+    noise = np.minimum(quarters.var(axis=1, ddof=1).mean(axis=0), 0.5 * (np.diff(frames, axis=0) ** 2).mean(axis=0))
+    within = noise / (n // QUARTERS) + (HARMLESS * mean) ** 2
     statistic = float((((quarters.mean(axis=1) - quarters.mean(axis=(0, 1))) ** 2).sum(axis=0) / within).sum())
     dof_within = n - QUARTERS
     f_mean = dof_within / (dof_within - 2)  # the noise within is estimated too

@@ -187,7 +187,8 @@ def test_wrong_options_are_explained(other_folder, options, says):
 def test_it_ends_with_its_parent(other_folder):
     """A shell that is killed outright cannot tell its stub to stop."""
     script = (
-        "import subprocess, sys; p = subprocess.Popen([sys.executable, '-m', 'firmware_stub']); print(p.pid); p.wait()"
+        "import subprocess, sys; p = subprocess.Popen([sys.executable, '-m', 'firmware_stub']); "
+        "print(p.pid, flush=True); p.wait()"
     )
     env = dict(os.environ, EITSKIN_RUNTIME=str(other_folder))
     parent = subprocess.Popen([sys.executable, "-c", script], env=env, stdout=subprocess.PIPE, text=True)

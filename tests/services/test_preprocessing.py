@@ -94,6 +94,14 @@ def test_frames_nearly_without_noise_are_a_tare(board: Board, bundle: Bundle) ->
         assert np.median(baseline.sigma / z) == pytest.approx(max(relative, 2e-6), rel=0.1)
 
 
+def test_presses_that_come_and_go_are_no_baseline(stage: Preprocessing, board: Board) -> None:
+    """Each quarter of the frames holds some of them, so the quarters' own scatter would hide them."""
+    touch = board.disc(0.05, 0.0, 0.2, 0.3)
+    for n in range(200):
+        out = run(stage, board.frame(touch if n % 27 < 18 else 0.0))
+    assert not out.valid and "disagree" in stage.health().messages[0]
+
+
 def test_a_measurement_that_failed_in_the_tare_is_left_out(board: Board, bundle: Bundle) -> None:
     frames = np.asarray(board.m.z0) * (1 + 1e-4 * np.random.default_rng(0).standard_normal((64, 120)))
     frames[5, 3] = np.nan
