@@ -302,6 +302,6 @@ class Touch:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class TruthFrame(Frame):
-    """What really touches at the middle of the scan; only a stub knows."""
+    """What really touches at the middle of the scan; only a stub knows. `publish`: the scan's last byte had left."""
 
     touches: list[Touch] = wire(ListOf(Record(Touch), 256), "the touches", list)
