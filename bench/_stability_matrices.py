@@ -97,7 +97,7 @@ def _inverted(pre: PreReconstructor, relative: float, drift: Drift, d: Array) ->
     values = np.maximum(np.diag(white), 0)
     mean = float(np.trace(m.gram) / len(noise) / noise.mean())
     smallest = float(m.ladder[-1])
-    images = np.asarray(operator.matrix @ d.astype(np.float32), float).reshape(len(m.ladder), -1)
+    images = np.asarray(operator.images(d[None])[0], float)
     errors = []
     for k, rung in enumerate(m.ladder):
         exact = np.asarray(m.back, LONG) @ solved_long(m.gram + rung * mean * covariance, d)

@@ -194,11 +194,11 @@ def lambdas(setting: Setting) -> Iterator[Row]:
 
         def images(scene: Scene, operator: Operator = operator, relative: float = relative) -> Array:
             d = pre.difference(noisy(scene.z, relative, rng), noisy(scene.z0, relative / 8, rng))
-            return np.asarray(operator.matrix @ d.astype(np.float32)).reshape(len(LAMBDAS), *operator.shape)
+            return np.asarray(operator.images(d[None])).reshape(len(LAMBDAS), *operator.shape)
 
         made = [(scene.touch, images(scene)) for scene in scenes for _ in range(draws)]
-        centre = pre.difference(scenes[0].z, scenes[0].z0).astype(np.float32)
-        gain = scenes[0].touch.drop / (operator.matrix @ centre).reshape(len(LAMBDAS), -1).max(axis=1)
+        centre = pre.difference(scenes[0].z, scenes[0].z0)
+        gain = scenes[0].touch.drop / operator.images(centre[None])[0].max(axis=1)
         for k, value in enumerate(LAMBDAS):
             yield {
                 "case": f"lambda {value:.1e}, {_decibel(decibel)}",

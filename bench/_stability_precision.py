@@ -42,8 +42,8 @@ def stages(setting: Setting) -> Iterator[Row]:
             noise = "noise-free" if np.isinf(decibel) else f"{decibel:g} dB"
             yield {"case": f"eigen-decomposition, {noise}, {name}", **_operator(pre, share(decibel), drift, d)}
     operator = pre.condition(np.full(pre.measurements, relative), drift=Drift(5e-5, 2e-4))
-    small = operator.matrix @ d.astype(np.float32)
-    yield {"case": "stack (matrix times d)", **_errors(small, operator.matrix.astype(float) @ d)}
+    exact = (operator.gains * (operator.whiten @ d)) @ operator.back.T.astype(float)
+    yield {"case": "stack", **_errors(operator.images(d[None])[0], exact)}
     image = 0.3 * np.asarray(scenes[1].touch.fraction(96))
     yield {"case": "segmentation", "moved_mm": _apart(image.astype(np.float32), image), "error": 0.0}
 

@@ -61,8 +61,10 @@ class Operator:
 
     shape: tuple[int, int]
     inside: npt.NDArray[np.bool_]
-    matrix: Array  # (C * h * w, K) float32
-    variance: Array  # (C * h * w,) float32: variance of those images from noise alone
+    back: Array  # (h * w, K') float32: images of whitened coefficients
+    gains: Array  # (C, K') what the ladder's images take of each coefficient
+    one_step_gain: Array  # (K',) the same for the one-step image
+    variance: Array  # (C, h * w) float32: variance of the ladder's images from noise alone
     level: Array  # (C,)
     scale_index: int
     noise: float  # rms standard deviation of d from noise and model error, live measurements
@@ -70,7 +72,6 @@ class Operator:
     live: float  # fraction of the measurements that count
     whiten: Array  # (K', K) noise of unit covariance, in the eigenvectors of the whitened Gram matrix
     detection: Array  # (K',) weight of each squared coefficient in the detection statistic
-    step: Array  # (h * w, K) the one-step image's matrix
     jacobian: Array  # (K, P)
     _axis: dict[int, Array] = field(default_factory=dict)
 
@@ -82,9 +83,7 @@ class Operator:
     def stacks(self, d: Array) -> tuple[Array, Array, Array]:
         """The same for a batch (N, K) -> (N, C, h, w), (N, 4), (N,); every image is divided by the frame's scale."""
         n, c, (h, w) = len(d), len(self.level), self.shape
-        d = np.asarray(d, dtype=np.float32)
-        images = (self.matrix @ d[0] if n == 1 else d @ self.matrix.T).reshape(n, c, h * w)
-        spread = self.variance.reshape(c, h * w)
+        images, spread = self.images(d), self.variance
         # The scale is a peak, so it cannot be below what noise alone makes of the strongest pixel.
         floor = 2.0 * float(np.sqrt(spread[self.scale_index].max()))
         scale = np.maximum(images[:, self.scale_index].max(axis=1), max(floor, 1e-9))
@@ -101,6 +100,15 @@ class Operator:
             axis=1,
         )
         return images.reshape(n, c, h, w), context.astype(np.float32), scale.astype(np.float32)
+
+    def images(self, d: Array) -> Array:
+        """(N, K) differences -> (N, C, h * w) the ladder's images [S/m], float32.
+
+        Through the coefficients rather than by one matrix of all images: a ninth of the memory to read.
+        """
+        coefficients = (np.asarray(d, dtype=float) @ self.whiten.T)[:, None] * self.gains
+        flat = coefficients.reshape(-1, coefficients.shape[2]).astype(np.float32)
+        return (flat @ self.back.T).reshape(len(d), len(self.gains), len(self.back))
 
     def score(self, d: Array) -> float:
         """Detection statistic of (K,) d: its whitened energy, each direction weighted by how much a touch could
@@ -126,7 +134,8 @@ class Operator:
 
         threshold is t; None leaves the image as equation 1 gives it, both signs.
         """
-        coarse = (self.step @ d.astype(np.float32)).reshape(self.shape)
+        coefficients = self.one_step_gain * (self.whiten @ d)
+        coarse = (self.back @ coefficients.astype(np.float32)).reshape(self.shape)
         image = self._upsample(n, self.shape[0]) @ coarse @ self._upsample(n, self.shape[1]).T
         if threshold is not None:
             image = np.where(image > max(threshold * image.max(initial=0.0), 0.0), image, 0.0)
@@ -212,20 +221,19 @@ class PreReconstructor:
         values = np.maximum(values, 0.0)
         whiten = np.zeros((int(live.sum()), k))
         whiten[:, live] = vectors.T @ inverse
-        back = m.back[:, live] @ inverse.T @ vectors  # (P, K')
+        # The images are well conditioned: single precision does, and half the time.
+        back = (m.back[:, live] @ inverse.T @ vectors).astype(np.float32)  # (P, K')
         # The ladder is relative to measurement noise of the same size in every channel, so that its images stay the
         # same combinations of d whatever the level; drift and unequal noise change the metric, not the rungs.
         mean = float(np.trace(m.gram[np.ix_(live, live)]) / live.sum() / typical)
-        # What follows is well conditioned: single precision does, and half the time.
-        gains = [*(1.0 / (values + lam * mean) for lam in m.ladder), 1.0 / (values + ONE_STEP_LAMBDA**2 * mean)]
-        images = np.concatenate([(back * gain).astype(np.float32) for gain in gains])
-        matrix = images @ whiten.astype(np.float32)
-        pixels = len(m.ladder) * len(back)
+        gains = 1.0 / (values + m.ladder[:, None] * mean)
         return Operator(
             shape=(m.inside.shape[0], m.inside.shape[1]),
             inside=m.inside,
-            matrix=matrix[:pixels],
-            variance=np.einsum("pk,pk->p", images[:pixels], images[:pixels]),
+            back=back,
+            gains=gains,
+            one_step_gain=1.0 / (values + ONE_STEP_LAMBDA**2 * mean),
+            variance=(gains**2).astype(np.float32) @ (back**2).T,
             level=m.level.astype(np.float32),
             scale_index=m.scale_index,
             noise=float(np.sqrt(typical)),
@@ -233,7 +241,6 @@ class PreReconstructor:
             live=float(live.mean()),
             whiten=whiten,
             detection=values / (values + mean * 1e-3),
-            step=matrix[pixels:],
             jacobian=m.jacobian,
         )
 

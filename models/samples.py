@@ -169,7 +169,6 @@ def levels(samples: Samples, pre: PreReconstructor) -> Array:
     unit size.
     """
     operator = pre.condition(np.full(pre.measurements, 1e-9))
-    c, (h, w) = len(operator.level), operator.shape
-    images = (samples.d @ operator.matrix.T).reshape(len(samples), c, h * w)
+    images = operator.images(samples.d)
     scale = images[:, operator.scale_index].max(axis=1)
     return np.sqrt(((images / scale[:, None, None]) ** 2)[:, :, operator.inside.ravel()].mean(axis=(0, 2)))

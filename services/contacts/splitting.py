@@ -49,7 +49,10 @@ def _distance(place: Place, peak: tuple[int, int]) -> float:
 
 def _maxima(smooth: Image, floor: float) -> list[tuple[int, int]]:
     """Local maxima above the floor, highest first; a flat top counts once."""
-    flat, count = ndimage.label((smooth == ndimage.maximum_filter(smooth, size=5)) & (smooth > floor), EIGHT)
+    top = (smooth == ndimage.maximum_filter(smooth, size=5)) & (smooth > floor)
+    if top.sum() == 1:
+        return [divmod(int(top.argmax()), top.shape[1])]
+    flat, count = ndimage.label(top, EIGHT)
     if count == 0:
         return []
     places = {flat[iy, ix]: (iy, ix) for iy, ix in np.argwhere(flat).tolist()}.values()
