@@ -18,11 +18,9 @@ import msgpack
 import zmq
 
 from protocol.sockets import ControlClient
-from services.stage import STAGES
 
 ROOT = Path(__file__).resolve().parents[1]
 START_S = 60.0
-PROCESSES = ("acquisition", *STAGES)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from protocol.topics import PRODUCERS
 from protocol.transport import Transport
+from services.stage import PROCESSES
 
 ROOT = Path(__file__).resolve().parents[1]
 BUNDLES, MANIFEST = ROOT / "models" / "bundles", "manifest.json"
@@ -135,12 +136,31 @@ class Logging(Section):
     level: Literal["debug", "info", "warning", "error"] = "info"
 
 
+class RealTime(Section):
+    """What each process asks of the kernel: services/realtime.py. What is refused is said in `status`."""
+
+    priority: Annotated[int, Field(ge=0, le=99)] = 0  # of SCHED_FIFO; 0: the ordinary scheduler
+    lock_memory: bool = False  # mlockall: no page of it is ever swapped out
+    cpus: dict[str, list[Annotated[int, Field(ge=0)]]] = {}  # process -> processors it may run on
+
+    @field_validator("cpus")
+    @classmethod
+    def known(cls, cpus: dict[str, list[int]]) -> dict[str, list[int]]:
+        for name, numbers in cpus.items():
+            if name not in PROCESSES:
+                raise ValueError(f"processes {', '.join(PROCESSES)} (found {name!r})")
+            if not numbers:
+                raise ValueError(f"at least one processor, counted from 0 (found none for {name})")
+        return cpus
+
+
 class Config(Section):
     """The whole file. `path` is where it was read from; relative paths in it are relative to its folder."""
 
     skins: Annotated[dict[str, Skin], Field(min_length=1)]
     sockets: Sockets = Sockets()
     security: Security = Security()
+    realtime: RealTime = RealTime()
     logging: Logging = Logging()
     path: Annotated[Path, Field(exclude=True)] = Path("skin.toml")
 

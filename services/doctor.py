@@ -24,7 +24,7 @@ from services.board import port as ports
 from services.board.boardlink import BoardLink, Scanning
 from services.config import RECORDINGS, Config, ConfigError, Skin, config_path, load
 from services.contacts.force import ForceLaw
-from services.supervision import PROCESSES
+from services.stage import PROCESSES
 
 BOARD_S = 2.5  # for a board to say who it is
 FRAME_S = 1.5

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from models.bundle import Bundle, BundleError
 from protocol.runtime import RuntimeDirError
 from protocol.transport import TransportError
+from services import realtime
 from services.config import ConfigError, Skin, load
 from services.runner import Runner
 from services.stage import Stage
@@ -23,7 +24,8 @@ def main(process: str, setup: Callable[[Runner], None]) -> int:
     try:
         config = load()
         logging.getLogger().setLevel(config.logging.level.upper())
-        runner = Runner(process, config)
+        refused = realtime.apply(config.realtime, process)
+        runner = Runner(process, config, refused)
         setup(runner)
     except (ConfigError, BundleError, RuntimeDirError, TransportError) as why:
         print(f"{process}: {why}", file=sys.stderr)

@@ -10,7 +10,7 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import zmq
@@ -38,8 +38,11 @@ log = logging.getLogger(__name__)
 class Runner:
     """A process: its sockets and its lanes. `run` returns when SIGINT or SIGTERM came."""
 
-    def __init__(self, process: str, config: Config) -> None:
-        self.process, self.config = process, config
+    def __init__(self, process: str, config: Config, problems: Sequence[str] = ()) -> None:
+        """problems: what the process as a whole goes without, for its status."""
+        self.process, self.config, self.problems = process, config, list(problems)
+        for problem in problems:
+            log.warning("%s", problem)
         transport.configure(config.transport())
         self.publisher = Publisher(process)
         commands = {"status": self._status, "state": self._state, "load": self._load, "reset": self._reset}
@@ -191,7 +194,8 @@ class Runner:
             beat = lane.heartbeat
             beat.drops["malformed"], beat.drops["skipped"] = lane.feed.malformed, lane.feed.skipped
             silent = "" if lane.asleep else beat.silence(SILENT_S, lane.stage.reads)
-            status = beat.status(lane.stage.health(), silent, now, HEARTBEAT_S, asleep=lane.asleep)
+            health = lane.stage.health().with_problems(self.problems)
+            status = beat.status(health, silent, now, HEARTBEAT_S, asleep=lane.asleep)
             if status is not None:
                 self._send(lane, status)
             info = lane.stage.info()

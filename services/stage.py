@@ -14,6 +14,7 @@ from protocol.frames import Frame
 STAGES = ("preprocessing", "inference", "publisher")
 """The processes whose stages keep state, in the order of the chain. Acquisition, or a replay in its place, feeds them.
 """
+PROCESSES = ("acquisition", *STAGES)
 
 
 class Refused(Exception):
@@ -27,6 +28,13 @@ class Health:
     level: str = "OK"
     messages: list[str] = field(default_factory=list)
     counters: dict[str, int] = field(default_factory=dict)
+
+    def with_problems(self, problems: Sequence[str]) -> Health:
+        """The same, and these."""
+        if not problems:
+            return self
+        level = "WARN" if self.level == "OK" else self.level
+        return Health(level, [*self.messages, *problems], self.counters)
 
 
 class Stage(ABC):

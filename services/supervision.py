@@ -28,15 +28,13 @@ from supervisor.supervisord import Supervisor
 from protocol.runtime import lock, runtime_dir
 from services.board.port import STUB_LINK
 from services.config import ROOT, Config
-from services.stage import STAGES
+from services.stage import PROCESSES
 
 POLL_S = 0.05
 HEALTHY_S = 3  # a process that lived this long starts its next restarts from the shortest delay
 FIRST_RETRY_S, LONGEST_RETRY_S = 0.1, 5.0
 STOP_S = 1  # from SIGTERM to SIGKILL
 PR_SET_PDEATHSIG = 1
-
-PROCESSES = ("acquisition", *STAGES)
 
 
 @dataclass(frozen=True)
