@@ -23,9 +23,11 @@ def name() -> str:
 
 
 class PyEIT:
-    """Three of pyEIT's methods on the square skin: "jac", "greit", "bp". `value`: its `lamb`."""
+    """Three of pyEIT's methods on the square skin: "jac", "greit", "bp". `value`: its `lamb`. pairs: our pattern, in
+    which every pair of electrodes measures itself, instead of its own.
+    """
 
-    def __init__(self, method: str, value: float | None = None, n: int = 48) -> None:
+    def __init__(self, method: str, value: float | None = None, n: int = 48, pairs: bool = False) -> None:
         import pyeit.eit.protocol as protocol
         from pyeit.eit.bp import BP
         from pyeit.eit.fem import EITForward
@@ -40,8 +42,14 @@ class PyEIT:
         el_pos = np.linalg.norm(nodes[None] - centres[:, None], axis=2).argmin(1)
         middle = (SIDE_CELLS // 2) * (SIDE_CELLS + 2)
         mesh = PyEITMesh(nodes, _triangles(SIDE_CELLS), 1.0, el_pos, int(middle))
-        plan = protocol.create(16, dist_exc=1, step_meas=1, parser_meas="std")
-        self.rows, self.v0 = _rows(plan), EITForward(mesh, plan).solve_eit()
+        if pairs:
+            both = patterns.pattern("pairs", 16)
+            plan = protocol.PyEITProtocol(both[:, :2], both[:, None, 2:], np.ones(len(both), dtype=bool))
+            self.rows = np.arange(len(both))
+        else:
+            plan = protocol.create(16, dist_exc=1, step_meas=1, parser_meas="std")
+            self.rows = _rows(plan)
+        self.v0 = EITForward(mesh, plan).solve_eit()
         self.method, self.n = method, n
         if method == "jac":
             self.solver = JAC(mesh, plan)
