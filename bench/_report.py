@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from bench._frames import REFERENCE, Frames, Level
+from bench._json import write_json
 from bench._machine import machine
 from bench._scores import Row
 from models.bundle import Bundle
@@ -62,15 +61,6 @@ RMS = {
 def progress(row: Row) -> None:
     """A line on standard error as each row is done."""
     print(f"{row['level']:>5} {row['method']}: IoU {row['mean_iou']:.3f}, {row['ms']:.2f} ms", file=sys.stderr)
-
-
-def strict(value: Any) -> Any:
-    """JSON knows no infinity (touches never told apart) and no NaN: null."""
-    if isinstance(value, dict):
-        return {k: strict(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [strict(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def text(row: Row, key: str, form: str) -> str:
@@ -151,9 +141,7 @@ class Report:
 
     def write(self, folder: Path) -> None:
         """accuracy.json and accuracy.png in `folder`."""
-        folder.mkdir(parents=True, exist_ok=True)
-        content = strict({**self.head, "floors": self.floors, "rows": self.rows})
-        (folder / "accuracy.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+        write_json(folder / "accuracy.json", {**self.head, "floors": self.floors, "rows": self.rows})
         self.draw(folder / "accuracy.png")
 
     def draw(self, path: Path) -> None:

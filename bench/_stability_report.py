@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,8 +11,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from bench._json import write_json
 from bench._machine import machine, versions
-from bench._report import strict, text
+from bench._report import text
 from bench._stability_run import Row, Setting
 
 COLUMNS = (  # heading, key, format
@@ -100,9 +100,7 @@ def head(setting: Setting, seconds: float, cpu_seconds: float) -> dict[str, Any]
 
 def write(folder: Path, top: Mapping[str, Any], found: Found) -> None:
     """stability.json and stability.png in `folder`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    content = strict({**top, "broken": broken(found), "parts": dict(found)})
-    (folder / "stability.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_json(folder / "stability.json", {**top, "broken": broken(found), "parts": dict(found)})
     draw(found, folder / "stability.png")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from bench._report import machine, strict
+from bench._json import write_json
+from bench._machine import machine
 from bench._tracking_scene import Recorded
 from models.bundle import Bundle
 
@@ -109,9 +109,8 @@ def show(head: dict[str, Any], found: dict[str, Any], notes: bool) -> None:
 
 def write(folder: Path, head: dict[str, Any], found: dict[str, Any]) -> None:
     """tracking.json in `folder`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    content = strict({**head, "targets": targets(found), **found, "notes": found["notes"][:KEPT_NOTES]})
-    (folder / "tracking.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    content = {**head, "targets": targets(found), **found, "notes": found["notes"][:KEPT_NOTES]}
+    write_json(folder / "tracking.json", content)
     print(f"wrote {folder / 'tracking.json'}")
 
 

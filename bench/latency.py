@@ -10,7 +10,6 @@ machine. Prints a table, writes latency.json and draws latency.png.
 from __future__ import annotations
 
 import argparse
-import json
 import signal
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from bench._json import write_json
 from bench._machine import machine, versions
 from bench._service import Outside, Service, running
 from protocol.frames import RawFrame, TruthFrame
@@ -205,9 +205,8 @@ def main(argv: list[str] | None = None) -> int:
     samples = run(args.seconds, sorted(args.controllers))
     rows = {name: figures(sample) for name, sample in samples.items()}
     Console(width=150).print(table(rows))
-    args.out.mkdir(parents=True, exist_ok=True)
     report = {"machine": machine(), "versions": versions(), "target_ms": TARGET_MS, "hop_ms": HOP_MS, "rows": rows}
-    (args.out / "latency.json").write_text(json.dumps(report, indent=1) + "\n")
+    write_json(args.out / "latency.json", report)
     draw(samples, args.out / "latency.png")
     print(f"wrote {args.out / 'latency.json'} and latency.png")
     return 0

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import json
 import os
 import tempfile
 import time
@@ -27,8 +26,9 @@ import zmq
 from rich.console import Console
 from rich.table import Table
 
+from bench._json import write_json
 from bench._machine import machine, versions
-from bench._service import PROCESSES, Service, running
+from bench._service import Service, running
 from bench._tracking_scene import Recorded
 from bench.skip import QUIET_S, run_once, scenes
 from models.bundle import Bundle
@@ -36,6 +36,7 @@ from protocol.frames import pack
 from services.config import Skin
 from services.pipeline import build_stages
 from services.recordings.recording import RecordingWriter
+from services.stage import PROCESSES
 
 RATE_HZ = 22.0
 TARGET = {"skins": 32, "p99_ms": 20.0}
@@ -208,9 +209,8 @@ def main(argv: list[str] | None = None) -> int:
         return int(found["growth"] > GROWTH)
     rows = [scaled(n, share, args.seconds) for share in args.touched for n in args.skins]
     Console(width=120).print(table(rows))
-    args.out.mkdir(parents=True, exist_ok=True)
     report = {"machine": machine(), "versions": versions(), "target": TARGET, "rows": rows}
-    (args.out / "scale.json").write_text(json.dumps(report, indent=1) + "\n")
+    write_json(args.out / "scale.json", report)
     draw(rows, args.out / "scale.png")
     print(f"wrote {args.out / 'scale.json'} and scale.png")
     return 0

@@ -23,14 +23,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from bench._json import write_json
 from bench._machine import machine, versions
-from bench._service import PROCESSES, Outside, Service, running
+from bench._service import Outside, Service, running
 from bench._tracking_scene import Recorded, record
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, Frame, RawFrame, pack, unpack
 from services.config import Skin, Touch
 from services.pipeline import build_stages
-from services.stage import Stage
+from services.stage import PROCESSES, Stage
 
 QUIET_S = 5.0  # of each scene, before it begins: the tare
 ROUNDS = 3
@@ -200,9 +201,8 @@ def main(argv: list[str] | None = None) -> int:
     ratios = {scene: processes[scene]["cpu_ms"] / processes["moving"]["cpu_ms"] for scene in TARGETS}
     for scene, ratio in ratios.items():
         print(f"{scene}: {ratio:.2f} of a moving touch's CPU (target at most {TARGETS[scene]})")
-    args.out.mkdir(parents=True, exist_ok=True)
     report = {"machine": machine(), "versions": versions(), "stages": variants, "live": processes, "ratios": ratios}
-    (args.out / "skip.json").write_text(json.dumps(report | {"targets": TARGETS}, indent=1) + "\n")
+    write_json(args.out / "skip.json", report | {"targets": TARGETS})
     print(f"wrote {args.out / 'skip.json'}")
     return 0
 

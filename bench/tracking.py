@@ -81,7 +81,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=None, help="only the scene's beginning")
     parser.add_argument("--snr", type=float, default=80.0, help="the stub's signal over noise, dB")
     parser.add_argument("--bundle", default="square16")
-    parser.add_argument("--network", default="int8", choices=("full", "fast", "int8", "none"))
+    parser.add_argument("--network", choices=("full", "fast", "int8", "none"), help="default: the services'")
     parser.add_argument("--seed", type=int, default=4, help="of the noise")
     parser.add_argument("--notes", action="store_true", help="also say what went wrong when")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
@@ -89,7 +89,9 @@ def main(argv: list[str] | None = None) -> int:
     recorded, simulated_s = record(args.scene, args.snr, args.seed, args.seconds)
     began = time.perf_counter()
     bundle = Bundle.load(args.bundle)
-    seen = follow(recorded, Skin(port="stub", bundle=args.bundle, network=args.network), bundle)
+    seen = follow(
+        recorded, Skin(port="stub", bundle=args.bundle, **({"network": args.network} if args.network else {})), bundle
+    )
     found = score(recorded, seen)
     head = report.head(args, bundle, recorded, simulated_s, time.perf_counter() - began)
     report.show(head, found, args.notes)

@@ -16,7 +16,7 @@ from models.prereconstruction import Array, Drift, Operator, PreReconstructor
 # there, a thousandth of what is, and falls off with the Gram matrix's eigenvalues almost as touches do (their power 0.4
 # in amplitude, against 0.5). Independent errors of that size on each channel would bury the corners of every shape.
 MODEL_ERROR, MODEL_ERROR_POWER = 1.2e-3, 0.4
-SERVICE_DRIFT = Drift(scale=2e-5, contact=1e-4)  # what preprocessing allows for by default
+SERVICE_DRIFT = Drift(scale=2e-5, contact=1e-4)  # a little less than services allow for at rest
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,22 @@ from models import bundle, geometry
 from models.evaluation import Predict, predict
 from models.export import session
 from models.forward import ForwardModel
-from models.prereconstruction import Array, Drift, PreReconstructor
+from models.prereconstruction import TARE_FRAMES, Array, Drift, PreReconstructor
 from models.scenes import Prior, random_shape
 from models.shapes import KINDS, Shape
-from models.uncertainty import ESTIMATES, LEAST_NOISE, Map, Seen, estimate, features, fit, maps
+from models.uncertainty import (
+    ESTIMATES,
+    FLOOR,
+    LEAST_NOISE,
+    PLATEAU,
+    RELATIVE_FLOOR,
+    Map,
+    Seen,
+    estimate,
+    features,
+    fit,
+    maps,
+)
 
 PRIOR = Prior(radius=(0.08, 0.50), drop=(0.10, 0.50), tail=0.0)  # 1 to 5 N
 MESH = "stub"  # no training sees it, and the accuracy benchmark uses another again
@@ -35,9 +47,7 @@ DECIBEL = (57.0, 95.0)
 NOISE_FREE_SHARE = 0.25
 DRIFT = Drift(2e-5, 1e-4), Drift(1e-4, 1e-3)  # from, to: what services allow for soon after an untouched frame
 FALSE_ALARMS = 1e-7  # as services: what is not touched has no force
-TARE_FRAMES = 64
 FOLDS = 5
-FLOOR = 0.02  # S/m: a weaker peak is no touch to services either
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,10 +153,10 @@ def look(image: Array, sigma: Array, noise: float) -> tuple[float, ...] | None:
     pixel = 2.0 / n
     mask = smooth > 0.5 * top
     values = image[mask]
-    peak = float(values[values >= 0.9 * values.max()].mean())
+    peak = float(values[values >= PLATEAU * values.max()].mean())
     iy, ix = np.nonzero(mask)
     x, y = (ix.mean() + 0.5) * pixel - 1, (iy.mean() + 0.5) * pixel - 1
-    integral = float(image[smooth > 0.5 * max(FLOOR, 0.12 * float(image.max()))].sum()) * pixel**2
+    integral = float(image[smooth > 0.5 * max(FLOOR, RELATIVE_FLOOR * float(image.max()))].sum()) * pixel**2
     area = len(values) * pixel**2
     return peak, float(sigma[mask].mean()), integral, area, 1 - max(abs(x), abs(y)), noise
 

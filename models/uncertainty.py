@@ -10,12 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.floating]
+
+# How services measure a touch in an image, and so how it was measured when the maps were fitted.
+FLOOR = 0.02  # S/m: a weaker peak is no touch (0.2 N by the default law)
+RELATIVE_FLOOR = 0.12  # of the strongest peak: weaker ones are side lobes of it
+PLATEAU = 0.9  # fraction of the highest pixel above which pixels belong to the peak
 
 ESTIMATES = ("peak", "integral", "known")
 WITHIN = 0.6827  # of the presses are to be within one sigma
@@ -68,6 +74,12 @@ def features(name: str, seen: Seen, area: Array | float | None = None) -> Array:
     return np.stack([np.atleast_1d(np.asarray(c, dtype=float)) for c in columns], axis=1)
 
 
+@lru_cache
+def _pairs(features: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    rows, columns = np.triu_indices(features)
+    return rows, columns
+
+
 @dataclass(frozen=True)
 class Map:
     """F features, P = 1 + F + F (F + 1) / 2 coefficients of the quadratic in them, standardised."""
@@ -81,8 +93,8 @@ class Map:
     def terms(self, x: Array) -> Array:
         """(N, F) -> (N, P)."""
         z = 2 * (np.clip(x, self.low, self.high) - self.low) / np.maximum(self.high - self.low, 1e-9) - 1
-        rows, columns = np.triu_indices(z.shape[1])
-        return np.column_stack([np.ones(len(z)), z, z[:, rows] * z[:, columns]])
+        rows, columns = _pairs(z.shape[1])
+        return np.concatenate([np.ones((len(z), 1)), z, z[:, rows] * z[:, columns]], axis=1)
 
     def __call__(self, x: Array) -> tuple[Array, Array]:
         """(factor, relative standard uncertainty) of (N, F) features, each (N,)."""

@@ -16,7 +16,7 @@ import zmq.asyncio
 
 from .client import SILENCE_S
 from .frames import ContactFrame
-from .freshness import WAIT_SLICE_S, NewestContacts, NotValid, Stale
+from .freshness import WAIT_SLICE_S, NewestContacts, Stale
 
 
 class AsyncContactSubscriber:
@@ -48,16 +48,10 @@ class AsyncContactSubscriber:
     async def next_frame(self, max_age: float = SILENCE_S, *, valid: bool = False) -> ContactFrame:
         """A frame not given out before. Raises Stale where none has come within `max_age` seconds."""
         deadline = time.monotonic() + max_age
-        while True:
-            if self._newest.take():
-                try:
-                    return self._newest.judge(max_age, valid)
-                except NotValid:
-                    raise
-                except Stale:
-                    pass  # it lay in the socket while nobody asked
+        while (frame := self._newest.fresh(max_age, valid)) is None:
             if not await self._wait(deadline):
                 raise self._newest.stale(max_age)
+        return frame
 
     async def frames(self, max_age: float = SILENCE_S, *, valid: bool = False) -> AsyncIterator[ContactFrame]:
         """`next_frame` for ever. Silence ends it with Stale; begin a new one to go on."""

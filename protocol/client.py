@@ -74,16 +74,10 @@ class ContactSubscriber:
         Raises Stale where none has come within `max_age` seconds.
         """
         deadline = time.monotonic() + max_age
-        while True:
-            if self._newest.take():
-                try:
-                    return self._newest.judge(max_age, valid)
-                except NotValid:
-                    raise
-                except Stale:
-                    pass  # it lay in the socket while nobody asked
+        while (frame := self._newest.fresh(max_age, valid)) is None:
             if not self._wait(deadline):
                 raise self._newest.stale(max_age)
+        return frame
 
     def frames(self, max_age: float = SILENCE_S, *, valid: bool = False) -> Iterator[ContactFrame]:
         """`next_frame` for ever. Silence ends it with Stale, so that a loop that moves a robot never just hangs;

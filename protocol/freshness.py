@@ -85,6 +85,19 @@ class NewestContacts:
             raise NotValid(frame, age)
         return frame
 
+    def fresh(self, max_age: float, valid: bool) -> ContactFrame | None:
+        """A frame that has arrived since the last look, as `judge` gives it; None where there is none, or where it is
+        old because it lay in the socket while nobody asked. With `valid`, NotValid.
+        """
+        if not self.take():
+            return None
+        try:
+            return self.judge(max_age, valid)
+        except NotValid:
+            raise
+        except Stale:
+            return None
+
     def stale(self, max_age: float) -> Stale:
         """The error that says what there is instead of a frame that is new enough."""
         age = self._age()

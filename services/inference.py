@@ -86,8 +86,7 @@ class Inference(Stage):
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
         ahead, self._ahead = self._ahead, None
-        ready = ahead is not None and ahead[0] is frame
-        out.image, out.sigma, out.classes = ahead[1] if ahead and ready else self._network.run(frame)
+        out.image, out.sigma, out.classes = ahead[1] if ahead and ahead[0] is frame else self._network.run(frame)
         out.noise = _rms(frame.sigma)
         out.residual = self._residual(frame.difference, frame.sigma, out.image)
         self._refused = self._refuses and frame.touched and out.residual is not None and self._residual.refused

@@ -12,6 +12,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.fields import Mismatch, decode_array, encode_array
 from protocol.runtime import runtime_dir
@@ -74,3 +75,11 @@ def arrays(value: Any) -> Any:
 
 def _file(process: str, skin: str) -> Path:
     return runtime_dir() / "state" / f"{process}-{skin}.msgpack"
+
+
+def shaped(values: Any, shape: tuple[int, ...], finite: bool = True) -> NDArray[np.float64]:
+    """The array of a saved state, checked. Raises ValueError."""
+    found = np.array(values, dtype=np.float64)
+    if found.shape != shape or (finite and not np.isfinite(found).all()):
+        raise ValueError(f"found an array of shape {found.shape}, expected {shape}, finite")
+    return found

@@ -101,11 +101,9 @@ class Publishing(Stage):
         """Contacts of a new image."""
         m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
         segments: list[Segment] = []
-        if frame.touched and frame.image.size and self.each_alone:
-            segments = segment(frame.image, frame.sigma)
-        elif frame.touched and frame.image.size:
-            expected = [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in self.tracker.expected(now)]
-            segments = segment(frame.image, frame.sigma, expected)
+        if frame.touched and frame.image.size:
+            places = [] if self.each_alone else self.tracker.expected(now)
+            segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
         seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
         tracks: Sequence[Track | None]
         ended: list[Track] = []

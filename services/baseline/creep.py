@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import Operator
+from services.persistence import shaped
 
 Array = NDArray[np.float64]
 
@@ -64,7 +65,5 @@ class Creep:
 
     def load(self, state: dict[str, Any]) -> None:
         """Raises KeyError, TypeError or ValueError where it does not fit."""
-        touch = np.array(state["touch"], dtype=float)
-        if touch.shape != (self._k,) or not np.isfinite(touch).all():
-            raise ValueError(f"found {touch.shape} numbers of a touch, expected {self._k} finite ones")
-        self._touch, self._ends_ns, self._followed = touch, int(state["ends_ns"]), float(state["followed"])
+        self._touch = shaped(state["touch"], (self._k,))
+        self._ends_ns, self._followed = int(state["ends_ns"]), float(state["followed"])

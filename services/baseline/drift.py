@@ -1,8 +1,8 @@
 """What an untouched skin may have done since it was last seen untouched, and how much of that a frame shows.
 
 The sheet dries and warms (a global factor), electrodes age (16 contact impedances). Both go on steadily rather than at
-random, so their standard deviations grow as rate * time, from REST_S of it. The
-allowance moves in steps of a factor of four, so that an operator serves for long.
+random, so their standard deviations grow as rate * time, from REST_S of it. The allowance moves in steps of a factor of
+four, so that an operator serves for long.
 
 An allowance that is too small makes drift look like touches; one that is too wide costs a touch the two thirds of its
 signal that drift could have made. Where time allows several steps, the frame decides: drift may go either way, while

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from models.prereconstruction import PreReconstructor
 from services.baseline.creep import SHARE, Creep
 from services.baseline.drift import REST_S
-from services.baseline.holding import Holding, shaped
+from services.baseline.holding import Holding
 from services.config import Tare
+from services.persistence import shaped
 
 Array = NDArray[np.float64]
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import PreReconstructor
+from services.persistence import shaped
 
 Array = NDArray[np.float64]
 
@@ -121,11 +122,3 @@ class Holding:
         self._reference_ns, self._frames = int(state["reference_ns"]), max(1, int(state["frames"]))
         self._sum, self._count = shaped(state["sum"], (k,)), shaped(state["count"], (k,))
         self._since_ns = int(state["since_ns"])
-
-
-def shaped(values: Any, shape: tuple[int, ...], finite: bool = True) -> Array:
-    """The array, checked. Raises ValueError."""
-    found = np.array(values, dtype=np.float64)
-    if found.shape != shape or (finite and not np.isfinite(found).all()):
-        raise ValueError(f"found an array of shape {found.shape}, expected {shape}, finite")
-    return found

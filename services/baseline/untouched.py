@@ -69,8 +69,8 @@ class Untouched:
         self._references.clear()
         if self.baseline is None and len(self._window) == self.config.frames and self._seen % RETRY_EVERY == 0:
             try:
-                sample_ns = frame.stamps.get("sample", 0)
-                self.set_baseline(take(np.array(self._window), self.pre, frame.board, sample_ns), sample_ns)
+                found = take(np.array(self._window), self.pre, frame.board, self._last_sample_ns)
+                self.set_baseline(found, self._last_sample_ns)
                 return True
             except Refused as why:
                 self.problem = f"no baseline yet: {why}"
@@ -151,12 +151,12 @@ class Untouched:
         self._references.append(amplitude)
         if len(self._references) > 1:  # several in a row: the noise is how they differ
             sigma = noise_of_steps(np.array(self._references))
-            sample_ns = frame.stamps.get("sample", 0)
+            sample_ns = self._last_sample_ns
             self.set_baseline(Baseline(amplitude, sigma, 1, frame.board, sample_ns, taken_by="file"), sample_ns)
         elif self.baseline is not None:
             self.baseline = dataclasses.replace(self.baseline, z0=amplitude)
             self.normaliser = self.pre.normaliser(amplitude)
-            self.follower.begin(frame.stamps.get("sample", 0))
+            self.follower.begin(self._last_sample_ns)
         return self.baseline is not None
 
     # state

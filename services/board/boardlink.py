@@ -98,10 +98,7 @@ class BoardLink:
         messages = self.decoder.feed(data)
         if self.decoder.bad > dropped:  # whose first byte that was is not known
             began_s = now_s
-        if messages or not self.decoder.waiting:
-            self._began_s = now_s
-        else:
-            self._began_s = began_s
+        self._began_s = now_s if messages or not self.decoder.waiting else began_s
         self._paused = self._paused and bool(messages)
         self.began_s = {}
         for n, message in enumerate(messages):

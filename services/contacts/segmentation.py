@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from models.uncertainty import FLOOR, PLATEAU, RELATIVE_FLOOR
 from services.contacts.splitting import FOUR, Image, Labels, Place, cut, peaks_of, territories
 
-FLOOR = 0.02  # S/m: a weaker peak is no touch (0.2 N by the default law)
-RELATIVE_FLOOR = 0.12  # of the strongest peak: weaker ones are side lobes of it
 LARGEST = 1e6  # S/m: beyond it a number is no conductivity
 MARGIN = 4  # pixels round the box that is looked at
 SMALLEST = 3  # pixels of a touch
-PLATEAU = 0.9  # fraction of the highest pixel above which pixels belong to the peak
 SMOOTHING = 1.0  # pixels: standard deviation of the Gaussian under which peaks are looked for
 KERNEL = np.exp(-0.5 * (np.arange(-4, 5) / SMOOTHING) ** 2)
 KERNEL /= KERNEL.sum()

@@ -16,6 +16,7 @@ from models.prereconstruction import Operator, PreReconstructor
 from services.baseline.creep import Creep
 from services.baseline.drift import Allowance, Evidence
 from services.config import Skin
+from services.persistence import shaped
 from services.touches.touch import TouchDecision
 
 Array = NDArray[np.float64]
@@ -216,24 +217,19 @@ class Judge:
     def load(self, state: dict[str, Any]) -> None:
         """Raises KeyError, TypeError or ValueError where it does not fit."""
         self.reset()
+        k = (self.pre.measurements,)
         self.step, self._permitted = (self._checked(int(state[key])) for key in ("step", "permitted"))
         self._look_ns, self._count, self._since_ns = (int(state[k]) for k in ("look_ns", "count", "since_ns"))
         self._again_s = float(state["again_s"])
-        self._live, self._sum = self._row(state["live"]) > 0, self._row(state["sum"])
+        self._live, self._sum = shaped(state["live"], k) > 0, shaped(state["sum"], k)
         self.creep.load(state["creep"])
         asked = state["question"]
         if asked is not None:
             steps = [self._checked(int(step)) for step in asked["steps"]]
-            sigma = np.array(asked["sigma"], dtype=float)  # infinite where nothing is measured
-            if sigma.shape != (self.pre.measurements,) or not (sigma > 0).all():
-                raise ValueError(f"found {sigma.shape} standard deviations, expected {self.pre.measurements} above 0")
-            self._question = self._row(asked["d"]), sigma, self._row(asked["live"]) > 0, steps
-
-    def _row(self, values: Any) -> Array:
-        found = np.array(values, dtype=float)
-        if found.shape != (self.pre.measurements,) or not np.isfinite(found).all():
-            raise ValueError(f"found {found.shape} numbers, expected {self.pre.measurements} finite ones")
-        return found
+            sigma = shaped(asked["sigma"], k, finite=False)  # infinite where nothing is measured
+            if not (sigma > 0).all():
+                raise ValueError(f"a standard deviation of {sigma.min()}, expected all above 0")
+            self._question = shaped(asked["d"], k), sigma, shaped(asked["live"], k) > 0, steps
 
     def _checked(self, step: int) -> int:
         if not 0 <= step <= self.allowance.widest:

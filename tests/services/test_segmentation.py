@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from models.shapes import Shape, drop_image
-from services.contacts.segmentation import FLOOR, segment
+from models.uncertainty import FLOOR
+from services.contacts.segmentation import segment
 
 N = 96
 NOTHING = np.zeros((0, 0), np.float32)

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.shapes import KINDS, Shape, drop_image
+from models.uncertainty import FLOOR, RELATIVE_FLOOR
 from protocol.frames import SHAPES, ContactFrame, ImageFrame, pack, unpack
 from services import persistence
 from services.config import Skin
 from services.contacts.motion import Seen
-from services.contacts.segmentation import FLOOR, RELATIVE_FLOOR, segment
+from services.contacts.segmentation import segment
 from services.contacts.tracking import Tracker
 from services.publishing import Publishing
 
