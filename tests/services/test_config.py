@@ -40,7 +40,10 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         ({"skins": {"Palm one": PALM}}, "found 'Palm one'"),
         ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publsher": "tcp://*:1"}}}, "found 'publsher'"),
         ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publisher": "here"}}}, "tcp://HOST:PORT"),
-        ({"skins": {"palm": PALM}, "loging": {}}, "unknown key; allowed here: skins, sockets, security, realtime, logging"),
+        (
+            {"skins": {"palm": PALM}, "loging": {}},
+            "unknown key; allowed here: skins, sockets, security, realtime, logging",
+        ),
     ],
 )
 def test_errors_name_file_key_found_and_allowed(raw: dict[str, Any], expected: str) -> None:
