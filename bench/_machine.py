@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import platform
+import sys
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 PACKAGES = ("numpy", "scipy", "onnxruntime", "pyzmq", "msgpack")
 
@@ -23,3 +26,9 @@ def machine() -> str:
 def versions() -> dict[str, str]:
     """Of Python and of what the service runs on."""
     return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+
+
+def provenance(benchmark: str, arguments: Sequence[str] | None) -> dict[str, Any]:
+    """How a report was made: command, machine, versions. arguments: as `main` was given them (None: sys.argv's)."""
+    words = ["skin", "bench", benchmark, *(sys.argv[1:] if arguments is None else arguments)]
+    return {"command": " ".join(words), "machine": machine(), "versions": versions()}

@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from bench._goals import Goal
 from bench._json import write_json
 from bench._machine import machine, versions
 from bench._report import text
@@ -98,9 +99,18 @@ def head(setting: Setting, seconds: float, cpu_seconds: float) -> dict[str, Any]
     }
 
 
+def goals(found: Found) -> list[Goal]:
+    return [
+        Goal("cases where the promise broke", len(broken(found)), at_most=0, gate=0),
+        Goal("cases", sum(map(len, found.values()))),
+    ]
+
+
 def write(folder: Path, top: Mapping[str, Any], found: Found) -> None:
     """stability.json and stability.png in `folder`."""
-    write_json(folder / "stability.json", {**top, "broken": broken(found), "parts": dict(found)})
+    targets = [goal.to_dict() for goal in goals(found)]
+    content = {**top, "targets": targets, "broken": broken(found), "parts": dict(found)}
+    write_json(folder / "stability.json", content)
     draw(found, folder / "stability.png")
 
 

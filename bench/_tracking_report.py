@@ -10,8 +10,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from bench._goals import Goal, table
 from bench._json import write_json
-from bench._machine import machine
+from bench._machine import machine, versions
 from bench._tracking_scene import Recorded
 from models.bundle import Bundle
 
@@ -50,22 +51,19 @@ NAMED_WITHIN = 3  # frames
 KEPT_NOTES = 100  # in the report
 
 
-def targets(found: dict[str, Any]) -> list[dict[str, Any]]:
-    """What the scene must reach: figure, value, target, met."""
+def goals(found: dict[str, Any]) -> list[Goal]:
+    """What the scene must reach."""
     row, faults = found["all"], found["faults"]
     per_100 = 100 * row["switches"] / max(row["touches"], 1)
     late = sum(f["named"] is None or f["named"] > NAMED_WITHIN for f in faults)
-    wanted = (
-        ("position error, median, % of the side", row["position_%"], 1.5),
-        ("force error, median, %", row["force_%"], 8.0),
-        ("id switches per 100 touches", per_100, 1.0),
-        ("false touches", row["false_touches"], 0),
-        (f"electrode faults not named within {NAMED_WITHIN} frames, of {len(faults)}", late, 0),
-        ("force of the held touch, fading, %", found["fade_%"], 2.0),
-    )
+    fade = found["fade_%"]
     return [
-        {"figure": name, "value": value, "at_most": most, "met": value is not None and abs(value) <= most}
-        for name, value, most in wanted
+        Goal("position error, median, % of the side", row["position_%"], at_most=1.5),
+        Goal("force error, median, %", row["force_%"], at_most=8.0),
+        Goal("id switches per 100 touches", per_100, at_most=1.0),
+        Goal("false touches", row["false_touches"], at_most=0),
+        Goal(f"electrode faults not named within {NAMED_WITHIN} frames, of {len(faults)}", late, at_most=0),
+        Goal("force of the held touch, change, %", None if fade is None else abs(fade), at_most=2.0),
     ]
 
 
@@ -74,6 +72,7 @@ def head(args: argparse.Namespace, bundle: Bundle, recorded: Recorded, simulated
         "command": f"skin bench tracking --scene {args.scene} --snr {args.snr:g} --seed {args.seed}"
         + (f" --seconds {args.seconds:g}" if args.seconds else ""),
         "machine": machine(),
+        "versions": versions(),
         "bundle": {"name": bundle.name, "hash": bundle.hash, "network": args.network},
         "scene": args.scene,
         "seed": args.seed,
@@ -91,13 +90,7 @@ def show(head: dict[str, Any], found: dict[str, Any], notes: bool) -> None:
     console.print(_table(title, "section", COLUMNS, rows))
     named = [(f"{f['fault']} {_brief(f['args'])} at {f['at_s']:.0f} s", f) for f in found["faults"]]
     console.print(_table("injected faults: frames", "fault", FAULTS, named))
-    goals = Table(title="targets", title_justify="left")
-    for heading in ("figure", "value", "at most", ""):
-        goals.add_column(heading)
-    for t in targets(found):
-        value = "not measured" if t["value"] is None else f"{t['value']:.3g}"
-        goals.add_row(t["figure"], value, f"{t['at_most']:g}", "met" if t["met"] else "[red]missed[/red]")
-    console.print(goals)
+    console.print(table(goals(found)))
     print(
         f"frames that name a healthy electrode: {found['false_alarms']}; sample time off by at most "
         f"{found['sample_time_p95_ms']:.2f} ms in 95 %; simulated in {head['simulated_s']:g} s, scored in "
@@ -109,7 +102,12 @@ def show(head: dict[str, Any], found: dict[str, Any], notes: bool) -> None:
 
 def write(folder: Path, head: dict[str, Any], found: dict[str, Any]) -> None:
     """tracking.json in `folder`."""
-    content = {**head, "targets": targets(found), **found, "notes": found["notes"][:KEPT_NOTES]}
+    content = {
+        **head,
+        "targets": [goal.to_dict() for goal in goals(found)],
+        **found,
+        "notes": found["notes"][:KEPT_NOTES],
+    }
     write_json(folder / "tracking.json", content)
     print(f"wrote {folder / 'tracking.json'}")
 

@@ -30,8 +30,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from bench import _goals
+from bench._goals import Goal
 from bench._json import write_json
-from bench._machine import machine, versions
+from bench._machine import machine, provenance
 from bench._peers import PyEIT, name
 from bench._relay_frames import HOPS, sizes
 from bench._tracking_scene import Recorded
@@ -43,6 +45,7 @@ RELAY = Path(__file__).with_name("_relay.py")
 SYSTEM_PYTHON = "/usr/bin/python3"  # rospy is Debian's
 START_S, STOP_S = 30.0, 5.0
 MOVING_S = 6.0
+SLOWER, CHECKED = 4.0, 6.0  # a short run's gates
 EACH = 200  # times that a frame is solved in a round
 
 
@@ -222,10 +225,24 @@ def relayed(frames: int, rounds: int) -> tuple[dict[str, dict[str, float]], list
     }, missing
 
 
+def goals(solving: dict[str, dict[str, float]], relaying: dict[str, dict[str, float]]) -> list[Goal]:
+    """Ours over theirs, medians."""
+    ours, found = solving["eitskin, pre-reconstruction (nine images)"]["p50_ms"], []
+    for method, row in solving.items():
+        if method.startswith("pyEIT"):
+            figure = f"pre-reconstruction's time, of {method}'s"
+            found.append(Goal(figure, ours / row["p50_ms"], gate=SLOWER if "jac" in method else None))
+    for transport, row in relaying.items():
+        if transport != "eitskin":
+            figure = f"four hops of checked frames, of {transport}'s opaque bytes"
+            found.append(Goal(figure, relaying["eitskin"]["p50_ms"] / row["p50_ms"], gate=CHECKED))
+    return [*found, Goal("our frames lost in the relay", relaying["eitskin"]["lost"], at_most=0, gate=0)]
+
+
 def table(title: str, rows: dict[str, dict[str, float]], reference: str) -> Table:
     made = Table(title=title, title_justify="left")
-    for head in ("", "p50 ms", "p99 ms", "times ours", "lost"):
-        made.add_column(head, justify="right" if head else "left")
+    for heading in ("", "p50 ms", "p99 ms", "times ours", "lost"):
+        made.add_column(heading, justify="right" if heading else "left")
     for label, row in rows.items():
         ratio = f"{row['p50_ms'] / rows[reference]['p50_ms']:.2f}"
         made.add_row(label, f"{row['p50_ms']:.3f}", f"{row['p99_ms']:.3f}", ratio, str(row.get("lost", "")))
@@ -246,8 +263,10 @@ def main(argv: list[str] | None = None) -> int:
     console.print(table(f"four hops between processes, {of} kB, 22 frames/s", relaying, "eitskin"))
     for line in missing:
         print(line)
-    report = {"machine": machine(), "versions": versions(), "solve": solving, "relay": relaying, "left_out": missing}
-    write_json(args.out / "peers.json", report)
+    wanted = goals(solving, relaying)
+    console.print(_goals.table(wanted))
+    report = {**provenance("peers", argv), "targets": [goal.to_dict() for goal in wanted]}
+    write_json(args.out / "peers.json", report | {"solve": solving, "relay": relaying, "left_out": missing})
     print(f"wrote {args.out / 'peers.json'}")
     return 0
 

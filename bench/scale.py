@@ -16,7 +16,6 @@ import gc
 import os
 import tempfile
 import time
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,10 @@ import zmq
 from rich.console import Console
 from rich.table import Table
 
+from bench import _goals
+from bench._goals import Goal
 from bench._json import write_json
-from bench._machine import machine, versions
+from bench._machine import machine, provenance
 from bench._service import Service, running
 from bench._tracking_scene import Recorded
 from bench.skip import QUIET_S, run_once, scenes
@@ -40,7 +41,7 @@ from services.stage import PROCESSES
 
 RATE_HZ = 22.0
 TARGET = {"skins": 32, "p99_ms": 20.0}
-MARGIN_S = 2.0  # of a recording, beyond what is measured
+START_S = 25.0  # of a recording, before it is measured: processes start, the tare
 STATUS_S = 1.5  # for the last status frames to tell what was dropped
 GROWTH = 0.01  # of memory, over a long run
 
@@ -72,16 +73,18 @@ def measure(service: Service, n: int, seconds: float) -> dict[str, Any]:
     """What one controller that takes everything sees of n skins."""
     socket = zmq.Context.instance().socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, 100_000)
-    socket.connect(f"ipc://{service.folder}/publisher.ipc")
-    socket.subscribe(b"contact/")
     for process in PROCESSES:
         socket.connect(f"ipc://{service.folder}/{process}.ipc")
-    socket.subscribe(b"status/")
-    latency, seen = [], Counter[str]()
-    dropped: dict[tuple[str, str], list[int]] = {}
-    cpu = service.cpu_s()
-    began = time.monotonic()
+    for topic in (b"contact/", b"status/"):
+        socket.subscribe(topic)
+    latency: list[float] = []
+    seen: dict[str, list[int]] = {}  # skin -> scans
+    dropped: dict[tuple[str, str], list[int]] = {}  # said by status frames: the last before we count, those after
+    cpu: dict[str, float] = {}
+    began = time.monotonic() + STATUS_S
     while (now := time.monotonic()) < began + seconds + STATUS_S:
+        if now >= began and not cpu:
+            cpu = service.cpu_s()
         if not socket.poll(100):
             continue
         message = socket.recv()
@@ -90,31 +93,37 @@ def measure(service: Service, n: int, seconds: float) -> dict[str, Any]:
         frame = msgpack.unpackb(body)
         if name.startswith(b"status/"):
             key = frame["process"], frame["skin"]
-            drops = sum(count for cause, count in frame["drops"].items())
-            dropped.setdefault(key, []).append(drops)
-        elif now < began + seconds:
-            seen[frame["skin"]] += 1
+            counts = dropped.setdefault(key, [])
+            if now < began:
+                counts.clear()
+            counts.append(sum(frame["drops"].values()))
+        elif began <= now < began + seconds:
+            seen.setdefault(frame["skin"], []).append(frame["scan"])
             latency.append((at - frame["stamps"]["read"]) * 1e-6)
+    took = time.monotonic() - began
     used = {name: seconds_used - cpu[name] for name, seconds_used in service.cpu_s().items()}
     socket.close(0)
-    expected = RATE_HZ * seconds
+    expected = sum(scans[-1] - scans[0] + 1 for scans in seen.values())
+    frames = sum(map(len, seen.values()))
+    reported = sum(counts[-1] - counts[0] for counts in dropped.values())
     return {
         "skins": n,
         "skins_seen": len(seen),
-        "frames": sum(seen.values()),
-        "lost": sum(max(0.0, expected - seen[f"s{k:02d}"]) for k in range(n)) / (n * expected),
-        "reported_dropped": sum(counts[-1] - counts[0] for counts in dropped.values()),
+        "frames": frames,
+        "lost": (expected - frames) / max(expected, 1),
+        "reported_dropped": reported,
+        "unreported": max(0, expected - frames - reported) / max(expected, 1),
         "p50_ms": float(np.percentile(latency or [np.inf], 50)),
         "p99_ms": float(np.percentile(latency or [np.inf], 99)),
-        "cores": sum(used.values()) / (time.monotonic() - began),
-        "cores_by_process": {k: v / (time.monotonic() - began) for k, v in used.items()},
+        "cores": sum(used.values()) / took,
+        "cores_by_process": {k: v / took for k, v in used.items()},
         "memory_mb": {k: v / 1e6 for k, v in service.memory_bytes().items()},
     }
 
 
 def scaled(n: int, touched: float, seconds: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="eitskin-scale") as folder:
-        path = recordings(Path(folder), n, touched, QUIET_S + seconds + STATUS_S + MARGIN_S)
+        path = recordings(Path(folder), n, touched, START_S + seconds + 2 * STATUS_S)
         before = os.environ.get("EITSKIN_CONFIG")
         os.environ["EITSKIN_CONFIG"] = str(path)
         try:
@@ -152,10 +161,29 @@ def _resident_mb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def goals(rows: list[dict[str, Any]]) -> list[Goal]:
+    found = []
+    for row in rows:
+        which = f"{row['skins']} skins, {100 * row['touched']:.0f} % touched"
+        if row["skins"] == TARGET["skins"]:
+            found.append(Goal(f"{which}: p99, ms", row["p99_ms"], at_most=TARGET["p99_ms"]))
+        found.append(Goal(f"{which}: skins not seen", row["skins"] - row["skins_seen"], at_most=0, gate=0))
+        found.append(Goal(f"{which}: share of frames lost", row["lost"]))
+        found.append(Goal(f"{which}: lost without a word, share", row["unreported"], at_most=0.0, gate=0.0))
+    for share in sorted({row["touched"] for row in rows}):
+        mine = sorted((row for row in rows if row["touched"] == share), key=lambda row: row["skins"])
+        if len(mine) > 1:
+            one, many = mine[0], mine[-1]
+            ratio = many["cores"] / many["skins"] / (one["cores"] / one["skins"])
+            which = f"CPU a skin with {many['skins']}, of one's with {one['skins']}, {100 * share:.0f} % touched"
+            found.append(Goal(which, ratio, gate=1.0))
+    return found
+
+
 def table(rows: list[dict[str, Any]]) -> Table:
     made = Table(title=f"skins at {RATE_HZ:g} frames/s from recordings, {machine()}", title_justify="left")
-    for head in ("skins", "touched", "frames", "lost %", "said", "p50 ms", "p99 ms", "cores", "memory MB"):
-        made.add_column(head, justify="right")
+    for heading in ("skins", "touched", "frames", "lost %", "said", "p50 ms", "p99 ms", "cores", "memory MB"):
+        made.add_column(heading, justify="right")
     for row in rows:
         made.add_row(
             str(row["skins"]),
@@ -209,7 +237,9 @@ def main(argv: list[str] | None = None) -> int:
         return int(found["growth"] > GROWTH)
     rows = [scaled(n, share, args.seconds) for share in args.touched for n in args.skins]
     Console(width=120).print(table(rows))
-    report = {"machine": machine(), "versions": versions(), "target": TARGET, "rows": rows}
+    wanted = goals(rows)
+    Console(width=120).print(_goals.table(wanted))
+    report = {**provenance("scale", argv), "targets": [goal.to_dict() for goal in wanted], "rows": rows}
     write_json(args.out / "scale.json", report)
     draw(rows, args.out / "scale.png")
     print(f"wrote {args.out / 'scale.json'} and scale.png")

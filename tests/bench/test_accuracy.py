@@ -106,11 +106,12 @@ def test_missed_targets_are_marked():
     ]
     frames = frames_of([("shapes", [Shape("circle", 0, 0, 0.3, 0.2)])])
     report = _report.Report(rows, {"70": {"position_rms_%": 0.5}}, frames, "stub", 1, Bundle.load("square16"))
-    assert "missed" not in report.reached("mean_iou", "none", ">= 0.94")
-    assert "missed" in report.reached("position_%", "none", "<= 0.3")
-    assert "missed" not in report.reached("position_%", "70", "1.3 x floor")  # 1.2
-    assert "missed" in report.reached("position_%", "70", "1.1 x floor")
-    assert report.reached("shape_%", "70", ">= 85") == "not measured"
+    goals = {goal.figure: goal for goal in report.goals()}
+    assert goals["mean IoU, five shapes, noise-free"].met and not goals["position, % of side, noise-free"].met
+    beside_floor = goals["position, % of side, 70 dB: rms over its floor"]
+    assert beside_floor.value == pytest.approx(1.2) and beside_floor.met
+    unknown = goals["shape class, radius >= 0.25, %, 70 dB"]
+    assert unknown.measured == "not measured" and unknown.met is False
 
 
 def test_reports_are_strict_json(tmp_path):

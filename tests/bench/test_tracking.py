@@ -165,7 +165,7 @@ def test_a_fault_that_nobody_names_misses_the_target():
     for named, met in ((23, False), (22, True)):
         seen = [Seen(True, (), states(open=[5]) if named <= k < 40 else states()) for k in range(N)]
         found = tracking.score(recorded, seen)
-        assert report.targets(found)[4]["met"] == met
+        assert report.goals(found)[4].met == met
 
 
 SCENE = """

@@ -1,0 +1,79 @@
+"""What a benchmark is to reach: figures beside their targets, in every report and on the page of all of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich.table import Table
+
+
+@dataclass(frozen=True)
+class Goal:
+    """One figure. at_most, at_least: its target, None where there is none.
+
+    gate: the same for a short run on a shared machine; only ratios and counts have one, never times. CI fails on it.
+    """
+
+    figure: str
+    value: float | None
+    at_most: float | None = None
+    at_least: float | None = None
+    gate: float | None = None
+
+    @property
+    def met(self) -> bool | None:
+        """None where there is no target."""
+        return self._within(self.at_most, self.at_least)
+
+    @property
+    def passed(self) -> bool:
+        """Whether the gate, if there is one, lets it through."""
+        if self.gate is None:
+            return True
+        low = self.at_least is not None
+        return bool(self._within(None if low else self.gate, self.gate if low else None))
+
+    def _within(self, most: float | None, least: float | None) -> bool | None:
+        if most is None and least is None:
+            return None
+        if self.value is None or not math.isfinite(self.value):
+            return False
+        return (most is None or self.value <= most) and (least is None or self.value >= least)
+
+    @property
+    def wanted(self) -> str:
+        if self.at_most is not None:
+            return f"at most {self.at_most:g}"
+        return "" if self.at_least is None else f"at least {self.at_least:g}"
+
+    @property
+    def measured(self) -> str:
+        return "not measured" if self.value is None else f"{self.value:.3g}"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "figure": self.figure,
+            "value": self.value,
+            "at_most": self.at_most,
+            "at_least": self.at_least,
+            "gate": self.gate,
+            "met": self.met,
+            "passed": self.passed,
+        }
+
+    @classmethod
+    def from_dict(cls, found: dict[str, Any]) -> Goal:
+        return cls(*(found.get(key) for key in ("figure", "value", "at_most", "at_least", "gate")))  # type: ignore[arg-type]
+
+
+def table(goals: Sequence[Goal]) -> Table:
+    made = Table(title="targets", title_justify="left")
+    for heading in ("figure", "measured", "target", ""):
+        made.add_column(heading, justify="right" if heading == "measured" else "left")
+    for goal in goals:
+        word = {True: "met", False: "[red]missed[/red]", None: ""}[goal.met]
+        made.add_row(goal.figure, goal.measured, goal.wanted, word)
+    return made

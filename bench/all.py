@@ -1,0 +1,128 @@
+"""Every benchmark, one page: latency, skip rules, many skins, adaptive scan, peers, tracking, stability, accuracy.
+
+    skin bench all                      the page of README: about an hour on two idle cores
+    skin bench all --quick              the short form of CI; exit status 1 where a ratio is beyond its gate
+    skin bench all --reuse              the page from the reports that are there; runs nothing
+    skin bench all --only latency skip
+
+Each runs in a process of its own, one after another. Prints the page and writes it, as README.md beside the reports:
+figures beside targets, the command, machine and versions of each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bench._goals import Goal
+from models import manifest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A module of this folder that writes NAME.json with `command`, `machine`, `versions` and `targets`."""
+
+    name: str
+    title: str
+    quick: tuple[str, ...]
+    pictures: tuple[str, ...] = ()
+
+
+BENCHMARKS = (
+    Benchmark("latency", "Latency, outside the processes", ("--seconds", "6", "--controllers", "1", "4"), ("latency",)),
+    Benchmark("skip", "Skip rules", ("--seconds", "8", "--live", "5")),
+    Benchmark("scale", "Many skins", ("--skins", "1", "8", "--seconds", "6", "--touched", "0.25"), ("scale",)),
+    Benchmark("sentinel", "Adaptive scan", ("--quick",)),
+    Benchmark("peers", "Peers", ("--frames", "30", "--rounds", "2")),
+    Benchmark("tracking", "Ten minutes of contacts", ("--seconds", "60")),
+    Benchmark("stability", "Numerical stability", ("--quick",), ("stability",)),
+    Benchmark("accuracy", "Accuracy against run time", ("--quick",), ("accuracy",)),
+)
+
+
+def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
+    """Runs it; its tables go to our output. Returns what went wrong, or ""."""
+    command = [sys.executable, "-m", f"bench.{benchmark.name}", *(benchmark.quick if quick else ())]
+    print(f"\n=== {benchmark.title}: {' '.join(command[2:])}", flush=True)
+    status = subprocess.run([*command, "--out", str(folder)], cwd=ROOT).returncode
+    return f"{benchmark.name} ended with exit status {status}" if status else ""
+
+
+def section(benchmark: Benchmark, folder: Path) -> tuple[list[str], list[Goal]]:
+    """(lines of the page, goals). Raises FileNotFoundError where it was not run."""
+    report: dict[str, Any] = json.loads((folder / f"{benchmark.name}.json").read_text(encoding="utf-8"))
+    goals = [Goal.from_dict(found) for found in report["targets"]]
+    versions = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
+    lines = [f"## {benchmark.title}", "", f"`{report['command'].strip()}` on {report['machine']}; {versions}."]
+    if bundle := report.get("bundle"):
+        lines[-1] += f" Bundle {bundle['name']} {bundle['hash'][:12]}."
+    lines += ["", "| | measured | target | |", "|---|---|---|---|"]
+    for goal in goals:
+        word = {True: "met", False: "**missed**", None: ""}[goal.met]
+        lines.append(f"| {goal.figure} | {goal.measured} | {goal.wanted} | {word} |")
+    for note in report.get("left_out", []):
+        lines += ["", note]
+    for picture in benchmark.pictures:
+        if (folder / f"{picture}.png").is_file():
+            lines += ["", f"![{benchmark.title}]({picture}.png)"]
+    return [*lines, ""], goals
+
+
+def page(chosen: Sequence[Benchmark], folder: Path) -> tuple[str, list[Goal]]:
+    """The page in Markdown, and all goals on it."""
+    bodies, every = [], []
+    for benchmark in chosen:
+        try:
+            lines, goals = section(benchmark, folder)
+        except FileNotFoundError:
+            lines, goals = [f"## {benchmark.title}", "", f"Not run: `skin bench {benchmark.name}`.", ""], []
+        bodies += lines
+        every += goals
+    with_target = [goal for goal in every if goal.met is not None]
+    met = sum(bool(goal.met) for goal in with_target)
+    top = [
+        "# Benchmarks",
+        "",
+        f"Made by `skin bench all` at commit {manifest.commit()}: {met} of {len(with_target)} targets met. Each section says "
+        "its own command; times are of two shared cores with the stub's board running beside the service.",
+        "",
+    ]
+    return "\n".join(top + bodies), every
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="skin bench all", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--quick", action="store_true", help="short forms; fails where a ratio is beyond its gate")
+    parser.add_argument("--reuse", action="store_true", help="run nothing: the page from the reports there are")
+    parser.add_argument("--only", nargs="+", metavar="NAME", choices=[b.name for b in BENCHMARKS])
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
+    args = parser.parse_args(argv)
+    chosen = [b for b in BENCHMARKS if args.only is None or b.name in args.only]
+    args.out.mkdir(parents=True, exist_ok=True)
+    began, wrong = time.perf_counter(), []
+    if not args.reuse:
+        wrong = [problem for b in chosen if (problem := run(b, args.out.resolve(), args.quick))]
+    text, goals = page(BENCHMARKS if args.only is None or args.reuse else chosen, args.out)
+    print("\n" + text)
+    if not args.quick and (args.only is None or args.reuse):
+        (args.out / "README.md").write_text(text, encoding="utf-8")
+        print(f"wrote {args.out / 'README.md'}")
+    wrong += [f"{goal.figure}: {goal.measured}, gate {goal.gate:g}" for goal in goals if not goal.passed]
+    for problem in wrong:
+        print(f"FAILED: {problem}", file=sys.stderr)
+    print(f"{(time.perf_counter() - began) / 60:.1f} minutes, {os.cpu_count()} cores")
+    return 1 if wrong and (args.quick or not goals) else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
