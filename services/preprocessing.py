@@ -84,6 +84,8 @@ class Preprocessing(Stage):
         out.electrodes = found.states
         for reason in found.reasons:
             add_reason(out.reasons, reason)
+        if found.order is not None:
+            amplitude = amplitude[found.order]
         amplitude[found.failed] = np.nan
         if self.untouched.offer(amplitude, frame):
             self._begin_anew()

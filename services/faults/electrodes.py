@@ -7,6 +7,7 @@ numbered from 0, as on the board's link (protocol/WIRE.md).
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -45,6 +46,7 @@ MOSTLY = 0.8  # fraction of an electrode's measurements that must have failed fo
 NOTHING_ANSWERS = 0.7  # fraction of all measurements that failed where it is not the electrodes
 TOO_MANY = 2  # electrodes at fault with which contacts can still be given
 WELL_FRAMES = 3  # in a row, after which an electrode counts again
+LOOK_BACK = 3  # frames over which a contact that rises under a touch is told from it
 WELL = 0.005  # relative: how near its baseline a measurement of a well electrode is, and within 6 sigma more
 FALLS = 0.03  # relative fall that no touch, warmth or noise makes: the wiring is looked at
 FALLS_UNTARED = 0.06  # against the bundle's prediction, contacts unknown
@@ -63,13 +65,16 @@ class Reference:
 
 @dataclass
 class Verdict:
-    """On one frame. live (K,): counts; failed (K,): no value for a baseline either; states (E,): ELECTRODE_STATES."""
+    """On one frame, its measurements in `order`. live (K,): counts; failed (K,): no value for a baseline either; states
+    (E,): ELECTRODE_STATES.
+    """
 
     live: Mask
     failed: Mask
     states: NDArray[np.uint8]
     reasons: list[str]
     usable: bool  # whether contacts can be given
+    order: NDArray[np.intp] | None  # (K,) of which measurements the values are, where wires are exchanged; else None
     shift: Array  # (K,) of |Z|: what a changed contact does to pairs of other electrodes; not pressing's
 
 
@@ -89,7 +94,7 @@ class ElectrodeHealth:
         self._wiring = Wiring(pattern)
         self._drift = ContactDrift(bundle, self.member)
         k, n = len(pattern), self.electrodes
-        self._all_well = Verdict(np.ones(k, bool), np.zeros(k, bool), np.zeros(n, "u1"), [], True, np.zeros(k))
+        self._all_well = Verdict(np.ones(k, bool), np.zeros(k, bool), np.zeros(n, "u1"), [], True, None, np.zeros(k))
         for array in (v for v in vars(self._all_well).values() if isinstance(v, np.ndarray)):
             array.setflags(write=False)  # it is given out again and again
         self.reset()
@@ -99,6 +104,7 @@ class ElectrodeHealth:
         self._well = np.zeros(self.electrodes, dtype=np.int64)  # frames in a row
         self._shown = self._states
         self._fault = ""  # of the board as a whole
+        self._past: deque[Array] = deque(maxlen=LOOK_BACK)  # |Z| (K,) of the last frames
         self._felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
 
     def tared(self) -> None:
@@ -107,13 +113,16 @@ class ElectrodeHealth:
 
     def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
         """(K,) |Z| and status bits of a frame."""
+        past = self._past[0] if len(self._past) == LOOK_BACK else None
+        self._past.append(amplitude.copy())
         if untouched is not None and self._unchanged(amplitude, status, untouched):
             return self._all_well
         trouble = (status & (STATUS_OPEN | STATUS_RTIA | STATUS_FIFO | STATUS_CLIPPED)) != 0
         failed = ~np.isfinite(amplitude) | (amplitude <= 0) | trouble
         reference = self._reference(amplitude, failed, untouched)
         self._fault = ""
-        seen = self._look(amplitude, status, failed, reference, untouched)
+        self._order: NDArray[np.intp] | None = None
+        seen = self._look(amplitude, status, failed, reference, untouched, past)
         if untouched is not None and self._nothing_wrong(seen, status, failed, untouched):
             self._shown = self._all_well.states
             return self._all_well
@@ -123,8 +132,12 @@ class ElectrodeHealth:
         lost = (self.member & ~known).sum(axis=1) >= MOSTLY * self.member.sum(axis=1)
         states[(states == OK) & lost] = UNKNOWN
         self._shown = states
-        at_fault = self.member[(states != OK) & (states != UNKNOWN)].any(axis=0)
-        wrong = self.member[(states != OK) & (states != UNKNOWN) & (states != DRIFTING)].any(axis=0)
+        # Exchanged wires that this very frame shows can be told apart: what they measure is that of each other.
+        out = (states != OK) & (states != UNKNOWN)
+        if self._order is not None:
+            failed, out = failed[self._order], out & (states != SWAPPED)
+        at_fault = self.member[out].any(axis=0)
+        wrong = self.member[out & (states != DRIFTING)].any(axis=0)
         live = ~failed & ~at_fault & known
         reasons = ["saturated"] if (status & STATUS_CLIPPED).any() else []
         reasons += [reason for state, reason in REASONS.items() if (states == state).any()]
@@ -134,7 +147,8 @@ class ElectrodeHealth:
             reasons.append("degraded")
         if not usable and not reasons:
             reasons.append("out_of_distribution")
-        return Verdict(live, failed | wrong, states, reasons, usable, self._shift(amplitude, failed, untouched))
+        shift = self._shift(amplitude, failed, untouched)
+        return Verdict(live, failed | wrong, states, reasons, usable, self._order, shift)
 
     def _unchanged(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference) -> bool:
         """Whether a frame without a mark differs from the untouched skin by its noise alone, and nothing was at fault:
@@ -175,8 +189,9 @@ class ElectrodeHealth:
         failed: Mask,
         reference: Array | None,
         untouched: Reference | None,
+        past: Array | None,
     ) -> NDArray[np.uint8]:
-        """(E,) what this frame alone shows."""
+        """(E,) what this frame shows; past: |Z| (K,) LOOK_BACK frames ago."""
         states = np.zeros(self.electrodes, dtype=np.uint8)
         no_current = ((status & STATUS_OPEN) != 0) | (failed & (status == 0))
         low = np.zeros_like(failed)
@@ -205,6 +220,9 @@ class ElectrodeHealth:
             live = ~failed & np.isfinite(untouched.sigma) & ~self.member[self._states != OK].any(axis=0)
             d = np.where(live, (amplitude - untouched.z0) / untouched.normaliser, 0.0)
             changed = self._drift(d, untouched.sigma, live)
+            if changed is None and past is not None and np.isfinite(past[live]).all():  # under a touch that stays
+                d = np.where(live, (amplitude - past) / untouched.normaliser, 0.0)
+                changed = self._drift.risen(d, np.sqrt(2.0) * untouched.sigma, live)
             if changed is not None:
                 states[changed] = DRIFTING
         return states
@@ -240,6 +258,8 @@ class ElectrodeHealth:
         fault = self._wiring(np.where(failed & ~low, np.nan, amplitude), reference)
         if isinstance(fault, Exchanged):
             states[fault.electrodes] = SWAPPED
+            if untouched is not None:  # else nothing tells whether that is right
+                self._order = self._wiring.order(fault)
         elif isinstance(fault, StuckBit):
             states[fault.electrodes] = STUCK
             self._fault = (
@@ -317,7 +337,8 @@ class ElectrodeHealth:
 
     def state(self) -> dict[str, Any]:
         felt = [[k, list(values)] for k, values in self._felt.items()]
-        return {"states": self._states.copy(), "well": self._well.copy(), "felt": felt}
+        past = np.array(self._past)
+        return {"states": self._states.copy(), "well": self._well.copy(), "felt": felt, "past": past}
 
     def load(self, state: dict[str, Any]) -> None:
         """Raises ValueError where it is of other electrodes."""
@@ -327,6 +348,10 @@ class ElectrodeHealth:
         self.reset()
         self._states, self._well = states, well
         self._felt = {int(k): np.array(values, dtype=float) for k, values in state.get("felt", [])}
+        past = np.array(state.get("past", []), dtype=float)
+        if past.size and past.shape[1:] != (self.member.shape[1],):
+            raise ValueError(f"the saved frames are of shape {past.shape}, expected (n, {self.member.shape[1]})")
+        self._past.extend(past if past.size else [])
 
 
 def _listed(numbers: Iterable[int]) -> str:

@@ -88,6 +88,10 @@ class Wiring:
             return self._stuck[best]
         return None
 
+    def order(self, fault: Exchanged) -> NDArray[np.intp]:
+        """(K,) which measurement of a frame holds the value that each would have with the wires put right."""
+        return np.asarray(self._orders[self._swaps.index(fault)])
+
     def _predicted(self, reference: Array) -> Array:
         """(B, K) |Z| of the untouched skin through each stuck multiplexer."""
         n = self.electrodes
