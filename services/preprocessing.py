@@ -23,7 +23,8 @@ from services.baseline.tare import Baseline
 from services.baseline.untouched import Untouched
 from services.config import Skin
 from services.describe import describe
-from services.faults.electrodes import ElectrodeHealth, Reference, Verdict
+from services.faults.contact_drift import Reference
+from services.faults.electrodes import ElectrodeHealth, Verdict
 from services.faults.plausibility import impossible
 from services.stage import Health, Refused, Stage, add_reason, inherited
 from services.touches.judging import Judge, Judgement, Noise

@@ -15,12 +15,16 @@ change since a few frames ago is the contact's alone. A fall is named at once: n
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
+from services.persistence import shaped
 
 Array = NDArray[np.floating]
 
@@ -28,11 +32,23 @@ MODEL_ERROR = 1.5e-3  # of |d|: what a contact's change may be off the formula
 TELLING = 1500.0  # |d| over the noise of one measurement from which a touch on an electrode would show
 UNTOUCHED = 0.03  # of |d|, what a changed contact leaves of it where nothing else changed
 LEAST_RISE = 0.5  # of the nominal contact impedance
+LOOK_BACK = 3  # frames over which a contact that rises under a touch is told from it
 STEEPEST = 1.2  # of a: it rises from nothing within a scan, at most
 FALL = 0.004  # relative: a pair that fell by more, and by 6 sigma
 SIGMAS = 6.0
 MOST_OF = 0.6  # share of the electrode's pairs that fell (a touch may have raised the others)
 FEW_OF = 0.05  # share of the other pairs that may have
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What is known of the untouched skin, each (K,): |Z0| (0 where unknown), what differences are divided by, and
+    their standard deviation (infinite where unknown).
+    """
+
+    z0: Array
+    normaliser: Array
+    sigma: Array
 
 
 class ContactDrift:
@@ -104,3 +120,64 @@ class ContactDrift:
         if left > UNTOUCHED**2 * float(d[live] @ d[live]):
             return None
         return np.where(self.members[k], 0.0, b * self._n[k])
+
+
+class ChangedContacts:
+    """Which contacts changed, and what they do to pairs of other electrodes; members (E, K)."""
+
+    def __init__(self, bundle: Bundle, members: NDArray[np.bool_]) -> None:
+        self._drift, self._k = ContactDrift(bundle, members), members.shape[1]
+        self.reset()
+
+    def reset(self) -> None:
+        self.felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
+        self._before: dict[int, Array] = {}  # by contact that rose under a touch: |Z| (K,) from before
+        self._past: deque[Array] = deque(maxlen=LOOK_BACK + 1)  # |Z| (K,), the newest last
+
+    def follow(self, amplitude: Array) -> None:
+        """A frame's |Z| (K,); to be called with each."""
+        self._past.append(amplitude.copy())
+
+    def changed(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> int | None:
+        """The electrode whose contact this frame shows to have changed."""
+        found = self._drift(_difference(amplitude, untouched.z0, untouched, live), untouched.sigma, live)
+        past = self._past[0]
+        if found is not None or len(self._past) <= LOOK_BACK or not np.isfinite(past[live]).all():
+            return found
+        # Under a touch that stays, what changed is the contact's.
+        found = self._drift.risen(_difference(amplitude, past, untouched, live), np.sqrt(2.0) * untouched.sigma, live)
+        if found is not None:
+            self._before[found] = past
+        return found
+
+    def keep(self, drifting: Sequence[int]) -> None:
+        """Forget the others."""
+        self.felt = {k: felt for k, felt in self.felt.items() if k in drifting}
+        self._before = {k: before for k, before in self._before.items() if k in drifting}
+
+    def shift(self, drifting: Sequence[int], amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Array:
+        """(K,) of |Z|; followed while nothing else changes: untouched, or under the touch it began under."""
+        for k in drifting:
+            for since in (untouched.z0, self._before.get(k)):
+                if since is not None:
+                    felt = self._drift.felt_by_others(k, _difference(amplitude, since, untouched, live), live)
+                    if felt is not None:
+                        self.felt[k] = felt
+                        break
+        return np.asarray(untouched.normaliser * np.sum([*self.felt.values(), np.zeros(self._k)], axis=0))
+
+    def state(self) -> dict[str, Any]:
+        felt, before = ([[k, list(row)] for k, row in rows.items()] for rows in (self.felt, self._before))
+        return {"felt": felt, "before": before, "past": np.array(self._past)}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Older recordings lack some. Raises ValueError where it does not fit."""
+        self.reset()
+        shape = (self._k,)
+        self.felt = {int(k): shaped(row, shape) for k, row in state.get("felt", [])}
+        self._before = {int(k): shaped(row, shape, finite=False) for k, row in state.get("before", [])}
+        self._past.extend(shaped(row, shape, finite=False) for row in state.get("past", []))
+
+
+def _difference(amplitude: Array, since: Array, untouched: Reference, live: NDArray[np.bool_]) -> Array:
+    return np.where(live, (amplitude - since) / untouched.normaliser, 0.0)

@@ -7,8 +7,6 @@ numbered from 0, as on the board's link (protocol/WIRE.md).
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,51 +14,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import ELECTRODE_STATES, STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA
-from services.faults.contact_drift import ContactDrift
+from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA
+from services.faults.advice import (
+    ADVICE,
+    DRIFTING,
+    OK,
+    OPEN,
+    REASONS,
+    SHORT,
+    STUCK,
+    SWAPPED,
+    UNKNOWN,
+    listed,
+)
+from services.faults.contact_drift import ChangedContacts, Reference
 from services.faults.wiring import Exchanged, StuckBit, Wiring
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(len(ELECTRODE_STATES))
-REASONS = {
-    OPEN: "electrode_open",
-    SHORT: "electrode_short",
-    UNKNOWN: "stale_baseline",
-    DRIFTING: "electrode_drift",
-    SWAPPED: "electrode_swapped",
-    STUCK: "multiplexer",
-}
-ADVICE = {
-    OPEN: "electrode {}: no contact; look at its wire and press it on",
-    SHORT: "electrodes {}: connected to each other; part their wires",
-    UNKNOWN: "electrode {}: no baseline, it was at fault when that was taken; run `skin tare`",
-    DRIFTING: "electrode {}: its contact with the skin changed; press it on, then run `skin tare`",
-    SWAPPED: "electrodes {}: their wires are exchanged; put them right",
-    STUCK: "the multiplexers do not reach electrode {}",
-}
 QUIET = 5.0  # standard deviations within which a measurement is what it was
 FAR = 10.0  # |Z| beyond this multiple of the baseline, or below its inverse, is no touch
 MOSTLY = 0.8  # fraction of an electrode's measurements that must have failed for the electrode to be named
 NOTHING_ANSWERS = 0.7  # fraction of all measurements that failed where it is not the electrodes
 TOO_MANY = 2  # electrodes at fault with which contacts can still be given
 WELL_FRAMES = 3  # in a row, after which an electrode counts again
-LOOK_BACK = 3  # frames over which a contact that rises under a touch is told from it
 WELL = 0.005  # relative: how near its baseline a measurement of a well electrode is, and within 6 sigma more
 FALLS = 0.03  # relative fall that no touch, warmth or noise makes: the wiring is looked at
 FALLS_UNTARED = 0.06  # against the bundle's prediction, contacts unknown
-
-
-@dataclass(frozen=True)
-class Reference:
-    """What is known of the untouched skin, each (K,): |Z0| (0 where unknown), what differences are divided by, and
-    their standard deviation (infinite where unknown).
-    """
-
-    z0: Array
-    normaliser: Array
-    sigma: Array
 
 
 @dataclass
@@ -92,7 +73,7 @@ class ElectrodeHealth:
         self._pattern = pattern
         self._predicted = np.asarray(bundle.z0, dtype=float) if bundle.matrices.normalisation == "model" else None
         self._wiring = Wiring(pattern)
-        self._drift = ContactDrift(bundle, self.member)
+        self._contacts = ChangedContacts(bundle, self.member)
         k, n = len(pattern), self.electrodes
         self._all_well = Verdict(np.ones(k, bool), np.zeros(k, bool), np.zeros(n, "u1"), [], True, None, np.zeros(k))
         for array in (v for v in vars(self._all_well).values() if isinstance(v, np.ndarray)):
@@ -104,8 +85,7 @@ class ElectrodeHealth:
         self._well = np.zeros(self.electrodes, dtype=np.int64)  # frames in a row
         self._shown = self._states
         self._fault = ""  # of the board as a whole
-        self._past: deque[Array] = deque(maxlen=LOOK_BACK)  # |Z| (K,) of the last frames
-        self._felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
+        self._contacts.reset()
 
     def tared(self) -> None:
         """There is a new baseline: what changed against the old one is forgotten."""
@@ -113,8 +93,7 @@ class ElectrodeHealth:
 
     def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
         """(K,) |Z| and status bits of a frame."""
-        past = self._past[0] if len(self._past) == LOOK_BACK else None
-        self._past.append(amplitude.copy())
+        self._contacts.follow(amplitude)
         if untouched is not None and self._unchanged(amplitude, status, untouched):
             return self._all_well
         trouble = (status & (STATUS_OPEN | STATUS_RTIA | STATUS_FIFO | STATUS_CLIPPED)) != 0
@@ -122,7 +101,7 @@ class ElectrodeHealth:
         reference = self._reference(amplitude, failed, untouched)
         self._fault = ""
         self._order: NDArray[np.intp] | None = None
-        seen = self._look(amplitude, status, failed, reference, untouched, past)
+        seen = self._look(amplitude, status, failed, reference, untouched)
         if untouched is not None and self._nothing_wrong(seen, status, failed, untouched):
             self._shown = self._all_well.states
             return self._all_well
@@ -154,7 +133,7 @@ class ElectrodeHealth:
         """Whether a frame without a mark differs from the untouched skin by its noise alone, and nothing was at fault:
         most frames of a skin, and a tenth of the work.
         """
-        if status.any() or self._states.any() or self._felt:
+        if status.any() or self._states.any() or self._contacts.felt:
             return False
         with np.errstate(invalid="ignore"):  # what is not finite has changed, also where the baseline knows nothing
             noise = QUIET * untouched.sigma * untouched.normaliser
@@ -166,7 +145,7 @@ class ElectrodeHealth:
         self, seen: NDArray[np.uint8], status: NDArray[np.uint8], failed: Mask, untouched: Reference
     ) -> bool:
         """Most touched frames: what follows would find that all is well too, at twice the work."""
-        quiet = not (seen.any() or status.any() or failed.any() or self._states.any() or self._felt)
+        quiet = not (seen.any() or status.any() or failed.any() or self._states.any() or self._contacts.felt)
         return quiet and bool(np.isfinite(untouched.sigma).all())
 
     def problems(self) -> list[str]:
@@ -177,7 +156,7 @@ class ElectrodeHealth:
         for state, text in ADVICE.items():
             named = np.flatnonzero(self._shown == state).tolist()
             if named:
-                found.append(text.format(_listed(named)) + " (electrodes are numbered from 0)")
+                found.append(text.format(listed(named)) + " (electrodes are numbered from 0)")
         return found
 
     # one frame
@@ -189,9 +168,8 @@ class ElectrodeHealth:
         failed: Mask,
         reference: Array | None,
         untouched: Reference | None,
-        past: Array | None,
     ) -> NDArray[np.uint8]:
-        """(E,) what this frame shows; past: |Z| (K,) LOOK_BACK frames ago."""
+        """(E,) what this frame shows."""
         states = np.zeros(self.electrodes, dtype=np.uint8)
         no_current = ((status & STATUS_OPEN) != 0) | (failed & (status == 0))
         low = np.zeros_like(failed)
@@ -218,11 +196,7 @@ class ElectrodeHealth:
         self._open(failed & (low | no_current), failed, states)
         if untouched is not None and not states.any():
             live = ~failed & np.isfinite(untouched.sigma) & ~self.member[self._states != OK].any(axis=0)
-            d = np.where(live, (amplitude - untouched.z0) / untouched.normaliser, 0.0)
-            changed = self._drift(d, untouched.sigma, live)
-            if changed is None and past is not None and np.isfinite(past[live]).all():  # under a touch that stays
-                d = np.where(live, (amplitude - past) / untouched.normaliser, 0.0)
-                changed = self._drift.risen(d, np.sqrt(2.0) * untouched.sigma, live)
+            changed = self._contacts.changed(amplitude, untouched, live)
             if changed is not None:
                 states[changed] = DRIFTING
         return states
@@ -264,7 +238,7 @@ class ElectrodeHealth:
             states[fault.electrodes] = STUCK
             self._fault = (
                 f"an address bit of a multiplexer is stuck: bit {fault.bit} of drive{fault.side} or sense{fault.side} "
-                f"stays {fault.value}, so electrodes {_listed(fault.electrodes)} (numbered from 0) are never reached; "
+                f"stays {fault.value}, so electrodes {listed(fault.electrodes)} (numbered from 0) are never reached; "
                 "look at the board's address lines"
             )
         return fault is not None
@@ -309,17 +283,12 @@ class ElectrodeHealth:
         return bool((off <= WELL + 6 * untouched.sigma[rows]).mean() >= MOSTLY)
 
     def _shift(self, amplitude: Array, failed: Mask, untouched: Reference | None) -> Array:
-        """Followed while nothing touches."""
+        """What the drifting electrodes do to the pairs of the others."""
         drifting = np.flatnonzero(self._states == DRIFTING).tolist()
-        self._felt = {k: felt for k, felt in self._felt.items() if k in drifting}
+        self._contacts.keep(drifting)
         if untouched is None or not drifting:
             return np.zeros(len(amplitude))
-        known = ~failed & np.isfinite(untouched.sigma)
-        d = np.where(known, (amplitude - untouched.z0) / untouched.normaliser, 0.0)
-        for k in drifting:
-            if (felt := self._drift.felt_by_others(k, d, known)) is not None:
-                self._felt[k] = felt
-        return np.asarray(untouched.normaliser * np.sum([*self._felt.values(), np.zeros(len(d))], axis=0))
+        return self._contacts.shift(drifting, amplitude, untouched, ~failed & np.isfinite(untouched.sigma))
 
     def _reference(self, amplitude: Array, failed: Mask, untouched: Reference | None) -> Array | None:
         """|Z| that a well, untouched skin has: its baseline, else the bundle's prediction times the frame's gain."""
@@ -336,9 +305,7 @@ class ElectrodeHealth:
     # state
 
     def state(self) -> dict[str, Any]:
-        felt = [[k, list(values)] for k, values in self._felt.items()]
-        past = np.array(self._past)
-        return {"states": self._states.copy(), "well": self._well.copy(), "felt": felt, "past": past}
+        return {"states": self._states.copy(), "well": self._well.copy(), **self._contacts.state()}
 
     def load(self, state: dict[str, Any]) -> None:
         """Raises ValueError where it is of other electrodes."""
@@ -347,13 +314,4 @@ class ElectrodeHealth:
             raise ValueError(f"the saved health is of {states.size} electrodes, expected {self.electrodes}")
         self.reset()
         self._states, self._well = states, well
-        self._felt = {int(k): np.array(values, dtype=float) for k, values in state.get("felt", [])}
-        past = np.array(state.get("past", []), dtype=float)
-        if past.size and past.shape[1:] != (self.member.shape[1],):
-            raise ValueError(f"the saved frames are of shape {past.shape}, expected (n, {self.member.shape[1]})")
-        self._past.extend(past if past.size else [])
-
-
-def _listed(numbers: Iterable[int]) -> str:
-    texts = [str(n) for n in numbers]
-    return texts[0] if len(texts) == 1 else ", ".join(texts[:-1]) + " and " + texts[-1]
+        self._contacts.load(state)

@@ -85,6 +85,45 @@ def test_a_contact_that_changes_is_named_left_out_and_not_tracked(skin: StubSkin
     skin.rest(3)
 
 
+@pytest.mark.parametrize("electrode", [0, 5, 9])
+def test_a_contact_that_rises_under_a_touch_is_named_and_makes_no_second_one(skin: StubSkin, electrode: int) -> None:
+    pressed = [skin.feel(PRESS) for _ in range(10)]
+    assert states(pressed[-1]) == {} and pressed[-1].contact.valid
+    lifted = [skin.feel(PRESS, contacts=((electrode, 6.0),)) for _ in range(20)]
+    assert all(states(r) == {"drifting": [electrode]} for r in lifted[NAMED_WITHIN - 1 :])
+    assert all(position_error_m(r) < 0.003 for r in lifted[NAMED_WITHIN - 1 :])  # of one contact: no phantom
+    assert states(skin.rest(BACK_WITHIN + 3)) == {}
+
+
+def test_a_contact_that_rises_within_scans_is_named_before_it_is_up(skin: StubSkin) -> None:
+    """Each measurement of a scan finds it higher than the last."""
+    rising = [transfer((), ((9, factor),)) for factor in (1.0, 3.5, 6.0)]
+    named = []
+    for before, after in zip(rising, [*rising[1:], rising[-1]], strict=True):
+        z, status = skin.analog.measure((before, after), skin.pattern, 128, 40_000.0, 0.0)
+        named.append(states(skin.run(z, status)))
+    assert {"drifting": [9]} in named[:2] and named[-1] == {"drifting": [9]}
+    assert states(skin.rest(BACK_WITHIN + 3)) == {}
+
+
+@pytest.mark.parametrize("pair", [(10, 11), (2, 13)])
+def test_exchanged_wires_are_read_as_each_others(skin: StubSkin, pair: tuple[int, int]) -> None:
+    """A touch between them is where it is, and the frame says that it is degraded."""
+    place = sheet().skin.point(sheet().skin.electrodes)[list(pair)].mean(axis=0) * 0.7
+    touch = (Shape("circle", float(place[0]), float(place[1]), 0.2, 0.3),)
+    skin.faults.inject("electrodes_swapped", {"electrodes": list(pair)}, 0.0, 1e9)
+    try:
+        skin.rest(5)
+        felt = [skin.feel(touch) for _ in range(6)]
+    finally:
+        skin.faults.clear()
+    for result in felt[1:]:
+        (contact,) = [c for c in result.contact.contacts if c.state != "end"]
+        assert np.hypot(*(np.array(contact.position[:2]) - 0.05 * place)) < 0.002
+        assert states(result) == {"swapped": sorted(pair)} and "degraded" in result.contact.reasons
+    assert states(skin.rest(BACK_WITHIN + 3)) == {}
+
+
 def test_a_tare_takes_a_changed_contact_as_it_is() -> None:
     own, changed = StubSkin(80.0), ((9, 4.0),)
     for _ in range(80):

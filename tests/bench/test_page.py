@@ -1,0 +1,60 @@
+"""Goals, and the page of all benchmarks: what is missed says so, what was not run says so, ratios stop CI."""
+
+import json
+
+import pytest
+
+from bench import all as page
+from bench._goals import Goal
+
+
+@pytest.mark.parametrize(
+    ("goal", "met", "passed"),
+    [
+        (Goal("a", 1.0, at_most=1.0), True, True),
+        (Goal("a", 1.1, at_most=1.0), False, True),  # missed, but only gates stop CI
+        (Goal("a", 1.1, at_most=1.0, gate=1.2), False, True),
+        (Goal("a", 1.3, at_most=1.0, gate=1.2), False, False),
+        (Goal("a", 2.9, at_least=3.0, gate=2.0), False, True),
+        (Goal("a", 1.9, at_least=3.0, gate=2.0), False, False),
+        (Goal("a", 5.0), None, True),
+        (Goal("a", 5.0, gate=4.0), None, False),
+        (Goal("a", None, at_most=1.0, gate=1.0), False, False),
+        (Goal("a", float("nan"), at_most=1.0), False, True),
+    ],
+)
+def test_goal(goal: Goal, met: bool | None, passed: bool) -> None:
+    assert (goal.met, goal.passed) == (met, passed)
+    assert Goal.from_dict(json.loads(json.dumps(goal.to_dict()))).to_dict()["passed"] == passed
+
+
+def report(folder, name, *goals, **more):
+    content = {"command": f"skin bench {name}", "machine": "2 x one", "versions": {"python": "3"}, **more}
+    content["targets"] = [goal.to_dict() for goal in goals]
+    (folder / f"{name}.json").write_text(json.dumps(content))
+
+
+def test_the_page_says_what_is_missed_and_what_was_not_run(tmp_path, capsys):
+    report(tmp_path, "latency", Goal("p50, ms", 1.5, at_most=2.0), Goal("p99, ms", 7.0, at_most=5.0))
+    report(tmp_path, "peers", Goal("ratio", 1.5), left_out=["rospy is not installed: left out"])
+    (tmp_path / "latency.png").write_bytes(b"")
+    assert page.main(["--reuse", "--out", str(tmp_path)]) == 0
+    written = (tmp_path / "README.md").read_text()
+    assert written in capsys.readouterr().out
+    assert "1 of 2 targets met" in written
+    assert "| p99, ms | 7 | at most 5 | **missed** |" in written and "| p50, ms | 1.5 | at most 2 | met |" in written
+    assert "| ratio | 1.5 |  |  |" in written and "rospy is not installed" in written
+    assert "`skin bench latency` on 2 x one; python 3." in written and "(latency.png)" in written
+    assert "Not run: `skin bench tracking`." in written
+
+
+def test_a_ratio_beyond_its_gate_fails_the_short_form(tmp_path, capsys):
+    report(tmp_path, "skip", Goal("untouched, of moving", 0.6, at_most=0.25, gate=0.45))
+    assert page.main(["--reuse", "--quick", "--out", str(tmp_path)]) == 1
+    assert "untouched, of moving: 0.6, gate 0.45" in capsys.readouterr().err
+    assert page.main(["--reuse", "--out", str(tmp_path)]) == 0  # the page itself only says it
+
+
+def test_every_benchmark_of_the_page_is_there() -> None:
+    for benchmark in page.BENCHMARKS:
+        assert (page.ROOT / "bench" / f"{benchmark.name}.py").is_file()
