@@ -89,8 +89,10 @@ def _labels(smooth: Image, floor: float, expected: Sequence[Place]) -> tuple[Lab
     peaks = peaks_of(smooth, floor, expected)
     while True:
         labels = territories(smooth, 0.5 * floor, peaks)
+        if len(peaks) == 1:
+            break
         small = [p for k, p in enumerate(peaks) if ((labels == k + 1) & (smooth > 0.5 * smooth[p])).sum() < SMALLEST]
-        if not small or len(peaks) == 1:
+        if not small:
             break
         peaks.remove(small[-1])  # a speck: its pixels go to a neighbour
     label, count = 1, len(peaks)
