@@ -93,8 +93,8 @@ def page(chosen: Sequence[Benchmark], folder: Path) -> tuple[str, list[Goal]]:
     top = [
         "# Benchmarks",
         "",
-        f"Made by `skin bench all` at commit {manifest.commit()}: {met} of {len(with_target)} targets met. Each section "
-        "says its own command; times are of two shared cores with the stub's board running beside the service.",
+        f"Made by `skin bench all` at commit {manifest.commit()}: {met} of {len(with_target)} targets met. Each "
+        "section says its own command; times are of two shared cores with the stub's board running beside the service.",
         "",
     ]
     return "\n".join(top + bodies), every

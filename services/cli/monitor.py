@@ -13,6 +13,7 @@ from protocol.sockets import AllReader
 from protocol.topics import TOPIC_OF, TOPICS
 
 WINDOW_S = 5.0
+SKIPS = ("untouched", "held", "unwanted")  # counters of frames that inference had no image to make for
 SILENT_S = 3.5
 """A process that says so little for so long is shown as silent: it promises a status each second."""
 
@@ -27,15 +28,16 @@ def percentile(values: list[float], share: float) -> float | None:
 class TopicRow:
     """One topic as seen here."""
 
-    arrivals: deque[tuple[float, float | None]] = field(default_factory=deque)  # when [s], age of the sample [ms]
+    # when [s], age of the sample [ms], time since acquisition read it [ms]
+    arrivals: deque[tuple[float, float | None, float | None]] = field(default_factory=deque)
     last: Frame | None = None
     last_s: float = 0.0
 
     def add(self, frame: Frame, now_s: float) -> None:
-        sample = frame.stamps.get("sample")
-        ours = sample is not None and frame.host == host_id() and frame.source != "replay"
-        age = now_s * 1e3 - sample / 1e6 if ours and sample is not None else None
-        self.arrivals.append((now_s, age))
+        ours = frame.host == host_id() and frame.source != "replay"
+        stamps = (frame.stamps.get(key) if ours else None for key in ("sample", "read"))
+        age, read = (None if stamp is None else now_s * 1e3 - stamp / 1e6 for stamp in stamps)
+        self.arrivals.append((now_s, age, read))
         self.last, self.last_s = frame, now_s
         self.trim(now_s)
 
@@ -45,12 +47,14 @@ class TopicRow:
 
     def summary(self, now_s: float, since_s: float) -> dict[str, Any]:
         self.trim(now_s)
-        ages = [age for _, age in self.arrivals if age is not None]
+        ages = [age for _, age, _ in self.arrivals if age is not None]
+        since_read = [read for _, _, read in self.arrivals if read is not None]
         seconds = max(min(WINDOW_S, now_s - since_s), 1e-3)
         return {
             "rate_hz": round(len(self.arrivals) / seconds, 2),
             "age_ms": round((now_s - self.last_s) * 1e3, 1) if self.last else None,
-            "latency_ms": {"p50": _round(percentile(ages, 0.5)), "p99": _round(percentile(ages, 0.99))},
+            "latency_ms": _quantiles(ages),
+            "since_read_ms": _quantiles(since_read),
             "valid": self.last.valid if self.last else None,
             "reasons": list(self.last.reasons) if self.last else [],
         }
@@ -66,6 +70,7 @@ class Monitor:
         self.reader = AllReader(names, skin)
         self.topics = {name: TopicRow() for name in names if name not in ("status", "info")}
         self.processes: dict[str, tuple[StatusFrame, float]] = {}
+        self._before: dict[str, StatusFrame] = {}  # the status before the last, of each
         self.info: dict[str, Any] = {}
 
     def read(self, seconds: float) -> None:
@@ -78,6 +83,8 @@ class Monitor:
 
     def take(self, frame: Frame, now_s: float) -> None:
         if isinstance(frame, StatusFrame):
+            if frame.process in self.processes:
+                self._before[frame.process] = self.processes[frame.process][0]
             self.processes[frame.process] = (frame, now_s)
         elif isinstance(frame, InfoFrame):
             self.info.update(frame.info)
@@ -112,7 +119,8 @@ class Monitor:
                 if row.last
             },
             "processes": {
-                name: _process(status, now - seen) for name, (status, seen) in sorted(self.processes.items())
+                name: _process(status, self._before.get(name), now - seen)
+                for name, (status, seen) in sorted(self.processes.items())
             },
             "contacts": [
                 {"id": c.id, "state": c.state, "position": list(c.position), "force_n": c.force_n, "shape": c.shape}
@@ -122,17 +130,33 @@ class Monitor:
         }
 
 
-def _process(status: StatusFrame, silent_s: float) -> dict[str, Any]:
+def _process(status: StatusFrame, before: StatusFrame | None, silent_s: float) -> dict[str, Any]:
     silent = silent_s > SILENT_S
+    rate = max((hz for topic, hz in status.rates.items() if topic not in ("status", "info")), default=0.0)
     return {
         "level": "STALE" if silent else status.level,
         "messages": [f"silent for {silent_s:.0f} s"] if silent else list(status.messages),
         "cpu": round(status.cpu, 4),
+        "cpu_ms_per_frame": round(1e3 * status.cpu / rate, 3) if rate > 0 else None,
+        "skipped": _skipped(status, before),
         "latency_ms": dict(status.latency),
         "rates_hz": dict(status.rates),
         "drops": dict(status.drops),
         "counters": dict(status.counters),
     }
+
+
+def _skipped(status: StatusFrame, before: StatusFrame | None) -> dict[str, float]:
+    """Which share of the frames since the status before each skip rule spared work for."""
+    new = {k: n - (before.counters.get(k, 0) if before else 0) for k, n in status.counters.items()}
+    counted = [new.get(k, 0) for k in ("networks_run", *SKIPS)]
+    if min(counted) < 0 or not sum(counted):  # it began anew, or nothing came
+        return {}
+    return {k: round(new.get(k, 0) / sum(counted), 3) for k in SKIPS if new.get(k, 0)}
+
+
+def _quantiles(values: list[float]) -> dict[str, float | None]:
+    return {"p50": _round(percentile(values, 0.5)), "p99": _round(percentile(values, 0.99))}
 
 
 def _round(value: float | None) -> float | None:

@@ -39,10 +39,10 @@ def _table(title: str, *heads: str) -> Table:
 
 
 def _topics(now: dict[str, Any]) -> Table:
-    table = _table("topic", "Hz", "age ms", "p50 ms", "p99 ms", "lost", "CPU %")
+    """Latencies in ms: since the middle of the scan, and since acquisition read it (as `skin bench latency` has it)."""
+    table = _table("topic", "Hz", "age ms", "p50 ms", "p99 ms", "read p50", "p99", "lost")
     table.add_column("is")
     for name, row in now["topics"].items():
-        process = now["processes"].get(row["producer"])
         says = Text("valid", style="green") if row["valid"] else Text("invalid", style="bold red")
         if row["reasons"]:
             says.append(": " + ", ".join(row["reasons"]), style="yellow")
@@ -52,25 +52,29 @@ def _topics(now: dict[str, Any]) -> Table:
             _number(row["age_ms"], 0),
             _number(row["latency_ms"]["p50"]),
             _number(row["latency_ms"]["p99"]),
+            _number(row["since_read_ms"]["p50"]),
+            _number(row["since_read_ms"]["p99"]),
             str(row["lost"]),
-            _number(process["cpu"] * 100 if process else None),
             says,
         )
     return table
 
 
 def _processes(now: dict[str, Any]) -> Table:
-    table = _table("process", "level", "CPU %", "p50 ms", "p99 ms")
+    table = _table("process", "level", "CPU %", "CPU ms a frame", "work p50 ms", "p99")
     table.add_column("dropped")
+    table.add_column("spared")
     for name, row in now["processes"].items():
         latency = row["latency_ms"]
         table.add_row(
             name,
             Text(row["level"], style=LEVELS[row["level"]]),
             _number(row["cpu"] * 100),
-            _number(latency.get("p50")),
-            _number(latency.get("p99")),
+            _number(row["cpu_ms_per_frame"], 2),
+            _number(latency.get("work_p50"), 2),
+            _number(latency.get("work_p99"), 2),
             ", ".join(f"{n} {cause}" for cause, n in row["drops"].items() if n) or "0",
+            ", ".join(f"{100 * share:.0f} % {rule}" for rule, share in row["skipped"].items()),
         )
     return table
 

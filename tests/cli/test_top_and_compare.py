@@ -30,6 +30,28 @@ def test_rates_and_latencies_are_counted_from_frames(runtime) -> None:  # type: 
     assert 19 < row["rate_hz"] <= 20 and 9 < row["latency_ms"]["p50"] < 60
 
 
+def test_time_since_read_is_the_services_own(runtime) -> None:  # type: ignore[no-untyped-def]
+    monitor = Monitor("palm")
+    frame = raw(1, 0.050)
+    frame.stamps["read"] = time.monotonic_ns() - 2_000_000
+    monitor.take(frame, time.monotonic())
+    row = monitor.snapshot()["topics"]["raw"]
+    assert row["latency_ms"]["p50"] > 49 and 1.9 < row["since_read_ms"]["p50"] < 30
+
+
+def test_what_skip_rules_spared_is_of_the_last_second(runtime) -> None:  # type: ignore[no-untyped-def]
+    monitor = Monitor("palm")
+    counts = {"networks_run": 100, "held": 0, "untouched": 0}
+    for more in ({}, {"networks_run": 105, "held": 10, "untouched": 5}):
+        status = StatusFrame(skin="palm", process="inference", level="OK", counters=counts | more, cpu=0.05)
+        status.rates = {"image": 20.0, "status": 1.0}
+        monitor.take(status, time.monotonic())
+    row = monitor.snapshot()["processes"]["inference"]
+    assert row["skipped"] == {"untouched": 0.25, "held": 0.5} and row["cpu_ms_per_frame"] == 2.5
+    monitor.take(StatusFrame(skin="palm", process="inference", counters={"networks_run": 1}), time.monotonic())
+    assert monitor.snapshot()["processes"]["inference"]["skipped"] == {}  # begun anew
+
+
 def test_a_replayed_or_foreign_frame_has_no_latency(runtime) -> None:  # type: ignore[no-untyped-def]
     monitor = Monitor("palm")
     for change in ({"source": "replay"}, {"host": "elsewhere"}):
