@@ -187,7 +187,7 @@ class Board:
                 self._running, self._seq, self._scan_start = config, 0, now
             else:
                 self._next = config
-            self._say(link.Ack(start.number), now)
+            self._say(link.Ack(start.number, start.config), now)
 
     def _self_test(self, now: float) -> int:
         def bad(*names: str) -> bool:

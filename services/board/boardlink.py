@@ -208,6 +208,8 @@ class BoardLink:
                 return  # a late answer to the one before
             self._pending = self._pending[1:]
             self._to(now_s, "config" if self._pending else "start")
+        elif ack.of == link.Start.number and ack.value != self._started.config:
+            return  # a late answer to another one
         elif self.state == "start" and ack.of == link.Start.number:
             self._last_seq = None
             self.problem = ""

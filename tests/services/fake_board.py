@@ -41,7 +41,7 @@ class FakeBoard:
                 out += link.encode(link.Ack(of=message.number, value=message.config))
             elif isinstance(message, link.Start):
                 self.running, self.seq = True, 0
-                out += link.encode(link.Ack(of=message.number))
+                out += link.encode(link.Ack(of=message.number, value=message.config))
         return out
 
     def scan(self, device_us: int = 0) -> bytes:

@@ -133,7 +133,7 @@ def test_scans_that_count_from_0_again_are_taken_after_a_start() -> None:
     board.seq = 1000
     host.received(board.scan(), now)
     board.seq = 0
-    host.received(link.encode(link.Ack(of=link.Start.number)), now)  # of a START that had been sent twice
+    host.received(link.encode(link.Ack(link.Start.number, SCANNING.config)), now)  # of a START sent twice
     assert [scan.seq for scan in host.received(board.scan(), now)] == [0]
     board.seq = 500
     host.received(board.scan(), now)

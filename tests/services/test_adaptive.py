@@ -149,13 +149,15 @@ def test_a_switch_is_one_start_again_until_answered() -> None:
         assert isinstance(sent, link.Config) and sent.config == config
         host.received(link.encode(link.Ack(link.Config.number, config)), 0.0)
     assert isinstance(said(0.0)[0], link.Start)
-    host.received(link.encode(link.Ack(link.Start.number)), 0.0)
+    host.received(link.encode(link.Ack(link.Start.number, full.config)), 0.0)
     assert host.state == "running" and host.switches and not said(0.01)
     host.switch(short)
     assert [m.config for m in said(0.02) if isinstance(m, link.Start)] == [short.config]
     assert not said(0.03)
     assert said(0.03 + SWITCH_S), "not answered: again"
-    host.received(link.encode(link.Ack(link.Start.number)), 0.2)
+    host.received(link.encode(link.Ack(link.Start.number, full.config)), 0.1)  # late, of another START
+    assert said(0.1 + 2 * SWITCH_S), "still not answered"
+    host.received(link.encode(link.Ack(link.Start.number, short.config)), 0.2)
     assert not said(0.2 + 2 * SWITCH_S)
     taken = host.received(link.encode(scan(full.config, 2, 5)) + link.encode(scan(short.config, 1, 6)), 0.4)
     assert [len(s.z) for s in taken] == [2, 1] and not host.gap
