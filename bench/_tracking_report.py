@@ -63,7 +63,7 @@ def goals(found: dict[str, Any]) -> list[Goal]:
         Goal("id switches per 100 touches", per_100, at_most=1.0),
         Goal("false touches", row["false_touches"], at_most=0),
         Goal(f"electrode faults not named within {NAMED_WITHIN} frames, of {len(faults)}", late, at_most=0),
-        Goal("force of the held touch, change, %", None if fade is None else abs(fade), at_most=2.0),
+        *([] if fade is None else [Goal("force of the held touch, change, %", abs(fade), at_most=2.0)]),
     ]
 
 

@@ -38,7 +38,7 @@ from services.pipeline import Pipeline
 HOPS = ("acquire", "preprocess", "infer", "publish", "receive")
 TARGET_MS = {"p50": 2.0, "p99": 5.0}
 HOP_MS = 0.15  # what a hop between processes may cost
-FLOORS, NOTICED = 4.0, 2.0  # a short run's gates: p50 over the floor's, p50 with more controllers over one's
+FLOORS, NOTICED = 10.0, 2.0  # a short run's gates: p50 over the floor's, p50 with more controllers over one's
 SETTLE_S = 2.0
 TARE_S = 6.0
 CONTROLLER = """

@@ -29,9 +29,9 @@ from bench import _goals
 from bench._goals import Goal
 from bench._json import write_json
 from bench._machine import machine, provenance
-from bench._service import Service, running
+from bench._service import Outside, Service, running
 from bench._tracking_scene import Recorded
-from bench.skip import QUIET_S, run_once, scenes
+from bench.skip import run_once, scenes
 from models.bundle import Bundle
 from protocol.frames import pack
 from services.config import Skin
@@ -41,14 +41,15 @@ from services.stage import PROCESSES
 
 RATE_HZ = 22.0
 TARGET = {"skins": 32, "p99_ms": 20.0}
-START_S = 25.0  # of a recording, before it is measured: processes start, the tare
+START_S = 30.0  # of a recording, untouched: processes start, the tare
+MARGIN_S = 3.0  # of a recording, beyond what is measured
 STATUS_S = 1.5  # for the last status frames to tell what was dropped
 GROWTH = 0.01  # of memory, over a long run
 
 
 def recordings(folder: Path, n: int, touched: float, seconds: float) -> Path:
     """n recordings and the skin.toml that plays them; returns the latter."""
-    of = scenes(seconds)
+    of = scenes(seconds, START_S)
     lines = []
     for k in range(n):
         recorded = of["moving" if (k + 0.5) * touched % 1 < touched and touched > 0 else "untouched"]
@@ -66,7 +67,8 @@ def _write(path: Path, skin: str, recorded: Recorded, phase_s: float) -> None:
             frame = recorded.frame(k)
             frame.skin = skin
             frame.stamps["sample"] += round(phase_s * 1e9) * (k > 0)
-            writer.write("raw/" + skin, pack(frame), frame.stamps["sample"])
+            topic, _, body = pack(frame).partition(b"\0")
+            writer.write(topic.decode(), body, frame.stamps["sample"])
 
 
 def measure(service: Service, n: int, seconds: float) -> dict[str, Any]:
@@ -123,17 +125,28 @@ def measure(service: Service, n: int, seconds: float) -> dict[str, Any]:
 
 def scaled(n: int, touched: float, seconds: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="eitskin-scale") as folder:
-        path = recordings(Path(folder), n, touched, START_S + seconds + 2 * STATUS_S)
+        path = recordings(Path(folder), n, touched, seconds + 2 * STATUS_S + MARGIN_S)
         before = os.environ.get("EITSKIN_CONFIG")
         os.environ["EITSKIN_CONFIG"] = str(path)
         try:
             with running(skin="s00") as service:
-                time.sleep(QUIET_S / 2)
+                _wait_for_touch(service, touched)
                 return {"touched": touched, **measure(service, n, seconds)}
         finally:
             os.environ.pop("EITSKIN_CONFIG")
             if before is not None:
                 os.environ["EITSKIN_CONFIG"] = before
+
+
+def _wait_for_touch(service: Service, touched: float) -> None:
+    """Until the recordings' quiet beginning is over: the first skin is a touched one, if any is."""
+    contacts = Outside("contact", "s00", service.folder)
+    end = time.monotonic() + START_S + MARGIN_S
+    while time.monotonic() < end and touched > 0:
+        got = contacts.recv(0.5)
+        if got and got[0]["contacts"]:
+            break
+    contacts.close()
 
 
 def memory(frames: int) -> dict[str, float]:

@@ -68,14 +68,14 @@ VARIANTS = {
 
 
 @lru_cache(maxsize=4)
-def scenes(seconds: float) -> dict[str, Recorded]:
-    """The three scenes in simulated time."""
-    end = QUIET_S + seconds
+def scenes(seconds: float, quiet_s: float = QUIET_S) -> dict[str, Recorded]:
+    """The three scenes in simulated time; nothing touches for quiet_s."""
+    end = quiet_s + seconds
     keys = {
         "untouched": [],
-        "still": [{"t": QUIET_S, **TOUCH}, {"t": end - ENDS_S, **TOUCH}],
+        "still": [{"t": quiet_s, **TOUCH}, {"t": end - ENDS_S, **TOUCH}],
         "moving": [
-            {"t": QUIET_S + s, **TOUCH, "x": 0.03 * float(np.cos(1.3 * s)), "y": 0.03 * float(np.sin(1.3 * s))}
+            {"t": quiet_s + s, **TOUCH, "x": 0.03 * float(np.cos(1.3 * s)), "y": 0.03 * float(np.sin(1.3 * s))}
             for s in np.arange(0, seconds - ENDS_S + 1e-9, 0.25)
         ],
     }

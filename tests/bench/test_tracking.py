@@ -217,7 +217,7 @@ def test_the_command_prints_tables_and_writes_strict_json(short, monkeypatch, tm
     printed = capsys.readouterr().out
     assert "position error, median" in printed and "electrode_open" in printed
     content = json.loads((tmp_path / "tracking.json").read_text())
-    assert content["sections"]["press"]["touches"] == 1 and len(content["targets"]) == 6
+    assert content["sections"]["press"]["touches"] == 1 and len(content["targets"]) == 5  # no hold here
 
 
 def test_a_contact_drifts_from_its_fast_change_until_it_is_what_it_was():
