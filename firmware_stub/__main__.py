@@ -135,8 +135,8 @@ def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, s
         if data := port.read():
             rig.feed(data, now)
         if sent := rig.pull(now):
+            written_ns = time.monotonic_ns()  # before the write: its reader may run before we do again
             port.write(sent)
-            written_ns = time.monotonic_ns()
         if (rig.unplugged is not None) != gone:
             gone = not gone
             if gone:

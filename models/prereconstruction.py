@@ -222,7 +222,7 @@ class PreReconstructor:
         whiten = np.zeros((int(live.sum()), k))
         whiten[:, live] = vectors.T @ inverse
         # The images are well conditioned: single precision does, and half the time.
-        back = (m.back[:, live] @ inverse.T @ vectors).astype(np.float32)  # (P, K')
+        back = (m.back[:, live] @ whiten[:, live].T).astype(np.float32)  # (P, K')
         # The ladder is relative to measurement noise of the same size in every channel, so that its images stay the
         # same combinations of d whatever the level; drift and unequal noise change the metric, not the rungs.
         mean = float(np.trace(m.gram[np.ix_(live, live)]) / live.sum() / typical)
