@@ -186,9 +186,7 @@ class Config(Message):
 
 @dataclass(frozen=True, eq=False)
 class Start(Message):
-    """Scan a configuration over and over; while running: change over to it after the scan under way, and count on. ACK
-    value: the configuration's id.
-    """
+    """Scan a configuration over and over, or change over to it after the scan under way. ACK value: its id."""
 
     number, sender = 0x03, "host"
     config: int = _wired("u16", "id of the configuration")

@@ -139,8 +139,8 @@ class Logging(Section):
 class RealTime(Section):
     """What each process asks of the kernel: services/realtime.py. What is refused is said in `status`."""
 
-    priority: Annotated[int, Field(ge=0, le=99)] = 0  # of SCHED_FIFO; 0: the ordinary scheduler
-    lock_memory: bool = False  # mlockall: no page of it is ever swapped out
+    priority: Annotated[int, Field(ge=0, le=99, strict=True)] = 0  # of SCHED_FIFO; 0: the ordinary scheduler
+    lock_memory: Annotated[bool, Field(strict=True)] = False  # mlockall: no page of it is ever swapped out
     cpus: dict[str, list[Annotated[int, Field(ge=0)]]] = {}  # process -> processors it may run on
 
     @field_validator("cpus")

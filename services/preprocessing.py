@@ -100,7 +100,7 @@ class Preprocessing(Stage):
     def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict) -> DeltaFrame:
         """Difference, decision, and the stack where one is needed."""
         measured = np.isfinite(self.untouched.sigma)
-        live = found.live & measured
+        live = found.live & measured & np.isfinite(amplitude)
         if not found.usable or live.sum() < len(live) / 2:
             out.valid = False
             live = measured & np.isfinite(amplitude) if np.isfinite(amplitude).sum() > len(live) / 2 else measured

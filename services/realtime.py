@@ -22,11 +22,15 @@ def apply(wanted: RealTime, process: str) -> list[str]:
     """
     refused = []
     if cpus := wanted.cpus.get(process):
+        text = "some of them are not there"
         try:
             os.sched_setaffinity(0, cpus)
-        except (OSError, ValueError) as why:
-            there = ", ".join(map(str, sorted(os.sched_getaffinity(0))))
-            refused.append(f"not on processors {', '.join(map(str, cpus))}: {_text(why)}; it may run on {there}")
+        except (OSError, ValueError, OverflowError) as why:
+            text = _text(why)
+        there = sorted(os.sched_getaffinity(0))
+        if there != sorted(set(cpus)):
+            found = ", ".join(map(str, there))
+            refused.append(f"not on processors {', '.join(map(str, cpus))}: {text}; it runs on {found}")
     if wanted.priority:
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(wanted.priority))

@@ -171,6 +171,8 @@ class BoardLink:
     def _to(self, now_s: float, state: str) -> None:
         self.state, self._since, self._due_s, self._tries = state, now_s, now_s, 0
         self._heard_s = now_s
+        if state == "start":
+            self._started = self._wanted = self.scanning
         if state == "hello":
             self._asked_since = now_s
 
@@ -208,7 +210,7 @@ class BoardLink:
                 return  # a late answer to the one before
             self._pending = self._pending[1:]
             self._to(now_s, "config" if self._pending else "start")
-        elif ack.of == link.Start.number and ack.value != self._started.config:
+        elif ack.of == link.Start.number and ack.value not in (0, self._started.config):  # 0: the board does not say
             return  # a late answer to another one
         elif self.state == "start" and ack.of == link.Start.number:
             self._last_seq = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from protocol.frames import ELECTRODE_STATES
+from services.faults.wiring import StuckBit
 
 OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(len(ELECTRODE_STATES))
 REASONS = {
@@ -23,6 +24,19 @@ ADVICE = {
     SWAPPED: "electrodes {}: their wires are exchanged; put them right",
     STUCK: "the multiplexers do not reach electrode {}",
 }
+
+NO_ANSWER = (
+    "no electrode answers: the multiplexers are not enabled, nothing is excited (power-cycle the board), or the skin's "
+    "cable is off"
+)
+
+
+def stuck_bit(fault: StuckBit) -> str:
+    return (
+        f"an address bit of a multiplexer is stuck: bit {fault.bit} of drive{fault.side} or sense{fault.side} stays "
+        f"{fault.value}, so electrodes {listed(fault.electrodes)} (numbered from 0) are never reached; look at the "
+        "board's address lines"
+    )
 
 
 def listed(numbers: Iterable[int]) -> str:

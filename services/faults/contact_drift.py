@@ -117,7 +117,7 @@ class ContactDrift:
         if not self.knows:
             return None
         (_, b, _), left = self._fit(k, d, live)
-        if left > UNTOUCHED**2 * float(d[live] @ d[live]):
+        if not left <= UNTOUCHED**2 * float(d[live] @ d[live]):  # NaN says nothing
             return None
         return np.where(self.members[k], 0.0, b * self._n[k])
 
@@ -132,18 +132,19 @@ class ChangedContacts:
     def reset(self) -> None:
         self.felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
         self._before: dict[int, Array] = {}  # by contact that rose under a touch: |Z| (K,) from before
-        self._past: deque[Array] = deque(maxlen=LOOK_BACK + 1)  # |Z| (K,), the newest last
+        self._past: deque[Array] = deque(maxlen=LOOK_BACK)  # |Z| (K,) of the frames before, the newest last
 
     def follow(self, amplitude: Array) -> None:
-        """A frame's |Z| (K,); to be called with each."""
+        """A frame's |Z| (K,); to be called after each."""
         self._past.append(amplitude.copy())
 
     def changed(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> int | None:
         """The electrode whose contact this frame shows to have changed."""
         found = self._drift(_difference(amplitude, untouched.z0, untouched, live), untouched.sigma, live)
-        past = self._past[0]
-        if found is not None or len(self._past) <= LOOK_BACK or not np.isfinite(past[live]).all():
+        if found is not None or len(self._past) < LOOK_BACK:
             return found
+        past = self._past[0]
+        live = live & np.isfinite(past)
         # Under a touch that stays, what changed is the contact's.
         found = self._drift.risen(_difference(amplitude, past, untouched, live), np.sqrt(2.0) * untouched.sigma, live)
         if found is not None:
@@ -160,7 +161,8 @@ class ChangedContacts:
         for k in drifting:
             for since in (untouched.z0, self._before.get(k)):
                 if since is not None:
-                    felt = self._drift.felt_by_others(k, _difference(amplitude, since, untouched, live), live)
+                    both = live & np.isfinite(since)
+                    felt = self._drift.felt_by_others(k, _difference(amplitude, since, untouched, both), both)
                     if felt is not None:
                         self.felt[k] = felt
                         break

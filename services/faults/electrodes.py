@@ -18,6 +18,7 @@ from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTI
 from services.faults.advice import (
     ADVICE,
     DRIFTING,
+    NO_ANSWER,
     OK,
     OPEN,
     REASONS,
@@ -26,6 +27,7 @@ from services.faults.advice import (
     SWAPPED,
     UNKNOWN,
     listed,
+    stuck_bit,
 )
 from services.faults.contact_drift import ChangedContacts, Reference
 from services.faults.wiring import Exchanged, StuckBit, Wiring
@@ -57,6 +59,17 @@ class Verdict:
     usable: bool  # whether contacts can be given
     order: NDArray[np.intp] | None  # (K,) of which measurements the values are, where wires are exchanged; else None
     shift: Array  # (K,) of |Z|: what a changed contact does to pairs of other electrodes; not pressing's
+
+
+@dataclass
+class _Look:
+    """What one frame shows by itself; measurements in `order` (None: as they came)."""
+
+    states: NDArray[np.uint8]  # (E,)
+    amplitude: Array  # (K,)
+    failed: Mask  # (K,)
+    order: NDArray[np.intp] | None = None
+    fault: str = ""  # of the board as a whole
 
 
 class ElectrodeHealth:
@@ -93,31 +106,32 @@ class ElectrodeHealth:
 
     def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
         """(K,) |Z| and status bits of a frame."""
-        self._contacts.follow(amplitude)
+        found = self._judge(amplitude, status, untouched)
+        self._contacts.follow(amplitude if found.order is None else amplitude[found.order])
+        return found
+
+    def _judge(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
         if untouched is not None and self._unchanged(amplitude, status, untouched):
             return self._all_well
         trouble = (status & (STATUS_OPEN | STATUS_RTIA | STATUS_FIFO | STATUS_CLIPPED)) != 0
         failed = ~np.isfinite(amplitude) | (amplitude <= 0) | trouble
-        reference = self._reference(amplitude, failed, untouched)
-        self._fault = ""
-        self._order: NDArray[np.intp] | None = None
-        seen = self._look(amplitude, status, failed, reference, untouched)
-        if untouched is not None and self._nothing_wrong(seen, status, failed, untouched):
+        seen = self._look(amplitude, status, failed, self._reference(amplitude, failed, untouched), untouched)
+        self._fault = seen.fault
+        if untouched is not None and self._nothing_wrong(seen, status, untouched):
             self._shown = self._all_well.states
             return self._all_well
-        self._remember(seen, amplitude, failed, untouched)
+        self._remember(seen, untouched)
         known = np.isfinite(untouched.sigma) if untouched else np.ones(len(amplitude), dtype=bool)
         states = self._states.copy()
         lost = (self.member & ~known).sum(axis=1) >= MOSTLY * self.member.sum(axis=1)
         states[(states == OK) & lost] = UNKNOWN
         self._shown = states
-        # Exchanged wires that this very frame shows can be told apart: what they measure is that of each other.
         out = (states != OK) & (states != UNKNOWN)
-        if self._order is not None:
-            failed, out = failed[self._order], out & (states != SWAPPED)
+        if seen.order is not None:  # what exchanged wires measure is that of each other
+            out &= states != SWAPPED
         at_fault = self.member[out].any(axis=0)
         wrong = self.member[out & (states != DRIFTING)].any(axis=0)
-        live = ~failed & ~at_fault & known
+        live = ~seen.failed & ~at_fault & known
         reasons = ["saturated"] if (status & STATUS_CLIPPED).any() else []
         reasons += [reason for state, reason in REASONS.items() if (states == state).any()]
         bad = int((states != OK).sum())
@@ -126,8 +140,7 @@ class ElectrodeHealth:
             reasons.append("degraded")
         if not usable and not reasons:
             reasons.append("out_of_distribution")
-        shift = self._shift(amplitude, failed, untouched)
-        return Verdict(live, failed | wrong, states, reasons, usable, self._order, shift)
+        return Verdict(live, seen.failed | wrong, states, reasons, usable, seen.order, self._shift(seen, untouched))
 
     def _unchanged(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference) -> bool:
         """Whether a frame without a mark differs from the untouched skin by its noise alone, and nothing was at fault:
@@ -141,12 +154,10 @@ class ElectrodeHealth:
         self._fault, self._shown = "", self._all_well.states
         return bool(quiet.all() and np.isfinite(noise).all())
 
-    def _nothing_wrong(
-        self, seen: NDArray[np.uint8], status: NDArray[np.uint8], failed: Mask, untouched: Reference
-    ) -> bool:
+    def _nothing_wrong(self, seen: _Look, status: NDArray[np.uint8], untouched: Reference) -> bool:
         """Most touched frames: what follows would find that all is well too, at twice the work."""
-        quiet = not (seen.any() or status.any() or failed.any() or self._states.any() or self._contacts.felt)
-        return quiet and bool(np.isfinite(untouched.sigma).all())
+        quiet = not (seen.states.any() or status.any() or seen.failed.any() or self._states.any())
+        return quiet and not self._contacts.felt and bool(np.isfinite(untouched.sigma).all())
 
     def problems(self) -> list[str]:
         """For a person: which electrodes, and what to do."""
@@ -168,8 +179,8 @@ class ElectrodeHealth:
         failed: Mask,
         reference: Array | None,
         untouched: Reference | None,
-    ) -> NDArray[np.uint8]:
-        """(E,) what this frame shows."""
+    ) -> _Look:
+        """What this frame shows."""
         states = np.zeros(self.electrodes, dtype=np.uint8)
         no_current = ((status & STATUS_OPEN) != 0) | (failed & (status == 0))
         low = np.zeros_like(failed)
@@ -177,29 +188,35 @@ class ElectrodeHealth:
             known = ~failed & (reference > 0)
             low = known & (amplitude < reference / FAR)
             no_current |= known & (amplitude > FAR * reference)
-        failed |= low | no_current
+        failed = failed | low | no_current
+        seen = _Look(states, amplitude, failed)
         if (low | no_current).mean() > NOTHING_ANSWERS:
             states[:] = STUCK
-            self._fault = (
-                "no electrode answers: the multiplexers are not enabled, nothing is excited (power-cycle the board), "
-                "or the skin's cable is off"
-            )
-            return states
+            seen.fault = NO_ANSWER
+            return seen
         shorted = self._short(low & self.self_sensing)
-        if (
-            reference is not None
-            and self._predicted is not None
-            and self._miswired(amplitude, failed, low, shorted, reference, untouched, states)
-        ):
-            return states
+        if reference is not None and self._predicted is not None and not shorted:
+            fault = self._miswired(amplitude, failed, low, reference, untouched)
+            if isinstance(fault, StuckBit):
+                states[fault.electrodes] = STUCK
+                seen.fault = stuck_bit(fault)
+                return seen
+            if isinstance(fault, Exchanged):
+                states[fault.electrodes] = SWAPPED
+                if untouched is None:  # nothing tells whether putting them right is right
+                    return seen
+                order = seen.order = self._wiring.order(fault)
+                seen.amplitude, seen.failed = amplitude[order], failed[order]
+                low, no_current = low[order], no_current[order]
         states[shorted] = SHORT
-        self._open(failed & (low | no_current), failed, states)
-        if untouched is not None and not states.any():
-            live = ~failed & np.isfinite(untouched.sigma) & ~self.member[self._states != OK].any(axis=0)
-            changed = self._contacts.changed(amplitude, untouched, live)
-            if changed is not None:
+        self._open(seen.failed & (low | no_current), seen.failed, states)
+        if untouched is not None and not np.isin(states, (SHORT, OPEN)).any():
+            well = (self._states == OK) | ((self._states == SWAPPED) & (states == SWAPPED))
+            live = ~seen.failed & np.isfinite(untouched.sigma) & ~self.member[~well].any(axis=0)
+            changed = self._contacts.changed(seen.amplitude, untouched, live)
+            if changed is not None and states[changed] == OK:
                 states[changed] = DRIFTING
-        return states
+        return seen
 
     def _short(self, low: Mask) -> list[int]:
         """Electrodes all joined to each other, by their pairs that measure next to nothing."""
@@ -211,37 +228,16 @@ class ElectrodeHealth:
         return joined
 
     def _miswired(
-        self,
-        amplitude: Array,
-        failed: Mask,
-        low: Mask,
-        shorted: list[int],
-        reference: Array,
-        untouched: Reference | None,
-        states: NDArray[np.uint8],
-    ) -> bool:
-        """Whether wires are exchanged or a multiplexer is stuck; sets `states`."""
-        if shorted:
-            return False
+        self, amplitude: Array, failed: Mask, low: Mask, reference: Array, untouched: Reference | None
+    ) -> Exchanged | StuckBit | None:
+        """Wires exchanged or a multiplexer stuck, where something fell as no touch lets it fall."""
         known = ~failed & (reference > 0)
         noise = 6 * untouched.sigma if untouched else np.zeros(len(amplitude))
         limit = FALLS if untouched else FALLS_UNTARED
         fell = known & (amplitude < (1 - limit) * reference - np.where(known, noise, 0.0) * reference)
         if fell.sum() < 2 and low.sum() < 2:
-            return False
-        fault = self._wiring(np.where(failed & ~low, np.nan, amplitude), reference)
-        if isinstance(fault, Exchanged):
-            states[fault.electrodes] = SWAPPED
-            if untouched is not None:  # else nothing tells whether that is right
-                self._order = self._wiring.order(fault)
-        elif isinstance(fault, StuckBit):
-            states[fault.electrodes] = STUCK
-            self._fault = (
-                f"an address bit of a multiplexer is stuck: bit {fault.bit} of drive{fault.side} or sense{fault.side} "
-                f"stays {fault.value}, so electrodes {listed(fault.electrodes)} (numbered from 0) are never reached; "
-                "look at the board's address lines"
-            )
-        return fault is not None
+            return None
+        return self._wiring(np.where(failed & ~low, np.nan, amplitude), reference)
 
     def _open(self, left: Mask, failed: Mask, states: NDArray[np.uint8]) -> None:
         """Sets `states`: the electrode that explains most failures first; its measurements do not count against the
@@ -261,14 +257,14 @@ class ElectrodeHealth:
 
     # over time
 
-    def _remember(self, seen: NDArray[np.uint8], amplitude: Array, failed: Mask, untouched: Reference | None) -> None:
+    def _remember(self, seen: _Look, untouched: Reference | None) -> None:
         """Faults at once, recovery after WELL_FRAMES."""
-        faulty = seen != OK
-        self._states[faulty] = seen[faulty]
+        faulty = seen.states != OK
+        self._states[faulty] = seen.states[faulty]
         self._well[faulty] = 0
         ailing = (self._states != OK) & ~faulty
         for k in np.flatnonzero(ailing):
-            self._well[k] = self._well[k] + 1 if self._is_well(int(k), amplitude, failed, untouched) else 0
+            self._well[k] = self._well[k] + 1 if self._is_well(int(k), seen.amplitude, seen.failed, untouched) else 0
             if self._well[k] >= WELL_FRAMES:
                 self._states[k] = OK
 
@@ -282,13 +278,13 @@ class ElectrodeHealth:
         off = np.abs(amplitude[rows] - untouched.z0[rows]) / untouched.normaliser[rows]
         return bool((off <= WELL + 6 * untouched.sigma[rows]).mean() >= MOSTLY)
 
-    def _shift(self, amplitude: Array, failed: Mask, untouched: Reference | None) -> Array:
+    def _shift(self, seen: _Look, untouched: Reference | None) -> Array:
         """What the drifting electrodes do to the pairs of the others."""
         drifting = np.flatnonzero(self._states == DRIFTING).tolist()
         self._contacts.keep(drifting)
         if untouched is None or not drifting:
-            return np.zeros(len(amplitude))
-        return self._contacts.shift(drifting, amplitude, untouched, ~failed & np.isfinite(untouched.sigma))
+            return np.zeros(len(seen.amplitude))
+        return self._contacts.shift(drifting, seen.amplitude, untouched, ~seen.failed & np.isfinite(untouched.sigma))
 
     def _reference(self, amplitude: Array, failed: Mask, untouched: Reference | None) -> Array | None:
         """|Z| that a well, untouched skin has: its baseline, else the bundle's prediction times the frame's gain."""

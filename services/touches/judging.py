@@ -168,7 +168,7 @@ class Judge:
 
     def operator(self, live: NDArray[np.bool_], noise: Noise, step: int) -> tuple[Operator, TouchDecision]:
         """RM and the touch decision for these measurements, this noise, this allowance: made once, then kept."""
-        key = live.tobytes(), noise.sigma.tobytes(), noise.frames, step
+        key = self._key(live, noise, step)
         if key not in self._operators:
             if len(self._operators) >= OPERATORS:
                 self._operators.pop(next(iter(self._operators)))
@@ -181,12 +181,16 @@ class Judge:
             self._operators[key] = operator, TouchDecision(operator, self.config.false_alarms, noise.frames)
         return self._operators[key]
 
+    @staticmethod
+    def _key(live: NDArray[np.bool_], noise: Noise, step: int) -> tuple[bytes, bytes, int, int]:
+        return live.tobytes(), noise.sigma.tobytes(), noise.frames, step
+
     def prepare(self, noise: Noise) -> bool:
         """Do one piece of what will be needed next; False where nothing is left. Changes no result."""
         live = self._live & np.isfinite(noise.sigma)
         near = {self.step, max(self.step - 1, 0), self._permitted, min(self._permitted + 1, self.allowance.widest)}
         for step in sorted(near):
-            if (live.tobytes(), noise.sigma.tobytes(), noise.frames, step) not in self._operators:
+            if self._key(live, noise, step) not in self._operators:
                 self.operator(live, noise, step)
                 return True
         if self._evidence is None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from protocol import link
 from protocol.frames import DeltaFrame
 from services.board.adaptive import DEAF_S, FULL_EVERY_S, AdaptiveScan
 from services.board.boardlink import SWITCH_S, BoardLink, Scanning
+from tests.services.fake_board import FakeBoard
 
 REST_S = 6.6  # from power-up to an idling board
 
@@ -161,6 +164,28 @@ def test_a_switch_is_one_start_again_until_answered() -> None:
     assert not said(0.2 + 2 * SWITCH_S)
     taken = host.received(link.encode(scan(full.config, 2, 5)) + link.encode(scan(short.config, 1, 6)), 0.4)
     assert [len(s.z) for s in taken] == [2, 1] and not host.gap
+
+
+def test_a_board_lost_on_the_short_list_is_started_again() -> None:
+    full = Scanning(np.array([[0, 1, 0, 1], [1, 2, 1, 2]]), 128, 4e4)
+    short = Scanning(full.pattern[:1], 128, 4e4)
+    host, board, now = BoardLink(full, 0.0, short), FakeBoard(), 0.0
+    board.ident = replace(board.ident, capabilities=link.Capability.SENTINEL)
+
+    def talk(until: float) -> float:
+        at = now
+        while at < until:
+            host.received(board.receive(host.to_send(at)), at)
+            at += 0.02
+        return at
+
+    now = talk(0.5)
+    host.switch(short)
+    now = talk(1.0)
+    assert host.confirmed is short
+    host._restart(now, "lost")
+    now = talk(now + 1.0)
+    assert host.state == "running" and host.confirmed is full
 
 
 def test_a_board_that_cannot_switch_is_left_at_full_scans() -> None:

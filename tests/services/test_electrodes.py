@@ -95,6 +95,36 @@ def test_a_contact_that_rises_under_a_touch_is_named_and_makes_no_second_one(ski
     assert states(skin.rest(BACK_WITHIN + 3)) == {}
 
 
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+def test_a_channel_that_comes_back_under_a_lifted_contact_blinds_nobody(broken: float) -> None:
+    own, lifted = StubSkin(80.0), ((9, 6.0),)
+
+    def felt(contacts: tuple[tuple[int, float], ...], gone: bool) -> Result:
+        z, status = own.analog.measure((transfer(PRESS, contacts),) * 2, own.pattern, 128, 40_000.0, 0.0)
+        z[50] = broken if gone else z[50]
+        return own.run(z, status)
+
+    for contacts, gone in (((), True), (lifted, True), (lifted, False)):
+        results = [felt(contacts, gone) for _ in range(12)]
+    assert states(results[-1]) == {"drifting": [9]} and np.isfinite(results[-1].delta.difference).all()
+    assert position_error_m(results[-1]) < 0.003
+    assert states(own.rest(BACK_WITHIN + 3)) == {}
+    own.rest(80)
+    assert position_error_m(own.feel(PRESS)) < 0.003  # the baseline is what it was
+
+
+def test_exchanged_wires_and_a_lifted_contact_are_three_faults(skin: StubSkin) -> None:
+    """No contact is valid: more electrodes are at fault than contacts can be given with."""
+    skin.faults.inject("electrodes_swapped", {"electrodes": [11, 14]}, 0.0, 1e9)
+    try:
+        felt = [skin.feel((), ((10, 12.0),)) for _ in range(12)]
+        assert states(felt[-1]) == {"swapped": [11, 14], "drifting": [10]} and not felt[-1].contact.valid
+        assert not any(r.contact.valid and r.contact.contacts for r in felt[NAMED_WITHIN:])
+    finally:
+        skin.faults.clear()
+    assert states(skin.rest(BACK_WITHIN + 3)) == {}
+
+
 def test_a_contact_that_rises_within_scans_is_named_before_it_is_up(skin: StubSkin) -> None:
     """Each measurement of a scan finds it higher than the last."""
     rising = [transfer((), ((9, factor),)) for factor in (1.0, 3.5, 6.0)]

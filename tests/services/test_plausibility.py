@@ -47,6 +47,7 @@ def test_a_gross_fault_gives_no_valid_contact(
     tared: dict[float, StubSkin], name: str, args: dict[str, Any], shapes: tuple[Shape, ...], snr_db: float
 ) -> None:
     skin = tared[snr_db]
+    skin.rest(6)  # whatever was before is over
     skin.faults.inject(name, args, 0.0, 1.0)
     try:
         found = [skin.feel(shapes) for _ in range(4)]
@@ -70,6 +71,7 @@ def test_the_hardest_touches_are_no_fault(
     tared: dict[float, StubSkin], shapes: tuple[Shape, ...], snr_db: float
 ) -> None:
     skin = tared[snr_db]
+    skin.rest(6)
     found = [skin.feel(shapes) for _ in range(4)]
     assert all(r.delta.touched and r.delta.valid for r in found)
     skin.feel()

@@ -56,6 +56,13 @@ def test_a_processor_that_is_not_there_is_said():
     assert len(refused) == 1 and "4000" in refused[0] and cpus == sorted(os.sched_getaffinity(0))
 
 
+@pytest.mark.parametrize("absent", [4000, 2**40])
+def test_processors_of_which_some_are_not_there_are_said(absent):
+    mine = sorted(os.sched_getaffinity(0))[-1]
+    refused, _, cpus, _ = ask({"cpus": {"inference": [mine, absent]}}, unprivileged=True)
+    assert len(refused) == 1 and str(absent) in refused[0] and mine in cpus
+
+
 def test_pinning_needs_no_privilege_and_is_for_the_process_named():
     mine = sorted(os.sched_getaffinity(0))[-1]
     refused, _, cpus, _ = ask({"cpus": {"inference": [mine]}}, unprivileged=True)
@@ -76,6 +83,8 @@ def test_each_is_had_or_refused_never_neither():
     ("section", "named"),
     [
         ({"priority": 100}, "realtime.priority"),
+        ({"priority": True}, "realtime.priority"),
+        ({"lock_memory": "no"}, "realtime.lock_memory"),
         ({"cpus": {"infrence": [0]}}, "infrence"),
         ({"cpus": {"inference": []}}, "inference"),
         ({"cpus": {"inference": [-1]}}, "realtime.cpus"),
