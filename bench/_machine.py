@@ -10,6 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from models import manifest
+
 PACKAGES = ("numpy", "scipy", "onnxruntime", "pyzmq", "msgpack")
 
 
@@ -29,6 +31,10 @@ def versions() -> dict[str, str]:
 
 
 def provenance(benchmark: str, arguments: Sequence[str] | None) -> dict[str, Any]:
-    """How a report was made: command, machine, versions. arguments: as `main` was given them (None: sys.argv's)."""
+    """How a report was made: command, commit, machine. arguments: as `main` was given them (None: the program's);
+    where the report goes to is left out.
+    """
     words = ["skin", "bench", benchmark, *(sys.argv[1:] if arguments is None else arguments)]
-    return {"command": " ".join(words), "machine": machine(), "versions": versions()}
+    if "--out" in words:
+        del words[words.index("--out") : words.index("--out") + 2]
+    return {"command": " ".join(words), "commit": manifest.commit(), "machine": machine(), "versions": versions()}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from rich.table import Table
 from bench._frames import REFERENCE, Frames, Level
 from bench._goals import Goal, table
 from bench._json import write_json
-from bench._machine import machine
+from bench._machine import machine, provenance
 from bench._scores import Row
 from models.bundle import Bundle
 
@@ -84,14 +83,12 @@ class Report:
     def head(self) -> dict[str, object]:
         names, counts = np.unique(self.frames.group, return_counts=True)
         return {
-            "command": "skin bench accuracy " + " ".join(sys.argv[1:]),
-            "machine": machine(),
+            **provenance("accuracy", None),
             "bundle": {"name": self.bundle.name, "hash": self.bundle.hash},
             "mesh": self.mesh,
             "seed": self.seed,
             "frames": {str(name): int(count) for name, count in zip(names, counts, strict=True)},
             "eidors": REFERENCE.exists(),
-            "versions": {name: version(name) for name in ("numpy", "scipy", "onnxruntime", "pyeit")},
             "time": "CPU time of one thread per frame, median; shipped: the whole pipeline, mean",
         }
 

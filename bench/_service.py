@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,19 @@ from protocol.sockets import ControlClient
 
 ROOT = Path(__file__).resolve().parents[1]
 START_S = 60.0
+
+
+BEGIN: dict[str, Callable[[Service], Any]] = {
+    "untouched": lambda service: service.stub("release"),
+    "still": lambda service: service.stub("press", x=0.01, y=0.0, force=3.0, seconds=600.0),
+    "moving": lambda service: service.stub("scene", name="slide"),
+}
+"""What the stub is told so that the skin is so."""
+
+
+def end_on_sigterm() -> None:
+    """SIGTERM unwinds the program, so that what it started ends too."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from bench._goals import Goal
 from bench._json import write_json
-from bench._machine import machine, versions
+from bench._machine import provenance
 from bench._report import text
 from bench._stability_run import Row, Setting
 
@@ -88,9 +88,7 @@ def show(found: Found) -> None:
 
 def head(setting: Setting, seconds: float, cpu_seconds: float) -> dict[str, Any]:
     return {
-        "command": "skin bench stability " + " ".join(sys.argv[1:]),
-        "machine": machine(),
-        "versions": versions(),
+        **provenance("stability", None),
         "bundle": {"name": setting.bundle.name, "hash": setting.bundle.hash},
         "seed": setting.seed,
         "quick": setting.quick,

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from bench._goals import Goal, table
 from bench._json import write_json
-from bench._machine import machine, versions
+from bench._machine import provenance
 from bench._tracking_scene import Recorded
 from models.bundle import Bundle
 
@@ -58,10 +58,10 @@ def goals(found: dict[str, Any]) -> list[Goal]:
     late = sum(f["named"] is None or f["named"] > NAMED_WITHIN for f in faults)
     fade = found["fade_%"]
     return [
-        Goal("position error, median, % of the side", row["position_%"], at_most=1.5),
-        Goal("force error, median, %", row["force_%"], at_most=8.0),
-        Goal("id switches per 100 touches", per_100, at_most=1.0),
-        Goal("false touches", row["false_touches"], at_most=0),
+        Goal("position error, median, % of the side", row["position_%"], at_most=1.5, gate=1.5),
+        Goal("force error, median, %", row["force_%"], at_most=8.0, gate=16.0),
+        Goal("id switches per 100 touches", per_100, at_most=1.0, gate=10.0),
+        Goal("false touches", row["false_touches"], at_most=0, gate=5),
         Goal(f"electrode faults not named within {NAMED_WITHIN} frames, of {len(faults)}", late, at_most=0),
         *([] if fade is None else [Goal("force of the held touch, change, %", abs(fade), at_most=2.0)]),
     ]
@@ -69,10 +69,7 @@ def goals(found: dict[str, Any]) -> list[Goal]:
 
 def head(args: argparse.Namespace, bundle: Bundle, recorded: Recorded, simulated_s: float, scored_s: float) -> Any:
     return {
-        "command": f"skin bench tracking --scene {args.scene} --snr {args.snr:g} --seed {args.seed}"
-        + (f" --seconds {args.seconds:g}" if args.seconds else ""),
-        "machine": machine(),
-        "versions": versions(),
+        **provenance("tracking", None),
         "bundle": {"name": bundle.name, "hash": bundle.hash, "network": args.network},
         "scene": args.scene,
         "seed": args.seed,

@@ -16,6 +16,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,9 +24,9 @@ from pathlib import Path
 from typing import Any
 
 from bench._goals import Goal
-from models import manifest
 
 ROOT = Path(__file__).resolve().parents[1]
+LIMIT_S = 3600.0  # for one benchmark
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ BENCHMARKS = (
     Benchmark("latency", "Latency, outside the processes", ("--seconds", "6", "--controllers", "1", "4"), ("latency",)),
     Benchmark("skip", "Skip rules", ("--seconds", "8", "--live", "5")),
     Benchmark("scale", "Many skins", ("--skins", "1", "8", "--seconds", "6", "--touched", "0.25"), ("scale",)),
+    Benchmark("memory", "Memory over many frames", ("--frames", "20000")),
     Benchmark("sentinel", "Adaptive scan", ("--quick",)),
     Benchmark("peers", "Peers", ("--frames", "30", "--rounds", "2")),
     Benchmark("tracking", "Ten minutes of contacts", ("--seconds", "60")),
@@ -51,25 +53,47 @@ BENCHMARKS = (
 
 
 def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
-    """Runs it; its tables go to our output. Returns what went wrong, or ""."""
+    """Runs it; its tables go to our output and to NAME.txt. Returns what went wrong, or ""."""
     command = [sys.executable, "-m", f"bench.{benchmark.name}", *(benchmark.quick if quick else ())]
     print(f"\n=== {benchmark.title}: {' '.join(command[2:])}", flush=True)
-    status = subprocess.run([*command, "--out", str(folder)], cwd=ROOT).returncode
+    for suffix in ("json", "txt"):  # what an earlier run left is not this one's
+        (folder / f"{benchmark.name}.{suffix}").unlink(missing_ok=True)
+    process = subprocess.Popen(
+        [*command, "--out", str(folder)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"COLUMNS": "150"},
+    )
+    late = threading.Timer(LIMIT_S, process.terminate)
+    late.start()
+    assert process.stdout is not None
+    with (folder / f"{benchmark.name}.txt").open("w", encoding="utf-8") as kept:
+        for line in process.stdout:
+            print(line, end="", flush=True)
+            kept.write(line)
+    status = process.wait()
+    late.cancel()
     return f"{benchmark.name} ended with exit status {status}" if status else ""
 
 
 def section(benchmark: Benchmark, folder: Path) -> tuple[list[str], list[Goal]]:
-    """(lines of the page, goals). Raises FileNotFoundError where it was not run."""
+    """(lines of the page, goals). Raises FileNotFoundError where it was not run, KeyError where an older one was."""
     report: dict[str, Any] = json.loads((folder / f"{benchmark.name}.json").read_text(encoding="utf-8"))
     goals = [Goal.from_dict(found) for found in report["targets"]]
     versions = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
-    lines = [f"## {benchmark.title}", "", f"`{report['command'].strip()}` on {report['machine']}; {versions}."]
+    made = f"`{report['command'].strip()}` at commit {report['commit']} on {report['machine']}; {versions}."
+    lines = [f"## {benchmark.title}", "", made]
     if bundle := report.get("bundle"):
         lines[-1] += f" Bundle {bundle['name']} {bundle['hash'][:12]}."
     lines += ["", "| | measured | target | |", "|---|---|---|---|"]
     for goal in goals:
         word = {True: "met", False: "**missed**", None: ""}[goal.met]
         lines.append(f"| {goal.figure} | {goal.measured} | {goal.wanted} | {word} |")
+    tables = folder / f"{benchmark.name}.txt"
+    if tables.is_file():
+        lines += ["", "<details><summary>all it printed</summary>", "", "```"]
+        lines += [tables.read_text(encoding="utf-8").rstrip(), "```", "", "</details>"]
     for note in report.get("left_out", []):
         lines += ["", note]
     for picture in benchmark.pictures:
@@ -84,7 +108,7 @@ def page(chosen: Sequence[Benchmark], folder: Path) -> tuple[str, list[Goal]]:
     for benchmark in chosen:
         try:
             lines, goals = section(benchmark, folder)
-        except FileNotFoundError:
+        except (FileNotFoundError, KeyError):
             lines, goals = [f"## {benchmark.title}", "", f"Not run: `skin bench {benchmark.name}`.", ""], []
         bodies += lines
         every += goals
@@ -93,8 +117,7 @@ def page(chosen: Sequence[Benchmark], folder: Path) -> tuple[str, list[Goal]]:
     top = [
         "# Benchmarks",
         "",
-        f"Made by `skin bench all` at commit {manifest.commit()}: {met} of {len(with_target)} targets met. Each "
-        "section says its own command; times are of two shared cores with the stub's board running beside the service.",
+        f"By `skin bench all`: {met} of {len(with_target)} targets met. Each section says its command and machine.",
         "",
     ]
     return "\n".join(top + bodies), every
@@ -112,6 +135,7 @@ def main(argv: list[str] | None = None) -> int:
     began, wrong = time.perf_counter(), []
     if not args.reuse:
         wrong = [problem for b in chosen if (problem := run(b, args.out.resolve(), args.quick))]
+    failed = bool(wrong)
     text, goals = page(BENCHMARKS if args.only is None or args.reuse else chosen, args.out)
     print("\n" + text)
     if not args.quick and (args.only is None or args.reuse):
@@ -121,7 +145,7 @@ def main(argv: list[str] | None = None) -> int:
     for problem in wrong:
         print(f"FAILED: {problem}", file=sys.stderr)
     print(f"{(time.perf_counter() - began) / 60:.1f} minutes, {os.cpu_count()} cores")
-    return 1 if wrong and (args.quick or not goals) else 0
+    return 1 if failed or (args.quick and wrong) else 0
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from bench._json import write_json
 from bench._machine import machine, provenance
 from bench._peers import PyEIT, name
 from bench._relay_frames import HOPS, sizes
+from bench._service import end_on_sigterm
 from bench._tracking_scene import Recorded
 from bench.skip import ENDS_S, QUIET_S, scenes
 from services.config import Skin
@@ -143,18 +144,18 @@ class Relay:
 def relays(folder: Path, stack: ExitStack) -> tuple[dict[str, Relay], list[str]]:
     """The transports that there are, and what to say of those that there are not."""
     log, missing = folder / "log.txt", []
+    port = _free_ports(1 + len(HOPS))  # roscore's, then zenoh's
     found = {
         "bare pyzmq": Relay("zmq", str(folder), sys.executable, {}, log, stack),
         "eitskin": Relay("eitskin", str(folder), sys.executable, {}, log, stack),
     }
     try:
         title = f"eclipse-zenoh {version('eclipse-zenoh')}"
-        found[title] = Relay("zenoh", str(_free_ports(len(HOPS))), sys.executable, {}, log, stack)
+        found[title] = Relay("zenoh", str(port + 1), sys.executable, {}, log, stack)
     except PackageNotFoundError:
         missing.append("eclipse-zenoh is not installed (pip install eclipse-zenoh): left out")
     ros = _ros_version()
     if ros and shutil.which("roscore"):
-        port = _free_ports(1)
         at_home = {
             "ROS_MASTER_URI": f"http://127.0.0.1:{port}",
             "ROS_IP": "127.0.0.1",
@@ -213,15 +214,17 @@ def relayed(frames: int, rounds: int) -> tuple[dict[str, dict[str, float]], list
         for _ in range(rounds):
             for transport, relay in found.items():
                 took.setdefault(transport, []).extend(relay.run(frames))
+    missing += [f"{transport} relayed nothing: left out" for transport, times in took.items() if not times]
     sent = frames * rounds
     return {
         transport: {
-            "p50_ms": float(np.percentile(times or [np.inf], 50)),
-            "p99_ms": float(np.percentile(times or [np.inf], 99)),
+            "p50_ms": float(np.percentile(times, 50)),
+            "p99_ms": float(np.percentile(times, 99)),
             "lost": sent - len(times),
             "sent": sent,
         }
         for transport, times in took.items()
+        if times
     }, missing
 
 
@@ -255,6 +258,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
     args = parser.parse_args(argv)
+    end_on_sigterm()
     solving = solved(args.rounds)
     console = Console(width=110)
     console.print(table(f"one scan of 120 measurements, warm, {machine()}", solving, next(iter(solving))))

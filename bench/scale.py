@@ -1,7 +1,6 @@
 """Many skins on one set of processes: frames lost, latency, CPU and memory against their number.
 
     skin bench scale [--skins 1 4 16 32 64] [--seconds 15] [--touched 0.25 1.0]
-    skin bench scale --memory 1000000          frames through the stages: what memory does
 
 Every skin is a recording of the stub's board, played at its own 22 frames a second and phase through the real
 processes. `touched`: the share of the skins that a moving touch is on all the time; the others have none. Latency is
@@ -12,10 +11,10 @@ writes scale.json and draws scale.png.
 from __future__ import annotations
 
 import argparse
-import gc
 import os
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +28,10 @@ from bench import _goals
 from bench._goals import Goal
 from bench._json import write_json
 from bench._machine import machine, provenance
-from bench._service import Outside, Service, running
+from bench._service import Outside, Service, end_on_sigterm, running
 from bench._tracking_scene import Recorded
-from bench.skip import run_once, scenes
-from models.bundle import Bundle
+from bench.skip import scenes
 from protocol.frames import pack
-from services.config import Skin
-from services.pipeline import build_stages
 from services.recordings.recording import RecordingWriter
 from services.stage import PROCESSES
 
@@ -44,21 +40,20 @@ TARGET = {"skins": 32, "p99_ms": 20.0}
 START_S = 30.0  # of a recording, untouched: processes start, the tare
 MARGIN_S = 3.0  # of a recording, beyond what is measured
 STATUS_S = 1.5  # for the last status frames to tell what was dropped
-GROWTH = 0.01  # of memory, over a long run
 
 
-def recordings(folder: Path, n: int, touched: float, seconds: float) -> Path:
-    """n recordings and the skin.toml that plays them; returns the latter."""
+def recordings(folder: Path, n: int, touched: float, seconds: float) -> tuple[Path, int, float]:
+    """n recordings and the skin.toml that plays them: its path, how many are touched, their frames a second."""
     of = scenes(seconds, START_S)
-    lines = []
+    lines, moving = [], [(k + 0.5) * touched % 1 < touched and touched > 0 for k in range(n)]
     for k in range(n):
-        recorded = of["moving" if (k + 0.5) * touched % 1 < touched and touched > 0 else "untouched"]
+        recorded = of["moving" if moving[k] else "untouched"]
         name = f"s{k:02d}"
         _write(folder / f"{name}.mcap", name, recorded, phase_s=(k * 0.618) % 1 / RATE_HZ)
         lines.append(f'[skins.{name}]\nport = "{folder / name}.mcap"\nbundle = "square16"\n')
     path = folder / "skin.toml"
     path.write_text("\n".join(lines))
-    return path
+    return path, sum(moving), 1 / float(np.median(np.diff(of["untouched"].seconds)))
 
 
 def _write(path: Path, skin: str, recorded: Recorded, phase_s: float) -> None:
@@ -71,7 +66,7 @@ def _write(path: Path, skin: str, recorded: Recorded, phase_s: float) -> None:
             writer.write(topic.decode(), body, frame.stamps["sample"])
 
 
-def measure(service: Service, n: int, seconds: float) -> dict[str, Any]:
+def measure(service: Service, n: int, seconds: float, rate_hz: float) -> dict[str, Any]:
     """What one controller that takes everything sees of n skins."""
     socket = zmq.Context.instance().socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, 100_000)
@@ -80,7 +75,7 @@ def measure(service: Service, n: int, seconds: float) -> dict[str, Any]:
     for topic in (b"contact/", b"status/"):
         socket.subscribe(topic)
     latency: list[float] = []
-    seen: dict[str, list[int]] = {}  # skin -> scans
+    seen = Counter[str]()
     dropped: dict[tuple[str, str], list[int]] = {}  # said by status frames: the last before we count, those after
     cpu: dict[str, float] = {}
     began = time.monotonic() + STATUS_S
@@ -100,13 +95,13 @@ def measure(service: Service, n: int, seconds: float) -> dict[str, Any]:
                 counts.clear()
             counts.append(sum(frame["drops"].values()))
         elif began <= now < began + seconds:
-            seen.setdefault(frame["skin"], []).append(frame["scan"])
+            seen[frame["skin"]] += 1
             latency.append((at - frame["stamps"]["read"]) * 1e-6)
     took = time.monotonic() - began
     used = {name: seconds_used - cpu[name] for name, seconds_used in service.cpu_s().items()}
     socket.close(0)
-    expected = sum(scans[-1] - scans[0] + 1 for scans in seen.values())
-    frames = sum(map(len, seen.values()))
+    frames = seen.total()
+    expected = max(frames, n * (int(rate_hz * seconds) - 1))  # one may lie on the window's edge
     reported = sum(counts[-1] - counts[0] for counts in dropped.values())
     return {
         "skins": n,
@@ -125,13 +120,13 @@ def measure(service: Service, n: int, seconds: float) -> dict[str, Any]:
 
 def scaled(n: int, touched: float, seconds: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="eitskin-scale") as folder:
-        path = recordings(Path(folder), n, touched, seconds + 2 * STATUS_S + MARGIN_S)
+        path, moving, rate_hz = recordings(Path(folder), n, touched, seconds + 2 * STATUS_S + MARGIN_S)
         before = os.environ.get("EITSKIN_CONFIG")
         os.environ["EITSKIN_CONFIG"] = str(path)
         try:
             with running(skin="s00") as service:
                 _wait_for_touch(service, touched)
-                return {"touched": touched, **measure(service, n, seconds)}
+                return {"touched": moving / n, **measure(service, n, seconds, rate_hz)}
         finally:
             os.environ.pop("EITSKIN_CONFIG")
             if before is not None:
@@ -149,31 +144,6 @@ def _wait_for_touch(service: Service, touched: float) -> None:
     contacts.close()
 
 
-def memory(frames: int) -> dict[str, float]:
-    """Resident memory [MB] of the stages after a tenth of the frames and after all of them, half of them touched."""
-    recorded, bundle = scenes(20.0), Bundle.load("square16")
-    stages = build_stages("palm", Skin(port="stub", bundle="square16", frame_id="palm"), bundle)
-    turns = [recorded["untouched"], recorded["moving"]]
-    found: dict[str, float] = {}
-    done = 0
-    while done < frames:
-        for scene in turns:
-            for k in range(len(scene)):
-                run_once(stages, scene.frame(k))
-                done += 1
-                if done == frames // 10:
-                    found["first_mb"] = _resident_mb()
-    found["last_mb"] = _resident_mb()
-    found["growth"] = found["last_mb"] / found["first_mb"] - 1
-    found["frames"] = done
-    return found
-
-
-def _resident_mb() -> float:
-    gc.collect()
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
 def goals(rows: list[dict[str, Any]]) -> list[Goal]:
     found = []
     for row in rows:
@@ -184,7 +154,7 @@ def goals(rows: list[dict[str, Any]]) -> list[Goal]:
         found.append(Goal(f"{which}: share of frames lost", row["lost"]))
         found.append(Goal(f"{which}: lost without a word, share", row["unreported"], at_most=0.0, gate=0.0))
     for share in sorted({row["touched"] for row in rows}):
-        mine = sorted((row for row in rows if row["touched"] == share), key=lambda row: row["skins"])
+        mine = sorted((r for r in rows if r["touched"] == share), key=lambda row: row["skins"])
         if len(mine) > 1:
             one, many = mine[0], mine[-1]
             ratio = many["cores"] / many["skins"] / (one["cores"] / one["skins"])
@@ -240,14 +210,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--skins", type=int, nargs="+", default=[1, 4, 16, 32, 64])
     parser.add_argument("--seconds", type=float, default=15.0, help="of each measurement")
     parser.add_argument("--touched", type=float, nargs="+", default=[0.25, 1.0], help="shares of the skins")
-    parser.add_argument("--memory", type=int, metavar="FRAMES", help="watch memory over so many frames instead")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
     args = parser.parse_args(argv)
-    if args.memory:
-        found = memory(args.memory)
-        print("{frames:.0f} frames: {first_mb:.1f} MB after a tenth, {last_mb:.1f} MB at the end".format(**found))
-        print(f"growth {100 * found['growth']:.2f} %, allowed {100 * GROWTH:.0f} %")
-        return int(found["growth"] > GROWTH)
+    end_on_sigterm()
     rows = [scaled(n, share, args.seconds) for share in args.touched for n in args.skins]
     Console(width=120).print(table(rows))
     wanted = goals(rows)

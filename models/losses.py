@@ -32,7 +32,7 @@ WEIGHTS = {
     "amplitude": 0.5,
     "peak": 0.3,
     "integral": 0.3,
-    "class": 0.5,
+    "class": 0.8,
     "sigma": 0.02,
 }
 

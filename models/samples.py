@@ -20,7 +20,7 @@ from models.shapes import from_rows
 
 N = 96
 GRID = 24
-KIND_WEIGHT = np.array([0.0, 0.85, 1.2, 1.2, 1.2, 1.2, 0.35])  # none, circle, triangle, rectangle, square, L, Hertz
+KIND_WEIGHT = np.array([0.0, 0.85, 1.2, 1.2, 1.2, 1.2, 0.8])  # none, circle, triangle, rectangle, square, L, Hertz
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,12 +132,10 @@ class Monitor:
 
 def _process(status: StatusFrame, before: StatusFrame | None, silent_s: float) -> dict[str, Any]:
     silent = silent_s > SILENT_S
-    rate = max((hz for topic, hz in status.rates.items() if topic not in ("status", "info")), default=0.0)
     return {
         "level": "STALE" if silent else status.level,
         "messages": [f"silent for {silent_s:.0f} s"] if silent else list(status.messages),
         "cpu": round(status.cpu, 4),
-        "cpu_ms_per_frame": round(1e3 * status.cpu / rate, 3) if rate > 0 else None,
         "skipped": _skipped(status, before),
         "latency_ms": dict(status.latency),
         "rates_hz": dict(status.rates),

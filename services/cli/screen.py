@@ -61,7 +61,7 @@ def _topics(now: dict[str, Any]) -> Table:
 
 
 def _processes(now: dict[str, Any]) -> Table:
-    table = _table("process", "level", "CPU %", "CPU ms a frame", "work p50 ms", "p99")
+    table = _table("process", "level", "CPU %", "work p50 ms", "p99")
     table.add_column("dropped")
     table.add_column("spared")
     for name, row in now["processes"].items():
@@ -70,7 +70,6 @@ def _processes(now: dict[str, Any]) -> Table:
             name,
             Text(row["level"], style=LEVELS[row["level"]]),
             _number(row["cpu"] * 100),
-            _number(row["cpu_ms_per_frame"], 2),
             _number(latency.get("work_p50"), 2),
             _number(latency.get("work_p99"), 2),
             ", ".join(f"{n} {cause}" for cause, n in row["drops"].items() if n) or "0",

@@ -29,7 +29,13 @@ def test_goal(goal: Goal, met: bool | None, passed: bool) -> None:
 
 
 def report(folder, name, *goals, **more):
-    content = {"command": f"skin bench {name}", "machine": "2 x one", "versions": {"python": "3"}, **more}
+    content = {
+        "command": f"skin bench {name}",
+        "commit": "c0ffee",
+        "machine": "2 x one",
+        "versions": {"python": "3"},
+        **more,
+    }
     content["targets"] = [goal.to_dict() for goal in goals]
     (folder / f"{name}.json").write_text(json.dumps(content))
 
@@ -44,8 +50,23 @@ def test_the_page_says_what_is_missed_and_what_was_not_run(tmp_path, capsys):
     assert "1 of 2 targets met" in written
     assert "| p99, ms | 7 | at most 5 | **missed** |" in written and "| p50, ms | 1.5 | at most 2 | met |" in written
     assert "| ratio | 1.5 |  |  |" in written and "rospy is not installed" in written
-    assert "`skin bench latency` on 2 x one; python 3." in written and "(latency.png)" in written
+    assert "`skin bench latency` at commit c0ffee on 2 x one; python 3." in written and "(latency.png)" in written
     assert "Not run: `skin bench tracking`." in written
+
+
+def test_a_report_of_an_older_version_is_not_run(tmp_path):
+    (tmp_path / "skip.json").write_text('{"machine": "one"}')
+    assert page.main(["--reuse", "--out", str(tmp_path)]) == 0
+    assert "Not run: `skin bench skip`." in (tmp_path / "README.md").read_text()
+
+
+def test_a_benchmark_that_fails_leaves_no_old_figures(tmp_path, monkeypatch, capsys):
+    report(tmp_path, "skip", Goal("old", 1.0))
+    broken = page.Benchmark("no_such_module", "Broken", ())
+    (tmp_path / "no_such_module.json").write_text((tmp_path / "skip.json").read_text())
+    monkeypatch.setattr(page, "BENCHMARKS", (broken,))
+    assert page.main(["--only", "no_such_module", "--out", str(tmp_path)]) == 1
+    assert "old" not in capsys.readouterr().out
 
 
 def test_a_ratio_beyond_its_gate_fails_the_short_form(tmp_path, capsys):
