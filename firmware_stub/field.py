@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import OrderedDict
@@ -20,6 +21,7 @@ MOST_SOLVES_HZ = 7.0  # faster movements get fewer key poses, and a coarser inte
 LOOK_AHEAD_S = 1.0
 KEPT = 4096  # solved worlds (2 kB each): a looping scene is solved once
 THREAD_SHARE = 0.25  # of one core the solving thread allows itself
+SOLVER_NICE = 10
 
 
 class Field:
@@ -149,6 +151,8 @@ class Field:
         return matrix
 
     def _work(self) -> None:
+        # A real board's physics costs the host nothing: whoever is in a hurry goes before it.
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), SOLVER_NICE)
         while True:
             with self._lock:
                 while not self._wanted and not self._stopped:

@@ -9,12 +9,16 @@ else.
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.prereconstruction import Drift
 
+KEPT = 10  # noises of frames whose matrices are kept, 0.3 MB each
 MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through
 DRIFT = Drift(scale=2e-3, contact=1e-2)  # a change that drift of this size explains is not held against the image
 CHANCE = 4.0  # standard deviations of chi-square that the noise may come to
@@ -23,8 +27,21 @@ FAINT = 100.0  # energy over the noise's below which it is refused from REFUSED_
 REFUSED_FAINT = 0.15  # of a faint touch noise hides what the image gets wrong, of a faint anything-else it does not
 
 
+class Conditioned(NamedTuple):
+    """For one noise of the frames."""
+
+    whiten: NDArray[np.float32]  # (K, K)
+    forward: NDArray[np.float32]  # (K, h * w), whitened
+    noise: float  # the energy that noise may leave; 0 where nothing can be told
+
+
+NOTHING = Conditioned(np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32), 0.0)
+
+
 class Residual:
-    """For one bundle and image size. Conditioned again whenever the noise of the frames changes."""
+    """For one bundle and image size. Conditioned once for each noise that frames come with: those of a touch that is
+    held are means of 1, 2, 4, 8 or 16.
+    """
 
     def __init__(self, bundle: Bundle, to_scale: bool) -> None:
         """to_scale: images are in S/m; else only their form counts, not their size."""
@@ -32,7 +49,7 @@ class Residual:
         self.shape: tuple[int, int] = bundle.matrices.inside.shape
         self.refused = False  # whether the last image that was given a share is of no touch
         self._sizes = (0, 0)
-        self._sigma, self._noise = b"", 0.0  # noise: the energy that it may leave; 0 where nothing can be told
+        self._known: OrderedDict[bytes, Conditioned] = OrderedDict()
 
     def __call__(
         self, difference: NDArray[np.float32], sigma: NDArray[np.float32], image: NDArray[np.float32]
@@ -43,7 +60,7 @@ class Residual:
         h, w = self.shape
         if image.ndim != 2 or not image.size or image.shape[0] % h or image.shape[1] % w:
             return None
-        if len(difference) != self.pre.measurements or not self._condition(sigma):
+        if len(difference) != self.pre.measurements or not (known := self._conditioned(sigma)).noise:
             return None
         y = np.clip(image, np.float32(0.0), np.float32(MOST_DROP))
         if self.to_scale:
@@ -52,14 +69,14 @@ class Residual:
             np.negative(y, out=y)
         down, across = self._means(*image.shape)
         coarse = (down @ y @ across).ravel()
-        seen, expected = self._whiten @ difference, self._forward @ coarse
+        seen, expected = known.whiten @ difference, known.forward @ coarse
         if not self.to_scale:
             expected *= max(0.0, float(expected @ seen)) / max(float(expected @ expected), 1e-30)
         left = seen - expected
-        beyond = float(left @ left) - self._noise
-        energy = max(float(seen @ seen), self._noise)
+        beyond = float(left @ left) - known.noise
+        energy = max(float(seen @ seen), known.noise)
         share = max(0.0, beyond) / energy
-        self.refused = not share <= (REFUSED if energy > FAINT * self._noise else REFUSED_FAINT)
+        self.refused = not share <= (REFUSED if energy > FAINT * known.noise else REFUSED_FAINT)
         return share if np.isfinite(share) else None
 
     def _means(self, rows: int, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -71,17 +88,23 @@ class Residual:
             self._matrices = np.ascontiguousarray(down), np.ascontiguousarray(across)
         return self._matrices
 
-    def _condition(self, sigma: NDArray[np.float32]) -> bool:
+    def _conditioned(self, sigma: NDArray[np.float32]) -> Conditioned:
         key = sigma.tobytes()
-        if key == self._sigma:
-            return self._noise > 0
-        self._sigma, self._noise = key, 0.0
+        if key not in self._known:
+            self._known[key] = self._condition(sigma)
+            if len(self._known) > KEPT:
+                self._known.popitem(last=False)
+        self._known.move_to_end(key)
+        return self._known[key]
+
+    def _condition(self, sigma: NDArray[np.float32]) -> Conditioned:
         live = np.isfinite(sigma)
         if live.sum() < len(sigma) / 4:
-            return False
+            return NOTHING
         operator = self.pre.condition(sigma.astype(float), drift=DRIFT, weights=live.astype(float))
         count = int(live.sum())
-        self._whiten = np.ascontiguousarray(operator.whiten, dtype=np.float32)
-        self._forward = np.ascontiguousarray(operator.whiten @ operator.jacobian, dtype=np.float32)
-        self._noise = count + CHANCE * float(np.sqrt(2 * count))
-        return True
+        return Conditioned(
+            whiten=np.ascontiguousarray(operator.whiten, dtype=np.float32),
+            forward=np.ascontiguousarray(operator.whiten @ operator.jacobian, dtype=np.float32),
+            noise=count + CHANCE * float(np.sqrt(2 * count)),
+        )
