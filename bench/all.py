@@ -27,6 +27,7 @@ from bench._goals import Goal
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 3600.0  # for one benchmark
+LONG = 12_000  # characters of its tables beyond which the page only names the file
 
 
 @dataclass(frozen=True)
@@ -91,9 +92,11 @@ def section(benchmark: Benchmark, folder: Path) -> tuple[list[str], list[Goal]]:
         word = {True: "met", False: "**missed**", None: ""}[goal.met]
         lines.append(f"| {goal.figure} | {goal.measured} | {goal.wanted} | {word} |")
     tables = folder / f"{benchmark.name}.txt"
-    if tables.is_file():
-        lines += ["", "<details><summary>all it printed</summary>", "", "```"]
-        lines += [tables.read_text(encoding="utf-8").rstrip(), "```", "", "</details>"]
+    printed = tables.read_text(encoding="utf-8").rstrip() if tables.is_file() else ""
+    if len(printed) > LONG:
+        lines += ["", f"[All it printed]({tables.name})"]
+    elif printed:
+        lines += ["", "<details><summary>All it printed</summary>", "", "```", printed, "```", "", "</details>"]
     for note in report.get("left_out", []):
         lines += ["", note]
     for picture in benchmark.pictures:
