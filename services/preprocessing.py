@@ -158,6 +158,8 @@ class Preprocessing(Stage):
                 self._counters["held"] += 1
                 return
             d = mean
+            if self.hold.averaged > 1:
+                operator = self.judge.of_mean(self.hold.averaged, self._noise())
             out.difference = d.astype(np.float32)
             out.sigma = (out.sigma / np.sqrt(self.hold.averaged)).astype(np.float32)
         out.reconstructed = out.scan

@@ -26,6 +26,7 @@ ASK_S = 1.0  # how often a touch's drift is asked for, and over how long its fra
 AGAIN_S, AGAIN_MOST_S = 0.25, 4.0  # how soon a touch that drift alone may be is looked at again, doubling
 STEADY = 2  # steps that are taken without asking: those of the baseline's own delay
 DECISIVE = 45.0  # log likelihood by which a touch must explain a frame better than drift that time permits
+SUREST = 1e-4  # relative: below it drift and the model are what a mean is wrong by, and they do not average out
 CLEARLY = 3.0  # difference of log likelihoods from which another step is taken
 
 
@@ -34,6 +35,13 @@ class Noise(NamedTuple):
 
     sigma: Array  # (K,) of d, one frame
     frames: int  # that the baseline is the mean of
+
+    def of_mean(self, n: int) -> Noise:
+        """That of the mean of n frames, as far as noise is what it is wrong by: not below SUREST."""
+        finite = self.sigma[np.isfinite(self.sigma)]
+        most = int((float(np.median(finite)) / SUREST) ** 2) if finite.size else 1
+        n = min(n, max(1, most))
+        return self if n == 1 else Noise(self.sigma / np.sqrt(n), max(1, self.frames // n))
 
 
 class Judgement(NamedTuple):
@@ -184,6 +192,11 @@ class Judge:
     @staticmethod
     def _key(live: NDArray[np.bool_], noise: Noise, step: int) -> tuple[bytes, bytes, int, int]:
         return live.tobytes(), noise.sigma.tobytes(), noise.frames, step
+
+    def of_mean(self, n: int, noise: Noise) -> Operator:
+        """The operator for the mean of n frames of a touch that is held."""
+        live = self._live & np.isfinite(noise.sigma)
+        return self.operator(live, noise.of_mean(n), self.step)[0]
 
     def prepare(self, noise: Noise) -> bool:
         """Do one piece of what will be needed next; False where nothing is left. Changes no result."""

@@ -24,6 +24,8 @@ def tared() -> dict[float, StubSkin]:
     return {snr_db: StubSkin(snr_db) for snr_db in (60.0, 80.0)}
 
 
+QUIET = 50  # frames after which the baseline has seen the skin untouched: whatever was before is over
+
 FAULTS: list[tuple[str, dict[str, Any]]] = [
     *(("mux_stuck", {"mux": mux, "bit": bit, "value": v}) for mux, bit, v in (
         ("drive+", 2, 0), ("drive+", 0, 1), ("drive-", 3, 0), ("sense+", 1, 1), ("sense-", 0, 0)
@@ -47,7 +49,7 @@ def test_a_gross_fault_gives_no_valid_contact(
     tared: dict[float, StubSkin], name: str, args: dict[str, Any], shapes: tuple[Shape, ...], snr_db: float
 ) -> None:
     skin = tared[snr_db]
-    skin.rest(6)  # whatever was before is over
+    skin.rest(QUIET)
     skin.faults.inject(name, args, 0.0, 1.0)
     try:
         found = [skin.feel(shapes) for _ in range(4)]
@@ -71,7 +73,7 @@ def test_the_hardest_touches_are_no_fault(
     tared: dict[float, StubSkin], shapes: tuple[Shape, ...], snr_db: float
 ) -> None:
     skin = tared[snr_db]
-    skin.rest(6)
+    skin.rest(QUIET)
     found = [skin.feel(shapes) for _ in range(4)]
     assert all(r.delta.touched and r.delta.valid for r in found)
     skin.feel()
