@@ -23,7 +23,7 @@ from services.stage import Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
 UNKNOWN_BELOW = 0.4  # probability of the best class, of five, below which a shape is "unknown"
-SURE = 0.03  # residual above which the touch changed during the scan; of steady touches one in a thousand has it
+SURE = 0.05  # residual above which the touch changed during the scan; of steady touches hardly one has it
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 

@@ -182,4 +182,5 @@ class ChangedContacts:
 
 
 def _difference(amplitude: Array, since: Array, untouched: Reference, live: NDArray[np.bool_]) -> Array:
-    return np.where(live, (amplitude - since) / untouched.normaliser, 0.0)
+    both = np.where(live, amplitude - np.where(live, since, 0.0), 0.0)
+    return both / untouched.normaliser
