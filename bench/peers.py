@@ -41,10 +41,11 @@ from bench._tracking_scene import Recorded
 from bench.skip import ENDS_S, QUIET_S, scenes
 from services.config import Skin
 from services.pipeline import Pipeline
+from services.recordings.replay_session import stop
 
 RELAY = Path(__file__).with_name("_relay.py")
 SYSTEM_PYTHON = "/usr/bin/python3"  # rospy is Debian's
-START_S, STOP_S = 30.0, 5.0
+START_S = 30.0
 MOVING_S = 6.0
 SLOWER, CHECKED, LOST = 4.0, 6.0, 0.1  # a short run's gates
 EACH = 200  # times that a frame is solved in a round
@@ -109,12 +110,7 @@ def started(command: list[str], environment: dict[str, str], log: Path, **more: 
     try:
         yield process
     finally:
-        process.terminate()
-        try:
-            process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        stop(process)
 
 
 class Relay:

@@ -69,12 +69,15 @@ class ContactDrift:
 
     def __call__(self, d: Array, sigma: Array, live: NDArray[np.bool_]) -> int | None:
         """The electrode, 0-based, whose contact changed, or None. d, sigma (K,); live: measurements that count."""
-        if not self.knows or live.sum() < len(d) / 2:
+        if not self._tells(live):
             return None
         fell = live & (d < -np.maximum(FALL, SIGMAS * np.where(live, sigma, 0.0)))
         if fell.any():
             return self._fallen(fell, live)
         return self.risen(d, sigma, live)
+
+    def _tells(self, live: NDArray[np.bool_]) -> bool:
+        return self.knows and bool(live.sum() >= len(live) / 2)
 
     def _fallen(self, fell: NDArray[np.bool_], live: NDArray[np.bool_]) -> int | None:
         own = (self.members & fell).sum(axis=1)
@@ -86,7 +89,7 @@ class ContactDrift:
 
     def risen(self, d: Array, sigma: Array, live: NDArray[np.bool_]) -> int | None:
         """The electrode whose contact rose, where that is all that d (K,) shows."""
-        if not self.knows or live.sum() < len(d) / 2:
+        if not self._tells(live):
             return None
         noise = float(np.sqrt(np.mean(sigma[live] ** 2)))
         size = float(np.linalg.norm(d[live]))
@@ -182,5 +185,5 @@ class ChangedContacts:
 
 
 def _difference(amplitude: Array, since: Array, untouched: Reference, live: NDArray[np.bool_]) -> Array:
-    both = np.where(live, amplitude - np.where(live, since, 0.0), 0.0)
-    return both / untouched.normaliser
+    change = np.where(live, amplitude - np.where(live, since, 0.0), 0.0)
+    return change / untouched.normaliser

@@ -92,7 +92,7 @@ def _stages(skins: list[str], reader: RecordingReader) -> Iterator[None]:
             return
         environment = os.environ | {"EITSKIN_CONFIG": str(_configuration(skins, reader))}
         for name in STAGES:
-            cleanup.callback(_stop, _start(name, environment))
+            cleanup.callback(stop, _start(name, environment))
         yield
 
 
@@ -119,7 +119,8 @@ def _start(name: str, environment: dict[str, str]) -> subprocess.Popen[bytes]:
     )
 
 
-def _stop(process: subprocess.Popen[bytes]) -> None:
+def stop(process: subprocess.Popen[Any]) -> None:
+    """Ask it to end; where it does not, end it."""
     process.terminate()
     try:
         process.wait(STOP_S)

@@ -21,7 +21,7 @@ from services.touches.touch import TouchDecision
 
 Array = NDArray[np.float64]
 
-OPERATORS = 16  # kept; 2 MB each
+OPERATORS = 16  # kept; 0.4 MB each
 ASK_S = 1.0  # how often a touch's drift is asked for, and over how long its frames are averaged
 AGAIN_S, AGAIN_MOST_S = 0.25, 4.0  # how soon a touch that drift alone may be is looked at again, doubling
 STEADY = 2  # steps that are taken without asking: those of the baseline's own delay
