@@ -103,10 +103,9 @@ class Publisher:
         """
         newcomers = []
         for _ in range(EVENTS_AT_ONCE):
-            try:
-                event = self.socket.recv(zmq.NOBLOCK)
-            except zmq.Again:
+            if not int(self.socket.get(zmq.EVENTS)) & zmq.POLLIN:
                 break
+            event = self.socket.recv(zmq.NOBLOCK)
             if event[:1] == b"\1":
                 self._subscriptions[event[1:]] += 1
                 newcomers.append(event[1:])

@@ -47,6 +47,7 @@ class Inference(Stage):
         self._last_scan = 0  # of the frame that it was reconstructed from
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
         self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
+        self._quiet: NDArray[np.float32] | None = None  # standard deviation that the last untouched frame stated
         self._counters = {"networks_run": 0, "held": 0, "untouched": 0, "unwanted": 0, "missed": 0, "refused": 0}
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
@@ -68,6 +69,7 @@ class Inference(Stage):
         else:
             self._counters["untouched"] += 1
             self._last = None
+            self._quiet = frame.sigma
         return [out]
 
     @classmethod
@@ -83,6 +85,9 @@ class Inference(Stage):
                 made = shared.run_many([frame for _, frame in members])
                 for (stage, frame), pictures in zip(members, made, strict=True):
                     stage._ahead = frame, pictures
+
+    def prepare(self) -> bool:
+        return self._quiet is not None and self._residual.prepare(self._quiet)
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
         ahead, self._ahead = self._ahead, None

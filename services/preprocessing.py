@@ -29,7 +29,7 @@ from services.faults.plausibility import impossible
 from services.stage import Health, Refused, Stage, add_reason, inherited
 from services.touches.judging import Judge, Judgement, Noise
 from services.touches.sentinel import Coarse
-from services.touches.touch import Hold, TouchDecision
+from services.touches.touch import Hold, TouchDecision, sigma_of_mean
 
 Array = NDArray[np.float64]
 
@@ -161,7 +161,7 @@ class Preprocessing(Stage):
             if self.hold.averaged > 1:
                 operator = self.judge.of_mean(self.hold.averaged, self._noise())
             out.difference = d.astype(np.float32)
-            out.sigma = (out.sigma / np.sqrt(self.hold.averaged)).astype(np.float32)
+            out.sigma = sigma_of_mean(out.sigma, self.hold.averaged)
         out.reconstructed = out.scan
         out.stack, out.context, out.scale = operator.stack(d)
         self._counters["reconstructed"] += 1

@@ -11,6 +11,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
+from itertools import cycle
 from typing import Any
 
 import zmq
@@ -25,6 +26,7 @@ from services import persistence
 from services.config import Config
 from services.lane import Feed, Lane, Newest
 from services.stage import Refused, Stage
+from services.waiting import Waiter
 
 HEARTBEAT_S = 1.0
 TICK_S = 0.2  # how often at most silence, changes of health and new subscribers are looked for
@@ -49,7 +51,7 @@ class Runner:
         self.control = ControlServer(process, commands)
         self.lanes: dict[str, Lane] = {}
         self._bundles: dict[str, Bundle] = {}
-        self._poller = zmq.Poller()
+        self._waiter = Waiter()
         self._by_socket: dict[Any, Lane] = {}
         self._stop = False
         self._frames = 0
@@ -76,18 +78,15 @@ class Runner:
     def run(self) -> None:
         """Drive the lanes until told to stop."""
         wake = _wake_on_signals(self._on_signal)
-        self._poller.register(wake, zmq.POLLIN)
-        self._poller.register(self.control.socket, zmq.POLLIN)
-        self._poller.register(self.publisher.socket, zmq.POLLIN)
-        for socket in self._by_socket:
-            self._poller.register(socket, zmq.POLLIN)
+        for socket in (wake, self.control.socket, self.publisher.socket, *self._by_socket):
+            self._waiter.register(socket)
+        self._turns = cycle(self.lanes.values())
         _settle()
-        next_tick = 0.0
+        next_tick = deadline = 0.0
         while not self._stop:
-            wait_s = max(next_tick, self._next_deadline()) - time.monotonic()
-            ready = self._poller.poll(max(0, 1 + int(wait_s * 1000)))
-            self._serve([self._by_socket[socket] for socket, _ in ready if socket in self._by_socket])
-            for socket, _ in ready:
+            ready = self._waiter.wait(max(next_tick, deadline) - time.monotonic())
+            self._serve([self._by_socket[socket] for socket in ready if socket in self._by_socket])
+            for socket in ready:
                 if socket is self.control.socket:
                     self.control.serve_once()
                 elif socket is self.publisher.socket:
@@ -95,13 +94,14 @@ class Runner:
                     next_tick = 0.0
             if time.monotonic() >= next_tick:
                 self._tick()
-                next_tick = time.monotonic() + TICK_S
-            if ready and not self._poller.poll(0):
+                self._waiter.doubt()
+                next_tick, deadline = time.monotonic() + TICK_S, self._next_deadline()
+            if ready and not self._waiter.wait(0.0):
                 self._prepare()
         self.close()
 
     def _next_deadline(self) -> float:
-        """When there is something to do although nothing arrives: a heartbeat, or silence to be noticed."""
+        """When there is something to do if nothing arrives: a heartbeat, or silence to be noticed."""
         return min((lane.heartbeat.deadline(SILENT_S) for lane in self.lanes.values()), default=0.0)
 
     def close(self) -> None:
@@ -109,6 +109,7 @@ class Runner:
             lane.feed.close()
         self.control.close()
         self.publisher.close()
+        self._waiter.close()
 
     # frames
 
@@ -152,17 +153,16 @@ class Runner:
         self._frames += 1
 
     def _prepare(self) -> None:
-        """One piece of work for later, while nobody waits."""
+        """One piece of work for later, while nobody waits: the lanes take turns, for even asking all of them costs."""
         if self._frames >= WARM_FRAMES and not self._settled:
             self._settled = True
             _settle()
         else:
-            for lane in self.lanes.values():
-                try:
-                    if lane.stage.prepare():
-                        return
-                except Exception as why:  # what could not be made ahead is made when it is needed, or fails then
-                    log.exception("%s: could not prepare", lane.stage.skin, exc_info=why)
+            lane = next(self._turns)
+            try:
+                lane.stage.prepare()
+            except Exception as why:  # what could not be made ahead is made when it is needed, or fails then
+                log.exception("%s: could not prepare", lane.stage.skin, exc_info=why)
 
     def _send(self, lane: Lane, frame: Frame) -> None:
         try:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.prereconstruction import Drift
+from services.touches.touch import MEANS, sigma_of_mean
 
 KEPT = 10  # noises of frames whose matrices are kept, 0.3 MB each
 MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through
@@ -49,6 +50,7 @@ class Residual:
         self.shape: tuple[int, int] = bundle.matrices.inside.shape
         self.refused = False  # whether the last image that was given a share is of no touch
         self._sizes = (0, 0)
+        self._prepared = b""  # noise of single frames that all is there for
         self._known: OrderedDict[bytes, Conditioned] = OrderedDict()
 
     def __call__(
@@ -78,6 +80,20 @@ class Residual:
         share = max(0.0, beyond) / energy
         self.refused = not share <= (REFUSED if energy > FAINT * known.noise else REFUSED_FAINT)
         return share if np.isfinite(share) else None
+
+    def prepare(self, sigma: NDArray[np.float32]) -> bool:
+        """Condition for one of the noises of a touch whose single frames have this one (K,); False where none is left
+        to do. The first image of a touch would wait for it, 10 ms and more.
+        """
+        if (key := sigma.tobytes()) == self._prepared or len(sigma) != self.pre.measurements:
+            return False
+        for n in MEANS:
+            of_mean = sigma_of_mean(sigma, n)
+            if of_mean.tobytes() not in self._known:
+                self._conditioned(of_mean)
+                return True
+        self._prepared = key
+        return False
 
     def _means(self, rows: int, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(h, rows) and (columns, w): the mean over the pixels of each coarse one (a product is faster than `mean`)."""

@@ -19,6 +19,12 @@ Array = NDArray[np.float64]
 RELEASE = 1e-2  # hysteresis: a touch ends where an untouched skin would be with this probability per frame
 CHANGED = 1e-3  # probability that an unchanged touch is reconstructed again: costs work, not truth
 LONGEST_MEAN = 16  # frames of a hold that are averaged at most, and after which it is reconstructed again at the latest
+MEANS = (1, 2, 4, 8, LONGEST_MEAN)  # frames in what is reconstructed of a touch
+
+
+def sigma_of_mean(sigma: NDArray[np.float32], n: int) -> NDArray[np.float32]:
+    """Of the mean of n frames, of `sigma` (K,) each: to the last bit what the frames of a touch that is held state."""
+    return np.asarray(sigma / np.sqrt(n), np.float32)
 
 
 class TouchDecision:
@@ -90,4 +96,4 @@ class Hold:
 
 
 def _due(count: int) -> bool:
-    return count in (1, 2, 4, 8) or count % LONGEST_MEAN == 0
+    return count in MEANS or count % LONGEST_MEAN == 0

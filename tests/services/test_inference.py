@@ -14,6 +14,7 @@ from protocol.frames import DeltaFrame, ImageFrame
 from services.config import Skin
 from services.inference import Inference
 from services.preprocessing import Preprocessing
+from services.touches.touch import MEANS
 from tests.services.conftest import Board
 
 WANTED = frozenset({"image"})
@@ -161,3 +162,28 @@ def test_a_bundle_that_was_tampered_with_is_refused(networked: Bundle, tmp_path:
     with pytest.raises(BundleError, match="network.onnx"):
         Bundle.load(copy)
     assert onnx.__version__
+
+
+def test_what_a_touch_needs_is_made_while_nothing_touches(
+    skin: Skin, networked: Bundle, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first image of a touch waits for no matrix, nor do those of its means."""
+    pre, stage = Preprocessing("palm", skin, networked), Inference("palm", skin, networked)
+    for _ in range(80):
+        (quiet,) = pre.process(board.frame(), frozenset({"delta"}))
+        assert isinstance(quiet, DeltaFrame)
+        run(stage, quiet)
+    pieces = 0
+    while stage.prepare():
+        pieces += 1
+    assert pieces == len(MEANS) and not stage.prepare()
+    too_late = "a matrix was made while an image waited for it"
+    monkeypatch.setattr(stage._residual, "_condition", lambda sigma: pytest.fail(too_late))
+    seen = 0
+    disc = board.disc(0.2, -0.1, 0.2, 0.3)
+    for _ in range(40):
+        (touched,) = pre.process(board.frame(disc), frozenset({"delta"}))
+        assert isinstance(touched, DeltaFrame)
+        out = run(stage, touched)
+        seen += out.image.size > 0 and not out.held
+    assert seen >= len(MEANS)
