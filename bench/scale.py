@@ -11,7 +11,6 @@ writes scale.json and draws scale.png.
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 import time
 from collections import Counter
@@ -121,16 +120,9 @@ def measure(service: Service, n: int, seconds: float, rate_hz: float) -> dict[st
 def scaled(n: int, touched: float, seconds: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="eitskin-scale") as folder:
         path, moving, rate_hz = recordings(Path(folder), n, touched, seconds + 2 * STATUS_S + MARGIN_S)
-        before = os.environ.get("EITSKIN_CONFIG")
-        os.environ["EITSKIN_CONFIG"] = str(path)
-        try:
-            with running(skin="s00") as service:
-                _wait_for_touch(service, touched)
-                return {"touched": moving / n, **measure(service, n, seconds, rate_hz)}
-        finally:
-            os.environ.pop("EITSKIN_CONFIG")
-            if before is not None:
-                os.environ["EITSKIN_CONFIG"] = before
+        with running("--config", str(path), skin="s00") as service:
+            _wait_for_touch(service, touched)
+            return {"touched": moving / n, **measure(service, n, seconds, rate_hz)}
 
 
 def _wait_for_touch(service: Service, touched: float) -> None:
