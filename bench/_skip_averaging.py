@@ -1,0 +1,59 @@
+"""What averaging brings while a touch is held still: its error against the time since it began.
+
+One touch under one noise says little: its first frames may be lucky. So the same touch is met again and again, each
+time with a tare of its own, and the root mean square is taken over these.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench._tracking_scene import Recorded
+from models.bundle import Bundle
+from services.board.file_source import FILE_RATE_HZ, file_frame
+from services.config import Skin, Touch
+from services.pipeline import Pipeline
+
+SNR_DB = 70.0
+TIMES = 16  # that the touch is met
+TARE, HELD = 100, 200  # frames before it, and of it
+EDGES = (0, 1, 4, 10, 22, 44, 110, HELD)  # frames since it began
+
+
+def averaging(recorded: Recorded, bundle: Bundle, seed: int = 1) -> dict[str, dict[str, float]]:
+    """Frames since the touch began -> rms position error [mm] with averaging and without, of the scene's one touch."""
+    touched = recorded.touches[:, 0].astype(int)
+    first, last = int(touched.min()), int(touched.max())
+    free = recorded.z[: first - 1].mean(axis=0)
+    pressed = recorded.z[first + 2 : last - 1].mean(axis=0)  # the scans that the touch was there for all along
+    place = recorded.touches[0, 2:4]
+    found: dict[str, dict[str, float]] = {}
+    for name, hold in (("averaged", True), ("each alone", False)):
+        rng = np.random.default_rng(seed)  # the same noise for both
+        errors = [_errors(free, pressed, place, hold, rng, bundle) for _ in range(TIMES)]
+        squares = np.nanmean(np.square(errors), axis=0)
+        for a, b in zip(EDGES, EDGES[1:], strict=False):
+            found.setdefault(str(a), {})[name] = 1e3 * float(np.sqrt(np.nanmean(squares[a:b])))
+    return found
+
+
+def _errors(
+    free: NDArray[np.complexfloating],
+    pressed: NDArray[np.complexfloating],
+    place: NDArray[np.floating],
+    hold: bool,
+    rng: np.random.Generator,
+    bundle: Bundle,
+) -> NDArray[np.float64]:
+    """(HELD,) distances [m] of what is found from `place`; NaN where nothing is."""
+    pipeline = Pipeline(Skin(port="stub", bundle="square16", touch=Touch(hold=hold)), bundle=bundle)
+    errors = np.full(HELD, np.nan)
+    for k in range(TARE + HELD):
+        noise = 10 ** (-SNR_DB / 20) * rng.standard_normal(len(free))
+        z = (free if k < TARE else pressed) * (1 + noise)
+        frame = file_frame("skin", "", k, z, "full", round(k / FILE_RATE_HZ * 1e9))
+        contacts = pipeline.run(frame).contact.contacts
+        if k >= TARE and contacts:
+            errors[k - TARE] = np.hypot(*(np.array(contacts[0].position[:2]) - place))
+    return errors
