@@ -4,8 +4,8 @@
 
 Part one runs the stages in one process, every frame packed and unpacked between them as on the wire, on three scenes
 of the stub in simulated time; variants take turns; a touch held still is met again and again. Part two brings up the
-real processes and reads their CPU time while the skin is untouched, touched and still, touched and moving. Prints tables,
-writes skip.json.
+real processes and reads their CPU time while the skin is untouched, touched and still, touched and moving. Prints
+tables, writes skip.json.
 """
 
 from __future__ import annotations
