@@ -33,6 +33,8 @@ from services.touches.touch import Hold, TouchDecision, sigma_of_mean
 
 Array = NDArray[np.float64]
 
+LASTING_S = 2.0  # a change that no touch can make, and that lasts so long, is the skin's or the board's new state
+
 
 class Preprocessing(Stage):
     """raw -> delta. K measurements in the bundle's pattern order."""
@@ -58,6 +60,7 @@ class Preprocessing(Stage):
     def reset(self) -> None:
         self._touched = False
         self._coarse_scan = 0  # of the coarse touch that no full scan has answered yet
+        self._impossible_ns = 0  # since when every frame is of no touch
         self._counters = {"frames": 0, "touched": 0, "reconstructed": 0, "held": 0, "foreign": 0}
         self._foreign = ""
         self.hold.reset()
@@ -110,21 +113,29 @@ class Preprocessing(Stage):
         self._live = live
         d = self.untouched.difference(amplitude, live)
         d, found_now = self._decide(d, amplitude, live, out.stamps.get("sample", 0))
+        now_ns = out.stamps.get("sample", 0)
+        teaches = True  # whether the baseline is to learn from this frame
         # Of a measured bundle it is not known which way its material goes.
         if self.bundle.matrices.normalisation == "model" and impossible(
             d, self.untouched.sigma, live & self.electrodes.self_sensing, self._touched
         ):
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
+            self._impossible_ns = self._impossible_ns or now_ns
+            teaches = (now_ns - self._impossible_ns) * 1e-9 >= LASTING_S
+        else:
+            self._impossible_ns = 0
         out.touched, out.score, out.threshold = self._touched, found_now.score, found_now.threshold
         out.difference = d.astype(np.float32)
         out.sigma = np.where(live, self.untouched.sigma, np.inf).astype(np.float32)
         if self._touched:
             self._counters["touched"] += 1
-            self.untouched.touched(amplitude, live, out.stamps.get("sample", 0))
+            if teaches:
+                self.untouched.touched(amplitude, live, now_ns)
         else:
             self.hold.reset()
-            self.untouched.untouched(amplitude, live, out.stamps.get("sample", 0), self.judge.creep)
+            if teaches:
+                self.untouched.untouched(amplitude, live, now_ns, self.judge.creep)
         if self._touched or self.always_reconstruct or not self.config.touch.skip_untouched:
             self._reconstruct(out, d, found_now.operator, found_now.decision)
         return out
@@ -215,6 +226,7 @@ class Preprocessing(Stage):
         return {
             "touched": self._touched,
             "coarse": self._coarse_scan,
+            "impossible_ns": self._impossible_ns,
             "hold": self.hold.state(),
             "electrodes": self.electrodes.state(),
             "judge": self.judge.state(),
@@ -229,6 +241,7 @@ class Preprocessing(Stage):
                 raise Refused(f"the saved hold is of shape {np.shape(rows)}, expected ({k},): reset")
         self._touched = bool(state["touched"])
         self._coarse_scan = int(state.get("coarse", 0))
+        self._impossible_ns = int(state.get("impossible_ns", 0))
         self.hold.load(state["hold"])
         self.judge.reset()
         if "judge" in state:  # older recordings have none

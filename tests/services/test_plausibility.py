@@ -67,6 +67,32 @@ def test_a_gross_fault_gives_no_valid_contact(
     assert all(r.contact.valid and not r.delta.electrodes.any() for r in after[3:])  # and when it is over, all is well
 
 
+@pytest.mark.parametrize("gain", [0.95, 1.05])
+def test_a_fault_that_comes_and_goes_teaches_the_baseline_nothing(gain: float) -> None:
+    skin = StubSkin(80.0)
+    before = skin.rest(60)
+    for _ in range(25):  # ten seconds without a quiet one
+        skin.faults.inject("stale_rtia", {"gain": gain}, 0.0, 1.0)
+        faulty = [skin.feel() for _ in range(4)]
+        skin.faults.clear()
+        assert not any(r.contact.valid for r in faulty)
+        assert not any(r.contact.contacts for r in [skin.feel() for _ in range(5)] if r.contact.valid)
+    after = [skin.feel() for _ in range(60)]
+    assert all(r.contact.valid and not r.delta.touched for r in after)
+    assert np.abs(after[-1].delta.difference).max() < 2 * np.abs(before.delta.difference).max()
+
+
+@pytest.mark.parametrize("gain", [0.95, 0.98, 1.02, 1.05])
+def test_another_gain_for_good_is_never_a_touch_and_ends_with_a_tare(gain: float) -> None:
+    skin = StubSkin(80.0)
+    skin.rest(60)
+    skin.faults.inject("stale_rtia", {"gain": gain}, 0.0, 1.0)
+    found = [skin.feel() for _ in range(700)]
+    assert not any(r.contact.valid and r.contact.contacts for r in found)
+    skin.pipeline.pre.command("tare", {"force": True})
+    assert all(r.contact.valid and not r.delta.touched for r in [skin.feel() for _ in range(50)])
+
+
 @pytest.mark.parametrize("snr_db", [60.0, 80.0])
 @pytest.mark.parametrize("shapes", HARD)
 def test_the_hardest_touches_are_no_fault(
