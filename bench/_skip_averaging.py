@@ -1,7 +1,8 @@
 """What averaging brings while a touch is held still: its error against the time since it began.
 
 One touch under one noise says little: its first frames may be lucky. So the same touch is met again and again, each
-time with a tare of its own, and the root mean square is taken over these.
+time with a tare of its own, and the root mean square is taken over these. The floor is what no estimator can beat from
+as many frames as are averaged, with that tare.
 """
 
 from __future__ import annotations
@@ -10,32 +11,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench._tracking_scene import Recorded
+from firmware_stub.world import NEWTON
+from models import fisher
 from models.bundle import Bundle
+from models.shapes import Shape
 from services.board.file_source import FILE_RATE_HZ, file_frame
 from services.config import Skin, Touch
+from services.config import Tare as TareConfig
 from services.pipeline import Pipeline
+from services.touches.touch import MEANS
 
 SNR_DB = 70.0
 TIMES = 16  # that the touch is met
-TARE, HELD = 100, 200  # frames before it, and of it
+QUIET, HELD = 100, 200  # frames before it, and of it
 EDGES = (0, 1, 4, 10, 22, 44, 110, HELD)  # frames since it began
+METRES = 0.05  # of a model unit
 
 
 def averaging(recorded: Recorded, bundle: Bundle, seed: int = 1) -> dict[str, dict[str, float]]:
-    """Frames since the touch began -> rms position error [mm] with averaging and without, of the scene's one touch."""
+    """Frames since the touch began -> rms position error [mm] with averaging and without, of the scene's one touch;
+    their floors; how many frames without averaging did not see it.
+    """
     touched = recorded.touches[:, 0].astype(int)
     first, last = int(touched.min()), int(touched.max())
     free = recorded.z[: first - 1].mean(axis=0)
     pressed = recorded.z[first + 2 : last - 1].mean(axis=0)  # the scans that the touch was there for all along
-    place = recorded.touches[0, 2:4]
+    _, _, x, y, newtons, radius, _ = recorded.touches[0]
+    shape = Shape("circle", x / METRES, y / METRES, radius / METRES, newtons * NEWTON)
     found: dict[str, dict[str, float]] = {}
     for name, hold in (("averaged", True), ("each alone", False)):
         rng = np.random.default_rng(seed)  # the same noise for both
-        errors = [_errors(free, pressed, place, hold, rng, bundle) for _ in range(TIMES)]
-        squares = np.nanmean(np.square(errors), axis=0)
+        errors = np.array([_errors(free, pressed, np.array([x, y]), hold, rng, bundle) for _ in range(TIMES)])
         for a, b in zip(EDGES, EDGES[1:], strict=False):
-            found.setdefault(str(a), {})[name] = 1e3 * float(np.sqrt(np.nanmean(squares[a:b])))
+            row = found.setdefault(str(a), {})
+            row[name] = 1e3 * float(np.sqrt(np.nanmean(np.square(errors[:, a:b]))))
+            row[f"{name}, floor"] = _floor_mm(shape, max(n for n in MEANS if n <= a + 1) if hold else 1)
+            row[f"{name}, frames not seen"] = float(np.isnan(errors[:, a:b]).sum())
     return found
+
+
+def _floor_mm(shape: Shape, averaged: int) -> float:
+    noise = fisher.Noise(SNR_DB + 10 * np.log10(averaged), tare_frames=TareConfig().frames / averaged)
+    return 1e3 * METRES * float(fisher.floors("square16", shape, noise, fisher.SizePrior())["bayes"].position)
 
 
 def _errors(
@@ -49,11 +66,11 @@ def _errors(
     """(HELD,) distances [m] of what is found from `place`; NaN where nothing is."""
     pipeline = Pipeline(Skin(port="stub", bundle="square16", touch=Touch(hold=hold)), bundle=bundle)
     errors = np.full(HELD, np.nan)
-    for k in range(TARE + HELD):
+    for k in range(QUIET + HELD):
         noise = 10 ** (-SNR_DB / 20) * rng.standard_normal(len(free))
-        z = (free if k < TARE else pressed) * (1 + noise)
+        z = (free if k < QUIET else pressed) * (1 + noise)
         frame = file_frame("skin", "", k, z, "full", round(k / FILE_RATE_HZ * 1e9))
         contacts = pipeline.run(frame).contact.contacts
-        if k >= TARE and contacts:
-            errors[k - TARE] = np.hypot(*(np.array(contacts[0].position[:2]) - place))
+        if k >= QUIET and contacts:
+            errors[k - QUIET] = np.hypot(*(np.array(contacts[0].position[:2]) - place))
     return errors

@@ -41,7 +41,12 @@ class Benchmark:
 
 
 BENCHMARKS = (
-    Benchmark("latency", "Latency, outside the processes", ("--seconds", "6", "--controllers", "1", "4"), ("latency",)),
+    Benchmark(
+        "latency",
+        "Latency, outside the processes",
+        ("--seconds", "6", "--controllers", "1", "4", "--usual-priority"),
+        ("latency",),
+    ),
     Benchmark("skip", "Skip rules", ("--seconds", "8", "--live", "5")),
     Benchmark("scale", "Many skins", ("--skins", "1", "8", "--seconds", "6", "--touched", "0.25"), ("scale",)),
     Benchmark("memory", "Memory over many frames", ("--frames", "20000")),
@@ -98,11 +103,16 @@ def section(benchmark: Benchmark, folder: Path) -> tuple[list[str], list[Goal]]:
     elif printed:
         lines += ["", "<details><summary>All it printed</summary>", "", "```", printed, "```", "", "</details>"]
     for note in report.get("left_out", []):
-        lines += ["", note]
+        lines += ["", note] if note not in printed else []
     for picture in benchmark.pictures:
         if (folder / f"{picture}.png").is_file():
             lines += ["", f"![{benchmark.title}]({picture}.png)"]
     return [*lines, ""], goals
+
+
+def _reports(chosen: Sequence[Benchmark], folder: Path) -> list[dict[str, Any]]:
+    files = [folder / f"{benchmark.name}.json" for benchmark in chosen]
+    return [json.loads(file.read_text(encoding="utf-8")) for file in files if file.is_file()]
 
 
 def page(chosen: Sequence[Benchmark], folder: Path) -> tuple[str, list[Goal]]:
@@ -115,12 +125,15 @@ def page(chosen: Sequence[Benchmark], folder: Path) -> tuple[str, list[Goal]]:
             lines, goals = [f"## {benchmark.title}", "", f"Not run: `skin bench {benchmark.name}`.", ""], []
         bodies += lines
         every += goals
+    commits = {found.get("commit") for found in _reports(chosen, folder)}
+    made = "all at one commit" if len(commits) == 1 else f"at {len(commits)} commits, each by a command of its own"
     with_target = [goal for goal in every if goal.met is not None]
     met = sum(bool(goal.met) for goal in with_target)
     top = [
         "# Benchmarks",
         "",
-        f"By `skin bench all`: {met} of {len(with_target)} targets met. Each section says its command and machine.",
+        f"`skin bench all`: {met} of {len(with_target)} targets met. The parts were run {made}; each section says its "
+        "command and machine.",
         "",
     ]
     return "\n".join(top + bodies), every

@@ -80,7 +80,7 @@ def all_stages(recorded: Recorded) -> list[float]:
         pipeline.run(recorded.frame(k))
         if QUIET_S + 1 < s < QUIET_S + MOVING_S - 2 * ENDS_S:
             took.append((time.perf_counter() - began) * 1e3)
-        pipeline.pre.prepare()
+        pipeline.prepare()
     return took
 
 

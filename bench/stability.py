@@ -3,8 +3,9 @@
     skin bench stability [--quick] [--only PART ...] [--out bench/reports]
 
 For each case: error against truth where there is one, and whether the promise was kept: no exception, no NaN or
-infinity out, never `valid` on garbage, no contact that jumps by more than 2 mm for a change within noise. Prints
-tables, writes stability.json and stability.png. Exit status 1 where the promise was broken.
+infinity out, never `valid` on garbage, no contact that jumps by more than 2 mm for a change within noise (or by four
+times what no estimator can beat, where that is more: a light touch under much noise). Prints tables, writes
+stability.json and stability.png. Exit status 1 where the promise was broken.
 """
 
 from __future__ import annotations

@@ -19,6 +19,8 @@ from services.networks import Network, OneStep, Pictures, network
 from services.stage import Health, Refused, Stage, add_reason, inherited
 from services.touches.sentinel import CoarseImage
 
+SETTLED = 5  # untouched frames in a row that state the same noise, from which it is taken to be a touch's too
+
 
 class Inference(Stage):
     """delta -> image [S/m], on the bundle's grid."""
@@ -47,7 +49,8 @@ class Inference(Stage):
         self._last_scan = 0  # of the frame that it was reconstructed from
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
         self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
-        self._quiet: NDArray[np.float32] | None = None  # standard deviation that the last untouched frame stated
+        self._quiet: NDArray[np.float32] | None = None  # standard deviation that untouched frames state
+        self._stated = 0  # how many have stated it, one after the other
         self._counters = {"networks_run": 0, "held": 0, "untouched": 0, "unwanted": 0, "missed": 0, "refused": 0}
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
@@ -69,7 +72,7 @@ class Inference(Stage):
         else:
             self._counters["untouched"] += 1
             self._last = None
-            self._quiet = frame.sigma
+            self._rest(frame.sigma)
         return [out]
 
     @classmethod
@@ -86,8 +89,16 @@ class Inference(Stage):
                 for (stage, frame), pictures in zip(members, made, strict=True):
                     stage._ahead = frame, pictures
 
+    def _rest(self, sigma: NDArray[np.float32]) -> None:
+        """An untouched frame stated this. One of a sentinel scan states nothing."""
+        if self._quiet is not None and np.array_equal(sigma, self._quiet):
+            self._stated += 1
+        elif np.isfinite(sigma).any():
+            self._quiet, self._stated = sigma, 1
+
     def prepare(self) -> bool:
-        return self._quiet is not None and self._residual.prepare(self._quiet)
+        """What a touch would need that began now: not for a noise that changes from frame to frame."""
+        return self._quiet is not None and self._stated >= SETTLED and self._residual.prepare(self._quiet)
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
         ahead, self._ahead = self._ahead, None

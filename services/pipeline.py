@@ -53,6 +53,11 @@ class Pipeline:
         assert isinstance(delta, DeltaFrame) and isinstance(image, ImageFrame) and isinstance(contact, ContactFrame)
         return Result(delta, image, contact)
 
+    def prepare(self) -> None:
+        """What the processes do while no frame waits."""
+        for stage in (self.pre, self.inference, self.publishing):
+            stage.prepare()
+
     def reset(self) -> None:
         """Forget baseline, touches and tracks."""
         for stage in (self.pre, self.inference, self.publishing):

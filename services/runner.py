@@ -55,6 +55,7 @@ class Runner:
         self._by_socket: dict[Any, Lane] = {}
         self._stop = False
         self._frames = 0
+        self._turns: Iterator[Lane] = iter(())  # who may prepare next
         self._settled = False  # what was made while warming up is out of the garbage collector's sight
 
     def bundle(self, skin: str) -> Bundle:
@@ -162,7 +163,7 @@ class Runner:
             try:
                 lane.stage.prepare()
             except Exception as why:  # what could not be made ahead is made when it is needed, or fails then
-                log.exception("%s: could not prepare", lane.stage.skin, exc_info=why)
+                self._log_once(lane, why, "%s: could not prepare (further such failures are not logged)")
 
     def _send(self, lane: Lane, frame: Frame) -> None:
         try:
@@ -177,11 +178,13 @@ class Runner:
     def _failed(self, lane: Lane, why: Exception) -> None:
         lane.heartbeat.drops["failed"] += 1
         lane.heartbeat.failure = f"a frame could not be processed: {type(why).__name__}: {why}"
+        self._log_once(lane, why, "%s: a frame was dropped (further ones of this kind are only counted)")
+
+    @staticmethod
+    def _log_once(lane: Lane, why: Exception, text: str) -> None:
         if str(why) not in lane.errors and len(lane.errors) < 100:
             lane.errors.add(str(why))
-            log.exception(
-                "%s: a frame was dropped (further ones of this kind are only counted)", lane.stage.skin, exc_info=why
-            )
+            log.exception(text, lane.stage.skin, exc_info=why)
 
     # housekeeping
 

@@ -1,9 +1,9 @@
 """Which of many sockets have something to read, at a cost that does not grow with those that have nothing.
 
-zmq.Poller asks every socket each time it waits: with the 35 of 32 skins that was a quarter of a process's CPU. Here the
-kernel says which descriptors woke, and only their sockets are asked. A ZeroMQ socket's descriptor wakes when something
-about it changes, not for as long as there is something to read (zmq_getsockopt, ZMQ_FD): so a socket that was ready is
-asked again before the next wait, and all of them whenever `doubt` says so.
+zmq.Poller asks every socket each time it waits: with 32 skins that was a quarter of a process's CPU. Here the kernel
+says which descriptors woke, and only their sockets are asked. A ZeroMQ socket's descriptor wakes when something about
+it changes, not for as long as there is something to read (zmq_getsockopt, ZMQ_FD): so a socket that was ready is asked
+again before the next wait, and all of them whenever `doubt` says so.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ class Waiter:
         self.doubt()
 
     def doubt(self) -> None:
-        """Ask every socket once. To be called now and then, and after one was used elsewhere than by reading it."""
+        """Ask every socket once. To be called now and then: another use of a socket than reading it (sending, a new
+        subscription) takes its signals too.
+        """
         self._doubtful = [what for what in self._by_descriptor.values() if not isinstance(what, int)]
 
     def wait(self, timeout_s: float) -> list[Waitable]:

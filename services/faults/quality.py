@@ -50,7 +50,6 @@ class Residual:
         self.shape: tuple[int, int] = bundle.matrices.inside.shape
         self.refused = False  # whether the last image that was given a share is of no touch
         self._sizes = (0, 0)
-        self._prepared = b""  # noise of single frames that all is there for
         self._known: OrderedDict[bytes, Conditioned] = OrderedDict()
 
     def __call__(
@@ -85,14 +84,14 @@ class Residual:
         """Condition for one of the noises of a touch whose single frames have this one (K,); False where none is left
         to do. The first image of a touch would wait for it, 10 ms and more.
         """
-        if (key := sigma.tobytes()) == self._prepared or len(sigma) != self.pre.measurements:
+        if len(sigma) != self.pre.measurements:
             return False
         for n in MEANS:
             of_mean = sigma_of_mean(sigma, n)
-            if of_mean.tobytes() not in self._known:
-                self._conditioned(of_mean)
+            is_new = of_mean.tobytes() not in self._known
+            self._conditioned(of_mean)
+            if is_new:
                 return True
-        self._prepared = key
         return False
 
     def _means(self, rows: int, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

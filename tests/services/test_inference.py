@@ -12,7 +12,8 @@ from onnx import TensorProto, helper
 from models.bundle import Bundle, write
 from protocol.frames import DeltaFrame, ImageFrame
 from services.config import Skin
-from services.inference import Inference
+from services.faults.quality import KEPT
+from services.inference import SETTLED, Inference
 from services.preprocessing import Preprocessing
 from services.touches.touch import MEANS
 from tests.services.conftest import Board
@@ -187,3 +188,29 @@ def test_what_a_touch_needs_is_made_while_nothing_touches(
         out = run(stage, touched)
         seen += out.image.size > 0 and not out.held
     assert seen >= len(MEANS)
+
+
+def test_a_noise_that_changes_from_frame_to_frame_is_not_prepared_for(
+    skin: Skin, networked: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Inference("palm", skin, networked)
+    monkeypatch.setattr(stage._residual, "_condition", lambda sigma: pytest.fail("a matrix for nothing"))
+    for k in range(30):  # another measurement fails each time
+        quiet = DeltaFrame(skin="palm", scan=k, valid=True)
+        quiet.sigma = np.full(120, 1e-4, np.float32)
+        quiet.sigma[k] = np.inf
+        run(stage, quiet)
+        assert not stage.prepare()
+
+
+def test_what_other_touches_displaced_is_prepared_again(skin: Skin, networked: Bundle) -> None:
+    stage = Inference("palm", skin, networked)
+    quiet = DeltaFrame(skin="palm", scan=1, valid=True)
+    quiet.sigma = np.full(120, 1e-4, np.float32)
+    for _ in range(SETTLED):
+        run(stage, quiet)
+    while stage.prepare():
+        pass
+    for k in range(KEPT):
+        stage._residual.prepare(np.full(120, 1e-5 * (k + 1), np.float32))
+    assert stage.prepare()

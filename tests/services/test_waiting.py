@@ -20,6 +20,13 @@ def context() -> Iterator["zmq.Context[Socket]"]:
     made.destroy(0)
 
 
+@pytest.fixture
+def waiter() -> Iterator[Waiter]:
+    made = Waiter()
+    yield made
+    made.close()
+
+
 def pair(context: "zmq.Context[Socket]", name: str, *, conflate: bool = False) -> tuple[Socket, Socket]:
     """(sender, receiver)"""
     send, receive = context.socket(zmq.PUSH), context.socket(zmq.PULL)
@@ -29,9 +36,8 @@ def pair(context: "zmq.Context[Socket]", name: str, *, conflate: bool = False) -
     return send, receive
 
 
-def test_only_what_has_something_comes(context: "zmq.Context[Socket]") -> None:
+def test_only_what_has_something_comes(context: "zmq.Context[Socket]", waiter: Waiter) -> None:
     pairs = [pair(context, str(k)) for k in range(MANY)]
-    waiter = Waiter()
     for _, receive in pairs:
         waiter.register(receive)
     _read_all(waiter, 0.1)
@@ -41,9 +47,8 @@ def test_only_what_has_something_comes(context: "zmq.Context[Socket]") -> None:
     assert found == {id(pairs[7][1]), id(pairs[30][1])}
 
 
-def test_what_is_not_read_empty_comes_again(context: "zmq.Context[Socket]") -> None:
+def test_what_is_not_read_empty_comes_again(context: "zmq.Context[Socket]", waiter: Waiter) -> None:
     send, receive = pair(context, "a")
-    waiter = Waiter()
     waiter.register(receive)
     for _ in range(5):
         send.send(b"x")
@@ -53,10 +58,9 @@ def test_what_is_not_read_empty_comes_again(context: "zmq.Context[Socket]") -> N
     assert waiter.wait(0.0) == [] or waiter.wait(0.0) == []  # asked once more, then silent
 
 
-def test_a_message_between_reading_and_waiting_is_not_missed(context: "zmq.Context[Socket]") -> None:
+def test_a_message_between_reading_and_waiting_is_not_missed(context: "zmq.Context[Socket]", waiter: Waiter) -> None:
     """The descriptor does not wake again for a message that came while the socket was read."""
     send, receive = pair(context, "a", conflate=True)
-    waiter = Waiter()
     waiter.register(receive)
     for k in range(2000):
         send.send(b"%d" % k)
@@ -68,8 +72,7 @@ def test_a_message_between_reading_and_waiting_is_not_missed(context: "zmq.Conte
             assert receive.recv(zmq.NOBLOCK) == b"%d again" % k
 
 
-def test_plain_descriptors_and_time(context: "zmq.Context[Socket]") -> None:
-    waiter = Waiter()
+def test_plain_descriptors_and_time(waiter: Waiter) -> None:
     event = os.eventfd(0, os.EFD_NONBLOCK)
     waiter.register(event)
     began = time.monotonic()
@@ -82,9 +85,8 @@ def test_plain_descriptors_and_time(context: "zmq.Context[Socket]") -> None:
     os.close(event)
 
 
-def test_doubt_finds_what_another_use_of_the_socket_hid(context: "zmq.Context[Socket]") -> None:
+def test_doubt_finds_what_another_use_of_the_socket_hid(context: "zmq.Context[Socket]", waiter: Waiter) -> None:
     send, receive = pair(context, "a")
-    waiter = Waiter()
     waiter.register(receive)
     _read_all(waiter, 0.05)
     send.send(b"x")
