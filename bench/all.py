@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from bench._goals import Goal
+from bench._service import end_on_sigterm
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 3600.0  # for one benchmark
@@ -74,12 +75,16 @@ def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
     late = threading.Timer(LIMIT_S, process.terminate)
     late.start()
     assert process.stdout is not None
-    with (folder / f"{benchmark.name}.txt").open("w", encoding="utf-8") as kept:
-        for line in process.stdout:
-            print(line, end="", flush=True)
-            kept.write(line)
-    status = process.wait()
-    late.cancel()
+    try:
+        with (folder / f"{benchmark.name}.txt").open("w", encoding="utf-8") as kept:
+            for line in process.stdout:
+                print(line, end="", flush=True)
+                kept.write(line)
+        status = process.wait()
+    finally:  # where we are told to end, it ends too
+        late.cancel()
+        process.terminate()
+        process.wait()
     return f"{benchmark.name} ended with exit status {status}" if status else ""
 
 
@@ -146,6 +151,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", metavar="NAME", choices=[b.name for b in BENCHMARKS])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
     args = parser.parse_args(argv)
+    end_on_sigterm()
     chosen = [b for b in BENCHMARKS if args.only is None or b.name in args.only]
     args.out.mkdir(parents=True, exist_ok=True)
     began, wrong = time.perf_counter(), []

@@ -31,6 +31,7 @@ from bench._json import write_json
 from bench._machine import machine, provenance
 from bench._service import BEGIN, Outside, end_on_sigterm, running
 from bench._skip_averaging import SNR_DB, averaging
+from bench._skip_batching import TOGETHER, batch_table, batched
 from bench._tracking_scene import Recorded, record
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, Frame, RawFrame, pack, unpack
@@ -193,21 +194,28 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
     args = parser.parse_args(argv)
     end_on_sigterm()
-    variants, held = stages_alone(args.seconds), averaging(scenes(args.seconds)["still"], Bundle.load("square16"))
-    processes = live(args.live)
+    bundle, recorded = Bundle.load("square16"), scenes(args.seconds)
+    variants, held = stages_alone(args.seconds), averaging(recorded["still"], bundle)
+    batches, processes = batched(recorded["moving"], bundle), live(args.live)
     console = Console(width=140)
-    console.print(_variants_table(variants))
-    console.print(_held_table(held))
-    console.print(_live_table(processes))
-    wanted = goals(variants, held, processes)
+    for table in (_variants_table(variants), _held_table(held), batch_table(batches), _live_table(processes)):
+        console.print(table)
+    wanted = goals(variants, held, batches, processes)
     console.print(_goals.table(wanted))
     report = {**provenance("skip", argv), "targets": [goal.to_dict() for goal in wanted]}
-    write_json(args.out / "skip.json", report | {"stages": variants, "held": held, "live": processes})
+    write_json(
+        args.out / "skip.json", report | {"stages": variants, "held": held, "batched": batches, "live": processes}
+    )
     print(f"wrote {args.out / 'skip.json'}")
     return 0
 
 
-def goals(variants: dict[str, Any], held: dict[str, dict[str, float]], processes: dict[str, Any]) -> list[Goal]:
+def goals(
+    variants: dict[str, Any],
+    held: dict[str, dict[str, float]],
+    batches: dict[str, dict[str, float]],
+    processes: dict[str, Any],
+) -> list[Goal]:
     found = []
     ours, without = variants["all rules"], variants["no rule"]
     for scene, most in TARGETS.items():
@@ -224,6 +232,9 @@ def goals(variants: dict[str, Any], held: dict[str, dict[str, float]], processes
     falls = f"still: position error after {list(held)[-1]} frames, of the first one's"
     found.append(Goal(falls, end["averaged"] / start["averaged"], at_most=1.0, gate=0.7))
     found.append(Goal("the same, floors", end["averaged, floor"] / start["averaged, floor"]))
+    most = batches[str(TOGETHER[-1])]
+    saved = f"network's CPU a frame, {TOGETHER[-1]} skins in one run, of each alone's"
+    found.append(Goal(saved, most["one run"] / most["each alone"], gate=1.1))
     for scene in ("untouched", "still", "moving"):
         found.append(Goal(f"{scene}: frames a second on one core, stages alone", 1e3 / ours[scene]["cpu_ms"]))
     return found

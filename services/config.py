@@ -154,6 +154,13 @@ class RealTime(Section):
         return cpus
 
 
+class Skip(Section):
+    """Switches of the skip rules that are not one skin's own (those are `touch` and `scan`). All on, but to measure."""
+
+    batch: Annotated[bool, Field(strict=True)] = True  # skins whose frames wait at once share a run of the network
+    unwanted: Annotated[bool, Field(strict=True)] = True  # what nobody subscribes to (force, shape) is not made
+
+
 class Config(Section):
     """The whole file. `path` is where it was read from; relative paths in it are relative to its folder."""
 
@@ -161,6 +168,7 @@ class Config(Section):
     sockets: Sockets = Sockets()
     security: Security = Security()
     realtime: RealTime = RealTime()
+    skip: Skip = Skip()
     logging: Logging = Logging()
     path: Annotated[Path, Field(exclude=True)] = Path("skin.toml")
 

@@ -117,7 +117,7 @@ class Runner:
     def _serve(self, lanes: list[Lane]) -> None:
         """What waits at these lanes, newest frames of several skins together."""
         work = [(lane, frame) for lane in lanes for frame in self._waiting(lane)]
-        if len(work) > 1:
+        if len(work) > 1 and self.config.skip.batch:
             try:
                 type(work[0][0].stage).together([(lane.stage, frame) for lane, frame in work])
             except Exception as why:  # each frame is still processed by itself
@@ -173,6 +173,9 @@ class Runner:
             self._failed(lane, why)
 
     def _wanted(self, stage: Stage) -> frozenset[str]:
+        """Topics that the stage is to make: those somebody subscribes to, unless skin.toml says all."""
+        if not self.config.skip.unwanted:
+            return frozenset(stage.writes)
         return frozenset(topic for topic in stage.writes if self.publisher.wanted(topic, stage.skin))
 
     def _failed(self, lane: Lane, why: Exception) -> None:

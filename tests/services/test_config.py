@@ -42,7 +42,7 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publisher": "here"}}}, "tcp://HOST:PORT"),
         (
             {"skins": {"palm": PALM}, "loging": {}},
-            "unknown key; allowed here: skins, sockets, security, realtime, logging",
+            "unknown key; allowed here: skins, sockets, security, realtime, skip, logging",
         ),
     ],
 )

@@ -7,16 +7,19 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from protocol.frames import DeltaFrame, Frame, InfoFrame, StatusFrame, pack
+from protocol.frames import DeltaFrame, Frame, InfoFrame, RawFrame, StatusFrame, pack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
-from services.config import ROOT
+from services.config import ROOT, parse
+from services.runner import Runner
+from services.stage import Stage
 from tests.services.conftest import Board
 
 CONFIG = '[skins.palm]\nport = "stub"\nbundle = "square16"\nnetwork = "none"\n'
@@ -162,6 +165,54 @@ def test_frames_commands_silence_and_a_crash(process: Process, board: Board, bun
     process.popen.send_signal(signal.SIGTERM)
     assert process.popen.wait(5) == 0 and time.monotonic() - began < 3
     assert "Traceback" not in process.logged()
+
+
+class Counting(Stage):
+    """Says which frames came together."""
+
+    reads, writes, stamp = "raw", ("delta",), "preprocess"
+    groups: ClassVar[list[int]] = []
+
+    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        return [DeltaFrame(skin=self.skin, scan=frame.scan)]
+
+    @classmethod
+    def together(cls, work: Sequence[tuple[Stage, Frame]]) -> None:
+        cls.groups.append(len(work))
+
+
+class OneFrame:
+    """A feed that holds one frame."""
+
+    malformed = skipped = 0
+
+    def __init__(self, skin: str) -> None:
+        self.socket = object()
+        z, status = np.ones(120, np.complex64), np.zeros(120, np.uint8)
+        stamps = {"read": time.monotonic_ns()}
+        self.waiting: list[Frame] = [RawFrame(skin=skin, stamps=stamps, valid=True, z=z, status=status)]
+
+    def recv(self) -> Frame | None:
+        return self.waiting.pop() if self.waiting else None
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("skip", [True, False])
+def test_rules_that_no_skin_owns_have_their_switches(runtime: Path, skip: bool) -> None:
+    skins = {name: {"port": "stub", "bundle": "square16"} for name in ("palm", "arm")}
+    runner = Runner("preprocessing", parse({"skins": skins, "skip": {"batch": skip, "unwanted": skip}}))
+    try:
+        Counting.groups.clear()
+        for name in skins:
+            runner.add(Counting(name), OneFrame(name))
+        assert runner._wanted(runner.lanes["arm"].stage) == (frozenset() if skip else {"delta"})
+        runner._serve(list(runner.lanes.values()))
+        assert Counting.groups == ([2] if skip else [])
+        assert runner.publisher.sent == {"delta/palm": 1, "delta/arm": 1}
+    finally:
+        runner.close()
 
 
 def test_a_configuration_that_is_wrong_ends_in_one_clear_line(runtime: Path) -> None:
