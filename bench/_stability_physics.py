@@ -69,7 +69,7 @@ def snr(setting: Setting) -> Iterator[Row]:
     draws = 2 if setting.quick else 12
     for decibel in (30, 40, 50, 60, 70, 80, 90, 100) if not setting.quick else (30, 50, 70, 100):
         found = answers(runner, setting.scenes(), share(decibel), rng, draws)
-        yield {"case": f"{decibel} dB", "value": decibel, **summary(found)}
+        yield {"case": f"{decibel} dB", "value": decibel, **summary(found, doubtful=True)}
 
 
 def few(setting: Setting) -> Iterator[Row]:

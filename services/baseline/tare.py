@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 DISAGREEMENT = 1e-5  # probability that quiet frames are refused
 HARMLESS = 5e-5  # relative change of a measurement within the frames that does no harm as part of a baseline
 TOO_NOISY = 0.05  # median relative noise beyond which no touch could be told from it
+UNTRAINED = 0.0056  # the same (45 dB), beyond which no network was trained (models/augmentation.py): it may see a touch
+# anywhere
 IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
 QUARTERS = 4
 ASSUMED_NOISE = 1e-3  # relative (60 dB), where frames do not tell
@@ -97,10 +99,23 @@ def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Bas
             f"the {len(frames)} untouched frames are identical, as measured ones never are: a noise of "
             f"{ASSUMED_NOISE:g} of each measurement is assumed; check the source and run `skin tare`"
         )
+    doubt = noisy(z0, sigma, pre) or doubt
     misfit = implausibility(z0, pre)
     if misfit > IMPLAUSIBLE:
         doubt = f"the baseline is {100 * misfit:.1f} % off what the bundle predicts: free the skin and run `skin tare`"
     return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
+
+
+def noisy(z0: Array, sigma: Array, pre: PreReconstructor) -> str:
+    """ "" or why no touch that is measured with this noise is to be believed. A measured bundle knows its own noise."""
+    live = np.isfinite(sigma) & (z0 > 0)
+    share = float(np.median(sigma[live] / z0[live])) if live.any() else 0.0
+    if pre.m.normalisation != "model" or share <= UNTRAINED:
+        return ""
+    return (
+        f"the frames scatter by {100 * share:.1f} %, networks were trained for {100 * UNTRAINED:.2f} % at most: check "
+        "grounding and cable, then run `skin tare`"
+    )
 
 
 def plausible_noise(z0: Array, sigma: Array) -> Array:

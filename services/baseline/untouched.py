@@ -15,7 +15,7 @@ from models.bundle import Bundle
 from protocol.frames import RawFrame
 from services.baseline.creep import Creep
 from services.baseline.following import Follower
-from services.baseline.tare import Baseline, noise_of_steps, plausible_noise, take
+from services.baseline.tare import Baseline, noise_of_steps, noisy, plausible_noise, take
 from services.config import Tare
 from services.stage import Refused
 
@@ -127,8 +127,9 @@ class Untouched:
         if self.baseline is not None and self._run < needed and not force:
             raise Refused(f"only {self._run} of {needed} untouched frames since the last touch: wait and try again")
         baseline = take(np.array(self._window), self.pre, self._board, self._last_sample_ns)
-        # Whoever gives the command has looked: no doubt.
-        self.set_baseline(dataclasses.replace(baseline, doubt="", taken_by="command"), self._last_sample_ns)
+        # Whoever gives the command has looked: no doubt, but that of noise, which looking does not mend.
+        doubt = noisy(baseline.z0, baseline.sigma, self.pre)
+        self.set_baseline(dataclasses.replace(baseline, doubt=doubt, taken_by="command"), self._last_sample_ns)
         return baseline
 
     def progress(self) -> str:

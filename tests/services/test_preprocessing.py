@@ -340,6 +340,20 @@ def test_reference_frames_are_the_baseline(stage: Preprocessing, board: Board) -
     assert run(stage, board.frame(shifted + board.disc(0.0, 0.3, 0.2, 0.3), source="replay")).touched
 
 
+def test_more_noise_than_networks_were_trained_with_is_never_valid(skin: Skin, bundle: Bundle) -> None:
+    """Not even after a tare on command: looking at the skin does not mend it."""
+    for snr_db, valid in ((50.0, True), (40.0, False), (30.0, False)):
+        stage, board = Preprocessing("palm", skin, bundle), Board(bundle, snr_db)
+        for _ in range(80):
+            found = run(stage, board.frame())
+        assert found.valid == valid and not found.touched
+        assert valid == (not stage.health().messages)
+        stage.command("tare", {"force": True})
+        assert run(stage, board.frame()).valid == valid
+        if not valid:
+            assert "trained for 0.56 %" in stage.health().messages[0]
+
+
 def test_take_refuses_noise_and_missing_measurements(bundle: Bundle) -> None:
     pre, rng = bundle.prereconstructor(), np.random.default_rng(0)
     with pytest.raises(Refused, match="scatter"):
