@@ -2,8 +2,8 @@
 
 Where touches merge they are told apart by the valley between their peaks (splitting.py says which part of the
 image is whose). What a tracker expects counts as evidence: two touches that are known to be there are kept apart at a
-shallower valley than two that would be new. Every pixel above the floor belongs to exactly one touch, so that the
-integrated drop is the same however a patch is split.
+shallower valley than two that would be new. Every pixel of the smoothed image above the floor belongs to exactly one
+touch, so that the integrated drop is the same however a patch is split.
 """
 
 from __future__ import annotations
