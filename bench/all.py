@@ -95,7 +95,7 @@ def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
     for suffix in ("json", "txt"):  # what an earlier run left is not this one's
         (folder / f"{benchmark.name}.{suffix}").unlink(missing_ok=True)
     process = subprocess.Popen(
-        [*command, "--out", str(folder)],
+        [*command, "--out", os.path.relpath(folder, ROOT)],  # what it says of it names no place of this machine
         cwd=ROOT,
         stdout=subprocess.PIPE,
         text=True,
