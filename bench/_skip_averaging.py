@@ -25,19 +25,19 @@ SNR_DB = 70.0
 TIMES = 16  # that the touch is met
 QUIET, HELD = 100, 200  # frames before it, and of it
 EDGES = (0, 1, 4, 10, 22, 44, 110, HELD)  # frames since it began
-METRES = 0.05  # of a model unit
 
 
 def averaging(recorded: Recorded, bundle: Bundle, seed: int = 1) -> dict[str, dict[str, float]]:
     """Frames since the touch began -> rms position error [mm] with averaging and without, of the scene's one touch;
-    their floors; how many frames without averaging did not see it.
+    their floors; how many frames did not see it.
     """
     touched = recorded.touches[:, 0].astype(int)
     first, last = int(touched.min()), int(touched.max())
     free = recorded.z[: first - 1].mean(axis=0)
     pressed = recorded.z[first + 2 : last - 1].mean(axis=0)  # the scans that the touch was there for all along
     _, _, x, y, newtons, radius, _ = recorded.touches[0]
-    shape = Shape("circle", x / METRES, y / METRES, radius / METRES, newtons * NEWTON)
+    metres = bundle.metres_per_unit
+    shape = Shape("circle", x / metres, y / metres, radius / metres, newtons * NEWTON)
     found: dict[str, dict[str, float]] = {}
     for name, hold in (("averaged", True), ("each alone", False)):
         rng = np.random.default_rng(seed)  # the same noise for both
@@ -45,14 +45,15 @@ def averaging(recorded: Recorded, bundle: Bundle, seed: int = 1) -> dict[str, di
         for a, b in zip(EDGES, EDGES[1:], strict=False):
             row = found.setdefault(str(a), {})
             row[name] = 1e3 * float(np.sqrt(np.nanmean(np.square(errors[:, a:b]))))
-            row[f"{name}, floor"] = _floor_mm(shape, max(n for n in MEANS if n <= a + 1) if hold else 1)
+            row[f"{name}, floor"] = 1e3 * metres * _floor(shape, max(n for n in MEANS if n <= a + 1) if hold else 1)
             row[f"{name}, frames not seen"] = float(np.isnan(errors[:, a:b]).sum())
     return found
 
 
-def _floor_mm(shape: Shape, averaged: int) -> float:
+def _floor(shape: Shape, averaged: int) -> float:
+    """Of the position, model units."""
     noise = fisher.Noise(SNR_DB + 10 * np.log10(averaged), tare_frames=TareConfig().frames / averaged)
-    return 1e3 * METRES * float(fisher.floors("square16", shape, noise, fisher.SizePrior())["bayes"].position)
+    return float(fisher.floors("square16", shape, noise, fisher.SizePrior())["bayes"].position)
 
 
 def _errors(

@@ -117,8 +117,8 @@ def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
     return f"{benchmark.name} ended with exit status {status}" if status else ""
 
 
-def section(benchmark: Benchmark, folder: Path) -> tuple[list[str], list[Goal]]:
-    """(lines of the page, goals). Raises FileNotFoundError where it was not run, KeyError where an older one was."""
+def section(benchmark: Benchmark, folder: Path) -> tuple[list[str], list[Goal], str]:
+    """(lines of the page, goals, commit). Raises FileNotFoundError where it was not run, KeyError where an old one was."""
     report: dict[str, Any] = json.loads((folder / f"{benchmark.name}.json").read_text(encoding="utf-8"))
     goals = [Goal.from_dict(found) for found in report["targets"]]
     versions = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
@@ -143,25 +143,21 @@ def section(benchmark: Benchmark, folder: Path) -> tuple[list[str], list[Goal]]:
     for picture in benchmark.pictures:
         if (folder / f"{picture}.png").is_file():
             lines += ["", f"![{benchmark.title}]({picture}.png)"]
-    return [*lines, ""], goals
-
-
-def _reports(chosen: Sequence[Benchmark], folder: Path) -> list[dict[str, Any]]:
-    files = [folder / f"{benchmark.name}.json" for benchmark in chosen]
-    return [json.loads(file.read_text(encoding="utf-8")) for file in files if file.is_file()]
+    return [*lines, ""], goals, report["commit"]
 
 
 def page(chosen: Sequence[Benchmark], folder: Path) -> tuple[str, list[Goal]]:
     """The page in Markdown, and all goals on it."""
-    bodies, every = [], []
+    bodies, every, commits = [], [], set()
     for benchmark in chosen:
         try:
-            lines, goals = section(benchmark, folder)
+            lines, goals, commit = section(benchmark, folder)
         except (FileNotFoundError, KeyError):
-            lines, goals = [f"## {benchmark.title}", "", f"Not run: `skin bench {benchmark.name}`.", ""], []
+            bodies += [f"## {benchmark.title}", "", f"Not run: `skin bench {benchmark.name}`.", ""]
+            continue
         bodies += lines
         every += goals
-    commits = {found.get("commit") for found in _reports(chosen, folder)}
+        commits.add(commit)
     made = "all at one commit" if len(commits) == 1 else f"at {len(commits)} commits, each by a command of its own"
     with_target = [goal for goal in every if goal.met is not None]
     met = sum(bool(goal.met) for goal in with_target)

@@ -20,8 +20,7 @@ Array = NDArray[np.float64]
 DISAGREEMENT = 1e-5  # probability that quiet frames are refused
 HARMLESS = 5e-5  # relative change of a measurement within the frames that does no harm as part of a baseline
 TOO_NOISY = 0.05  # median relative noise beyond which no touch could be told from it
-UNTRAINED = 0.0056  # the same (45 dB), beyond which no network was trained (models/augmentation.py): it may see a touch
-# anywhere
+UNTRAINED = 0.0056  # the same (45 dB), beyond which no network was trained: models/augmentation.py
 IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
 QUARTERS = 4
 ASSUMED_NOISE = 1e-3  # relative (60 dB), where frames do not tell
