@@ -118,7 +118,7 @@ def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
 
 
 def section(benchmark: Benchmark, folder: Path) -> tuple[list[str], list[Goal], str]:
-    """(lines of the page, goals, commit). Raises FileNotFoundError where it was not run, KeyError where an old one was."""
+    """(lines of the page, goals, commit). Raises FileNotFoundError where it was not run, KeyError of an older form."""
     report: dict[str, Any] = json.loads((folder / f"{benchmark.name}.json").read_text(encoding="utf-8"))
     goals = [Goal.from_dict(found) for found in report["targets"]]
     versions = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
