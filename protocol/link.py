@@ -38,12 +38,14 @@ from .link_messages import (
     SelfTestFault,
     Start,
     Stop,
+    Time,
+    TimeAsk,
 )  # fmt: skip
 
 __all__ = [
     "CHIP_ID", "LINK_VERSION", "MAX_BODY", "MAX_SCAN", "MAX_TEXT", "MESSAGES", "SCHEMA_HASH", "SCHEMA_TEXT",
     "Ack", "Capability", "Config", "Decoder", "Event", "EventCode", "Frame", "Hello", "Ident", "LinkError", "Message",
-    "Nak", "NakReason", "SelfTest", "SelfTestFault", "Start", "Stop", "encode",
+    "Nak", "NakReason", "SelfTest", "SelfTestFault", "Start", "Stop", "Time", "TimeAsk", "encode",
 ]  # fmt: skip
 
 MAX_PIECE = MAX_BODY + MAX_BODY // 254 + 1

@@ -36,6 +36,7 @@ class Capability(IntFlag):
     SENTINEL = 1
     SELF_TEST = 2
     VARIABLE_DFT = 4
+    TIME = 8
 
 
 class NakReason(IntEnum):
@@ -207,6 +208,14 @@ class SelfTest(Message):
 
 
 @dataclass(frozen=True, eq=False)
+class TimeAsk(Message):
+    """What does your clock say? In any state; only of a board with the capability TIME. Answered by TIME."""
+
+    number, sender = 0x06, "host"
+    nonce: int = _wired("u32", "any number, another one each time: the answer repeats it")
+
+
+@dataclass(frozen=True, eq=False)
 class Ident(_WithText):
     """The answer to HELLO."""
 
@@ -228,6 +237,7 @@ class Ack(Message):
     number, sender = 0x82, "board"
     of: int = _wired("u8", "number of the command's message")
     value: int = _wired("u32", "the command's result, see there", 0)
+    device_us: int = _wired("u64", "the microcontroller's clock when it was carried out [us]; 0: the board cannot say", 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +294,18 @@ class Event(_WithText):
     text: str = _wired("text", "what, for a person", "")
 
 
-MESSAGES: tuple[type[Message], ...] = (Hello, Config, Start, Stop, SelfTest, Ident, Ack, Nak, Frame, Event)
+@dataclass(frozen=True, eq=False)
+class Time(Message):
+    """The answer to TIME_ASK."""
+
+    number, sender = 0x86, "board"
+    nonce: int = _wired("u32", "that of the question")
+    device_us: int = _wired("u64", "the microcontroller's clock between the question's arrival and this answer [us]")
+
+
+MESSAGES: tuple[type[Message], ...] = (
+    Hello, Config, Start, Stop, SelfTest, TimeAsk, Ident, Ack, Nak, Frame, Event, Time,
+)  # fmt: skip
 BY_NUMBER = {m.number: m for m in MESSAGES}
 HEADS = {m: m._head() for m in MESSAGES}
 SCHEMA_TEXT = "".join(

@@ -23,15 +23,17 @@ LINK = {
     "Start": (0x03, "<H", ("config",)),
     "Stop": (0x04, "<", ()),
     "SelfTest": (0x05, "<", ()),
+    "TimeAsk": (0x06, "<I", ("nonce",)),
     "Ident": (
         0x81,
         "<BIH12sIBH",
         ("link_version", "schema_hash", "chip_id", "unique_id", "capabilities", "electrodes", "max_scan"),
     ),
-    "Ack": (0x82, "<BI", ("of", "value")),
+    "Ack": (0x82, "<BIQ", ("of", "value", "device_us")),
     "Nak": (0x83, "<BB", ("of", "reason")),
     "Frame": (0x84, "<IQIH", ("seq", "device_us", "duration_us", "config")),
     "Event": (0x85, "<H", ("code",)),
+    "Time": (0x86, "<IQ", ("nonce", "device_us")),
 }
 PLAIN_CRC = ("Hello", "Ident", "Nak")
 
