@@ -47,6 +47,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add("--listen", metavar="URL", help="socket://HOST:PORT instead of a pty")
     add("--port-name", default="board", help="the pty's name in the runtime folder (default: %(default)s)")
     add("--seed", type=int, help="of the noise (default: another one each time)")
+    add("--no-time", action="store_true", help="a firmware that does not answer TIME_ASK")
     add("--detached", action="store_true", help="go on when the parent process has ended")
     add("--faults", action="store_true", help="list what can go wrong on request, and end")
     options = parser.parse_args(argv)
@@ -88,6 +89,7 @@ def main(argv: list[str] | None = None) -> int:
             baud=options.baud,
             seed=options.seed,
             threaded=True,
+            answers_time=not options.no_time,
         )
         port = open_port(options.listen, runtime_dir(), options.port_name)
     except (ValueError, OSError, RuntimeDirError) as error:
@@ -131,8 +133,9 @@ def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, s
     checked, written_ns = 0.0, begin_ns
     status = Status(skin)
     while not stop.asked:
-        now = (time.monotonic_ns() - begin_ns) * 1e-9
-        if data := port.read():
+        data = port.read()
+        now = (time.monotonic_ns() - begin_ns) * 1e-9  # after: the board has not read what it is told before it came
+        if data:
             rig.feed(data, now)
         if sent := rig.pull(now):
             written_ns = time.monotonic_ns()  # before the write: its reader may run before we do again

@@ -43,7 +43,7 @@ class Board:
     """The state machine. It is scanning from START to STOP, a scan every `measurement_s` times its list's length.
 
     speed: how many times faster than a real board it measures. crystal_ppm: how much too fast its clock runs.
-    on_scan is called with each scan once it is measured.
+    answers_time: whether its firmware knows TIME_ASK. on_scan is called with each scan once it is measured.
     """
 
     def __init__(
@@ -56,11 +56,12 @@ class Board:
         speed: float = 1.0,
         crystal_ppm: float = 12.0,
         unique_id: bytes = b"eitskin-stub",
+        answers_time: bool = True,
         on_scan: Callable[[Scan], None] | None = None,
     ) -> None:
         self.field, self.analog, self.faults = field, analog, faults
         self.electrodes, self.speed, self.crystal_ppm, self.unique_id = electrodes, speed, crystal_ppm, unique_id
-        self.on_scan = on_scan
+        self.answers_time, self.on_scan = answers_time, on_scan
         self.power_cycle(0.0)
 
     # --- life ---
@@ -70,6 +71,7 @@ class Board:
         self.faults.power_cycled()
         self._decoder = link.Decoder()
         self._booted = now
+        self._sent: dict[int, tuple[NDArray[np.complex64], NDArray[np.uint8]]] = {}  # by configuration, last
         self._configs: dict[int, link.Config] = {}
         self._running: link.Config | None = None
         self._next: link.Config | None = None
@@ -128,7 +130,7 @@ class Board:
                     schema_hash=self._schema(now),
                     chip_id=self._chip_id(now),
                     unique_id=self.unique_id[:12].ljust(12, b"\0"),
-                    capabilities=CAPABILITIES,
+                    capabilities=CAPABILITIES | (link.Capability.TIME if self.answers_time else 0),
                     electrodes=self.electrodes,
                     max_scan=link.MAX_SCAN,
                     firmware=FIRMWARE,
@@ -145,12 +147,17 @@ class Board:
             self._start(message, now)
         elif isinstance(message, link.Stop):
             self._running = self._next = None
-            self._say(link.Ack(message.number), now)
+            self._done(message, 0, now)
         elif isinstance(message, link.SelfTest):
             if self._running is not None:
                 self._refuse(message, NakReason.BUSY, "scanning: STOP first", now)
             else:
-                self._say(link.Ack(message.number, self._self_test(now)), now)
+                self._done(message, self._self_test(now), now)
+        elif isinstance(message, link.TimeAsk):
+            if self.answers_time:
+                self._say(link.Time(message.nonce, self.device_us(now)), now)
+            else:
+                self._refuse(message, NakReason.UNKNOWN, "this firmware does not know TIME_ASK", now)
 
     def _configure(self, config: link.Config, now: float) -> None:
         wrong = ""
@@ -172,7 +179,7 @@ class Board:
         if self._running is not None and self._running.config == config.config:
             self._next = config
         self.faults.clear("brown_out")
-        self._say(link.Ack(config.number, config.config), now)
+        self._done(config, config.config, now)
 
     def _start(self, start: link.Start, now: float) -> None:
         config = self._configs.get(start.config)
@@ -187,7 +194,7 @@ class Board:
                 self._running, self._seq, self._scan_start = config, 0, now
             else:
                 self._next = config
-            self._say(link.Ack(start.number, start.config), now)
+            self._done(start, start.config, now)
 
     def _self_test(self, now: float) -> int:
         def bad(*names: str) -> bool:
@@ -226,6 +233,9 @@ class Board:
         scan = np.asarray(config.scan, np.int64)
         transfer = self.field.over(start, end)
         z, status = self.analog.measure(transfer, scan, config.dft_points, config.rtia_ohm, start)
+        if self.faults.active("frozen", start) is not None:
+            z, status = self._sent.get(config.config, (z, status))
+        self._sent[config.config] = z, status
         self._notice(start, end)
         self._send(seq, start, end, config, z, status)
         if self.on_scan is not None:
@@ -250,6 +260,10 @@ class Board:
         """The microcontroller's clock at time t."""
         return max(0, round((t - self._booted) * 1e6 * (1 + self.crystal_ppm * 1e-6)))
 
+    def jump(self, seconds: float) -> None:
+        """The microcontroller's clock goes forward at once, or back."""
+        self._booted -= seconds
+
     def _notice(self, start: float, end: float) -> None:
         """Report what the firmware can notice by itself."""
         for name, code in (
@@ -267,6 +281,9 @@ class Board:
         if now - self._reported.get(code, -math.inf) >= EVENT_PAUSE_S:
             self._reported[code] = now
             self._say(link.Event(code, text), now)
+
+    def _done(self, command: link.Message, value: int, now: float) -> None:
+        self._say(link.Ack(command.number, value, self.device_us(now)), now)
 
     def _refuse(self, message: link.Message, reason: NakReason, text: str, now: float) -> None:
         self._say(link.Nak(message.number, reason, text), now)

@@ -81,6 +81,8 @@ FAULTS: dict[str, Fault] = {
     "wrong_schema": Fault(
         "the firmware is another version: another schema hash in IDENT and in every check", {"schema": 0xBAD0F00D}
     ),
+    "clock_jump": Fault("the microcontroller's clock jumps `by` so many seconds, once", {"by": -5.0}),
+    "frozen": Fault("the same scan is sent again and again, with new numbers and times"),
     "hang": Fault("the board neither answers nor sends"),
     "unplug": Fault(
         "the device vanishes and comes back, power-cycled, after the seconds; as <runtime>/`name` where one is given",

@@ -48,6 +48,7 @@ class Rig:
         baud: int = BAUD,
         seed: int | None = None,
         threaded: bool = False,
+        answers_time: bool = True,
     ) -> None:
         script = scenes.load(scene)  # first, since it fails fast
         self.sheet = geometry if isinstance(geometry, Sheet) else Sheet(geometry)
@@ -67,6 +68,7 @@ class Rig:
             electrodes=self.sheet.electrodes,
             speed=rate_hz * full_s if rate_hz else 1.0,
             crystal_ppm=crystal_ppm,
+            answers_time=answers_time,
             on_scan=self._scanned,
         )
         self._unplugged: dict[str, Any] | None = None
@@ -84,6 +86,9 @@ class Rig:
     def pull(self, now: float) -> bytes:
         """Bytes that reached the host since the last call."""
         self._cues(now)
+        if (jump := self.faults.active("clock_jump", now)) is not None:
+            self.faults.clear("clock_jump")
+            self.board.jump(jump["by"])
         if self._plugging(now):
             return b""
         if self._realtime and now - self._then > SLEPT_S:

@@ -44,7 +44,7 @@ class Host:
         """The answer to a command."""
         self.wait(0.02)
         self.send(message)
-        (answer,) = (m for m in self.wait(0.05) if isinstance(m, (link.Ack, link.Nak, link.Ident)))
+        (answer,) = (m for m in self.wait(0.05) if isinstance(m, (link.Ack, link.Nak, link.Ident, link.Time)))
         return answer
 
     def start(self, scan: np.ndarray = PAIRS, points: int = 128, config: int = 1) -> None:

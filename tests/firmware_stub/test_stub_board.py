@@ -67,6 +67,21 @@ def test_the_device_clock_is_off_by_its_crystal(host):
     assert measured * 1e6 == pytest.approx(200, abs=1)
 
 
+def test_the_board_says_what_its_clock_shows_unless_its_firmware_cannot(host):
+    board = host(crystal_ppm=200.0)
+    assert board.ask(link.Hello()).capabilities & link.Capability.TIME
+    board.start()
+    for nonce in (7, 2**32 - 1):
+        asked = board.now + 0.02  # `ask` waits so long
+        answer = board.ask(link.TimeAsk(nonce))
+        assert isinstance(answer, link.Time) and answer.nonce == nonce
+        assert asked <= answer.device_us / (1 + 200e-6) * 1e-6 + 1e-6 and answer.device_us * 1e-6 < board.now
+    assert board.ask(link.Start(1)).device_us * 1e-6 == pytest.approx(board.now - 0.05, abs=0.01)
+    old = host(answers_time=False)
+    assert not old.ask(link.Hello()).capabilities & link.Capability.TIME
+    assert old.ask(link.TimeAsk(1)).reason == link.NakReason.UNKNOWN
+
+
 def test_noise_is_what_was_asked_for_and_falls_with_the_points(host):
     scatter = {}
     for points in (128, 512):

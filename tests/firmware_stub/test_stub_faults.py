@@ -233,6 +233,25 @@ def test_a_hanging_board_is_silent(running):
     assert during(board, "hang")[1:] == []
 
 
+def test_the_clock_jumps_once_and_the_scans_go_on(running):
+    board, _ = running
+    board.wait(7.0)
+    (before, *_) = board.frames(0.1)
+    board.rig.fault("clock_jump", {"by": -5.0}, board.now)
+    after = board.frames(0.5)[-1]
+    true_us = (after.seq - before.seq) * before.duration_us
+    assert (after.device_us - before.device_us - true_us) * 1e-6 == pytest.approx(-5.0, abs=0.001)
+
+
+def test_a_frozen_scan_has_new_numbers_and_times(running):
+    board, _ = running
+    board.wait(0.2)
+    board.rig.fault("frozen", {}, board.now, 1.0)
+    frames = board.frames(0.6)[1:]
+    assert len(frames) > 8 and len({bytes(f.z) for f in frames}) == 1
+    assert len({f.seq for f in frames}) == len({f.device_us for f in frames}) == len(frames)
+
+
 def test_unplug_forgets_the_configuration_and_starts_the_clock_anew(running):
     board, _ = running
     board.wait(2.0)
