@@ -14,7 +14,6 @@ from firmware_stub.timeline import Script, Timeline
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame
 from services.board.boardlink import BoardLink
-from services.board.clock import DeviceClock
 from services.board.source import BoardSource
 from services.config import Skin
 from services.pipeline import Pipeline
@@ -41,7 +40,6 @@ class Host:
         self.source = BoardSource("palm", skin, bundle)
         self.adaptive = self.source.adaptive()
         self.link = BoardLink(self.source.scanning, 0.0, self.source.idling)
-        self.clock = DeviceClock()
         self.pipeline = Pipeline(skin, "palm", bundle)
         self.pipeline.pre.warm_up()
         self.kinds: Counter[str] = Counter()
@@ -82,7 +80,7 @@ class Host:
         self.kinds[kind] += 1
         if self.deaf:
             return
-        raw = self.source.raw_frame(scan, self.link, self.clock, round(self.now * 1e9), kind)
+        raw = self.source.raw_frame(scan, self.link, round(self.now * 1e9), kind)
         delta, _, contact = self.pipeline.run(raw)
         heapq.heappush(self._verdicts, (self.now + CHAIN_S, len(self.contacts), delta))
         self.contacts.append((self.now + CHAIN_S, contact))

@@ -25,7 +25,6 @@ from firmware_stub.world import NEWTON, World
 from models.bundle import Bundle
 from protocol.frames import RawFrame
 from services.board.boardlink import BoardLink
-from services.board.clock import DeviceClock
 from services.board.source import BoardSource
 from services.config import Skin
 
@@ -34,7 +33,7 @@ WORK = Path(__file__).with_name("work")
 MADE_BY = (
     *(f"firmware_stub/{n}.py" for n in ("analog", "board", "faults", "field", "rig", "scene", "sheet", "timeline")),
     *(f"models/{n}.py" for n in ("elements", "forward", "geometry", "meshing", "patterns", "shapes")),
-    *(f"services/board/{n}.py" for n in ("boardlink", "clock", "source")),
+    *(f"services/board/{n}.py" for n in ("boardlink", "clock", "scan_order", "source")),
 )
 LAYOUT = 1  # of what is kept: raised when Recorded or what fills it changes
 KEPT = 6  # recorded scenes
@@ -137,7 +136,7 @@ class _Host:
         self.rig, self.now = rig, 0.0
         skin, bundle = Skin(port="stub", bundle="square16"), Bundle.load("square16")
         self.source = BoardSource("palm", skin, bundle)
-        self.link, self.clock = BoardLink(self.source.scanning, 0.0), DeviceClock()
+        self.link = BoardLink(self.source.scanning, 0.0)
         self._rng = np.random.default_rng([seed, 7])
         self._felt: dict[int, tuple[float, float, World, dict[str, object]]] = {}
         self._frames: list[RawFrame] = []
@@ -154,7 +153,7 @@ class _Host:
             self._felt[scan.seq] = scan.start, middle, world, in_force
         read_ns = round(self.now * 1e9)
         for scan in self.link.received(data, self.now) if data else []:
-            self._frames.append(self.source.raw_frame(scan, self.link, self.clock, read_ns))
+            self._frames.append(self.source.raw_frame(scan, self.link, read_ns))
 
     def recorded(self, script: Script) -> Recorded:
         felt = [self._felt[frame.scan] for frame in self._frames]

@@ -237,7 +237,7 @@ class Ack(Message):
     number, sender = 0x82, "board"
     of: int = _wired("u8", "number of the command's message")
     value: int = _wired("u32", "the command's result, see there", 0)
-    device_us: int = _wired("u64", "the microcontroller's clock when it was carried out [us]; 0: the board cannot say", 0)
+    device_us: int = _wired("u64", "the microcontroller's clock when it was carried out [us]; 0: it cannot say", 0)
 
 
 @dataclass(frozen=True, eq=False)

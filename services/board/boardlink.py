@@ -1,4 +1,4 @@
-"""The host's end of the board's link: HELLO, IDENT, check, CONFIG, START, scans. A state machine without I/O.
+"""The host's end of the board's link: HELLO, IDENT, check, CONFIG, START, scans, TIME. A state machine without I/O.
 
 `received` takes bytes in, `to_send` gives bytes out; both are told the time. Nothing the board does, or fails to do,
 raises.
@@ -15,18 +15,22 @@ from numpy.typing import NDArray
 
 from protocol import link
 from protocol.frames import STATUS_OPEN, STATUS_RTIA
+from services.board.clock import GOOD_NS, DeviceClock
+from services.board.frozen import FrozenScans
+from services.board.line_pace import LinePace
+from services.board.scan_order import ScanOrder
+from services.board.time_questions import TimeQuestions
 
 HELLO_EVERY_S = 0.2
 ANSWER_S = 0.5  # a command that is not answered in this time is sent again
 SWITCH_S = 0.1  # a running board that does not answer to a START in this time is told again
 TRIES = 3  # then everything starts from HELLO
-EARLY_S = 0.0015  # before a scan's last byte is expected it is waited for byte by byte
-LONGEST_LINE_S = 0.02  # that a scan is expected to take on the line: slower ones are listened to all the time
 SILENT_S = 1.0  # a running board that sends nothing for so long is asked again
 EXPLAIN_AFTER_S = 1.5  # of unanswered HELLOs
 DEAD_SCANS = 10  # in a row with all measurements out of range: the board may have lost its registers
 DEAD_AGAIN_S = 5.0  # then it is configured again, at most this often
 REFUSED_AGAIN_S = 1.0  # a refused board is tried again, for it may be power-cycled or flashed
+IMPOSSIBLE_SCANS = 3  # in a row whose times cannot be: the board's clock has jumped
 NO_CURRENT = STATUS_OPEN | STATUS_RTIA
 
 
@@ -50,6 +54,7 @@ class Scanning:
 class BoardLink:
     """One connection. `state` is hello, config, start, running or refused.
 
+    `clock` maps the board's time to this host's. It begins anew only where START and its answer say so.
     idle: a second configuration that a running board may be switched to (`switch`), where its firmware can.
     """
 
@@ -59,23 +64,31 @@ class BoardLink:
         self._started = scanning  # what the board was last told to scan
         self._wanted = scanning
         self.decoder = link.Decoder()
-        self.began_s: dict[int, float] = {}  # of the scans received last: when the first byte came
-        self._began_s = now_s  # when the first byte of what is not complete came
-        self._line_s = 0.0  # from the first byte of the last scan to its last
-        self._paused = False  # since the last look at the line
+        self.clock = DeviceClock()
+        self.frozen = FrozenScans()
+        self.reasons: dict[int, list[str]] = {}  # of the scans received last, by number: gap, frozen
+        self._order = ScanOrder()
+        self._questions = TimeQuestions()
+        self._impossible = 0  # scans in a row
+        self._heard_us = 0  # newest time of the board's clock
+        self._start_s: float | None = None  # when START was sent first in this state
+        self._pace = LinePace(now_s)
         self.ident: link.Ident | None = None
         self.problem = ""  # what stands in the way, for a person; "" when all is well
         self.counts: Counter[str] = Counter()  # scans, missing, repeated, foreign, events, restarts, garbled
-        self._last_seq: int | None = None
         self.state, self._since, self._due_s, self._tries = "hello", now_s, now_s, 0
         self._heard_s = self._asked_since = now_s
         self._dead_scans, self._dead_s = 0, -DEAD_AGAIN_S
-        self.gap = False  # whether scans are missing just before the last one returned
 
     @property
     def board(self) -> str:
         """Unique id of the board, hexadecimal; "" until it has introduced itself."""
         return self.ident.unique_id.hex() if self.ident else ""
+
+    @property
+    def clock_unknown(self) -> bool:
+        """Whether it is not known how old the board's scans are."""
+        return self.clock.unknown(self._heard_us)
 
     @property
     def switches(self) -> bool:
@@ -94,20 +107,16 @@ class BoardLink:
     def received(self, data: bytes, now_s: float) -> list[link.Frame]:
         """Scans that `data` completes, in order; everything else is dealt with here."""
         scans = []
-        began_s, dropped = self._began_s if self.decoder.waiting else now_s, self.decoder.bad
+        waited, bad = self.decoder.waiting, self.decoder.bad
         messages = self.decoder.feed(data)
-        if self.decoder.bad > dropped:  # whose first byte that was is not known
-            began_s = now_s
-        self._began_s = now_s if messages or not self.decoder.waiting else began_s
-        self._paused = self._paused and bool(messages)
-        self.began_s = {}
+        dropped, waits = self.decoder.bad > bad, self.decoder.waiting
+        began_s = self._pace.first_byte_s(now_s, waited=waited, dropped=dropped, complete=bool(messages), waits=waits)
+        self.reasons = {}
         for n, message in enumerate(messages):
             if isinstance(message, link.Frame):
-                self.began_s[message.seq] = began_s if n == 0 else now_s
-                # Complete at the first look after a pause: the pause was too long.
-                took_s = now_s - self.began_s[message.seq]
-                self._line_s = self._line_s / 2 if self._paused else (took_s if took_s < LONGEST_LINE_S else 0.0)
-                if self._is_ours(message):
+                first_byte_s = began_s if n == 0 else now_s
+                self._pace.took(now_s - first_byte_s)
+                if self._is_ours(message, first_byte_s, now_s):
                     self._heard_s = now_s
                     scans.append(message)
                     self._watch(message, now_s)
@@ -119,21 +128,19 @@ class BoardLink:
                 self._not_accepted(message, now_s)
             elif isinstance(message, link.Event):
                 self._happened(message, now_s)
+            elif isinstance(message, link.Time):
+                self._told_time(message, now_s)
         return scans
 
     def pause_s(self, now_s: float) -> float:
-        """How long the next byte is not worth waking up for: the rest of a scan comes as slowly as that of the last."""
-        if self.state != "running" or not self.decoder.waiting:
-            return 0.0
-        pause_s = self._line_s - EARLY_S - (now_s - self._began_s)
-        self._paused = pause_s > 0
-        return max(0.0, pause_s)
+        """How long the next byte is not worth waking up for."""
+        return self._pace.pause_s(now_s) if self.state == "running" and self.decoder.waiting else 0.0
 
     def to_send(self, now_s: float) -> bytes:
         """What is due now."""
         if self.state == "running":
             if now_s - self._heard_s <= SILENT_S:
-                return self._switching(now_s)
+                return self._switching(now_s) + self._asking(now_s)
             self._restart(now_s, f"the board went silent for {SILENT_S:g} s: asking it again")
         if self.state == "refused" and now_s - self._since >= REFUSED_AGAIN_S:
             self._to(now_s, "hello")
@@ -157,8 +164,33 @@ class BoardLink:
                         config=s.config, dft_points=s.dft_points, rtia_ohm=s.rtia_ohm, scan=s.pattern.astype("u1")
                     )
                 )
+            self._start_s = now_s if self._start_s is None else self._start_s
             return link.encode(link.Start(config=s.config))
         return b""
+
+    def suspended(self, now_s: float) -> None:
+        """This machine was suspended, and its clock with it, while the board's went on."""
+        self.clock.reset()
+        self._restart(now_s, "this machine was suspended: asking the board again")
+
+    def _asking(self, now_s: float) -> bytes:
+        """TIME_ASK where one is due."""
+        if not self.clock.timed:
+            return b""
+        width_ns = self.clock.width_ns(self._heard_us)
+        return self._questions.to_send(now_s, width_ns is not None and width_ns < GOOD_NS, self.decoder.waiting)
+
+    def _told_time(self, answer: link.Time, now_s: float) -> None:
+        asked_s = self._questions.asked_s(answer, now_s)
+        if asked_s is None or self.state != "running":
+            return
+        self._heard_us = max(self._heard_us, answer.device_us)
+        if not self.clock.answered(_ns(asked_s), answer.device_us, _ns(now_s)):
+            self._clock_jumped(now_s)
+
+    def _clock_jumped(self, now_s: float) -> None:
+        self.counts["clock_jumps"] += 1
+        self._restart(now_s, "the board's clock jumped, or runs wrong by more than 1 ms/s: asking it again")
 
     def _switching(self, now_s: float) -> bytes:
         """START of another configuration, again until it is answered."""
@@ -170,7 +202,7 @@ class BoardLink:
 
     def _to(self, now_s: float, state: str) -> None:
         self.state, self._since, self._due_s, self._tries = state, now_s, now_s, 0
-        self._heard_s = now_s
+        self._heard_s, self._start_s, self._impossible = now_s, None, 0
         if state == "start":
             self._started = self._wanted = self.scanning
         if state == "hello":
@@ -183,6 +215,7 @@ class BoardLink:
 
     def _introduced(self, ident: link.Ident, now_s: float) -> None:
         self.ident = ident
+        self.clock.timed = bool(ident.capabilities & link.Capability.TIME)
         needed = int(self.scanning.pattern.max()) + 1
         if ident.schema_hash != link.SCHEMA_HASH or ident.link_version != link.LINK_VERSION:
             found, ours = f"{ident.schema_hash:08x}", f"{link.SCHEMA_HASH:08x}"
@@ -213,15 +246,25 @@ class BoardLink:
         elif ack.of == link.Start.number and ack.value not in (0, self._started.config):  # 0: the board does not say
             return  # a late answer to another one
         elif self.state == "start" and ack.of == link.Start.number:
-            self._last_seq = None
             self.problem = ""
             self._started = self._wanted = self.scanning
+            self._begin(ack, self._start_s, now_s)
             self._to(now_s, "running")
         elif self.state == "running" and ack.of == link.Start.number:
             if self._tries:  # of a switch: scans go on being counted
                 self._tries = 0
             else:
-                self._last_seq = None  # a START sent twice, for its first answer was late: scans count from 0 again
+                self._order.started(ack.device_us)  # a START sent twice: scans count from 0 again
+
+    def _begin(self, ack: link.Ack, asked_s: float | None, now_s: float) -> None:
+        """START was carried out: what comes now is from after it, and its answer says what the board's clock shows."""
+        self._order.started(ack.device_us)
+        self._questions.begin(now_s)
+        self._heard_us = ack.device_us
+        if ack.device_us and asked_s is not None:
+            self.clock.started(_ns(asked_s), ack.device_us, _ns(now_s))
+        else:
+            self.clock.reset()
 
     def _not_accepted(self, nak: link.Nak, now_s: float) -> None:
         """A NAK of nothing in particular answers noise on the line towards the board: our command is sent again anyway.
@@ -250,20 +293,34 @@ class BoardLink:
                 now_s, "no current through any electrode: configuring the board again; is the skin connected?"
             )
 
-    def _is_ours(self, scan: link.Frame) -> bool:
+    def _is_ours(self, scan: link.Frame, first_byte_s: float, now_s: float) -> bool:
+        """Whether to believe that this is the board's next scan; counts what it is otherwise."""
         known = (self.scanning, self._idle) if self.switches else (self.scanning,)
         ours = any(s is not None and scan.config == s.config and len(scan.z) == len(s.pattern) for s in known)
         if self.state != "running" or not ours:
             self.counts["foreign"] += 1
             return False
-        missing = 0 if self._last_seq is None else (scan.seq - self._last_seq - 1) & 0xFFFFFFFF
-        if missing >= 0x80000000:  # repeated or older. If the board began anew without a word, it counts as silent
+        missing = self._order.missing(scan)
+        if missing < 0:  # repeated or older. If the board began anew without a word, it counts as silent
             self.counts["repeated"] += 1
             return False
-        self.gap = missing > 0
-        if missing:
-            self.counts["missing"] += missing
-        self._last_seq = scan.seq
+        ended_us, arrived_ns = scan.device_us + scan.duration_us, _ns(first_byte_s)
+        if not self._order.consistent(scan) or not self.clock.possible(ended_us, arrived_ns):
+            self.counts["foreign"] += 1  # captured from before, or of a clock that jumped
+            self._impossible += 1
+            if self._impossible >= IMPOSSIBLE_SCANS:
+                self._clock_jumped(now_s)
+            return False
+        self._impossible = 0
+        self._order.take(scan)
+        self._heard_us = max(self._heard_us, ended_us)
+        # The first byte leaves as the scan ends; the last one as much later as the line is slow.
+        self.clock.observe(ended_us, arrived_ns, fit=scan.config == self.scanning.config)
+        self.reasons[scan.seq] = ["gap"] if missing else []
+        if self.frozen(scan):
+            self.reasons[scan.seq].append("frozen")
+            self.counts["frozen"] += 1
+        self.counts["missing"] += missing
         self.counts["scans"] += 1
         return True
 
@@ -273,6 +330,10 @@ class BoardLink:
                 f"no answer to HELLO, only noise ({self.decoder.last_error}): is it the board, and at this baud rate?"
             )
         return "no answer to HELLO: is it the board, and is its firmware running?"
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)
 
 
 def _reason(number: int) -> str:

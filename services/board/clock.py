@@ -1,78 +1,187 @@
-"""When was a scan measured, on the host's clock? By regression of the time at which frames arrive on the board's own
-clock.
+"""When was a scan measured, on the host's clock? From what the board's clock said, and what cannot have been otherwise.
 
-A frame arrives late by the link and by the scheduler: always late, never early, and by a varying amount. So the line
-is fitted to the earliest arrivals: of each BLOCK frames only the one that came soonest after the current line counts.
-The slope is the board's crystal against ours; it is bounded, because a crystal wrong by more than MAX_RATE_ERROR is a
-broken clock.
+Sought is host time minus device time. Whatever the board sends arrives after it was sent: every arrival bounds the
+difference from above. A timed question (START, TIME_ASK) is answered after it was asked: every answer bounds it from
+below too, within its round trip. A bound holds for ever, but for the crystals: they part by at most MAX_RATE_ERROR, so
+it widens by that. The earliest arrivals and the shortest round trips count; what comes late moves nothing.
+
+Between the bounds the line is fitted to the earliest arrivals: of each BLOCK frames only the one that came soonest
+after the current line. A frame that is later than the bounds allow is no point of the fit, so that neither a slow link
+nor a scheduler bends it.
+
+Without answers to timed questions there is no bound from below but that of START: a delay that was there from the
+start, or that grows by less than MAX_RATE_ERROR, cannot be told from the crystals then.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 BLOCK = 16
 BLOCKS = 64
-MAX_RATE_ERROR = 1e-3
-UNSETTLED_NS = 5_000_000  # standard deviation stated before the first block is full
-RESET_NS = 500_000_000  # a frame that is off the line by more: the board's clock was restarted
+MAX_RATE_ERROR = 1e-3  # s/s that the two crystals part at most; a delay that grows faster is seen as a delay
+TOLERANCE_NS = 2_000_000  # beyond the bounds by more: not the same clock; later than the line by more: late
+WIDE_NS = 50_000_000  # between the bounds: with more, it is not known how old a frame is
+GOOD_NS = 10_000_000  # between the bounds: with more, it is worth asking more often
+UNSETTLED_NS = 5_000_000  # standard deviation stated before the line is settled
+
+Bound = tuple[int, int]  # device ns, difference ns
 
 
 class DeviceClock:
-    """Maps device time to host monotonic time. One object a connection."""
+    """Maps device time to host monotonic time. One object a connection.
+
+    timed: the board answers timed questions, so that the bounds say how sure a stamp is.
+    """
 
     def __init__(self) -> None:
-        self.reset()
+        self.timed = False
+        self.resets = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._upper: Bound | None = None
+        self._lower: Bound | None = None
+        self._origin: Bound | None = None  # of the line
+        self._block: list[tuple[float, float]] = []  # device s since origin, lateness s against slope 1
+        self._points: deque[tuple[float, float]] = deque(maxlen=BLOCKS)
+        self._slope = self._offset = 0.0
+        self._scatter_ns = UNSETTLED_NS
 
     def reset(self) -> None:
-        """Forget everything: a new connection, or a device clock that jumped."""
-        self._origin: tuple[int, int] | None = None  # device ns, host ns
-        self._block: list[tuple[float, float]] = []
-        self._points: deque[tuple[float, float]] = deque(
-            maxlen=BLOCKS
-        )  # device s since origin, lateness s against slope 1
-        self._slope = 0.0
-        self._offset = 0.0
-        self.sigma_ns = UNSETTLED_NS
-        self.resets = 0
+        """Forget everything: the board's clock or the host's was set anew."""
+        self._forget()
+        self.resets += 1
 
-    def observe(self, device_us: int, arrival_ns: int) -> None:
-        """A frame that the board finished at device_us arrived at arrival_ns (host monotonic)."""
-        if self._origin is None:
-            self._origin = (device_us * 1000, arrival_ns)
-        device_ns, host_ns = device_us * 1000 - self._origin[0], arrival_ns - self._origin[1]
-        late_s = (host_ns - device_ns) * 1e-9
-        if abs(late_s - self._line(device_ns * 1e-9)) * 1e9 > RESET_NS:
-            resets = self.resets + 1
+    # what is heard of the board's clock
+
+    def started(self, asked_ns: int, device_us: int, answered_ns: int) -> None:
+        """The answer to a START said device_us: what is known goes on where it agrees, else it is forgotten."""
+        if not self.answered(asked_ns, device_us, answered_ns):
             self.reset()
-            self.resets = resets
-            self._origin, device_ns, late_s = (device_us * 1000, arrival_ns), 0, 0.0
-        if not self._points:
-            self._offset = late_s if not self._block else min(self._offset, late_s)
-        self._block.append((device_ns * 1e-9, late_s))
+            self.answered(asked_ns, device_us, answered_ns)
+
+    def answered(self, asked_ns: int, device_us: int, answered_ns: int) -> bool:
+        """A question of asked_ns was answered with device_us, heard at answered_ns. False, and nothing is learnt, where
+        that cannot be by what is known: a clock has jumped.
+        """
+        device_ns = device_us * 1000
+        least, most = asked_ns - device_ns, answered_ns - device_ns
+        lower, upper = self._bounds(device_ns)
+        if (upper is not None and least > upper + TOLERANCE_NS) or (lower is not None and most < lower - TOLERANCE_NS):
+            return False
+        self._not_below(device_ns, least)
+        self._not_above(device_ns, most)
+        return True
+
+    def possible(self, device_us: int, arrival_ns: int) -> bool:
+        """Whether what the board finished at device_us can have arrived by then: not before it was finished."""
+        lower, _ = self._bounds(device_us * 1000)
+        return lower is None or arrival_ns - device_us * 1000 >= lower - TOLERANCE_NS
+
+    def observe(self, device_us: int, arrival_ns: int, fit: bool = True) -> None:
+        """A frame that the board finished at device_us arrived at arrival_ns (host monotonic). fit: it may be a point
+        of the line; scans of a short list are none, for they arrive sooner.
+        """
+        device_ns = device_us * 1000
+        difference = arrival_ns - device_ns
+        _, upper = self._bounds(device_ns)
+        self._not_above(device_ns, difference)
+        if not fit or (upper is not None and difference > upper + TOLERANCE_NS):
+            return
+        if self._origin is None:
+            self._origin = (device_ns, difference)
+        since = (device_ns - self._origin[0]) * 1e-9, (difference - self._origin[1]) * 1e-9
+        self._block.append(since)
         if len(self._block) == BLOCK:
             self._points.append(min(self._block, key=lambda point: point[1] - self._slope * point[0]))
             self._block.clear()
             self._fit()
 
+    # what is known of it
+
     def host_ns(self, device_us: int) -> int:
         """Host monotonic time [ns] at which the board's clock showed device_us."""
-        if self._origin is None:
+        device_ns = device_us * 1000
+        lower, upper = self._bounds(device_ns)
+        if upper is None:
             raise ValueError("no frame was observed yet")
-        device_ns = device_us * 1000 - self._origin[0]
-        return self._origin[1] + device_ns + round(self._line(device_ns * 1e-9) * 1e9)
+        found = self._line(device_ns) if self._points else upper
+        if lower is not None:
+            found = max(lower, found)
+        return device_ns + min(upper, found)
 
-    def _line(self, device_s: float) -> float:
-        return self._offset + self._slope * device_s
+    def width_ns(self, device_us: int) -> int | None:
+        """How far the bounds are apart at that time; None without a bound from below."""
+        lower, upper = self._bounds(device_us * 1000)
+        return None if lower is None or upper is None else max(0, upper - lower)
+
+    def unknown(self, device_us: int) -> bool:
+        """Whether it is not known how old something of that time is, although the board could say."""
+        width = self.width_ns(device_us)
+        return self.timed and (width is None or width > WIDE_NS)
+
+    def sigma_ns(self, device_us: int) -> int:
+        """Standard uncertainty of `host_ns`: anywhere between the bounds, or the scatter about the line."""
+        width = self.width_ns(device_us)
+        if not self.timed or width is None:
+            return self._scatter_ns
+        scatter = self._scatter_ns if self._settled else 0
+        return max(1000, round(math.hypot(scatter, width / 12**0.5)))
+
+    # inside
+
+    @property
+    def _settled(self) -> bool:
+        return len(self._points) >= 4
+
+    def _bounds(self, device_ns: int) -> tuple[int | None, int | None]:
+        """The least and the most that the difference can be at that time."""
+        lower, upper = self._lower, self._upper
+        return (
+            None if lower is None else lower[1] - round(MAX_RATE_ERROR * abs(device_ns - lower[0])),
+            None if upper is None else upper[1] + round(MAX_RATE_ERROR * abs(device_ns - upper[0])),
+        )
+
+    def _not_above(self, device_ns: int, difference: int) -> None:
+        if self._upper is None or _later(self._upper, device_ns, difference, +1):
+            self._upper = (device_ns, difference)
+
+    def _not_below(self, device_ns: int, difference: int) -> None:
+        if self._lower is None or _later(self._lower, device_ns, difference, -1):
+            self._lower = (device_ns, difference)
+
+    def _line(self, device_ns: int) -> int:
+        assert self._origin is not None
+        since_s = (device_ns - self._origin[0]) * 1e-9
+        return self._origin[1] + round((self._offset + self._slope * since_s) * 1e9)
 
     def _fit(self) -> None:
+        self._points = deque((p for p in self._points if not self._late(*p)), maxlen=BLOCKS)
         n = len(self._points)
+        if not n:
+            return
         mean_t = sum(t for t, _ in self._points) / n
         mean_late = sum(late for _, late in self._points) / n
         spread = sum((t - mean_t) ** 2 for t, _ in self._points)
-        if n >= 4:
+        if self._settled and spread > 0:
             slope = sum((t - mean_t) * (late - mean_late) for t, late in self._points) / spread
             self._slope = max(-MAX_RATE_ERROR, min(MAX_RATE_ERROR, slope))
         self._offset = mean_late - self._slope * mean_t
-        scatter = sum((late - self._line(t)) ** 2 for t, late in self._points) / max(1, n - 2)
-        self.sigma_ns = max(1000, round(scatter**0.5 * 1e9)) if n >= 4 else UNSETTLED_NS
+        scatter = sum((late - self._offset - self._slope * t) ** 2 for t, late in self._points) / max(1, n - 2)
+        self._scatter_ns = max(1000, round(scatter**0.5 * 1e9)) if self._settled else UNSETTLED_NS
+
+    def _late(self, t: float, late: float) -> bool:
+        """Whether a point has turned out to be late: others came so much sooner."""
+        assert self._origin is not None
+        _, upper = self._bounds(self._origin[0] + round(t * 1e9))
+        return upper is not None and self._origin[1] + late * 1e9 > upper + TOLERANCE_NS
+
+
+def _later(bound: Bound, device_ns: int, difference: int, sign: int) -> bool:
+    """Whether a new bound is tighter than `bound` from the later of their times on. sign: +1 above, -1 below."""
+    newest = max(device_ns, bound[0])
+    new = difference + sign * MAX_RATE_ERROR * (newest - device_ns)
+    old = bound[1] + sign * MAX_RATE_ERROR * (newest - bound[0])
+    return sign * (old - new) > 0

@@ -17,9 +17,11 @@ from protocol import link
 from protocol.frames import DeltaFrame, RawFrame
 from protocol.sockets import NewestReader
 from services.board import port as ports
-from services.board.adaptive import AdaptiveScan
+from services.board.adaptive import AdaptiveScan, Passed
 from services.board.boardlink import BoardLink, Scanning
-from services.board.clock import UNSETTLED_NS, DeviceClock
+from services.board.clock import UNSETTLED_NS
+from services.board.host_time import STOOD_STILL_S, HostTime, Suspensions
+from services.board.remarks import Remarks
 from services.config import Skin
 from services.stage import Health
 from services.touches.sentinel import sentinel_of
@@ -28,7 +30,9 @@ POLL_S = 0.1
 REOPEN_S = 0.2  # between attempts to open a port
 INTRODUCE_S = 0.6  # for a board under another name to say who it is
 COUNT_EVERY_S = 0.1
-SCANS_VALID = 3  # a frame is valid until this many scans later
+SCANS_VALID = 3  # a frame is valid until this many full scans after its own,
+VALID_S = 0.25  # or for so long, where that is more
+MOST_WAITING = 4_000_000  # bytes read in one go after a standstill
 
 log = logging.getLogger(__name__)
 
@@ -66,8 +70,10 @@ class Source(ABC):
 class BoardSource(Source):
     """A board behind a serial port. Opens, asks, configures, starts, and does so again whenever anything goes wrong."""
 
-    def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
+    def __init__(self, name: str, skin: Skin, bundle: Bundle, host: HostTime | None = None) -> None:
         super().__init__(name, skin, bundle)
+        self.host = host or HostTime()
+        self.remarks = Remarks()
         self.scanning = Scanning(bundle.pattern, skin.dft_points, skin.rtia_ohm)
         self.idling: Scanning | None = None
         self._verdicts: NewestReader | None = None  # what preprocessing makes of the frames
@@ -83,7 +89,7 @@ class BoardSource(Source):
         while True:
             for n, url in enumerate(ports.candidates(self.skin.port, self._usb_serial, bool(self._board))):
                 try:
-                    self._port = ports.Port(url)
+                    self._port = self.open_port(url)
                 except ports.PortError as why:
                     self._trouble(str(why) if n == 0 else self.problem)  # the configured name is the one to speak of
                     continue
@@ -97,8 +103,15 @@ class BoardSource(Source):
                 finally:
                     self.close()
                 break
-            time.sleep(REOPEN_S)
+            self.host.sleep(REOPEN_S)
             yield None
+
+    def open_port(self, url: str) -> ports.Port:
+        """Raises PortError."""
+        return ports.Port(url)
+
+    def health(self) -> Health:
+        return self.remarks.added_to(super().health())
 
     def close(self) -> None:
         if self._verdicts is not None:
@@ -110,44 +123,76 @@ class BoardSource(Source):
 
     def _connection(self, port: ports.Port, must_be: str) -> Generator[RawFrame | None, None, bool]:
         """Until the port is gone (PortError), or turns out to be another board than `must_be` (returns True)."""
-        opened = time.monotonic()
-        board, clock = BoardLink(self.scanning, opened, self.idling), DeviceClock()
+        opened = last = self._now()
+        board, suspensions = BoardLink(self.scanning, opened, self.idling), Suspensions(self.host)
         adaptive = self.adaptive()
         seen: Counter[str] = Counter()
-        counted_ns = 0
-        while True:
-            now = time.monotonic()
-            wait_s = POLL_S if board.state == "running" else 0.02
-            if adaptive is not None:
-                self._listen(adaptive, now)
-                if board.state != "running" or not board.switches:
-                    adaptive.interrupted()
-                else:
-                    self.steer(board, adaptive, now)
-                    wait_s = min(wait_s, adaptive.due_s(now))
-            due = board.to_send(now)
-            if due:
-                port.write(due)
-            if adaptive is None:  # its lists differ in length, and it cannot wait
-                time.sleep(board.pause_s(time.monotonic()))
-            data = port.read(wait_s)
-            read_ns = time.monotonic_ns()
-            scans = board.received(data, read_ns * 1e-9) if data else []
-            if read_ns - counted_ns > COUNT_EVERY_S * 1e9 or not scans:
-                counted_ns = read_ns
-                self._count(board, seen, adaptive)
-            if must_be and (board.board or now - opened > INTRODUCE_S) and board.board != must_be:
-                return True
-            if board.state == "running" and self._board != board.board:
-                self._board, self._usb_serial = board.board, ports.usb_serial_number(port.url)
-            if board.problem != self.problem:
-                self._trouble(board.problem)
-            for scan in scans:
-                passed = adaptive.scanned(scan, read_ns * 1e-9) if adaptive else [(scan, "full")]
-                for what, kind in passed:
-                    yield self.raw_frame(what, board, clock, read_ns, kind)
-            if not scans:
-                yield None
+        counted = 0.0
+        try:
+            while True:
+                now = self._now()
+                wait_s = POLL_S if board.state == "running" else 0.02
+                if adaptive is not None:
+                    self._listen(adaptive, now)
+                    if board.state != "running" or not board.switches:
+                        adaptive.interrupted()
+                    else:
+                        self.steer(board, adaptive, now)
+                        wait_s = min(wait_s, adaptive.due_s(now))
+                # After a standstill what waits is read first: the board was not silent, and not asked either.
+                due = board.to_send(now) if now - last < STOOD_STILL_S else b""
+                if due:
+                    port.write(due)
+                if adaptive is None:  # its lists differ in length, and it cannot wait
+                    self.host.sleep(board.pause_s(self._now()))
+                data = port.read(wait_s)
+                stood_s = self._now() - last
+                if stood_s > STOOD_STILL_S:
+                    data += self._waiting(port)
+                if suspensions.happened():
+                    board.suspended(self._now())
+                read_ns = self.host.now_ns()
+                last = read_ns * 1e-9
+                scans = board.received(data, last) if data else []
+                if must_be and (board.board or now - opened > INTRODUCE_S) and board.board != must_be:
+                    return True
+                if board.state == "running" and self._board != board.board:
+                    self._board, self._usb_serial = board.board, ports.usb_serial_number(port.url)
+                if board.problem != self.problem:
+                    self._trouble(board.problem)
+                passed = [p for scan in scans for p in (adaptive.scanned(scan, last) if adaptive else [(scan, "full")])]
+                if stood_s > STOOD_STILL_S:
+                    passed = self._newest(passed, board, stood_s, last)
+                frames = [self.raw_frame(scan, board, read_ns, kind) for scan, kind in passed]
+                if last - counted > COUNT_EVERY_S or not scans:
+                    counted = last
+                    self._count(board, seen, adaptive)
+                    self.remarks.look(board, last)
+                yield from frames
+                if not scans:
+                    yield None
+        finally:
+            self._count(board, seen, adaptive)
+
+    def _now(self) -> float:
+        return self.host.now_ns() * 1e-9
+
+    def _waiting(self, port: ports.Port) -> bytes:
+        """Everything that has come while this process stood still."""
+        data = b""
+        while len(data) < MOST_WAITING and (more := port.read(0.0)):
+            data += more
+        return data
+
+    def _newest(self, passed: list[Passed], board: BoardLink, stood_s: float, now_s: float) -> list[Passed]:
+        """What goes on of the scans that waited while this process stood still: the newest one."""
+        skipped = max(0, len(passed) - 1)
+        if skipped:
+            board.reasons[passed[-1][0].seq] = sorted({"gap", *board.reasons.get(passed[-1][0].seq, ())})
+        self.counts["standstills"] += 1
+        self.counts["skipped"] += skipped
+        self.remarks.stood_still(stood_s, skipped, now_s)
+        return passed[-1:]
 
     def adaptive(self) -> AdaptiveScan | None:
         """What decides which list a new connection's board scans, where skin.toml wants that."""
@@ -167,31 +212,25 @@ class BoardSource(Source):
             if isinstance(delta, DeltaFrame):
                 adaptive.heard(delta, now_s)
 
-    def raw_frame(
-        self, scan: link.Frame, board: BoardLink, clock: DeviceClock, read_ns: int, kind: str = "full"
-    ) -> RawFrame:
-        """A scan of the board with this host's stamps; `read_ns`: when its last byte was read.
-
-        Only full scans set the clock: one that is shorter on the line arrives sooner.
-        """
+    def raw_frame(self, scan: link.Frame, board: BoardLink, read_ns: int, kind: str = "full") -> RawFrame:
+        """A scan of the board with this host's stamps; `read_ns`: when its last byte was read."""
         if kind == "full":
-            # The first byte leaves as the scan ends; the last one as much later as the line is slow.
-            arrived_ns = round(board.began_s.get(scan.seq, read_ns * 1e-9) * 1e9)
-            clock.observe(scan.device_us + scan.duration_us, min(arrived_ns, read_ns))
             self._full_s = scan.duration_us * 1e-6
-        reasons = ["gap"] if board.gap else []
-        if clock.sigma_ns >= UNSETTLED_NS:
+        middle_us = scan.device_us + scan.duration_us // 2
+        unknown, sigma_ns = board.clock.unknown(middle_us), board.clock.sigma_ns(middle_us)
+        reasons = list(board.reasons.get(scan.seq, ()))
+        if unknown or sigma_ns >= UNSETTLED_NS:
             reasons.append("clock")
         assert board.ident is not None
         return RawFrame(
             skin=self.name,
             scan=scan.seq,
-            stamps={"sample": min(read_ns, clock.host_ns(scan.device_us + scan.duration_us // 2)), "read": read_ns},
-            sample_sigma_ns=clock.sigma_ns,
+            stamps={"sample": min(read_ns, board.clock.host_ns(middle_us)), "read": read_ns},
+            sample_sigma_ns=sigma_ns,
             source="stub" if "stub" in board.ident.firmware.lower() else "board",
-            valid=True,
+            valid=not unknown and "frozen" not in reasons,
             reasons=reasons,
-            valid_for_s=max(0.05, SCANS_VALID * self._full_s),
+            valid_for_s=max(VALID_S, SCANS_VALID * self._full_s),
             z=scan.z,
             kind=kind,
             status=scan.status,

@@ -8,15 +8,21 @@ import select
 import threading
 import time
 import tty
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from protocol import link
 
+DURATION_US = 4000
+
 
 class FakeBoard:
-    """The firmware: bytes in, bytes out. `ident` may be changed to play another firmware or a broken chip."""
+    """The firmware: bytes in, bytes out. `ident` may be changed to play another firmware or a broken chip.
+
+    clock: its time [us], or None for a firmware that does not know the questions for it.
+    """
 
     def __init__(self, unique_id: bytes = b"0123456789ab", measurements: int = 120) -> None:
         self.ident = link.Ident(schema_hash=link.SCHEMA_HASH, unique_id=unique_id, firmware="fake 1.0")
@@ -27,6 +33,8 @@ class FakeBoard:
         self.seq = 0
         self.deaf = False
         self.status = 0  # of every measurement
+        self.clock: Callable[[], int] | None = None
+        self._scanned = (0, 0)  # number of the last scan, when it began [us]
 
     def receive(self, data: bytes) -> bytes:
         out = b""
@@ -41,16 +49,24 @@ class FakeBoard:
                 out += link.encode(link.Ack(of=message.number, value=message.config))
             elif isinstance(message, link.Start):
                 self.running, self.seq = True, 0
-                out += link.encode(link.Ack(of=message.number, value=message.config))
+                us = self.clock() if self.clock else 0
+                out += link.encode(link.Ack(of=message.number, value=message.config, device_us=us))
+            elif isinstance(message, link.TimeAsk) and self.clock is not None:
+                out += link.encode(link.Time(nonce=message.nonce, device_us=self.clock()))
         return out
 
-    def scan(self, device_us: int = 0) -> bytes:
+    def scan(self, device_us: int | None = None) -> bytes:
+        """The next scan; without a time, one that follows the scan before without a pause."""
         assert self.config is not None
+        if device_us is None:
+            ahead = (self.seq - self._scanned[0] + 2**31) % 2**32 - 2**31
+            device_us = max(0, self._scanned[1] + ahead * DURATION_US)
+        self._scanned = (self.seq, device_us)
         n = len(self.config.scan)
         frame = link.Frame(
             seq=self.seq,
             device_us=device_us,
-            duration_us=4000,
+            duration_us=DURATION_US,
             config=self.config.config,
             z=np.full(n, 1 + 2j, np.complex64),
             status=np.full(n, self.status, np.uint8),

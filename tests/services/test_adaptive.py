@@ -163,7 +163,7 @@ def test_a_switch_is_one_start_again_until_answered() -> None:
     host.received(link.encode(link.Ack(link.Start.number, short.config)), 0.2)
     assert not said(0.2 + 2 * SWITCH_S)
     taken = host.received(link.encode(scan(full.config, 2, 5)) + link.encode(scan(short.config, 1, 6)), 0.4)
-    assert [len(s.z) for s in taken] == [2, 1] and not host.gap
+    assert [len(s.z) for s in taken] == [2, 1] and host.reasons == {5: [], 6: []}
 
 
 def test_a_board_lost_on_the_short_list_is_started_again() -> None:

@@ -1,0 +1,50 @@
+"""What status says of a board that runs, beside what stands in the way: what cannot be seen of it, or believed."""
+
+from __future__ import annotations
+
+from services.board.boardlink import BoardLink
+from services.board.clock import MAX_RATE_ERROR, WIDE_NS
+from services.stage import Health
+
+REMEMBERED_S = 5.0  # how long status speaks of a standstill
+
+UNTIMED = (
+    "this board's firmware does not tell its time (TIME_ASK): a delay of its line that was there from the start, "
+    f"or that grows by less than {MAX_RATE_ERROR * 1e3:g} ms/s, is not seen"
+)
+FROZEN = "the board sends the same scan again and again, with new numbers: its frames are not valid; power-cycle it"
+UNKNOWN = (
+    f"how old the board's frames are is not known within {WIDE_NS / 1e6:.0f} ms, for its answers take too long: "
+    "its frames are not valid; is the line to it slow?"
+)
+
+
+class Remarks:
+    """Kept by the source's thread, read by the runner's."""
+
+    def __init__(self) -> None:
+        self._levels: dict[str, str] = {}  # by text
+        self._stood_still = -REMEMBERED_S, ""  # when that was last, and the text
+
+    def stood_still(self, stood_s: float, skipped: int, now_s: float) -> None:
+        """Acquisition has not run for so long, and skipped so many scans that waited."""
+        self._stood_still = now_s, f"acquisition stood still for {stood_s:.1f} s: {skipped} scans were skipped"
+
+    def look(self, board: BoardLink, now_s: float) -> None:
+        """What is there to say now?"""
+        levels = {}
+        if board.state == "running":
+            if not board.clock.timed:
+                levels[UNTIMED] = "WARN"
+            if board.clock_unknown:
+                levels[UNKNOWN] = "ERROR"
+            if board.frozen.frozen:
+                levels[FROZEN] = "ERROR"
+        if now_s - self._stood_still[0] < REMEMBERED_S:
+            levels[self._stood_still[1]] = "WARN"
+        self._levels = levels
+
+    def added_to(self, health: Health) -> Health:
+        levels = self._levels
+        level = max(health.level, *levels.values(), key=("OK", "WARN", "ERROR").index) if levels else health.level
+        return Health(level, [*health.messages, *levels], health.counters)

@@ -1,0 +1,44 @@
+"""TIME_ASK to the board, and what its answers belong to. Without I/O, told the time."""
+
+from __future__ import annotations
+
+import os
+
+from protocol import link
+
+ASK_EVERY_S = 0.5
+ASK_OFTEN_S = 0.1  # while the board's clock is not known well
+PATIENCE_S = 0.2  # that a question waits for a moment when nothing is on the line, where answers come soonest
+KEPT = 128  # unanswered questions
+
+
+class TimeQuestions:
+    """Those of one connection."""
+
+    def __init__(self) -> None:
+        self._asked_s: dict[int, float] = {}
+        self._due_s = 0.0
+        self.answered_s = -1e9  # when an answer came last
+
+    def begin(self, now_s: float) -> None:
+        """The board has been started: ask it soon. What was asked before counts no more."""
+        self._asked_s.clear()
+        self._due_s = now_s
+
+    def to_send(self, now_s: float, well_known: bool, line_busy: bool) -> bytes:
+        """The question that is due now, or b""."""
+        if now_s < self._due_s or (line_busy and now_s < self._due_s + PATIENCE_S):
+            return b""
+        self._due_s = now_s + (ASK_EVERY_S if well_known else ASK_OFTEN_S)
+        nonce = int.from_bytes(os.urandom(4), "little")  # no answer of an earlier connection is taken for one of this
+        self._asked_s[nonce] = now_s
+        if len(self._asked_s) > KEPT:
+            self._asked_s.pop(next(iter(self._asked_s)))
+        return link.encode(link.TimeAsk(nonce=nonce))
+
+    def asked_s(self, answer: link.Time, now_s: float) -> float | None:
+        """When the question was asked that this answers; None for no question of ours, or one answered before."""
+        asked_s = self._asked_s.pop(answer.nonce, None)
+        if asked_s is not None:
+            self.answered_s = now_s
+        return asked_s
