@@ -15,9 +15,11 @@ import time
 
 import zmq
 
+from protocol import logs
 from protocol.frame_types import NAME
 from protocol.runtime import RuntimeDirError, control_endpoint, runtime_dir
 from protocol.sockets import ControlClient, ControlError, Publisher
+from protocol.transport import TransportError
 
 from . import scene as scenes
 from .control import Control
@@ -72,7 +74,7 @@ def main(argv: list[str] | None = None) -> int:
         for name, row in FAULTS.items():
             print(f"{name:20s} {row.what}  {dict(row.args) or ''}")
         return 0
-    logging.basicConfig(level=logging.INFO, format="stub: %(message)s", stream=sys.stderr)
+    logs.setup("stub: %(message)s")
     stop = _Stop()
     parent = None if options.detached else os.getppid()
     try:
@@ -103,7 +105,7 @@ def main(argv: list[str] | None = None) -> int:
         control = Control(rig, options.skin, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context)
         log.info("board at %s, scene %s", port.url, options.scene)
         _run(rig, port, publisher, options.skin, begin_ns, stop, parent)
-    except zmq.ZMQError as error:
+    except (zmq.ZMQError, TransportError) as error:
         log.error("sockets: %s", error)
         return 1
     finally:
@@ -161,6 +163,7 @@ def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, s
         if now - checked > PARENT_CHECK_S:
             checked = now
             publisher.poll()
+            publisher.mind()
             if parent is not None and os.getppid() != parent:
                 log.info("the parent process has ended")
                 return

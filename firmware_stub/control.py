@@ -70,6 +70,7 @@ class Control:
         try:
             while not self._stop.is_set():
                 self._server.serve_once(0.1)
+                self._server.mind()
         except zmq.ContextTerminated:
             pass
         finally:

@@ -16,8 +16,22 @@ import zmq
 
 from . import transport
 from .frames import FrameError, read_map
+from .gate import described, peer_of
+from .listening import Listening
+from .logs import foreign
 from .runtime import host_id
 from .transport import Context, Socket
+
+READ_ONLY = ("clock", "status", "state")
+"""Commands that change nothing. Over TCP all others need the key of an operator."""
+
+QUEUE = 8
+"""Requests held for each peer, and answers held for one that does not read them; its further ones are dropped."""
+
+BUSY = 100
+"""Requests a second from which on status speaks of a flood. They are answered one at a time, frames come first."""
+
+SPOKEN_OF_S = 5.0
 
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -28,7 +42,7 @@ class ControlError(RuntimeError):
     """A command was not carried out.
 
     `kind` is `unreachable` (no such process), `timeout` (no answer), `bad_reply`, `bad_request`, `unknown_command`,
-    or the name of the exception that the command raised in the process.
+    `forbidden` (needs an operator's key), or the name of the exception that the command raised in the process.
     """
 
     def __init__(self, kind: str, message: str) -> None:
@@ -42,9 +56,12 @@ class ControlError(RuntimeError):
 class ControlServer:
     """Takes a process's commands: `handlers` maps a command's name to a function from its arguments to its result.
 
-    Poll `socket` and call `serve_once` when it is readable. An exception in a handler becomes the reply; the process
-    goes on. `clock` is built in: this host's monotonic clock, from which a reader elsewhere finds its offset (see
-    `clock_offset`).
+    Poll `socket` and call `serve_once` when it is readable, and `mind` at least once a second. An exception in a
+    handler becomes the reply; the process goes on. `clock` is built in: this host's monotonic clock, from which a
+    reader elsewhere finds its offset (see `clock_offset`).
+
+    On an ipc socket the runtime folder's rights decide who may give commands. Over TCP clients may give READ_ONLY
+    ones, and operators, known by their keys, all.
     """
 
     def __init__(
@@ -58,31 +75,80 @@ class ControlServer:
         self.process = process
         self.handlers: dict[str, Handler] = {"clock": _clock, **handlers}
         self.malformed = 0
-        self.socket: Socket = transport.bind(
+        self._listening = Listening(
             context or zmq.Context.instance(),
             zmq.ROUTER,
             address or transport.current().control_address(process),
-            {zmq.LINGER: 200},  # so that the answer to "stop" still goes out
+            {zmq.LINGER: 200, zmq.RCVHWM: QUEUE, zmq.SNDHWM: QUEUE},  # so long the answer to "stop" may still go out
         )
+        self._second, self._asked, self._flood, self._flood_until = 0, 0, "", 0.0
+
+    @property
+    def socket(self) -> Socket:
+        """The socket in use; another one after `mind` has mended something."""
+        return self._listening.socket
+
+    @property
+    def problems(self) -> list[str]:
+        """What status should say of the socket."""
+        flood = [self._flood] if time.monotonic() < self._flood_until else []
+        return self._listening.problems + flood
+
+    def mind(self) -> bool:
+        """Look whether the socket is still reachable as configured, and mend it; whether `socket` is another one
+        now.
+        """
+        return self._listening.mind()
 
     def serve_once(self, timeout_s: float = 0.0) -> bool:
         """Answer one request if there is one within `timeout_s`; whether there was."""
         if not self.socket.poll(int(timeout_s * 1000)):
             return False
         try:
-            parts = self.socket.recv_multipart(zmq.NOBLOCK)
+            frames = self.socket.recv_multipart(zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return False
-        if len(parts) < 3 or parts[-2] != b"":
+        peer = peer_of(frames[-1], self._listening.secured)
+        self._count(peer)
+        if len(frames) < 3 or frames[-2].bytes != b"":
             self.malformed += 1
             return True
         try:
-            self.socket.send_multipart([*parts[:-1], self._answer(parts[-1])], zmq.NOBLOCK)
+            answer = self._answer(frames[-1].bytes, peer)
+            self.socket.send_multipart([*(frame.bytes for frame in frames[:-1]), answer], zmq.NOBLOCK)
         except zmq.ZMQError as bad:  # the caller has gone
             log.debug("reply not sent: %s", bad)
         return True
 
-    def _answer(self, request: bytes) -> bytes:
+    def _count(self, peer: str) -> None:
+        """Notice who asks too often."""
+        now = time.monotonic()
+        if int(now) != self._second:
+            self._second, self._asked = int(now), 0
+        self._asked += 1
+        if self._asked == BUSY:
+            self._flood = f"more than {BUSY} control requests a second, the last from {described(peer)}: mend or end it"
+            if now > self._flood_until:
+                log.warning("%s: %s", self.process, self._flood)
+            self._flood_until = now + SPOKEN_OF_S
+
+    def _forbidden(self, command: str, peer: str) -> str:
+        """Why `peer` may not give this command; "" where it may."""
+        if not self._listening.address.startswith("tcp://"):
+            return ""
+        admitted = self._listening.admission
+        if admitted is not None and admitted.operates(peer.encode()):
+            return ""
+        if command in READ_ONLY and (admitted is None or admitted.allows(peer.encode())):
+            return ""
+        if admitted is None:
+            return f"over unencrypted TCP only {', '.join(READ_ONLY)} are answered; {command} needs an operator's key"
+        return (
+            f"{command} needs the key of an operator: put the caller's public key into the folder that "
+            "security.operators of the service names"
+        )
+
+    def _answer(self, request: bytes, peer: str) -> bytes:
         try:
             asked = read_map(request, f"{self.process} control")
             command, args = asked.get("command"), asked.get("args", {})
@@ -97,18 +163,22 @@ class ControlServer:
                 "unknown_command",
                 f"{self.process} has no command {command[:64]!r}; it has: {', '.join(sorted(self.handlers))}",
             )
+        if forbidden := self._forbidden(command, peer):
+            return _refusal("forbidden", forbidden)
         try:
             return _packed({"ok": True, "result": handler(args) or {}})
         except ControlError as bad:
             return _refusal(bad.kind, bad.message)
         except Exception as bad:
             why = f"{command} needs the argument {bad}" if isinstance(bad, KeyError) else str(bad) or type(bad).__name__
-            log.warning("command %s failed: %s: %s", command, type(bad).__name__, why, exc_info=log.isEnabledFor(10))
+            log.warning(
+                "command %s failed: %s: %s", command, type(bad).__name__, foreign(why), exc_info=log.isEnabledFor(10)
+            )
             return _refusal(type(bad).__name__, why)
 
     def close(self) -> None:
         """Close the socket, giving the last answer 0.2 s to leave."""
-        self.socket.close()
+        self._listening.close(None)
 
 
 class ControlClient:

@@ -8,7 +8,6 @@ not thread-safe: each belongs to the thread that uses it.
 from __future__ import annotations
 
 import logging
-import secrets
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -17,110 +16,21 @@ import zmq
 
 from . import transport
 from .control import ControlClient, ControlError, ControlServer, clock_offset
-from .frames import Frame, FrameError, pack, unpack
-from .runtime import host_id
+from .frames import Frame, FrameError, unpack
+from .logs import foreign
+from .publishing import Publisher
 from .topics import TOPIC_OF, TOPICS, wire_topic
 from .transport import Context, Socket
 
 __all__ = ["AllReader", "ControlClient", "ControlError", "ControlServer", "NewestReader", "Publisher", "clock_offset"]
 
-SEND_QUEUE = 100
-"""Messages held for a subscriber that does not read (100 images: 4 MB); its further ones are dropped, nobody else's."""
 ALL_QUEUE = 10_000
 """Messages held in a reader of all."""
-
-EVENTS_AT_ONCE = 1000
-"""Subscriptions taken in by one call of `Publisher.poll`, after which a flood of them cannot hold the producer."""
 
 GARBAGE_AT_ONCE = 1000
 """Malformed messages dropped in one call, after which a flood of them cannot hold the reader."""
 
 log = logging.getLogger(__name__)
-
-
-class Publisher:
-    """A producer's data socket.
-
-    XPUB that is told of every subscription and counts them itself: by default ZeroMQ hides the second one, so that a
-    late joiner would not get latched values and `wanted` could not be known. `session` is new with each Publisher
-    unless given.
-    """
-
-    def __init__(
-        self, producer: str, context: Context | None = None, *, address: str | None = None, session: str | None = None
-    ):
-        self.producer = producer
-        self.session = session or secrets.token_hex(8)
-        self.sent: Counter[str] = Counter()
-        """Messages sent, by "topic/skin"."""
-        self._subscriptions: Counter[bytes] = Counter()
-        self._latched: dict[bytes, bytes] = {}
-        self.socket: Socket = transport.bind(
-            context or zmq.Context.instance(),
-            zmq.XPUB,
-            address or transport.current().data_address(producer),
-            {zmq.XPUB_VERBOSER: 1, zmq.SNDHWM: SEND_QUEUE},
-        )
-
-    def send(self, frame: Frame) -> bytes:
-        """Publish a frame; its session, seq and host are set here. Returns the message. Never blocks. Raises
-        FrameError.
-        """
-        topic = TOPIC_OF[type(frame)]
-        name = wire_topic(topic.name, frame.skin)
-        key = name.decode()
-        frame.session, frame.host, frame.seq = self.session, host_id(), self.sent[key]
-        message = pack(frame)
-        self.poll()
-        self.socket.send(message, zmq.NOBLOCK)
-        self.sent[key] += 1
-        if topic.latched:
-            self._latched[name] = message
-        return message
-
-    def renew(self) -> None:
-        """Begin a new session: frames count from 0 again."""
-        self.session = secrets.token_hex(8)
-        self.sent.clear()
-
-    def wanted(self, topic: str, skin: str) -> bool:
-        """Whether anybody subscribes to it, as of the last `poll` or `send`."""
-        return self.subscribers(topic, skin) > 0
-
-    def subscribers(self, topic: str, skin: str) -> int:
-        """How many subscriptions cover the topic: a subscription is a prefix, so "" and b"contact/" cover
-        b"contact/palm" too.
-        """
-        head = wire_topic(topic, skin) + b"\0"
-        return sum(n for prefix, n in self._subscriptions.items() if head.startswith(prefix) or prefix.startswith(head))
-
-    def poll(self) -> None:
-        """Take in new and ended subscriptions, and send latched values to who has just come. Call it at least once a
-        second.
-
-        A latched value goes to all who subscribe to it, not only to the newcomer: readers know it by its seq. Takes in
-        EVENTS_AT_ONCE at most; the rest waits for the next call.
-        """
-        newcomers = []
-        for _ in range(EVENTS_AT_ONCE):
-            if not int(self.socket.get(zmq.EVENTS)) & zmq.POLLIN:  # cheaper than an exception with every frame
-                break
-            event = self.socket.recv(zmq.NOBLOCK)
-            if event[:1] == b"\1":
-                self._subscriptions[event[1:]] += 1
-                newcomers.append(event[1:])
-            elif event[:1] == b"\0" and event[1:] in self._subscriptions:
-                self._subscriptions[event[1:]] -= 1
-                if self._subscriptions[event[1:]] <= 0:
-                    del self._subscriptions[event[1:]]
-        if newcomers:
-            for message in self._latched.values():
-                if any(message.startswith(prefix) for prefix in newcomers):
-                    self.socket.send(message, zmq.NOBLOCK)
-
-    def close(self) -> None:
-        """Close the socket; what is not yet sent is dropped."""
-        self.socket.close(0)
 
 
 class _Reader:
@@ -155,7 +65,9 @@ class _Reader:
                 if source not in self._logged and len(self._logged) < 100:
                     self._logged.add(source)
                     log.warning(
-                        "dropped a malformed message from %s (further ones are only counted): %s", self._where, bad
+                        "dropped a malformed message from %s (further ones are only counted): %s",
+                        self._where,
+                        foreign(bad),
                     )
         return None
 

@@ -8,19 +8,23 @@ traffic is encrypted and both ends known to each other by CURVE, or, beyond the 
 from __future__ import annotations
 
 import ipaddress
+import os
+import secrets
+import socket as sockets
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import zmq
-import zmq.auth
 
 from . import runtime
 from .frames import MAX_MESSAGE
+from .gate import Gate
+from .keys import KeyFolder, TransportError, read_pair, read_public, write_keys
 
-if TYPE_CHECKING:
-    import zmq.auth.thread
+__all__ = ["Context", "Socket", "Transport", "TransportError", "bind", "configure", "connect", "current", "write_keys"]
 
 RECONNECT_MS = 30
 """How soon a reader looks again for a producer that has gone."""
@@ -34,25 +38,28 @@ Context = zmq.Context[zmq.Socket[bytes]]
 Socket = zmq.Socket[bytes]
 
 
-class TransportError(RuntimeError):
-    """A socket cannot be opened as configured: the message says what was found and what to do."""
-
-
 @dataclass(frozen=True)
 class Transport:
     """Addresses and keys.
 
     `addresses`: producer -> address of its data socket, `<process>.ctl` -> of its control socket; the runtime
     folder's for the rest. `secret_key`: file with our key pair (as `write_keys` makes it). `server_keys`: producer ->
-    file with its public key. `clients`: folder with the public keys that may connect to us. `insecure`: allow
-    unencrypted TCP beyond this host.
+    file with its public key. `clients`: folder with the public keys that may connect to us. `operators`: folder with
+    the public keys that may also give commands that change something. `insecure`: allow unencrypted TCP beyond this
+    host.
     """
 
     addresses: Mapping[str, str] = field(default_factory=dict)
     secret_key: Path | None = None
     server_keys: Mapping[str, Path] = field(default_factory=dict)
     clients: Path | None = None
+    operators: Path | None = None
     insecure: bool = False
+
+    @property
+    def keyed(self) -> bool:
+        """Whether anything of keys is configured: then no TCP socket goes without."""
+        return bool(self.secret_key or self.server_keys or self.clients or self.operators)
 
     def data_address(self, producer: str) -> str:
         """Where `producer` publishes."""
@@ -64,11 +71,14 @@ class Transport:
 
 
 _current = Transport()
-_authenticators: dict[int, zmq.auth.thread.ThreadAuthenticator] = {}
+_gates: dict[int, Gate] = {}
 
 
 def configure(transport: Transport) -> None:
-    """Use `transport` for all sockets that this process opens from now on."""
+    """Use `transport` for all sockets that this process opens from now on. Raises TransportError where its keys are
+    only half configured or cannot be used.
+    """
+    check(transport)
     global _current
     _current = transport
 
@@ -78,66 +88,210 @@ def current() -> Transport:
     return _current
 
 
-def bind(context: Context, kind: int, address: str, options: Mapping[int, Any]) -> Socket:
-    """A bound socket. Raises TransportError for an address that is taken, or unencrypted and reachable from other
-    hosts.
+def check(transport: Transport) -> None:
+    """Raises TransportError where keys are half configured, or a key file cannot be used."""
+    if not transport.keyed:
+        return
+    if transport.secret_key is None:
+        given = [name for name in ("server_keys", "clients", "operators") if getattr(transport, name)]
+        raise TransportError(
+            f"found {' and '.join(given)} without secret_key: nothing would be encrypted; make a key pair of our own "
+            "(skin keys new) and name it as secret_key"
+        )
+    if transport.clients is None and not transport.server_keys:
+        raise TransportError(
+            "found secret_key alone: a server also needs `clients`, the folder of the clients' public keys; a client "
+            "`server_keys`, the public key of each process it connects to"
+        )
+    if transport.operators is not None and transport.clients is None:
+        raise TransportError("found operators without clients: name the folder of the clients' public keys too")
+    read_pair(transport.secret_key)
+    for key in transport.server_keys.values():
+        read_public(key)
+    for what in ("clients", "operators"):
+        folder: Path | None = getattr(transport, what)
+        if folder is not None and not folder.is_dir():
+            raise TransportError(f"{what}: found no folder {folder}: make it, and put public keys (*.key) into it")
+
+
+@dataclass(frozen=True)
+class Admission:
+    """Whose keys a bound TCP socket lets in, and which of them may change something."""
+
+    own: bytes
+    secret: bytes = field(repr=False)
+    clients: KeyFolder
+    operators: KeyFolder | None = None
+
+    def keys(self) -> frozenset[bytes]:
+        """All that may connect: who holds our own secret key, clients, operators."""
+        return frozenset({self.own, *self.clients.keys(), *(self.operators.keys() if self.operators else ())})
+
+    def allows(self, key: bytes) -> bool:
+        return key in self.keys()
+
+    def operates(self, key: bytes) -> bool:
+        """Whether this key may change something."""
+        return key == self.own or (self.operators is not None and key in self.operators.keys())
+
+    @property
+    def problems(self) -> list[str]:
+        """Files that hold no key."""
+        return [*self.clients.problems, *(self.operators.problems if self.operators else ())]
+
+
+def admission(address: str) -> Admission | None:
+    """Whom a socket bound at `address` lets in; None where no key is asked for (ipc: the folder's rights decide;
+    unencrypted TCP). Raises TransportError for an address that would be open to others against the configuration.
     """
     transport = _current
-    secured = transport.secret_key is not None and address.startswith("tcp://")
-    if address.startswith("tcp://") and not secured and not transport.insecure and not _is_loopback(address):
+    if not address.startswith("tcp://"):
+        return None
+    if not transport.keyed:
+        if not transport.insecure and not _is_loopback(address):
+            raise TransportError(
+                f"{address} would be open, unencrypted, to other hosts: configure CURVE keys, or say insecure = true"
+            )
+        return None
+    check(transport)
+    if transport.clients is None or transport.secret_key is None:
         raise TransportError(
-            f"{address} would be open, unencrypted, to other hosts: configure CURVE keys, or say insecure = true"
+            f"{address} needs `clients`, the folder of the clients' public keys: without it nobody could be refused"
         )
+    operators = KeyFolder(transport.operators) if transport.operators else None
+    return Admission(*read_pair(transport.secret_key), KeyFolder(transport.clients), operators)
+
+
+def bind(
+    context: Context,
+    kind: int,
+    address: str,
+    options: Mapping[int, Any],
+    admitted: Admission | None = None,
+    *,
+    guarded: bool = False,
+) -> Socket:
+    """A bound socket. `admitted` is what `admission(address)` gave. `guarded`: peers that flooded us are refused.
+
+    Raises TransportError for an address that is taken.
+    """
     socket = _open(context, kind, options)
-    if secured:
-        _authenticate(context, transport)
-        socket.curve_publickey, socket.curve_secretkey = _read_keys(transport.secret_key)
-        socket.curve_server = True
     try:
+        if admitted is not None:
+            socket.curve_publickey, socket.curve_secretkey = admitted.own, admitted.secret
+            socket.curve_server = True
+        if admitted is not None or guarded:
+            gate(context).guard(socket, secrets.token_hex(8), admitted.allows if admitted is not None else None)
+        taken_by(address)
         socket.bind(address)
     except zmq.ZMQError as bad:
         socket.close(0)
-        raise TransportError(f"cannot listen at {address}: {bad.strerror}") from None
+        hint = ": another program uses it; end that one, or choose another port" if bad.errno == zmq.EADDRINUSE else ""
+        raise TransportError(f"cannot listen at {address}: {bad.strerror}{hint}") from None
+    except TransportError:
+        socket.close(0)
+        raise
     return socket
+
+
+def listener(address: str) -> int | None:
+    """The process that listens at an ipc address (0: of another container), None where nobody does."""
+    if not address.startswith("ipc://"):
+        return None
+    with sockets.socket(sockets.AF_UNIX, sockets.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(os.fsencode(address.removeprefix("ipc://")))
+        except BlockingIOError:  # somebody, whose queue is full
+            return 0
+        except OSError:
+            return None
+        credentials = probe.getsockopt(sockets.SOL_SOCKET, sockets.SO_PEERCRED, struct.calcsize("3i"))
+        return int(struct.unpack("3i", credentials)[0])
+
+
+def taken_by(address: str) -> None:
+    """Raises TransportError where another process listens at this ipc address: ZeroMQ would take it over silently."""
+    owner = listener(address)
+    if owner is not None and owner != os.getpid():
+        who = f"process {owner}" if owner else "a process of another container"
+        raise TransportError(
+            f"cannot listen at {address}: {who} does already; end it, or give this service its own EITSKIN_RUNTIME"
+        )
 
 
 def connect(context: Context, kind: int, addresses: Mapping[str, str], options: Mapping[int, Any]) -> Socket:
     """A socket connected to `addresses` (name of who is there -> address); who is not there yet is found when it
-    comes.
+    comes. Raises TransportError where that would be unencrypted against the configuration.
     """
-    transport = _current
     socket = _open(context, kind, options)
-    if any(address.startswith("tcp://") for address in addresses.values()):
-        socket.setsockopt(zmq.HEARTBEAT_IVL, PATIENCE_MS // 2)
-        for option in (zmq.HEARTBEAT_TIMEOUT, zmq.CONNECT_TIMEOUT):
-            socket.setsockopt(option, PATIENCE_MS)
-    for name, address in addresses.items():
-        if address.startswith("tcp://") and name in transport.server_keys:
-            socket.curve_publickey, socket.curve_secretkey = _read_keys(transport.secret_key)
-            socket.curve_serverkey = zmq.auth.load_certificate(transport.server_keys[name])[0]
-        try:
-            socket.connect(address)
-        except zmq.ZMQError as bad:
-            socket.close(0)
-            raise TransportError(
-                f"cannot connect to {address}: {bad.strerror}; expected ipc://PATH or tcp://HOST:PORT"
-            ) from None
+    try:
+        if any(address.startswith("tcp://") for address in addresses.values()):
+            socket.setsockopt(zmq.HEARTBEAT_IVL, PATIENCE_MS // 2)
+            for option in (zmq.HEARTBEAT_TIMEOUT, zmq.CONNECT_TIMEOUT):
+                socket.setsockopt(option, PATIENCE_MS)
+        # ipc first: keys, once set, hold for all that is connected after.
+        for name, address in sorted(addresses.items(), key=lambda item: item[1].startswith("tcp://")):
+            if address.startswith("tcp://"):
+                _use_keys(socket, name, address)
+            socket.connect(_reachable(address))
+    except zmq.ZMQError as bad:
+        socket.close(0)
+        raise TransportError(
+            f"cannot connect to {address}: {bad.strerror}; expected ipc://PATH or tcp://HOST:PORT"
+        ) from None
+    except TransportError:
+        socket.close(0)
+        raise
     return socket
 
 
-def write_keys(folder: Path, name: str) -> tuple[Path, Path]:
-    """Make a CURVE key pair: the files (public, secret), the latter readable by us only."""
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    public, secret = zmq.auth.create_certificates(folder, name)
-    Path(secret).chmod(0o600)
-    return Path(public), Path(secret)
+def _use_keys(socket: Socket, name: str, address: str) -> None:
+    """Set the keys for connecting to `name`. Raises TransportError where that would be neither encrypted nor allowed
+    to be in clear.
+    """
+    transport = _current
+    if not transport.keyed:
+        if not transport.insecure and not _is_loopback(address):
+            raise TransportError(
+                f"{address} would be read unencrypted, from whoever answers there: configure secret_key and "
+                f"server_keys for {name}, or say insecure = true"
+            )
+        return
+    check(transport)
+    assert transport.secret_key is not None
+    socket.curve_publickey, socket.curve_secretkey = read_pair(transport.secret_key)
+    if name in transport.server_keys:
+        socket.curve_serverkey = read_public(transport.server_keys[name])
+    elif transport.clients is not None:  # we are this service: all its processes hold our own key
+        socket.curve_serverkey = socket.curve_publickey
+    else:
+        raise TransportError(
+            f"{address}: found a secret_key but no server key of {name}: anybody could answer there; name the file of "
+            f"its public key as server_keys, {{ {name} = FILE }}"
+        )
 
 
-def stop_authenticator(context: Context) -> None:
-    """End the thread that checks clients of this context's CURVE sockets; before the context is closed."""
-    authenticator = _authenticators.pop(context.underlying, None)
-    if authenticator is not None:
-        authenticator.stop()
+def _reachable(address: str) -> str:
+    """Where to connect to what listens at `address`: on this host, where it listens on every interface."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    if not address.startswith("tcp://") or host not in ("*", "0.0.0.0", "[::]"):
+        return address
+    return f"tcp://{'[::1]' if host == '[::]' else '127.0.0.1'}:{port}"
+
+
+def gate(context: Context) -> Gate:
+    """Who decides on the handshakes of this context's sockets; started at the first call."""
+    if context.underlying not in _gates:
+        _gates[context.underlying] = Gate(context)
+    return _gates[context.underlying]
+
+
+def stop_gate(context: Context) -> None:
+    """End the thread that decides on the handshakes of this context; before the context is closed."""
+    found = _gates.pop(context.underlying, None)
+    if found is not None:
+        found.stop()
 
 
 def _open(context: Context, kind: int, options: Mapping[int, Any]) -> Socket:
@@ -156,33 +310,3 @@ def _is_loopback(address: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host in ("localhost", "lo")
-
-
-def _read_keys(path: Path | None) -> tuple[bytes, bytes]:
-    if path is None:
-        raise TransportError(
-            "a CURVE connection needs a key pair of our own: make one and name it in the configuration"
-        )
-    try:
-        public, secret = zmq.auth.load_certificate(path)
-    except (OSError, ValueError) as bad:
-        raise TransportError(f"key file {path}: {bad}") from None
-    if secret is None:
-        raise TransportError(f"key file {path} holds no secret key: name the .key_secret file")
-    return public, secret
-
-
-def _authenticate(context: Context, transport: Transport) -> None:
-    """Start this context's authenticator once: only clients whose public keys lie in `transport.clients` get in."""
-    if transport.clients is None:
-        raise TransportError(
-            "a CURVE socket needs the folder of the clients' public keys: without it nobody could be refused"
-        )
-    key = context.underlying
-    if key not in _authenticators:
-        import zmq.auth.thread  # here: it imports asyncio, which most processes do without
-
-        authenticator = zmq.auth.thread.ThreadAuthenticator(context)
-        authenticator.start()
-        _authenticators[key] = authenticator
-    _authenticators[key].configure_curve(domain="*", location=str(transport.clients))

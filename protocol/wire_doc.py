@@ -15,7 +15,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
-from . import fields, frame_types, frames, link, link_messages, records, runtime, sockets, topics
+from . import fields, frame_types, frames, link, link_messages, publishing, records, runtime, topics
 
 WIRE_MD = Path(__file__).with_name("WIRE.md")
 
@@ -101,7 +101,9 @@ def limit_table() -> str:
             ("msgpack map", f"{fields.MAX_MAP} entries"),
             ("msgpack extension types", "none"),
             ("nesting of `info`", f"{fields.MAX_DEPTH} levels"),
-            ("messages held for a subscriber that does not read", sockets.SEND_QUEUE),
+            ("messages held for a subscriber that does not read", publishing.SEND_QUEUE),
+            ("a subscription", f"{publishing.MAX_SUBSCRIPTION} bytes"),
+            ("different subscriptions at one time", publishing.MOST_PREFIXES),
             ("path of a socket", f"{runtime.MAX_SOCKET_PATH} bytes"),
         ),
     )

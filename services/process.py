@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 
 from models.bundle import Bundle, BundleError
+from protocol import logs
 from protocol.runtime import RuntimeDirError
 from protocol.transport import TransportError
 from services import realtime
@@ -20,7 +21,7 @@ def main(process: str, setup: Callable[[Runner], None]) -> int:
     """A process's main: configuration, sockets, lanes, loop. Returns the exit status; says on stderr what stands in
     the way.
     """
-    logging.basicConfig(format=f"{process}: %(message)s", level=logging.INFO, stream=sys.stderr)
+    logs.setup(f"{process}: %(message)s")
     try:
         config = load()
         logging.getLogger().setLevel(config.logging.level.upper())

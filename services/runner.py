@@ -52,6 +52,7 @@ class Runner:
         self.lanes: dict[str, Lane] = {}
         self._bundles: dict[str, Bundle] = {}
         self._waiter = Waiter()
+        self._minded: list[tuple[Publisher | ControlServer, Any]] = []  # what listens, with the socket we wait for
         self._by_socket: dict[Any, Lane] = {}
         self._stop = False
         self._frames = 0
@@ -81,6 +82,7 @@ class Runner:
         wake = _wake_on_signals(self._on_signal)
         for socket in (wake, self.control.socket, self.publisher.socket, *self._by_socket):
             self._waiter.register(socket)
+        self._minded = [(self.publisher, self.publisher.socket), (self.control, self.control.socket)]
         self._turns = cycle(self.lanes.values())
         _settle()
         next_tick = deadline = 0.0
@@ -191,8 +193,17 @@ class Runner:
 
     # housekeeping
 
+    def _mind_sockets(self) -> list[str]:
+        """Mend what has become of our sockets; what to say of it in status."""
+        for place, (owner, socket) in enumerate(self._minded):
+            if owner.mind():
+                self._waiter.exchange(socket, owner.socket)
+                self._minded[place] = (owner, owner.socket)
+        return self.publisher.problems + self.control.problems
+
     def _tick(self) -> None:
         self.publisher.poll()
+        problems = self.problems + self._mind_sockets()
         now = time.monotonic()
         for lane in self.lanes.values():
             lane.wanted = self._wanted(lane.stage)
@@ -200,7 +211,7 @@ class Runner:
             beat = lane.heartbeat
             beat.drops["malformed"], beat.drops["skipped"] = lane.feed.malformed, lane.feed.skipped
             silent = "" if lane.asleep else beat.silence(SILENT_S, lane.stage.reads)
-            health = lane.stage.health().with_problems(self.problems)
+            health = lane.stage.health().with_problems(problems)
             status = beat.status(health, silent, now, HEARTBEAT_S, asleep=lane.asleep)
             if status is not None:
                 self._send(lane, status)

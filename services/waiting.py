@@ -8,6 +8,7 @@ again before the next wait, and all of them whenever `doubt` says so.
 
 from __future__ import annotations
 
+import contextlib
 import select
 
 import zmq
@@ -30,6 +31,15 @@ class Waiter:
         self._epoll.register(descriptor, select.EPOLLIN)
         self.doubt()
 
+    def exchange(self, old: Socket, new: Socket) -> None:
+        """Wait for `new` instead of `old`, which may be closed already."""
+        for descriptor, what in list(self._by_descriptor.items()):
+            if what is old:
+                del self._by_descriptor[descriptor]
+                with contextlib.suppress(OSError):  # closed: the kernel has forgotten it
+                    self._epoll.unregister(descriptor)
+        self.register(new)
+
     def doubt(self) -> None:
         """Ask every socket once. To be called now and then: another use of a socket than reading it (sending, a new
         subscription) takes its signals too.
@@ -42,8 +52,8 @@ class Waiter:
         """
         ready: list[Waitable] = [socket for socket in self._doubtful if int(socket.get(zmq.EVENTS)) & zmq.POLLIN]
         for descriptor, _ in self._epoll.poll(0.0 if ready else max(0.0, timeout_s)):
-            what = self._by_descriptor[descriptor]
-            if what not in ready:
+            what = self._by_descriptor.get(descriptor)
+            if what is not None and what not in ready:
                 ready.append(what)
         self._doubtful = [what for what in ready if not isinstance(what, int)]
         return ready

@@ -28,7 +28,7 @@ def publisher(runtime, context):
 @pytest.fixture
 def elsewhere(monkeypatch):
     """The publisher's frames come from another host, whose clock says nothing here."""
-    monkeypatch.setattr("protocol.sockets.host_id", lambda: "another")
+    monkeypatch.setattr("protocol.publishing.host_id", lambda: "another")
 
 
 def frame(**fields):

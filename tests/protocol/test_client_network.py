@@ -37,7 +37,7 @@ def test_contacts_over_tcp_with_keys(runtime, tmp_path):
             assert skin.latest(max_age=2.0, wait_s=2.0, valid=True).seq == 0
     finally:
         publisher.close()
-        transport.stop_authenticator(context)
+        transport.stop_gate(context)
         context.destroy(linger=0)
 
 

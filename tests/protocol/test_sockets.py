@@ -85,7 +85,7 @@ def test_subscribers_are_counted_by_prefix_also_the_second_of_the_same(publisher
 
 
 def test_a_flood_of_subscriptions_does_not_hold_the_publisher(publisher, context, monkeypatch):
-    monkeypatch.setattr("protocol.sockets.EVENTS_AT_ONCE", 10)
+    monkeypatch.setattr("protocol.publishing.EVENTS_AT_ONCE", 10)
     socket = context.socket(zmq.SUB)
     socket.connect(endpoint("publisher"))
     for n in range(35):

@@ -70,7 +70,7 @@ def test_curve_lets_in_who_is_allowed_and_nobody_else(tmp_path):
         publisher.close()
         for r in readers:
             r.close()
-        transport.stop_authenticator(context)
+        transport.stop_gate(context)
         context.destroy(linger=0)
 
 

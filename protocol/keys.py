@@ -1,0 +1,125 @@
+"""Key files: a CURVE key pair of one's own, and folders with the public keys of those who may do something.
+
+A file holds the lines `public-key = "..."` and, where it is the secret one, `secret-key = "..."`: 40 characters each
+(the format of zmq.auth, so that keys made by any ZeroMQ program fit).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+
+import zmq
+from zmq.utils import z85
+
+MAX_FILE = 64 * 1024
+_LINE = re.compile(rb'^\s*(public|secret)-key\s*=\s*"([^"]*)"', re.MULTILINE)
+
+
+class TransportError(RuntimeError):
+    """A socket cannot be opened as configured, or a key file cannot be used: the message says what was found and what
+    to do.
+    """
+
+
+def write_keys(folder: Path, name: str) -> tuple[Path, Path]:
+    """Make a CURVE key pair: the files (public, secret), the latter readable by us only. Raises OSError."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    public_key, secret_key = (key.decode() for key in zmq.curve_keypair())
+    public, secret = folder / f"{name}.key", folder / f"{name}.key_secret"
+    public_line, secret_line = f'    public-key = "{public_key}"\n', f'    secret-key = "{secret_key}"\n'
+    note = "# Secret: it stays on this host, readable by its owner only."
+    _write(secret, f"{note}\ncurve\n{public_line}{secret_line}", 0o600)
+    _write(public, f"# Public: for the other end.\ncurve\n{public_line}", 0o644)
+    return public, secret
+
+
+def _write(path: Path, text: str, mode: int) -> None:
+    path.unlink(missing_ok=True)  # an older file's mode and links would stay
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode), "w", encoding="ascii") as file:
+        file.write(text)
+
+
+def read_pair(path: Path) -> tuple[bytes, bytes]:
+    """Our own (public, secret) key. Raises TransportError, also where others may read the file."""
+    found = _keys(path, secret=True)
+    if "secret" not in found:
+        raise TransportError(f"key file {path} holds no secret key: name the .key_secret file")
+    return found["public"], found["secret"]
+
+
+def read_public(path: Path) -> bytes:
+    """A public key. Raises TransportError."""
+    return _keys(path)["public"]
+
+
+def _keys(path: Path, secret: bool = False) -> dict[str, bytes]:
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            about = os.fstat(file.fileno())
+            if not stat.S_ISREG(about.st_mode):
+                raise TransportError(f"key file {path}: found something that is no file")
+            if secret and about.st_mode & 0o077:
+                raise TransportError(
+                    f"key file {path} has mode {stat.S_IMODE(about.st_mode):04o}, so others can use the key, "
+                    f"expected 0600: chmod 600 {path}, and make a new key where others may have read it"
+                )
+            text = file.read(MAX_FILE)
+    except OSError as bad:
+        raise TransportError(f"key file {path}: {bad.strerror}; make one with `skin keys new`") from None
+    found = {kind.decode(): key for kind, key in _LINE.findall(text)}
+    if "public" not in found:
+        raise TransportError(f'key file {path}: found no line public-key = "...", as `skin keys new` writes it')
+    for kind, key in found.items():
+        try:
+            if len(z85.decode(key)) != 32:
+                raise ValueError
+        except (ValueError, KeyError, IndexError):
+            raise TransportError(f"key file {path}: the {kind} key is damaged, expected 40 characters of Z85") from None
+    return found
+
+
+class KeyFolder:
+    """The public keys in a folder's `*.key` files, read again when the folder changes. Any thread may ask.
+
+    A file that holds no key is named in `problems`; the others stay good.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.problems: tuple[str, ...] = ()
+        self._known: tuple[object, Mapping[bytes, str]] = (None, {})
+
+    def keys(self) -> Mapping[bytes, str]:
+        """Public key -> the name of its file."""
+        try:
+            files = sorted(path for path in self.path.iterdir() if path.suffix == ".key")
+            seen: object = [(path, about.st_ino, about.st_size, about.st_mtime_ns) for path, about in _stats(files)]
+        except OSError as bad:
+            self.problems = (f"no key of {self.path} is good: {bad.strerror}",)
+            self._known = (None, {})
+            return {}
+        if self._known[0] != seen:
+            found: dict[bytes, str] = {}
+            problems = []
+            for file in files:
+                try:
+                    found[read_public(file)] = file.stem
+                except TransportError as bad:
+                    problems.append(f"{bad}; the other keys stay good")
+            self.problems = tuple(problems)
+            self._known = (seen, found)
+        return self._known[1]
+
+
+def _stats(files: list[Path]) -> list[tuple[Path, os.stat_result]]:
+    found = []
+    for path in files:
+        try:
+            found.append((path, path.stat()))
+        except OSError:  # removed just now, or a dangling link
+            found.append((path, path.lstat()) if path.is_symlink() else (path, os.stat_result([0] * 10)))
+    return found

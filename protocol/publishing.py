@@ -1,0 +1,170 @@
+"""A producer's data socket: what is sent, who subscribes, and what becomes of a subscriber that sends too much."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections import Counter
+
+import zmq
+
+from . import transport
+from .frames import Frame, pack
+from .gate import peer_of
+from .listening import Listening
+from .runtime import host_id
+from .topics import TOPIC_OF, wire_topic
+from .transport import Context, Socket
+
+SEND_QUEUE = 100
+"""Messages held for a subscriber that does not read (100 images: 4 MB); its further ones are dropped, nobody else's."""
+
+RECEIVE_QUEUE = 100
+"""Subscriptions held that we have not yet taken in, for each subscriber; it waits with its further ones."""
+
+MAX_SUBSCRIPTION = 1024
+"""Longest subscription in bytes (a topic has 50 at most, a handshake with keys some 400); who sends more is cut off."""
+
+MOST_PREFIXES = 4096
+"""Different subscriptions at one time; beyond, the peer with most of them is disconnected. 64 skins have about 600."""
+
+EVENTS_AT_ONCE = 1000
+"""Subscriptions taken in by one call of `Publisher.poll`, after which a flood of them cannot hold the producer."""
+
+RETURN_S = 1.0
+"""How long the subscriptions of before count after the socket was opened anew: their owners are on their way back."""
+
+
+class Publisher:
+    """A producer's data socket.
+
+    XPUB that is told of every subscription and counts them itself: by default ZeroMQ hides the second one, so that a
+    late joiner would not get latched values and `wanted` could not be known. `session` is new with each Publisher
+    unless given.
+    """
+
+    def __init__(
+        self, producer: str, context: Context | None = None, *, address: str | None = None, session: str | None = None
+    ):
+        self.producer = producer
+        self.session = session or secrets.token_hex(8)
+        self.sent: Counter[str] = Counter()
+        """Messages sent, by "topic/skin"."""
+        self._subscriptions: Counter[bytes] = Counter()
+        self._latched: dict[bytes, bytes] = {}
+        self._asked_by: dict[bytes, str] = {}  # who first subscribed to each prefix
+        self._before: tuple[float, Counter[bytes]] = (0.0, Counter())  # until when, and what was subscribed to
+        self._flooded_by: str | None = None
+        self._listening = Listening(
+            context or zmq.Context.instance(),
+            zmq.XPUB,
+            address or transport.current().data_address(producer),
+            {
+                zmq.XPUB_VERBOSER: 1,
+                zmq.SNDHWM: SEND_QUEUE,
+                zmq.RCVHWM: RECEIVE_QUEUE,
+                zmq.MAXMSGSIZE: MAX_SUBSCRIPTION,
+            },
+        )
+
+    @property
+    def socket(self) -> Socket:
+        """The socket in use; another one after `mind` has mended something."""
+        return self._listening.socket
+
+    @property
+    def problems(self) -> list[str]:
+        """What status should say of the socket."""
+        return self._listening.problems
+
+    def mind(self) -> bool:
+        """Look whether the socket is still reachable as configured and nobody floods it, and mend it; whether `socket`
+        is another one now. Call it at least once a second. Latched values are kept, and so are the subscriptions until
+        their owners have come back.
+        """
+        peer, self._flooded_by = self._flooded_by, None
+        if peer is not None:
+            self._listening.shed(peer, f"more than {MOST_PREFIXES} subscriptions")
+        elif not self._listening.mind():
+            return False
+        self._before = (time.monotonic() + RETURN_S, Counter(dict(self._subscriptions.most_common(MOST_PREFIXES))))
+        if peer is not None:
+            flood = {prefix for prefix, who in self._asked_by.items() if who == peer}
+            self._before = (self._before[0], Counter({p: n for p, n in self._before[1].items() if p not in flood}))
+        self._subscriptions.clear()
+        self._asked_by.clear()
+        return True
+
+    def send(self, frame: Frame) -> bytes:
+        """Publish a frame; its session, seq and host are set here. Returns the message. Never blocks. Raises
+        FrameError.
+        """
+        topic = TOPIC_OF[type(frame)]
+        name = wire_topic(topic.name, frame.skin)
+        key = name.decode()
+        frame.session, frame.host, frame.seq = self.session, host_id(), self.sent[key]
+        message = pack(frame)
+        self.poll()
+        self.socket.send(message, zmq.NOBLOCK)
+        self.sent[key] += 1
+        if topic.latched:
+            self._latched[name] = message
+        return message
+
+    def renew(self) -> None:
+        """Begin a new session: frames count from 0 again."""
+        self.session = secrets.token_hex(8)
+        self.sent.clear()
+
+    def wanted(self, topic: str, skin: str) -> bool:
+        """Whether anybody subscribes to it, as of the last `poll` or `send`."""
+        return self.subscribers(topic, skin) > 0
+
+    def subscribers(self, topic: str, skin: str) -> int:
+        """How many subscriptions cover the topic: a subscription is a prefix, so "" and b"contact/" cover
+        b"contact/palm" too.
+        """
+        head = wire_topic(topic, skin) + b"\0"
+        until, before = self._before
+        return max(_covering(head, self._subscriptions), _covering(head, before) if time.monotonic() < until else 0)
+
+    def poll(self) -> None:
+        """Take in new and ended subscriptions, and send latched values to who has just come. Call it at least once a
+        second.
+
+        A latched value goes to all who subscribe to it, not only to the newcomer: readers know it by its seq. Takes in
+        EVENTS_AT_ONCE at most; the rest waits for the next call.
+        """
+        newcomers = []
+        for _ in range(EVENTS_AT_ONCE):
+            if self._flooded_by is not None:  # until `mind`
+                break
+            if not int(self.socket.get(zmq.EVENTS)) & zmq.POLLIN:  # cheaper than an exception with every frame
+                break
+            received = self.socket.recv(zmq.NOBLOCK, copy=False)
+            event = received.bytes
+            prefix = event[1:]
+            if event[:1] == b"\1":
+                self._subscriptions[prefix] += 1
+                newcomers.append(prefix)
+                if prefix not in self._asked_by:
+                    self._asked_by[prefix] = peer_of(received, self._listening.secured)
+                if len(self._asked_by) > MOST_PREFIXES:
+                    self._flooded_by = Counter(self._asked_by.values()).most_common(1)[0][0]
+            elif event[:1] == b"\0" and prefix in self._subscriptions:
+                self._subscriptions[prefix] -= 1
+                if self._subscriptions[prefix] <= 0:
+                    del self._subscriptions[prefix]
+                    self._asked_by.pop(prefix, None)
+        if newcomers:
+            for message in self._latched.values():
+                if any(message.startswith(prefix) for prefix in newcomers):
+                    self.socket.send(message, zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Close the socket; what is not yet sent is dropped."""
+        self._listening.close()
+
+
+def _covering(head: bytes, subscriptions: Counter[bytes]) -> int:
+    return sum(n for prefix, n in subscriptions.items() if head.startswith(prefix) or prefix.startswith(head))
