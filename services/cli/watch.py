@@ -61,13 +61,15 @@ def _live(monitor: Monitor) -> None:
     from rich.console import Console
     from rich.live import Live
 
+    from services.cli.keyboard import keys
     from services.cli.screen import screen
 
     console = Console()
-    with Live(screen(monitor, console.width), console=console, screen=True, auto_refresh=False) as live:
-        while True:
+    first = screen(monitor, console.width, live=True)
+    with keys() as typed, Live(first, console=console, screen=True, auto_refresh=False) as live:
+        while "q" not in typed().lower():
             monitor.read(0.2)
-            live.update(screen(monitor, console.width), refresh=True)
+            live.update(screen(monitor, console.width, live=True), refresh=True)
 
 
 def echo(
