@@ -160,7 +160,8 @@ class Rig:
     def fault(self, name: str, args: Mapping[str, Any], now: float, seconds: float = 5.0) -> dict[str, Any]:
         """Let something go wrong, see FAULTS. Raises ValueError."""
         for key in ("electrode", "electrodes"):
-            for electrode in np.atleast_1d(args.get(key, 0)):
+            given = args.get(key, 0)
+            for electrode in given if isinstance(given, list) else [given]:
                 if electrode not in range(self.sheet.electrodes):
                     raise ValueError(
                         f"fault {name}: electrode {electrode!r}, expected 0 to {self.sheet.electrodes - 1}"

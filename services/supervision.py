@@ -25,7 +25,7 @@ from supervisor.process import Subprocess
 from supervisor.states import ProcessStates
 from supervisor.supervisord import Supervisor
 
-from protocol.runtime import lock, runtime_dir
+from protocol.runtime import CONFIG_LINK, lock, runtime_dir
 from services.config import BUNDLES, MANIFEST, ROOT, Config
 from services.stage import PROCESSES
 
@@ -73,6 +73,7 @@ def up(config: Config, extra: Sequence[Program] = (), wanted: Sequence[Program] 
     runtime = runtime_dir()
     with lock():
         running = list(programs(config) if wanted is None else wanted) + list(extra)
+        _link(runtime / CONFIG_LINK, config.path.resolve())
         file = runtime / "supervisord.conf"
         file.write_text(_settings(runtime, config, running), encoding="utf-8")
         options = ServerOptions()
@@ -93,13 +94,19 @@ def _clear(runtime: Path, ran: Sequence[Program]) -> None:
     """Remove what we and the programs that ran left in the runtime folder. `lock` and `state` stay, and so do sockets
     of others (`skin record`, `skin replay`).
     """
-    left = [runtime / "supervisord.conf", runtime / "supervisord.pid"]
+    left = [runtime / "supervisord.conf", runtime / "supervisord.pid", runtime / CONFIG_LINK]
     left += [runtime / f"{program.name}{suffix}" for program in ran for suffix in (".ipc", ".ctl")]
     if any(program.name == "stub" for program in ran):
         left += [path for path in runtime.glob("board*") if path.is_symlink()]
     for path in left:
         with contextlib.suppress(OSError):  # not there, mostly
             path.unlink()
+
+
+def _link(link: Path, target: Path) -> None:
+    """Tell whoever comes to this folder which configuration runs here."""
+    link.unlink(missing_ok=True)
+    link.symlink_to(target)
 
 
 class _Service(Supervisor):  # type: ignore[misc]

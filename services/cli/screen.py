@@ -65,7 +65,7 @@ def _contacts(now: dict[str, Any], most: int) -> RenderableType:
         x, y = c["position"][0] * 1e3, c["position"][1] * 1e3
         table.add_row(str(c["id"]), f"{x:+.1f}", f"{y:+.1f}", force, c["shape"])
     if not now["contacts"]:
-        table.add_row(Text("none: nothing touches", style="dim"))
+        return Text("no contact: nothing touches\n" if now["valid"] else "no contact\n", style="dim")
     more = len(now["contacts"]) - most
     return Group(table, Text(f"and {more} more\n" if more > 0 else ""))
 
@@ -93,7 +93,9 @@ def _detailed(now: dict[str, Any]) -> list[RenderableType]:
         times = (row["rate_hz"], 1), (row["age_ms"], 0), (latency["p50"], 1), (latency["p99"], 1), (read["p50"], 1)
         cells = [_number(value, digits) for value, digits in (*times, (read["p99"], 1))]
         topics.add_row(f"{name}/{now['skin']}", *cells, str(row["lost"]), says)
-    said = "delay: from the middle of the scan to here; since read: from the board's last byte. Median, 99th percentile.\n"
+    said = (
+        "delay: from the middle of the scan to here; since read: from the board's last byte. Median, 99th percentile.\n"
+    )
     processes = _table("process", "is", "CPU %", "ms a frame", "p99")
     processes.add_column("frames dropped")
     processes.add_column("network not run")
