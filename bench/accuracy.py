@@ -127,12 +127,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="*", default=None, help="methods whose name contains one of these")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
     args = parser.parse_args(argv)
+    bundle = Bundle.load(args.bundle)
+    # first: it says within a second whether a peer's package is missing
+    methods = _methods.classical() + _methods.peers() + _methods.published(bundle) + _methods.shipped(bundle)
     levels = args.levels or (("none", "70") if args.quick else LEVELS)
     mesh, n = ("stub", 6) if args.quick else ("reference", 20)
     frames = _frames.load(args.seed, n, mesh)
     tuning = _frames.load(args.seed + 1000, 4, "stub", ("shapes", "hertz"))
-    bundle = Bundle.load(args.bundle)
-    methods = _methods.classical() + _methods.peers() + _methods.published(bundle) + _methods.shipped(bundle)
     wanted = [m for m in methods if args.only is None or any(o in m.name for o in args.only)]
     began = time.perf_counter()
     slow = SLOW_SHARE["quick" if args.quick else "full"]

@@ -4,3 +4,8 @@
 
 They import from `protocol`, being run from the checkout; with the wheel installed write `eitskin` for it.
 """
+
+import sys
+
+_usual = sys.excepthook
+sys.excepthook = lambda kind, *rest: None if kind is KeyboardInterrupt else _usual(kind, *rest)  # Ctrl-C: no traceback

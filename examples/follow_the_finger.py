@@ -68,5 +68,5 @@ if __name__ == "__main__":
     parser = options(str(__doc__))
     parser.add_argument("--seconds", type=float, default=math.inf)
     given = parser.parse_args()
-    with ContactSubscriber(given.skin, given.endpoint) as palm:
-        follow(Robot(), palm, given.max_age, given.seconds)
+    with Robot() as robot, ContactSubscriber(given.skin, given.endpoint) as palm:
+        follow(robot, palm, given.max_age, given.seconds)

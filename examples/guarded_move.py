@@ -64,5 +64,5 @@ if __name__ == "__main__":
     parser = options(str(__doc__))
     parser.add_argument("--newtons", type=float, default=2.0)
     given = parser.parse_args()
-    with ContactSubscriber(given.skin, given.endpoint) as palm:
-        sys.exit(guarded_move(Robot(), palm, given.newtons, given.max_age))
+    with Robot() as robot, ContactSubscriber(given.skin, given.endpoint) as palm:
+        sys.exit(guarded_move(robot, palm, given.newtons, given.max_age))

@@ -14,12 +14,21 @@ SAY_S = 0.5
 
 
 class Robot:
-    """Moves at the velocity [m/s] last commanded, COMMAND_S at most. Positions in metres, from where it began."""
+    """Moves at the velocity [m/s] last commanded, COMMAND_S at most. Positions in metres, from where it began.
+
+    As a context it stands still afterwards, however its controller ended.
+    """
 
     def __init__(self) -> None:
         self.velocity: Vector = (0.0, 0.0, 0.0)
         self._position: Vector = (0.0, 0.0, 0.0)
         self._commanded = self._said = self._then = time.monotonic()
+
+    def __enter__(self) -> Robot:
+        return self
+
+    def __exit__(self, *why: object) -> None:
+        self.stop()
 
     @property
     def position(self) -> Vector:

@@ -30,5 +30,5 @@ def stop_on_contact(robot: Robot, skin: ContactSubscriber, max_age: float) -> in
 
 if __name__ == "__main__":
     given = options(str(__doc__)).parse_args()
-    with ContactSubscriber(given.skin, given.endpoint) as palm:
-        sys.exit(stop_on_contact(Robot(), palm, given.max_age))
+    with Robot() as robot, ContactSubscriber(given.skin, given.endpoint) as palm:
+        sys.exit(stop_on_contact(robot, palm, given.max_age))

@@ -1,4 +1,4 @@
-"""python -m firmware_stub: the board on a pty in the runtime folder, its sheet, its control socket and the truth."""
+"""python -m firmware_stub: boards on ptys in the runtime folder, their sheets, one control socket and the truth."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import time
 
 import zmq
 
+from models.bundle import BundleError
 from protocol import logs
 from protocol.frame_types import NAME
 from protocol.runtime import RuntimeDirError, control_endpoint, runtime_dir
@@ -24,37 +25,48 @@ from protocol.transport import TransportError
 from . import scene as scenes
 from .control import Control
 from .faults import FAULTS
-from .port import Port, open_port, tcp_address
+from .port import open_port, tcp_address
 from .rig import Rig
-from .status import Status
-from .truth import truth_frame
+from .stub_skin import StubSkin, link_name, unique_id
 
 log = logging.getLogger("stub")
 PARENT_CHECK_S = 0.5
+SKIN = "palm"
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
-        prog="firmware_stub", description="A skin's impedance board, without the hardware."
+        prog="firmware_stub", description="Skins' impedance boards, without the hardware: one board for each --skin."
     )
     add = parser.add_argument
-    add("--skin", default="palm", help="name the truth is published under (default: %(default)s)")
-    add("--geometry", default="square16", help="skin of models/skins, or a .toml file (default: %(default)s)")
+    add("--skin", action="append", metavar="NAME[=SHEET]", help=f"a skin's name, and its sheet (default: {SKIN})")
+    add(
+        "--geometry",
+        default="square16",
+        metavar="SHEET",
+        help="sheet of skins that name none: a skin of models/skins, a .toml file or a bundle's folder "
+        "(default: %(default)s)",
+    )
     add("--scene", default="demo", help=f"one of {', '.join(scenes.names())}, or a .toml file (default: %(default)s)")
     add("--snr", type=float, default=80.0, help="signal over noise in dB, at 128 DFT points (default: %(default)s)")
     add("--floor", type=float, default=0.0, help="noise floor in ohm (default: %(default)s)")
     add("--rate", type=float, help="full scans per second (default: as the real board, about 22)")
     add("--ppm", type=float, default=12.0, help="how much too fast the board's crystal is (default: %(default)s)")
     add("--baud", type=int, default=921_600, help="bit rate of the line (default: %(default)s)")
-    add("--listen", metavar="URL", help="socket://HOST:PORT instead of a pty")
-    add("--port-name", default="board", help="the pty's name in the runtime folder (default: %(default)s)")
+    add("--listen", metavar="URL", help="socket://HOST:PORT instead of a pty; further skins take the ports after it")
     add("--seed", type=int, help="of the noise (default: another one each time)")
     add("--no-time", action="store_true", help="a firmware that does not answer TIME_ASK")
     add("--detached", action="store_true", help="go on when the parent process has ended")
     add("--faults", action="store_true", help="list what can go wrong on request, and end")
     options = parser.parse_args(argv)
-    if not re.fullmatch(NAME, options.skin):
-        parser.error(f"--skin {options.skin!r}: expected letters, digits, '.', '_' or '-'")
+    options.skins = {}
+    for text in options.skin or [SKIN]:
+        name, _, sheet = text.partition("=")
+        if not re.fullmatch(NAME, name):
+            parser.error(f"--skin {text!r}: expected a name of letters, digits, '.', '_' or '-', or NAME=SHEET")
+        if name in options.skins:
+            parser.error(f"--skin {name!r} is given twice: expected one board for each skin")
+        options.skins[name] = sheet or options.geometry
     if options.rate is not None and not 0.1 <= options.rate <= 10_000:
         parser.error(f"--rate {options.rate:g}: expected 0.1 to 10000 full scans per second")
     for name, value, low, high in (
@@ -77,46 +89,59 @@ def main(argv: list[str] | None = None) -> int:
     logs.setup("stub: %(message)s")
     stop = _Stop()
     parent = None if options.detached else os.getppid()
+    skins: dict[str, StubSkin] = {}
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    publisher = control = None
     try:
-        if options.listen:
-            tcp_address(options.listen)
-        _alone()
-        rig = Rig(
-            options.geometry,
+        begin_ns = _open(options, skins)
+        publisher = Publisher("stub", context)
+        rigs = {name: skin.rig for name, skin in skins.items()}
+        control = Control(rigs, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context)
+        for name, skin in skins.items():
+            log.info("board of %s at %s, scene %s", name, skin.port.url, options.scene)
+        _run(list(skins.values()), publisher, begin_ns, stop, parent)
+    except (ValueError, OSError, RuntimeDirError, BundleError) as error:
+        log.error("%s", error)
+        return 2
+    except (zmq.ZMQError, TransportError) as error:
+        log.error("sockets: %s", error)
+        return 1
+    finally:
+        if control is not None:
+            control.close()
+        if publisher is not None:
+            publisher.close()
+        for skin in skins.values():
+            skin.close()
+        context.destroy(linger=0)
+    return 0
+
+
+def _open(options: argparse.Namespace, skins: dict[str, StubSkin]) -> int:
+    """Fills in a skin for each that is asked for, each at a port of its own; returns when they began [ns]."""
+    host, first = tcp_address(options.listen) if options.listen else ("", 0)
+    _alone()
+    rigs = {
+        name: Rig(
+            sheet,
             scene=options.scene,
             snr_db=options.snr,
             floor_ohm=options.floor,
             rate_hz=options.rate,
             crystal_ppm=options.ppm,
             baud=options.baud,
-            seed=options.seed,
+            seed=None if options.seed is None else options.seed + n,
+            unique_id=unique_id(name),
             threaded=True,
             answers_time=not options.no_time,
         )
-        port = open_port(options.listen, runtime_dir(), options.port_name)
-    except (ValueError, OSError, RuntimeDirError) as error:
-        log.error("%s", error)
-        return 2
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        for n, (name, sheet) in enumerate(options.skins.items())
+    }
     begin_ns = time.monotonic_ns()
-    publisher = control = None
-    try:
-        publisher = Publisher("stub", context)
-        control = Control(rig, options.skin, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context)
-        log.info("board at %s, scene %s", port.url, options.scene)
-        _run(rig, port, publisher, options.skin, begin_ns, stop, parent)
-    except (zmq.ZMQError, TransportError) as error:
-        log.error("sockets: %s", error)
-        return 1
-    finally:
-        port.close()
-        if control is not None:
-            control.close()
-        if publisher is not None:
-            publisher.close()
-        rig.close()
-        context.destroy(linger=0)
-    return 0
+    for n, (name, rig) in enumerate(rigs.items()):
+        listen = f"socket://{f'[{host}]' if ':' in host else host}:{first + n if first else 0}" if host else None
+        skins[name] = StubSkin(name, rig, open_port(listen, runtime_dir(), link_name(name)), begin_ns)
+    return begin_ns
 
 
 def _alone() -> None:
@@ -129,37 +154,13 @@ def _alone() -> None:
             )
 
 
-def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, stop: _Stop, parent: int | None) -> None:
-    """Until a signal, or the parent's end: hand bytes to and fro, publish what was true."""
-    name, gone = "", False
-    checked, written_ns = 0.0, begin_ns
-    status = Status(skin)
+def _run(skins: list[StubSkin], publisher: Publisher, begin_ns: int, stop: _Stop, parent: int | None) -> None:
+    """Until a signal, or the parent's end."""
+    checked = 0.0
     while not stop.asked:
-        data = port.read()
-        now = (time.monotonic_ns() - begin_ns) * 1e-9  # after: the board has not read what it is told before it came
-        if data:
-            rig.feed(data, now)
-        if sent := rig.pull(now):
-            written_ns = time.monotonic_ns()  # before the write: its reader may run before we do again
-            port.write(sent)
-        if (rig.unplugged is not None) != gone:
-            gone = not gone
-            if gone:
-                assert rig.unplugged is not None
-                name = rig.unplugged["name"]
-                port.unplug()
-                log.info("unplugged")
-            else:
-                port.plug(name)
-                log.info("plugged in again as %s %s", port.url, name)
-        # A scan's last byte has left when the line has nothing left to send, or has gone on to the scans after it.
-        while rig.scans and (not rig.line.backlog or len(rig.scans) > 1):
-            scan, world, middle = rig.scans.popleft()
-            stamps = {"sample": begin_ns + round(middle * 1e9), "publish": written_ns}
-            publisher.send(truth_frame(skin, rig.sheet, scan, world, stamps))
-            status.scanned()
-        if (due := status.due(rig, port, now)) is not None:
-            publisher.send(due)
+        for skin in skins:
+            skin.step(publisher)
+        now = (time.monotonic_ns() - begin_ns) * 1e-9
         if now - checked > PARENT_CHECK_S:
             checked = now
             publisher.poll()
@@ -167,7 +168,8 @@ def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, s
             if parent is not None and os.getppid() != parent:
                 log.info("the parent process has ended")
                 return
-        select.select([*port.filenos(), stop.fileno()], [], [], rig.wake_s((time.monotonic_ns() - begin_ns) * 1e-9))
+        wait_s = min(skin.rig.wake_s(now) for skin in skins)
+        select.select([*(fd for skin in skins for fd in skin.port.filenos()), stop.fileno()], [], [], wait_s)
 
 
 class _Stop:

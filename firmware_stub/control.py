@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import zmq
@@ -19,10 +19,10 @@ log = logging.getLogger(__name__)
 
 
 class Control:
-    """Serves the rig's commands until `close`. `clock` gives the rig's time in seconds."""
+    """Serves the commands of all rigs (by skin) until `close`. `clock` gives their time in seconds."""
 
-    def __init__(self, rig: Rig, skin: str, clock: Callable[[], float], context: zmq.Context[Any]) -> None:
-        self._rig, self._skin, self._clock, self._context = rig, skin, clock, context
+    def __init__(self, rigs: Mapping[str, Rig], clock: Callable[[], float], context: zmq.Context[Any]) -> None:
+        self._rigs, self._clock, self._context = rigs, clock, context
         self._stop = threading.Event()
         self._server = self._bind()
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
@@ -30,41 +30,38 @@ class Control:
 
     def _bind(self) -> ControlServer:
         handlers = {
-            "press": lambda args: self._rig.press(self._mine(args), self._clock()),
-            "release": lambda args: self._rig.release(self._clock()),
+            "press": lambda args: self._rig(args).press(_touch(args), self._clock()),
+            "release": lambda args: self._rig(args).release(self._clock()),
             "scene": self._scene,
             "faults": self._fault,
             "fault": self._fault,
-            "status": lambda args: self._rig.status(self._clock()),
+            "status": lambda args: self._rig(args).status(self._clock()),
         }
         return ControlServer("stub", handlers, context=self._context)
 
-    def _mine(self, args: dict[str, Any]) -> dict[str, Any]:
-        """The arguments, unless they are meant for another skin."""
-        skin = args.pop("skin", None) or self._skin
-        if skin != self._skin:
-            raise ValueError(f"this stub is skin {self._skin!r}, not {skin!r}")
-        for key in ("x", "y"):
-            if key not in args:
-                raise ValueError(f"press needs {key}, in metres")
-        if args.get("force") is None and args.get("drop") is None:
-            raise ValueError("press needs force (N) or drop (S/m)")
-        return args
+    def _rig(self, args: dict[str, Any]) -> Rig:
+        """The rig of the skin meant, by default the first."""
+        name = args.get("skin") or next(iter(self._rigs))
+        if name not in self._rigs:
+            raise ValueError(f"the stub board has no skin {name!r}: expected one of {', '.join(self._rigs)}")
+        return self._rigs[name]
 
     def _scene(self, args: dict[str, Any]) -> dict[str, Any]:
         if not args.get("name"):
             return {"scenes": {name: scenes.load(name).about for name in scenes.names()}}
-        return self._rig.play(str(args["name"]), self._clock())
+        return self._rig(args).play(str(args["name"]), self._clock())
 
     def _fault(self, args: dict[str, Any]) -> dict[str, Any]:
-        now, name = self._clock(), args.get("name")
+        rig, now, name = self._rig(args), self._clock(), args.get("name")
         if args.get("clear"):
-            self._rig.faults.clear(*([str(name)] if name else []))
-            return {"faults": self._rig.faults.listing(now)}
+            rig.faults.clear(*([str(name)] if name else []))
+            return {"faults": rig.faults.listing(now)}
         if not name:
-            known = {key: {"what": row.what, "args": dict(row.args)} for key, row in FAULTS.items()}
-            return {"known": known, "faults": self._rig.faults.listing(now)}
-        return self._rig.fault(str(name), args.get("args") or {}, now, float(args.get("seconds", 5.0)))
+            known = {
+                key: {"what": row.what, "args": dict(row.args), "sticky": row.sticky} for key, row in FAULTS.items()
+            }
+            return {"known": known, "faults": rig.faults.listing(now)}
+        return rig.fault(str(name), args.get("args") or {}, now, float(args.get("seconds", 5.0)))
 
     def _serve(self) -> None:
         try:
@@ -79,3 +76,13 @@ class Control:
     def close(self) -> None:
         self._stop.set()
         self._thread.join(2.0)
+
+
+def _touch(args: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of a press, where it has the ones that it needs."""
+    for key in ("x", "y"):
+        if key not in args:
+            raise ValueError(f"press needs {key}, in metres")
+    if args.get("force") is None and args.get("drop") is None:
+        raise ValueError("press needs force (N) or drop (S/m)")
+    return {key: value for key, value in args.items() if key != "skin"}

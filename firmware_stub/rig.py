@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from models.patterns import pattern
-
 from . import scene as scenes
 from .analog import Analog, Noise
 from .board import Board, Scan, measurement_s
@@ -26,6 +24,7 @@ from .sheet import Sheet
 from .timeline import Timeline, press_track
 from .world import World
 
+UNTOUCHED = "demo"  # the scene in which nothing touches
 SLEPT_S = 1.0  # a longer pause between two calls was the machine's sleep, not the board's
 
 
@@ -47,6 +46,7 @@ class Rig:
         crystal_ppm: float = 12.0,
         baud: int = BAUD,
         seed: int | None = None,
+        unique_id: bytes = b"eitskin-stub",
         threaded: bool = False,
         answers_time: bool = True,
     ) -> None:
@@ -60,7 +60,7 @@ class Rig:
         self._rng = np.random.default_rng(seed)
         self._realtime = threaded
         noise = Noise(10 ** (-snr_db / 20), floor_ohm)
-        full_s = len(pattern(self.sheet.skin.pattern_name, self.sheet.electrodes)) * measurement_s(128)
+        full_s = len(self.sheet.skin.pattern) * measurement_s(128)
         self.board = Board(
             self.field,
             Analog(noise, self.faults, np.random.default_rng(self._rng.integers(2**63))),
@@ -69,6 +69,7 @@ class Rig:
             speed=rate_hz * full_s if rate_hz else 1.0,
             crystal_ppm=crystal_ppm,
             answers_time=answers_time,
+            unique_id=unique_id,
             on_scan=self._scanned,
         )
         self._unplugged: dict[str, Any] | None = None
@@ -143,11 +144,15 @@ class Rig:
         }
 
     def release(self, now: float) -> dict[str, Any]:
-        """Take every press off."""
+        """Take every press off and end the scene: nothing touches any more. Faults go on."""
         old = self.field.timeline
         gone = sum(p.times[-1] > now for p in old.presses)
-        self.field.play(Timeline(old.script, old.start, (), old.electrodes), now)
-        return {"released": gone}
+        self.play(UNTOUCHED, now)
+        return {
+            "released": gone,
+            "scene_ended": None if old.script.name == UNTOUCHED else old.script.name,
+            "faults": self.faults.listing(now),
+        }
 
     def play(self, name: str, now: float) -> dict[str, Any]:
         """Begin a scene. Raises SceneError."""
@@ -160,12 +165,14 @@ class Rig:
     def fault(self, name: str, args: Mapping[str, Any], now: float, seconds: float = 5.0) -> dict[str, Any]:
         """Let something go wrong, see FAULTS. Raises ValueError."""
         for key in ("electrode", "electrodes"):
-            for electrode in np.atleast_1d(args.get(key, 0)):
+            given = args.get(key, 0)
+            for electrode in given if isinstance(given, list) else [given]:
                 if electrode not in range(self.sheet.electrodes):
                     raise ValueError(
                         f"fault {name}: electrode {electrode!r}, expected 0 to {self.sheet.electrodes - 1}"
                     )
-        return {"fault": name, "args": self.faults.inject(name, args, now, seconds), "what": FAULTS[name].what}
+        full, row = self.faults.inject(name, args, now, seconds), FAULTS[name]
+        return {"fault": name, "args": full, "what": row.what, "sticky": row.sticky, "seconds": seconds}
 
     def status(self, now: float) -> dict[str, Any]:
         world = self.field.timeline.at(now)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from models import geometry
+from models.bundle import Bundle
 from models.forward import ForwardModel
 from models.shapes import Shape
 
@@ -15,10 +18,14 @@ MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through
 
 
 class Sheet:
-    """Forward model on the mesh "stub", which nothing is trained or inverted on. Units: ohm, metres."""
+    """Forward model on the mesh "stub", which nothing is trained or inverted on. Units: ohm, metres.
 
-    def __init__(self, geometry_name: str = "square16") -> None:
-        self.skin = geometry.load(geometry_name)
+    `of`: a skin of models/skins, a TOML file, or the folder of a bundle, whose manifest says its geometry.
+    """
+
+    def __init__(self, of: str = "square16") -> None:
+        in_bundle = (Path(of) / "manifest.json").is_file()
+        self.skin = geometry.from_dict(Bundle.load(of).skin) if in_bundle else geometry.load(of)
         self.model = ForwardModel(self.skin, mesh="stub")
 
     @property

@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+CONFIG_LINK = "config"
+"""Name of the link, in the runtime folder, to the configuration of the service that runs there."""
 MAX_SOCKET_PATH = 107
 """Longest path of a Unix socket on Linux, in bytes (sun_path less its final 0)."""
 

@@ -6,47 +6,28 @@ import itertools
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle, BundleError
 from protocol import transport
-from protocol.frames import InfoFrame, RawFrame
 from protocol.link import SCHEMA_HASH
-from protocol.runtime import AlreadyRunning, RuntimeDirError, lock, runtime_dir
-from protocol.sockets import AllReader, ControlClient, ControlError, NewestReader
+from protocol.runtime import RuntimeDirError, runtime_dir
+from services import doctor_live as live
 from services.baseline.tare import implausibility
 from services.board import port as ports
 from services.board.boardlink import BoardLink, Scanning
 from services.config import RECORDINGS, Config, ConfigError, Skin, config_path, load
 from services.contacts.force import ForceLaw
-from services.stage import PROCESSES
+from services.doctor_live import Finding
 
 BOARD_S = 2.5  # for a board to say who it is
-FRAME_S = 1.5
 LATENCY_TIMER_MS = 1
 GOOD_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page")
 GOOD_FIT = 0.01  # relative misfit of |Z0| to the bundle's prediction
 SWAP_GAIN = 3.0  # a swap of two electrodes is suspected where it makes the fit so many times better
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line: `level` OK, WARN, FAIL or SKIP (not looked at); what was looked at; what was found and what to do."""
-
-    level: str
-    what: str
-    text: str
-
-    def __str__(self) -> str:
-        return f"{self.level:4s}  {self.what:18s} {self.text}"
-
-    def plain(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def examine(path: Path | None = None) -> list[Finding]:
@@ -67,21 +48,13 @@ def _examine(path: Path | None) -> Iterator[Finding]:
     except RuntimeDirError as why:
         yield Finding("FAIL", "runtime folder", str(why))
         return
-    running = _running()
+    running = live.running()
     yield Finding("OK", "runtime folder", f"{folder}, {'a service runs' if running else 'no service runs'} there")
-    yield _clock()
     if running:
-        yield from _processes()
+        yield from live.configuration(config.path)
+    yield _clock()
     for name, skin in config.skins.items():
         yield from _skin(name, skin, config, running)
-
-
-def _running() -> bool:
-    try:
-        with lock():
-            return False
-    except AlreadyRunning:
-        return True
 
 
 def _clock() -> Finding:
@@ -93,17 +66,6 @@ def _clock() -> Finding:
     if source in GOOD_CLOCKS:
         return Finding("OK", "clock", f"monotonic clock from {source}")
     return Finding("WARN", "clock", f"the kernel's clock source is {source}, slow to read; expected {GOOD_CLOCKS[0]}")
-
-
-def _processes() -> Iterator[Finding]:
-    for name in PROCESSES:
-        try:
-            status = ControlClient(name, 1.0).call("status")
-        except ControlError as why:
-            yield Finding("FAIL", name, str(why))
-            continue
-        level = {"OK": "OK", "WARN": "WARN"}.get(str(status.get("level")), "FAIL")
-        yield Finding(level, name, "; ".join(status.get("messages", [])) or "frames flow")
 
 
 def _skin(name: str, skin: Skin, config: Config, running: bool) -> Iterator[Finding]:
@@ -121,12 +83,19 @@ def _skin(name: str, skin: Skin, config: Config, running: bool) -> Iterator[Find
     if Path(skin.port).suffix in RECORDINGS:
         found = Path(skin.port).is_file()
         yield Finding("OK" if found else "FAIL", f"{name}: port", f"{skin.port} {'is' if found else 'is not'} there")
+    elif running:
+        yield from live.port(name, skin)
     elif skin.port == "stub":
-        yield Finding("OK", f"{name}: port", "the stub board, started by `skin up`")
+        yield Finding("OK", f"{name}: port", "the stub board, which `skin up` starts")
     else:
-        yield from _device(name, skin, bundle, running)
+        yield from _device(name, skin, bundle)
+    if skin.port != "stub":
+        yield from _latency_timer(name, skin)
     if running:
-        yield from _frames(name, bundle)
+        yield from live.processes(name)
+        info = live.info(name)
+        yield from live.compared(name, skin, bundle, info)
+        yield electrode_order(name, live.baseline(info), bundle)
     else:
         yield Finding("SKIP", f"{name}: electrodes", "their order is looked at while the service runs: `skin up`")
 
@@ -142,21 +111,21 @@ def _calibration(name: str, skin: Skin, bundle: Bundle) -> Finding:
     return Finding("OK", what, f"{skin.calibration}: {law}")
 
 
-def _device(name: str, skin: Skin, bundle: Bundle, running: bool) -> Iterator[Finding]:
+def _device(name: str, skin: Skin, bundle: Bundle) -> Iterator[Finding]:
     what = f"{name}: port"
-    if running:
-        yield Finding("OK", what, f"{skin.port}, in use by our acquisition")
-    else:
-        try:
-            port = ports.Port(skin.port)
-        except ports.PortError as why:
-            yield Finding("FAIL", what, str(why))
-            return
-        try:
-            yield Finding("OK", what, f"{skin.port} opens")
-            yield _board(name, skin, bundle, port)
-        finally:
-            port.close()
+    try:
+        port = ports.Port(skin.port)
+    except ports.PortError as why:
+        yield Finding("FAIL", what, str(why))
+        return
+    try:
+        yield Finding("OK", what, f"{skin.port} opens")
+        yield _board(name, skin, bundle, port)
+    finally:
+        port.close()
+
+
+def _latency_timer(name: str, skin: Skin) -> Iterator[Finding]:
     timer = Path("/sys/bus/usb-serial/devices", Path(os.path.realpath(skin.port)).name, "latency_timer")
     if timer.is_file():
         found = int(timer.read_text())
@@ -181,34 +150,6 @@ def _board(name: str, skin: Skin, bundle: Bundle, port: ports.Port) -> Finding:
     if link.state == "refused":
         return Finding("FAIL", what, link.problem)
     return Finding("OK", what, f"{link.board}, firmware {link.ident.firmware!r}, schema {SCHEMA_HASH:08x} as ours")
-
-
-def _frames(name: str, bundle: Bundle) -> Iterator[Finding]:
-    raw = NewestReader("raw", name)
-    frame = raw.recv(FRAME_S)
-    raw.close()
-    if isinstance(frame, RawFrame):
-        sigma = f"sample times known to {frame.sample_sigma_ns / 1e6:.2f} ms"
-        level = "WARN" if "clock" in frame.reasons else "OK"
-        yield Finding(
-            level, f"{name}: frames", f"{len(frame.z)} measurements from {frame.board or frame.source}, {sigma}"
-        )
-    else:
-        yield Finding("FAIL", f"{name}: frames", f"no raw frame within {FRAME_S:g} s: see acquisition above")
-    yield electrode_order(name, _baseline(name), bundle)
-
-
-def _baseline(name: str) -> NDArray[np.float64] | None:
-    reader = AllReader(["info"], name)
-    end = time.monotonic() + FRAME_S
-    try:
-        while (left := end - time.monotonic()) > 0:
-            frame = reader.recv(left)
-            if isinstance(frame, InfoFrame) and "baseline" in frame.info:
-                return np.array(frame.info["baseline"], dtype=float)
-    finally:
-        reader.close()
-    return None
 
 
 def electrode_order(name: str, z0: NDArray[np.float64] | None, bundle: Bundle) -> Finding:

@@ -25,9 +25,8 @@ from supervisor.process import Subprocess
 from supervisor.states import ProcessStates
 from supervisor.supervisord import Supervisor
 
-from protocol.runtime import lock, runtime_dir
-from services.board.port import STUB_LINK
-from services.config import ROOT, Config
+from protocol.runtime import CONFIG_LINK, lock, runtime_dir
+from services.config import BUNDLES, MANIFEST, ROOT, Config
 from services.stage import PROCESSES
 
 POLL_S = 0.05
@@ -50,9 +49,20 @@ class Program:
 def programs(config: Config) -> list[Program]:
     """What a configuration needs: the stages, and the stub where a skin's port is "stub"."""
     found = [Program(name, f"services.{name}") for name in PROCESSES]
-    if any(skin.port == "stub" for skin in config.skins.values()):
-        found.insert(0, Program("stub", "firmware_stub"))
+    if on_stub := stub_arguments(config):
+        found.insert(0, Program("stub", "firmware_stub", on_stub))
     return found
+
+
+def stub_arguments(config: Config) -> tuple[str, ...]:
+    """What `python -m firmware_stub` is told: a board for each skin whose port is "stub", with that skin's bundle."""
+    skins = [(name, skin) for name, skin in config.skins.items() if skin.port == "stub"]
+    return tuple(part for name, skin in skins for part in ("--skin", f"{name}={_folder(skin.bundle)}"))
+
+
+def _folder(bundle: str) -> Path:
+    """A bundle's folder; the stub runs in the checkout, wherever `skin up` was called."""
+    return Path(bundle).resolve() if (Path(bundle) / MANIFEST).is_file() else BUNDLES / bundle
 
 
 def up(config: Config, extra: Sequence[Program] = (), wanted: Sequence[Program] | None = None) -> int:
@@ -63,6 +73,7 @@ def up(config: Config, extra: Sequence[Program] = (), wanted: Sequence[Program] 
     runtime = runtime_dir()
     with lock():
         running = list(programs(config) if wanted is None else wanted) + list(extra)
+        _link(runtime / CONFIG_LINK, config.path.resolve())
         file = runtime / "supervisord.conf"
         file.write_text(_settings(runtime, config, running), encoding="utf-8")
         options = ServerOptions()
@@ -83,13 +94,19 @@ def _clear(runtime: Path, ran: Sequence[Program]) -> None:
     """Remove what we and the programs that ran left in the runtime folder. `lock` and `state` stay, and so do sockets
     of others (`skin record`, `skin replay`).
     """
-    left = [runtime / "supervisord.conf", runtime / "supervisord.pid"]
+    left = [runtime / "supervisord.conf", runtime / "supervisord.pid", runtime / CONFIG_LINK]
     left += [runtime / f"{program.name}{suffix}" for program in ran for suffix in (".ipc", ".ctl")]
     if any(program.name == "stub" for program in ran):
-        left += [path for path in runtime.glob(f"{STUB_LINK}*") if path.is_symlink()]
+        left += [path for path in runtime.glob("board*") if path.is_symlink()]
     for path in left:
         with contextlib.suppress(OSError):  # not there, mostly
             path.unlink()
+
+
+def _link(link: Path, target: Path) -> None:
+    """Tell whoever comes to this folder which configuration runs here."""
+    link.unlink(missing_ok=True)
+    link.symlink_to(target)
 
 
 class _Service(Supervisor):  # type: ignore[misc]

@@ -16,7 +16,7 @@ from serial.tools import list_ports
 from protocol.runtime import runtime_dir
 
 BAUD = 921_600
-STUB_LINK = "board"  # name of the stub's pty in the runtime folder
+STUB_LINKS = "board-"  # and the skin's name: the link to the stub's pty in the runtime folder
 
 
 class PortError(Exception):
@@ -71,18 +71,18 @@ class Port:
             pass
 
 
-def candidates(port: str, usb_serial: str | None, known_board: bool) -> Iterator[str]:
-    """URLs at which the board may be: first the configured one, then, once we know it, the names it may have come
-    back under.
+def candidates(port: str, skin: str, usb_serial: str | None, known_board: bool) -> Iterator[str]:
+    """URLs at which the skin's board may be: first the configured one, then, once we know it, the names it may have
+    come back under.
     """
     if port == "stub":
         folder = runtime_dir()
-        link = folder / STUB_LINK
+        link = folder / f"{STUB_LINKS}{skin}"
         # A pty's path, or the URL of a stub that listens on a socket: ptys do not cross containers.
         target = os.readlink(link) if link.is_symlink() else ""
         yield target if "://" in target else str(link)
         if known_board:
-            yield from (str(p) for p in sorted(folder.glob(STUB_LINK + "?*")) if p.is_symlink())
+            yield from (str(p) for p in sorted(folder.glob("board*")) if p.is_symlink() and p != link)
         return
     yield port
     if "://" in port or not known_board:
@@ -109,7 +109,7 @@ def explain(url: str, why: Exception) -> str:
     if "exclusively lock" in text or number in (11, 16):
         return f"{url} is held by another program: close that one (`fuser {url}` names it)"
     if number == 2 or "No such file" in text:
-        if url == str(runtime_dir() / STUB_LINK):
+        if url.startswith(str(runtime_dir() / STUB_LINKS)):
             return "the stub board is not there yet: `skin up` starts it, or `python -m firmware_stub`"
         return f"{url} is not there: plug the board in, or correct `port` in skin.toml"
     if number == 13 or "Permission denied" in text:

@@ -87,7 +87,7 @@ class BoardSource(Source):
 
     def frames(self) -> Iterator[RawFrame | None]:
         while True:
-            for n, url in enumerate(ports.candidates(self.skin.port, self._usb_serial, bool(self._board))):
+            for n, url in enumerate(ports.candidates(self.skin.port, self.name, self._usb_serial, bool(self._board))):
                 try:
                     self._port = self.open_port(url)
                 except ports.PortError as why:

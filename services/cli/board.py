@@ -7,14 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from services.cli.common import USAGE, JsonOption, SkinOption, control, emit, fail, skin_name
+from services.cli.common import USAGE, JsonOption, SkinOption, control, emit, fail, of_service, skin_name
 
 Metre = Annotated[float, typer.Option(help="Metres in the skin's frame, origin at its centre.")]
 
 
 def register(app: typer.Typer) -> None:
     for command in (press, release, scene, fault, tare):
-        app.command()(command)
+        app.command()(of_service(command))
 
 
 def press(
@@ -44,9 +44,15 @@ def press(
 
 
 def release(skin: SkinOption = "", as_json: JsonOption = False) -> None:
-    """Take every press off the stub's skin."""
+    """Take every press off the stub's skin and end its scene: nothing touches any more. Faults go on."""
     answer = _stub("release", skin)
-    emit(answer) if as_json else print("released")
+    if as_json:
+        emit(answer)
+        return
+    ended = f", scene {answer['scene_ended']} ended" if answer["scene_ended"] else ""
+    print(f"nothing touches: {answer['released']} of your presses released{ended}")
+    if answer["faults"]:
+        print(f"faults that go on: {', '.join(answer['faults'])} (`skin fault --clear` ends them)")
 
 
 def scene(
@@ -66,7 +72,12 @@ def scene(
 
         name = str(Path(name).resolve())
     answer = _stub("scene", skin, name=name)
-    emit(answer) if as_json else print(f"playing {name}")
+    if as_json:
+        emit(answer)
+        return
+    length = f", {answer['seconds']:g} s" if answer["seconds"] else ""
+    again = ", again and again" if answer["loop"] else ""
+    print(f"playing {answer['scene']}{length}{again}: {answer['about']}; `skin release` ends it")
 
 
 def fault(
@@ -81,13 +92,30 @@ def fault(
     args: dict[str, Any] = {"name": name, "args": dict(_pair(a) for a in arguments or [])}
     args |= {"seconds": seconds, "clear": clear}
     answer = _stub("faults", skin, **(args if name or clear else {}))
-    if as_json or name or clear:
+    if as_json:
         emit(answer)
-        return
-    for fault_name, row in answer.get("known", answer).items():
-        what, defaults = (row.get("what", ""), row.get("args", {})) if isinstance(row, dict) else (row, {})
-        listed = ", ".join(f"{key}={value}" for key, value in defaults.items())
-        print(f"{fault_name:20s} {what}" + (f"  [{listed}]" if listed else ""))
+    elif clear:
+        left = ", ".join(answer["faults"])
+        print(f"faults that go on: {left}" if left else "no fault is in force")
+    elif name:
+        given = " ".join(f"{key}={value}" for key, value in answer["args"].items())
+        print(f"{name} {given}".rstrip() + f": {answer['what']}")
+        if name != "power_cycle":  # which happens at once
+            print(f"{_lasts(answer)}, or until `skin fault {name} --clear`")
+    else:
+        for fault_name, row in answer["known"].items():
+            listed = ", ".join(f"{key}={value}" for key, value in row["args"].items())
+            sticky = " (sticky)" if row["sticky"] else ""
+            print(f"{fault_name:20s} {row['what']}{sticky}" + (f"  [{listed}]" if listed else ""))
+        print("A sticky fault lasts until `skin fault power_cycle`; every other one for --seconds.")
+        if answer["faults"]:
+            print(f"in force now: {', '.join(answer['faults'])}")
+
+
+def _lasts(answer: dict[str, Any]) -> str:
+    if answer["sticky"]:
+        return "sticky, it does not end by itself: it lasts until `skin fault power_cycle`"
+    return f"it lasts {answer['seconds']:g} s"
 
 
 def _pair(text: str) -> tuple[str, Any]:

@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from services.cli.common import USAGE, JsonOption, SkinOption, emit, fail, skin_name, use_configured_sockets
+from services.cli.common import (
+    USAGE,
+    JsonOption,
+    SkinOption,
+    config_file,
+    emit,
+    fail,
+    of_service,
+    skin_name,
+    use_configured_sockets,
+)
 
 if TYPE_CHECKING:
     from services.calibrating.calibration_fit import Press
@@ -20,7 +30,7 @@ PLAN = ((0, 0, 1), (0, 0, 3), (0, 0, 5), (1, 1, 2), (-1, 1, 4), (-1, -1, 2), (1,
 def register(app: typer.Typer) -> None:
     calibrate = typer.Typer(help="Teach a skin from what is known.", no_args_is_help=True)
     calibrate.callback()(lambda: None)  # so that `force` stays a command of its own
-    calibrate.command("force")(force)
+    calibrate.command("force")(of_service(force))
     app.add_typer(calibrate, name="calibrate")
 
 
@@ -47,7 +57,7 @@ def force(
     from services.config import load
 
     name = skin_name(skin)
-    configured = load().skin(name)
+    configured = load(config_file()).skin(name)
     bundle = Bundle.load(configured.bundle)
     if measurements is not None and csv is None:
         fail(

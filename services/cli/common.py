@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import inspect
 import json
 import os
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -15,6 +19,12 @@ ROOT = Path(__file__).resolve().parents[2]
 FAILED, USAGE, NOT_RUNNING = 1, 2, 3
 """Exit codes: it did not work, the request itself is wrong, no service answers."""
 
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="Configuration; default: the running service's, else skin.toml.")
+]
+RuntimeOption = Annotated[
+    Path | None, typer.Option("--runtime", help="Runtime folder of the service; default: as README says.")
+]
 SkinOption = Annotated[str, typer.Option("--skin", help="Which skin; default: the first of skin.toml.", metavar="NAME")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 
@@ -31,12 +41,43 @@ def fail(message: str, code: int = FAILED) -> NoReturn:
     raise CliError(message, code)
 
 
-def nobody(skin: str, seconds: float) -> str:
+def of_service(command: Callable[..., Any], starts: bool = False) -> Callable[..., Any]:
+    """The command with --config and --runtime: which service it talks to. `starts`: the folder may be a new one."""
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, config: Path | None = None, runtime: Path | None = None, **more: Any) -> Any:
+        if runtime is not None:
+            if not starts and not runtime.is_dir():
+                fail(f"no folder {runtime}: no service runs there; `skin up` says which folder it uses", USAGE)
+            os.environ["EITSKIN_RUNTIME"] = str(runtime.absolute())
+        if config is not None:
+            if not config.is_file():
+                fail(f"no file {config}: expected a configuration such as {ROOT / 'skin.toml'}", USAGE)
+            os.environ["EITSKIN_CONFIG"] = str(config.resolve())
+        return command(*args, **more)
+
+    signature = inspect.signature(command, eval_str=True)
+    added = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+        for name, annotation in (("config", ConfigOption), ("runtime", RuntimeOption))
+    ]
+    found = signature.replace(parameters=[*signature.parameters.values(), *added])
+    wrapped.__signature__ = found  # type: ignore[attr-defined]
+    wrapped.__annotations__ = {name: parameter.annotation for name, parameter in found.parameters.items()}
+    return wrapped
+
+
+def nobody(skin: str, seconds: float, topic: str = "") -> str:
     """What to say where a service was listened to and nothing came."""
     from protocol.runtime import runtime_dir
 
-    found = f"no frame of skin {skin!r} came within {seconds:g} s at {runtime_dir()}"
-    return f"{found}: start the service with `skin up`, or set EITSKIN_RUNTIME"
+    folder = runtime_dir()
+    what = f"{topic}/{skin}" if topic else f"skin {skin!r}"
+    found = f"no frame of {what} came within {seconds:g} s at {folder}"
+    if not (folder / "publisher.ctl").exists():
+        return f"{found}: start the service with `skin up`, or name its folder with --runtime"
+    skins = ", ".join(_configuration().get("skins", {}))
+    return f"{found}: `skin doctor` says why (skins of {config_file()}: {skins})"
 
 
 EXPECTED = {
@@ -67,22 +108,43 @@ def expected_code(error: BaseException) -> int | None:
     return None
 
 
+def running_config() -> Path | None:
+    """The configuration of the service that runs in the runtime folder (`skin up` leaves a link to it there)."""
+    from protocol.runtime import CONFIG_LINK, RuntimeDirError, runtime_dir
+
+    with contextlib.suppress(RuntimeDirError, OSError):
+        link = runtime_dir(create=False) / CONFIG_LINK
+        if link.is_symlink() and link.is_file():
+            return Path(os.readlink(link))
+    return None
+
+
 def config_file() -> Path:
-    """The same file as services.config.config_path, without importing it."""
-    return Path(os.environ.get("EITSKIN_CONFIG") or ROOT / "skin.toml")
+    """The configuration meant: $EITSKIN_CONFIG (--config sets it), else the running service's, else the checkout's."""
+    return Path(os.environ.get("EITSKIN_CONFIG") or running_config() or ROOT / "skin.toml")
 
 
 def _configuration() -> dict[str, Any]:
-    """The configuration as it stands, unchecked; empty where there is none."""
+    """The configuration as it stands, unchecked; CliError where there is none that can be read."""
+    file = config_file()
     try:
-        return tomllib.loads(config_file().read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as why:
+        fail(f"{file}: cannot be read: {why.strerror}; name the configuration with --config", USAGE)
+    except ValueError as why:
+        fail(f"{file}: is not TOML: {why}", USAGE)
 
 
 def skin_name(given: str) -> str:
-    """The skin meant: the one given, else the first that the configuration names."""
-    return given or next(iter(_configuration().get("skins", {})), "palm")
+    """The skin meant: the one given, else the first that the configuration names. CliError where the service that runs
+    has no such skin.
+    """
+    if given and running_config() != config_file():
+        return given  # a service elsewhere, or in containers: it knows
+    skins = _configuration().get("skins", {})
+    if given and given not in skins:
+        fail(f"no skin {given!r}: {config_file()} has {', '.join(skins)}", USAGE)
+    return given or next(iter(skins), "palm")
 
 
 def use_configured_sockets() -> None:
@@ -91,7 +153,7 @@ def use_configured_sockets() -> None:
         from protocol import transport
         from services.config import load
 
-        transport.configure(load().transport())
+        transport.configure(load(config_file()).transport())
 
 
 def emit(value: Any) -> None:
@@ -122,7 +184,11 @@ def control(process: str, command: str, *, timeout_s: float = 2.0, **args: Any) 
     who = "the stub board" if process == "stub" else process
     address = transport.current().control_address(process)
     if address.startswith("ipc://") and not os.path.exists(address.removeprefix("ipc://")):
-        fail(f"{who} does not run here (no {address}): start it with `skin up`, or set EITSKIN_RUNTIME", NOT_RUNNING)
+        what = 'a skin with port = "stub" in its configuration has one' if process == "stub" else "start it: `skin up`"
+        found = f"{who} does not run here (no {address})"
+        if os.path.exists(transport.current().control_address("publisher").removeprefix("ipc://")):
+            fail(f"{found}: {what}", NOT_RUNNING)
+        fail(f"{found}: start the service with `skin up`, or name its folder with --runtime", NOT_RUNNING)
     try:
         answer: dict[str, Any] = ControlClient(process, timeout_s).call(command, **args)
         return answer

@@ -12,7 +12,8 @@ from rich.text import Text
 RAMP = ((16, 18, 32), (56, 24, 96), (150, 30, 90), (230, 90, 40), (255, 200, 60), (255, 255, 220))
 """Colours from no drop to the full one."""
 LETTERS = ".:-=+*#%@"
-OUTSIDE = (0, 0, 0)
+SCALE = 9  # characters of the scale below the skin
+FULL_SCALE = 0.5  # S/m, the brightest colour, unless a larger drop is there
 
 
 def colour(value: float) -> tuple[int, int, int]:
@@ -38,39 +39,72 @@ def inside(outline: Sequence[Sequence[float]], x: NDArray[Any], y: NDArray[Any])
     return result
 
 
+def top_of_scale(image: NDArray[np.floating[Any]] | None) -> float:
+    """The drop [S/m] that the brightest colour stands for."""
+    return FULL_SCALE if image is None or image.size == 0 else max(FULL_SCALE, float(image.max()))
+
+
 def draw(
     image: NDArray[np.floating[Any]] | None,
     half_width_m: float,
     contacts: Sequence[tuple[float, float]] = (),
     outline: Sequence[Sequence[float]] | None = None,
-    full_scale: float = 0.5,
     cells: int = 32,
     coloured: bool = True,
 ) -> Text:
-    """Text of cells / 2 lines of `cells` columns, y upwards; `contacts` are (x, y) in metres, `full_scale` in S/m.
+    """Text of cells / 2 lines of `cells` columns, y upwards; `contacts` are (x, y) in metres.
 
     Not `coloured`: one character for the stronger of each two cells.
     """
     values = np.zeros((cells, cells)) if image is None or image.size == 0 else coarse(image, cells)
-    values = values / max(full_scale, float(values.max()))
+    values = values / top_of_scale(image)
     axis = (-1 + 2 * (np.arange(cells) + 0.5) / cells) * half_width_m
     covered = np.ones((cells, cells), bool) if outline is None else inside(outline, axis[None, :], axis[:, None])
     marks = {(_cell(y, half_width_m, cells) // 2, _cell(x, half_width_m, cells)) for x, y in contacts}
     text = Text()
     for row in range(cells // 2 - 1, -1, -1):
         for column in range(cells):
-            top, bottom = (colour(values[r, column]) if covered[r, column] else OUTSIDE for r in (2 * row + 1, 2 * row))
-            if not coloured:
-                value = max(values[2 * row, column], values[2 * row + 1, column])
-                letter = LETTERS[min(int(value * len(LETTERS)), len(LETTERS) - 1)]
-                on = covered[2 * row, column] or covered[2 * row + 1, column]
-                text.append("X" if (row, column) in marks else letter if on else " ")
-            elif (row, column) in marks:
-                text.append("+", style=f"bold white on rgb({bottom[0]},{bottom[1]},{bottom[2]})")
+            pair = values[[2 * row + 1, 2 * row], column]
+            on = covered[[2 * row + 1, 2 * row], column]
+            if (row, column) in marks:
+                style = f"bold white on {_rgb(pair[1])}" if coloured else ""
+                text.append("+" if coloured else "X", style=style)
+            elif not coloured:
+                letter = LETTERS[min(int(pair.max() * len(LETTERS)), len(LETTERS) - 1)]
+                text.append(letter if on.any() else " ")
+            elif on.all():
+                text.append("▀", style=f"{_rgb(pair[0])} on {_rgb(pair[1])}")
+            elif on.any():
+                text.append("▀" if on[0] else "▄", style=_rgb(pair[0 if on[0] else 1]))
             else:
-                text.append("▀", style=f"rgb({top[0]},{top[1]},{top[2]}) on rgb({bottom[0]},{bottom[1]},{bottom[2]})")
+                text.append(" ")
         text.append("\n")
     return text
+
+
+def framed(skin: Text, half_width_m: float, full_scale: float, coloured: bool = True) -> Text:
+    """What `draw` gives, with axes in mm, and the scale of its colours below."""
+    lines = skin.split("\n")[:-1] if skin.plain.endswith("\n") else skin.split("\n")
+    lines = [line for line in lines if line.plain or len(lines) == 1]
+    half, width = f"{half_width_m * 1e3:.0f}", len(lines[0])
+    labels = {0: f"+{half}", len(lines) // 2: "0", len(lines) - 1: f"-{half}", 1: "y mm"}
+    text = Text()
+    for k, line in enumerate(lines):
+        text.append(f"{labels.get(k, ''):>5s} ", style="dim").append(line).append("\n")
+    middle = f"{'0':^{width - 2 * len(half) - 2}s}"
+    text.append(f"{'':6s}-{half}{middle}+{half}\n", style="dim")
+    text.append(f"{'x mm':^{width + 12}s}".rstrip() + "\n", style="dim")
+    text.append("conductivity drop 0 ", style="dim")
+    for k in range(SCALE):
+        if coloured:
+            text.append("█", style=_rgb((k + 0.5) / SCALE))
+        else:
+            text.append(LETTERS[k * len(LETTERS) // SCALE])
+    return text.append(f" {full_scale:.2f} S/m", style="dim")
+
+
+def _rgb(value: float) -> str:
+    return "rgb({},{},{})".format(*colour(float(value)))
 
 
 def _cell(position: float, half_width_m: float, cells: int) -> int:

@@ -72,6 +72,9 @@ class Monitor:
         self.processes: dict[str, tuple[StatusFrame, float]] = {}
         self._before: dict[str, StatusFrame] = {}  # the status before the last, of each
         self.info: dict[str, Any] = {}
+        self.image: ImageFrame | None = None
+        """The last frame that brought an image, for as long as later ones hold it; None while nothing touches."""
+        self.image_held = False
 
     def read(self, seconds: float) -> None:
         """Takes in what arrives within `seconds`."""
@@ -90,6 +93,10 @@ class Monitor:
             self.info.update(frame.info)
         else:
             self.topics[TOPIC_OF[type(frame)].name].add(frame, now_s)
+            if isinstance(frame, ImageFrame):
+                self.image_held = frame.held
+                if frame.image.size or not (frame.held and frame.touched):
+                    self.image = frame if frame.image.size else None
 
     @property
     def heard(self) -> bool:
@@ -99,11 +106,6 @@ class Monitor:
     def contact(self) -> ContactFrame | None:
         last = self.topics["contact"].last
         return last if isinstance(last, ContactFrame) else None
-
-    @property
-    def image(self) -> ImageFrame | None:
-        last = self.topics["image"].last
-        return last if isinstance(last, ImageFrame) else None
 
     def snapshot(self) -> dict[str, Any]:
         """Everything `skin top` shows, as plain values."""
@@ -122,6 +124,8 @@ class Monitor:
                 name: _process(status, self._before.get(name), now - seen)
                 for name, (status, seen) in sorted(self.processes.items())
             },
+            "valid": bool(contact and contact.valid),
+            "reasons": list(contact.reasons) if contact else [],
             "contacts": [
                 {"id": c.id, "state": c.state, "position": list(c.position), "force_n": c.force_n, "shape": c.shape}
                 for c in (contact.contacts if contact else [])

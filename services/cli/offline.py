@@ -135,11 +135,13 @@ def _dispatch(module: str, args: list[str]) -> None:
     """Hands the rest of the command line to a module's `main`."""
     import importlib
 
+    from models import not_installed
+
     try:
-        main = importlib.import_module(module).main
+        status = importlib.import_module(module).main(args)
     except ImportError as error:
-        missing = error.name or module
-        if missing.split(".")[0] in ("models", "bench", "services"):
+        said = not_installed(error)
+        if not said:
             fail(f"{module} cannot be loaded: {error}")
-        fail(f"{module} needs the Python package {missing!r}, which is not installed: run `make venv-dev`", USAGE)
-    raise typer.Exit(main(args) or 0)
+        fail(f"{module}: {said}", USAGE)
+    raise typer.Exit(status or 0)

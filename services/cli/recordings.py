@@ -9,15 +9,25 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from services.cli.common import USAGE, JsonOption, SkinOption, emit, fail, load_npz, skin_name, use_configured_sockets
+from services.cli.common import (
+    USAGE,
+    JsonOption,
+    SkinOption,
+    emit,
+    fail,
+    load_npz,
+    of_service,
+    skin_name,
+    use_configured_sockets,
+)
 
 if TYPE_CHECKING:
     from protocol.frames import ContactFrame
 
 
 def register(app: typer.Typer) -> None:
-    app.command()(record)
-    app.command()(replay)
+    app.command()(of_service(record))
+    app.command()(of_service(replay, starts=True))
     app.command("import")(import_file)
 
 

@@ -1,4 +1,4 @@
-"""The picture of `skin top`: tables of topics and processes beside the skin's heat map."""
+"""The picture of `skin top`: the skin as a heat map, its contacts, and how topics and processes do."""
 
 from __future__ import annotations
 
@@ -9,64 +9,99 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from services.cli.heatmap import draw
+from services.cli.heatmap import draw, framed, top_of_scale
 from services.cli.monitor import Monitor
 
 WIDE = 130
-"""Columns from which the skin is drawn beside the tables instead of below them."""
+"""Columns from which every latency and counter is shown."""
+NARROW = 76
+"""Columns from which the tables stand beside the skin instead of below it."""
+MOST_CONTACTS, MOST_SAYINGS = 4, 2  # rows of them that 24 lines have room for
 LEVELS = {"OK": "green", "WARN": "yellow", "ERROR": "bold red", "STALE": "bold red"}
 
 
-def screen(monitor: Monitor, width: int, coloured: bool = True) -> RenderableType:
-    """The whole page for a terminal of so many columns."""
+def screen(monitor: Monitor, width: int, coloured: bool = True, live: bool = False) -> RenderableType:
+    """The whole page for a terminal of so many columns: 24 lines where it is narrower than WIDE."""
     now = monitor.snapshot()
+    leaves = Text("\nq leaves", style="dim") if live else Text()
     if not monitor.heard:
-        return Text(f"waiting for frames of skin {monitor.skin!r}; is the service running (`skin up`)?", style="yellow")
-    tables = Group(_topics(now), _processes(now), _sayings(now))
-    if width < WIDE:
-        return Group(tables, _skin(monitor, coloured), _contacts(now))
-    page = Table.grid(padding=(0, 2))
-    page.add_row(tables, Group(_skin(monitor, coloured), _contacts(now)))
-    return page
+        waiting = f"waiting for frames of skin {monitor.skin!r}: start the service with `skin up`"
+        return Group(Text(waiting, style="yellow"), leaves)
+    wide = width >= WIDE
+    tables = Group(_contacts(now, 16 if wide else MOST_CONTACTS), *(_detailed(now) if wide else _short(now)))
+    page: RenderableType = Group(_skin(monitor, coloured), tables)
+    if width >= NARROW:
+        page = Table.grid(padding=(0, 2))
+        page.add_row(_skin(monitor, coloured), tables)
+    return Group(_verdict(now, live), page, _sayings(now, 8 if wide else MOST_SAYINGS, width))
+
+
+def _verdict(now: dict[str, Any], live: bool) -> Text:
+    """The first line: may the contacts be acted on?"""
+    text = Text(f"skin {now['skin']}: ", style="bold", no_wrap=True, overflow="ellipsis")
+    if "contact" not in now["topics"]:
+        text.append("no contact frames come", style="bold red")
+    elif now["valid"]:
+        text.append("contacts valid", style="green")
+    else:
+        text.append("contacts NOT VALID, do not act on them", style="bold red")
+    if now["reasons"]:
+        text.append(f" ({', '.join(now['reasons'])})", style="yellow")
+    return text.append("   q leaves", style="dim") if live else text
 
 
 def _table(title: str, *heads: str) -> Table:
-    table = Table(box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column(title, no_wrap=True)
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
     return table
 
 
-def _topics(now: dict[str, Any]) -> Table:
-    """Latencies in ms: since the middle of the scan, and since acquisition read it (as `skin bench latency` has it)."""
-    table = _table("topic", "Hz", "age ms", "p50 ms", "p99 ms", "read p50", "p99", "lost")
-    table.add_column("is")
+def _contacts(now: dict[str, Any], most: int) -> RenderableType:
+    table = _table("contact", "x mm", "y mm", "force", "shape")
+    for c in now["contacts"][:most]:
+        force = f"{c['force_n']:.2f} N" if c["force_n"] is not None else "unknown"
+        x, y = c["position"][0] * 1e3, c["position"][1] * 1e3
+        table.add_row(str(c["id"]), f"{x:+.1f}", f"{y:+.1f}", force, c["shape"])
+    if not now["contacts"]:
+        return Text("no contact: nothing touches\n" if now["valid"] else "no contact\n", style="dim")
+    more = len(now["contacts"]) - most
+    return Group(table, Text(f"and {more} more\n" if more > 0 else ""))
+
+
+def _short(now: dict[str, Any]) -> list[RenderableType]:
+    """Topics and processes in 38 columns."""
+    topics = _table("topic", "frames/s", "delay ms", "lost")
     for name, row in now["topics"].items():
-        says = Text("valid", style="green") if row["valid"] else Text("invalid", style="bold red")
+        median = _number(row["latency_ms"]["p50"], 0)
+        topics.add_row(name, _number(row["rate_hz"]), median, str(row["lost"]))
+    processes = _table("process", "is", "CPU %")
+    for name, row in now["processes"].items():
+        processes.add_row(name, Text(row["level"], style=LEVELS[row["level"]]), _number(row["cpu"] * 100))
+    return [topics, Text("delay: from mid-scan to here, median\n", style="dim"), processes]
+
+
+def _detailed(now: dict[str, Any]) -> list[RenderableType]:
+    topics = _table("topic", "frames/s", "last ms ago", "delay ms", "p99", "since read ms", "p99", "lost")
+    topics.add_column("is")
+    for name, row in now["topics"].items():
+        says = Text("valid", style="green") if row["valid"] else Text("not valid", style="bold red")
         if row["reasons"]:
             says.append(": " + ", ".join(row["reasons"]), style="yellow")
-        table.add_row(
-            f"{name}/{now['skin']}",
-            _number(row["rate_hz"]),
-            _number(row["age_ms"], 0),
-            _number(row["latency_ms"]["p50"]),
-            _number(row["latency_ms"]["p99"]),
-            _number(row["since_read_ms"]["p50"]),
-            _number(row["since_read_ms"]["p99"]),
-            str(row["lost"]),
-            says,
-        )
-    return table
-
-
-def _processes(now: dict[str, Any]) -> Table:
-    table = _table("process", "level", "CPU %", "work p50 ms", "p99")
-    table.add_column("dropped")
-    table.add_column("spared")
+        latency, read = row["latency_ms"], row["since_read_ms"]
+        times = (row["rate_hz"], 1), (row["age_ms"], 0), (latency["p50"], 1), (latency["p99"], 1), (read["p50"], 1)
+        cells = [_number(value, digits) for value, digits in (*times, (read["p99"], 1))]
+        topics.add_row(f"{name}/{now['skin']}", *cells, str(row["lost"]), says)
+    said = (
+        "delay: from the middle of the scan to here; since read: from the board's last byte. Median, 99th percentile.\n"
+    )
+    processes = _table("process", "is", "CPU %", "ms a frame", "p99")
+    processes.add_column("frames dropped")
+    processes.add_column("network not run")
     for name, row in now["processes"].items():
         latency = row["latency_ms"]
-        table.add_row(
+        processes.add_row(
             name,
             Text(row["level"], style=LEVELS[row["level"]]),
             _number(row["cpu"] * 100),
@@ -75,37 +110,36 @@ def _processes(now: dict[str, Any]) -> Table:
             ", ".join(f"{n} {cause}" for cause, n in row["drops"].items() if n) or "0",
             ", ".join(f"{100 * share:.0f} % {rule}" for rule, share in row["skipped"].items()),
         )
-    return table
+    return [topics, Text(said, style="dim"), processes]
 
 
-def _sayings(now: dict[str, Any]) -> Text:
-    """What the processes have to say, one line each."""
+def _sayings(now: dict[str, Any], most: int, width: int) -> Text:
+    """What the processes have to say, one line each, the worst first."""
+    worst = sorted(now["processes"].items(), key=lambda item: -list(LEVELS).index(item[1]["level"]))
+    said = [(name, row["level"], message) for name, row in worst for message in row["messages"]]
     text = Text()
-    for name, row in now["processes"].items():
-        for message in row["messages"]:
-            text.append(f"{name}: ", style=LEVELS[row["level"]])
-            text.append(message + "\n")
+    for name, level, message in said[:most]:
+        room = max(20, width - len(name) - 2)
+        text.append(f"\n{name}: ", style=LEVELS[level])
+        text.append(message if len(message) <= room else message[: room - 3] + "...")
+    if len(said) > most:
+        text.append(f"  (and {len(said) - most} more: `skin echo status`)", style="dim")
     return text
 
 
 def _skin(monitor: Monitor, coloured: bool) -> RenderableType:
     image, contact = monitor.image, monitor.contact
+    drop = image.image if image is not None else None
     geometry = monitor.info.get("geometry") or {}
     outline = np.asarray(geometry.get("outline", np.zeros((0, 2)))).tolist() or None
     half = max((abs(v) for point in outline for v in point), default=0.05) if outline else 0.05
-    if image is not None and image.image.size:
+    if image is not None:
         half = max(half, -min(image.origin))
-    marks = [(c.position[0], c.position[1]) for c in contact.contacts] if contact else []
-    return draw(image.image if image is not None else None, half, marks, outline, coloured=coloured)
-
-
-def _contacts(now: dict[str, Any]) -> Text:
-    text = Text()
-    for c in now["contacts"]:
-        force = f"{c['force_n']:.2f} N" if c["force_n"] is not None else "force unknown"
-        x, y = c["position"][0] * 1e3, c["position"][1] * 1e3
-        text.append(f"{c['id']:4d} ({x:+6.1f}, {y:+6.1f}) mm  {force}  {c['shape']}\n")
-    return text if now["contacts"] else Text("nothing touches", style="dim")
+    marks = [(c.position[0], c.position[1]) for c in contact.contacts if c.state != "end"] if contact else []
+    skin = framed(draw(drop, half, marks, outline, coloured=coloured), half, top_of_scale(drop), coloured)
+    if monitor.image_held:
+        skin.append("\nimage held: unchanged" if drop is not None else "\nimage held: shown when it changes", "dim")
+    return skin
 
 
 def _number(value: float | None, digits: int = 1) -> str:

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from services.cli.common import FAILED, USAGE, JsonOption, emit, fail
+from services.cli.common import FAILED, USAGE, JsonOption, config_file, emit, fail, of_service
 
 
 def register(app: typer.Typer) -> None:
-    app.command()(up)
-    app.command()(doctor)
+    app.command()(of_service(up, starts=True))
+    app.command()(of_service(doctor))
     keys = typer.Typer(help="Key pairs for encrypted TCP sockets.", no_args_is_help=True)
     keys.command("new")(new_keys)
     app.add_typer(keys, name="keys")
 
 
 def up(
-    config: Annotated[Path | None, typer.Option(help="Configuration; default: skin.toml of the checkout.")] = None,
     record: Annotated[Path | None, typer.Option(help="Also record, to this folder.")] = None,
     no_board: Annotated[bool, typer.Option("--no-board", help="Stages only: `skin replay` is the board.")] = False,
 ) -> None:
@@ -30,9 +28,7 @@ def up(
     from services.supervision import Program, programs
     from services.supervision import up as supervise
 
-    if config is not None:
-        os.environ["EITSKIN_CONFIG"] = str(config.resolve())
-    found = load(config)
+    found = load()
     wanted = [p for p in programs(found) if not (no_board and p.name in ("acquisition", "stub"))]
     extra = [Program("recorder", "services.recorder", ("--folder", str(record.resolve())))] if record else []
     with lock():  # said before anything else where a service runs here already
@@ -47,13 +43,12 @@ def up(
 
 
 def doctor(
-    config: Annotated[Path | None, typer.Option(help="Configuration; default: skin.toml of the checkout.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Say what stands in the way of contacts: configuration, bundle, port, board, clock, electrodes."""
     from services.doctor import examine
 
-    findings = examine(config)
+    findings = examine(config_file())
     if as_json:
         emit([finding.plain() for finding in findings])
     else:

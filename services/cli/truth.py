@@ -42,21 +42,24 @@ def pairs(truth: TruthFrame, contact: ContactFrame) -> list[dict[str, Any]]:
     return rows
 
 
-def compare_for(skin: str, seconds: float, as_json: bool) -> None:
+def compare_for(skin: str, seconds: float, count: int, as_json: bool) -> None:
+    """Until `count` frames were compared (0: without end), or `seconds` have passed."""
     contacts, truths = AllReader(["contact"], skin), AllReader(["truth"], skin)
     known: dict[int, TruthFrame] = {}
     waiting: dict[int, ContactFrame] = {}
     rows: list[dict[str, Any]] = []
     end = time.monotonic() + seconds
     heard_contact = heard_truth = False
-    while (now := time.monotonic()) < end:
+    compared = 0
+    while (now := time.monotonic()) < end and not 0 < count <= compared:
         frame = contacts.recv(min(0.05, end - now))
         if isinstance(frame, ContactFrame):
             waiting[frame.scan], heard_contact = frame, True
         while (true := truths.recv(0.0)) is not None:
             if isinstance(true, TruthFrame):
                 known[true.scan], heard_truth = true, True
-        for scan in sorted(waiting.keys() & known.keys()):
+        for scan in sorted(waiting.keys() & known.keys())[: count - compared if count else None]:
+            compared += 1
             for row in pairs(known.pop(scan), waiting.pop(scan)):
                 rows.append(row)
                 emit(row) if as_json else print(_line(row), flush=True)
@@ -67,7 +70,7 @@ def compare_for(skin: str, seconds: float, as_json: bool) -> None:
         fail(nobody(skin, seconds), NOT_RUNNING)
     if not heard_truth:
         fail(f"no truth/{skin} came: only the stub board knows the truth", NOT_RUNNING)
-    _summary(rows, as_json)
+    _summary(rows, compared, as_json)
 
 
 def _line(row: dict[str, Any]) -> str:
@@ -83,7 +86,7 @@ def _newton(force: float | None) -> str:
     return "   -  N" if force is None else f"{force:5.2f} N"
 
 
-def _summary(rows: list[dict[str, Any]], as_json: bool) -> None:
+def _summary(rows: list[dict[str, Any]], frames: int, as_json: bool) -> None:
     seen = [row for row in rows if row["found"] is not None]
     errors = sorted(row["found"]["error_mm"] for row in seen)
     forces = sorted(
@@ -92,6 +95,7 @@ def _summary(rows: list[dict[str, Any]], as_json: bool) -> None:
         if (row["force_n"] or 0.0) >= LIGHT_N and row["found"]["force_n"] is not None
     )
     result = {
+        "frames": frames,
         "touches": len(rows),
         "seen": len(seen),
         "position_error_mm": _spread(errors),
@@ -100,9 +104,9 @@ def _summary(rows: list[dict[str, Any]], as_json: bool) -> None:
     if as_json:
         emit({"summary": result})
     elif not rows:
-        print("nothing touched: `skin press --x 0.02 --y -0.01 --force 3`")
+        print(f"nothing touched in {frames} frames: `skin press --x 0.02 --y -0.01 --force 3`")
     else:
-        print(f"{len(seen)} of {len(rows)} true touches seen")
+        print(f"{frames} frames: {len(seen)} of {len(rows)} true touches seen")
         if errors:
             text = "position error: median {median:.2f} mm, p95 {p95:.2f} mm, largest {max:.2f} mm"
             print(text.format(**_spread(errors)))

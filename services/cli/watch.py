@@ -14,6 +14,7 @@ from services.cli.common import (
     emit,
     fail,
     nobody,
+    of_service,
     skin_name,
     use_configured_sockets,
 )
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     for command in (top, echo, compare):
-        app.command()(command)
+        app.command()(of_service(command))
 
 
 def top(
@@ -61,13 +62,15 @@ def _live(monitor: Monitor) -> None:
     from rich.console import Console
     from rich.live import Live
 
+    from services.cli.keyboard import keys
     from services.cli.screen import screen
 
     console = Console()
-    with Live(screen(monitor, console.width), console=console, screen=True, auto_refresh=False) as live:
-        while True:
+    first = screen(monitor, console.width, live=True)
+    with keys() as typed, Live(first, console=console, screen=True, auto_refresh=False) as live:
+        while "q" not in typed().lower():
             monitor.read(0.2)
-            live.update(screen(monitor, console.width), refresh=True)
+            live.update(screen(monitor, console.width, live=True), refresh=True)
 
 
 def echo(
@@ -91,7 +94,7 @@ def echo(
     while not count or shown < count:
         frame = reader.recv(timeout or 1e6)
         if frame is None:
-            fail(nobody(wanted, timeout), NOT_RUNNING)
+            fail(nobody(wanted, timeout, name), NOT_RUNNING)
         if as_json:
             emit(plain(frame))
         else:
@@ -112,7 +115,8 @@ def plain(value: Any) -> Any:
 
 def line(name: str, frame: Any) -> str:
     """A frame for a person: what it says first, then where it comes from."""
-    head = f"{name}/{frame.skin} {frame.seq:6d} {'valid  ' if frame.valid else 'INVALID'}"
+    number = f"frame {frame.seq:7d}" if name in ("status", "info") else f"scan {frame.scan:7d}"
+    head = f"{name}/{frame.skin} {number} {'valid  ' if frame.valid else 'INVALID'}"
     reasons = f" [{', '.join(frame.reasons)}]" if frame.reasons else ""
     if name == "contact":
         body = "; ".join(
@@ -146,10 +150,11 @@ def _short(value: Any) -> str:
 def compare(
     skin: SkinOption = "",
     seconds: Annotated[float, typer.Option(help="How long to compare.")] = 10.0,
+    count: Annotated[int, typer.Option("--count", "-n", help="Leave after so many frames; 0: after --seconds.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Print position and force of every contact beside the stub's truth, scan by scan, and the errors at the end."""
     from services.cli.truth import compare_for
 
     use_configured_sockets()
-    compare_for(skin_name(skin), seconds, as_json)
+    compare_for(skin_name(skin), seconds, count, as_json)

@@ -43,9 +43,10 @@ def steps(reader: RecordingReader, start_s: float = 0.0, only: str = "") -> Iter
     """The raw frames from `start_s` on, in order, and the states that belong before them.
 
     The first state of a skin goes before its first frame: the recorder asked for it on seeing that frame. Malformed
-    messages are left out.
+    messages are left out. Raises ReplayError where nothing lies behind `start_s`.
     """
     first_ns: int | None = None
+    last_ns, any_raw = 0, False
     latest = _first_states(reader)
     held = set(latest)
     for message in reader.messages({"raw", STATE_TOPIC}):
@@ -53,14 +54,21 @@ def steps(reader: RecordingReader, start_s: float = 0.0, only: str = "") -> Iter
         step = _step(message)
         if step is None or (only and step.skin != only):
             continue
+        last_ns = message.log_time_ns
         if step.raw is None and step.skin in held:
             held.remove(step.skin)  # that one is in `latest` already
         elif message.log_time_ns - first_ns >= start_s * 1e9:
             if step.skin in latest:
                 yield latest.pop(step.skin)
+            any_raw = any_raw or step.raw is not None
             yield step
         elif step.raw is None:
             latest[step.skin] = step
+    if start_s > 0 and not any_raw and first_ns is not None:
+        long_s = (last_ns - first_ns) * 1e-9
+        raise ReplayError(
+            f"found --from {start_s:g}, but {reader.path} is only {long_s:.1f} s long: begin before its end"
+        )
 
 
 def _first_states(reader: RecordingReader) -> dict[str, Step]:

@@ -79,11 +79,11 @@ def stub(folder):
     stub = Process(folder)
     yield stub
     assert stub.stop() == 0
-    assert not (folder / "board").is_symlink()
+    assert not (folder / "board-palm").is_symlink()
 
 
 def test_frames_and_truth_over_the_pty(stub, folder):
-    stub.open(folder / "board").start()
+    stub.open(folder / "board-palm").start()
     truth = NewestReader("truth", "palm")
     client = ControlClient("stub", 20.0)
     healthy = np.abs(stub.until(link.Frame).z)
@@ -96,7 +96,7 @@ def test_frames_and_truth_over_the_pty(stub, folder):
     assert len(true.touches[0].outline) > 8
     assert abs(true.scan - frames[-1].seq) < 40
     assert 0 < time.monotonic_ns() - true.stamps["sample"] < 3e9
-    assert client.call("release") == {"released": 1}
+    assert client.call("release") == {"released": 1, "scene_ended": None, "faults": {}}
     assert stub.decoder.counts["good"] > 5 and stub.decoder.bad == 0
     truth.close()
 
@@ -108,7 +108,7 @@ def test_commands_explain_what_was_wrong(stub):
         ("press", {"x": 0.0, "y": 0.0}, "force"),
         ("press", {"y": 0.0, "force": 1.0}, "needs x"),
         ("press", {"x": "left", "y": 0.0, "force": 1.0}, "left"),
-        ("press", {"x": 0.0, "y": 0.0, "force": 1.0, "skin": "sole"}, "'palm', not 'sole'"),
+        ("press", {"x": 0.0, "y": 0.0, "force": 1.0, "skin": "sole"}, "no skin 'sole': expected one of palm"),
         ("scene", {"name": "nowhere"}, "paper_49"),
         ("faults", {"name": "gremlins"}, "electrode_open"),
     ):
@@ -120,14 +120,14 @@ def test_commands_explain_what_was_wrong(stub):
 
 
 def test_unplugged_and_back_under_another_name(stub, folder):
-    stub.open(folder / "board").start()
-    device = os.path.realpath(folder / "board")
+    stub.open(folder / "board-palm").start()
+    device = os.path.realpath(folder / "board-palm")
     ControlClient("stub", 20.0).call("faults", name="unplug", args={"name": "board2"}, seconds=0.5)
     with pytest.raises((serial.SerialException, OSError)):
         end = time.monotonic() + 20.0
         while time.monotonic() < end:
             stub.serial.read(4096)
-    assert not (folder / "board").is_symlink()
+    assert not (folder / "board-palm").is_symlink()
     stub.serial.close()
     end = time.monotonic() + 20.0
     while not (folder / "board2").is_symlink() and time.monotonic() < end:
@@ -143,18 +143,18 @@ def test_unplugged_and_back_under_another_name(stub, folder):
     )  # and back to its own name, for the other tests
     stub.serial.close()
     end = time.monotonic() + 20.0
-    while not (folder / "board").is_symlink() and time.monotonic() < end:
+    while not (folder / "board-palm").is_symlink() and time.monotonic() < end:
         time.sleep(0.02)
     assert not (folder / "board2").is_symlink()
 
 
 def test_a_late_reader_finds_fresh_frames(stub, folder):
     """Nobody read for a second: the kernel must not hand that second to the next reader."""
-    stub.open(folder / "board").start()
+    stub.open(folder / "board-palm").start()
     first = stub.until(link.Frame)
     time.sleep(1.2)
     stub.serial.close()
-    stub.open(folder / "board")
+    stub.open(folder / "board-palm")
     frame = stub.until(link.Frame)
     assert (frame.device_us - first.device_us) * 1e-6 > 0.7
 
@@ -194,7 +194,7 @@ def test_it_ends_with_its_parent(other_folder):
     parent = subprocess.Popen([sys.executable, "-c", script], env=env, stdout=subprocess.PIPE, text=True)
     child = int(parent.stdout.readline())
     end = time.monotonic() + 20.0
-    while not (other_folder / "board").is_symlink() and time.monotonic() < end:
+    while not (other_folder / "board-palm").is_symlink() and time.monotonic() < end:
         time.sleep(0.05)
     parent.kill()
     parent.wait()

@@ -132,7 +132,7 @@ def test_a_stop_leaves_only_what_is_to_stay(up: Callable[..., subprocess.Popen[s
     for name in ours + others:
         (runtime / name).touch()
     (runtime / "state").mkdir()
-    for name in ("board", "board2"):
+    for name in ("board-palm", "board2"):
         (runtime / name).symlink_to("/dev/pts/none")
     assert (runtime / "supervisord.conf").exists() and (runtime / "supervisord.pid").exists()
     service.send_signal(signal.SIGTERM)
