@@ -11,6 +11,8 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from models.files import FileError, read_text
+
 ROOT = Path(__file__).resolve().parents[2]
 FAILED, USAGE, NOT_RUNNING = 1, 2, 3
 """Exit codes: it did not work, the request itself is wrong, no service answers."""
@@ -75,8 +77,8 @@ def config_file() -> Path:
 def _configuration() -> dict[str, Any]:
     """The configuration as it stands, unchecked; empty where there is none."""
     try:
-        return tomllib.loads(config_file().read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return tomllib.loads(read_text(config_file()))
+    except (FileError, ValueError, RecursionError):
         return {}
 
 
