@@ -67,7 +67,7 @@ def _check_sizes(entries: list[zipfile.ZipInfo], packed: int, name: str, most: i
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> NDArray[Any]:
     """One member. Its header is compared with its size before anything is allocated."""
     with archive.open(entry) as member:
-        version = np.lib.format.read_magic(member)  # type: ignore[no-untyped-call]
+        version = np.lib.format.read_magic(member)
         read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
         shape, fortran, dtype = read(member)
         if dtype.kind not in "biufcU" or dtype.hasobject:
