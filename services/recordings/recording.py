@@ -17,10 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import lz4.frame
-import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Metadata
+from mcap.stream_reader import lz4, zstandard  # what the library itself unpacks with
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from models.files import FileError, open_file
@@ -223,7 +222,7 @@ def _decompressed(chunk: Chunk) -> bytes | None:
             with zstandard.ZstdDecompressor(max_window_size=MAX_RECORD).stream_reader(chunk.data) as stream:
                 data = stream.read(size + 1)
         elif chunk.compression == "lz4":
-            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+            data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
         else:
             data = chunk.data if not chunk.compression else b""
     except Exception:  # zstandard and lz4 each raise their own: all mean that this chunk is bad
