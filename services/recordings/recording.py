@@ -19,7 +19,7 @@ from typing import Any, BinaryIO
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Metadata
-from mcap.stream_reader import lz4, zstandard  # what the library itself unpacks with
+from mcap.stream_reader import lz4, zstandard  # type: ignore[attr-defined]  # what the library unpacks with
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from models.files import FileError, open_file
