@@ -1,12 +1,16 @@
-"""A bundle: the folder a skin runs from, with a hash of every file in its manifest (numpy only).
+"""A bundle: the folder a skin runs from, one hash over all of it (numpy only).
 
-    models/bundles/square16/manifest.json      geometry, pattern, image grid, provenance, measured figures, hashes
+    models/bundles/square16/SHA256             the bundle's hash: of manifest.json; `sha256sum -c SHA256` reads it
+                            manifest.json      geometry, pattern, image grid, provenance, measured figures, hashes
                             matrices.npz       see prereconstruction.Matrices
                             network.onnx       "full"
                             network_fast.onnx  "fast"
                             network_int8.onnx  "int8"
 
-Networks may be missing. A bundle without any is a working bundle: the services then show the one-step image.
+The manifest holds the hash of every other file, so that the one over the manifest is over the whole. Networks may be
+missing. A bundle without any is a working bundle: the services then show the one-step image.
+
+    python -m models.bundle FOLDER             writes SHA256 anew: for who has changed a manifest by hand, and means it
 """
 
 from __future__ import annotations
@@ -14,6 +18,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
+import sys
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -23,11 +29,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from models.bundle_check import Wrong, check
+from models.files import FileError, read_bytes
+from models.npz import read_npz
 from models.prereconstruction import Matrices, PreReconstructor
 
 SCHEMA = 1
 BUNDLES = Path(__file__).parent / "bundles"
 MAX_BYTES = 8 * 1024 * 1024
+MAX_MANIFEST = 1024 * 1024
+MAX_MATRICES = 64 * 1024 * 1024  # unpacked
+SEAL = "SHA256"
 NETWORKS = {"full": "network.onnx", "fast": "network_fast.onnx", "int8": "network_int8.onnx"}
 CLASSES = ("circle", "triangle", "rectangle", "square", "L")
 
@@ -43,7 +55,7 @@ class Bundle:
     path: Path
     manifest: dict[str, Any]
     matrices: Matrices
-    hash: str  # sha256 of manifest.json, which holds the hashes of everything else
+    hash: str  # of the whole: sha256 of manifest.json, which holds the hashes of everything else; as SHA256 says
 
     @property
     def name(self) -> str:
@@ -98,30 +110,32 @@ class Bundle:
                 f"no bundle {str(name_or_path)!r}: shipped are {', '.join(known) or 'none'}; "
                 f"build one with `make train SKIN={Path(name_or_path).name}`"
             )
-        text = (path / "manifest.json").read_bytes()
-        try:
-            manifest = json.loads(text)
-            files = dict(manifest["files"])
-        except (ValueError, KeyError, TypeError) as error:
+        text = _read(path / "manifest.json", MAX_MANIFEST)
+        digest = hashlib.sha256(text).hexdigest()
+        manifest = _manifest(path, text)
+        sealed = _sealed(path)
+        if sealed != digest:
             raise BundleError(
-                f"{path / 'manifest.json'} is no bundle manifest ({error}): build the bundle again"
-            ) from error
-        if manifest.get("schema") != SCHEMA:
-            raise BundleError(
-                f"{path}: manifest schema {manifest.get('schema')}, this program reads {SCHEMA}: build the bundle again"
+                f"{path / 'manifest.json'}: sha256 {digest[:12]}..., {SEAL} beside it says {sealed[:12]}...: "
+                "the manifest was changed or damaged; restore it or build the bundle again"
             )
-        for name, expected in files.items():
-            if not (path / name).is_file():
+        for name, expected in manifest["files"].items():
+            if not (path / name).exists():
                 raise BundleError(
                     f"{path / name} is missing, though the manifest lists it: restore it or build the bundle again"
                 )
-            found = sha256(path / name)
+            found = hashlib.sha256(_read(path / name, MAX_BYTES)).hexdigest()
             if found != expected:
                 raise BundleError(
                     f"{path / name}: sha256 {found[:12]}..., the manifest says {expected[:12]}...: "
                     "the file was changed or damaged; restore it or build the bundle again"
                 )
-        return Bundle(path, manifest, _read_matrices(path / "matrices.npz"), hashlib.sha256(text).hexdigest())
+        matrices = _read_matrices(path / "matrices.npz")
+        try:
+            check(manifest, matrices)
+        except Wrong as why:
+            raise BundleError(f"{path}: {why}: build the bundle again") from None
+        return Bundle(path, manifest, matrices, digest)
 
 
 def write(
@@ -130,8 +144,8 @@ def write(
     """Writes a bundle folder and loads it back. networks: variant -> ONNX bytes. `files` and `schema` are filled in
     here.
 
-    The manifest is replaced last and at once, so a reader sees the old bundle, an error, or the new one, never a
-    mixture that passes.
+    The manifest and then its hash are replaced last, each at once, so a reader sees the old bundle, an error, or the
+    new one, never a mixture that passes.
     """
     path.mkdir(parents=True, exist_ok=True)
     arrays: dict[str, Any] = {f.name: np.asarray(getattr(matrices, f.name)) for f in fields(Matrices)}
@@ -154,25 +168,94 @@ def write(
 
 def replace_manifest(path: Path, full: Mapping[str, Any]) -> Bundle:
     """Another manifest for the files that are there, at once, and loads the bundle back."""
-    handle, temporary = tempfile.mkstemp(dir=path, prefix=".manifest")
-    with os.fdopen(handle, "w") as out:
-        json.dump(full, out, indent=2)
-        out.write("\n")
-    os.chmod(temporary, 0o644)
-    os.replace(temporary, path / "manifest.json")
+    _replace(path / "manifest.json", json.dumps(full, indent=2, allow_nan=False) + "\n")
+    seal(path)
     return Bundle.load(path)
+
+
+def seal(path: Path) -> str:
+    """Writes the bundle's hash beside its manifest, and returns it."""
+    found = sha256(path / "manifest.json")
+    _replace(path / SEAL, f"{found}  manifest.json\n")
+    return found
+
+
+def _replace(path: Path, text: str) -> None:
+    """The file's new content, at once."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}")
+    with os.fdopen(handle, "w", encoding="utf-8") as out:
+        out.write(text)
+    os.chmod(temporary, 0o644)
+    os.replace(temporary, path)
 
 
 def sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def _read(path: Path, most: int) -> bytes:
+    try:
+        return read_bytes(path, most)
+    except FileError as why:
+        raise BundleError(f"{why}: restore it or build the bundle again") from None
+
+
+def _manifest(path: Path, text: bytes) -> dict[str, Any]:
+    """What the manifest says, as far as the files need it: its schema, and names and hashes of files we know."""
+    place = path / "manifest.json"
+    try:
+        manifest = json.loads(text)
+        files = dict(manifest["files"])
+        schema, name = manifest.get("schema"), manifest["name"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise BundleError(f"{place} is no bundle manifest ({str(error)[:80]}): build the bundle again") from None
+    if schema != SCHEMA:
+        raise BundleError(f"{path}: manifest schema {schema}, this program reads {SCHEMA}: build the bundle again")
+    known = ("matrices.npz", *NETWORKS.values())
+    for file, digest in files.items():
+        if file not in known or not (isinstance(digest, str) and re.fullmatch("[0-9a-f]{64}", digest)):
+            raise BundleError(
+                f"{place}: files: found {file!r:.80}, expected names of {', '.join(known)} and their sha256"
+            )
+    if "matrices.npz" not in files or not (isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", name)):
+        raise BundleError(
+            f"{place}: found the name {name!r:.80} and files {', '.join(files) or 'none'}; "
+            "expected a name of letters, digits, - . _ and at least matrices.npz: build the bundle again"
+        )
+    return {**manifest, "files": files}
+
+
+def _sealed(path: Path) -> str:
+    """The hash that was written when the bundle was made."""
+    if not (path / SEAL).exists():
+        raise BundleError(
+            f"{path / SEAL} is missing, the hash of the whole bundle: restore it, build the bundle again, or, where "
+            f"you know that its manifest is right, run `python -m models.bundle {path}`"
+        )
+    found = re.fullmatch(rb"([0-9a-f]{64})  manifest\.json\n?", _read(path / SEAL, 1024))
+    if found is None:
+        raise BundleError(f"{path / SEAL}: found no line `<sha256>  manifest.json`: build the bundle again")
+    return found[1].decode()
+
+
 def _read_matrices(path: Path) -> Matrices:
-    with np.load(path, allow_pickle=False) as data:
-        missing = [f.name for f in fields(Matrices) if f.name not in data]
-        if missing:
-            raise BundleError(f"{path} lacks {', '.join(missing)}: build the bundle again")
-        arrays = {f.name: data[f.name] for f in fields(Matrices)}
-    arrays["scale_index"], arrays["normalisation"] = int(arrays["scale_index"]), str(arrays["normalisation"])
-    arrays["model_error"] = float(arrays["model_error"])
+    try:
+        data = read_npz(path, MAX_MATRICES)
+    except FileError as why:
+        raise BundleError(f"{why}: build the bundle again") from None
+    missing = [f.name for f in fields(Matrices) if f.name not in data]
+    if missing:
+        raise BundleError(f"{path} lacks {', '.join(missing)}: build the bundle again")
+    arrays: dict[str, Any] = {f.name: data[f.name] for f in fields(Matrices)}
+    try:
+        arrays["scale_index"], arrays["normalisation"] = int(arrays["scale_index"]), str(arrays["normalisation"])
+        arrays["model_error"] = float(arrays["model_error"])
+    except (TypeError, ValueError) as why:
+        raise BundleError(f"{path}: {why}: build the bundle again") from None
     return Matrices(**arrays)
+
+
+if __name__ == "__main__":
+    for folder in sys.argv[1:]:
+        print(f"{seal(Path(folder))}  {folder}")
+        Bundle.load(folder)

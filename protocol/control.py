@@ -15,6 +15,7 @@ import msgpack
 import zmq
 
 from . import transport
+from .fields import brief
 from .frames import FrameError, read_map
 from .gate import described, peer_of
 from .listening import Listening
@@ -153,7 +154,7 @@ class ControlServer:
             asked = read_map(request, f"{self.process} control")
             command, args = asked.get("command"), asked.get("args", {})
             if not isinstance(command, str) or not isinstance(args, dict):
-                raise FrameError("control", "command, args", f"{command!r:.40}, {type(args).__name__}", "text, map")
+                raise FrameError("control", "command, args", f"{brief(command)}, {type(args).__name__}", "text, map")
         except FrameError as bad:
             self.malformed += 1
             return _refusal("bad_request", str(bad))
@@ -222,7 +223,9 @@ class ControlClient:
         if reply.get("ok") is True and isinstance(result, dict):
             return result
         if isinstance(error, dict):
-            raise ControlError(str(error.get("type")), str(error.get("message")))
+            kind, message = error.get("type"), error.get("message")
+            if isinstance(kind, str) and isinstance(message, str):
+                raise ControlError(kind, message)
         raise ControlError("bad_reply", f"{self.process} answered {command} with neither result nor error")
 
 
@@ -233,7 +236,9 @@ def clock_offset(client: ControlClient, tries: int = 8) -> tuple[int, int]:
     """
     best: tuple[int, int] | None = None
     for _ in range(tries):
-        there = client.call("clock")["monotonic_ns"]
+        there = client.call("clock").get("monotonic_ns")
+        if type(there) is not int:
+            raise ControlError("bad_reply", f"{client.process} answered clock with {brief(there)}, expected ns")
         sent, back = client.round_trip_ns
         if best is None or back - sent < 2 * best[1]:
             best = (there - (sent + back) // 2, (back - sent + 1) // 2)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
@@ -23,6 +24,8 @@ MAX_LIST = 4096
 MAX_MAP = 1024
 MAX_TEXT = 65536
 MAX_DEPTH = 8
+MAX_EXTENT = 2**31
+"""Bytes that an array without elements would have if each of its empty dimensions had one: numpy computes with them."""
 REMEMBERED = 64  # texts that a checker has accepted and need not look at again
 
 
@@ -38,11 +41,15 @@ class Mismatch(Exception):
         return Mismatch(self.found, self.expected, step + self.path)
 
 
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 3  # repr() itself fails on a list a thousand levels deep, which one small message can hold
+
+
 def brief(value: object) -> str:
-    """A value as an error message shows it: its type, and the value itself where that is short."""
+    """A value as an error message shows it: its type, and the value itself where that is short. Never raises."""
     if isinstance(value, (bytes, list, dict)) and len(value) > 3:
         return f"{type(value).__name__} of length {len(value)}"
-    text = repr(value)
+    text = _SHORT.repr(value) if isinstance(value, (list, tuple, dict)) else repr(value)
     return f"{type(value).__name__} {text if len(text) <= 40 else text[:37] + '...'}"
 
 
@@ -253,13 +260,16 @@ def decode_array(value: Any) -> NDArray[Any]:
         raise Mismatch(brief(value), f"{expected}, dtype one of {' '.join(_DTYPES)}") from None
     if type(shape) is not list or type(data) is not bytes or len(shape) > 8:
         raise Mismatch(f"shape {brief(shape)}, data {brief(data)}", expected)
-    size = dtype.itemsize
+    size = extent = dtype.itemsize
     for n in shape:
         if type(n) is not int or n < 0:
             raise Mismatch(f"shape {brief(shape)}", expected)
         size *= n
+        extent *= n or 1
     if size != len(data):
         raise Mismatch(f"{len(data)} bytes of data", f"{size} bytes for shape {shape} of {name}")
+    if extent > MAX_EXTENT:
+        raise Mismatch(f"shape {shape}", f"dimensions that multiply to at most {MAX_EXTENT} bytes")
     array = np.frombuffer(data, dtype)
     return array if len(shape) == 1 else array.reshape(shape)
 

@@ -256,7 +256,7 @@ class StatusFrame(Frame):
 
 INFO_KEYS = {
     "bundle": "name of the model bundle",
-    "bundle_hash": "sha256 of its manifest",
+    "bundle_hash": "sha256 over the whole of it, as its file SHA256 says",
     "geometry": "map: outline (n, 2) [m], electrodes (E, 2) [m], metres_per_unit, name",
     "pattern": "name of the drive pattern",
     "frame_id": "name of the skin's coordinate frame",

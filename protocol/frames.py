@@ -98,11 +98,16 @@ def unpack(message: bytes) -> Frame:
     fields_read = read_map(memoryview(message)[len(head) + 1 :], name)
     try:
         frame: Frame = record.decode(fields_read)
+        finite = record.finite(frame)
     except Mismatch as bad:
         raise FrameError(name, bad.path.lstrip("."), bad.found, bad.expected) from None
+    except Exception as bad:  # a reader drops one message rather than die of it, whatever a checker has overlooked
+        raise FrameError(
+            name, "", f"what no field allows ({type(bad).__name__}: {str(bad)[:80]})", "the fields of its topic"
+        ) from None
     if frame.skin != skin:
         raise FrameError(name, "skin", brief(frame.skin), f"{skin!r}, as in the message's topic")
-    if not record.finite(frame):
+    if not finite:
         frame.note_valid(frame.valid)
         frame.valid = False
         if "non_finite" not in frame.reasons:

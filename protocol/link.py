@@ -133,7 +133,7 @@ class Decoder:
             raise _Dropped("unknown", f"no message has number {body[0]:#04x}")
         try:
             message = kind.read(body)
-        except LinkError as bad:
+        except Exception as bad:  # LinkError says what is wrong; nothing else that a body can cause ends the reader
             raise _Dropped("bad_payload", str(bad)) from None
         if isinstance(message, (Hello, Ident)):
             self.peer_schema = message.schema_hash

@@ -26,15 +26,18 @@ class RuntimeDirError(RuntimeError):
 
 
 class AlreadyRunning(RuntimeError):
-    """Another service holds the runtime folder; `pid` is its process, 0 where that is not known."""
+    """Another service holds the runtime folder, or another process of this name runs there (`process`, else "");
+    `pid` is its number, 0 where that is not known.
+    """
 
-    def __init__(self, folder: Path, pid: int) -> None:
-        super().__init__(folder, pid)
-        self.folder, self.pid = folder, pid
+    def __init__(self, folder: Path, pid: int, process: str = "") -> None:
+        super().__init__(folder, pid, process)
+        self.folder, self.pid, self.process = folder, pid, process
 
     def __str__(self) -> str:
         who = f" by process {self.pid}" if self.pid else ""
-        return f"{self.folder} is in use{who}: stop that service first, or give this one its own EITSKIN_RUNTIME"
+        what = f"{self.folder} has its {self.process} already, held" if self.process else f"{self.folder} is in use"
+        return f"{what}{who}: stop that service first, or give this one its own EITSKIN_RUNTIME"
 
 
 def runtime_dir(create: bool = True) -> Path:
@@ -94,20 +97,21 @@ def _ipc(name: str) -> str:
 
 
 @contextlib.contextmanager
-def lock(folder: Path | None = None) -> Iterator[Path]:
-    """Hold the runtime folder for one service; the kernel lets go of it however the process ends. Raises
-    AlreadyRunning.
+def lock(folder: Path | None = None, process: str = "") -> Iterator[Path]:
+    """Hold the runtime folder for one service, or for one process of it by its name (`acquisition`); the kernel lets go
+    of it however the process ends, and of a stopped one it keeps it. Raises AlreadyRunning.
 
     Without it a second service would take over the first one's sockets without either of them noticing.
     """
     folder = folder or runtime_dir()
-    fd = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    name = f"{process}.lock" if process else "lock"
+    fd = os.open(folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     try:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             pid = os.pread(fd, 16, 0).strip()
-            raise AlreadyRunning(folder, int(pid) if pid.isdigit() else 0) from None
+            raise AlreadyRunning(folder, int(pid) if pid.isdigit() else 0, process) from None
         os.ftruncate(fd, 0)
         os.pwrite(fd, b"%d\n" % os.getpid(), 0)
         yield folder

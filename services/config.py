@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
+from models.files import FileError, read_text
 from protocol.topics import PRODUCERS
 from protocol.transport import Transport
 from services.stage import PROCESSES
@@ -30,7 +31,7 @@ class ConfigError(Exception):
 
 
 class Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Pose(Section):
@@ -222,10 +223,10 @@ def load(path: str | Path | None = None) -> Config:
     """Read and check the configuration. Raises ConfigError, one line for each thing that is wrong."""
     file = config_path(path)
     try:
-        raw = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as why:
-        raise ConfigError(f"{file}: cannot be read: {why.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as why:
+        raw = tomllib.loads(read_text(file))
+    except FileError as why:
+        raise ConfigError(str(why)) from None
+    except (tomllib.TOMLDecodeError, RecursionError) as why:
         raise ConfigError(f"{file}: is not TOML: {why}") from None
     return parse(raw, file)
 

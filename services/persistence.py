@@ -4,9 +4,13 @@ plain maps.
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import logging
 import os
+import stat
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,40 +18,90 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
+from models.files import check
 from protocol.fields import Mismatch, decode_array, encode_array
+from protocol.frames import MAX_MESSAGE, read_map
 from protocol.runtime import runtime_dir
 
-LARGEST = 16 * 1024 * 1024
+LARGEST = MAX_MESSAGE
+CHECKSUM = hashlib.sha256().digest_size
+AHEAD_S = 1.0  # what a clock that is being set right may have gone back by between two processes
 
 log = logging.getLogger(__name__)
 
 
 def save(process: str, skin: str, state: dict[str, Any]) -> None:
-    """Keep a state; what a crash leaves behind is the old one or the new one."""
-    path = _file(process, skin)
+    """Keep a state, with its checksum before it; what a crash leaves behind is the old one or the new one."""
+    name = f"{process}-{skin}.msgpack"
+    fresh = f"{name}.{os.getpid()}"
+    packed: bytes = msgpack.packb({"saved_unix_s": time.time(), "state": plain(state)})
     try:
-        path.parent.mkdir(mode=0o700, exist_ok=True)
-        fresh = path.with_suffix(f".{os.getpid()}")
-        fresh.write_bytes(msgpack.packb({"saved_unix_s": time.time(), "state": plain(state)}))
-        fresh.replace(path)
-    except OSError as why:
+        with _folder(create=True) as folder:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(fresh, dir_fd=folder)
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+            with os.fdopen(os.open(fresh, flags, 0o600, dir_fd=folder), "wb") as file:
+                file.write(hashlib.sha256(packed).digest() + packed)
+            os.replace(fresh, name, src_dir_fd=folder, dst_dir_fd=folder)
+    except (OSError, ValueError) as why:
         log.warning("%s: the state could not be kept (%s): after a crash there will be a new tare", skin, why)
 
 
 def restore(process: str, skin: str) -> tuple[dict[str, Any], float] | None:
-    """The kept state and its age [s]; None where there is none that can be read."""
-    path = _file(process, skin)
+    """The kept state and its age [s]; None where there is none that can be read and believed."""
+    name = f"{process}-{skin}.msgpack"
     try:
-        packed = path.read_bytes()
-        if len(packed) > LARGEST:
-            raise ValueError(f"{len(packed)} bytes")
-        kept = msgpack.unpackb(packed)
-        return arrays(kept["state"]), max(0.0, time.time() - float(kept["saved_unix_s"]))
+        with _folder() as folder:
+            packed = _read(name, folder)
+        if hashlib.sha256(packed[CHECKSUM:]).digest() != packed[:CHECKSUM]:
+            raise ValueError("its checksum is not that of its content")
+        kept = read_map(packed[CHECKSUM:], "the kept state")
+        ahead = float(kept["saved_unix_s"]) - time.time()
+        if not ahead <= AHEAD_S:
+            raise ValueError(f"it is of {ahead:.0f} s from now: was the clock set back?")
+        state = arrays(kept["state"])
+        if not isinstance(state, dict):
+            raise ValueError(f"found {type(state).__name__}, expected a map")
+        return state, max(0.0, -ahead)
     except FileNotFoundError:
         return None
     except Exception as why:  # whatever is in the file, the service starts
-        log.warning("%s: %s is no kept state (%s): starting without it", skin, path, why)
+        log.warning("%s: %s is no kept state (%s): starting without it", skin, _place() / name, why)
         return None
+
+
+def _place() -> Path:
+    return runtime_dir() / "state"
+
+
+@contextlib.contextmanager
+def _folder(create: bool = False) -> Iterator[int]:
+    """The folder of kept states, by descriptor: ours, and no link to another. Raises OSError, ValueError."""
+    if create:
+        _place().mkdir(mode=0o700, exist_ok=True)
+    fd = os.open(_place(), os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        _check_owner(os.fstat(fd), "its folder")
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def _read(name: str, folder: int) -> bytes:
+    """A regular file of ours, no link. Raises OSError, ValueError, FileError."""
+    fd = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
+    with os.fdopen(fd, "rb") as file:
+        found = os.fstat(fd)
+        check(found, name, LARGEST)
+        _check_owner(found, "it")
+        return file.read(LARGEST)
+
+
+def _check_owner(found: os.stat_result, what: str) -> None:
+    if found.st_uid != os.geteuid():
+        raise ValueError(f"{what} belongs to user {found.st_uid}, expected {os.geteuid()} (us)")
+    if found.st_mode & 0o022:
+        raise ValueError(f"{what} has mode {stat.S_IMODE(found.st_mode):04o}: others can write it")
 
 
 def plain(value: Any) -> Any:
@@ -71,10 +125,6 @@ def arrays(value: Any) -> Any:
                 raise ValueError(f"found {wrong.found}, expected {wrong.expected}") from None
         return {key: arrays(inner) for key, inner in value.items()}
     return [arrays(inner) for inner in value] if isinstance(value, list) else value
-
-
-def _file(process: str, skin: str) -> Path:
-    return runtime_dir() / "state" / f"{process}-{skin}.msgpack"
 
 
 def shaped(values: Any, shape: tuple[int, ...], finite: bool = True) -> NDArray[np.float64]:

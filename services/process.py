@@ -9,8 +9,7 @@ from collections.abc import Callable
 
 from models.bundle import Bundle, BundleError
 from protocol import logs
-from protocol.runtime import RuntimeDirError
-from protocol.transport import TransportError
+from protocol.runtime import AlreadyRunningfrom protocol.transport import TransportError
 from services import realtime
 from services.config import ConfigError, Skin, load
 from services.runner import Runner
@@ -26,13 +25,14 @@ def main(process: str, setup: Callable[[Runner], None]) -> int:
         config = load()
         logging.getLogger().setLevel(config.logging.level.upper())
         refused = realtime.apply(config.realtime, process)
-        runner = Runner(process, config, refused)
-        setup(runner)
-    except (ConfigError, BundleError, RuntimeDirError, TransportError) as why:
+        with lock(process=process):  # whose sockets these are, for as long as we live
+            runner = Runner(process, config, refused)
+            setup(runner)
+            with contextlib.suppress(KeyboardInterrupt):
+                runner.run()
+    except (AlreadyRunning, ConfigError, BundleError, RuntimeDirError, TransportError) as why:
         print(f"{process}: {why}", file=sys.stderr)
         return 1
-    with contextlib.suppress(KeyboardInterrupt):
-        runner.run()
     return 0
 
 

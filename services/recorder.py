@@ -19,12 +19,14 @@ from typing import Any
 
 import msgpack
 
+from models.bundle import BundleError
 from protocol import transport
 from protocol.frames import Frame, InfoFrame
 from protocol.runtime import host_id
 from protocol.sockets import AllReader, ControlClient, ControlError, ControlServer
 from protocol.topics import TOPICS
-from services.config import ConfigError, config_path, load
+from services.config import ConfigError, load
+from services.recordings import settings
 from services.recordings.recording import STATE_TOPIC, RecordingError, RecordingWriter
 from services.stage import STAGES
 
@@ -160,16 +162,19 @@ def stage_states(skin: str) -> dict[str, Any]:
 
 def _metadata(topics: list[str], skin: str | None) -> dict[str, str]:
     try:
-        configuration = config_path().read_text(encoding="utf-8")
-    except OSError:
-        configuration = ""
+        config = load()
+        wanted = {name: found for name, found in config.skins.items() if skin in (None, name)}
+        carried = settings.text_of(wanted, config.skip)
+    except (ConfigError, BundleError) as error:
+        log.warning("how the skins are configured is not in the recording: %s", error)
+        carried = ""
     return {
         "origin": "record",
         "host": host_id(),
         "topics": " ".join(topics),
         "skin": skin or "",
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "configuration": configuration,
+        settings.KEY: carried,
     }
 
 

@@ -24,6 +24,8 @@ RUNTIME_NEEDS = WIRE_NEEDS | {"serial", "onnxruntime", "scipy", "pydantic", "typ
 OFFLINE_DOORS = {"services/cli"}
 SERVICES_USE_OF_MODELS = {
     "models.bundle",
+    "models.files",
+    "models.npz",
     "models.prereconstruction",
     "models.patterns",
     "models.sentinel",

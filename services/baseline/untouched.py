@@ -22,6 +22,7 @@ from services.stage import Refused
 Array = NDArray[np.float64]
 
 RETRY_EVERY = 8  # frames between attempts at the first tare
+LONGEST_S = 1e9  # a saved time that is longer is none
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
 
 
@@ -226,7 +227,9 @@ class Untouched:
             raise Refused(f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest / 3600:.1f} h")
         baseline = Baseline.from_dict(saved.get("baseline", {}), len(self.bundle.pattern))
         try:
-            taken_s, quiet_s = (max(0.0, float(saved.get(key, 0.0))) for key in ("taken_s", "quiet_s"))
+            taken_s, quiet_s = (float(saved.get(key, 0.0)) for key in ("taken_s", "quiet_s"))
+            if not (0 <= taken_s <= LONGEST_S and 0 <= quiet_s <= LONGEST_S):
+                raise ValueError(f"found {taken_s:g} s and {quiet_s:g} s")
         except (TypeError, ValueError) as wrong:
             raise Refused(f"the saved baseline has no age ({wrong}): tare again") from None
         self.set_baseline(dataclasses.replace(baseline, restored=True), age_s=age_s + quiet_s)

@@ -18,10 +18,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from models.bundle import Bundle
+from models.files import FileError, read_text
 from services.config import ConfigError, Skin
 from services.contacts.force_curve import Curve
 
 SCHEMA = "eitskin.force/1"
+MOST_BYTES = 1024 * 1024
 MOST_N = 5.0
 
 Of = Literal["peak", "integral"]
@@ -66,7 +68,9 @@ def save(path: Path, found: Calibration, name: str, skin: Skin, bundle: Bundle) 
 def load(path: Path, skin: Skin, bundle: Bundle, name: str = "") -> Calibration:
     """Reads a calibration and checks that it belongs to this skin and bundle. Raises ConfigError."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(read_text(path, MOST_BYTES))
+        if not isinstance(found, dict):
+            raise ValueError(f"found {type(found).__name__}, expected a map")
         if "schema" not in found:
             return _by_hand(found)
         if found["schema"] != SCHEMA:
@@ -81,8 +85,10 @@ def load(path: Path, skin: Skin, bundle: Bundle, name: str = "") -> Calibration:
         if not (0 < numbers[0] < math.inf and 0 <= numbers[1] < math.inf):
             raise ValueError("most_n and own_error")
         return Calibration(Curve.from_dict(found["curve"]), found["of"], *numbers, said=content)
-    except (OSError, ValueError, KeyError, TypeError) as why:
-        raise ConfigError(f"{path} is no calibration of forces: {why!r}") from None
+    except FileError as why:
+        raise ConfigError(f"{why}: correct `calibration` in skin.toml") from None
+    except (ValueError, KeyError, TypeError, RecursionError) as why:
+        raise ConfigError(f"{path} is no calibration of forces: {why!r:.200}") from None
 
 
 AGAIN = "calibrate again with `skin calibrate force`, or take `calibration` out of skin.toml"

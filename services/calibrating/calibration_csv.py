@@ -17,6 +17,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from models.files import FileError, read_text
 from services.calibrating.calibration_fit import CalibrationError, Press
 from services.contacts.force import Look
 
@@ -30,10 +31,11 @@ def read(path: Path, look_of: Callable[[int], Look] | None = None) -> list[Press
     Raises CalibrationError, which names line and column.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as why:
-        raise CalibrationError(f"{path} cannot be read: {why}") from None
-    rows = list(csv.reader(text.splitlines()))
+        rows = list(csv.reader(read_text(path).splitlines()))
+    except FileError as why:
+        raise CalibrationError(str(why)) from None
+    except csv.Error as why:
+        raise CalibrationError(f"{path} is no CSV file: {why}") from None
     names = [name.strip() for name in rows[0]] if rows else []
     wanted = ("force_n", "row") if look_of is not None else ("force_n", *SHOWN)
     missing = [name for name in wanted if name not in names]

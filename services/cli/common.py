@@ -15,6 +15,8 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from models.files import FileError, read_text
+
 ROOT = Path(__file__).resolve().parents[2]
 FAILED, USAGE, NOT_RUNNING = 1, 2, 3
 """Exit codes: it did not work, the request itself is wrong, no service answers."""
@@ -128,10 +130,10 @@ def _configuration() -> dict[str, Any]:
     """The configuration as it stands, unchecked; CliError where there is none that can be read."""
     file = config_file()
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as why:
-        fail(f"{file}: cannot be read: {why.strerror}; name the configuration with --config", USAGE)
-    except ValueError as why:
+        return tomllib.loads(read_text(file))
+    except FileError as why:
+        fail(f"{why}; name the configuration with --config", USAGE)
+    except (ValueError, RecursionError) as why:
         fail(f"{file}: is not TOML: {why}", USAGE)
 
 

@@ -78,6 +78,7 @@ def replay(
     start: Annotated[float, typer.Option("--from", help="Begin so many seconds into the file.")] = 0.0,
     out: Annotated[Path | None, typer.Option(help="Write the contacts that come out to this recording.")] = None,
     private: Annotated[bool, typer.Option("--private", help="Use a runtime folder of its own.")] = False,
+    bundle: Annotated[Path | None, typer.Option(help="Use this one, not the recorded one (found by its hash).")] = None,
     skin: SkinOption = "",
     as_json: JsonOption = False,
 ) -> None:
@@ -89,7 +90,7 @@ def replay(
         fail(f"found --speed {speed:g}, expected a number above 0 (or --fast)", USAGE)
     from services.recordings.replay_session import replay_file
 
-    report = replay_file(file, None if fast else speed, start, skin, out, private, progress=_bar)
+    report = replay_file(file, None if fast else speed, start, skin, out, private, progress=_bar, bundle=bundle)
     for warning in report["warnings"]:
         print(f"skin: {warning}", file=sys.stderr)
     if as_json:

@@ -13,6 +13,7 @@ from models.bundle import Bundle
 from protocol.frames import pack
 from services.board.file_source import file_frame
 from services.config import SKIN_NAME
+from services.recordings import settings
 from services.recordings.npz_file import InputError, frames_of, read_input
 from services.recordings.reconstruction import find_skin
 from services.recordings.recording import RecordingWriter
@@ -46,7 +47,10 @@ def import_arrays(
         data = read_input(arrays, len(bundle.pattern))
     except InputError as error:
         raise ImportRefused(f"{source}: {error}") from None
-    metadata = {"origin": "import", "of": source.name, "bundle": configured.bundle, "skin": skin}
+    if not SKIN_NAME.fullmatch(configured.frame_id):
+        configured = configured.model_copy(update={"frame_id": skin})
+    carried = settings.text_of({skin: configured})
+    metadata = {"origin": "import", "of": source.name, "skin": skin, settings.KEY: carried}
     step_ns, count = int(1e9 / rate_hz), 0
     with RecordingWriter(target, metadata, overwrite) as writer:
         for count, (values, kind) in enumerate(frames_of(data), start=1):

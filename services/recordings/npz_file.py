@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from models import npz
+from models.files import FileError
+
 Array = NDArray[np.float64]
 
 TARE_ROWS = 64
@@ -32,21 +35,11 @@ class Input:
 
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an npz file. Raises InputError where it is none, is damaged, or holds pickled objects."""
+    """All arrays of an npz file. Raises InputError where it is none, is damaged, too large, or holds objects."""
     try:
-        data = np.load(path, allow_pickle=False)
-        if isinstance(data, np.ndarray):
-            raise InputError(f"{path} holds one bare array, expected named ones: numpy.savez(path, name=array)")
-        with data:
-            return {name: np.asarray(data[name]) for name in data.files}
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or 'not a file of numpy.savez'}") from None
-    except Exception:  # zipfile, zlib and numpy each raise their own: all mean that the file is damaged or another
-        raise InputError(
-            f"{path} is no npz of plain arrays (numpy.savez): found something else, a damaged file, or object arrays"
-        ) from None
+        return npz.read_npz(path)
+    except FileError as why:
+        raise InputError(str(why)) from None
 
 
 def read_input(arrays: Mapping[str, NDArray[Any]], k: int) -> Input:

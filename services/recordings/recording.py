@@ -3,7 +3,7 @@
 One channel a topic (``raw/palm``), message encoding ``msgpack``, the msgpack map of a frame as its data: any MCAP tool
 reads it. ``state/<skin>`` holds what the stages' state was, by process. Nothing stays in memory longer than `FLUSH_S`:
 what a killed recorder loses. A file that ends anywhere is read up to its last whole chunk: `RecordingReader` never
-needs the index at the end.
+needs the index at the end. A file may come from anybody: what a chunk unpacks to is bounded before it is unpacked.
 """
 
 from __future__ import annotations
@@ -11,22 +11,31 @@ from __future__ import annotations
 import io
 import struct
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Metadata
-from mcap.stream_reader import breakup_chunk
+from mcap.stream_reader import lz4, zstandard  # type: ignore[attr-defined]  # what the library unpacks with
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from models.files import FileError, open_file
 
 FLUSH_S = 0.1
 CHUNK_BYTES = 64 * 1024
 PROFILE = "eitskin"
 STATE_TOPIC = "state"
+MAX_FILE = 2**40
+MAX_RECORD = 16 * 1024 * 1024
+"""Bytes of a record of the file, and of what a chunk unpacks to: the largest message and more."""
+RATIO, SMALL = 100, 32 * 1024 * 1024
+"""All chunks together may unpack to SMALL bytes, or to RATIO times the file: measurements never pack so well."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
+_KINDS: dict[int, Any] = {Opcode.CHANNEL: Channel, Opcode.MESSAGE: Message}
 
 
 class RecordingError(ValueError):
@@ -113,10 +122,12 @@ class Damage:
     truncated: bool = False
     lost_bytes: int = 0
     bad_chunks: int = 0
+    too_large: int = 0
 
     def __str__(self) -> str:
         parts = [f"cut short: the last {self.lost_bytes} bytes are not a whole chunk"] if self.truncated else []
         parts += [f"{self.bad_chunks} chunk(s) with a wrong checksum left out"] if self.bad_chunks else []
+        parts += [f"{self.too_large} record(s) of more than {MAX_RECORD} bytes left out"] if self.too_large else []
         return "; ".join(parts) or "whole"
 
 
@@ -133,18 +144,21 @@ class RecordingReader:
     damage: Damage = field(default_factory=Damage)
 
     def __post_init__(self) -> None:
-        try:
-            with open(self.path, "rb") as file:
-                head = file.read(len(MCAP0_MAGIC))
-                if head == MCAP0_MAGIC:
-                    self._read_metadata(file)
-        except OSError as error:
-            raise RecordingError(f"cannot read {self.path}: {error.strerror}") from None
+        with self._open() as file:
+            head = file.read(len(MCAP0_MAGIC))
+            if head == MCAP0_MAGIC:
+                self._read_metadata(file)
         if head != MCAP0_MAGIC:
             what = "is empty" if not head else f"starts with {head[:8]!r}"
             raise RecordingError(f"{self.path} {what}: not a recording of `skin record` or `skin import` (MCAP)")
 
-    def _read_metadata(self, file: io.BufferedReader) -> None:
+    def _open(self) -> BinaryIO:
+        try:
+            return open_file(self.path, MAX_FILE)
+        except FileError as why:
+            raise RecordingError(str(why)) from None
+
+    def _read_metadata(self, file: BinaryIO) -> None:
         for opcode, body in _records(file, Damage()):
             if opcode == Opcode.METADATA:
                 record = _parse(Metadata, body)
@@ -154,16 +168,29 @@ class RecordingReader:
                 return
 
     def messages(self, topics: set[str] | None = None, start_s: float = 0.0) -> Iterator[Recorded]:
-        """Messages in file order; of those topics only (names without the skin), from `start_s` after the first one."""
+        """Messages in file order; of those topics only (names without the skin), from `start_s` after the first one.
+
+        Raises RecordingError where the file unpacks to more than any recording does.
+        """
         self.damage = Damage()
         names: dict[int, str] = {}
         first_ns: int | None = None
-        with open(self.path, "rb") as file:
-            file.seek(len(MCAP0_MAGIC))
+        with self._open() as file:
+            size = file.seek(0, io.SEEK_END)
+            left = max(SMALL, RATIO * size)
             for opcode, body in _records(file, self.damage):
                 if opcode == Opcode.DATA_END:
                     return
-                for record in self._contents(opcode, body):
+                if opcode == Opcode.CHUNK:
+                    chunk = _parse(Chunk, body)
+                    left -= chunk.uncompressed_size if chunk is not None else 0
+                    if left < 0:
+                        raise RecordingError(
+                            f"{self.path}: its {size} bytes unpack to more than {max(SMALL, RATIO * size)}: "
+                            "no recording of measurements does"
+                        )
+                    body = self._unpacked(chunk)
+                for record in _contents(opcode, body):
                     if isinstance(record, Channel):
                         names[record.id] = record.topic
                         continue
@@ -174,26 +201,55 @@ class RecordingReader:
                     if topics is None or topic.partition("/")[0] in topics:
                         yield Recorded(topic, record.log_time, record.data)
 
-    def _contents(self, opcode: int, body: bytes) -> Iterator[Channel | Message]:
-        """Channels and messages of one record of the file, which may be a chunk of them."""
-        if opcode == Opcode.CHUNK:
-            try:
-                inner = breakup_chunk(_require(_parse(Chunk, body)), validate_crc=True)
-            except Exception:  # zstandard, lz4, struct and the library each raise their own: all mean this chunk is bad
-                self.damage.bad_chunks += 1
-                return
-            yield from (record for record in inner if isinstance(record, Channel | Message))
-        elif opcode == Opcode.CHANNEL:
-            channel = _parse(Channel, body)
-            if channel is not None:
-                yield channel
-        elif opcode == Opcode.MESSAGE:
-            message = _parse(Message, body)
-            if message is not None:
-                yield message
+    def _unpacked(self, chunk: Chunk | None) -> bytes:
+        """The records of a chunk; none where it is damaged or declares too much."""
+        if chunk is not None and chunk.uncompressed_size > MAX_RECORD:
+            self.damage.too_large += 1
+            return b""
+        data = _decompressed(chunk) if chunk is not None else None
+        if data is None:
+            self.damage.bad_chunks += 1
+        return data or b""
 
 
-def _records(file: io.BufferedReader, damage: Damage) -> Iterator[tuple[int, bytes]]:
+def _decompressed(chunk: Chunk) -> bytes | None:
+    """What a chunk holds; None where that is not what it declares. The compressed stream's own word for its size is
+    never asked for.
+    """
+    size = chunk.uncompressed_size
+    try:
+        if chunk.compression == "zstd":
+            with zstandard.ZstdDecompressor(max_window_size=MAX_RECORD).stream_reader(chunk.data) as stream:
+                data = stream.read(size + 1)
+        elif chunk.compression == "lz4":
+            data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        else:
+            data = chunk.data if not chunk.compression else b""
+    except Exception:  # zstandard and lz4 each raise their own: all mean that this chunk is bad
+        return None
+    intact = len(data) == size and chunk.uncompressed_crc in (0, zlib.crc32(data))
+    return bytes(data) if intact else None
+
+
+def _contents(opcode: int, body: bytes) -> Iterator[Channel | Message]:
+    """Channels and messages of one record of the file, or of the records of a chunk that was unpacked."""
+    if opcode != Opcode.CHUNK:
+        record = _parse(_KINDS.get(opcode), body)
+        if record is not None:
+            yield record
+        return
+    at = 0
+    while at + _RECORD_HEAD.size <= len(body):
+        inner, length = _RECORD_HEAD.unpack_from(body, at)
+        at += _RECORD_HEAD.size
+        if length > len(body) - at:
+            return
+        if inner in (Opcode.CHANNEL, Opcode.MESSAGE):
+            yield from _contents(inner, body[at : at + length])
+        at += length
+
+
+def _records(file: BinaryIO, damage: Damage) -> Iterator[tuple[int, bytes]]:
     """(opcode, body) of each whole record; what remains of a cut one goes to `damage`."""
     size = file.seek(0, io.SEEK_END)
     position = len(MCAP0_MAGIC)
@@ -203,8 +259,10 @@ def _records(file: io.BufferedReader, damage: Damage) -> Iterator[tuple[int, byt
         opcode, length = _RECORD_HEAD.unpack(head) if len(head) == _RECORD_HEAD.size else (0, size)
         if opcode == 0 or length > size - position - _RECORD_HEAD.size:
             break
-        body = file.read(length)
-        yield opcode, body
+        if length > MAX_RECORD:
+            damage.too_large += 1
+        else:
+            yield opcode, file.read(length)
         if opcode == Opcode.FOOTER:
             return
         position += _RECORD_HEAD.size + length
@@ -219,14 +277,11 @@ def _stream(body: bytes) -> Any:
 
 
 def _parse(kind: Any, body: bytes) -> Any:
-    """One record, or None where its body does not hold one."""
+    """One record, or None where its body does not hold one, or it is of a kind that nobody asks for."""
+    if kind is None:
+        return None
     try:
         return kind.read(_stream(body), len(body)) if kind is Message else kind.read(_stream(body))
     except Exception:  # struct.error, EndOfFile, UnicodeDecodeError: a body that does not hold what its opcode says
         return None
 
-
-def _require(chunk: Any) -> Chunk:
-    if not isinstance(chunk, Chunk):
-        raise RecordingError("not a chunk")
-    return chunk

@@ -13,16 +13,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgpack
-
-from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, unpack
+from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, read_map, unpack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
-from services.recordings.recording import STATE_TOPIC, Recorded, RecordingReader, RecordingWriter
+from services.config import SKIN_NAME
+from services.recordings.recording import STATE_TOPIC, Recorded, RecordingError, RecordingReader, RecordingWriter
 from services.stage import STAGES, add_reason
 
 CHAIN_S = 20.0  # for the stages to start and find each other
 ANSWER_S = 5.0  # for the contacts of one frame
 PRIME_EVERY_S = 0.25
+LONGEST_PAUSE_S = 10.0  # between two recorded frames: a file's times are its maker's, and nobody is to wait for years
+MOST_SKINS = 64
 
 
 class ReplayError(Exception):
@@ -84,10 +85,9 @@ def _step(message: Recorded) -> Step | None:
     topic, _, skin = message.topic.partition("/")
     try:
         if topic == STATE_TOPIC:
-            states = msgpack.unpackb(message.data, strict_map_key=False)
-            return Step(message.log_time_ns, skin, states=states) if isinstance(states, dict) else None
+            return Step(message.log_time_ns, skin, states=read_map(message.data, STATE_TOPIC))
         frame = unpack(message.wire)
-    except (FrameError, ValueError, msgpack.UnpackException):
+    except FrameError:
         return None
     return Step(message.log_time_ns, skin, raw=frame) if isinstance(frame, RawFrame) else None
 
@@ -110,7 +110,8 @@ class Replayer:
         self.counts: Counter[str] = Counter()
         self.warnings: list[str] = []
         self._started: set[str] = set()
-        self._zero: tuple[int, float] | None = None
+        self._before_ns: int | None = None
+        self._due = 0.0
         self._status_due = 0.0
 
     def run(self, source: Iterator[Step]) -> Iterator[ContactFrame]:
@@ -133,11 +134,14 @@ class Replayer:
                 yield self._send(step, step.raw)
 
     def _pace(self, at_ns: int) -> None:
-        if self._zero is None or self.speed is None:
-            self._zero = self._zero or (at_ns, time.monotonic())
+        if self.speed is None:
             return
-        due = self._zero[1] + (at_ns - self._zero[0]) * 1e-9 / self.speed
-        while (left := due - time.monotonic()) > 0:
+        if self._before_ns is None:
+            self._before_ns, self._due = at_ns, time.monotonic()
+        pause = (at_ns - self._before_ns) * 1e-9
+        self._before_ns = at_ns
+        self._due += min(max(0.0, pause), LONGEST_PAUSE_S) / self.speed
+        while (left := self._due - time.monotonic()) > 0:
             time.sleep(min(left, 0.2))
             self._report()
 
@@ -241,5 +245,15 @@ def _primer(skin: str) -> RawFrame:
 
 
 def skins_in(reader: RecordingReader) -> dict[str, int]:
-    """The skins whose raw frames a recording holds, and how many. The reader's `damage` is complete then."""
-    return dict(Counter(message.topic.partition("/")[2] for message in reader.messages({"raw"})))
+    """The skins whose raw frames a recording holds, and how many. The reader's `damage` is complete then.
+
+    Raises RecordingError where they are more than any service has.
+    """
+    found: Counter[str] = Counter()
+    for message in reader.messages({"raw"}):
+        skin = message.topic.partition("/")[2]
+        if SKIN_NAME.fullmatch(skin):
+            found[skin] += 1
+        if len(found) > MOST_SKINS:
+            raise RecordingError(f"{reader.path} holds more than {MOST_SKINS} skins: no recording does")
+    return dict(found)

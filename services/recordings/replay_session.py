@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import json
 import os
 import signal
 import subprocess
@@ -17,8 +16,8 @@ from typing import Any
 
 from protocol.frames import ContactFrame
 from protocol.runtime import AlreadyRunning, lock, runtime_dir
-from protocol.sockets import ControlClient, ControlError
-from services.config import ROOT, ConfigError, config_path, load
+from services.config import ROOT, ConfigError, Skin, config_path, load
+from services.recordings import settings
 from services.recordings.recording import RecordingReader, RecordingWriter
 from services.recordings.replay import Replayer, ReplayError, skins_in, steps
 from services.stage import STAGES
@@ -37,10 +36,13 @@ def replay_file(
     out: Path | None = None,
     private: bool = False,
     progress: Progress = lambda contacts, total: contacts,
+    bundle: Path | None = None,
 ) -> dict[str, Any]:
     """Replays `file`; the report's keys: frames, contacts, touched, seconds, damage, warnings.
 
-    Raises RecordingError, ConfigError, ReplayError.
+    bundle: to use instead of the one that the recording names by its hash.
+
+    Raises RecordingError, ConfigError, BundleError, ReplayError.
     """
     reader = RecordingReader(file)
     skins = skins_in(reader)
@@ -53,7 +55,7 @@ def replay_file(
     with contextlib.ExitStack() as cleanup:
         if private:
             cleanup.enter_context(_private_runtime())
-        cleanup.enter_context(_stages(list(wanted), reader))
+        warnings = cleanup.enter_context(_stages(list(wanted), reader, bundle))
         writer = cleanup.enter_context(RecordingWriter(out, {"origin": "replay", "of": file.name})) if out else None
         replayer = Replayer(list(wanted), speed, writer)
         cleanup.callback(replayer.close)
@@ -63,7 +65,7 @@ def replay_file(
                 writer.flush_if_due()
         seconds = time.monotonic() - began
     counts = {key: replayer.counts[key] for key in ("frames", "contacts", "touched")}
-    return counts | {"seconds": seconds, "damage": str(reader.damage), "warnings": replayer.warnings}
+    return counts | {"seconds": seconds, "damage": str(reader.damage), "warnings": [*warnings, *replayer.warnings]}
 
 
 @contextlib.contextmanager
@@ -81,30 +83,35 @@ def _private_runtime() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _stages(skins: list[str], reader: RecordingReader) -> Iterator[None]:
-    """Stages that run here already, else ones of our own for as long as it takes."""
+def _stages(skins: list[str], reader: RecordingReader, bundle: Path | None) -> Iterator[list[str]]:
+    """Stages that run here already, else ones of our own for as long as it takes; gives what is to be warned of.
+
+    Who holds the folder's locks decides, and not who answers: a process that stands still has its sockets all the same.
+    """
     with contextlib.ExitStack() as cleanup:
+        try:
+            cleanup.enter_context(lock(process="acquisition"))
+        except AlreadyRunning as busy:
+            raise ReplayError(
+                f"a board feeds the service in {busy.folder} (acquisition, process {busy.pid}): "
+                "use `skin replay --private`, or start it with `skin up --no-board`"
+            ) from None
         try:
             cleanup.enter_context(lock())
         except AlreadyRunning as busy:
-            _refuse_a_board(busy)
-            yield
+            if bundle is not None:
+                raise ReplayError(
+                    f"--bundle is for stages that replay starts itself, but those of the service in {busy.folder} "
+                    "(`skin up --no-board`) run already: give their skin.toml that bundle, or use --private"
+                ) from None
+            yield []
             return
-        environment = os.environ | {"EITSKIN_CONFIG": str(_configuration(skins, reader))}
+        folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="replay-", dir=runtime_dir())))
+        file, warnings = _configuration(skins, reader, bundle, folder)
+        environment = os.environ | {"EITSKIN_CONFIG": str(file)}
         for name in STAGES:
             cleanup.callback(stop, _start(name, environment))
-        yield
-
-
-def _refuse_a_board(busy: AlreadyRunning) -> None:
-    try:
-        ControlClient("acquisition", 0.5).call("clock")
-    except ControlError:
-        return
-    raise ReplayError(
-        f"a board feeds the service in {busy.folder}: "
-        "use `skin replay --private`, or start it with `skin up --no-board`"
-    )
+        yield warnings
 
 
 def _start(name: str, environment: dict[str, str]) -> subprocess.Popen[bytes]:
@@ -129,25 +136,44 @@ def stop(process: subprocess.Popen[Any]) -> None:
         process.wait()
 
 
-def _configuration(skins: list[str], reader: RecordingReader) -> Path:
-    """A file that configures all `skins`: the one in force, else the recorded one, else one that names their bundle."""
-    missing = skins
-    with contextlib.suppress(ConfigError):
-        missing = [name for name in skins if name not in load().skins]
-    if not missing:
-        return config_path()
-    recorded = runtime_dir() / "replay.toml"
-    text = reader.metadata.get("configuration", "")
-    if text:
-        recorded.write_text(text, encoding="utf-8")
-        if all(name in load(recorded).skins for name in skins):
-            return recorded
-    bundle = reader.metadata.get("bundle", "")
-    if not bundle:
-        raise ReplayError(
-            f"the recording is of skin {', '.join(missing)}, which {config_path()} does not configure: add it"
-        )
-    lines = [f'[skins.{name}]\nport = "stub"\nbundle = {json.dumps(bundle)}\n' for name in skins]
-    recorded.write_text("\n".join(lines), encoding="utf-8")
-    load(recorded)
-    return recorded
+def _configuration(
+    skins: list[str], reader: RecordingReader, bundle: Path | None, folder: Path
+) -> tuple[Path, list[str]]:
+    """A file in `folder` that configures all `skins`, and what is to be warned of: each as the recording says, else as
+    the configuration in force does. Addresses, keys and paths are never the recording's.
+    """
+    recorded = settings.read(reader.metadata.get(settings.KEY, ""), reader.path)
+    config, unusable = None, ""
+    try:
+        config = load()
+    except ConfigError as why:
+        unusable = f" ({str(why).splitlines()[0]})"
+    known = settings.Known.here(config, bundle)
+    said = {name: skin for name, skin in recorded.skins.items() if name in skins}
+    content = settings.configuration(recorded.model_copy(update={"skins": said}), known, folder)
+    for name in skins:
+        if name in said:
+            continue
+        if config is not None and name in config.skins:
+            content["skins"][name] = _of_ours(config.skins[name])
+        elif bundle is None:
+            raise ReplayError(
+                f"the recording does not say how skin {name} is configured, nor does {config_path()}{unusable}: "
+                "add it there, or name its bundle with --bundle PATH"
+            )
+        if known.given is not None:
+            content["skins"].setdefault(name, {"port": "stub"})["bundle"] = str(known.given.path.resolve())
+    file = folder / "skin.toml"
+    file.write_text(settings.toml(content), encoding="utf-8")
+    load(file)
+    return file, [text for name, skin in said.items() if (text := known.differs(name, skin))]
+
+
+def _of_ours(skin: Skin) -> dict[str, Any]:
+    """A skin of the configuration in force, its paths whole."""
+    said = skin.model_dump(mode="json") | {"port": "stub"}
+    if "/" in skin.bundle:
+        said["bundle"] = str(Path(skin.bundle).resolve())
+    if skin.calibration is not None:
+        said["calibration"] = str(skin.calibration.resolve())
+    return said

@@ -108,7 +108,7 @@ def test_no_service_is_said_at_once(skin, command) -> None:  # type: ignore[no-u
         (("fault", "electrode_open", "electrode"), "expected key=value"),
         (("bench", "speed"), "no benchmark 'speed'"),
         (("replay", "x.mcap", "--speed", 0), "above 0"),
-        (("replay", "missing.mcap"), "cannot read missing.mcap"),
+        (("replay", "missing.mcap"), "missing.mcap: cannot be read"),
         (("record", "/nowhere/x.mcap"), "cannot write /nowhere/x.mcap"),
         (("record", "/tmp/x.mcap", "--topics", "raw,sound"), "no topic 'sound'"),
     ],

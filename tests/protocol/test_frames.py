@@ -102,6 +102,8 @@ def test_a_wrong_field_inside_a_contact_is_named_with_its_place(key, value):
         ({"dtype": "<c8", "shape": [1, 2], "data": bytes(16)}, "(K)"),
         ({"dtype": "<c8", "shape": [-2], "data": bytes(16)}, "array"),
         ({"dtype": "<c8", "shape": [2**62, 2**62], "data": b""}, "bytes for shape"),
+        ({"dtype": "<c8", "shape": [2**40, 2**40, 0], "data": b""}, "dimensions that multiply"),
+        ({"dtype": "<c8", "shape": [0, 2**63], "data": b""}, "dimensions that multiply"),
         ({"dtype": "object", "shape": [2], "data": bytes(16)}, "one of"),
         ({"dtype": ["<c8"], "shape": [2], "data": bytes(16)}, "one of"),
         ({"dtype": "<c8", "shape": 2, "data": bytes(16)}, "array"),

@@ -101,7 +101,7 @@ def test_other_files_are_refused_in_words(tmp_path: Path, content: bytes) -> Non
 
 
 def test_missing_file_and_no_overwriting(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="cannot read"):
+    with pytest.raises(RecordingError, match="cannot be read"):
         RecordingReader(tmp_path / "none.mcap")
     (tmp_path / "a.mcap").write_bytes(b"")
     with pytest.raises(RecordingError, match="overwrite"):
