@@ -18,8 +18,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bench.reliability import faults_report as report
-from bench.reliability import matrix, workers
+from bench.reliability import faults_report, matrix, report, workers
 from bench.reliability.matrix import ROWS, SITUATIONS, Score
 from firmware_stub.world import Touch
 
@@ -65,10 +64,11 @@ def main(argv: list[str] | None = None) -> int:
     found: dict[str, Any] = {}
     places = args.places or (QUICK_PLACES if args.quick else PLACES)
     cells = run_matrix(places, args.seed, titles, args.bundle, args.cores)
-    found["matrix"] = report.matrix_rows(cells)
-    goals = report.matrix_goals(cells, args.quick)
+    found["matrix"] = faults_report.matrix_rows(cells)
+    goals = faults_report.matrix_goals(cells, args.quick)
     head = report.head("faults", argv, args, time.perf_counter() - began)
-    report.show(head, found, goals)
+    faults_report.show(found)
+    report.show(head, goals)
     if args.only is None:
         report.write(args.out / "faults.json", head, found, goals)
     return report.status(goals, sys.stderr)

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, TextIO
+from collections.abc import Mapping
+from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
-from bench._goals import Goal, table
-from bench._json import write_json
-from bench._machine import provenance
-from bench._report import text
+from bench._goals import Goal
 from bench.reliability.matrix import ROWS, SITUATIONS, Score
-from models.bundle import Bundle
+from bench.reliability.report import cell, console
 
 COLUMNS = (  # heading, key, format
     ("cases", "cases", "{:.0f}"),
@@ -72,26 +65,12 @@ def _sum(scores: Any) -> Score:
     return whole
 
 
-def head(benchmark: str, argv: Sequence[str] | None, args: argparse.Namespace, seconds: float) -> dict[str, Any]:
-    bundle = Bundle.load(args.bundle)
-    return {
-        **provenance(benchmark, argv),
-        "bundle": {"name": bundle.name, "hash": bundle.hash},
-        "seed": args.seed,
-        "snr_db": 80,
-        "seconds": round(seconds, 1),
-    }
-
-
-def show(head: Mapping[str, Any], found: Mapping[str, Any], goals: Sequence[Goal]) -> None:
-    console = Console(width=150) if not sys.stdout.isatty() else Console()
+def show(found: Mapping[str, Any]) -> None:
     if rows := found.get("matrix"):
-        console.print(_matrix(rows))
-        for name, row in rows.items():
-            if ", " not in name.replace(", silent", "") and row["wrong"]:
-                print(f"wrong: {'; '.join(row['worst'][:2])}")
-    console.print(table(goals))
-    print(f"{head['seconds']:.0f} s, {head['machine']}, bundle {head['bundle']['name']} {head['bundle']['hash'][:12]}")
+        console().print(_matrix(rows))
+        for row in ROWS:
+            if row.title in rows and rows[row.title]["wrong"]:
+                print(f"wrong: {'; '.join(rows[row.title]['worst'][:2])}")
 
 
 def _matrix(rows: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -104,21 +83,8 @@ def _matrix(rows: Mapping[str, Mapping[str, Any]]) -> Table:
     for row in ROWS:
         if row.title in rows:
             whole = rows[row.title]
-            cells = [text(whole, key, form) for _, key, form in COLUMNS]
+            cells = [cell(whole.get(key), form) for _, key, form in COLUMNS]
             split = "/".join(str(rows[f"{row.title}, {s}"]["wrong"]) for s in SITUATIONS)
             style = "red" if whole["wrong"] or whole["late"] else ""
             made.add_row(row.title, *cells, split, ", ".join(whole["reasons"]), style=style)
     return made
-
-
-def write(path: Path, head: Mapping[str, Any], found: Mapping[str, Any], goals: Sequence[Goal]) -> None:
-    write_json(path, {**head, "targets": [goal.to_dict() for goal in goals], **found})
-    print(f"wrote {path}")
-
-
-def status(goals: Sequence[Goal], errors: TextIO) -> int:
-    """1 where a gate is broken."""
-    broken = [goal for goal in goals if not goal.passed]
-    for goal in broken:
-        print(f"FAILED: {goal.figure}: {goal.measured}, gate {goal.gate:g}", file=errors)
-    return 1 if broken else 0

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache, partial
 from typing import TypeVar
 
@@ -33,7 +33,7 @@ def pipeline(bundle: str = "square16", **settings: object) -> Pipeline:
 
 
 def spread(work: Callable[[Task], Found], tasks: Iterable[Task], cores: int, what: str) -> Iterator[Found]:
-    """The results of all tasks, in the order in which they are done. One core: in this process."""
+    """The results of all tasks, in their order. One core: in this process."""
     waiting = list(tasks)
     began = said = time.perf_counter()
     for done, result in enumerate(_results(partial(_kept, work), waiting, cores), 1):
@@ -53,8 +53,7 @@ def _results(work: Callable[[Task], Found], tasks: list[Task], cores: int) -> It
         return
     context = multiprocessing.get_context("spawn")  # threads and network sessions do not survive a fork
     with ProcessPoolExecutor(min(cores, len(tasks)), mp_context=context) as pool:
-        for future in as_completed([pool.submit(work, task) for task in tasks]):
-            yield future.result()
+        yield from pool.map(work, tasks)
 
 
 def _kept(work: Callable[[Task], Found], task: Task) -> Found:
