@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 from models.bundle import Bundle, BundleError
 from protocol import logs
-from protocol.runtime import AlreadyRunningfrom protocol.transport import TransportError
+from protocol.runtime import AlreadyRunning, RuntimeDirError, lock
+from protocol.transport import TransportError
 from services import realtime
 from services.config import ConfigError, Skin, load
 from services.runner import Runner
