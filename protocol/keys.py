@@ -45,28 +45,29 @@ def _write(path: Path, text: str, mode: int) -> None:
 
 def read_pair(path: Path) -> tuple[bytes, bytes]:
     """Our own (public, secret) key. Raises TransportError, also where others may read the file."""
-    found = _keys(path, secret=True)
+    found, mode = _keys(path)
     if "secret" not in found:
         raise TransportError(f"key file {path} holds no secret key: name the .key_secret file")
+    if mode & 0o077:
+        raise TransportError(
+            f"key file {path} has mode {mode:04o}, so others can use the key, expected 0600: chmod 600 {path}, and "
+            "make a new key where others may have read it"
+        )
     return found["public"], found["secret"]
 
 
 def read_public(path: Path) -> bytes:
     """A public key. Raises TransportError."""
-    return _keys(path)["public"]
+    return _keys(path)[0]["public"]
 
 
-def _keys(path: Path, secret: bool = False) -> dict[str, bytes]:
+def _keys(path: Path) -> tuple[dict[str, bytes], int]:
+    """The keys in a file, and its mode."""
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             about = os.fstat(file.fileno())
             if not stat.S_ISREG(about.st_mode):
                 raise TransportError(f"key file {path}: found something that is no file")
-            if secret and about.st_mode & 0o077:
-                raise TransportError(
-                    f"key file {path} has mode {stat.S_IMODE(about.st_mode):04o}, so others can use the key, "
-                    f"expected 0600: chmod 600 {path}, and make a new key where others may have read it"
-                )
             text = file.read(MAX_FILE)
     except OSError as bad:
         raise TransportError(f"key file {path}: {bad.strerror}; make one with `skin keys new`") from None
@@ -79,7 +80,7 @@ def _keys(path: Path, secret: bool = False) -> dict[str, bytes]:
                 raise ValueError
         except (ValueError, KeyError, IndexError):
             raise TransportError(f"key file {path}: the {kind} key is damaged, expected 40 characters of Z85") from None
-    return found
+    return found, stat.S_IMODE(about.st_mode)
 
 
 class KeyFolder:

@@ -260,11 +260,12 @@ def _use_keys(socket: Socket, name: str, address: str) -> None:
         return
     check(transport)
     assert transport.secret_key is not None
-    socket.curve_publickey, socket.curve_secretkey = read_pair(transport.secret_key)
+    public, secret = read_pair(transport.secret_key)
+    socket.curve_publickey, socket.curve_secretkey = public, secret
     if name in transport.server_keys:
         socket.curve_serverkey = read_public(transport.server_keys[name])
     elif transport.clients is not None:  # we are this service: all its processes hold our own key
-        socket.curve_serverkey = socket.curve_publickey
+        socket.curve_serverkey = public
     else:
         raise TransportError(
             f"{address}: found a secret_key but no server key of {name}: anybody could answer there; name the file of "
