@@ -10,6 +10,7 @@ import os
 import re
 import stat
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import zmq
@@ -124,3 +125,29 @@ def _stats(files: list[Path]) -> list[tuple[Path, os.stat_result]]:
         except OSError:  # removed just now, or a dangling link
             found.append((path, path.lstat()) if path.is_symlink() else (path, os.stat_result([0] * 10)))
     return found
+
+
+@dataclass(frozen=True)
+class Admission:
+    """Whose keys a bound TCP socket lets in, and which of them may change something."""
+
+    own: bytes
+    secret: bytes = field(repr=False)
+    clients: KeyFolder
+    operators: KeyFolder | None = None
+
+    def keys(self) -> frozenset[bytes]:
+        """All that may connect: who holds our own secret key, clients, operators."""
+        return frozenset({self.own, *self.clients.keys(), *(self.operators.keys() if self.operators else ())})
+
+    def allows(self, key: bytes) -> bool:
+        return key in self.keys()
+
+    def operates(self, key: bytes) -> bool:
+        """Whether this key may change something."""
+        return key == self.own or (self.operators is not None and key in self.operators.keys())
+
+    @property
+    def problems(self) -> list[str]:
+        """Files that hold no key."""
+        return [*self.clients.problems, *(self.operators.problems if self.operators else ())]

@@ -24,6 +24,7 @@ from protocol.frames import Frame, InfoFrame
 from protocol.runtime import host_id
 from protocol.sockets import AllReader, ControlClient, ControlError, ControlServer
 from protocol.topics import TOPICS
+from protocol.transport import TransportError
 from services.config import ConfigError, config_path, load
 from services.recordings.recording import STATE_TOPIC, RecordingError, RecordingWriter
 from services.stage import STAGES
@@ -199,7 +200,7 @@ def main(argv: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, on_signal)
     try:
         transport.configure(load().transport())
-    except ConfigError as error:
+    except (ConfigError, TransportError) as error:
         log.error("%s", error)
         return 2
     try:
