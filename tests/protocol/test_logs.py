@@ -1,5 +1,6 @@
 """What others write is logged as one short line, and no place in the program floods the log."""
 
+import io
 import logging
 
 import pytest
@@ -12,13 +13,22 @@ from .test_sockets import until
 
 
 @pytest.fixture
-def log(capsys):
+def log(monkeypatch):
     """A process's log; gives a function that returns the lines since the last call."""
-    root = logging.getLogger()
+    root, stream = logging.getLogger(), io.StringIO()
     before, level = root.handlers[:], root.level
     root.handlers.clear()
-    logs.setup("here: %(message)s")
-    yield lambda: capsys.readouterr().err.splitlines()
+    with monkeypatch.context() as patch:
+        patch.setattr("sys.stderr", stream)
+        logs.setup("here: %(message)s")
+
+    def lines():
+        text = stream.getvalue()
+        stream.seek(0)
+        stream.truncate()
+        return text.splitlines()
+
+    yield lines
     root.handlers[:], root.level = before, level
 
 
