@@ -10,6 +10,7 @@ import os
 import re
 import stat
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import zmq
@@ -45,28 +46,29 @@ def _write(path: Path, text: str, mode: int) -> None:
 
 def read_pair(path: Path) -> tuple[bytes, bytes]:
     """Our own (public, secret) key. Raises TransportError, also where others may read the file."""
-    found = _keys(path, secret=True)
+    found, mode = _keys(path)
     if "secret" not in found:
         raise TransportError(f"key file {path} holds no secret key: name the .key_secret file")
+    if mode & 0o077:
+        raise TransportError(
+            f"key file {path} has mode {mode:04o}, so others can use the key, expected 0600: chmod 600 {path}, and "
+            "make a new key where others may have read it"
+        )
     return found["public"], found["secret"]
 
 
 def read_public(path: Path) -> bytes:
     """A public key. Raises TransportError."""
-    return _keys(path)["public"]
+    return _keys(path)[0]["public"]
 
 
-def _keys(path: Path, secret: bool = False) -> dict[str, bytes]:
+def _keys(path: Path) -> tuple[dict[str, bytes], int]:
+    """The keys in a file, and its mode."""
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             about = os.fstat(file.fileno())
             if not stat.S_ISREG(about.st_mode):
                 raise TransportError(f"key file {path}: found something that is no file")
-            if secret and about.st_mode & 0o077:
-                raise TransportError(
-                    f"key file {path} has mode {stat.S_IMODE(about.st_mode):04o}, so others can use the key, "
-                    f"expected 0600: chmod 600 {path}, and make a new key where others may have read it"
-                )
             text = file.read(MAX_FILE)
     except OSError as bad:
         raise TransportError(f"key file {path}: {bad.strerror}; make one with `skin keys new`") from None
@@ -79,7 +81,7 @@ def _keys(path: Path, secret: bool = False) -> dict[str, bytes]:
                 raise ValueError
         except (ValueError, KeyError, IndexError):
             raise TransportError(f"key file {path}: the {kind} key is damaged, expected 40 characters of Z85") from None
-    return found
+    return found, stat.S_IMODE(about.st_mode)
 
 
 class KeyFolder:
@@ -123,3 +125,29 @@ def _stats(files: list[Path]) -> list[tuple[Path, os.stat_result]]:
         except OSError:  # removed just now, or a dangling link
             found.append((path, path.lstat()) if path.is_symlink() else (path, os.stat_result([0] * 10)))
     return found
+
+
+@dataclass(frozen=True)
+class Admission:
+    """Whose keys a bound TCP socket lets in, and which of them may change something."""
+
+    own: bytes
+    secret: bytes = field(repr=False)
+    clients: KeyFolder
+    operators: KeyFolder | None = None
+
+    def keys(self) -> frozenset[bytes]:
+        """All that may connect: who holds our own secret key, clients, operators."""
+        return frozenset({self.own, *self.clients.keys(), *(self.operators.keys() if self.operators else ())})
+
+    def allows(self, key: bytes) -> bool:
+        return key in self.keys()
+
+    def operates(self, key: bytes) -> bool:
+        """Whether this key may change something."""
+        return key == self.own or (self.operators is not None and key in self.operators.keys())
+
+    @property
+    def problems(self) -> list[str]:
+        """Files that hold no key."""
+        return [*self.clients.problems, *(self.operators.problems if self.operators else ())]

@@ -28,6 +28,9 @@ MAX_SUBSCRIPTION = 1024
 MOST_PREFIXES = 4096
 """Different subscriptions at one time; beyond, the peer with most of them is disconnected. 64 skins have about 600."""
 
+MOST_BYTES = 256 * 1024
+"""The same for all their lengths together: libzmq takes some 50 bytes of memory for each byte of a subscription."""
+
 EVENTS_AT_ONCE = 1000
 """Subscriptions taken in by one call of `Publisher.poll`, after which a flood of them cannot hold the producer."""
 
@@ -54,6 +57,7 @@ class Publisher:
         self._latched: dict[bytes, bytes] = {}
         self._asked_by: dict[bytes, str] = {}  # who first subscribed to each prefix
         self._before: tuple[float, Counter[bytes]] = (0.0, Counter())  # until when, and what was subscribed to
+        self._bytes = 0  # of all different subscriptions
         self._flooded_by: str | None = None
         self._listening = Listening(
             context or zmq.Context.instance(),
@@ -84,7 +88,7 @@ class Publisher:
         """
         peer, self._flooded_by = self._flooded_by, None
         if peer is not None:
-            self._listening.shed(peer, f"more than {MOST_PREFIXES} subscriptions")
+            self._listening.shed(peer, f"too many subscriptions (at most {MOST_PREFIXES}, {MOST_BYTES} bytes)")
         elif not self._listening.mind():
             return False
         self._before = (time.monotonic() + RETURN_S, Counter(dict(self._subscriptions.most_common(MOST_PREFIXES))))
@@ -93,7 +97,15 @@ class Publisher:
             self._before = (self._before[0], Counter({p: n for p, n in self._before[1].items() if p not in flood}))
         self._subscriptions.clear()
         self._asked_by.clear()
+        self._bytes = 0
         return True
+
+    def _most(self) -> str:
+        """The peer whose subscriptions are longest, all together."""
+        sizes: Counter[str] = Counter()
+        for prefix, peer in self._asked_by.items():
+            sizes[peer] += 1 + len(prefix)
+        return sizes.most_common(1)[0][0]
 
     def send(self, frame: Frame) -> bytes:
         """Publish a frame; its session, seq and host are set here. Returns the message. Never blocks. Raises
@@ -149,12 +161,14 @@ class Publisher:
                 newcomers.append(prefix)
                 if prefix not in self._asked_by:
                     self._asked_by[prefix] = peer_of(received, self._listening.secured)
-                if len(self._asked_by) > MOST_PREFIXES:
-                    self._flooded_by = Counter(self._asked_by.values()).most_common(1)[0][0]
+                    self._bytes += len(prefix)
+                if len(self._asked_by) > MOST_PREFIXES or self._bytes > MOST_BYTES:
+                    self._flooded_by = self._most()
             elif event[:1] == b"\0" and prefix in self._subscriptions:
                 self._subscriptions[prefix] -= 1
                 if self._subscriptions[prefix] <= 0:
                     del self._subscriptions[prefix]
+                    self._bytes -= len(prefix)
                     self._asked_by.pop(prefix, None)
         if newcomers:
             for message in self._latched.values():

@@ -22,7 +22,7 @@ import zmq
 from . import runtime
 from .frames import MAX_MESSAGE
 from .gate import Gate
-from .keys import KeyFolder, TransportError, read_pair, read_public, write_keys
+from .keys import Admission, KeyFolder, TransportError, read_pair, read_public, write_keys
 
 __all__ = ["Context", "Socket", "Transport", "TransportError", "bind", "configure", "connect", "current", "write_keys"]
 
@@ -90,21 +90,10 @@ def current() -> Transport:
 
 def check(transport: Transport) -> None:
     """Raises TransportError where keys are half configured, or a key file cannot be used."""
-    if not transport.keyed:
-        return
+    if missing := half(transport):
+        raise TransportError(f"keys are half configured: expected {missing}")
     if transport.secret_key is None:
-        given = [name for name in ("server_keys", "clients", "operators") if getattr(transport, name)]
-        raise TransportError(
-            f"found {' and '.join(given)} without secret_key: nothing would be encrypted; make a key pair of our own "
-            "(skin keys new) and name it as secret_key"
-        )
-    if transport.clients is None and not transport.server_keys:
-        raise TransportError(
-            "found secret_key alone: a server also needs `clients`, the folder of the clients' public keys; a client "
-            "`server_keys`, the public key of each process it connects to"
-        )
-    if transport.operators is not None and transport.clients is None:
-        raise TransportError("found operators without clients: name the folder of the clients' public keys too")
+        return
     read_pair(transport.secret_key)
     for key in transport.server_keys.values():
         read_public(key)
@@ -114,37 +103,31 @@ def check(transport: Transport) -> None:
             raise TransportError(f"{what}: found no folder {folder}: make it, and put public keys (*.key) into it")
 
 
-@dataclass(frozen=True)
-class Admission:
-    """Whose keys a bound TCP socket lets in, and which of them may change something."""
-
-    own: bytes
-    secret: bytes = field(repr=False)
-    clients: KeyFolder
-    operators: KeyFolder | None = None
-
-    def keys(self) -> frozenset[bytes]:
-        """All that may connect: who holds our own secret key, clients, operators."""
-        return frozenset({self.own, *self.clients.keys(), *(self.operators.keys() if self.operators else ())})
-
-    def allows(self, key: bytes) -> bool:
-        return key in self.keys()
-
-    def operates(self, key: bytes) -> bool:
-        """Whether this key may change something."""
-        return key == self.own or (self.operators is not None and key in self.operators.keys())
-
-    @property
-    def problems(self) -> list[str]:
-        """Files that hold no key."""
-        return [*self.clients.problems, *(self.operators.problems if self.operators else ())]
+def half(transport: Transport) -> str:
+    """What is missing where keys are configured by half, so that something would go unencrypted or unasked; else ""."""
+    if not transport.keyed:
+        return ""
+    if transport.secret_key is None:
+        given = [name for name in ("server_keys", "clients", "operators") if getattr(transport, name)]
+        return (
+            f"secret_key too (found {' and '.join(given)} without it: nothing would be encrypted); "
+            "make a key pair with `skin keys new`"
+        )
+    if transport.clients is None and transport.operators is not None:
+        return "clients too, the folder of the public keys that may read (found operators without it)"
+    if transport.clients is None and not transport.server_keys:
+        return (
+            "clients or server_keys too (found secret_key alone): a service needs the folder of its clients' public "
+            "keys, a client the public key of each process it connects to"
+        )
+    return ""
 
 
-def admission(address: str) -> Admission | None:
+def admission(address: str, transport: Transport | None = None) -> Admission | None:
     """Whom a socket bound at `address` lets in; None where no key is asked for (ipc: the folder's rights decide;
     unencrypted TCP). Raises TransportError for an address that would be open to others against the configuration.
     """
-    transport = _current
+    transport = transport or _current
     if not address.startswith("tcp://"):
         return None
     if not transport.keyed:
@@ -220,6 +203,16 @@ def taken_by(address: str) -> None:
         )
 
 
+def try_out(address: str, transport: Transport) -> None:
+    """Raises TransportError where a process that is to listen at `address` would fail."""
+    admission(address, transport)
+    if address.startswith("ipc://"):
+        taken_by(address)
+        return
+    with zmq.Context() as context:
+        bind(context, zmq.XPUB, address, {}).close(0)
+
+
 def connect(context: Context, kind: int, addresses: Mapping[str, str], options: Mapping[int, Any]) -> Socket:
     """A socket connected to `addresses` (name of who is there -> address); who is not there yet is found when it
     comes. Raises TransportError where that would be unencrypted against the configuration.
@@ -260,11 +253,12 @@ def _use_keys(socket: Socket, name: str, address: str) -> None:
         return
     check(transport)
     assert transport.secret_key is not None
-    socket.curve_publickey, socket.curve_secretkey = read_pair(transport.secret_key)
+    public, secret = read_pair(transport.secret_key)
+    socket.curve_publickey, socket.curve_secretkey = public, secret
     if name in transport.server_keys:
         socket.curve_serverkey = read_public(transport.server_keys[name])
     elif transport.clients is not None:  # we are this service: all its processes hold our own key
-        socket.curve_serverkey = socket.curve_publickey
+        socket.curve_serverkey = public
     else:
         raise TransportError(
             f"{address}: found a secret_key but no server key of {name}: anybody could answer there; name the file of "

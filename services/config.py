@@ -5,17 +5,18 @@ An error names the file, the key, what was found and what is allowed; see `Confi
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from models.files import FileError, read_text
 from protocol.topics import PRODUCERS
-from protocol.transport import Transport
+from protocol.transport import Transport, half
 from services.stage import PROCESSES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -106,6 +107,13 @@ class Skin(Section):
 RECORDINGS = (".mcap", ".npz")
 
 
+def _one_board(port: str, other: str) -> bool:
+    """Whether two ports are the same board: a device may have several names."""
+    if port == "stub" or Path(port).suffix in RECORDINGS:  # a stub is started for each skin, a file read by each
+        return False
+    return port == other or (port.startswith("/") and os.path.realpath(port) == os.path.realpath(other))
+
+
 class Sockets(Section):
     """Where processes publish and take commands: ipc sockets in the runtime folder, or the addresses given here."""
 
@@ -117,9 +125,26 @@ class Sockets(Section):
         for name, address in addresses.items():
             if name.removesuffix(".ctl") not in (*PRODUCERS, "recorder"):
                 raise ValueError(f"producers {', '.join(PRODUCERS)}, or one of these with .ctl (found {name!r})")
-            if not re.fullmatch(r"(tcp://\S+:\d+|ipc://\S+)", address):
+            port = address.rpartition(":")[2] if address.startswith("tcp://") else "1"
+            if not re.fullmatch(r"(tcp://\S+:\d{1,5}|ipc://\S+)", address) or not 1 <= int(port) <= 65535:
                 raise ValueError(f"tcp://HOST:PORT or ipc://PATH (found {address!r} for {name})")
+        for (name, address), (other, same) in itertools.combinations(addresses.items(), 2):
+            if _overlap(address, same):
+                raise ValueError(
+                    f"an address of its own for each socket ({name} has {address!r}, {other} has {same!r}: "
+                    "only one of them could listen there)"
+                )
         return addresses
+
+
+def _overlap(one: str, other: str) -> bool:
+    """Whether two addresses cannot both be listened at."""
+    if not (one.startswith("tcp://") and other.startswith("tcp://")):
+        return one == other
+    (host, _, port), (other_host, _, other_port) = (a.removeprefix("tcp://").rpartition(":") for a in (one, other))
+    host, other_host = (name.replace("localhost", "127.0.0.1") for name in (host, other_host))
+    every = {"*", "0.0.0.0", "[::]"}
+    return int(port) == int(other_port) and (host == other_host or bool(every & {host, other_host}))
 
 
 class Security(Section):
@@ -130,7 +155,33 @@ class Security(Section):
     secret_key: Path | None = None  # our own key pair
     server_keys: dict[str, Path] = {}  # producer -> its public key
     clients: Path | None = None  # folder with the public keys that may connect
-    insecure: bool = False
+    operators: Path | None = None  # folder with those that may also give commands that change something
+    insecure: Annotated[bool, Field(strict=True)] = False
+
+    @field_validator("server_keys")
+    @classmethod
+    def known(cls, keys: dict[str, Path]) -> dict[str, Path]:
+        for name in keys:
+            if name not in (*PRODUCERS, "recorder"):
+                raise ValueError(f"producers {', '.join(PRODUCERS)} or recorder (found {name!r})")
+        return keys
+
+    @model_validator(mode="after")
+    def whole(self) -> Security:
+        if missing := half(self.transport({}, Path())):
+            raise ValueError(missing)
+        return self
+
+    def transport(self, addresses: dict[str, str], folder: Path) -> Transport:
+        """For `protocol.transport.configure`; relative paths are relative to `folder`."""
+        return Transport(
+            addresses=addresses,
+            secret_key=folder / self.secret_key if self.secret_key else None,
+            server_keys={name: folder / key for name, key in self.server_keys.items()},
+            clients=folder / self.clients if self.clients else None,
+            operators=folder / self.operators if self.operators else None,
+            insecure=self.insecure,
+        )
 
 
 class Logging(Section):
@@ -179,18 +230,17 @@ class Config(Section):
         for name in skins:
             if not SKIN_NAME.fullmatch(name):
                 raise ValueError(f"skin names of lower-case letters, digits, - and _ (found {name!r})")
+        for (name, skin), (other, same) in itertools.combinations(skins.items(), 2):
+            if _one_board(skin.port, same.port):
+                raise ValueError(
+                    f"a port of its own for each skin ({name} has {skin.port!r}, {other} has {same.port!r}: "
+                    "one board measures one skin)"
+                )
         return {name: s if s.frame_id else s.model_copy(update={"frame_id": name}) for name, s in skins.items()}
 
     def transport(self) -> Transport:
         """For `protocol.transport.configure`."""
-        keys = self.security
-        return Transport(
-            addresses=self.sockets.addresses,
-            secret_key=self.relative(keys.secret_key),
-            server_keys={name: self.path.parent / key for name, key in keys.server_keys.items()},
-            clients=self.relative(keys.clients),
-            insecure=keys.insecure,
-        )
+        return self.security.transport(self.sockets.addresses, self.path.parent)
 
     def relative(self, path: Path | None) -> Path | None:
         """A path of the file: relative ones are relative to its folder."""

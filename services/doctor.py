@@ -40,7 +40,7 @@ def _examine(path: Path | None) -> Iterator[Finding]:
         config = load(path)
         transport.configure(config.transport())
         yield Finding("OK", "configuration", f"{config_path(path)}: skin {', '.join(config.skins)}")
-    except ConfigError as why:
+    except (ConfigError, transport.TransportError) as why:
         yield Finding("FAIL", "configuration", str(why).replace("\n", "; "))
         return
     try:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterable
+from typing import Any
 
 from protocol import transport
 from protocol.runtime import RuntimeDirError
@@ -52,15 +53,18 @@ def _stub(client: ControlClient) -> str:
 
 
 def _recorder(client: ControlClient) -> str:
-    before = _recorded(client)
+    before = _recorded(client.call("status"))
     time.sleep(GROWING_S)
-    after = _recorded(client)
+    status = client.call("status")
+    after = _recorded(status)
+    if status.get("level") == "ERROR":
+        return "recorder: " + "; ".join(map(str, status.get("problems", [])))
     return "" if after > before else f"recorder: {after} frames recorded, none in the last {GROWING_S:g} s"
 
 
-def _recorded(client: ControlClient) -> int:
+def _recorded(status: dict[str, Any]) -> int:
     """Frames written so far."""
-    counts = client.call("status").get("messages", {})
+    counts = status.get("messages", {})
     return sum(n for topic, n in counts.items() if topic.partition("/")[0] not in BESIDES)
 
 

@@ -20,11 +20,12 @@ from typing import Any
 import msgpack
 
 from models.bundle import BundleError
-from protocol import transport
+from protocol import logs, transport
 from protocol.frames import Frame, InfoFrame
 from protocol.runtime import host_id
 from protocol.sockets import AllReader, ControlClient, ControlError, ControlServer
 from protocol.topics import TOPICS
+from protocol.transport import TransportError
 from services.config import ConfigError, load
 from services.recordings import settings
 from services.recordings.recording import STATE_TOPIC, RecordingError, RecordingWriter
@@ -34,6 +35,7 @@ DEFAULT_TOPICS = ("raw", "contact", "status", "info")
 POLL_S = 0.05
 STATE_TIMEOUT_S = 0.5
 MOST_SKINS = 64
+COMMANDS_AT_ONCE = 5  # answered between two turns of recording
 
 log = logging.getLogger("recorder")
 
@@ -72,6 +74,15 @@ class Recorder:
             self.writer.write(topic.decode(), data, self._now_ns())
             taken += 1
             self._ask_states(frame)
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the recording, and what to do; "" while all is well."""
+        lost = f"{self.writer.lost} messages are lost so far" if self.writer.lost else "nothing is lost yet"
+        if self.writer.full:
+            folder = self.path.resolve().parent
+            return f"{self.writer.full}: make room in {folder}; {lost}, recording goes on by itself when there is room"
+        return f"{lost}: the disk was full" if self.writer.lost else ""
 
     def _ask_states(self, frame: Frame) -> None:
         """At the first frame of a skin, and when its baseline has changed."""
@@ -194,7 +205,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     if (args.file is None) == (args.folder is None):
         parser.error("name either a file or --folder")
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    logs.setup("%(asctime)s %(name)s %(levelname)s %(message)s")
     stop = threading.Event()
 
     def on_signal(number: int, frame: FrameType | None) -> None:
@@ -204,7 +215,7 @@ def main(argv: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, on_signal)
     try:
         transport.configure(load().transport())
-    except ConfigError as error:
+    except (ConfigError, TransportError) as error:
         log.error("%s", error)
         return 2
     try:
@@ -215,15 +226,27 @@ def main(argv: list[str] | None = None) -> int:
     except (RecordingError, OSError) as error:
         log.error("%s", error)
         return 2
-    server = ControlServer("recorder", {"status": lambda _: _status(recorder)})
+    try:
+        server = ControlServer("recorder", {})
+    except TransportError as error:
+        recorder.close()
+        log.error("%s", error)
+        return 2
+    server.handlers["status"] = lambda _: _status(recorder, server)
     log.info("recording to %s", path)
+    full = False
     try:
         with recorder:
             while not stop.is_set():
                 recorder.step()
-                while server.serve_once():
-                    pass
-    except OSError as error:  # disk full, folder gone
+                server.mind()
+                for _ in range(COMMANDS_AT_ONCE):
+                    if not server.serve_once():
+                        break
+                if bool(recorder.writer.full) != full:
+                    full = not full
+                    log.log(logging.ERROR if full else logging.INFO, "%s", recorder.problem or "recording goes on")
+    except OSError as error:  # the disk is broken, or gone
         log.error("cannot go on writing %s: %s", path, error.strerror)
         return 1
     finally:
@@ -232,8 +255,17 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def _status(recorder: Recorder) -> dict[str, Any]:
-    return {"file": str(recorder.path), "messages": recorder.writer.counts, "gaps": recorder.gaps}
+def _status(recorder: Recorder, server: ControlServer) -> dict[str, Any]:
+    """`level` and `problems` as in status frames; `lost`: messages that there was no room for on the disk."""
+    problems = [text for text in (recorder.problem,) if text] + server.problems
+    return {
+        "file": str(recorder.path),
+        "messages": recorder.writer.counts,
+        "gaps": recorder.gaps,
+        "lost": recorder.writer.lost,
+        "level": "ERROR" if recorder.writer.full else "WARN" if problems else "OK",
+        "problems": problems,
+    }
 
 
 if __name__ == "__main__":

@@ -59,9 +59,12 @@ def record(
             while not stop.is_set() and time.monotonic() < end:
                 recorder.step(0.1)
                 counts = ", ".join(f"{topic} {n}" for topic, n in recorder.writer.counts.items())
-                status.update(f"recording to {file}: {counts or 'nothing yet'}  (Ctrl-C ends it)")
+                said = f"  {recorder.problem}" if recorder.problem else ""
+                status.update(f"recording to {file}: {counts or 'nothing yet'}{said}  (Ctrl-C ends it)")
     size = file.stat().st_size
     result = {"file": str(file), "messages": recorder.writer.counts, "gaps": recorder.gaps, "bytes": size}
+    if recorder.problem:
+        print(f"skin: {file}: {recorder.problem}", file=sys.stderr)
     if as_json:
         emit(result)
     else:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from services.cli.common import FAILED, USAGE, JsonOption, config_file, emit, fail, of_service
+
+if TYPE_CHECKING:
+    from protocol.transport import Transport
 
 
 def register(app: typer.Typer) -> None:
@@ -23,7 +26,7 @@ def up(
     no_board: Annotated[bool, typer.Option("--no-board", help="Stages only: `skin replay` is the board.")] = False,
 ) -> None:
     """Start all processes and keep them alive, in the foreground; Ctrl-C or SIGTERM stops them all."""
-    from protocol.runtime import lock, runtime_dir
+    from protocol.runtime import lock
     from services.config import load
     from services.supervision import Program, programs
     from services.supervision import up as supervise
@@ -32,14 +35,27 @@ def up(
     wanted = [p for p in programs(found) if not (no_board and p.name in ("acquisition", "stub"))]
     extra = [Program("recorder", "services.recorder", ("--folder", str(record.resolve())))] if record else []
     with lock():  # said before anything else where a service runs here already
-        names = ", ".join(found.skins)
-    print(
-        f"skin {names}: contacts at ipc://{runtime_dir()}/publisher.ipc, topics contact/{next(iter(found.skins))} ..."
-    )
+        contacts = _addresses(found.transport(), [program.name for program in wanted])
+    names, first = ", ".join(found.skins), next(iter(found.skins))
+    print(f"skin {names}: contacts at {contacts}, topics contact/{first} ...")
     print(
         "look with `./skin top`, press with `./skin press --x 0.02 --y -0.01 --force 3`, stop with Ctrl-C", flush=True
     )
     raise typer.Exit(supervise(found, extra, wanted))
+
+
+def _addresses(transport: Transport, processes: list[str]) -> str:
+    """Where contacts are to be had, once all processes are found able to listen where they are told to. Raises
+    TransportError.
+    """
+    from protocol.transport import check, try_out
+
+    check(transport)
+    for name in processes:
+        for address in (transport.data_address(name), transport.control_address(name)):
+            if name != "stub":  # it keeps to the runtime folder, and waits for its place by itself
+                try_out(address, transport)
+    return transport.data_address("publisher")
 
 
 def doctor(

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Metadata
@@ -23,6 +23,7 @@ from mcap.stream_reader import lz4, zstandard  # type: ignore[attr-defined]  # w
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from models.files import FileError, open_file
+from services.recordings.patient_file import PatientFile
 
 FLUSH_S = 0.1
 CHUNK_BYTES = 64 * 1024
@@ -61,24 +62,33 @@ class RecordingWriter:
 
     def __init__(self, path: Path, metadata: dict[str, str] | None = None, overwrite: bool = False) -> None:
         try:
-            self._file = open(path, "wb" if overwrite else "xb")
+            self._file = PatientFile(path, overwrite)
         except FileExistsError:
             raise RecordingError(f"{path} is there already: choose another name, or say --overwrite") from None
         except OSError as error:
             raise RecordingError(f"cannot write {path}: {error.strerror}") from None
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        # What the library asks of a stream, a PatientFile has: write and tell.
+        self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         # The library closes a chunk by its size only; this is the method it does that with.
         self._close_chunk: Callable[[], None] = getattr(self._writer, "_Writer__finalize_chunk")  # noqa: B009
         self._writer.start(profile=PROFILE)
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
         self._oldest: float | None = None
+        self.lost = 0
+        """Messages that there was no room for."""
         if metadata:
             self._writer.add_metadata(PROFILE, metadata)
         self._file.flush()
 
     def write(self, topic: str, data: bytes, log_time_ns: int) -> None:
-        """Takes one message; it is in the file (safe from a kill) after at most `FLUSH_S`."""
+        """Takes one message; it is in the file (safe from a kill) after at most `FLUSH_S`. While the disk is full some
+        megabytes are kept in memory; then messages are dropped, and counted in `lost`.
+        """
+        if not self._file.room:
+            self.lost += 1
+            self.flush_if_due()
+            return
         if topic not in self._channels:
             name, _, skin = topic.partition("/")
             self._channels[topic] = self._writer.register_channel(topic, "msgpack", 0, {"topic": name, "skin": skin})
@@ -91,12 +101,19 @@ class RecordingWriter:
     def flush_if_due(self) -> None:
         if self._oldest is not None and time.monotonic() - self._oldest >= FLUSH_S:
             self.flush()
+        elif self._file.full:
+            self._file.flush()
 
     def flush(self) -> None:
         """Closes the chunk and hands it to the operating system."""
         self._close_chunk()
         self._file.flush()
         self._oldest = None
+
+    @property
+    def full(self) -> str:
+        """Why nothing can be written now, as the system says it; "" while all is well."""
+        return self._file.full
 
     @property
     def counts(self) -> dict[str, int]:

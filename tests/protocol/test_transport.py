@@ -72,13 +72,3 @@ def test_curve_lets_in_who_is_allowed_and_nobody_else(tmp_path):
             r.close()
         transport.stop_gate(context)
         context.destroy(linger=0)
-
-
-def test_keys_that_are_missing_are_named(tmp_path, context):
-    _, secret = transport.write_keys(tmp_path, "own")
-    transport.configure(transport.Transport(secret_key=secret))
-    with pytest.raises(transport.TransportError, match="clients' public keys"):
-        Publisher("publisher", context, address=f"tcp://0.0.0.0:{free_port()}")
-    transport.configure(transport.Transport(secret_key=tmp_path / "none", clients=tmp_path))
-    with pytest.raises(transport.TransportError, match="key file"):
-        Publisher("publisher", context, address=f"tcp://0.0.0.0:{free_port()}")

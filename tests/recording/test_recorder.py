@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -16,9 +17,11 @@ import numpy as np
 import pytest
 
 from protocol.frames import ContactFrame, InfoFrame, RawFrame
-from protocol.sockets import ControlServer, Publisher
+from protocol.sockets import ControlClient, ControlServer, Publisher
 from services.recorder import Recorder
-from services.recordings.recording import Recorded, RecordingError, RecordingReader
+from services.recordings import patient_file
+from services.recordings.patient_file import PatientFile
+from services.recordings.recording import Recorded, RecordingError, RecordingReader, RecordingWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -141,3 +144,89 @@ def test_a_stopped_recorder_loses_nothing(runtime: Path, tmp_path: Path) -> None
     assert process.wait(5) == 0
     publisher.close()
     assert len(recorded(tmp_path)) == 30
+
+
+def test_a_full_disk_is_named_and_recording_goes_on_when_there_is_room(runtime: Path, tmp_path: Path) -> None:
+    """The recorder's files may grow to 8 kB, then to any size: to it that is a disk that is full for a while."""
+    publisher = Publisher("publisher")
+    process = start(tmp_path, publisher)
+    control = ControlClient("recorder", 5.0)
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (8192, resource.RLIM_INFINITY))
+    sent = 0
+
+    def send_until(level: str) -> dict[str, object]:
+        nonlocal sent
+        end = time.monotonic() + 30
+        while (status := control.call("status"))["level"] != level:
+            for _ in range(20):
+                publisher.send(ContactFrame(skin="palm", reasons=["gap"], stamps={"publish": time.monotonic_ns()}))
+                sent += 1
+                time.sleep(0.001)
+            assert time.monotonic() < end and process.poll() is None
+        return status
+
+    status = send_until("ERROR")
+    assert f"make room in {tmp_path}" in " ".join(status["problems"]) and status["lost"] == 0  # type: ignore[arg-type]
+    (file,) = tmp_path.glob("*.mcap")
+    assert file.stat().st_size <= 8192
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    send_until("OK")
+    for _ in range(50):
+        publisher.send(ContactFrame(skin="palm"))
+        sent += 1
+        time.sleep(0.001)
+    time.sleep(0.5)
+    process.terminate()
+    assert process.wait(5) == 0
+    publisher.close()
+    assert len(recorded(tmp_path)) == sent
+    assert str(RecordingReader(file).damage) == "whole"
+
+
+def test_what_does_not_fit_is_kept_up_to_a_bound_then_dropped_and_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that takes 10 000 bytes, one write in parts, until it has room again."""
+    room, real = 10_000, os.write
+
+    def write(descriptor: int, data: bytes) -> int:
+        nonlocal room
+        if room <= 0:
+            raise OSError(28, "No space left on device")
+        count = real(descriptor, data[:room])
+        room -= count
+        return count
+
+    monkeypatch.setattr(patient_file.os, "write", write)
+    monkeypatch.setattr(patient_file, "KEPT_BYTES", 100_000)
+    monkeypatch.setattr(patient_file, "RETRY_S", 0.0)
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    data = [msgpack.packb({"n": n, "noise": os.urandom(1000)}) for n in range(1000)]
+    for n in range(500):
+        writer.write("contact/palm", data[n], n)
+        writer.flush()
+    assert "No space left" in writer.full and 350 < writer.lost < 450
+    lost, room = writer.lost, 10**9
+    writer.flush_if_due()
+    assert not writer.full
+    for n in range(500, 1000):
+        writer.write("contact/palm", data[n], n)
+    writer.close()
+    assert writer.lost == lost
+    reader = RecordingReader(tmp_path / "a.mcap")
+    got = [message.data for message in reader.messages()]
+    assert got == data[: 500 - lost] + data[500:] and str(reader.damage) == "whole"
+
+
+def test_a_disk_that_is_broken_is_no_full_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = PatientFile(tmp_path / "a")
+    file.write(b"x")
+
+    def broken(descriptor: int, data: bytes) -> int:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(patient_file.os, "write", broken)
+    with pytest.raises(OSError, match="Input"):
+        file.flush()
+    with pytest.raises(OSError, match="Input"):
+        file.close()

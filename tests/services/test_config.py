@@ -41,6 +41,40 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publsher": "tcp://*:1"}}}, "found 'publsher'"),
         ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publisher": "here"}}}, "tcp://HOST:PORT"),
         (
+            {"skins": {"palm": PALM}, "security": {"insecure": "yes"}},
+            "security.insecure: found 'yes'; allowed: a valid",
+        ),
+        (
+            {"skins": {"palm": PALM}, "security": {"insecure": 1}},
+            "security.insecure: found 1; allowed: a valid boolean",
+        ),
+        (
+            {"skins": {"palm": PALM}, "security": {"clients": "keys"}},
+            "security: found {'clients': 'keys'}; allowed: sec",
+        ),
+        ({"skins": {"palm": PALM}, "security": {"secret_key": "me"}}, "allowed: clients or server_keys too (found sec"),
+        ({"skins": {"palm": PALM}, "security": {"server_keys": {"palm": "k"}}}, "security.server_keys: found {'palm'"),
+        (
+            {
+                "skins": {"palm": PALM},
+                "sockets": {"addresses": {"publisher": "tcp://h:1", "publisher.ctl": "tcp://*:1"}},
+            },
+            "sockets.addresses: found {",
+        ),
+        (
+            {"skins": {"palm": PALM}, "sockets": {"addresses": {"inference": "ipc://a", "publisher": "ipc://a"}}},
+            "(inference has 'ipc://a', publisher has 'ipc://a'",
+        ),
+        ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publisher": "tcp://*:70000"}}}, "tcp://HOST:PORT"),
+        (
+            {"skins": {name: PALM | {"port": "/dev/ttyACM0"} for name in ("palm", "arm")}},
+            "skins: found {",
+        ),
+        (
+            {"skins": {name: PALM | {"port": "socket://board:4000"} for name in ("palm", "arm")}},
+            "allowed: a port of its own for each skin (palm has 'socket://board:4000', arm has 'socket://board:4000'",
+        ),
+        (
             {"skins": {"palm": PALM}, "loging": {}},
             "unknown key; allowed here: skins, sockets, security, realtime, skip, logging",
         ),
@@ -56,7 +90,7 @@ def test_errors_name_file_key_found_and_allowed(raw: dict[str, Any], expected: s
 def test_every_key_of_the_shipped_file_is_one_that_exists() -> None:
     """Also those that are commented out: taking one's comment sign away must give a valid file."""
     text = (ROOT / "skin.toml").read_text()
-    with_all = re.sub(r"^# (?=[a-z]+ = |\[)", "", text, flags=re.MULTILINE)
+    with_all = re.sub(r"^# (?=[a-z_]+ = |\"|\[)", "", text, flags=re.MULTILINE)
     assert with_all.count("#") < text.count("#")
     config = parse(tomllib.loads(with_all))
     assert config.skin("palm").calibration == Path("palm.json") and config.sockets.addresses

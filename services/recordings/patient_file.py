@@ -1,0 +1,68 @@
+"""A file that waits for room: what does not fit on the disk stays in memory, bounded, and is written when there is room
+again. Nothing that was accepted is lost or written in part, so what writes to it need not know.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from pathlib import Path
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+KEPT_BYTES = 4 * 1024 * 1024
+"""Kept in memory while the disk is full; beyond, the caller is to drop messages (`room` says so)."""
+RETRY_S = 0.5
+
+
+class PatientFile:
+    """Append only. Raises OSError for anything but a full disk."""
+
+    def __init__(self, path: Path, overwrite: bool = False) -> None:
+        kind = os.O_TRUNC if overwrite else os.O_EXCL
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | kind, 0o666)
+        self._written = 0
+        self._waiting = bytearray()
+        self._retry_at = 0.0
+        self.full = ""
+        """Why nothing can be written now, as the system says it; "" while all is well."""
+        self.closed = False
+
+    def tell(self) -> int:
+        return self._written + len(self._waiting)
+
+    def write(self, data: bytes | bytearray | memoryview) -> int:
+        self._waiting += data
+        return len(data)
+
+    @property
+    def room(self) -> bool:
+        """Whether more may be written."""
+        return not self.full or len(self._waiting) < KEPT_BYTES
+
+    def flush(self, now: bool = False) -> None:
+        """Hand what waits to the operating system, as far as there is room. While the disk is full it is tried every
+        RETRY_S, or `now`.
+        """
+        if self.full and not now and time.monotonic() < self._retry_at:
+            return
+        while self._waiting:
+            try:
+                count = os.write(self._fd, bytes(self._waiting[: 1 << 20]))
+            except OSError as bad:
+                if bad.errno not in FULL:
+                    raise
+                self.full, self._retry_at = os.strerror(bad.errno or 0), time.monotonic() + RETRY_S
+                return
+            self._written += count
+            del self._waiting[:count]
+        self.full = ""
+
+    def close(self) -> None:
+        """Write what there is room for, and close."""
+        if not self.closed:
+            self.closed = True
+            try:
+                self.flush(now=True)
+            finally:
+                os.close(self._fd)
