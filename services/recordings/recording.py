@@ -223,8 +223,10 @@ def _decompressed(chunk: Chunk) -> bytes | None:
                 data = stream.read(size + 1)
         elif chunk.compression == "lz4":
             data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        elif not chunk.compression:
+            data = chunk.data
         else:
-            data = chunk.data if not chunk.compression else b""
+            return None
     except Exception:  # zstandard and lz4 each raise their own: all mean that this chunk is bad
         return None
     intact = len(data) == size and chunk.uncompressed_crc in (0, zlib.crc32(data))
@@ -284,4 +286,3 @@ def _parse(kind: Any, body: bytes) -> Any:
         return kind.read(_stream(body), len(body)) if kind is Message else kind.read(_stream(body))
     except Exception:  # struct.error, EndOfFile, UnicodeDecodeError: a body that does not hold what its opcode says
         return None
-
