@@ -100,10 +100,14 @@ class Bundle:
 
     @staticmethod
     def load(name_or_path: str | os.PathLike[str]) -> Bundle:
-        """Loads a shipped bundle by name or any by path, and checks each file's hash. Raises BundleError."""
-        path = Path(name_or_path)
+        """Loads a shipped bundle by name, else one by path, and checks each file's hash. Raises BundleError.
+
+        A name is a shipped bundle's first, whatever lies in the working folder.
+        """
+        given = Path(name_or_path)
+        path = BUNDLES / given.name if len(given.parts) == 1 else given
         if not (path / "manifest.json").is_file():
-            path = BUNDLES / str(name_or_path)
+            path = given
         if not (path / "manifest.json").is_file():
             known = sorted(p.parent.name for p in BUNDLES.glob("*/manifest.json"))
             raise BundleError(

@@ -23,6 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BUNDLES, MANIFEST = ROOT / "models" / "bundles", "manifest.json"
 SKIN_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 
+Switch = Annotated[bool, Field(strict=True)]  # true or false; no word, which would be taken for true
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -66,8 +67,8 @@ class Touch(Section):
     """The touch decision: see services/touches/touch.py."""
 
     false_alarms: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
-    hold: bool = True  # switch of the rule "nothing changed: do not reconstruct again"
-    skip_untouched: bool = True  # switch of the rule "nothing touches: do not reconstruct"
+    hold: Switch = True  # switch of the rule "nothing changed: do not reconstruct again"
+    skip_untouched: Switch = True  # switch of the rule "nothing touches: do not reconstruct"
 
 
 class Indenter(Section):
@@ -192,7 +193,7 @@ class RealTime(Section):
     """What each process asks of the kernel: services/realtime.py. What is refused is said in `status`."""
 
     priority: Annotated[int, Field(ge=0, le=99, strict=True)] = 0  # of SCHED_FIFO; 0: the ordinary scheduler
-    lock_memory: Annotated[bool, Field(strict=True)] = False  # mlockall: no page of it is ever swapped out
+    lock_memory: Switch = False  # mlockall: no page of it is ever swapped out
     cpus: dict[str, list[Annotated[int, Field(ge=0)]]] = {}  # process -> processors it may run on
 
     @field_validator("cpus")
@@ -209,8 +210,8 @@ class RealTime(Section):
 class Skip(Section):
     """Switches of the skip rules that are not one skin's own (those are `touch` and `scan`). All on, but to measure."""
 
-    batch: Annotated[bool, Field(strict=True)] = True  # skins whose frames wait at once share a run of the network
-    unwanted: Annotated[bool, Field(strict=True)] = True  # what nobody subscribes to (force, shape) is not made
+    batch: Switch = True  # skins whose frames wait at once share a run of the network
+    unwanted: Switch = True  # what nobody subscribes to (force, shape) is not made
 
 
 class Config(Section):
@@ -276,7 +277,7 @@ def load(path: str | Path | None = None) -> Config:
         raw = tomllib.loads(read_text(file))
     except FileError as why:
         raise ConfigError(str(why)) from None
-    except (tomllib.TOMLDecodeError, RecursionError) as why:
+    except (ValueError, RecursionError) as why:  # TOMLDecodeError; a number of ten thousand digits
         raise ConfigError(f"{file}: is not TOML: {why}") from None
     return parse(raw, file)
 
@@ -296,10 +297,17 @@ def _explain(file: Path, error: Any) -> str:
         return f"{file}: {key}: is missing; add it"
     if error["type"] == "extra_forbidden":
         return f"{file}: {key}: unknown key; allowed here: {', '.join(_allowed(error['loc'][:-1]))}"
-    found = repr(error["input"])
-    found = found if len(found) < 80 else found[:77] + "..."
+    found = _shown(error["input"])
     allowed = error["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     return f"{file}: {key}: found {found}; allowed: {allowed}"
+
+
+def _shown(value: Any) -> str:
+    try:
+        found = repr(value)
+    except (ValueError, RecursionError):  # a number of ten thousand digits, a list a thousand deep
+        return f"a {type(value).__name__} too long to show"
+    return found if len(found) < 80 else found[:77] + "..."
 
 
 def _allowed(location: tuple[int | str, ...]) -> list[str]:

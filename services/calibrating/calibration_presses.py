@@ -123,7 +123,7 @@ def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None])
             arrays = {**arrays, "measurements": arrays["touched"]}
         data = read_input({k: arrays[k] for k in ("measurements", "untouched") if k in arrays}, len(bundle.pattern))
     except InputError as why:
-        raise CalibrationError(f"{path}: {why}") from None
+        raise CalibrationError(str(why) if str(path) in str(why) else f"{path}: {why}") from None
     assert data.untouched is not None  # read_input sees to it
     skin = skin.model_copy(update={"calibration": None})
     pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any, BinaryIO, cast
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message, Metadata
+from mcap.records import Channel, Chunk, Metadata
 from mcap.stream_reader import lz4, zstandard  # type: ignore[attr-defined]  # what the library unpacks with
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
@@ -32,11 +32,11 @@ STATE_TOPIC = "state"
 MAX_FILE = 2**40
 MAX_RECORD = 16 * 1024 * 1024
 """Bytes of a record of the file, and of what a chunk unpacks to: the largest message and more."""
-RATIO, SMALL = 100, 32 * 1024 * 1024
+RATIO, SMALL = 100, 16 * 1024 * 1024
 """All chunks together may unpack to SMALL bytes, or to RATIO times the file: measurements never pack so well."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
-_KINDS: dict[int, Any] = {Opcode.CHANNEL: Channel, Opcode.MESSAGE: Message}
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
 class RecordingError(ValueError):
@@ -200,6 +200,9 @@ class RecordingReader:
                     return
                 if opcode == Opcode.CHUNK:
                     chunk = _parse(Chunk, body)
+                    if chunk is not None and chunk.uncompressed_size > MAX_RECORD:
+                        self.damage.too_large += 1
+                        continue
                     left -= chunk.uncompressed_size if chunk is not None else 0
                     if left < 0:
                         raise RecordingError(
@@ -211,18 +214,16 @@ class RecordingReader:
                     if isinstance(record, Channel):
                         names[record.id] = record.topic
                         continue
-                    first_ns = record.log_time if first_ns is None else first_ns
-                    topic = names.get(record.channel_id)
-                    if topic is None or record.log_time - first_ns < start_s * 1e9:
+                    channel, log_time_ns, data = record
+                    first_ns = log_time_ns if first_ns is None else first_ns
+                    topic = names.get(channel)
+                    if topic is None or log_time_ns - first_ns < start_s * 1e9:
                         continue
                     if topics is None or topic.partition("/")[0] in topics:
-                        yield Recorded(topic, record.log_time, record.data)
+                        yield Recorded(topic, log_time_ns, data)
 
     def _unpacked(self, chunk: Chunk | None) -> bytes:
-        """The records of a chunk; none where it is damaged or declares too much."""
-        if chunk is not None and chunk.uncompressed_size > MAX_RECORD:
-            self.damage.too_large += 1
-            return b""
+        """The records of a chunk; none where it is damaged."""
         data = _decompressed(chunk) if chunk is not None else None
         if data is None:
             self.damage.bad_chunks += 1
@@ -240,30 +241,36 @@ def _decompressed(chunk: Chunk) -> bytes | None:
                 data = stream.read(size + 1)
         elif chunk.compression == "lz4":
             data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        elif not chunk.compression:
+            data = chunk.data
         else:
-            data = chunk.data if not chunk.compression else b""
+            return None
     except Exception:  # zstandard and lz4 each raise their own: all mean that this chunk is bad
         return None
     intact = len(data) == size and chunk.uncompressed_crc in (0, zlib.crc32(data))
     return bytes(data) if intact else None
 
 
-def _contents(opcode: int, body: bytes) -> Iterator[Channel | Message]:
-    """Channels and messages of one record of the file, or of the records of a chunk that was unpacked."""
-    if opcode != Opcode.CHUNK:
-        record = _parse(_KINDS.get(opcode), body)
+def _contents(opcode: int, body: bytes) -> Iterator[Channel | tuple[int, int, bytes]]:
+    """Channels, and (channel, log time, data) of messages: of one record of the file, or of those of a chunk."""
+    if opcode == Opcode.MESSAGE:
+        if len(body) >= _MESSAGE_HEAD.size:
+            channel, _, log_time_ns, _ = _MESSAGE_HEAD.unpack_from(body)
+            yield channel, log_time_ns, body[_MESSAGE_HEAD.size :]
+    elif opcode == Opcode.CHANNEL:
+        record = _parse(Channel, body)
         if record is not None:
             yield record
-        return
-    at = 0
-    while at + _RECORD_HEAD.size <= len(body):
-        inner, length = _RECORD_HEAD.unpack_from(body, at)
-        at += _RECORD_HEAD.size
-        if length > len(body) - at:
-            return
-        if inner in (Opcode.CHANNEL, Opcode.MESSAGE):
-            yield from _contents(inner, body[at : at + length])
-        at += length
+    elif opcode == Opcode.CHUNK:
+        at, end = 0, len(body)
+        while at + _RECORD_HEAD.size <= end:
+            inner, length = _RECORD_HEAD.unpack_from(body, at)
+            at += _RECORD_HEAD.size
+            if length > end - at:
+                return
+            if inner in (Opcode.CHANNEL, Opcode.MESSAGE):
+                yield from _contents(inner, body[at : at + length])
+            at += length
 
 
 def _records(file: BinaryIO, damage: Damage) -> Iterator[tuple[int, bytes]]:
@@ -294,11 +301,8 @@ def _stream(body: bytes) -> Any:
 
 
 def _parse(kind: Any, body: bytes) -> Any:
-    """One record, or None where its body does not hold one, or it is of a kind that nobody asks for."""
-    if kind is None:
-        return None
+    """One record, or None where its body does not hold one."""
     try:
-        return kind.read(_stream(body), len(body)) if kind is Message else kind.read(_stream(body))
+        return kind.read(_stream(body))
     except Exception:  # struct.error, EndOfFile, UnicodeDecodeError: a body that does not hold what its opcode says
         return None
-

@@ -1,6 +1,7 @@
 """A bundle is read whole and unchanged, or refused with a reason a person can act on."""
 
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -78,3 +79,96 @@ def test_shipped_bundles_load():
         loaded = Bundle.load(name)
         assert loaded.name == name and len(loaded.z0) == len(loaded.pattern)
         assert sum(f.stat().st_size for f in loaded.path.iterdir()) <= bundle.MAX_BYTES
+
+
+def resealed(path, change):
+    """A bundle made wrongly: its hashes are right, its numbers are not."""
+    manifest = json.loads((path / "manifest.json").read_text())
+    change(manifest)
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    bundle.seal(path)
+
+
+def test_a_changed_manifest_is_refused_though_every_file_s_hash_is_right(made):
+    text = (made.path / "manifest.json").read_text()
+    (made.path / "manifest.json").write_text(text.replace("0.05", "0.06"))
+    with pytest.raises(BundleError, match=r"manifest.json: sha256 .* SHA256 beside it says .* changed or damaged"):
+        Bundle.load(made.path)
+
+
+def test_the_hash_is_the_one_that_sha256sum_finds(made):
+    line = (made.path / "SHA256").read_text()
+    assert line == f"{made.hash}  manifest.json\n" == f"{bundle.sha256(made.path / 'manifest.json')}  manifest.json\n"
+
+
+@pytest.mark.parametrize(
+    "content, says", [(None, "SHA256 is missing.*models.bundle"), (b"", "no line"), (b"0" * 64, "no line")]
+)
+def test_a_bundle_without_its_hash_is_refused(made, content, says):
+    (made.path / "SHA256").unlink()
+    if content is not None:
+        (made.path / "SHA256").write_bytes(content)
+    with pytest.raises(BundleError, match=says):
+        Bundle.load(made.path)
+
+
+CHANGES = {
+    "image.metres_per_unit": lambda m: m["image"].update(metres_per_unit=-1.0),
+    "image.half_width": lambda m: m["image"].update(half_width=float("inf")),
+    "image.n": lambda m: m["image"].update(n=10**9),
+    "image.stack": lambda m: m["image"].update(stack=[9, 24, 24]),
+    "network.full.x": lambda m: m.update(network={"full": {"x": float("nan")}}),
+    "normalisation": lambda m: m.update(normalisation="measured"),
+    "prior.ladder": lambda m: m.update(prior={"ladder": [1.0]}),
+    "one_step.lambda": lambda m: m.update(one_step={"lambda": 0}),
+    "skin": lambda m: m.update(skin={"name": "x", "electrodes": 3}),
+    "deeper nesting": lambda m: m.update(notes=json.loads("[" * 50 + "]" * 50)),
+    "found the name": lambda m: m.update(name="../x"),
+    "found '../../secret'": lambda m: m["files"].update({"../../secret": "0" * 64}),
+    "sha256": lambda m: m["files"].update({"network.onnx": 3}),
+    "no bundle manifest": lambda m: m.update(files=[1]),
+    "files none": lambda m: m.update(files={}),
+}
+
+
+@pytest.mark.parametrize("says", CHANGES)
+def test_a_manifest_with_numbers_that_cannot_be_is_refused(made, says):
+    resealed(made.path, CHANGES[says])
+    with pytest.raises(BundleError) as refused:
+        Bundle.load(made.path)
+    assert says in str(refused.value) and str(made.path) in str(refused.value)
+
+
+WRONG = {
+    "gram": np.eye(19),
+    "z0": np.r_[np.zeros(1), np.ones(19)],
+    "jacobian": np.full((20, 36), np.nan),
+    "pattern": np.full((20, 4), 7),
+    "inside": np.zeros((6, 6), bool),
+    "contact": np.zeros((19, 4)),
+    "back": np.zeros((36, 20), complex),
+    "ladder": np.array([1e-3, 1e-1]),
+    "level": np.array([0.0, 1.0]),
+    "scale_index": 2,
+    "normalisation": "guessed",
+    "model_error": np.inf,
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_matrices_that_do_not_fit_each_other_are_refused(tmp_path, name):
+    with pytest.raises(BundleError, match=f"matrices.npz: {name}: found|matrices.npz: {name}.*found"):
+        bundle.write(tmp_path / "wrong", MANIFEST, matrices(**{name: WRONG[name]}))
+
+
+def test_matrices_that_unpack_to_gigabytes_are_not_unpacked(made):
+    import hashlib
+
+    with zipfile.ZipFile(made.path / "matrices.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        with archive.open("gram.npy", "w") as member:
+            for _ in range(100):
+                member.write(bytes(2**20))
+    digest = hashlib.sha256((made.path / "matrices.npz").read_bytes()).hexdigest()
+    resealed(made.path, lambda m: m["files"].update({"matrices.npz": digest}))
+    with pytest.raises(BundleError, match="unpack to 104857600, expected at most"):
+        Bundle.load(made.path)

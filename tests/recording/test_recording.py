@@ -3,16 +3,26 @@
 import os
 import random
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
 import time
+import tracemalloc
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from mcap.stream_reader import lz4, zstandard
 
-from services.recordings.recording import FLUSH_S, Recorded, RecordingError, RecordingReader, RecordingWriter
+from services.recordings.recording import (
+    FLUSH_S,
+    MAX_RECORD,
+    Recorded,
+    RecordingError,
+    RecordingReader,
+    RecordingWriter,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -140,3 +150,61 @@ def test_kill_9_loses_at_most_two_tenths_of_a_second(tmp_path: Path) -> None:
     got = list(RecordingReader(path).messages())
     assert got and last_sent - got[-1].log_time_ns < 0.2e9 and killed_ns - got[-1].log_time_ns < 0.5e9
     assert FLUSH_S < 0.2
+
+
+def chunk(compression: str, declared: int, data: bytes, crc: int = 0) -> bytes:
+    """A chunk record that declares what we like."""
+    body = struct.pack("<QQQII", 0, 1, declared, crc, len(compression)) + compression.encode()
+    body += struct.pack("<Q", len(data)) + data
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+def bomb(path: Path, *records: bytes) -> Path:
+    path.write_bytes(b"\x89MCAP0\r\n" + b"".join(records))
+    return path
+
+
+def test_a_chunk_that_declares_too_much_is_left_out_and_said(tmp_path: Path) -> None:
+    huge = zstandard.compress(bytes(MAX_RECORD + 1))
+    reader = RecordingReader(bomb(tmp_path / "a.mcap", chunk("zstd", MAX_RECORD + 1, huge)))
+    assert list(reader.messages()) == [] and reader.damage.too_large == 1 and "more than" in str(reader.damage)
+
+
+@pytest.mark.parametrize("declared", [0, 100, 10**6])
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "", "brotli"])
+def test_a_chunk_that_unpacks_to_something_else_is_damaged(tmp_path: Path, compression: str, declared: int) -> None:
+    """Nothing is unpacked beyond what is declared, whatever the compressed stream says of itself."""
+    data = bytes(2**22)
+    packed = {"zstd": zstandard.compress(data), "lz4": lz4.compress(data)}.get(compression, data)
+    path = bomb(tmp_path / "a.mcap", chunk(compression, declared, packed))
+    tracemalloc.start()
+    reader = RecordingReader(path)
+    assert list(reader.messages()) == [] and reader.damage.bad_chunks == 1
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 3 * len(packed) + 2 * declared + 2**20
+
+
+def test_a_file_of_many_such_chunks_is_refused_before_it_takes_long(tmp_path: Path) -> None:
+    """Intact chunks of the right checksum, 200 kB in all, that unpack to gigabytes of tiny messages."""
+    message = struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0)
+    data = message * (MAX_RECORD // len(message))
+    one = chunk("zstd", len(data), zstandard.compress(data, 3))
+    path = bomb(tmp_path / "a.mcap", *[one] * (200_000 // len(one)))
+    assert path.stat().st_size <= 200_000
+    with pytest.raises(RecordingError, match="unpack to more than"):
+        list(RecordingReader(path).messages())
+
+
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    for name, says in (("pipe.mcap", "a pipe"), (".", "a folder")):
+        with pytest.raises(RecordingError, match=says):
+            RecordingReader(tmp_path / name)
+
+
+def test_a_sparse_file_takes_no_memory(tmp_path: Path) -> None:
+    path = bomb(tmp_path / "a.mcap", struct.pack("<BQ", 6, 2**39))
+    os.truncate(path, 2**39 + 1000)
+    reader = RecordingReader(path)
+    assert list(reader.messages()) == [] and reader.damage.too_large == 1

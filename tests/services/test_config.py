@@ -14,6 +14,7 @@ from services.config import ROOT, ConfigError, load, parse
 from services.contacts.force import ForceLaw
 from services.contacts.force_curve import Curve
 
+NAN, INF = float("nan"), float("inf")
 PALM: dict[str, Any] = {"port": "stub", "bundle": "square16"}
 
 
@@ -40,6 +41,14 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         ({"skins": {"Palm one": PALM}}, "found 'Palm one'"),
         ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publsher": "tcp://*:1"}}}, "found 'publsher'"),
         ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publisher": "here"}}}, "tcp://HOST:PORT"),
+        ({"skins": {"palm": PALM | {"rtia_ohm": NAN}}}, "skins.palm.rtia_ohm: found nan; allowed: a finite number"),
+        ({"skins": {"palm": PALM | {"tare": {"max_age_s": INF}}}}, "tare.max_age_s: found inf; allowed: a finite"),
+        ({"skins": {"palm": PALM | {"indenter": {"radius_m": NAN}}}}, "radius_m: found nan; allowed: a finite number"),
+        ({"skins": {"palm": PALM | {"pose": {"position_m": [0, -INF, 0]}}}}, "position_m.1: found -inf; allowed: a"),
+        ({"skins": {"palm": PALM | {"pose": {"quaternion_xyzw": [0, 0, NAN, 1]}}}}, "found nan; allowed: a finite"),
+        ({"skins": {"palm": PALM | {"touch": {"false_alarms": NAN}}}}, "false_alarms: found nan; allowed: a finite"),
+        ({"skins": {"palm": PALM | {"touch": {"hold": "yes"}}}}, "touch.hold: found 'yes'; allowed: a valid boolean"),
+        ({"skins": {"palm": PALM | {"rtia_ohm": 16**9000}}}, "rtia_ohm: found a int too long to show"),
         (
             {"skins": {"palm": PALM}, "security": {"insecure": "yes"}},
             "security.insecure: found 'yes'; allowed: a valid",
@@ -85,6 +94,15 @@ def test_errors_name_file_key_found_and_allowed(raw: dict[str, Any], expected: s
         parse(raw, Path("robot.toml"))
     assert str(error.value).startswith("robot.toml: ")
     assert expected in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["a = nan.", "a = " + "[" * 10_000, "a = " + "9" * 10_000, "\x00", "[skins.palm]\nport = 0x" + "f" * 10_000]
+)
+def test_a_file_that_is_no_configuration_is_one_error(tmp_path: Path, text: str) -> None:
+    (tmp_path / "skin.toml").write_text(text)
+    with pytest.raises(ConfigError, match=r"skin\.toml"):
+        load(tmp_path / "skin.toml")
 
 
 def test_every_key_of_the_shipped_file_is_one_that_exists() -> None:
