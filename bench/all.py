@@ -1,4 +1,5 @@
-"""Every benchmark, one page: latency, skip rules, many skins, adaptive scan, peers, tracking, stability, accuracy.
+"""Every benchmark, one page: latency, skip rules, many skins, adaptive scan, peers, tracking, faults, drift, stability,
+accuracy.
 
     skin bench all                      the page of README: about an hour on two idle cores
     skin bench all --quick              the short form of CI; exit status 1 where a ratio is beyond its gate
@@ -75,6 +76,18 @@ BENCHMARKS = (
         limits="Our relay keeps the newest frame, so one that is overtaken is skipped by design.",
     ),
     Benchmark("tracking", "Ten minutes of contacts", ("--seconds", "60")),
+    Benchmark(
+        "faults",
+        "Faults of the board",
+        ("--quick",),
+        limits="docs/reliability.md says of each row what is wrong today.",
+    ),
+    Benchmark(
+        "drift",
+        "Starts under a touch, gain, drift",
+        ("--quick",),
+        limits="docs/reliability.md says what is wrong today.",
+    ),
     Benchmark("stability", "Numerical stability", ("--quick",), ("stability",)),
     Benchmark(
         "accuracy",

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bench._service import end_on_sigterm
 from bench.reliability import drift_report, drifted, gain_steps, report, starts, workers
 from bench.reliability.drifted import CHANGES, Answer, Change
 from bench.reliability.scenes import grid, touches_at_random
@@ -172,6 +173,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--cores", type=int, default=workers.cores())
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
     args = parser.parse_args(argv)
+    end_on_sigterm()
     began = time.perf_counter()
     found = run(setting_of(args), args.only)
     goals = drift_report.goals(found, args.quick)

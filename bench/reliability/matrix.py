@@ -159,6 +159,9 @@ class Score:
         finite = [t for t in self.again_s if math.isfinite(t)]
         return {
             "cases": self.cases,
+            "frames": self.frames,
+            "nameable": self.nameable,
+            "named": self.named,
             "wrong": self.wrong,
             "wrong_changing": self.wrong_changing,
             "unseen": self.unseen,

@@ -69,7 +69,7 @@ def moment(read_s: float, middle_s: float, felt: Felt | None, delta: DeltaFrame,
         contact.valid,
         tuple(contact.reasons),
         tuple(delta.electrodes.tolist()),
-        tuple(Contact(*c.position[:2], c.force_n) for c in contact.contacts if c.state != "end"),
+        tuple(Contact(c.position[0], c.position[1], c.force_n) for c in contact.contacts if c.state != "end"),
         (*middle, *first),
         middle if first else (),
     )

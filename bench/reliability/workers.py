@@ -22,8 +22,8 @@ SAY_EVERY_S = 20.0
 
 
 @lru_cache(maxsize=1)
-def sheet(keep: bool = True) -> SolvedSheet:
-    return SolvedSheet(keep)
+def sheet() -> SolvedSheet:
+    return SolvedSheet()
 
 
 @lru_cache(maxsize=8)
@@ -53,7 +53,10 @@ def _results(work: Callable[[Task], Found], tasks: list[Task], cores: int) -> It
         return
     context = multiprocessing.get_context("spawn")  # threads and network sessions do not survive a fork
     with ProcessPoolExecutor(min(cores, len(tasks)), mp_context=context) as pool:
-        yield from pool.map(work, tasks)
+        try:
+            yield from pool.map(work, tasks)
+        finally:
+            pool.shutdown(cancel_futures=True)  # whoever ends us does not wait for the rest
 
 
 def _kept(work: Callable[[Task], Found], task: Task) -> Found:
