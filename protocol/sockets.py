@@ -11,13 +11,13 @@ import logging
 import secrets
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import zmq
 
 from . import transport
 from .control import ControlClient, ControlError, ControlServer, clock_offset
-from .frames import Frame, FrameError, pack, unpack
+from .frames import SCHEMA, Frame, FrameError, pack, unpack
 from .runtime import host_id
 from .topics import TOPIC_OF, TOPICS, wire_topic
 from .transport import Context, Socket
@@ -38,6 +38,13 @@ GARBAGE_AT_ONCE = 1000
 log = logging.getLogger(__name__)
 
 
+def covers(prefix: bytes, head: bytes) -> bool:
+    """Whether a subscription to `prefix` gets the messages that begin with `head`: "" and b"contact/" get those of
+    b"contact/palm\0" too.
+    """
+    return head.startswith(prefix) or prefix.startswith(head)
+
+
 class Publisher:
     """A producer's data socket.
 
@@ -53,6 +60,8 @@ class Publisher:
         self.session = session or secrets.token_hex(8)
         self.sent: Counter[str] = Counter()
         """Messages sent, by "topic/skin"."""
+        self.on_join: Callable[[bytes], None] | None = None
+        """Called in `poll` with each new subscription's prefix."""
         self._subscriptions: Counter[bytes] = Counter()
         self._latched: dict[bytes, bytes] = {}
         self.socket: Socket = transport.bind(
@@ -63,13 +72,14 @@ class Publisher:
         )
 
     def send(self, frame: Frame) -> bytes:
-        """Publish a frame; its session, seq and host are set here. Returns the message. Never blocks. Raises
-        FrameError.
+        """Publish a frame; its schema, session and seq are set here, and its host where it has none yet: the stamps of
+        one that came from elsewhere are of that host's clock. Returns the message. Never blocks. Raises FrameError.
         """
         topic = TOPIC_OF[type(frame)]
         name = wire_topic(topic.name, frame.skin)
         key = name.decode()
-        frame.session, frame.host, frame.seq = self.session, host_id(), self.sent[key]
+        frame.schema, frame.session, frame.seq = SCHEMA, self.session, self.sent[key]
+        frame.host = frame.host or host_id()
         message = pack(frame)
         self.poll()
         self.socket.send(message, zmq.NOBLOCK)
@@ -88,11 +98,9 @@ class Publisher:
         return self.subscribers(topic, skin) > 0
 
     def subscribers(self, topic: str, skin: str) -> int:
-        """How many subscriptions cover the topic: a subscription is a prefix, so "" and b"contact/" cover
-        b"contact/palm" too.
-        """
+        """How many subscriptions cover the topic."""
         head = wire_topic(topic, skin) + b"\0"
-        return sum(n for prefix, n in self._subscriptions.items() if head.startswith(prefix) or prefix.startswith(head))
+        return sum(n for prefix, n in self._subscriptions.items() if covers(prefix, head))
 
     def poll(self) -> None:
         """Take in new and ended subscriptions, and send latched values to who has just come. Call it at least once a
@@ -109,6 +117,8 @@ class Publisher:
             if event[:1] == b"\1":
                 self._subscriptions[event[1:]] += 1
                 newcomers.append(event[1:])
+                if self.on_join is not None:
+                    self.on_join(event[1:])
             elif event[:1] == b"\0" and event[1:] in self._subscriptions:
                 self._subscriptions[event[1:]] -= 1
                 if self._subscriptions[event[1:]] <= 0:
