@@ -138,7 +138,7 @@ class Publishing(Stage):
         """
         recent = not self.tracker.forgotten(frame.stamps.get("sample", 0))
         session, scan = self._seen_in
-        theirs = session in (ANY, frame.session) and scan == frame.reconstructed
+        theirs = session in (ANY, frame.session) and scan == frame.reconstructed > 0  # 0: nobody says
         return self._known and recent and not self.tracker.waits and theirs
 
     def _keep(self, frame: ImageFrame) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from protocol.frames import ContactFrame, Frame, ImageFrame, InfoFrame, StatusFrame
+from protocol.held import HeldImage
 from protocol.runtime import host_id
 from protocol.sockets import AllReader
 from protocol.topics import TOPIC_OF, TOPICS
@@ -72,6 +73,7 @@ class Monitor:
         self.processes: dict[str, tuple[StatusFrame, float]] = {}
         self._before: dict[str, StatusFrame] = {}  # the status before the last, of each
         self.info: dict[str, Any] = {}
+        self._held = HeldImage()
 
     def read(self, seconds: float) -> None:
         """Takes in what arrives within `seconds`."""
@@ -89,6 +91,8 @@ class Monitor:
         elif isinstance(frame, InfoFrame):
             self.info.update(frame.info)
         else:
+            if isinstance(frame, ImageFrame):
+                self._held.complete(frame)
             self.topics[TOPIC_OF[type(frame)].name].add(frame, now_s)
 
     @property
