@@ -44,7 +44,7 @@ def test_the_ten_lines_print_contacts_and_when_not_to_act(document, variable, ru
     monkeypatch.delenv("EITSKIN_RUNTIME")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     if variable == "EITSKIN_RUNTIME":
-        monkeypatch.setenv(variable, str(runtime / "here"))
+        monkeypatch.setenv(variable, f"{runtime}/here")
     code = re.search(r"```python\n(import msgpack.*?)```", document.read_text(), re.DOTALL)[1]
     publisher = Publisher("publisher", context)
     process = subprocess.Popen([sys.executable, "-uc", code], stdout=subprocess.PIPE, text=True, env=dict(os.environ))
