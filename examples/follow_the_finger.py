@@ -17,10 +17,11 @@ MASS_KG, DAMPING = 4.0, 40.0  # [kg], [N s/m]: it answers within MASS_KG / DAMPI
 DEAD_N, DEAD_M = 0.3, 0.004  # lighter, and nearer to the centre, than this is no intention
 REACH_M = 0.05  # from the skin's centre to its edge
 FASTEST = 0.1  # m/s
+LONGEST_STEP_S = 0.1  # that one frame may change the velocity by, however long it was waited for
 STILL = 0.0005  # m/s: slower than this is standing
 
 
-def follow(robot: Robot, skin: ContactSubscriber, max_age: float, seconds: float = math.inf) -> None:
+def follow(robot: Robot, skin: ContactSubscriber, max_age: float | None = None, seconds: float = math.inf) -> None:
     velocity: Vector = (0.0, 0.0, 0.0)
     then = began = time.monotonic()
     while then - began < seconds:
@@ -31,7 +32,7 @@ def follow(robot: Robot, skin: ContactSubscriber, max_age: float, seconds: float
                 print(f"holding still: {why}", flush=True)
             velocity = (0.0, 0.0, 0.0)
         else:
-            velocity = answer(velocity, push(frame.contacts), min(time.monotonic() - then, max_age))
+            velocity = answer(velocity, push(frame.contacts), min(time.monotonic() - then, LONGEST_STEP_S))
         then = time.monotonic()
         robot.move(velocity)
     robot.stop()

@@ -18,7 +18,7 @@ BACK_OFF_M = 0.01
 EXPECTED_M = 0.025  # contact is expected so near the skin's centre
 
 
-def guarded_move(robot: Robot, skin: ContactSubscriber, newtons: float, max_age: float) -> int:
+def guarded_move(robot: Robot, skin: ContactSubscriber, newtons: float, max_age: float | None = None) -> int:
     try:
         while True:
             contacts = [c for c in skin.next_frame(max_age, valid=True).contacts if c.state != "end"]
@@ -36,7 +36,7 @@ def guarded_move(robot: Robot, skin: ContactSubscriber, newtons: float, max_age:
         return 1
 
 
-def back_off(robot: Robot, skin: ContactSubscriber, max_age: float) -> int:
+def back_off(robot: Robot, skin: ContactSubscriber, max_age: float | None) -> int:
     """Away from what is touched, but not blindly: Stale ends this too."""
     top = robot.position[2] + BACK_OFF_M
     while robot.position[2] < top:

@@ -58,10 +58,12 @@ def millimetres(v: Vector) -> str:
     return "({:+.1f}, {:+.1f}, {:+.1f}) mm".format(*(1e3 * c for c in v))
 
 
-def options(about: str, max_age: float = 0.1) -> argparse.ArgumentParser:
+def options(about: str) -> argparse.ArgumentParser:
     """What the examples' command lines have in common."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--skin", default="palm")
     parser.add_argument("--endpoint", help="of the publisher, where it is not in the runtime folder: tcp://HOST:PORT")
-    parser.add_argument("--max-age", type=float, default=max_age, help="seconds without a frame that count as silence")
+    parser.add_argument(
+        "--max-age", type=float, help="seconds without a frame that count as silence (default: what the frames say)"
+    )
     return parser

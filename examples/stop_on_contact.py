@@ -13,7 +13,7 @@ from protocol.client import ContactSubscriber, Stale
 VELOCITY: Vector = (0.05, 0.0, 0.0)  # m/s
 
 
-def stop_on_contact(robot: Robot, skin: ContactSubscriber, max_age: float) -> int:
+def stop_on_contact(robot: Robot, skin: ContactSubscriber, max_age: float | None = None) -> int:
     """Each frame, also an empty one, is the permission to move on until the next."""
     try:
         while not (frame := skin.next_frame(max_age, valid=True)).contacts:

@@ -1,7 +1,7 @@
 """The client for asyncio: as `client.ContactSubscriber`, with `await`.
 
 async with AsyncContactSubscriber("palm") as skin:
-    frame = await skin.latest(max_age=0.05, valid=True)
+    frame = await skin.latest(valid=True)
     async for frame in skin: ...
 """
 
@@ -14,7 +14,6 @@ from types import TracebackType
 
 import zmq.asyncio
 
-from .client import SILENCE_S
 from .frames import ContactFrame
 from .freshness import WAIT_SLICE_S, NewestContacts, Stale
 
@@ -32,28 +31,32 @@ class AsyncContactSubscriber:
         """Replayed frames that were ignored."""
         return self._newest.replayed
 
-    async def latest(self, max_age: float = 0.05, wait_s: float = 0.0, *, valid: bool = False) -> ContactFrame:
-        """The newest frame, at most `max_age` seconds old and within its own `valid_for_s`, waiting up to `wait_s`
-        for one. Raises Stale, with `valid` also NotValid.
+    async def latest(
+        self, max_age: float | None = None, wait_s: float | None = None, *, valid: bool = False
+    ) -> ContactFrame:
+        """The newest frame, within its own `valid_for_s` and `max_age`; waits for the first one, 1 s at most, or up to
+        `wait_s`. Raises Stale, with `valid` also NotValid.
         """
-        deadline = time.monotonic() + wait_s
+        deadline = None if wait_s is None else time.monotonic() + wait_s
         while True:
             self._newest.take()
             try:
                 return self._newest.judge(max_age, valid)
             except Stale:
-                if not await self._wait(deadline):
+                if not await self._wait(self._newest.first_by() if deadline is None else deadline):
                     raise
 
-    async def next_frame(self, max_age: float = SILENCE_S, *, valid: bool = False) -> ContactFrame:
-        """A frame not given out before. Raises Stale where none has come within `max_age` seconds."""
-        deadline = time.monotonic() + max_age
+    async def next_frame(self, max_age: float | None = None, *, valid: bool = False) -> ContactFrame:
+        """A frame not given out before. Raises Stale where none has come for `max_age` seconds, or for as long as the
+        newest one was valid for.
+        """
+        deadline = time.monotonic() + self._newest.silence_s(max_age)
         while (frame := self._newest.fresh(max_age, valid)) is None:
             if not await self._wait(deadline):
                 raise self._newest.stale(max_age)
         return frame
 
-    async def frames(self, max_age: float = SILENCE_S, *, valid: bool = False) -> AsyncIterator[ContactFrame]:
+    async def frames(self, max_age: float | None = None, *, valid: bool = False) -> AsyncIterator[ContactFrame]:
         """`next_frame` for ever. Silence ends it with Stale; begin a new one to go on."""
         while True:
             yield await self.next_frame(max_age, valid=valid)
@@ -73,7 +76,7 @@ class AsyncContactSubscriber:
     def close(self) -> None:
         """Close the subscription."""
         self._socket.close(0)
-        self._newest.reader.close()
+        self._newest.close()
 
     async def __aenter__(self) -> AsyncContactSubscriber:
         return self

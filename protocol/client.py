@@ -1,7 +1,7 @@
 """What a robot controller uses: the newest contacts, or an error, never old data.
 
 with ContactSubscriber("palm") as skin:
-    frame = skin.latest(max_age=0.05, valid=True)    # else Stale: stop
+    frame = skin.latest(valid=True)                  # else Stale: stop
     for contact in frame.contacts: ...
 
 with ContactSubscriber("palm") as skin:
@@ -25,10 +25,7 @@ from types import TracebackType
 from .frames import ContactFrame
 from .freshness import WAIT_SLICE_S, NewestContacts, NotValid, Stale
 
-__all__ = ["SILENCE_S", "ContactSubscriber", "NotValid", "Stale"]
-
-SILENCE_S = 0.25
-"""So long without a frame is silence, unless said otherwise: five frames of the demo's 22 a second."""
+__all__ = ["ContactSubscriber", "NotValid", "Stale"]
 
 
 class ContactSubscriber:
@@ -40,8 +37,14 @@ class ContactSubscriber:
     A frame with `valid` false is given out, with its `reasons`, to who asks for any frame; `valid=True` asks for one
     to act on, and raises NotValid, a kind of Stale, instead.
 
-    Ages count from a frame's `publish` stamp; on another host from its reception, and a frame that waited for us to
-    ask counts from when we last asked. Ask there at least every `max_age`, or wait for a frame with `wait_s`.
+    A frame's age counts from when the skin was measured, its stamp `sample` (of a replayed one: from `read`). A frame
+    is out of date when it is older than its own `valid_for_s`, which the service sets to three scans, 0.25 s at least;
+    `max_age` asks for a newer one. From another host, whose clock a control socket tells, see protocol/WIRE.md: until
+    it has told, a frame that waited for us to ask counts from when we last asked, so wait for frames there, or ask
+    often.
+
+    A contact that is new to us has `state` begin where it was not there in the service's frame before, and hold where
+    it had been there already; the `end` of one that we were not told of is left out.
     """
 
     def __init__(self, skin: str, endpoint: str | None = None, *, replay: bool = False) -> None:
@@ -53,33 +56,35 @@ class ContactSubscriber:
         """Replayed frames that were ignored."""
         return self._newest.replayed
 
-    def latest(self, max_age: float = 0.05, wait_s: float = 0.0, *, valid: bool = False) -> ContactFrame:
-        """The newest frame, at most `max_age` seconds old and within its own `valid_for_s`; the same one again until
-        there is a newer one.
+    def latest(self, max_age: float | None = None, wait_s: float | None = None, *, valid: bool = False) -> ContactFrame:
+        """The newest frame, within its own `valid_for_s` and at most `max_age` seconds old where that is given; the
+        same one again until there is a newer one.
 
-        Waits up to `wait_s` for one. Raises Stale. Without `valid=True`, look at `frame.valid` before acting on it.
+        Waits for the first frame after subscribing, 1 s at most, and never again; with `wait_s` up to so long for a
+        frame that will do. Raises Stale. Without `valid=True`, look at `frame.valid` before acting on it.
         """
-        deadline = time.monotonic() + wait_s
+        deadline = None if wait_s is None else time.monotonic() + wait_s
         while True:
             self._newest.take()
             try:
                 return self._newest.judge(max_age, valid)
             except Stale:
-                if not self._wait(deadline):
+                if not self._wait(self._newest.first_by() if deadline is None else deadline):
                     raise
 
-    def next_frame(self, max_age: float = SILENCE_S, *, valid: bool = False) -> ContactFrame:
+    def next_frame(self, max_age: float | None = None, *, valid: bool = False) -> ContactFrame:
         """A frame not given out before, the newest one where several have come; waits for it.
 
-        Raises Stale where none has come within `max_age` seconds.
+        Raises Stale where none has come for `max_age` seconds; unless given, for as long as the newest one was valid
+        for, and 1 s for the first.
         """
-        deadline = time.monotonic() + max_age
+        deadline = time.monotonic() + self._newest.silence_s(max_age)
         while (frame := self._newest.fresh(max_age, valid)) is None:
             if not self._wait(deadline):
                 raise self._newest.stale(max_age)
         return frame
 
-    def frames(self, max_age: float = SILENCE_S, *, valid: bool = False) -> Iterator[ContactFrame]:
+    def frames(self, max_age: float | None = None, *, valid: bool = False) -> Iterator[ContactFrame]:
         """`next_frame` for ever. Silence ends it with Stale, so that a loop that moves a robot never just hangs;
         begin a new one to go on.
         """
@@ -93,11 +98,12 @@ class ContactSubscriber:
         self,
         on_contact: Callable[[ContactFrame], object],
         on_stale: Callable[[Stale], object],
-        max_age: float = SILENCE_S,
+        max_age: float | None = None,
         stop: threading.Event | None = None,
     ) -> None:
         """Call `on_contact` with each new valid frame, also when nothing touches, and `on_stale` for each frame that
-        is not valid (NotValid, with the frame) and for every `max_age` seconds of silence; until `stop` is set.
+        is not valid (NotValid, with the frame) and for every `max_age` seconds of silence (unless given, as of
+        `next_frame`); until `stop` is set.
 
         So one of the two is called at least every `max_age` seconds. An exception in either ends `run` and reaches
         the caller.
@@ -122,7 +128,7 @@ class ContactSubscriber:
 
     def close(self) -> None:
         """Close the subscription."""
-        self._newest.reader.close()
+        self._newest.close()
 
     def __enter__(self) -> ContactSubscriber:
         return self

@@ -43,7 +43,8 @@ class ControlError(RuntimeError):
     """A command was not carried out.
 
     `kind` is `unreachable` (no such process), `timeout` (no answer), `bad_reply`, `bad_request`, `unknown_command`,
-    `forbidden` (needs an operator's key), or the name of the exception that the command raised in the process.
+    `forbidden` (needs an operator's key), `other_host`, or the name of the exception that the command raised in the
+    process.
     """
 
     def __init__(self, kind: str, message: str) -> None:
@@ -229,16 +230,20 @@ class ControlClient:
         raise ControlError("bad_reply", f"{self.process} answered {command} with neither result nor error")
 
 
-def clock_offset(client: ControlClient, tries: int = 8) -> tuple[int, int]:
+def clock_offset(client: ControlClient, tries: int = 8, host: str = "") -> tuple[int, int]:
     """How far the process's monotonic clock is ahead of ours, and the uncertainty of that, both in ns.
 
-    The shortest of `tries` round trips, halved: the answer was made somewhere within it. Raises ControlError.
+    The shortest of `tries` round trips, halved: the answer was made somewhere within it. With `host`, the clock of that
+    one, as frames name it, and of no other. Raises ControlError.
     """
     best: tuple[int, int] | None = None
     for _ in range(tries):
-        there = client.call("clock").get("monotonic_ns")
+        answer = client.call("clock")
+        there = answer.get("monotonic_ns")
         if type(there) is not int:
             raise ControlError("bad_reply", f"{client.process} answered clock with {brief(there)}, expected ns")
+        if host and answer.get("host") != host:
+            raise ControlError("other_host", f"{client.process} runs on another host than {host}, whose clock is asked")
         sent, back = client.round_trip_ns
         if best is None or back - sent < 2 * best[1]:
             best = (there - (sent + back) // 2, (back - sent + 1) // 2)

@@ -114,6 +114,16 @@ class Int(Check):
 
 
 @dataclass(frozen=True)
+class Version(Int):
+    """The layout that a message was written in: all up to ours can be read, a newer one cannot."""
+
+    def refuse(self, value: object) -> Mismatch:
+        if type(value) is not int or value <= self.high:
+            return super().refuse(value)
+        return Mismatch(f"schema {value}", f"schema {self.high} at most: who sent it is newer, update this reader")
+
+
+@dataclass(frozen=True)
 class Float(Check):
     """A number, in [low, high] if it is finite; a whole number is accepted for it.
 
@@ -287,11 +297,14 @@ _DTYPES: Mapping[str, np.dtype[Any]] = {
 }
 
 
-def wire(check: Check, doc: str, default: Any = ...) -> Any:
+def wire(check: Check, doc: str, default: Any = ..., *, always: bool = False) -> Any:
     """A dataclass field with its checker and its one line of documentation; `default` may be a class to call for a
     fresh value.
+
+    A field with a default may be missing from a message, which was then written before there was such a field, and
+    is read as the default. `always`: it may not, because its default would claim what nobody has said.
     """
-    metadata = {"check": check, "doc": doc}
+    metadata = {"check": check, "doc": doc, "always": always}
     if default is ...:
         return dataclass_field(metadata=metadata)
     if isinstance(default, type) or callable(default):

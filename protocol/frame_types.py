@@ -15,11 +15,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .fields import UINT64_MAX, Array, Bool, Float, Int, Text, Vector, wire
+from .fields import UINT64_MAX, Array, Bool, Float, Int, Text, Vector, Version, wire
 from .records import ListOf, MapOf, Maybe, Record, Tree
 
-SCHEMA = 1
-"""Version of the frames' layout: raised when a field changes its meaning, goes, or is added as required."""
+SCHEMA = 2
+"""Version of the frames' layout: raised when a field changes its meaning, goes, or is added without a default. Readers
+accept all up to theirs. 2: `valid_for_s` counts from `sample`, not from `publish`; a held image is sent once.
+"""
 
 STAMPS = ("sample", "read", "preprocess", "infer", "publish")
 SOURCES = ("board", "stub", "replay")
@@ -38,6 +40,7 @@ REASONS = {
     "coarse": "from the short sentinel scan: that something touches, roughly where",
     "changing": "the touch came, went or changed while it was scanned: that something touches, but only roughly where",
     "extrapolated": "a force beyond the calibrated range",
+    "late": "measured longer ago than it may be acted on: what brought it was held up",
     "clock": "the sample time is uncertain: the board's clock is not known well enough, or it jumped",
     "frozen": "the board sends the same scan again and again, with new numbers and times",
     "uncalibrated_force": "the skin has no force law: forces are nil",
@@ -76,22 +79,29 @@ class Heard:
 class Frame(Heard):
     """The header: what every frame carries."""
 
-    schema: int = wire(Int(SCHEMA, SCHEMA), "version of this layout", SCHEMA)
+    schema: int = wire(Version(1, SCHEMA), "version of this layout", SCHEMA, always=True)
     skin: str = wire(_NAME, "name of the skin, as in the topic")
-    session: str = wire(Text(16, form="[0-9a-f]{16}"), "random, new each time the producer starts", "0" * 16)
-    seq: int = wire(_COUNT, "number of this frame: counts up by one, per topic, in this session", 0)
+    session: str = wire(
+        Text(16, form="[0-9a-f]{16}"), "random, new each time the producer starts", "0" * 16, always=True
+    )
+    seq: int = wire(_COUNT, "number of this frame: counts up by one, per topic, in this session", 0, always=True)
     scan: int = wire(_COUNT, "the board's number of the scan that this frame comes from", 0)
-    host: str = wire(Text(64), "host whose monotonic clock the stamps are of (its boot id)", "")
+    host: str = wire(
+        Text(64), "host whose monotonic clock the stamps are of (its boot id): where it was measured", "", always=True
+    )
     stamps: dict[str, int] = wire(
         MapOf(Int(0, unit="ns"), STAMPS, 16),
         "monotonic ns: `sample` = middle of the scan, the others = that stage was done",
         dict,
+        always=True,
     )
-    sample_sigma_ns: int = wire(Int(0, unit="ns"), "standard uncertainty of `sample`", 0)
-    source: str = wire(Text(choices=SOURCES), "where the measurements come from", "board")
-    valid: bool = wire(Bool(), "whether the payload may be acted on", False)
+    sample_sigma_ns: int = wire(Int(0, unit="ns"), "standard uncertainty of `sample`", 0, always=True)
+    source: str = wire(Text(choices=SOURCES), "where the measurements come from", "board", always=True)
+    valid: bool = wire(Bool(), "whether the payload may be acted on; false where missing", False)
     reasons: list[str] = wire(ListOf(Text(64), 64), "why it is not valid, or what to know although it is", list)
-    valid_for_s: float = wire(Float(0, unit="s"), "how long after `publish` the frame may be acted on", 0.0)
+    valid_for_s: float = wire(
+        Float(0, unit="s"), "how long after `sample` the frame may be acted on (a replayed one: after `read`)", 0.0
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -122,7 +132,7 @@ class DeltaFrame(Frame):
 
     same_length: ClassVar[tuple[str, ...]] = ("difference", "sigma")
 
-    touched: bool = wire(Bool(), "whether anything touches", False)
+    touched: bool = wire(Bool(), "whether anything touches", False, always=True)
     held: bool = wire(Bool(), "nothing changed since the frame last reconstructed", False)
     reconstructed: int = wire(_COUNT, "scan of the frame last reconstructed in this touch; 0 while untouched", 0)
     score: float = wire(Float(), "noise-whitened statistic that `touched` was decided by", 0.0)
@@ -151,13 +161,16 @@ class DeltaFrame(Frame):
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class ImageFrame(Frame):
-    """The conductivity drop over the skin's bounding box."""
+    """The conductivity drop over the skin's bounding box. That of a held frame was sent before: see the rules for
+    readers.
+    """
 
-    touched: bool = wire(Bool(), "whether anything touches", False)
+    touched: bool = wire(Bool(), "whether anything touches", False, always=True)
     held: bool = wire(Bool(), "the image is that of an earlier frame: nothing changed since", False)
+    reconstructed: int = wire(_COUNT, "scan that the image was reconstructed from; 0 where there is none", 0)
     image: NDArray[np.float32] = wire(
         Array("<f4", ("H", "W"), "S/m", or_empty=True),
-        "conductivity drop [iy, ix], positive where touched, row 0 lowest y; empty while untouched",
+        "conductivity drop [iy, ix], positive where touched, row 0 lowest y; empty while untouched or held",
         _empty("<f4", 2),
     )
     sigma: NDArray[np.float32] = wire(
@@ -183,7 +196,11 @@ class Contact:
     """One touch."""
 
     id: int = wire(_COUNT, "stays the same while the touch lasts; unique in a session")
-    state: str = wire(Text(choices=("begin", "hold", "end")), "first frame of the touch, in between, last one", "hold")
+    state: str = wire(
+        Text(choices=("begin", "hold", "end")),
+        "first frame of the touch; in between, or not known to be the first; last one",
+        "hold",
+    )
     position: list[float] = wire(Vector(3, "m"), "centroid of the contact patch, in the skin's frame")
     velocity: list[float] = wire(Vector(3, "m/s"), "of `position`", lambda: [0.0] * 3)
     normal: list[float] = wire(Vector(3), "unit vector out of the skin", lambda: [0.0, 0.0, 1.0])
@@ -209,7 +226,7 @@ class ContactFrame(Frame):
     quality: float | None = wire(
         Maybe(Float(0, 1)), "share of the measured change that the image explains; nil while untouched", None
     )
-    contacts: list[Contact] = wire(ListOf(Record(Contact), 256), "the touches, strongest first", list)
+    contacts: list[Contact] = wire(ListOf(Record(Contact), 256), "the touches, strongest first", list, always=True)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -217,7 +234,10 @@ class ForceFrame(Frame):
     """The total load alone: small, for fast loops."""
 
     wrench: list[float] = wire(
-        Vector(6), "Fx, Fy, Fz [N], Tx, Ty, Tz [N m] on the skin, at its frame's origin", lambda: [0.0] * 6
+        Vector(6),
+        "Fx, Fy, Fz [N], Tx, Ty, Tz [N m] on the skin, at its frame's origin",
+        lambda: [0.0] * 6,
+        always=True,
     )
     force_n: float | None = wire(Maybe(Float(unit="N")), "sum of the normal forces, or nil", None)
 
@@ -305,4 +325,4 @@ class Touch:
 class TruthFrame(Frame):
     """What really touches at the middle of the scan; only a stub knows. `publish`: the scan's last byte had left."""
 
-    touches: list[Touch] = wire(ListOf(Record(Touch), 256), "the touches", list)
+    touches: list[Touch] = wire(ListOf(Record(Touch), 256), "the touches", list, always=True)

@@ -7,9 +7,17 @@ from __future__ import annotations
 
 import time
 
+from .ages import Ages
 from .frames import ContactFrame
 from .runtime import host_id
 from .sockets import NewestReader
+
+SILENCE_S = 0.25
+"""So long without a first frame is silence; later it is the newest frame's own `valid_for_s`."""
+FIRST_S = 1.0
+"""So long `latest` waits for the first frame of a subscription."""
+MOST_SEEN = 1024
+"""Contacts remembered: more than can be there at once."""
 
 WAIT_SLICE_S = 0.1
 """Longest single wait for a frame: what a longer one wakes to has come while the whole process was stopped."""
@@ -32,26 +40,30 @@ class NotValid(Stale):
     A kind of Stale, so that one `except Stale: robot.stop()` stops for both.
     """
 
-    def __init__(self, frame: ContactFrame, age_s: float) -> None:
+    def __init__(self, frame: ContactFrame, age_s: float | None) -> None:
         reasons = ", ".join(frame.reasons) or "no reason given"
         super().__init__(f"the newest contact frame of {frame.skin} is not valid: {reasons}", age_s)
         self.frame = frame
 
 
 class NewestContacts:
-    """The newest contact frame of a skin and when it was made, as far as this host can know.
+    """The newest contact frame of a skin and when it was measured, as far as this host can know (ages.py).
 
-    On the publisher's host a frame's age counts from its `publish` stamp. Another host's clock is not ours: there it
-    counts from reception, and a frame that may have lain in the socket counts from when the socket was last seen empty.
+    Of another host's frame that may have lain in the socket it is known only that it came after the socket was last
+    seen empty.
     """
 
     def __init__(self, skin: str, endpoint: str | None = None, *, replay: bool = False) -> None:
         self.skin, self.replay = skin, replay
         self.reader = NewestReader("contact", skin, endpoint)
         self.replayed = 0
+        self._ages = Ages()
         self._frame: ContactFrame | None = None
-        self._born_ns = 0
+        self._measured_ns: int | None = None
         self._empty_ns = time.monotonic_ns()
+        self._first_by: float | None = None  # when to give up waiting for the first frame
+        self._session = ""
+        self._seen: dict[int, None] = {}  # ids of contacts that were given out, oldest first
 
     def take(self) -> bool:
         """Take in the newest frame that has arrived; whether there was one."""
@@ -63,18 +75,44 @@ class NewestContacts:
         if frame.source == "replay" and not self.replay:
             self.replayed += 1
             return False
-        self._frame, self._born_ns = frame, received_ns
-        if frame.host == host_id():  # a stamp from the future would make it look new for long
-            self._born_ns = min(frame.stamps.get("publish", received_ns), time.monotonic_ns())
+        here = frame.host == host_id()  # a stamp of ours says when; one from the future would make it look new for long
+        self._measured_ns = self._ages.measured_ns(frame, time.monotonic_ns() if here else received_ns)
+        self._frame = frame
+        self._leave_out_unseen_ends(frame)
         return True
+
+    def _leave_out_unseen_ends(self, frame: ContactFrame) -> None:
+        """A touch that we were never told of does not end for us."""
+        if frame.session != self._session:
+            self._session, self._seen = frame.session, {}
+        if not frame.contacts:
+            return
+        frame.contacts = [c for c in frame.contacts if c.state != "end" or c.id in self._seen]
+        self._seen.update(dict.fromkeys(c.id for c in frame.contacts))
+        while len(self._seen) > MOST_SEEN:
+            del self._seen[next(iter(self._seen))]
 
     def woken(self, since_ns: int) -> None:
         """The socket, empty at `since_ns`, has become readable: what is in it has come just now."""
         now = time.monotonic_ns()
-        if now - since_ns < 1.5 * WAIT_SLICE_S * 1e9:
+        if now - since_ns < 1.5 * WAIT_SLICE_S * 1e9 and not self._ages.look():
             self._empty_ns = now
 
-    def judge(self, max_age: float, valid: bool) -> ContactFrame:
+    def first_by(self) -> float:
+        """Until when `latest` waits where nothing else is said: for the first frame, FIRST_S after it was first asked;
+        not at all once that has come.
+        """
+        if self._first_by is None:
+            self._first_by = time.monotonic() + FIRST_S
+        return self._first_by if self._frame is None else 0.0
+
+    def silence_s(self, max_age: float | None) -> float:
+        """How long to wait for the next frame: as long as the newest one holds, where nothing else is said."""
+        if max_age is not None:
+            return max_age
+        return max(SILENCE_S, self._frame.valid_for_s) if self._frame is not None else FIRST_S
+
+    def judge(self, max_age: float | None, valid: bool) -> ContactFrame:
         """The newest frame where it is at most `max_age` seconds old and within its own `valid_for_s`, else Stale;
         with `valid`, NotValid where it is not.
         """
@@ -85,36 +123,43 @@ class NewestContacts:
             raise NotValid(frame, age)
         return frame
 
-    def fresh(self, max_age: float, valid: bool) -> ContactFrame | None:
+    def fresh(self, max_age: float | None, valid: bool) -> ContactFrame | None:
         """A frame that has arrived since the last look, as `judge` gives it; None where there is none, or where it is
-        old because it lay in the socket while nobody asked. With `valid`, NotValid.
+        old: it was measured long ago, or lay in the socket while nobody asked. With `valid`, NotValid, of an old one
+        too: it is news that nothing may be acted on.
         """
-        if not self.take():
+        if not self.take() or self._frame is None:
             return None
-        try:
-            return self.judge(max_age, valid)
-        except NotValid:
-            raise
-        except Stale:
-            return None
+        age = self._age()
+        if valid and not self._frame.valid:
+            raise NotValid(self._frame, age)
+        return self._frame if age is not None and age <= self._limit(max_age) else None
 
-    def stale(self, max_age: float) -> Stale:
+    def stale(self, max_age: float | None) -> Stale:
         """The error that says what there is instead of a frame that is new enough."""
         age = self._age()
-        if age is None:
+        if self._frame is None:
             text = f"no contact frame of {self.skin} yet: is the service running (skin up)?"
+        elif age is None:
+            text = f"the newest contact frame of {self.skin} does not say when it was measured"
         else:
             limit = self._limit(max_age)
             text = f"the newest contact frame of {self.skin} is {age:.3f} s old, expected at most {limit:.3f} s"
+        if self._frame is not None and not self._frame.valid and self._frame.reasons:
+            text += f"; it is not valid either: {', '.join(self._frame.reasons)}"
         if self.replayed:
             text += f"; {self.replayed} replayed ones were ignored (replay=True takes them)"
         if self.reader.malformed:
             text += f"; {self.reader.malformed} malformed ones were dropped, the last because {self.reader.last_error}"
         return Stale(text, age)
 
-    def _age(self) -> float | None:
-        return None if self._frame is None else (time.monotonic_ns() - self._born_ns) / 1e9
+    def close(self) -> None:
+        self._ages.close()
+        self.reader.close()
 
-    def _limit(self, max_age: float) -> float:
+    def _age(self) -> float | None:
+        return None if self._measured_ns is None else self._ages.age_s(self._measured_ns)
+
+    def _limit(self, max_age: float | None) -> float:
         own = self._frame.valid_for_s if self._frame is not None else 0.0
-        return min(max_age, own) if own > 0 else max_age
+        return own if max_age is None else min(max_age, own)

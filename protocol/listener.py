@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from types import TracebackType
 
-from .client import SILENCE_S, ContactSubscriber
+from .client import ContactSubscriber
 from .frames import ContactFrame
 from .freshness import Stale
 
@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 class ContactListener:
     """Calls `on_contact` with each new valid frame, also when nothing touches, and `on_stale` for each frame that is
     not valid (NotValid) and for every `max_age` seconds of silence: one of them at least every `max_age` seconds.
+    Unless given, that is how long the newest frame was valid for (0.25 s of the demo; 1 s for the first frame).
 
     Begins at once; ends with `close`. Both are called from one background thread, one at a time, and should return
     within a frame's time: meanwhile newer frames overtake older ones.
@@ -35,7 +36,7 @@ class ContactListener:
         skin: str,
         on_contact: Callable[[ContactFrame], object],
         on_stale: Callable[[Stale], object],
-        max_age: float = SILENCE_S,
+        max_age: float | None = None,
         endpoint: str | None = None,
         *,
         replay: bool = False,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import secrets
 import time
 from collections import Counter
+from collections.abc import Callable
 
 import zmq
 
 from . import transport
-from .frames import Frame, pack
+from .frames import SCHEMA, Frame, pack
 from .gate import peer_of
 from .listening import Listening
 from .runtime import host_id
@@ -53,6 +54,8 @@ class Publisher:
         self.session = session or secrets.token_hex(8)
         self.sent: Counter[str] = Counter()
         """Messages sent, by "topic/skin"."""
+        self.on_join: Callable[[bytes], None] | None = None
+        """Called in `poll` with each new subscription's prefix."""
         self._subscriptions: Counter[bytes] = Counter()
         self._latched: dict[bytes, bytes] = {}
         self._asked_by: dict[bytes, str] = {}  # who first subscribed to each prefix
@@ -108,13 +111,14 @@ class Publisher:
         return sizes.most_common(1)[0][0]
 
     def send(self, frame: Frame) -> bytes:
-        """Publish a frame; its session, seq and host are set here. Returns the message. Never blocks. Raises
-        FrameError.
+        """Publish a frame; its schema, session and seq are set here, and its host where it has none yet: the stamps of
+        one that came from elsewhere are of that host's clock. Returns the message. Never blocks. Raises FrameError.
         """
         topic = TOPIC_OF[type(frame)]
         name = wire_topic(topic.name, frame.skin)
         key = name.decode()
-        frame.session, frame.host, frame.seq = self.session, host_id(), self.sent[key]
+        frame.schema, frame.session, frame.seq = SCHEMA, self.session, self.sent[key]
+        frame.host = frame.host or host_id()
         message = pack(frame)
         self.poll()
         self.socket.send(message, zmq.NOBLOCK)
@@ -133,9 +137,7 @@ class Publisher:
         return self.subscribers(topic, skin) > 0
 
     def subscribers(self, topic: str, skin: str) -> int:
-        """How many subscriptions cover the topic: a subscription is a prefix, so "" and b"contact/" cover
-        b"contact/palm" too.
-        """
+        """How many subscriptions cover the topic."""
         head = wire_topic(topic, skin) + b"\0"
         until, before = self._before
         return max(_covering(head, self._subscriptions), _covering(head, before) if time.monotonic() < until else 0)
@@ -159,6 +161,8 @@ class Publisher:
             if event[:1] == b"\1":
                 self._subscriptions[prefix] += 1
                 newcomers.append(prefix)
+                if self.on_join is not None:
+                    self.on_join(prefix)
                 if prefix not in self._asked_by:
                     self._asked_by[prefix] = peer_of(received, self._listening.secured)
                     self._bytes += len(prefix)
@@ -180,5 +184,12 @@ class Publisher:
         self._listening.close()
 
 
+def covers(prefix: bytes, head: bytes) -> bool:
+    """Whether a subscription to `prefix` gets the messages that begin with `head`: "" and b"contact/" get those of
+    b"contact/palm\0" too.
+    """
+    return head.startswith(prefix) or prefix.startswith(head)
+
+
 def _covering(head: bytes, subscriptions: Counter[bytes]) -> int:
-    return sum(n for prefix, n in subscriptions.items() if head.startswith(prefix) or prefix.startswith(head))
+    return sum(n for prefix, n in subscriptions.items() if covers(prefix, head))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import MISSING, Field, dataclass
 from dataclasses import fields as dataclass_fields
 from typing import Any
 
@@ -139,10 +139,17 @@ class Tree(Check):
         return "free content"
 
 
+def may_be_missing(field: Field[Any]) -> bool:
+    """Whether a message without this field is read with its default."""
+    has_default = field.default is not MISSING or field.default_factory is not MISSING
+    return has_default and not field.metadata["always"]
+
+
 class Record(Check):
     """A map with named fields, read into the dataclass `kind`.
 
-    Unknown keys are ignored, missing ones are a mismatch. The fields in its `same_length` are equally long.
+    Unknown keys are ignored; a missing one takes its default, or is a mismatch where it has none or must always be
+    there (see `fields.wire`). The fields in its `same_length` are equally long.
     """
 
     def __init__(self, kind: type[Any]) -> None:
@@ -150,6 +157,7 @@ class Record(Check):
         self.checks: tuple[tuple[str, Check], ...] = tuple(
             (f.name, f.metadata["check"]) for f in dataclass_fields(kind)
         )
+        self._may_be_missing = frozenset(f.name for f in dataclass_fields(kind) if may_be_missing(f))
         self._same_length: tuple[str, ...] = getattr(kind, "same_length", ())
         self._can_be_infinite = tuple((n, c.finite) for n, c in self.checks if _can_be_infinite(c))
         self._decoders = tuple((n, c.decode, *_range(c)) for n, c in self.checks)
@@ -165,13 +173,27 @@ class Record(Check):
                 found = value[name]
                 # Plain numbers are checked here: a call for each of them costs as much as all the rest.
                 read[name] = found if type(found) is kind and low <= found <= high else decode(found)
-        except KeyError:
-            raise Mismatch("nothing", dict(self.checks)[name].describe(), f".{name}") from None
+        except KeyError:  # tried first as if all were there: looking for each key costs every frame
+            read = self._decode_partial(value)
         except Mismatch as bad:
             raise bad.below(f".{name}") from None
+        made = self.kind(**read)
         if self._same_length:
-            self._check_lengths(read)
-        return self.kind(**read)
+            self._check_lengths(made)
+        return made
+
+    def _decode_partial(self, value: dict[str, Any]) -> dict[str, Any]:
+        """The fields that are there, where the others may be missing."""
+        read = {}
+        for name, check in self.checks:
+            if name in value:
+                try:
+                    read[name] = check.decode(value[name])
+                except Mismatch as bad:
+                    raise bad.below(f".{name}") from None
+            elif name not in self._may_be_missing:
+                raise Mismatch("nothing", check.describe(), f".{name}")
+        return read
 
     def encode(self, value: Any) -> dict[str, Any]:
         out = {}
@@ -186,16 +208,15 @@ class Record(Check):
             expected = dict(self.checks)[name].describe()
             raise Mismatch(f"{brief(getattr(value, name))} ({bad})", expected, f".{name}") from None
         if self._same_length:
-            self._check_lengths({name: getattr(value, name) for name in self._same_length})
+            self._check_lengths(value)
         return out
 
-    def _check_lengths(self, values: Mapping[str, Any]) -> None:
-        first, *others = self._same_length or ("",)
+    def _check_lengths(self, made: Any) -> None:
+        first, *others = self._same_length
+        expected = len(getattr(made, first))
         for name in others:
-            if len(values[name]) != len(values[first]):
-                raise Mismatch(
-                    f"length {len(values[name])}", f"length {len(values[first])}, as {first} has", f".{name}"
-                )
+            if (found := len(getattr(made, name))) != expected:
+                raise Mismatch(f"length {found}", f"length {expected}, as {first} has", f".{name}")
 
     def finite(self, value: Any) -> bool:
         for name, finite in self._can_be_infinite:

@@ -6,14 +6,18 @@ python -m protocol.wire_doc --check    exits 1 where WIRE.md is not current
 
 from __future__ import annotations
 
+import json
 import re
 import struct
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import MISSING, Field
 from dataclasses import fields as dataclass_fields
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from . import fields, frame_types, frames, link, link_messages, publishing, records, runtime, topics
 
@@ -55,8 +59,18 @@ def field_table(kind: type[Any], below: type[Any] | None = None) -> str:
     for f in dataclass_fields(kind):
         if f.name not in known:
             check: fields.Check = f.metadata["check"]
-            rows.append((f"`{f.name}`", check.describe(), unit_of(check), f.metadata["doc"]))
-    return table(("key", "type", "unit", "meaning"), rows)
+            rows.append((f"`{f.name}`", check.describe(), unit_of(check), f.metadata["doc"], if_missing(f)))
+    return table(("key", "type", "unit", "meaning", "if missing"), rows)
+
+
+def if_missing(field: Field[Any]) -> str:
+    """What a reader takes where a message lacks the field."""
+    if not records.may_be_missing(field):
+        return "no frame"
+    value = field.default if field.default_factory is MISSING else field.default_factory()
+    if isinstance(value, np.ndarray):
+        return "zeros" if value.size else "empty"
+    return "nil" if value is None else json.dumps(value)
 
 
 def unit_of(check: fields.Check) -> str:

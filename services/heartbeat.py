@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter, deque
 from typing import Any
 
 from protocol.frames import Frame, StatusFrame
+from protocol.runtime import host_id
 from services.stage import Health
 
 LATENCIES = 256  # frames over which p50 and p99 are taken
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
+LATE_S = 2.0  # how long a late frame is spoken of
 FAILURE_S = 5.0  # how long a frame that could not be processed is spoken of
 
 
@@ -18,7 +21,9 @@ class Heartbeat:
     def __init__(self, process: str, skin: str) -> None:
         self.process, self.skin = process, skin
         self.sent: Counter[str] = Counter()
-        self.drops: Counter[str] = Counter({"old": 0, "failed": 0})
+        self.drops: Counter[str] = Counter({"late": 0, "failed": 0})
+        self.late = 0  # frames that were sent too old to be acted on
+        self._late_at, self._late_by_s = -math.inf, 0.0
         self._failure, self._failed_at = "", 0.0
         self._since = self._heard = time.monotonic()
         self._heard_any = False
@@ -44,11 +49,14 @@ class Heartbeat:
         """A frame came."""
         self._heard, self._heard_any = now_ns * 1e-9, True
 
-    def done(self, frame: Frame, began_ns: int, now_ns: int) -> None:
-        """It was processed and its successors sent."""
+    def done(self, frame: Frame, began_ns: int, now_ns: int, late: bool = False) -> None:
+        """It was processed and its successors sent, too old to be acted on where `late`."""
         since = frame.stamps.get("sample")
-        if since is not None and frame.source != "replay":
+        if since is not None and frame.source != "replay" and frame.host in ("", host_id()):
             self._latency.append((now_ns - since) * 1e-6)
+            if late:
+                self.late += 1
+                self._late_at, self._late_by_s = now_ns * 1e-9, (now_ns - since) * 1e-9
         self._work.append((now_ns - began_ns) * 1e-6)
 
     def silence(self, limit_s: float, upstream: str) -> str:
@@ -76,6 +84,12 @@ class Heartbeat:
             level = "STALE"
         if silent:
             messages.append(silent)
+        if now - self._late_at < LATE_S:
+            level = "WARN" if level == "OK" else level
+            messages.append(
+                f"frames come {self._late_by_s:.1f} s after they were measured, too late to be acted on: "
+                "what is slow is the line to the board, or a process before this one"
+            )
         if asleep:
             messages.append("idle: nobody subscribes")
         last = self._last
@@ -93,7 +107,7 @@ class Heartbeat:
             messages=messages,
             rates=dict(self._rates),
             drops=dict(self.drops),
-            counters=dict(health.counters),
+            counters={**health.counters, "late": self.late},
             latency=self._quantiles(),
             cpu=self._cpu,
             stamps={"publish": time.monotonic_ns()},

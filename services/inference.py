@@ -47,6 +47,7 @@ class Inference(Stage):
         self._last: ImageFrame | None = None  # of the touch that is being held
         self._refused = False  # whether it explains its frame too badly to be of a touch
         self._last_scan = 0  # of the frame that it was reconstructed from
+        self._again = True  # whether somebody may not have it: the next frame that holds it brings it
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
         self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
         self._quiet: NDArray[np.float32] | None = None  # standard deviation that untouched frames state
@@ -74,6 +75,9 @@ class Inference(Stage):
             self._last = None
             self._rest(frame.sigma)
         return [out]
+
+    def joined(self, topic: str) -> None:
+        self._again = True
 
     @classmethod
     def together(cls, work: Sequence[tuple[Stage, Frame]]) -> None:
@@ -108,15 +112,19 @@ class Inference(Stage):
         self._refused = self._refuses and frame.touched and out.residual is not None and self._residual.refused
         self._judge(out)
         self._counters["networks_run"] += 1
-        self._last, self._unseen = out, None
-        self._last_scan = frame.scan
+        self._shows(frame, out)
 
     def _roughly(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """The image of a few measurements, which no network was trained on."""
         self._coarse = self._coarse or CoarseImage(self.bundle)
         out.image, out.sigma, out.classes = self._coarse.run(frame)
+        self._shows(frame, out)
+
+    def _shows(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        """`out` has the image of `frame`, which later ones may hold."""
         self._last, self._unseen = out, None
-        self._last_scan = frame.scan
+        self._last_scan = out.reconstructed = frame.scan
+        self._again = False
 
     def _judge(self, out: ImageFrame) -> None:
         """An image that does not explain the measurements is of no touch."""
@@ -126,12 +134,16 @@ class Inference(Stage):
             self._counters["refused"] += 1
 
     def _hold(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        """The image of the frame last reconstructed, if we have seen that one."""
+        """The image of the frame last reconstructed, if we have seen that one. It was sent then, and is sent again only
+        to who has come since.
+        """
         last = self._last
         if last is not None and self._last_scan == frame.reconstructed:
             out.held = True
-            out.image, out.sigma, out.classes, out.noise = last.image, last.sigma, last.classes, last.noise
-            out.residual = last.residual
+            out.reconstructed, out.noise, out.residual = self._last_scan, last.noise, last.residual
+            if self._again:
+                out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
+                self._again = False
             self._judge(out)
             self._counters["held"] += 1
         else:  # skipped, or before we started: not valid until the next reconstruction, at most 16 frames on

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 from protocol.frames import Frame
 from protocol.sockets import NewestReader
+from protocol.topics import wire_topic
 from services.heartbeat import Heartbeat
 from services.stage import Stage
 
@@ -30,6 +31,7 @@ class Lane:
     def __init__(self, process: str, stage: Stage, feed: Feed) -> None:
         self.stage, self.feed = stage, feed
         self.heartbeat = Heartbeat(process, stage.skin)
+        self.heads = {topic: wire_topic(topic, stage.skin) + b"\0" for topic in stage.writes}  # of its messages
         self.asleep = False
         self.wanted: frozenset[str] = frozenset()  # topics somebody subscribes to, as of the last tick
         self.errors: set[str] = set()
@@ -56,6 +58,11 @@ class Newest:
 
     def listen(self, on: bool) -> None:
         (self.socket.subscribe if on else self.socket.unsubscribe)(self._name)
+
+    def ask_again(self) -> None:
+        """Have upstream send again what it sends to who has just come: nothing else is heard of a subscription."""
+        self.listen(False)
+        self.listen(True)
 
     def close(self) -> None:
         self.reader.close()

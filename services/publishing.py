@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame
+from protocol.held import ANY, HeldImage
 from services.config import Skin
 from services.contacts.force import ForceLaw, Look
 from services.contacts.motion import Seen, Track
@@ -45,16 +45,21 @@ class Publishing(Stage):
 
     def reset(self) -> None:
         self.tracker.reset()
+        self.held = HeldImage()
         self._forget()
         self._counters = {"frames": 0, "contacts": 0, "unknown": 0}
 
     def new_session(self) -> None:
         self.tracker = Tracker()
 
+    def wake(self) -> None:
+        self.tracker.forget()
+        self._forget()
+
     def _forget(self) -> None:
         """Nothing is known of what touches."""
         self._known = self._touched = False
-        self._image = 0  # fingerprint of the image that the contacts were seen in
+        self._seen_in = (ANY, -1)  # session and scan of the image that the contacts were seen in
         self._contacts: list[Contact] = []  # of the frame made last, strongest first; those that ended come last
         self._segments: list[Segment] = []  # of the contacts that did not end, in their order
         self._classes: list[list[float]] = []
@@ -66,8 +71,12 @@ class Publishing(Stage):
         out = ContactFrame(**inherited(frame), frame_id=self.config.frame_id, force_calibrated=self.law.calibrated)
         if not self.law.exists:
             add_reason(out.reasons, "uncalibrated_force")
+        self.lacks = not self.held.complete(frame)
         if not frame.valid and "out_of_distribution" in frame.reasons:
             self._miss(out, "out_of_distribution")
+        elif self.lacks:
+            add_reason(out.reasons, "gap")
+            self._miss(out, "gap")
         elif frame.held and self._knows(frame):
             self._keep(frame)
             out.held = True
@@ -118,16 +127,19 @@ class Publishing(Stage):
                 present.append((self._contact(track, place, s, classes, frame), s, classes))
         present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
         self._segments, self._classes = [s for _, s, _ in present], [classes for _, _, classes in present]
-        self._geometry, self._known, self._image = (m, [x0, y0]), True, _fingerprint(frame)
+        self._geometry, self._known = (m, [x0, y0]), True
+        self._seen_in = frame.session, frame.reconstructed
         self._contacts = [contact for contact, _, _ in present] + self._ends(ended)
-        self._counters["contacts"] += sum(contact.state == "begin" for contact, _, _ in present)
+        self._counters["contacts"] += sum(track is not None and track.age == 1 for track in tracks)
 
     def _knows(self, frame: ImageFrame) -> bool:
         """Whether our contacts are those of this held image: frames in between may have passed us by, and what waits
         to be seen twice is seen again in it.
         """
         recent = not self.tracker.forgotten(frame.stamps.get("sample", 0))
-        return self._known and recent and not self.tracker.waits and _fingerprint(frame) == self._image
+        session, scan = self._seen_in
+        theirs = session in (ANY, frame.session) and scan == frame.reconstructed > 0  # 0: nobody says
+        return self._known and recent and not self.tracker.waits and theirs
 
     def _keep(self, frame: ImageFrame) -> None:
         """The same contacts a frame later."""
@@ -149,7 +161,7 @@ class Publishing(Stage):
         known = bool(classes) and classes[best] >= UNKNOWN_BELOW
         return Contact(
             id=track.id,
-            state="begin" if track.age == 1 else "hold",
+            state="begin" if track.age == 1 and track.begins else "hold",
             position=[seen.x, seen.y, 0.0],
             velocity=[track.vx, track.vy, 0.0],
             orientation=s.orientation,
@@ -194,7 +206,8 @@ class Publishing(Stage):
             "tracker": self.tracker.state(),
             "known": self._known,
             "touched": self._touched,
-            "image": self._image,
+            "reconstructed": self._seen_in[1],
+            "held": None if self.held.last is None else _kept(self.held.last),
             "contacts": [asdict(c) for c in self._contacts],
             "segments": [{**asdict(s), "mask": s.mask.astype(np.uint8)} for s in self._segments],
             "classes": self._classes,
@@ -204,7 +217,9 @@ class Publishing(Stage):
     def load(self, state: dict[str, Any]) -> None:
         self.tracker.load(state["tracker"])
         self._known, self._touched = bool(state["known"]), bool(state.get("touched", False))
-        self._image = int(state.get("image", 0))
+        self._seen_in = (ANY, int(state.get("reconstructed", -1)))  # older recordings have none
+        kept = state.get("held")
+        self.held.last = None if kept is None else _image_of(self.skin, kept)
         self._contacts = [Contact(**c) for c in state["contacts"]]
         self._segments = [Segment(**{**s, "mask": np.array(s["mask"], dtype=bool)}) for s in state["segments"]]
         self._classes = [list(p) for p in state["classes"]]
@@ -221,8 +236,17 @@ def _sound(frame: ImageFrame) -> bool:
     return readable(frame.image) and frame.metres_per_pixel > 0 and bool((places < LARGEST_M).all())
 
 
-def _fingerprint(frame: ImageFrame) -> int:
-    return zlib.crc32(np.ascontiguousarray(frame.image).data)
+def _kept(frame: ImageFrame) -> dict[str, Any]:
+    return {
+        "scan": frame.reconstructed,
+        **{name: np.array(getattr(frame, name), np.float32) for name in ("image", "sigma", "classes")},
+    }
+
+
+def _image_of(skin: str, kept: dict[str, Any]) -> ImageFrame:
+    image, sigma, classes = (np.asarray(kept[name], np.float32) for name in ("image", "sigma", "classes"))
+    scan = int(kept["scan"])
+    return ImageFrame(skin=skin, session=ANY, reconstructed=scan, image=image, sigma=sigma, classes=classes)
 
 
 def _explained(frame: ImageFrame) -> bool:

@@ -19,19 +19,21 @@ import zmq
 from models.bundle import Bundle
 from protocol import transport
 from protocol.frames import Frame, FrameError, InfoFrame
+from protocol.publishing import covers
 from protocol.runtime import host_id
 from protocol.sockets import ControlError, ControlServer, Publisher
 from protocol.topics import TOPIC_OF
 from services import persistence
 from services.config import Config
 from services.lane import Feed, Lane, Newest
-from services.stage import Refused, Stage
+from services.lateness import Lateness
+from services.stage import Refused, Stage, add_reason
 from services.waiting import Waiter
 
 HEARTBEAT_S = 1.0
 TICK_S = 0.2  # how often at most silence, changes of health and new subscribers are looked for
 SILENT_S = 0.5  # without frames from upstream: status STALE
-OLD_S = 0.5  # a frame read longer ago is dropped: never stale as fresh
+AT_ONCE = 256  # frames taken from a feed before any is processed
 WARM_FRAMES = 50  # frames after which what lives is taken to live for ever (garbage collection)
 
 log = logging.getLogger(__name__)
@@ -52,6 +54,8 @@ class Runner:
         self.lanes: dict[str, Lane] = {}
         self._bundles: dict[str, Bundle] = {}
         self._waiter = Waiter()
+        self._lateness = Lateness()
+        self.publisher.on_join = self._joined
         self._minded: list[tuple[Publisher | ControlServer, Any]] = []  # what listens, with the socket we wait for
         self._by_socket: dict[Any, Lane] = {}
         self._stop = False
@@ -87,8 +91,10 @@ class Runner:
         _settle()
         next_tick = deadline = 0.0
         while not self._stop:
-            ready = self._waiter.wait(max(next_tick, deadline) - time.monotonic())
-            self._serve([self._by_socket[socket] for socket in ready if socket in self._by_socket])
+            timeout_s = max(next_tick, deadline) - time.monotonic()
+            ready = self._waiter.wait(timeout_s)
+            stood = self._lateness.stood_still(timeout_s)
+            self._serve([self._by_socket[socket] for socket in ready if socket in self._by_socket], stood)
             for socket in ready:
                 if socket is self.control.socket:
                     self.control.serve_once()
@@ -110,15 +116,16 @@ class Runner:
     def close(self) -> None:
         for lane in self.lanes.values():
             lane.feed.close()
+        self._lateness.close()
         self.control.close()
         self.publisher.close()
         self._waiter.close()
 
     # frames
 
-    def _serve(self, lanes: list[Lane]) -> None:
+    def _serve(self, lanes: list[Lane], stood: bool = False) -> None:
         """What waits at these lanes, newest frames of several skins together."""
-        work = [(lane, frame) for lane in lanes for frame in self._waiting(lane)]
+        work = [(lane, frame) for lane in lanes for frame in self._waiting(lane, stood)]
         if len(work) > 1 and self.config.skip.batch:
             try:
                 type(work[0][0].stage).together([(lane.stage, frame) for lane, frame in work])
@@ -127,17 +134,16 @@ class Runner:
         for lane, frame in work:
             self._handle(lane, frame)
 
-    def _waiting(self, lane: Lane) -> Iterator[Frame]:
-        """Frames to process; those that waited too long are counted."""
-        while (frame := lane.feed.recv()) is not None:
-            read = frame.stamps.get("read", 0)
-            mine = frame.source != "replay" and frame.host in ("", host_id())
-            if mine and time.monotonic_ns() - read > OLD_S * 1e9:
-                lane.heartbeat.drops["old"] += 1
-            else:
-                yield frame
+    def _waiting(self, lane: Lane, stood: bool) -> list[Frame]:
+        """Frames to process: the newest of a socket, all of a feed but what it is too late for."""
+        frames: list[Frame] = []
+        while len(frames) < AT_ONCE and (frame := lane.feed.recv()) is not None:
+            frames.append(frame)
             if isinstance(lane.feed, Newest):
-                return
+                return frames
+        news = self._lateness.news(frames, stood)
+        lane.heartbeat.drops["late"] += len(frames) - len(news)
+        return news
 
     def _handle(self, lane: Lane, frame: Frame) -> None:
         beat, stage = lane.heartbeat, lane.stage
@@ -149,11 +155,27 @@ class Runner:
             self._failed(lane, why)
             return
         done = time.monotonic_ns()
-        for out in made:
-            out.stamps.setdefault(stage.stamp, done)
+        late = False
+        for n, out in enumerate(made):
+            if out.host in ("", host_id()):  # whose clock the stamps are of
+                out.stamps.setdefault(stage.stamp, done)
+            if n == 0:
+                late = self._lateness.late(out)
+            if late:
+                out.valid = False
+                add_reason(out.reasons, "late")
             self._send(lane, out)
-        beat.done(frame, now, time.monotonic_ns())
+        beat.done(frame, now, time.monotonic_ns(), late)
+        if stage.lacks and isinstance(lane.feed, Newest):
+            lane.feed.ask_again()
         self._frames += 1
+
+    def _joined(self, prefix: bytes) -> None:
+        """Somebody subscribes to what begins so."""
+        for lane in self.lanes.values():
+            for topic, head in lane.heads.items():
+                if covers(prefix, head):
+                    lane.stage.joined(topic)
 
     def _prepare(self) -> None:
         """One piece of work for later, while nobody waits: the lanes take turns, for even asking all of them costs."""
@@ -234,6 +256,8 @@ class Runner:
         if idle != lane.asleep:
             lane.asleep = idle
             lane.feed.listen(not idle)
+            if not idle:
+                lane.stage.wake()
 
     def _restore(self, lane: Lane) -> None:
         found = persistence.restore(self.process, lane.stage.skin)

@@ -46,6 +46,7 @@ class Stage(ABC):
     commands: ClassVar[tuple[str, ...]] = ()  # what `command` understands
     sleeps: ClassVar[bool] = False  # unsubscribes while nobody subscribes to what it writes
     persists: ClassVar[bool] = False  # `saved` is kept in the runtime folder and loaded at start
+    lacks = False  # what upstream sends only once is missing here: subscribing anew has it sent again
 
     def __init__(self, skin: str) -> None:
         self.skin = skin
@@ -75,6 +76,12 @@ class Stage(ABC):
 
     def restore(self, saved: dict[str, Any], age_s: float) -> None:  # noqa: B027
         """Take over what an earlier process saved `age_s` ago. Raises Refused where it does not fit."""
+
+    def joined(self, topic: str) -> None:  # noqa: B027
+        """Somebody has subscribed to `topic`, which it writes: what is sent only once is to be sent again."""
+
+    def wake(self) -> None:  # noqa: B027
+        """Frames come again after a time without, in which nobody subscribed: who does now knows nothing of before."""
 
     def command(self, name: str, args: dict[str, Any]) -> dict[str, Any]:
         """Carry out one of `commands`. Raises Refused."""
@@ -107,6 +114,7 @@ def inherited(frame: Frame) -> dict[str, Any]:
     """Header fields that a frame hands on to what is made of it."""
     return {
         "skin": frame.skin,
+        "host": frame.host,
         "scan": frame.scan,
         "stamps": dict(frame.stamps),
         "sample_sigma_ns": frame.sample_sigma_ns,

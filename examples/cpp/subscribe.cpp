@@ -9,6 +9,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <chrono>
 #include <cstdarg>
 #include <cstdint>
@@ -27,7 +28,7 @@ namespace {
 
 using Map = std::map<std::string, msgpack::object>;
 
-constexpr int kSchema = 1;
+constexpr int kSchema = 2;  // and all before it
 constexpr double kSilenceS = 0.25;  // five frames of the demo
 
 struct NoFrame : std::runtime_error {
@@ -63,15 +64,20 @@ const msgpack::object& field(const Map& map, const char* key) {
   return found->second;
 }
 
-// Whether the frame may still be acted on: `valid_for_s` after its `publish` stamp. Another host's stamps say nothing
-// about our clock; its frames were waited for, and have just come.
-bool is_fresh(const Map& frame) {
+// Whether the frame may still be acted on: `valid_for_s` after its `sample` stamp, when the skin was measured (after
+// `read` where it is replayed). Another host's stamps say nothing about our clock; its frames were waited for, and have
+// just come, after what their own stamps say that it took.
+bool is_fresh(const Map& frame, bool replay) {
   static const std::string host = this_host();
-  const double valid_for_s = field(frame, "valid_for_s").as<double>();
-  if (valid_for_s <= 0.0 || field(frame, "host").as<std::string>() != host) return true;
   const auto stamps = field(frame, "stamps").as<std::map<std::string, std::int64_t>>();
-  const auto publish = stamps.find("publish");
-  return publish != stamps.end() && 1e-9 * static_cast<double>(monotonic_ns() - publish->second) <= valid_for_s;
+  const auto sample = stamps.find(replay ? "read" : "sample");
+  if (sample == stamps.end()) return false;
+  std::int64_t now = monotonic_ns();
+  if (field(frame, "host").as<std::string>() != host) {
+    now = sample->second;
+    for (const auto& stamp : stamps) now = std::max(now, stamp.second);
+  }
+  return 1e-9 * static_cast<double>(now - sample->second) <= field(frame, "valid_for_s").as<double>();
 }
 
 [[gnu::format(printf, 1, 2)]] std::string text(const char* form, ...) {
@@ -101,8 +107,8 @@ bool print(const std::string& message) {
   if (body == std::string::npos) throw NoFrame("no topic");
   const auto unpacked = msgpack::unpack(message.data() + body + 1, message.size() - body - 1);
   const auto frame = unpacked.get().as<Map>();
-  if (field(frame, "schema").as<int>() != kSchema) throw NoFrame("of another schema than this program knows");
-  const bool fresh = is_fresh(frame), replay = field(frame, "source").as<std::string>() == "replay";
+  if (field(frame, "schema").as<int>() > kSchema) throw NoFrame("of a newer schema than this program knows");
+  const bool replay = field(frame, "source").as<std::string>() == "replay", fresh = is_fresh(frame, replay);
   const bool valid = field(frame, "valid").as<bool>();
   std::string out = text("frame %llu ", field(frame, "seq").as<unsigned long long>());
   out += !fresh ? "STALE" : replay ? "REPLAY" : valid ? "valid" : "INVALID";

@@ -13,6 +13,7 @@ import numpy as np
 
 from models.bundle import Bundle
 from protocol.frames import Frame, ImageFrame
+from protocol.held import HeldImage
 from services.calibrating.calibration import Of
 from services.calibrating.calibration_fit import CalibrationError
 from services.config import Skin
@@ -54,10 +55,12 @@ class Steady:
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, Look]] = deque()
+        self._held = HeldImage()
         self.trouble = "nothing touches"
 
     def __call__(self, frame: ImageFrame) -> Look | None:
         """The mean of the steady time, or None while it is not over; `trouble` then says why."""
+        self._held.complete(frame)
         found = looks(frame)
         if len(found) != 1 or not frame.valid:
             self._recent.clear()

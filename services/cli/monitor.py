@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from protocol.frames import ContactFrame, Frame, ImageFrame, InfoFrame, StatusFrame
+from protocol.held import HeldImage
 from protocol.runtime import host_id
 from protocol.sockets import AllReader
 from protocol.topics import TOPIC_OF, TOPICS
@@ -73,8 +74,9 @@ class Monitor:
         self._before: dict[str, StatusFrame] = {}  # the status before the last, of each
         self.info: dict[str, Any] = {}
         self.image: ImageFrame | None = None
-        """The last frame that brought an image, for as long as later ones hold it; None while nothing touches."""
+        """The newest frame with an image, its own or the one it holds; None while nothing touches."""
         self.image_held = False
+        self._held = HeldImage()
 
     def read(self, seconds: float) -> None:
         """Takes in what arrives within `seconds`."""
@@ -92,11 +94,11 @@ class Monitor:
         elif isinstance(frame, InfoFrame):
             self.info.update(frame.info)
         else:
-            self.topics[TOPIC_OF[type(frame)].name].add(frame, now_s)
             if isinstance(frame, ImageFrame):
+                self._held.complete(frame)
+                self.image = frame if frame.image.size else None
                 self.image_held = frame.held
-                if frame.image.size or not (frame.held and frame.touched):
-                    self.image = frame if frame.image.size else None
+            self.topics[TOPIC_OF[type(frame)].name].add(frame, now_s)
 
     @property
     def heard(self) -> bool:

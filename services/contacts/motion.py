@@ -43,6 +43,7 @@ class Track:
     vv: float = FIRST_SPEED**2
     missing: int = 0  # frames since it was seen
     age: int = 1  # frames in which it was seen
+    begins: bool = True  # whether it was looked for, and not there, just before
     since_ns: int = 0  # when the last one of `inside` came
     until_ns: int = 0  # how long it is waited for while it is inside another one's patch
     inside: list[Track] = field(default_factory=list)

@@ -3,6 +3,9 @@
 Each touch is where its velocity takes it until it is seen (motion.py); what is seen is given to the touches by
 the assignment of least total cost. Touches that grow into one patch, and come out of it, are merging.py's.
 
+A touch *begins* where the frame before was looked at and did not show it. What the first frame shows that anybody looks
+at, after a start or after a time of not looking, may have been there for long.
+
 The first touch begins at once, if its image is good. What appears beside others, or in an image that does not explain
 what was measured, begins when a second frame shows it too: while a touch comes or goes during a scan, the image of that
 scan may show more than there is, or something else.
@@ -31,7 +34,7 @@ class Tracker:
 
     def __init__(self) -> None:
         self._next_id = 1
-        self._looked_ns = 0  # sample time of the last frame that said anything
+        self._looked_ns: int | None = None  # sample time of the last frame that said anything
         self._untold: list[Track] = []  # ended by a reset
         self.tracks: list[Track] = []
 
@@ -39,6 +42,10 @@ class Tracker:
         """End everything; the next frame tells. Ids go on counting: none is used again in a session."""
         self._untold += [one for track in self.tracks for one in (track, *others(track)) if one.id != UNCONFIRMED]
         self.tracks = []
+
+    def forget(self) -> None:
+        """Nobody is left who was told of anything: there is nothing to end."""
+        self.tracks, self._untold, self._looked_ns = [], [], None
 
     def expected(self, sample_ns: int) -> list[tuple[float, float]]:
         """Where each touch should be then [m], those inside one patch one by one."""
@@ -57,6 +64,7 @@ class Tracker:
         """What one frame shows -> (the track of each entry, in their order, None for one to be confirmed; tracks that
         ended). sure: whether what this frame shows can be believed at once.
         """
+        begins = not self.forgotten(sample_ns)
         ended = self._begin_frame(sample_ns)
         owners = self._assign(seen, sample_ns)
         self._merge(owners, seen, sample_ns)
@@ -64,7 +72,7 @@ class Tracker:
         found: list[Track] = []
         for entry, track in zip(seen, owners, strict=True):
             if track is None:
-                track = Track(UNCONFIRMED, entry.x, entry.y, sample_ns, entry.size, entry.reach)
+                track = Track(UNCONFIRMED, entry.x, entry.y, sample_ns, entry.size, entry.reach, begins=begins)
             else:
                 track.move(entry, sample_ns)
                 if track.inside:
@@ -106,7 +114,7 @@ class Tracker:
 
     def forgotten(self, sample_ns: int) -> bool:
         """Whether nobody looked for so long that no touch can be known to be the same."""
-        return sample_ns - self._looked_ns > FORGOTTEN_S * 1e9
+        return self._looked_ns is None or sample_ns - self._looked_ns > FORGOTTEN_S * 1e9
 
     def _begin_frame(self, sample_ns: int) -> list[Track]:
         """Tracks that ended before this frame: by a reset, or since nobody looked."""
@@ -174,7 +182,7 @@ class Tracker:
     def state(self) -> dict[str, Any]:
         return {
             "next_id": self._next_id,
-            "looked_ns": self._looked_ns,
+            "looked_ns": -1 if self._looked_ns is None else self._looked_ns,
             "untold": [asdict(t) for t in self._untold],
             "tracks": [asdict(t) for t in self.tracks],
         }
@@ -194,7 +202,8 @@ class Tracker:
         told = [track for track in map(_track, state["untold"]) if track.id >= self._next_id]
         self._untold = [t for t in (here | {t.id: t for t in told}).values() if t.id not in going_on]
         self._next_id = max(self._next_id, int(state["next_id"]))
-        self._looked_ns = int(state["looked_ns"])
+        looked_ns = int(state["looked_ns"])
+        self._looked_ns = None if looked_ns < 0 else looked_ns
 
 
 def _track(values: dict[str, Any]) -> Track:

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import gc
-import time
 import warnings
 
 import pytest
@@ -12,7 +11,7 @@ from protocol.aio import AsyncContactSubscriber
 from protocol.client import NotValid, Stale
 from protocol.sockets import Publisher
 
-from .test_client import RESTARTED, frame
+from .test_client import RESTARTED, ago, frame
 from .test_sockets import run, subscribed
 
 
@@ -25,14 +24,14 @@ def test_latest_and_iterating(publisher):
     async def main():
         async with AsyncContactSubscriber("palm") as skin:
             with pytest.raises(Stale, match="no contact frame of palm yet"):
-                await skin.latest()
+                await skin.latest(wait_s=0.0)
             subscribed(publisher)
             sending = asyncio.get_running_loop().call_later(0.05, lambda: publisher.send(frame()))
-            assert (await skin.latest(max_age=0.5, wait_s=2.0)).seq == 0, "and the loop was not blocked meanwhile"
+            assert (await skin.latest()).seq == 0, "the first one is waited for, and the loop was not blocked meanwhile"
             sending.cancel()
             frames = aiter(skin)
             for seq in range(1, 4):
-                publisher.send(frame())
+                publisher.send(frame(valid_for_s=0.25))
                 assert (await anext(frames)).seq == seq
             with pytest.raises(Stale, match="expected at most 0.250 s"):
                 await anext(frames)
@@ -51,7 +50,7 @@ def test_old_frames_are_skipped(publisher):
     async def main():
         async with AsyncContactSubscriber("palm") as skin:
             subscribed(publisher)
-            publisher.send(frame(stamps={"publish": time.monotonic_ns() - 1_000_000_000}))
+            publisher.send(frame(valid_for_s=0.25, stamps=ago(1.0)))
             with pytest.raises(Stale):
                 await skin.next_frame(0.3)
 

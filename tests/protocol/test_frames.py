@@ -14,15 +14,17 @@ from protocol.frames import (
     Contact,
     ContactFrame,
     DeltaFrame,
+    ForceFrame,
     FrameError,
     ImageFrame,
     InfoFrame,
     RawFrame,
     ShapeFrame,
+    TruthFrame,
     pack,
     unpack,
 )
-from protocol.topics import TOPICS, wire_topic
+from protocol.topics import TOPIC_OF, TOPICS, wire_topic
 
 
 def contact_map(**changes):
@@ -43,7 +45,9 @@ def refused(data):
 @pytest.mark.parametrize(
     ("field", "value", "found", "expected"),
     [
-        ("schema", 2, "int 2", "int 1"),
+        ("schema", 3, "schema 3", "schema 2 at most: who sent it is newer, update this reader"),
+        ("schema", 0, "int 0", "int 1..2"),
+        ("schema", "2", "str '2'", "int 1..2"),
         ("skin", "other", "'other'", "'palm', as in the message's topic"),
         ("skin", "pa/lm", "'pa/lm'", "text"),
         ("session", "0123", "'0123'", "[0-9a-f]{16}"),
@@ -72,10 +76,49 @@ def test_a_wrong_field_is_named_with_what_was_found_and_expected(field, value, f
     assert all(part in str(error) for part in ("contact", field, error.found, error.expected))
 
 
-def test_a_missing_field_is_named():
+@pytest.mark.parametrize(
+    "field",
+    ["schema", "skin", "session", "seq", "host", "stamps", "sample_sigma_ns", "source", "contacts"],
+)
+def test_a_missing_field_whose_default_would_claim_something_is_named(field):
     content = contact_map()
+    del content[field]
+    error = refused(message(content))
+    assert (error.field, error.found) == (field, "nothing")
+
+
+@pytest.mark.parametrize("kind", [RawFrame, DeltaFrame, ImageFrame, ForceFrame, TruthFrame])
+def test_no_frame_says_that_nothing_touches_by_saying_nothing(kind):
+    needed = {"raw": ("z", "status"), "delta": ("touched",), "image": ("touched",), "force": ("wrench",)}
+    topic = TOPIC_OF[kind].name
+    given = {"z": np.ones(3), "status": np.zeros(3)} if kind is RawFrame else {}
+    content = msgpack.unpackb(pack(kind(skin="palm", **given)).partition(b"\0")[2])
+    for field in needed.get(topic, ("touches",)):
+        less = {key: value for key, value in content.items() if key != field}
+        assert refused(message(less, wire_topic(topic, "palm"))).field == field
+
+
+def test_other_missing_fields_take_their_defaults():
+    """Written before there was such a field."""
+    content = contact_map(valid=True)
+    for field in ("held", "frame_id", "quality", "scan", "reasons"):
+        del content[field]
+    del content["contacts"][0]["orientation"], content["contacts"][0]["state"]
+    frame = unpack(message(content))
+    assert (frame.held, frame.frame_id, frame.quality, frame.scan, frame.reasons) == (False, "", None, 0, [])
+    assert frame.valid and (frame.contacts[0].orientation, frame.contacts[0].state) == (0.0, "hold")
+    del content["valid"], content["valid_for_s"]
+    frame = unpack(message(content))
+    assert frame.valid is False and frame.valid_for_s == 0.0, "nobody says that it may be acted on"
+
+
+def test_a_wrong_field_is_refused_although_others_are_missing():
+    content = contact_map(frame_id=3)
     del content["held"]
-    assert (refused(message(content)).field, refused(message(content)).found) == ("held", "nothing")
+    assert refused(message(content)).field == "frame_id"
+    content = contact_map()
+    del content["held"], content["contacts"][0]["position"]
+    assert refused(message(content)).field == "contacts[0].position"
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from protocol import cobs, link
-from protocol.frames import pack, unpack
+from protocol.frames import SCHEMA, pack, unpack
 from protocol.records import Record
 from protocol.topics import TOPICS
 
@@ -19,6 +19,7 @@ spec.loader.exec_module(make_vectors)
 
 VECTORS = make_vectors.VECTORS
 FRAMES = sorted(p.stem for p in (VECTORS / "frames").glob("*.json"))
+OLD = sorted(p.relative_to(VECTORS).with_suffix("") for p in VECTORS.glob("frames-schema-*/*.json"))
 LINK = sorted(p.stem for p in (VECTORS / "link").glob("*.json"))
 
 
@@ -54,6 +55,27 @@ def test_frame(name):
         frame.valid, frame.reasons = True, []
     assert_same(frame, vector["fields"])
     assert pack(frame) == message
+
+
+@pytest.mark.parametrize("path", OLD, ids=str)
+def test_a_frame_of_an_older_schema_is_read(path):
+    """As its file says; what it does not have is as it would have been said."""
+    vector, message = load(path.parent, path.name)
+    frame = unpack(message)
+    if path.name == "raw_non_finite":
+        assert (frame.valid, frame.reasons) == (False, ["non_finite"])
+        frame.valid, frame.reasons = True, []
+    assert_same(frame, vector["fields"])
+    assert frame.schema < SCHEMA and f"schema-{frame.schema}" in str(path)
+    if vector["topic"] == "image":
+        assert frame.reconstructed == 0
+    assert isinstance(unpack(pack(frame)), type(frame))
+
+
+def test_every_topic_has_a_vector_of_every_older_schema():
+    assert len({path.parent for path in OLD}) == SCHEMA - 1
+    for folder in {path.parent for path in OLD}:
+        assert {load(folder, path.name)[0]["topic"] for path in OLD if path.parent == folder} == set(TOPICS)
 
 
 def test_every_topic_and_every_field_has_a_vector():

@@ -9,6 +9,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from protocol import frames, link, topics, wire_doc
 from protocol.frames import Contact, ContactFrame
 from protocol.sockets import Publisher
@@ -35,14 +37,27 @@ def test_wire_md_names_every_topic_key_and_message():
         assert f"`{reason}`" in text
 
 
-def test_the_example_prints_contacts(runtime, context):
-    code = re.search(r"```python\n(.*?)```", wire_doc.WIRE_MD.read_text(), re.DOTALL)[1]
+@pytest.mark.parametrize("document", [wire_doc.WIRE_MD, PROTOCOL.parent / "README.md"], ids=lambda path: path.name)
+@pytest.mark.parametrize("variable", ["EITSKIN_RUNTIME", "XDG_RUNTIME_DIR"])
+def test_the_ten_lines_print_contacts_and_when_not_to_act(document, variable, runtime, context, monkeypatch):
+    """In the folder where the service puts its sockets, also on a desktop, which sets the second variable."""
+    monkeypatch.delenv("EITSKIN_RUNTIME")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    if variable == "EITSKIN_RUNTIME":
+        monkeypatch.setenv(variable, f"{runtime}/here")
+    code = re.search(r"```python\n(import msgpack.*?)```", document.read_text(), re.DOTALL)[1]
     publisher = Publisher("publisher", context)
     process = subprocess.Popen([sys.executable, "-uc", code], stdout=subprocess.PIPE, text=True, env=dict(os.environ))
     try:
         subscribed(publisher)
-        publisher.send(ContactFrame(skin="palm", valid=True, contacts=[Contact(id=1, position=[0.02, -0.01, 0.0])]))
-        assert process.stdout.readline() == "0 True [[0.02, -0.01, 0.0]]\n"
+        now = time.monotonic_ns()
+        for n, (valid, sample) in enumerate(((True, now), (False, now), (True, now - 60 * 10**9), (True, 2 * now))):
+            contact = Contact(id=1, position=[0.02, -0.01, 0.0], force_n=1.0)
+            stamps = {"sample": sample, "publish": now}
+            frame = ContactFrame(skin="palm", scan=n, valid=valid, valid_for_s=30.0, stamps=stamps, contacts=[contact])
+            publisher.send(frame)
+            assert process.stdout.readline() == f"{n} {n == 0} [([0.02, -0.01, 0.0], 1.0)]\n"
+        assert process.wait(30) == 0, "silence"
     finally:
         process.kill()
         process.communicate()
@@ -56,7 +71,7 @@ def test_the_package_stands_alone_as_eitskin(runtime, tmp_path):
         "for m in pkgutil.iter_modules(eitskin.__path__): importlib.import_module('eitskin.' + m.name)\n"
         "assert not {'protocol', 'services', 'models'} & set(sys.modules)\n"
         "from eitskin.client import ContactSubscriber, Stale\n"
-        "try: ContactSubscriber('palm').latest()\n"
+        "try: ContactSubscriber('palm').latest(wait_s=0)\n"
         "except Stale as stale: print(stale)\n"
     )
     done = subprocess.run(

@@ -7,6 +7,7 @@ import asyncio
 import os
 import tempfile
 import threading
+import time
 
 from eitskin.aio import AsyncContactSubscriber
 from eitskin.client import ContactSubscriber, NotValid, Stale
@@ -17,12 +18,12 @@ from eitskin.sockets import Publisher
 
 def send_until(done: threading.Event, publisher: Publisher) -> None:
     while not done.wait(0.02):
-        publisher.send(ContactFrame(skin="palm", valid=True))
+        publisher.send(ContactFrame(skin="palm", valid=True, valid_for_s=1.0, stamps={"sample": time.monotonic_ns()}))
 
 
 async def by_asyncio() -> None:
     async with AsyncContactSubscriber("palm") as skin:
-        print("asyncio:", (await skin.latest(max_age=1.0, wait_s=5.0, valid=True)).seq)
+        print("asyncio:", (await skin.latest(wait_s=5.0, valid=True)).seq)
         async for frame in skin:
             print("asyncio:", frame.seq)
             break
@@ -43,7 +44,7 @@ def main() -> None:
     try:
         with ContactSubscriber("palm") as skin:
             try:
-                frame: ContactFrame = skin.latest(max_age=1.0, wait_s=5.0, valid=True)
+                frame: ContactFrame = skin.latest(wait_s=5.0, valid=True)
             except NotValid as why:
                 raise SystemExit(f"{why.frame.reasons}") from None
             print("client:", frame.seq, [contact.position for contact in frame.contacts])

@@ -10,7 +10,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from models.bundle import Bundle, write
-from protocol.frames import DeltaFrame, ImageFrame
+from protocol.frames import DeltaFrame, ImageFrame, pack
 from services.config import Skin
 from services.faults.quality import KEPT
 from services.inference import SETTLED, Inference
@@ -101,10 +101,21 @@ def test_untouched_frames_run_no_network(stage: Inference) -> None:
 def test_a_held_frame_has_the_image_of_the_one_reconstructed(stage: Inference) -> None:
     first = run(stage, delta(1, 0.5))
     held = run(stage, delta(2, held=True, reconstructed=1))
-    assert held.held and held.valid and (held.image == first.image).all()
+    assert held.held and held.valid and held.image.size == held.sigma.size == held.classes.size == 0
+    assert held.reconstructed == first.reconstructed == 1 and held.noise == first.noise
+    assert len(pack(held)) < 2000, "not the image again"
     lost = run(stage, delta(9, held=True, reconstructed=8))  # frame 8 never came
     assert not lost.valid and lost.reasons == ["gap"] and lost.image.size == 0
     assert stage.health().counters["networks_run"] == 1
+
+
+def test_a_held_image_is_sent_again_to_who_has_just_come(stage: Inference) -> None:
+    first = run(stage, delta(1, 0.5))
+    assert not run(stage, delta(2, held=True, reconstructed=1)).image.size
+    stage.joined("image")
+    assert (run(stage, delta(3, held=True, reconstructed=1)).image == first.image).all()
+    again = run(stage, delta(4, held=True, reconstructed=1))
+    assert again.held and not again.image.size, "once"
 
 
 def test_what_nobody_wants_is_not_run_but_made_up_for(stage: Inference) -> None:
@@ -136,7 +147,8 @@ def test_state_carries_the_held_image(stage: Inference, skin: Skin, networked: B
     first = run(stage, delta(1, 0.5))
     twin = Inference("palm", skin.model_copy(update={"network": "full"}), networked)
     twin.load(stage.state())
-    assert (run(twin, delta(2, held=True, reconstructed=1)).image == first.image).all()
+    held = run(twin, delta(2, held=True, reconstructed=1))
+    assert held.reconstructed == 1 and (held.image == first.image).all()
 
 
 def test_without_a_network_the_one_step_image_shows_the_touch(skin: Skin, bundle: Bundle, board: Board) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame, pack, unpack
+from services import persistence
 from services.config import Skin
 from services.contacts.outline import outline
 from services.contacts.tracking import LOST_FRAMES
@@ -73,7 +74,7 @@ def test_position_force_area_and_wrench_of_a_touch(stage: Publishing) -> None:
     assert c.force_n == pytest.approx(3.0, rel=0.01)
     assert c.area_m2 == pytest.approx(math.pi * 0.01**2, rel=0.03)
     assert c.wrench == pytest.approx([0, 0, -3.0, 0.01 * 3.0, 0.02 * 3.0, 0], rel=0.02, abs=1e-9)
-    assert c.normal == [0, 0, 1] and c.state == "begin"
+    assert c.normal == [0, 0, 1]
 
 
 @pytest.mark.parametrize(
@@ -132,17 +133,84 @@ def test_uncertainty_of_force_and_confidence_come_from_the_images(stage: Publish
 
 def test_a_touch_begins_lasts_and_ends_once(stage: Publishing) -> None:
     seen = []
-    for scan, there in enumerate([True] * 4 + [False] * 4):
+    contacts(stage, image_frame(NOTHING, 1))
+    for scan, there in enumerate([True] * 4 + [False] * 4, 2):
         image = discs((0.001 * scan, 0, 0.01, 0.3)) if there else NOTHING
         seen.append([(c.id, c.state) for c in contacts(stage, image_frame(image, scan)).contacts])
     assert seen == [[(1, "begin")], *[[(1, "hold")]] * 3, *[[]] * LOST_FRAMES, [(1, "end")], [], []][: len(seen)]
     assert contacts(stage, image_frame(discs((0, 0, 0.01, 0.3)), 20)).contacts[0].id == 2
 
 
+def held_frame(scan: int, reconstructed: int, **fields: Any) -> ImageFrame:
+    """As inference sends it: without the image."""
+    frame = image_frame(NOTHING, scan, held=True, reconstructed=reconstructed, **fields)
+    frame.touched = True
+    return frame
+
+
 def test_held_frames_keep_contacts_and_say_so(stage: Publishing) -> None:
-    contacts(stage, image_frame(discs((0.01, 0, 0.01, 0.3))))
-    out = contacts(stage, image_frame(discs((0.01, 0, 0.01, 0.3)), 2, held=True))
-    assert out.held and [(c.id, c.state) for c in out.contacts] == [(1, "hold")]
+    (before,) = contacts(stage, image_frame(discs((0.01, 0, 0.01, 0.3)), reconstructed=1)).contacts
+    for scan in (2, 3):
+        out = contacts(stage, held_frame(scan, 1))
+        assert out.held and out.valid and not stage.lacks and [(c.id, c.state) for c in out.contacts] == [(1, "hold")]
+        assert out.contacts[0].position == before.position and out.contacts[0].force_n == before.force_n
+
+
+def test_a_held_image_that_never_came_is_asked_for(stage: Publishing) -> None:
+    """Passed by, or of before we started: nothing may be said of the touch until the image comes again."""
+    contacts(stage, image_frame(discs((0.01, 0, 0.01, 0.3)), 1, reconstructed=1))
+    for scan, frame in ((5, held_frame(5, 4)), (6, held_frame(6, 1, session="f" * 16))):
+        out = contacts(stage, frame)
+        assert stage.lacks and not out.valid and "gap" in out.reasons and out.contacts == [], scan
+    image = discs((-0.02, 0.0, 0.01, 0.3))
+    out = contacts(stage, image_frame(image, 7, held=True, reconstructed=4))
+    assert out.valid and not stage.lacks
+    out = contacts(stage, image_frame(image, 8, held=True, reconstructed=4))  # a jump is told when it is seen twice
+    assert out.valid and any(c.position[0] == pytest.approx(-0.02, abs=1e-3) for c in out.contacts)
+
+
+def test_what_appears_twice_is_seen_twice_in_an_image_that_came_once(stage: Publishing) -> None:
+    contacts(stage, image_frame(NOTHING, 1))
+    two = image_frame(discs((-0.02, 0.0, 0.01, 0.5), (0.02, 0.0, 0.006, 0.2)), 2, reconstructed=2)
+    assert len(contacts(stage, two).contacts) == 1
+    assert len(contacts(stage, held_frame(3, 2)).contacts) == 2
+
+
+def test_the_state_carries_the_held_image(stage: Publishing, skin: Skin, bundle: Bundle) -> None:
+    """A recording may begin while a touch is held: its replay gives the same contacts, in a session of its own."""
+    contacts(stage, image_frame(NOTHING, 1))
+    two = image_frame(discs((-0.02, 0.0, 0.01, 0.5), (0.02, 0.0, 0.006, 0.2)), 2, reconstructed=2, session="a" * 16)
+    contacts(stage, two)
+    twin = Publishing("palm", skin, bundle)
+    twin.load(persistence.arrays(persistence.plain(stage.state())))
+    for scan in (3, 4):
+        ours, theirs = (contacts(s, held_frame(scan, 2, session=n * 16)) for s, n in ((stage, "a"), (twin, "b")))
+        assert len(ours.contacts) == 2 and pack(ours) == pack(theirs)
+
+
+def test_a_touch_that_was_there_before_anybody_looked_does_not_begin(stage: Publishing) -> None:
+    """After a start, and for who wakes a publisher that slept: no `begin` of an old touch, no `end` of one that nobody
+    was told of.
+    """
+    image = discs((0.01, 0.0, 0.01, 0.3))
+    (first,) = contacts(stage, image_frame(image, 1)).contacts
+    assert first.state == "hold"
+    stage.wake()
+    (again,) = contacts(stage, image_frame(image, 2)).contacts
+    assert again.state == "hold" and again.id > first.id, "no id is used twice"
+    stage.wake()
+    assert contacts(stage, image_frame(NOTHING, 100)).contacts == []
+    (new,) = contacts(stage, image_frame(image, 101)).contacts
+    assert new.state == "begin"
+
+
+def test_a_touch_after_a_time_in_which_nobody_could_look_does_not_begin(stage: Publishing) -> None:
+    contacts(stage, image_frame(NOTHING, 1))
+    unseen = image_frame(NOTHING, 2)
+    unseen.valid, unseen.reasons = False, ["late"]
+    assert not contacts(stage, unseen).valid
+    (c,) = contacts(stage, image_frame(discs((0.01, 0.0, 0.01, 0.3)), 60)).contacts
+    assert c.state == "hold"
 
 
 def test_a_held_image_that_was_never_seen_is_looked_at(stage: Publishing) -> None:

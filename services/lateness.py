@@ -1,0 +1,53 @@
+"""Late is late: which frames are too old to be acted on, and what is skipped of those that have queued up."""
+
+from __future__ import annotations
+
+import time
+
+from protocol.ages import Ages
+from protocol.frames import Frame
+
+STOOD_S = 0.1  # beyond what it meant to wait: the process stood still, and what has come meanwhile is not news
+ARRIVING_S = 0.01  # for what has piled up in sockets and threads meanwhile to be there, all of it
+
+
+class Lateness:
+    """Of one process. A frame from a recording is never late here: a replay gives the same frames however slow the
+    machine; who asks for replays judges them by their stamp `read`.
+    """
+
+    def __init__(self) -> None:
+        self._ages = Ages(("acquisition",))
+        self._looked_s = time.monotonic()
+
+    def stood_still(self, timeout_s: float) -> bool:
+        """Whether this process (stopped, swapped out) or the whole host (suspended) stood still since the last call, of
+        which timeout_s were to be waited. If so, what has piled up is let come, so that the newest of it is found.
+        """
+        now = time.monotonic()
+        stood = self._ages.look() or now - self._looked_s > max(0.0, timeout_s) + STOOD_S
+        if stood:
+            time.sleep(ARRIVING_S)
+            now = time.monotonic()
+        self._looked_s = now
+        return stood
+
+    def late(self, frame: Frame) -> bool:
+        """Whether a live frame was measured longer ago than its `valid_for_s`."""
+        if frame.source == "replay":
+            return False
+        measured = self._ages.measured_ns(frame, time.monotonic_ns())
+        return measured is not None and self._ages.age_s(measured) > frame.valid_for_s
+
+    def news(self, frames: list[Frame], stood: bool) -> list[Frame]:
+        """Those of queued frames, oldest first, that are to be processed: not a live one that is late where a newer one
+        waits; after the process `stood` still only the newest.
+        """
+        return [
+            frame
+            for n, frame in enumerate(frames, 1)
+            if n == len(frames) or frame.source == "replay" or not (stood or self.late(frame))
+        ]
+
+    def close(self) -> None:
+        self._ages.close()
