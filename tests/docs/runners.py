@@ -13,9 +13,9 @@ from typing import Literal
 
 How = Literal["ends", "runs", "help", "slow", "ci", "service"]
 """ends: run to its end, exit status 0. runs: run until it printed `says`, then Ctrl-C, no traceback. help: too long to
-be run at all; its program knows every option that is named (.ci/run runs benchmarks in short form). slow: as `ends`, or as `runs`
-where `says` is given, in .ci/run only. ci: .ci/run has this step, `says` is the line. service: it is how the service
-of these tests was started.
+be run at all; its program knows every option that is named (.ci/run runs benchmarks in short form). slow: as `ends`,
+but in .ci/run only. ci: .ci/run has this step, `says` is the line. service: it is how the service of these tests was
+started.
 """
 
 
@@ -54,7 +54,9 @@ COMMANDS = (
         says="true touches seen|nothing touched",
         instead="./skin compare --seconds 2",
     ),
-    Row("(./)?skin top", "runs", says="skin palm", instead="./skin top --json"),  # as a picture: test_top_screen.py
+    Row(
+        "(./)?skin top", "runs", says='"skin": "palm"', instead="./skin top --json"
+    ),  # as a picture: test_top_screen.py
     Row("(./)?skin echo contact", "runs", says="contact/palm scan +[0-9]+ valid"),
     Row("skin echo TOPIC", "ends", says="raw/palm scan", instead="./skin echo raw -n 2"),
     Row("(./)?skin scene paper_49", "ends", says="playing paper_49"),

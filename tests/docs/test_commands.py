@@ -14,7 +14,7 @@ import pytest
 
 from protocol.frames import ContactFrame
 from protocol.sockets import ControlClient, NewestReader
-from tests.docs.runners import NOT_RUN, PROGRAMS, SCENES, Program, Row, row_for
+from tests.docs.runners import NOT_RUN, PROGRAMS, SCENES, Row, row_for
 from tests.docs.snippets import ROOT, Snippet, in_text, snippets
 from tests.docs.world import START_S, World, world
 
@@ -137,22 +137,20 @@ def test_a_program_reads_contacts(place: World, untouched: None, snippet: Snippe
     """As an outsider's script: without the checkout on its path, but for the wheel's `eitskin`."""
     known = [p for p in PROGRAMS if p.file == snippet.file and p.marker in snippet.text]
     assert known, f"{snippet}: nothing says how it is run: add a row to tests/docs/runners.py"
-    script, wheel = place.folder / "program.py", place.folder / "wheel"
-    script.write_text(snippet.text)
+    outside, wheel = place.folder / "outside", place.folder / "wheel"
+    outside.mkdir(exist_ok=True)
+    (outside / "program.py").write_text(snippet.text)
     wheel.mkdir(exist_ok=True)
     if not (wheel / "eitskin").is_symlink():
         (wheel / "eitskin").symlink_to(place.checkout / "protocol")
-    check_program(place, known[0], f"cd {place.folder} && PYTHONPATH={wheel} exec eitskin/.venv/bin/python -I {script}")
-
-
-def check_program(place: World, program: Program, command: str) -> None:
-    with place.started(command.replace("-I ", "")) as process:
-        time.sleep(program.seconds)
+    python = place.checkout / ".venv" / "bin" / "python"
+    with place.started(f"cd {outside} && PYTHONPATH={wheel} exec {python} program.py") as process:
+        time.sleep(known[0].seconds)
         alive = process.poll() is None
         process.kill()
         out, _ = process.communicate()
-    assert alive and "Traceback" not in out, f"ended within {program.seconds:g} s:\n{out}"
-    assert len(out.splitlines()) >= program.lines, f"printed only, in {program.seconds:g} s:\n{out}"
+    assert alive and "Traceback" not in out, f"ended within {known[0].seconds:g} s:\n{out}"
+    assert len(out.splitlines()) >= known[0].lines, f"printed only, in {known[0].seconds:g} s:\n{out}"
 
 
 @pytest.mark.parametrize("snippet", [s for s in ALL if s.kind == "toml"], ids=str)

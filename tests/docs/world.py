@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import select
 import shutil
 import signal
 import subprocess
@@ -70,17 +71,16 @@ class World:
     @staticmethod
     def _until(process: subprocess.Popen[str], says: str, timeout_s: float) -> str:
         assert process.stdout is not None
-        os.set_blocking(process.stdout.fileno(), False)
-        printed, end = "", time.monotonic() + timeout_s
-        while not re.search(says, printed, re.MULTILINE):
-            assert time.monotonic() < end, f"expected {says!r}, found after {timeout_s:g} s:\n{printed}"
-            ended = process.poll() is not None
-            printed += process.stdout.read() or ""
-            if ended:
-                break
-            time.sleep(0.05)
-        os.set_blocking(process.stdout.fileno(), True)
-        return printed
+        printed, end = b"", time.monotonic() + timeout_s
+        while not re.search(says, printed.decode(errors="replace"), re.MULTILINE):
+            found = printed.decode(errors="replace")
+            assert time.monotonic() < end, f"expected {says!r}, found after {timeout_s:g} s:\n{found}"
+            if select.select([process.stdout], [], [], 0.1)[0]:
+                more = os.read(process.stdout.fileno(), 65536)
+                printed += more
+                if not more:
+                    break
+        return printed.decode(errors="replace")
 
     @contextlib.contextmanager
     def started(self, command: str) -> Iterator[subprocess.Popen[str]]:
