@@ -131,7 +131,7 @@ def import_file(
     """
     from services.recordings.importing import import_arrays
 
-    report = import_arrays(load_npz(source), source, target, skin_name(skin), rate, overwrite)
+    report = import_arrays(load_npz(source), source, target, skin or skin_name(""), rate, overwrite)
     if as_json:
         emit(report)
     else:

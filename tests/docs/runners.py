@@ -1,0 +1,172 @@
+"""How each snippet of the documents is run: the reviewed list. A snippet that no row fits fails the test, so that
+nothing new is shown untried.
+
+The first row whose pattern fits a command from its beginning to its end is the one. `{name}` in `instead` is a file
+of the folder that `world.py` prepares.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+How = Literal["ends", "runs", "help", "slow", "ci", "service"]
+"""ends: run to its end, exit status 0. runs: run until it printed `says`, then Ctrl-C, no traceback. help: too long to
+be run at all; its program knows every option that is named (.ci/run runs benchmarks in short form). slow: as `ends`,
+but in .ci/run only. ci: .ci/run has this step, `says` is the line. service: it is how the service of these tests was
+started.
+"""
+
+
+@dataclass(frozen=True)
+class Row:
+    pattern: str
+    how: How
+    says: str = ""  # regular expression that the output must hold
+    instead: str = ""  # what is typed where the document's line names a file or an argument of the reader's own
+    code: int = 0
+
+
+TOUCHED = "./skin press --x 0.02 --y -0.01 --force 3"
+
+COMMANDS = (
+    # starting, testing
+    Row("make up", "slow", says="contacts at"),
+    Row("make test", "ci", says="make test"),
+    Row("make venv-dev", "ci", says="make test"),  # its first prerequisite
+    Row("make train SKIN=square16 QUICK=1", "ci", says="models.build --skin square16 --minutes 3"),
+    Row("skin up", "service"),
+    Row(
+        "export EITSKIN_UID=.*",
+        "ends",
+        says="^[0-9]+ [0-9]+ /tmp/",
+        instead="{line} && echo $EITSKIN_UID $EITSKIN_GID $EITSKIN_RUNTIME",
+    ),
+    Row("docker compose --profile demo up", "ci", says=r"docker compose -f \$compose --profile demo up"),
+    Row("docker compose up", "ci", says=r"docker compose -f \$compose --profile demo up"),
+    # pressing, watching
+    Row(re.escape(TOUCHED), "ends", says="pressing at .* with 3 N for 20 s"),
+    Row("(./)?skin press", "ends", says="pressing at", instead=TOUCHED),
+    Row(
+        "(./)?skin compare( --seconds (5|300))?",
+        "ends",
+        says="true touches seen|nothing touched",
+        instead="./skin compare --seconds 2",
+    ),
+    Row(
+        "(./)?skin top", "runs", says='"skin": "palm"', instead="./skin top --json"
+    ),  # as a picture: test_top_screen.py
+    Row("(./)?skin echo contact", "runs", says="contact/palm scan +[0-9]+ valid"),
+    Row("skin echo TOPIC", "ends", says="raw/palm scan", instead="./skin echo raw -n 2"),
+    Row("(./)?skin scene paper_49", "ends", says="playing paper_49"),
+    Row("skin scene", "ends", says="paper_49"),
+    Row(
+        "skin fault NAME key=value --seconds S",
+        "ends",
+        says="electrode_open electrode=3",
+        instead="./skin fault electrode_open electrode=3 --seconds 0.1",
+    ),
+    Row("skin fault", "ends", says="electrode_open"),
+    Row("skin release", "ends", says="nothing touches"),
+    Row("skin tare", "ends", says="new baseline from 64 frames"),
+    Row("(./)?skin doctor", "ends", says="OK +configuration"),
+    Row(
+        "python -m firmware_stub",
+        "runs",
+        says="board of palm at",
+        instead="EITSKIN_RUNTIME={folder}/stub .venv/bin/python -m firmware_stub",
+    ),
+    Row("skin (up|down|press|top|release|replay|doctor)", "ends", instead="./skin --help"),
+    # recordings, files
+    Row("skin record", "ends", says="contact/palm [0-9]+", instead="./skin record {folder}/demo.mcap --seconds 2"),
+    Row(
+        "skin replay",
+        "ends",
+        says="contact frames of which",
+        instead="./skin replay {folder}/demo.mcap --private --fast",
+    ),
+    Row(
+        "skin import",
+        "ends",
+        says="frames of 192 measurements",
+        instead="./skin import {presses} {folder}/presses.mcap --skin disc16 --overwrite",
+    ),
+    Row(
+        "skin reconstruct IN.npz OUT.npz --skin square16",
+        "ends",
+        says="2 rows",
+        instead="./skin reconstruct {measurements} {folder}/out.npz --skin square16",
+    ),
+    Row(
+        "skin reconstruct",
+        "ends",
+        says="2 rows",
+        instead="./skin reconstruct {measurements} {folder}/out.npz --skin square16",
+    ),
+    Row(
+        "skin calibrate force",
+        "ends",
+        says="force = ",
+        instead="./skin calibrate force --csv {forces} --out {folder}/palm-force.json",
+    ),
+    Row(
+        "(./)?skin register",
+        "slow",
+        says="wrote",
+        instead="./skin register {presses} --skin disc16 --out {folder}/my-skin",
+    ),
+    # the real skin's block, in its order; FILE is the reference data
+    Row(r"\./skin (register|import|replay) .*", "slow", instead="{line}"),
+    Row(r"\.venv/bin/python -m bench.real_presses FILE", "slow", says="skin register"),
+    # examples
+    Row(
+        r"\.venv/bin/python -m examples\.(stop_on_contact|guarded_move --newtons 2)",
+        "runs",
+        says="robot (moves|stands)",
+    ),
+    Row(
+        r"\.venv/bin/python -m examples\.follow_the_finger",
+        "runs",
+        says="robot (moves|stands)",
+        instead=f"{TOUCHED} && {{line}}",
+    ),
+    Row(r"g\+\+ .* -o /tmp/subscribe && /tmp/subscribe palm", "slow", says=r"frame \d+ valid"),
+    # offline
+    Row("skin limits", "slow", says="position"),
+    Row("skin bench", "ends", says="accuracy"),
+    Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB"),
+    Row(r"(\./)?skin bench (?P<name>\w+)( .*)?", "help"),
+    Row("python -m models.average", "help"),
+    Row("python -m protocol.wire_doc", "ends", instead=".venv/bin/python -m protocol.wire_doc"),
+)
+
+
+def row_for(command: str) -> Row | None:
+    """The row that says how a command is run; None: nobody has thought of it."""
+    return next((row for row in COMMANDS if re.fullmatch(row.pattern, command)), None)
+
+
+@dataclass(frozen=True)
+class Program:
+    """A block of Python: the one in `file` that holds `marker`. Run for `seconds` while frames flow, and then still
+    running, having printed at least so many lines.
+    """
+
+    file: str
+    marker: str
+    seconds: float
+    lines: int
+
+
+PROGRAMS = (
+    Program("README.md", "zmq.Context()", 4.0, 10),
+    Program("README.md", "from eitskin.client import", 3.0, 0),
+    Program("protocol/WIRE.md", "zmq.Context()", 4.0, 10),
+)
+
+SCENES = (("firmware_stub/README.md", "[[press]]"),)
+"""Blocks of TOML that are scenes of the stub: (file, marker)."""
+
+NOT_RUN = (("protocol/WIRE.md", "01 Hello: "),)
+"""Blocks that are nothing to run: (file, how it begins). The link's schema: tests/protocol/test_wire_doc.py has it."""
