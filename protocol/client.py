@@ -11,7 +11,7 @@ In the background: `listener.ContactListener`; with asyncio: `aio.AsyncContactSu
 
 transport.configure(Transport(
     addresses={"publisher": "tcp://robot:47600"},
-    secret_key=Path("me.key_secret"), server_keys={"publisher": Path("publisher.key")}))
+    secret_key=Path("arm.key_secret"), server_keys={"publisher": Path("robot.key")}))
 """
 
 from __future__ import annotations

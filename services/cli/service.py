@@ -90,4 +90,7 @@ def new_keys(
     except OSError as error:
         fail(f"cannot write to {folder}: {error.strerror}")
     print(f"secret: {secret} (security.secret_key of this host's skin.toml)")
-    print(f"public: {public} (to the other end: security.server_keys, or the folder security.clients)")
+    print(
+        f"public: {public} (to the other end: a service puts it into the folder security.clients or "
+        "security.operators, a client names it in security.server_keys)"
+    )

@@ -1,0 +1,37 @@
+"""What the compose files grant: no network but where it is needed, no rights but where they are needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def services(name: str) -> dict[str, dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / name).read_text())["services"]
+    return found
+
+
+def test_no_process_has_a_network_and_the_stub_shares_acquisitions_loopback() -> None:
+    modes = {name: service["network_mode"] for name, service in services("docker-compose.yml").items()}
+    assert modes.pop("stub") == "service:acquisition"
+    assert set(modes.values()) == {"none"}
+
+
+def test_a_board_on_the_network_gives_acquisition_a_network_and_nothing_else() -> None:
+    assert services("docker-compose.network-board.yml") == {"acquisition": {"network_mode": "bridge"}}
+
+
+def test_only_the_helper_is_root_and_it_only_hands_folders_over() -> None:
+    for name, service in services("docker-compose.yml").items():
+        assert service["cap_drop"] == ["ALL"] and service["read_only"] is True, name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        if name != "runtime":
+            assert "cap_add" not in service and service["user"].startswith("${EITSKIN_UID"), name
+    helper = services("docker-compose.yml")["runtime"]
+    assert helper["cap_add"] == ["CHOWN", "FOWNER"] and helper["command"][:3] == ["python", "-m", "services.folders"]
+    mounted = {volume.rpartition(":")[2]: volume.rpartition(":")[0] for volume in helper["volumes"]}
+    assert dict(argument.split("=", 1) for argument in helper["command"][4:]) == mounted
