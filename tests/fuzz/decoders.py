@@ -94,16 +94,28 @@ def _server() -> ControlServer:
     return server
 
 
+_broken: list[Exception] = []
+
+
 def _load(args: dict[str, Any]) -> dict[str, Any]:
+    """As the runner's: what is taken over can be worked with, or the stage refuses it."""
     _stage().reset()
     _stage().load(persistence.arrays(args["state"]))
-    return persistence.plain(_stage().state())
+    try:
+        _stage().process(_scan(), frozenset(("delta",)))
+        return persistence.plain(_stage().state())
+    except Exception as why:
+        _broken.append(why)
+        raise
 
 
 def request(data: bytes) -> None:
     """A command. There is an answer to everything, and the answer can be read."""
+    _broken.clear()
     reply = read_map(_server()._answer(data), "reply")
     assert reply["ok"] in (True, False)
+    if _broken:
+        raise _broken[0]
 
 
 def reply(data: bytes) -> None:
