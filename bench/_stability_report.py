@@ -20,6 +20,7 @@ from bench._stability_run import Row, Setting
 COLUMNS = (  # heading, key, format
     ("frames", "frames", "{:.0f}"),
     ("valid %", "valid_%", "{:.0f}"),
+    ("refused %", "refused_%", "{:.0f}"),
     ("missed", "missed", "{:.0f}"),
     ("position % side", "position_%", "{:.2f}"),
     ("worst", "position_max_%", "{:.2f}"),
@@ -105,11 +106,12 @@ def goals(found: Found) -> list[Goal]:
 
 
 def write(folder: Path, top: Mapping[str, Any], found: Found) -> None:
-    """stability.json and stability.png in `folder`."""
+    """stability.json in `folder`, and stability.png where there is something to draw."""
     targets = [goal.to_dict() for goal in goals(found)]
     content = {**top, "targets": targets, "broken": broken(found), "parts": dict(found)}
     write_json(folder / "stability.json", content)
-    draw(found, folder / "stability.png")
+    if any(found.get(part) for part, *_ in PANELS):
+        draw(found, folder / "stability.png")
 
 
 PANELS = (  # part, x axis, log x, curves (key, label), log y

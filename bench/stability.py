@@ -18,6 +18,7 @@ from pathlib import Path
 
 import services  # noqa: F401, I001  (one thread for the numerical libraries, before numpy starts them)
 from bench import (
+    _stability_bytes,
     _stability_change,
     _stability_garbage,
     _stability_matrices,
@@ -33,6 +34,7 @@ PARTS = {
     **_stability_physics.PARTS,
     **_stability_precision.PARTS,
     **_stability_garbage.PARTS,
+    **_stability_bytes.PARTS,
     **_stability_change.PARTS,
 }
 

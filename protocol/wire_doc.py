@@ -114,6 +114,7 @@ def limit_table() -> str:
             ("msgpack array", f"{fields.MAX_LIST} entries"),
             ("msgpack map", f"{fields.MAX_MAP} entries"),
             ("msgpack extension types", "none"),
+            ("dimensions of an array multiplied, those of 0 taken as 1", f"{fields.MAX_EXTENT} bytes"),
             ("nesting of `info`", f"{fields.MAX_DEPTH} levels"),
             ("messages held for a subscriber that does not read", publishing.SEND_QUEUE),
             ("a subscription", f"{publishing.MAX_SUBSCRIPTION} bytes"),

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench import _stability_bytes as bytes_of_others
 from bench import _stability_garbage as garbage
 from bench import _stability_report as report
 from bench._stability_matrices import solved_long
@@ -230,3 +231,26 @@ def test_a_stage_that_lets_infinity_out_is_found(runner: Runner, scene: Scene, b
     monkeypatch.setattr(network, "run", spoiled)
     answer = runner.once(baseline, scene.z)
     assert "not finite: image.image" in answer.broken and not answer.valid
+
+
+@pytest.mark.parametrize("part", bytes_of_others.PARTS)
+def test_what_was_changed_is_never_believed(setting: Setting, part: str) -> None:
+    rows = list(bytes_of_others.PARTS[part](setting))
+    assert not report.broken({part: rows})
+    assert any(row["refused_%"] == 100 for row in rows) and all(row["frames"] > 10 for row in rows)
+
+
+def test_a_decoder_that_believes_or_raises_is_seen() -> None:
+    """The benchmark can fail."""
+
+    def believes(data: bytes) -> object:
+        raise bytes_of_others.Broken("a changed state was believed")
+
+    def raises(data: bytes) -> object:
+        raise IndexError("out of range")
+
+    rows = [bytes_of_others.case("one", [b"x"] * 3, believes), bytes_of_others.case("two", [b"x"], raises)]
+    assert report.broken({"part": rows}) == [
+        "part: one: a changed state was believed (3 of 3)",
+        "part: two: crash: IndexError: out of range (1 of 1)",
+    ]
