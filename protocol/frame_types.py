@@ -45,6 +45,7 @@ REASONS = {
     "frozen": "the board sends the same scan again and again, with new numbers and times",
     "uncalibrated_force": "the skin has no force law: forces are nil",
     "replay": "from a recording",
+    "separate": "a scan that stands by itself, from a file of such: it does not follow the frame before it in time",
     "non_finite": "set by the reader: a measured field holds NaN or infinity",
 }
 """The reasons in use and what they mean; a reader accepts others too."""

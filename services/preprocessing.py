@@ -26,7 +26,7 @@ from services.describe import describe
 from services.faults.contact_drift import Reference
 from services.faults.electrodes import ElectrodeHealth, Verdict
 from services.faults.plausibility import impossible
-from services.stage import Health, Refused, Stage, add_reason, inherited
+from services.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
 from services.touches.judging import Judge, Judgement, Noise
 from services.touches.sentinel import Coarse
 from services.touches.touch import Hold, TouchDecision, sigma_of_mean
@@ -83,6 +83,11 @@ class Preprocessing(Stage):
         self.untouched.follow(frame)
         amplitude = np.abs(frame.z.astype(np.complex128))
         known = self.untouched.baseline
+        if separate := SEPARATE in frame.reasons:
+            self.electrodes.reset()
+            self._begin_anew()
+            self._impossible_ns = 0
+            known = None if frame.kind == "reference" else known  # of another scan, perhaps of another day
         reference = Reference(known.z0, self.untouched.normaliser, self.untouched.sigma) if known else None
         found = self.electrodes(amplitude, frame.status, reference)
         out.electrodes = found.states
@@ -98,9 +103,9 @@ class Preprocessing(Stage):
         if self.untouched.baseline.doubt:
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
-        return [self._compare(out, amplitude - found.shift, found)]
+        return [self._compare(out, amplitude - found.shift, found, learns=not separate)]
 
-    def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict) -> DeltaFrame:
+    def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict, learns: bool) -> DeltaFrame:
         """Difference, decision, and the stack where one is needed."""
         measured = np.isfinite(self.untouched.sigma)
         live = found.live & measured & np.isfinite(amplitude)
@@ -114,7 +119,7 @@ class Preprocessing(Stage):
         d = self.untouched.difference(amplitude, live)
         d, found_now = self._decide(d, amplitude, live, out.stamps.get("sample", 0))
         now_ns = out.stamps.get("sample", 0)
-        teaches = True  # whether the baseline is to learn from this frame
+        teaches = learns  # whether the baseline is to learn from this frame
         # Of a measured bundle it is not known which way its material goes.
         if self.bundle.matrices.normalisation == "model" and impossible(
             d, self.untouched.sigma, live & self.electrodes.self_sensing, self._touched
@@ -122,7 +127,7 @@ class Preprocessing(Stage):
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
             self._impossible_ns = self._impossible_ns or now_ns
-            teaches = (now_ns - self._impossible_ns) * 1e-9 >= LASTING_S
+            teaches = learns and (now_ns - self._impossible_ns) * 1e-9 >= LASTING_S
         else:
             self._impossible_ns = 0
         out.touched, out.score, out.threshold = self._touched, found_now.score, found_now.threshold
@@ -155,7 +160,7 @@ class Preprocessing(Stage):
 
     def _noise(self) -> Noise:
         assert self.untouched.baseline is not None
-        return Noise(self.untouched.sigma, self.untouched.baseline.frames)
+        return Noise(self.untouched.sigma, self.untouched.baseline.frames, self.untouched.baseline.noise_frames)
 
     def prepare(self) -> bool:
         return self.untouched.baseline is not None and self.judge.prepare(self._noise())

@@ -19,7 +19,7 @@ from services.contacts.motion import Seen, Track
 from services.contacts.outline import outline
 from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.tracking import Tracker
-from services.stage import Health, Stage, add_reason, inherited
+from services.stage import SEPARATE, Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
 UNKNOWN_BELOW = 0.4  # probability of the best class, of five, below which a shape is "unknown"
@@ -91,8 +91,9 @@ class Publishing(Stage):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)
-        begins = not self._touched and not self.each_alone
-        if frame.touched and not frame.held and (begins or not _explained(frame)):
+        # What stands by itself was still while it was scanned, as its source says.
+        moves = not self._alone(frame) and (not self._touched or not _explained(frame))
+        if frame.touched and not frame.held and moves:
             add_reason(out.reasons, "changing")
         self._touched = frame.touched
         explained = out.quality is not None and out.quality >= EXPLAINED
@@ -111,13 +112,13 @@ class Publishing(Stage):
         m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
         segments: list[Segment] = []
         if frame.touched and frame.image.size:
-            places = [] if self.each_alone else self.tracker.expected(now)
+            places = [] if self._alone(frame) else self.tracker.expected(now)
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
         seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
         tracks: Sequence[Track | None]
         ended: list[Track] = []
-        if self.each_alone:
-            tracks = self.tracker.alone(seen, now)
+        if self._alone(frame):
+            tracks, ended = self.tracker.alone(seen, now)
         else:
             tracks, ended = self.tracker.update(seen, now, _explained(frame))
         present = []
@@ -131,6 +132,10 @@ class Publishing(Stage):
         self._seen_in = frame.session, frame.reconstructed
         self._contacts = [contact for contact, _, _ in present] + self._ends(ended)
         self._counters["contacts"] += sum(track is not None and track.age == 1 for track in tracks)
+
+    def _alone(self, frame: ImageFrame) -> bool:
+        """Whether this frame follows no other."""
+        return self.each_alone or SEPARATE in frame.reasons
 
     def _knows(self, frame: ImageFrame) -> bool:
         """Whether our contacts are those of this held image: frames in between may have passed us by, and what waits

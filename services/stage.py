@@ -17,6 +17,10 @@ STAGES = ("preprocessing", "inference", "publisher")
 PROCESSES = ("acquisition", *STAGES)
 
 
+SEPARATE = "separate"
+"""Reason that a source of scans which do not follow each other in time gives to each of them, and stages hand on."""
+
+
 class Refused(Exception):
     """A command that the stage will not carry out now. The text says why and what to do."""
 

@@ -40,6 +40,7 @@ class Baseline:
     doubt: str = ""  # why the skin may have been touched meanwhile; empty: no doubt
     taken_by: str = "start"  # or "command", "file"
     restored: bool = False  # an earlier process took it
+    noise_frames: int = 0  # how many frames sigma was found from; 0: those of the mean
 
     @property
     def hash(self) -> str:
@@ -55,6 +56,7 @@ class Baseline:
             z0, sigma = np.array(saved["z0"], dtype=float), np.array(saved["sigma"], dtype=float)
             rest = int(saved["frames"]), str(saved["board"]), int(saved["taken_ns"]), str(saved["doubt"])
             provenance = str(saved.get("taken_by", "start")), bool(saved.get("restored", False))
+            noise_frames = int(saved.get("noise_frames", 0))
         except (KeyError, TypeError, ValueError) as wrong:
             raise Refused(f"no baseline in the saved state ({wrong}): tare again") from None
         if z0.shape != (measurements,) or sigma.shape != (measurements,):
@@ -64,7 +66,7 @@ class Baseline:
         known = int(((z0 > 0) & np.isfinite(sigma)).sum())
         if known < 0.5 * measurements:
             raise Refused(f"the saved baseline knows only {known} of {measurements} measurements: tare again")
-        return cls(z0, sigma, *rest, *provenance)
+        return cls(z0, sigma, *rest, *provenance, noise_frames)
 
 
 def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Baseline:
@@ -125,17 +127,6 @@ def plausible_noise(z0: Array, sigma: Array) -> Array:
     finite = np.where(found, np.maximum(sigma, LEAST_NOISE * np.abs(z0)), ASSUMED_NOISE * np.abs(z0))
     # A measurement that has no baseline either is not used.
     return np.where(np.isposinf(sigma) | ~(np.abs(z0) > 0), np.inf, finite)
-
-
-def noise_of_steps(frames: Array) -> Array:
-    """(K,) standard deviation of one |Z|, from how consecutive untouched frames (N, K) differ: drift hardly counts.
-
-    Shrunk towards noise proportional to |Z| as in `noise_of_frames`.
-    """
-    own = 0.5 * (np.diff(frames, axis=0) ** 2).mean(axis=0)
-    mean, n = frames.mean(axis=0), len(frames)
-    pooled = np.median(own / mean**2) * mean**2
-    return np.asarray(np.sqrt((n * own + 32 * pooled) / (n + 32)))
 
 
 def disagreement(frames: Array) -> tuple[float, float]:

@@ -15,9 +15,10 @@ from models.bundle import Bundle
 from protocol.frames import RawFrame
 from services.baseline.creep import Creep
 from services.baseline.following import Follower
-from services.baseline.tare import Baseline, noise_of_steps, noisy, plausible_noise, take
+from services.baseline.references import References
+from services.baseline.tare import Baseline, noisy, plausible_noise, take
 from services.config import Tare
-from services.stage import Refused
+from services.stage import SEPARATE, Refused
 
 Array = NDArray[np.float64]
 
@@ -33,11 +34,12 @@ class Untouched:
         self.bundle, self.config = bundle, config
         self.pre = bundle.prereconstructor()
         self.follower = Follower(self.pre, config)
+        self.references = References(len(bundle.pattern))
         self.reset()
 
     def reset(self) -> None:
         self._window: deque[Array] = deque(maxlen=self.config.frames)
-        self._references: deque[Array] = deque(maxlen=self.config.frames)  # those in a row
+        self.references.reset()
         self._run = 0  # untouched frames since the last touch
         self._seen = 0
         self._source = self._board = ""
@@ -64,10 +66,14 @@ class Untouched:
         self._seen += 1
         self._last_sample_ns = frame.stamps.get("sample", 0)
         self._date()
-        self._window.append(amplitude)
         if frame.kind == "reference":
+            self._window.append(amplitude)
             return self._refer(amplitude, frame)
-        self._references.clear()
+        self.references.interrupted()
+        if SEPARATE in frame.reasons:
+            self._needs_reference(frame)
+            return False
+        self._window.append(amplitude)
         if self.baseline is None and len(self._window) == self.config.frames and self._seen % RETRY_EVERY == 0:
             try:
                 found = take(np.array(self._window), self.pre, frame.board, self._last_sample_ns)
@@ -148,18 +154,22 @@ class Untouched:
 
     def _refer(self, amplitude: Array, frame: RawFrame) -> bool:
         """An imported file says that this frame is untouched: it is the baseline until the next one."""
-        if not np.isfinite(amplitude).all():
-            return False
-        self._references.append(amplitude)
-        if len(self._references) > 1:  # several in a row: the noise is how they differ
-            sigma = noise_of_steps(np.array(self._references))
-            sample_ns = self._last_sample_ns
-            self.set_baseline(Baseline(amplitude, sigma, 1, frame.board, sample_ns, taken_by="file"), sample_ns)
-        elif self.baseline is not None:
-            self.baseline = dataclasses.replace(self.baseline, z0=amplitude)
-            self.normaliser = self.pre.normaliser(amplitude)
-            self.follower.begin(self._last_sample_ns)
-        return self.baseline is not None
+        found = self.references.baseline(amplitude, frame.scan, frame.board, self._last_sample_ns)
+        if found is None:
+            self._use(None)
+            self.problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"
+        else:
+            self.set_baseline(found)
+            # The same in each of them, to the last bit: what is made for a noise then serves for all.
+            share = np.divide(found.z0, self.normaliser, out=np.zeros(len(found.z0)), where=self.normaliser > 0)
+            self.sigma = np.where(np.isfinite(found.sigma), self.references.noise * share, np.inf)
+        return True
+
+    def _needs_reference(self, frame: RawFrame) -> None:
+        """A scan that stands by itself is compared with the reference just before it, and with no other."""
+        if self.baseline is not None and frame.scan != self.references.scan + 1:
+            self._use(None)
+            self.problem = f"the reference of scan {frame.scan} did not come: it cannot be compared"
 
     # state
 
@@ -170,6 +180,7 @@ class Untouched:
             "normaliser": self.normaliser if self.baseline else None,
             "sigma": self.sigma if self.baseline else None,
             "follower": self.follower.state(),
+            "references": self.references.state(),
             "window": np.array(self._window),
             "run": self._run,
             "seen": self._seen,
@@ -195,6 +206,11 @@ class Untouched:
                 self.sigma = np.where(np.isfinite(self.baseline.sigma), self.sigma, np.inf)
                 if self.sigma.shape != (k,) or not (self.sigma > 0).all():
                     raise Refused(f"the saved noise is not {k} numbers above 0: tare again")
+        if "references" in state:  # older recordings have none
+            try:
+                self.references.load(state["references"])
+            except (KeyError, TypeError, ValueError) as wrong:
+                raise Refused(f"the saved reference scans do not fit ({wrong}): reset") from None
         window = np.array(state["window"], dtype=float)
         if window.size and (window.ndim != 2 or window.shape[1] != k):
             raise Refused(f"the saved frames are of shape {window.shape}, expected (n, {k}): tare again")

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from protocol.frames import FrameError, RawFrame, unpack
 from services.board.source import POLL_S, SCANS_VALID, Source
-from services.recordings.npz_file import InputError, frames_of, load_npz, read_input
+from services.recordings.npz_file import InputError, frames_of, load_npz, read_scans
+from services.stage import SEPARATE
 
 FILE_RATE_HZ = 22.0  # at which frames of a file without times are given
 LONGEST_PAUSE_S = 1.0  # between two recorded frames
@@ -64,26 +65,28 @@ class FileSource(Source):
     def frames(self) -> Iterator[RawFrame | None]:
         due = time.monotonic()
         try:
-            data = read_input(load_npz(Path(self.skin.port)), len(self.bundle.pattern))
+            data = read_scans(load_npz(Path(self.skin.port)), self.bundle)
         except InputError as why:
             text = str(why)
             yield from self._ended(text if self.skin.port in text else f"{self.skin.port}: {text}")
         for scan, (values, kind) in enumerate(frames_of(data)):
             due += 1 / FILE_RATE_HZ
             yield from _wait_until(due)
-            yield file_frame(self.name, self.pattern_name, scan, values, kind, time.monotonic_ns())
+            yield file_frame(self.name, self.pattern_name, scan, values, kind, time.monotonic_ns(), data.separate)
         yield from self._ended(f"the file {self.skin.port} has ended")
 
 
-def file_frame(skin: str, pattern: str, scan: int, values: NDArray[np.generic], kind: str, now_ns: int) -> RawFrame:
-    """A raw frame of one row (K,) of a file."""
+def file_frame(
+    skin: str, pattern: str, scan: int, values: NDArray[np.generic], kind: str, now_ns: int, separate: bool = False
+) -> RawFrame:
+    """A raw frame of one row (K,) of a file; separate: the one before it is not the one before it in time."""
     return RawFrame(
         skin=skin,
         scan=scan,
         stamps={"sample": now_ns, "read": now_ns},
         source="replay",
         valid=True,
-        reasons=["replay"],
+        reasons=["replay", SEPARATE] if separate else ["replay"],
         valid_for_s=SCANS_VALID / FILE_RATE_HZ,
         z=np.asarray(values, np.complex64),
         status=np.zeros(len(values), np.uint8),

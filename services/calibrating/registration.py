@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 from models.bundle import Bundle
-from services.recordings.importing import ImportRefused, measurement_order
-from services.recordings.reconstruction import noise_of_references
+from services.baseline.references import noise_of_references
+from services.recordings.npz_file import InputError, measurement_order
 
 Array = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
         )
     try:
         order = measurement_order(arrays, bundle)
-    except ImportRefused as why:
+    except InputError as why:
         raise RegistrationError(str(why)) from None
     touched, untouched, xy = (np.asarray(arrays[name]) for name in ("touched", "untouched", "xy"))
     if touched.shape != untouched.shape or touched.ndim != 2 or touched.shape[1] != len(order):

@@ -41,13 +41,13 @@ def reconstruct(
     """
     import numpy as np
 
-    from services.recordings.npz_file import InputError, read_input
+    from services.recordings.npz_file import InputError, read_scans
     from services.recordings.reconstruction import UNKNOWN_AGE_S, find_skin
     from services.recordings.reconstruction import reconstruct as run
 
     found, bundle = find_skin(skin)
     try:
-        data = read_input(load_npz(source), len(bundle.pattern))
+        data = read_scans(load_npz(source), bundle)
     except InputError as error:
         fail(f"{source}: {error}", USAGE)
     if target.suffix != ".npz":  # numpy would add it and the file would not be where it was asked for

@@ -52,13 +52,14 @@ class Tracker:
         sure = [track for track in self.tracks if track.id != UNCONFIRMED]
         return [one.ahead(sample_ns) for track in sure for one in (track.inside or [track])]
 
-    def alone(self, seen: Sequence[Seen], sample_ns: int) -> list[Track]:
-        """The tracks of a frame that is no other's successor: each entry begins."""
-        self.tracks, self._untold = [], []
+    def alone(self, seen: Sequence[Seen], sample_ns: int) -> tuple[list[Track], list[Track]]:
+        """The same as `update` for a frame that is no other's successor: what was there ended, each entry begins."""
+        self.reset()
+        ended = self._begin_frame(sample_ns)
         for entry in seen:
             self.tracks.append(Track(self._next_id, entry.x, entry.y, sample_ns, entry.size, entry.reach))
             self._next_id += 1
-        return list(self.tracks)
+        return list(self.tracks), ended
 
     def update(self, seen: Sequence[Seen], sample_ns: int, sure: bool = True) -> tuple[list[Track | None], list[Track]]:
         """What one frame shows -> (the track of each entry, in their order, None for one to be confirmed; tracks that

@@ -1,5 +1,5 @@
 """Files of measurements (npz): the one place that reads and checks them, and says in which order their rows are
-frames.
+frames, and whether those follow each other in time.
 """
 
 from __future__ import annotations
@@ -13,12 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import npz
+from models.bundle import Bundle
 from models.files import FileError
+from services.baseline.references import alike
 
 Array = NDArray[np.float64]
 
 TARE_ROWS = 64
-"""Rows of `reference` that come first as frames, from which the noise is found."""
+"""Rows of `reference` that come first as frames, from which the noise is found: those most alike, in whatever order the
+rows stand.
+"""
 
 
 class InputError(ValueError):
@@ -33,6 +37,11 @@ class Input:
     untouched: Array | None  # (M, K) |Z|
     reference: Array | None  # (N, K) |Z|
 
+    @property
+    def separate(self) -> bool:
+        """Whether no row follows the one before it in time: each has an untouched scan of its own."""
+        return self.reference is not None
+
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
     """All arrays of an npz file. Raises InputError where it is none, is damaged, too large, or holds objects."""
@@ -40,6 +49,19 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
         return npz.read_npz(path)
     except FileError as why:
         raise InputError(str(why)) from None
+
+
+def read_scans(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Input:
+    """The same as `read_input`, in the order of the bundle's measurements; a file of presses (`touched` and
+    `untouched`, a row of each for a press) too. Raises InputError.
+    """
+    order = measurement_order(arrays, bundle)
+    if "touched" in arrays and "measurements" not in arrays:
+        own = {"reference": arrays["untouched"]} if "untouched" in arrays else {}
+        arrays = {"measurements": arrays["touched"], **own}
+    data = read_input(arrays, len(bundle.pattern))
+    untouched, reference = (None if a is None else a[:, order] for a in (data.untouched, data.reference))
+    return Input(data.measurements[:, order], untouched, reference)
 
 
 def read_input(arrays: Mapping[str, NDArray[Any]], k: int) -> Input:
@@ -68,10 +90,37 @@ def frames_of(data: Input) -> Iterator[tuple[NDArray[Any], str]]:
         yield from ((row, "reference") for row in data.untouched)
         yield from ((row, "full") for row in data.measurements)
     elif data.reference is not None:
-        yield from ((row, "reference") for row in data.reference[:TARE_ROWS])
+        yield from ((row, "reference") for row in data.reference[alike(data.reference, TARE_ROWS)])
         for before, row in zip(data.reference, data.measurements, strict=True):
             yield before, "reference"
             yield row, "full"
+
+
+def measurement_order(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> NDArray[np.intp]:
+    """Where in the file each measurement of the bundle stands. Raises InputError where one is not there."""
+    if "pattern" not in arrays:
+        return np.arange(len(bundle.pattern))
+    theirs = arrays["pattern"]
+    if theirs.ndim != 2 or theirs.shape[1] != 4 or theirs.dtype.kind not in "iu":
+        raise InputError(
+            f"`pattern` is {theirs.dtype} of shape {theirs.shape}, "
+            "expected integers (k, 4): drive+, drive-, sense+, sense-"
+        )
+    places = {_key(row): at for at, row in reversed(list(enumerate(theirs.tolist())))}
+    missing = [row for row in bundle.pattern.tolist() if _key(row) not in places]
+    if missing or len(theirs) != len(bundle.pattern):
+        detail = f", and lacks {missing[0]}" if missing else ""
+        raise InputError(
+            f"`pattern` has {len(theirs)} rows{detail}; the skin's bundle {bundle.name} measures "
+            f"{len(bundle.pattern)} ({bundle.skin.get('pattern', 'custom')}): choose the skin that was measured"
+        )
+    return np.array([places[_key(row)] for row in bundle.pattern.tolist()])
+
+
+def _key(row: list[int]) -> tuple[int, int, frozenset[int]]:
+    """An amplitude has no sign, so the sense pair may be either way round. The drive pair may not: on a real board the
+    two ways are two measurements."""
+    return row[0], row[1], frozenset(row[2:])
 
 
 def _amplitudes(arrays: Mapping[str, NDArray[Any]], name: str, k: int) -> Array:

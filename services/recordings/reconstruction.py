@@ -14,9 +14,9 @@ from models.prereconstruction import noise_of_frames
 from protocol.frames import RawFrame
 from services.baseline.tare import Baseline, take
 from services.config import ConfigError, Skin, load
-from services.pipeline import Pipeline, Result
-from services.recordings.npz_file import Input
-from services.stage import Refused
+from services.pipeline import ALL, Pipeline, Result
+from services.recordings.npz_file import Input, frames_of
+from services.stage import SEPARATE, Refused
 
 Array = NDArray[np.float64]
 
@@ -74,20 +74,6 @@ def baseline_of(frames: Array, pipeline: Pipeline, warn: Callable[[str], None]) 
     return Baseline(z0, sigma, len(frames), "file", 0, doubt)
 
 
-def noise_of_references(reference: Array) -> Array:
-    """(K,) relative noise of a frame, from how neighbouring references differ.
-
-    What all measurements do together (gain) is left out, and medians let single steps and slow drift count little.
-    """
-    if len(reference) < 8:
-        return np.full(reference.shape[1], ASSUMED_NOISE)
-    steps = np.diff(np.log(np.where(reference > 0, reference, np.nan)), axis=0)
-    steps -= np.nanmedian(steps, axis=1, keepdims=True)
-    own = np.nanmedian(np.abs(steps), axis=0) / 0.6745 / np.sqrt(2)
-    own = np.where(np.isfinite(own) & (own > 0), own, ASSUMED_NOISE)
-    return np.asarray(np.maximum(own, 0.1 * np.median(own) + 1e-7))
-
-
 def reconstruct(
     data: Input,
     skin: Skin,
@@ -120,33 +106,50 @@ def _reconstruct(
     pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
     pipeline.publishing.each_alone = not sequence
     out = _empty(len(data.measurements))
-    baseline = baseline_of(data.untouched, pipeline, warn) if data.untouched is not None else None
-    noise = noise_of_references(data.reference) if data.reference is not None else None
-    lost = 0
-    for row in progress(range(len(data.measurements))):
+    rows = progress(range(len(data.measurements)))
+    if data.untouched is None:
+        _beside_references(data, pipeline, sequence, rows, out, warn)
+        return out
+    baseline = baseline_of(data.untouched, pipeline, warn)
+    for row in rows:
         if not sequence:
             pipeline.reset()
-        if data.reference is not None and noise is not None:
-            z0 = data.reference[row]
-            good = np.isfinite(z0) & (z0 > 0)
-            if good.sum() < len(z0) / 2:
-                lost += 1
-                continue
-            baseline = Baseline(np.where(good, z0, 0.0), np.where(good, noise * z0, np.inf), 1, "file", 0)
-        assert baseline is not None
-        if not sequence or row == 0 or data.reference is not None:
+        if not sequence or row == 0:
             fresh = Baseline(**{**baseline.to_dict(), "z0": baseline.z0.copy()})
-            pipeline.pre.set_baseline(fresh, age_s=age_s if data.reference is None else 0.0)
+            pipeline.pre.set_baseline(fresh, age_s=age_s)
         _store(out, row, pipeline.run(raw_frame(data.measurements[row], row if sequence else 0)))
-    if lost:
-        warn(f"{lost} of {len(out['valid'])} rows are not valid: their `reference` gives too few measurements")
     return out
 
 
-def raw_frame(measurement: NDArray[Any], scan: int) -> RawFrame:
+def _beside_references(
+    data: Input,
+    pipeline: Pipeline,
+    sequence: bool,
+    rows: Iterable[int],
+    out: dict[str, NDArray[Any]],
+    warn: Callable[[str], None],
+) -> None:
+    """Each row against the reference just before it: the very frames that an import or a port gives of such a file."""
+    frames, lost = frames_of(data), 0
+    for row in rows:
+        for values, kind in frames:
+            frame = raw_frame(values, row, kind, separate=not sequence)
+            if kind == "full":
+                break
+            pipeline.pre.process(frame, ALL)
+        frame.scan += 1
+        _store(out, row, pipeline.run(frame))
+        lost += pipeline.pre.untouched.baseline is None
+    if lost:
+        warn(f"{lost} of {len(out['valid'])} rows are not valid: their `reference` gives too few measurements")
+
+
+def raw_frame(measurement: NDArray[Any], scan: int, kind: str = "full", separate: bool = False) -> RawFrame:
     return RawFrame(
         skin="file",
         scan=scan,
+        kind=kind,
+        reasons=[SEPARATE] if separate else [],
         z=measurement.astype(np.complex64),
         status=np.zeros(len(measurement), np.uint8),
         stamps={"sample": (scan + 1) * ROW_NS},

@@ -35,13 +35,14 @@ class Noise(NamedTuple):
 
     sigma: Array  # (K,) of d, one frame
     frames: int  # that the baseline is the mean of
+    found_from: int = 0  # frames that sigma was found from; 0: the same
 
     def of_mean(self, n: int) -> Noise:
         """That of the mean of n frames, as far as noise is what it is wrong by: not below SUREST."""
         finite = self.sigma[np.isfinite(self.sigma)]
         most = int((float(np.median(finite)) / SUREST) ** 2) if finite.size else 1
         n = min(n, max(1, most))
-        return self if n == 1 else Noise(self.sigma / np.sqrt(n), max(1, self.frames // n))
+        return self if n == 1 else Noise(self.sigma / np.sqrt(n), max(1, self.frames // n), self.found_from)
 
 
 class Judgement(NamedTuple):
@@ -58,7 +59,7 @@ class Judge:
         self.allowance = Allowance(skin.tare)
         self._evidence: Evidence | None = None
         self.creep = Creep(pre.measurements)
-        self._operators: dict[tuple[bytes, bytes, int, int], tuple[Operator, TouchDecision]] = {}
+        self._operators: dict[tuple[bytes, bytes, int, int, int], tuple[Operator, TouchDecision]] = {}
         self.reset()
 
     def reset(self) -> None:
@@ -186,12 +187,13 @@ class Judge:
                 weights=live.astype(float),
                 tare_frames=noise.frames,
             )
-            self._operators[key] = operator, TouchDecision(operator, self.config.false_alarms, noise.frames)
+            known_from = noise.found_from or noise.frames
+            self._operators[key] = operator, TouchDecision(operator, self.config.false_alarms, known_from)
         return self._operators[key]
 
     @staticmethod
-    def _key(live: NDArray[np.bool_], noise: Noise, step: int) -> tuple[bytes, bytes, int, int]:
-        return live.tobytes(), noise.sigma.tobytes(), noise.frames, step
+    def _key(live: NDArray[np.bool_], noise: Noise, step: int) -> tuple[bytes, bytes, int, int, int]:
+        return live.tobytes(), noise.sigma.tobytes(), noise.frames, noise.found_from, step
 
     def of_mean(self, n: int, noise: Noise) -> Operator:
         """The operator for the mean of n frames of a touch that is held."""
