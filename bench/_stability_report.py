@@ -52,6 +52,9 @@ COLUMNS = (  # heading, key, format
     ("N per 1 of |d|", "N_per_share", "{:.0f}"),
     ("rms mm", "rms_mm", "{:.2f}"),
     ("worst direction mm", "worst_direction_mm", "{:.2f}"),
+    ("oldest ms", "oldest_ms", "{:.0f}"),
+    ("stamp off ms", "stamp_off_ms", "{:.1f}"),
+    ("scans refused", "refused", "{:.0f}"),
 )
 Found = Mapping[str, list[Row]]
 
@@ -106,7 +109,7 @@ def goals(found: Found) -> list[Goal]:
 
 
 def write(folder: Path, top: Mapping[str, Any], found: Found) -> None:
-    """stability.json in `folder`, and stability.png where there is something to draw."""
+    """stability.json in `folder`, and stability.png where there are curves to draw."""
     targets = [goal.to_dict() for goal in goals(found)]
     content = {**top, "targets": targets, "broken": broken(found), "parts": dict(found)}
     write_json(folder / "stability.json", content)
@@ -144,6 +147,8 @@ def draw(found: Found, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     panels = [p for p in PANELS if found.get(p[0])]
+    if not panels:
+        return
     figure, axes = plt.subplots(-(-len(panels) // 3), 3, figsize=(15, 3.6 * -(-len(panels) // 3)), squeeze=False)
     for axis in axes.ravel()[len(panels) :]:
         axis.axis("off")

@@ -4,8 +4,9 @@
 
 For each case: error against truth where there is one, and whether the promise was kept: no exception, no NaN or
 infinity out, never `valid` on garbage, no contact that jumps by more than 2 mm for a change within noise (or by four
-times what no estimator can beat, where that is more: a light touch under much noise). Prints tables, writes
-stability.json and stability.png. Exit status 1 where the promise was broken.
+times what no estimator can beat, where that is more: a light touch under much noise), no frame to act on that is older
+than its `valid_for_s` and 0.1 s. Prints tables, writes stability.json and stability.png. Exit status 1 where the
+promise was broken.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from bench import (
     _stability_physics,
     _stability_precision,
     _stability_report,
+    _stability_time,
 )
 from bench._stability_run import SKIN, Row, Setting
 from models.bundle import Bundle
@@ -36,6 +38,7 @@ PARTS = {
     **_stability_garbage.PARTS,
     **_stability_bytes.PARTS,
     **_stability_change.PARTS,
+    **_stability_time.PARTS,
 }
 
 
@@ -67,7 +70,7 @@ def main(argv: list[str] | None = None) -> int:
     _stability_report.show(found)
     top = _stability_report.head(setting, time.perf_counter() - began, time.process_time() - cpu)
     _stability_report.write(args.out, top, found)
-    print(f"{top['seconds']:.0f} s ({top['cpu_seconds']:.0f} s of CPU); wrote {args.out}/stability.json and .png")
+    print(f"{top['seconds']:.0f} s ({top['cpu_seconds']:.0f} s of CPU); wrote {args.out}/stability.json")
     return 1 if _stability_report.broken(found) else 0
 
 

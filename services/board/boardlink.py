@@ -31,6 +31,7 @@ DEAD_SCANS = 10  # in a row with all measurements out of range: the board may ha
 DEAD_AGAIN_S = 5.0  # then it is configured again, at most this often
 REFUSED_AGAIN_S = 1.0  # a refused board is tried again, for it may be power-cycled or flashed
 IMPOSSIBLE_SCANS = 3  # in a row whose times cannot be: the board's clock has jumped
+DOUBTED_SCANS = 3  # after that: the clock is to be believed again only once it goes on well
 NO_CURRENT = STATUS_OPEN | STATUS_RTIA
 
 
@@ -66,10 +67,10 @@ class BoardLink:
         self.decoder = link.Decoder()
         self.clock = DeviceClock()
         self.frozen = FrozenScans()
-        self.reasons: dict[int, list[str]] = {}  # of the scans received last, by number: gap, frozen
+        self.reasons: dict[int, list[str]] = {}  # of the scans received last, by number: gap, clock, frozen
         self._order = ScanOrder()
         self._questions = TimeQuestions()
-        self._impossible = 0  # scans in a row
+        self._impossible = self._doubted = 0  # scans in a row; scans still to come
         self._heard_us = 0  # newest time of the board's clock
         self._start_s: float | None = None  # when START was sent first in this state
         self._pace = LinePace(now_s)
@@ -190,6 +191,7 @@ class BoardLink:
 
     def _clock_jumped(self, now_s: float) -> None:
         self.counts["clock_jumps"] += 1
+        self._doubted = DOUBTED_SCANS
         self._restart(now_s, "the board's clock jumped, or runs wrong by more than 1 ms/s: asking it again")
 
     def _switching(self, now_s: float) -> bytes:
@@ -317,6 +319,9 @@ class BoardLink:
         # The first byte leaves as the scan ends; the last one as much later as the line is slow.
         self.clock.observe(ended_us, arrived_ns, fit=scan.config == self.scanning.config)
         self.reasons[scan.seq] = ["gap"] if missing else []
+        if self._doubted:
+            self._doubted -= 1
+            self.reasons[scan.seq].append("clock")
         if self.frozen(scan):
             self.reasons[scan.seq].append("frozen")
             self.counts["frozen"] += 1

@@ -102,14 +102,16 @@ class DeviceClock:
     # what is known of it
 
     def host_ns(self, device_us: int) -> int:
-        """Host monotonic time [ns] at which the board's clock showed device_us."""
+        """Host monotonic time [ns] at which the board's clock showed device_us; where that is unknown, the earliest
+        that it can have been.
+        """
         device_ns = device_us * 1000
         lower, upper = self._bounds(device_ns)
         if upper is None:
             raise ValueError("no frame was observed yet")
         found = self._line(device_ns) if self._points else upper
         if lower is not None:
-            found = max(lower, found)
+            found = lower if self.unknown(device_us) else max(lower, found)
         return device_ns + min(upper, found)
 
     def width_ns(self, device_us: int) -> int | None:

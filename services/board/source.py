@@ -23,7 +23,7 @@ from services.board.clock import UNSETTLED_NS
 from services.board.host_time import STOOD_STILL_S, HostTime, Suspensions
 from services.board.remarks import Remarks
 from services.config import Skin
-from services.stage import Health
+from services.stage import Health, add_reason
 from services.touches.sentinel import sentinel_of
 
 POLL_S = 0.1
@@ -219,8 +219,9 @@ class BoardSource(Source):
         middle_us = scan.device_us + scan.duration_us // 2
         unknown, sigma_ns = board.clock.unknown(middle_us), board.clock.sigma_ns(middle_us)
         reasons = list(board.reasons.get(scan.seq, ()))
+        valid = not unknown and not {"clock", "frozen"} & set(reasons)
         if unknown or sigma_ns >= UNSETTLED_NS:
-            reasons.append("clock")
+            add_reason(reasons, "clock")
         assert board.ident is not None
         return RawFrame(
             skin=self.name,
@@ -228,7 +229,7 @@ class BoardSource(Source):
             stamps={"sample": min(read_ns, board.clock.host_ns(middle_us)), "read": read_ns},
             sample_sigma_ns=sigma_ns,
             source="stub" if "stub" in board.ident.firmware.lower() else "board",
-            valid=not unknown and "frozen" not in reasons,
+            valid=valid,
             reasons=reasons,
             valid_for_s=max(VALID_S, SCANS_VALID * self._full_s),
             z=scan.z,

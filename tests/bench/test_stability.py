@@ -10,6 +10,7 @@ import pytest
 from bench import _stability_bytes as bytes_of_others
 from bench import _stability_garbage as garbage
 from bench import _stability_report as report
+from bench import _stability_time as held_up
 from bench._stability_matrices import solved_long
 from bench._stability_run import (
     METRES,
@@ -254,3 +255,16 @@ def test_a_decoder_that_believes_or_raises_is_seen() -> None:
         "part: one: a changed state was believed (3 of 3)",
         "part: two: crash: IndexError: out of range (1 of 1)",
     ]
+
+
+def test_time_that_is_believed_wrongly_breaks_the_promise(monkeypatch) -> None:
+    """A clock that takes any delay for the crystal's rate; scans that are never known to be frozen."""
+    growing = next(case for case in held_up.UNTIMED if case.name == "growing by 20 ms/s")
+    frozen = next(case for case in held_up.AGAIN if case.name.startswith("the same scan"))
+    for case in (growing, frozen):
+        row = held_up.judged(case, seed=1)
+        assert row["broken"] == {} and row["frames"] > 150 and row["valid_%"] > 30
+    monkeypatch.setattr("services.board.clock.MAX_RATE_ERROR", 1.0)
+    monkeypatch.setattr("services.board.frozen.PROOF", 10**9)
+    for case in (growing, frozen):
+        assert held_up.judged(case, seed=1)["broken"]["a frame to act on is older than it may be"] > 20
