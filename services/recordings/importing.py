@@ -16,6 +16,7 @@ from services.config import SKIN_NAME
 from services.recordings.npz_file import InputError, frames_of, read_input
 from services.recordings.reconstruction import find_skin
 from services.recordings.recording import RecordingWriter
+from services.stage import valid_for_s
 
 ROWS_PER_CHUNK = 8
 EPOCH_NS = 1_000_000_000_000_000_000
@@ -52,7 +53,7 @@ def import_arrays(
         for count, (values, kind) in enumerate(frames_of(data), start=1):
             now_ns = count * step_ns
             frame = file_frame(skin, str(bundle.skin.get("pattern", "custom")), count, values[order], kind, now_ns)
-            frame.valid_for_s, frame.board, frame.unit = 3 / rate_hz, source.name, "counts"
+            frame.valid_for_s, frame.board, frame.unit = valid_for_s(1 / rate_hz), source.name, "counts"
             frame.session, frame.seq = "0" * 16, count - 1
             writer.write(f"raw/{skin}", pack(frame).partition(b"\0")[2], EPOCH_NS + now_ns)
             if count % ROWS_PER_CHUNK == 0:
