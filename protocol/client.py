@@ -10,7 +10,7 @@ with ContactSubscriber("palm") as skin:
 In the background: `listener.ContactListener`; with asyncio: `aio.AsyncContactSubscriber`. A skin on another host:
 
 transport.configure(Transport(
-    addresses={"publisher": "tcp://robot:47600"},
+    addresses={"publisher": "tcp://robot:47600", "publisher.ctl": "tcp://robot:47601"},  # the latter tells its clock
     secret_key=Path("arm.key_secret"), server_keys={"publisher": Path("robot.key")}))
 """
 

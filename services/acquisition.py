@@ -13,6 +13,7 @@ import threading
 from collections import deque
 
 from protocol.frames import Frame, RawFrame
+from services.board.host_time import SUSPENDED_NS, HostTime
 from services.board.source import Source, open_source
 from services.process import main
 from services.runner import Runner
@@ -41,18 +42,21 @@ class Acquiring(Stage):
     def health(self) -> Health:
         found = self._feed.source.health()
         found.counters["overrun"] = self._feed.overrun
+        found.counters["slept_over"] = self._feed.slept_over
         return found
 
 
 class SourceFeed:
     """A source in a thread; `socket` becomes readable when frames wait."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, host: HostTime | None = None) -> None:
         self.source = source
+        self._host = host or HostTime()
+        self.slept_over = 0  # frames that waited while the machine was suspended: their stamps do not show it
         self.socket = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self.overrun = 0
         self.malformed = self.skipped = 0
-        self._frames: deque[RawFrame] = deque()
+        self._frames: deque[tuple[RawFrame, int]] = deque()  # and for how long the machine had been suspended by then
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"source-{source.name}", daemon=True)
         self._thread.start()
@@ -61,10 +65,15 @@ class SourceFeed:
         """The oldest frame not yet taken, or None."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.socket)
-        try:
-            return self._frames.popleft()
-        except IndexError:
-            return None
+        suspended_ns = self._host.suspended_ns()
+        while True:
+            try:
+                frame, then_ns = self._frames.popleft()
+            except IndexError:
+                return None
+            if suspended_ns - then_ns < SUSPENDED_NS:
+                return frame
+            self.slept_over += 1
 
     def close(self) -> None:
         """Tell the thread to end, which closes the source, and wait CLOSE_S for it at most."""
@@ -82,7 +91,7 @@ class SourceFeed:
             try:
                 for frame in self.source.frames():
                     if frame is not None:
-                        self._frames.append(frame)
+                        self._frames.append((frame, self._host.suspended_ns()))
                         if len(self._frames) > QUEUE:
                             self._frames.popleft()
                             self.overrun += 1

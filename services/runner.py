@@ -166,7 +166,7 @@ class Runner:
                 add_reason(out.reasons, "late")
             self._send(lane, out)
         beat.done(frame, now, time.monotonic_ns(), late)
-        if stage.lacks and isinstance(lane.feed, Newest):
+        if stage.lacks and not lane.asleep and isinstance(lane.feed, Newest):
             lane.feed.ask_again()
         self._frames += 1
 

@@ -114,6 +114,14 @@ class Stage(ABC):
         """Do once what is slow the first time."""
 
 
+VALID_S, VALID_SCANS = 0.25, 3
+
+
+def valid_for_s(scan_s: float) -> float:
+    """How long after it was measured a frame of a source with full scans of scan_s may be acted on."""
+    return max(VALID_S, VALID_SCANS * scan_s)
+
+
 def inherited(frame: Frame) -> dict[str, Any]:
     """Header fields that a frame hands on to what is made of it."""
     return {

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import FrameError, RawFrame, unpack
-from services.board.source import POLL_S, SCANS_VALID, Source
+from services.board.source import POLL_S, Source
 from services.recordings.npz_file import InputError, frames_of, load_npz, read_scans
-from services.stage import SEPARATE
+from services.stage import SEPARATE, valid_for_s
 
 FILE_RATE_HZ = 22.0  # at which frames of a file without times are given
 LONGEST_PAUSE_S = 1.0  # between two recorded frames
@@ -87,7 +87,7 @@ def file_frame(
         source="replay",
         valid=True,
         reasons=["replay", SEPARATE] if separate else ["replay"],
-        valid_for_s=SCANS_VALID / FILE_RATE_HZ,
+        valid_for_s=valid_for_s(1 / FILE_RATE_HZ),
         z=np.asarray(values, np.complex64),
         status=np.zeros(len(values), np.uint8),
         device_us=now_ns // 1000,

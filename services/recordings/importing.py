@@ -15,6 +15,7 @@ from services.recordings import settings
 from services.recordings.npz_file import InputError, frames_of, read_scans
 from services.recordings.reconstruction import find_skin
 from services.recordings.recording import RecordingWriter
+from services.stage import valid_for_s
 
 ROWS_PER_CHUNK = 8
 EPOCH_NS = 1_000_000_000_000_000_000
@@ -52,7 +53,7 @@ def import_arrays(
             frame = file_frame(
                 skin, str(bundle.skin.get("pattern", "custom")), count, values, kind, now_ns, data.separate
             )
-            frame.valid_for_s, frame.board, frame.unit = 3 / rate_hz, source.name, "counts"
+            frame.valid_for_s, frame.board, frame.unit = valid_for_s(1 / rate_hz), source.name, "counts"
             frame.session, frame.seq = "0" * 16, count - 1
             writer.write(f"raw/{skin}", pack(frame).partition(b"\0")[2], EPOCH_NS + now_ns)
             if count % ROWS_PER_CHUNK == 0:

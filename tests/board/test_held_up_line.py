@@ -44,7 +44,7 @@ class Got:
 
     @property
     def usable(self) -> bool:
-        return self.frame["valid"] and self.age_s <= self.frame["valid_for_s"]
+        return self.frame.get("valid", False) and self.age_s <= self.frame["valid_for_s"]
 
 
 class Bench:
@@ -85,7 +85,7 @@ class Bench:
 
     def entered_ns(self, got: Got) -> int:
         """When this scan left the board."""
-        return self.proxy.entered[got.frame["scan"], got.frame["device_us"]]
+        return self.proxy.entered[got.frame.get("scan", 0), got.frame.get("device_us", 0)]
 
     def true_age_s(self, got: Got) -> float:
         """Since the middle of its scan, at least: the board may have sent it late."""
@@ -98,7 +98,7 @@ class Bench:
     def promise(self, heard: list[Got]) -> None:
         """Nothing that may be acted on is older than it may be."""
         old = [g for g in heard if g.usable and self.true_age_s(g) > g.frame["valid_for_s"] + SLACK_S]
-        assert not old, [(self.true_age_s(g), g.age_s, g.frame["reasons"]) for g in old[:3]]
+        assert not old, [(self.true_age_s(g), g.age_s, g.frame.get("reasons")) for g in old[:3]]
 
     def close(self) -> None:
         for process in self.processes:
@@ -161,7 +161,7 @@ def test_scans_that_come_twice_or_out_of_order_are_shown_once_and_in_order(well:
         setattr(well.proxy, what, True)
         heard = well.hear(2.0)
         setattr(well.proxy, what, False)
-        scans = [g.frame["scan"] for g in heard]
+        scans = [g.frame.get("scan", 0) for g in heard]
         assert len(scans) > 10 and scans == sorted(set(scans))
         well.promise(heard)
 

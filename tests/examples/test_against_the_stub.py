@@ -5,6 +5,7 @@ Python's three controllers and the C++ subscriber share one service.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -112,6 +113,43 @@ def pid_of(module: str) -> int:
         except OSError:
             continue
     raise AssertionError(f"no process of {module}")
+
+
+def test_the_newest_frame_is_there_right_after_connecting() -> None:
+    """As README has it. A busy machine may be late once in a while; a client that asks for too much always was."""
+    good = 0
+    for _ in range(8):
+        with ContactSubscriber("palm") as skin, contextlib.suppress(Stale):
+            good += skin.latest(valid=True).valid
+    assert good >= 4
+
+
+def test_who_comes_late_is_told_of_no_beginning_and_no_end() -> None:
+    """Nobody subscribes while the touch comes, so that the publisher sleeps; nor while it goes."""
+
+    def first(count: int) -> list[list[str]]:
+        found: list[list[str]] = []
+        with ContactSubscriber("palm") as skin:
+            while len(found) < count:
+                with contextlib.suppress(Stale):
+                    found.append([c.state for c in skin.next_frame(1.0, valid=True).contacts])
+        return found
+
+    def asleep() -> None:
+        control, end = ControlClient("publisher", 5.0), time.monotonic() + 30
+        while not control.call("status")["idle"]:
+            assert time.monotonic() < end, "somebody subscribes"
+            time.sleep(0.05)
+
+    asleep()
+    press(0.02, -0.01, 3.0)
+    time.sleep(1.0)
+    states = first(5)
+    assert set(sum(states, [])) == {"hold"}
+    asleep()
+    stub("release")
+    time.sleep(1.0)
+    assert sum(first(5), []) == []
 
 
 def test_stop_on_contact_stops_with_the_first_frame_that_has_one(start: Start) -> None:

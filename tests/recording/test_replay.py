@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import msgpack
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from protocol.frames import RawFrame, pack, unpack
+from protocol.frames import ContactFrame, RawFrame, pack, unpack
+from services import persistence
+from services.pipeline import Pipeline
 from services.recordings.importing import ImportRefused, import_arrays
 from services.recordings.recording import RecordingReader, RecordingWriter
 from services.recordings.replay import ReplayError, steps
@@ -66,6 +69,46 @@ def test_two_replays_give_identical_contacts(runtime: Path, recording: Path, tmp
     assert [s for s in states[88:] if s] == [["end"]], "it ends once, and is not there any more"
     x = [f["contacts"][0]["position"][0] for f in first[72:88]]  # type: ignore[index]
     assert np.corrcoef(x, 0.05 * 0.03 * np.arange(8, 24))[0, 1] > 0.99 and abs(x[0] - 0.012) < 0.004
+
+
+def test_a_recording_that_begins_while_a_touch_is_held_is_replayed_as_it_was(runtime: Path, tmp_path: Path) -> None:
+    """The image came before the recording did: the states bring it, and contacts come out as they did live."""
+    bundle, rng = Bundle.load("square16"), np.random.default_rng(7)
+    pipeline = Pipeline("square16", name="palm", bundle=bundle)
+    side = -1 + 2 * (np.arange(24) + 0.5) / 24
+    disc = np.hypot(side[None] - 0.3, side[:, None] + 0.2) < 0.2
+    touched = bundle.matrices.z0 * (1 + bundle.matrices.jacobian @ (0.3 * disc.ravel()))
+
+    def raw(scan: int, z0: np.ndarray) -> RawFrame:
+        z = z0 * (1 + 1e-4 * rng.standard_normal(len(z0)))
+        stamps = {"sample": scan * 45_000_000, "read": scan * 45_000_000 + 1}
+        status = np.zeros(len(z), np.uint8)
+        frame = RawFrame(skin="palm", scan=scan, stamps=stamps, valid=True, z=z.astype("c8"), status=status, board="b")
+        frame.valid_for_s = 0.25
+        return frame
+
+    scans = iter(range(1, 1000))
+    for _ in range(80):
+        pipeline.run(raw(next(scans), bundle.matrices.z0))
+    for _ in range(5):  # of which the first, second and fourth are reconstructed, as will be the eighth
+        pipeline.run(raw(next(scans), touched))
+    stages = {"preprocessing": pipeline.pre, "inference": pipeline.inference, "publisher": pipeline.publishing}
+    states = {name: persistence.plain(stage.state()) for name, stage in stages.items()}
+    live: list[ContactFrame] = []
+    with RecordingWriter(tmp_path / "held.mcap", {"bundle": "square16"}) as writer:
+        writer.write("state/palm", msgpack.packb(states), 1)
+        for n in range(2, 22):
+            frame = raw(next(scans), touched)
+            writer.write("raw/palm", pack(frame).partition(b"\0")[2], n * 45_000_000)
+            live.append(pipeline.run(frame).contact)
+    assert live[0].held and live[0].contacts
+    report = replay_file(tmp_path / "held.mcap", None, out=tmp_path / "again.mcap", private=True)
+    assert report["frames"] == 20 and report["warnings"] == []
+    again = [unpack(message.wire) for message in RecordingReader(tmp_path / "again.mcap").messages({"contact"})]
+    for one, other in zip(live, again, strict=True):
+        assert isinstance(other, ContactFrame)
+        assert (one.scan, one.valid, one.held) == (other.scan, other.valid, other.held)
+        assert [asdict(c) for c in one.contacts] == [asdict(c) for c in other.contacts]
 
 
 def test_steps_begin_with_the_recorded_state(tmp_path: Path, touches: dict[str, np.ndarray]) -> None:

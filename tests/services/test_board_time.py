@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 
 from bench._delayed_line import DelayedLine, Seen, listen
+from models.bundle import Bundle
 from protocol import link
+from protocol.frames import RawFrame
+from services.acquisition import SourceFeed
 from services.board.boardlink import DOUBTED_SCANS, BoardLink
 from services.board.clock import MAX_RATE_ERROR, WIDE_NS, DeviceClock
 from services.board.frozen import FROZEN, PROOF, FrozenScans
@@ -16,7 +20,9 @@ from services.board.host_time import HostTime
 from services.board.remarks import FROZEN as FROZEN_TEXT
 from services.board.remarks import UNKNOWN, UNTIMED
 from services.board.scan_order import ScanOrder
+from services.board.source import Source
 from services.board.time_questions import ASK_EVERY_S, TimeQuestions
+from services.config import Skin
 from tests.services.fake_board import FakeBoard
 from tests.services.test_acquisition import SCANNING
 
@@ -273,3 +279,31 @@ def test_a_start_that_is_answered_with_the_time_settles_the_clock_at_once() -> N
     assert not host.received(board.scan(6_000_000), now) and host.counts["foreign"] == 1, "from before START"
     board.seq = 0
     assert host.received(board.scan(7_100_000), now) and host.clock.host_ns(7_100_000) == pytest.approx(0.1e9, abs=MS)
+
+
+def test_frames_that_wait_while_the_machine_sleeps_are_dropped(skin: Skin, bundle: Bundle) -> None:
+    """The monotonic clock stood still meanwhile: by their stamps they would be new."""
+
+    class Host(HostTime):
+        slept_ns = 0
+
+        def suspended_ns(self) -> int:
+            return self.slept_ns
+
+    class Three(Source):
+        def frames(self) -> Iterator[RawFrame | None]:
+            for k in range(3):
+                host.slept_ns = 0 if k < 2 else 60 * 10**9
+                yield RawFrame(skin="palm", scan=k, z=np.ones(2, np.complex64), status=np.zeros(2, np.uint8))
+            done.set()
+            yield from self._ended("no more")
+
+    host, done = Host(), threading.Event()
+    feed = SourceFeed(Three("palm", skin, bundle), host)
+    try:
+        assert done.wait(10)
+        frame = feed.recv()
+        assert frame is not None and frame.scan == 2 and feed.slept_over == 2
+        assert feed.recv() is None
+    finally:
+        feed.close()

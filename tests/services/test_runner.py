@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from protocol.frames import DeltaFrame, Frame, InfoFrame, RawFrame, StatusFrame, pack
+from protocol.frames import DeltaFrame, Frame, ImageFrame, InfoFrame, RawFrame, StatusFrame, pack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
 from services.config import ROOT, parse
 from services.lateness import Lateness
@@ -282,6 +282,60 @@ def test_replayed_frames_are_neither_late_nor_skipped(passed: Callable[..., list
     """A replay gives the same frames however slow the machine."""
     sent = passed(Waiting("palm", 9e3, 8e3, 7e3, source="replay"), True)
     assert [(f.scan, f.valid) for f in sent] == [(0, True), (1, True), (2, True)]
+
+
+class Lacking(Passing):
+    """Wants again what upstream sends only once, and notes what the runner tells it."""
+
+    reads, writes, sleeps = "image", ("contact",), True
+
+    def __init__(self, skin: str) -> None:
+        super().__init__(skin)
+        self.told: list[str] = []
+
+    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        self.lacks = True
+        return []
+
+    def joined(self, topic: str) -> None:
+        self.told.append(topic)
+
+    def wake(self) -> None:
+        self.told.append("awake")
+
+
+def test_who_subscribes_is_told_of_and_what_is_lacking_is_asked_for_by_subscribing(runtime: Path) -> None:
+    upstream = Publisher("inference")
+    asked: list[bytes] = []
+    upstream.on_join = asked.append
+    runner = Runner("publisher", parse({"skins": {"palm": {"port": "stub", "bundle": "square16"}}}))
+    contacts = AllReader(["contact"], "palm")
+    stage = Lacking("palm")
+
+    def until(what: Callable[[], object]) -> None:
+        end = time.monotonic() + 20
+        while not what():
+            assert time.monotonic() < end
+            runner._tick()
+            upstream.poll()
+            upstream.send(ImageFrame(skin="palm"))
+            runner._serve(list(runner.lanes.values()))
+            time.sleep(0.01)
+
+    try:
+        runner.add(stage)
+        until(lambda: "contact" in stage.told)
+        until(lambda: len(asked) >= 5 and set(asked) == {b"image/palm\0"})
+        contacts.close()
+        until(lambda: runner.lanes["palm"].asleep)
+        asked.clear()
+        contacts = AllReader(["contact"], "palm")
+        until(lambda: asked)
+        assert "awake" in stage.told[stage.told.index("contact") + 1 :]
+    finally:
+        contacts.close()
+        runner.close()
+        upstream.close()
 
 
 def test_a_stop_and_a_sleep_of_the_host_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
