@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -171,7 +172,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if options.map:
             draw(case, radius, options.drop, max(options.grid, MAP_SIDE), options.map)
     except ValueError as error:
-        print(f"skin limits: {error}")
+        print(f"skin limits: {error}", file=sys.stderr)
         return 2
     if options.json:
         given = json.loads(json.dumps(asdict(case)), parse_constant=str)  # infinities as words: JSON has none

@@ -30,8 +30,6 @@ POLL_S = 0.1
 REOPEN_S = 0.2  # between attempts to open a port
 INTRODUCE_S = 0.6  # for a board under another name to say who it is
 COUNT_EVERY_S = 0.1
-SCANS_VALID = 3  # a frame is valid until this many full scans after its own,
-VALID_S = 0.25  # or for so long, where that is more
 MOST_WAITING = 4_000_000  # bytes read in one go after a standstill
 
 log = logging.getLogger(__name__)
@@ -231,7 +229,7 @@ class BoardSource(Source):
             source="stub" if "stub" in board.ident.firmware.lower() else "board",
             valid=valid,
             reasons=reasons,
-            valid_for_s=max(VALID_S, SCANS_VALID * self._full_s),
+            valid_for_s=valid_for_s(self._full_s),
             z=scan.z,
             kind=kind,
             status=scan.status,

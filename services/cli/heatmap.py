@@ -84,8 +84,7 @@ def draw(
 
 def framed(skin: Text, half_width_m: float, full_scale: float, coloured: bool = True) -> Text:
     """What `draw` gives, with axes in mm, and the scale of its colours below."""
-    lines = skin.split("\n")[:-1] if skin.plain.endswith("\n") else skin.split("\n")
-    lines = [line for line in lines if line.plain or len(lines) == 1]
+    lines = [line for line in skin.split("\n") if line.plain]
     half, width = f"{half_width_m * 1e3:.0f}", len(lines[0])
     labels = {0: f"+{half}", len(lines) // 2: "0", len(lines) - 1: f"-{half}", 1: "y mm"}
     text = Text()

@@ -27,7 +27,10 @@ def skin(runtime: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
     def call(*arguments: object) -> Ran:
         monkeypatch.setattr(sys, "argv", ["skin", *map(str, arguments)])
+        before = dict(os.environ)
         code = run()
+        os.environ.clear()  # --config and --runtime are said in the environment of the command's own process
+        os.environ.update(before)
         captured = capsys.readouterr()
         assert "Traceback" not in captured.err and "a fault of this program" not in captured.err, captured.err
         return Ran(code, captured.out, captured.err)

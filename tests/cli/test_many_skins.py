@@ -148,7 +148,7 @@ def test_the_doctor_names_a_bundle_and_a_calibration_changed_since(folder: Path)
 
 def test_the_doctor_never_calls_a_port_both_well_and_ill(folder: Path) -> None:
     """Unplugged while the service runs: the port and acquisition are both a failure."""
-    skin(folder, "fault", "unplug", "--seconds", 8)
+    skin(folder, "fault", "unplug", "--seconds", 120)
     time.sleep(1.0)
     found = json.loads(skin(folder, "doctor", "--json", check=False).stdout)
     levels = {f["what"]: f["level"] for f in found}
