@@ -23,7 +23,7 @@ from services.board.clock import UNSETTLED_NS
 from services.board.host_time import STOOD_STILL_S, HostTime, Suspensions
 from services.board.remarks import Remarks
 from services.config import Skin
-from services.stage import Health, add_reason
+from services.stage import Health, add_reason, valid_for_s
 from services.touches.sentinel import sentinel_of
 
 POLL_S = 0.1

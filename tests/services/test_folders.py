@@ -1,4 +1,4 @@
-"""What the root helper of the compose file changes: an empty folder of root that is mounted from its own name alone."""
+"""What the root helper of the compose file changes: an empty folder of root, mounted from its own name, and no more."""
 
 from __future__ import annotations
 
