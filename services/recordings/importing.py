@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import pack
 from services.board.file_source import file_frame
-from services.config import SKIN_NAME
+from services.config import BUNDLES, MANIFEST, SKIN_NAME
 from services.recordings.npz_file import InputError, frames_of, read_scans
 from services.recordings.reconstruction import find_skin
 from services.recordings.recording import RecordingWriter
@@ -40,7 +40,9 @@ def import_arrays(
         data = read_scans(arrays, bundle)
     except InputError as error:
         raise ImportRefused(f"{source}: {error}") from None
-    metadata = {"origin": "import", "of": source.name, "bundle": configured.bundle, "skin": skin}
+    shipped = (BUNDLES / configured.bundle / MANIFEST).is_file()
+    own = configured.bundle if shipped else str(bundle.path.resolve())  # a replay may run in another folder
+    metadata = {"origin": "import", "of": source.name, "bundle": own, "skin": skin}
     step_ns, count = int(1e9 / rate_hz), 0
     with RecordingWriter(target, metadata, overwrite) as writer:
         for count, (values, kind) in enumerate(frames_of(data), start=1):
