@@ -103,6 +103,10 @@ class Preprocessing(Stage):
         if self.untouched.baseline.doubt:
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
+        if frame.kind == "reference":  # untouched, as the file says: there is nothing to decide
+            out.difference = np.zeros(len(amplitude), np.float32)
+            out.sigma = np.asarray(self.untouched.sigma, np.float32)
+            return [out]
         return [self._compare(out, amplitude - found.shift, found, learns=not separate)]
 
     def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict, learns: bool) -> DeltaFrame:

@@ -31,7 +31,8 @@ class References:
     def reset(self) -> None:
         self._row: list[Array] = []  # those that came one after the other, without another scan in between
         self.noise: Array | None = None  # (K,) relative, of one scan
-        self._found_from = 0  # scans that it was found from
+        self.typical = np.zeros(self._k)  # (K,) |Z| of the scans that it was found from; 0 where nothing was measured
+        self._found_from = 0  # how many those were
         self.scan = -1  # number of the last one
 
     def interrupted(self) -> None:
@@ -47,19 +48,23 @@ class References:
         self._row.append(np.where(good, amplitude, np.nan))
         del self._row[:-MOST_ROWS]
         if self.noise is None or len(self._row) > 1:
-            self.noise, self._found_from = noise_of_references(np.array(self._row)), len(self._row)
+            rows = np.array(self._row)
+            self.noise, self._found_from = noise_of_references(rows), len(rows)
+            self.typical = np.nan_to_num(_quietly(lambda scans: np.nanmedian(scans, axis=0), rows))
         z0, sigma = np.where(good, amplitude, 0.0), np.where(good, self.noise * amplitude, np.inf)
         # Two scans share each of the differences that it was found from.
         return Baseline(z0, sigma, 1, board, sample_ns, taken_by="file", noise_frames=self._found_from // 2)
 
     def state(self) -> dict[str, Any]:
-        return {"row": np.array(self._row), "noise": self.noise, "found_from": self._found_from, "scan": self.scan}
+        state = {"row": np.array(self._row), "noise": self.noise, "typical": self.typical}
+        return state | {"found_from": self._found_from, "scan": self.scan}
 
     def load(self, state: dict[str, Any]) -> None:
         """Raises KeyError, TypeError or ValueError where it does not fit."""
         self.reset()
         self._row = [shaped(row, (self._k,), finite=False) for row in state["row"]]
         self.noise = None if state["noise"] is None else shaped(state["noise"], (self._k,))
+        self.typical = shaped(state["typical"], (self._k,))
         self._found_from, self.scan = int(state["found_from"]), int(state["scan"])
 
 
@@ -95,13 +100,14 @@ def noise_of_references(reference: Array) -> Array:
 
 
 def _noise(reference: Array) -> Array:
-    rows = np.unique(reference, axis=0)  # a scan that stands there twice says nothing of noise
+    measured = np.where(np.isfinite(reference) & (reference > 0), reference, 0.0)
+    rows = np.unique(measured, axis=0)  # a scan that stands there twice says nothing of noise
     rows = rows[:: -(-len(rows) // MOST_ROWS)]
     n, k = len(rows), reference.shape[1]
     if n < 2:
         return np.full(k, ASSUMED_NOISE)
     form, own, few = forms(rows), np.full(k, np.nan), min(NEIGHBOURS, n - 1)
-    form[~(np.isfinite(rows) & (rows > 0))] = np.nan
+    form[rows == 0] = np.nan
     for half in (slice(0, None, 2), slice(1, None, 2)):
         nearest = _nearest(np.nan_to_num(np.delete(form, np.arange(k)[half], axis=1)), few)
         apart = np.abs(form[:, None, half] - form[:, half][nearest])

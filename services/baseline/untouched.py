@@ -160,9 +160,10 @@ class Untouched:
             self.problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"
         else:
             self.set_baseline(found)
-            # The same in each of them, to the last bit: what is made for a noise then serves for all.
-            share = np.divide(found.z0, self.normaliser, out=np.zeros(len(found.z0)), where=self.normaliser > 0)
-            self.sigma = np.where(np.isfinite(found.sigma), self.references.noise * share, np.inf)
+            # As in a typical one of them, and so the same in all: what is made for a noise is made once.
+            typical, known = self.references.typical, self.references.typical > 0
+            share = np.divide(typical, self.pre.normaliser(typical), out=np.zeros(len(typical)), where=known)
+            self.sigma = np.where(np.isfinite(found.sigma) & known, self.references.noise * share, np.inf)
         return True
 
     def _needs_reference(self, frame: RawFrame) -> None:

@@ -99,9 +99,8 @@ def replay(
     if as_json:
         emit(report)
     else:
-        print(
-            "{frames} frames in {seconds:.1f} s, {contacts} contact frames of which {touched} touched".format(**report)
-        )
+        said = "{frames} frames in {seconds:.1f} s, {contacts} contact frames, {valid} of them valid, {touched} touched"
+        print(said.format(**report))
         if report["damage"] != "whole":
             print(f"the file is {report['damage']}")
 
@@ -126,8 +125,9 @@ def import_file(
 ) -> None:
     """Turn an npz of measurements into a recording that replays like any other.
 
-    Either measurements (n, k) with untouched (m, k) or reference (n, k); or presses as published with the hydrogel
-    skin: untouched (n, k), touched (n, k) and optionally pattern (k, 4).
+    Either measurements (n, k) with untouched (m, k), which then are one scan after the other, or with reference (n, k);
+    or presses as published with the hydrogel skin: untouched (n, k), touched (n, k). These and references are separate
+    scans, of which none follows another in time. pattern (k, 4), where the file has it, says their order.
     """
     from services.recordings.importing import import_arrays
 

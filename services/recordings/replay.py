@@ -168,6 +168,7 @@ class Replayer:
                 if self.out is not None and skin in self._started:
                     self.out.write(f"contact/{skin}", message.partition(b"\0")[2], time.time_ns())
                 self.counts["contacts"] += 1
+                self.counts["valid"] += frame.valid
                 self.counts["touched"] += any(c.state != "end" for c in frame.contacts)
                 return frame
         return None

@@ -38,7 +38,7 @@ def replay_file(
     progress: Progress = lambda contacts, total: contacts,
     bundle: Path | None = None,
 ) -> dict[str, Any]:
-    """Replays `file`; the report's keys: frames, contacts, touched, seconds, damage, warnings.
+    """Replays `file`; the report's keys: frames, contacts, valid, touched, seconds, damage, warnings.
 
     bundle: to use instead of the one that the recording names by its hash.
 
@@ -64,7 +64,7 @@ def replay_file(
             if writer is not None:
                 writer.flush_if_due()
         seconds = time.monotonic() - began
-    counts = {key: replayer.counts[key] for key in ("frames", "contacts", "touched")}
+    counts = {key: replayer.counts[key] for key in ("frames", "contacts", "valid", "touched")}
     return counts | {"seconds": seconds, "damage": str(reader.damage), "warnings": [*warnings, *replayer.warnings]}
 
 
