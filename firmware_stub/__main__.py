@@ -48,6 +48,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add("--baud", type=int, default=921_600, help="bit rate of the line (default: %(default)s)")
     add("--listen", metavar="URL", help="socket://HOST:PORT instead of a pty")
     add("--port-name", default="board", help="the pty's name in the runtime folder (default: %(default)s)")
+    add("--leave", type=float, metavar="SECONDS", help="end when a host that was connected has been gone for so long")
     add("--seed", type=int, help="of the noise (default: another one each time)")
     add("--detached", action="store_true", help="go on when the parent process has ended")
     add("--faults", action="store_true", help="list what can go wrong on request, and end")
@@ -102,7 +103,7 @@ def main(argv: list[str] | None = None) -> int:
         publisher = Publisher("stub", context)
         control = Control(rig, options.skin, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context)
         log.info("board at %s, scene %s", port.url, options.scene)
-        _run(rig, port, publisher, options.skin, begin_ns, stop, parent)
+        _run(rig, port, publisher, options.skin, begin_ns, stop, parent, options.leave)
     except (zmq.ZMQError, TransportError) as error:
         log.error("sockets: %s", error)
         return 1
@@ -127,8 +128,17 @@ def _alone() -> None:
             )
 
 
-def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, stop: _Stop, parent: int | None) -> None:
-    """Until a signal, or the parent's end: hand bytes to and fro, publish what was true."""
+def _run(
+    rig: Rig,
+    port: Port,
+    publisher: Publisher,
+    skin: str,
+    begin_ns: int,
+    stop: _Stop,
+    parent: int | None,
+    leave_s: float | None = None,
+) -> None:
+    """Until a signal, the parent's end, or no host for leave_s: hand bytes to and fro, publish what was true."""
     name, gone = "", False
     checked, written_ns = 0.0, begin_ns
     status = Status(skin)
@@ -163,6 +173,9 @@ def _run(rig: Rig, port: Port, publisher: Publisher, skin: str, begin_ns: int, s
             publisher.mind()
             if parent is not None and os.getppid() != parent:
                 log.info("the parent process has ended")
+                return
+            if leave_s is not None and port.deserted_s > leave_s:
+                log.info("no host for %g s: ending", leave_s)
                 return
         select.select([*port.filenos(), stop.fileno()], [], [], rig.wake_s((time.monotonic_ns() - begin_ns) * 1e-9))
 
