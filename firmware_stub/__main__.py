@@ -54,6 +54,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add("--ppm", type=float, default=12.0, help="how much too fast the board's crystal is (default: %(default)s)")
     add("--baud", type=int, default=921_600, help="bit rate of the line (default: %(default)s)")
     add("--listen", metavar="URL", help="socket://HOST:PORT instead of a pty; further skins take the ports after it")
+    add("--leave", type=float, metavar="SECONDS", help="end when a host that was connected has been gone for so long")
     add("--seed", type=int, help="of the noise (default: another one each time)")
     add("--no-time", action="store_true", help="a firmware that does not answer TIME_ASK")
     add("--detached", action="store_true", help="go on when the parent process has ended")
@@ -99,7 +100,7 @@ def main(argv: list[str] | None = None) -> int:
         control = Control(rigs, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context)
         for name, skin in skins.items():
             log.info("board of %s at %s, scene %s", name, skin.port.url, options.scene)
-        _run(list(skins.values()), publisher, begin_ns, stop, parent)
+        _run(list(skins.values()), publisher, begin_ns, stop, parent, options.leave)
     except (ValueError, OSError, RuntimeDirError, BundleError) as error:
         log.error("%s", error)
         return 2
@@ -154,8 +155,15 @@ def _alone() -> None:
             )
 
 
-def _run(skins: list[StubSkin], publisher: Publisher, begin_ns: int, stop: _Stop, parent: int | None) -> None:
-    """Until a signal, or the parent's end."""
+def _run(
+    skins: list[StubSkin],
+    publisher: Publisher,
+    begin_ns: int,
+    stop: _Stop,
+    parent: int | None,
+    leave_s: float | None = None,
+) -> None:
+    """Until a signal, the parent's end, or no host at any port for leave_s."""
     checked = 0.0
     while not stop.asked:
         for skin in skins:
@@ -167,6 +175,9 @@ def _run(skins: list[StubSkin], publisher: Publisher, begin_ns: int, stop: _Stop
             publisher.mind()
             if parent is not None and os.getppid() != parent:
                 log.info("the parent process has ended")
+                return
+            if leave_s is not None and all(skin.port.deserted_s > leave_s for skin in skins):
+                log.info("no host for %g s: ending", leave_s)
                 return
         wait_s = min(skin.rig.wake_s(now) for skin in skins)
         select.select([*(fd for skin in skins for fd in skin.port.filenos()), stop.fileno()], [], [], wait_s)

@@ -79,6 +79,10 @@ class Port(Protocol):
 
     @property
     def url(self) -> str: ...
+    @property
+    def deserted_s(self) -> float:
+        """For how long a host that was connected has been gone, where that is to be seen; else 0."""
+
     def filenos(self) -> list[int]: ...
     def read(self) -> bytes: ...
     def write(self, data: bytes) -> None: ...
@@ -89,6 +93,8 @@ class Port(Protocol):
 
 class PtyPort:
     """A pty, linked as <folder>/<name>. Its slave end is kept open: without any, the master sees errors."""
+
+    deserted_s = 0.0  # whether a host has it open is not to be seen
 
     def __init__(self, folder: Path, name: str = "board") -> None:
         self.folder, self.name = folder, name
@@ -174,6 +180,7 @@ class TcpPort:
         self.overrun = 0
         self._server: socket.socket | None = None
         self._client: socket.socket | None = None
+        self._deserted: float | None = None
         self.plug()
 
     @property
@@ -217,8 +224,7 @@ class TcpPort:
         except OSError:
             data = b""
         if not data:
-            self._client.close()
-            self._client = None
+            self._desert()
         return data
 
     def write(self, data: bytes) -> None:
@@ -229,8 +235,18 @@ class TcpPort:
         except BlockingIOError:
             self.overrun += len(data)
         except OSError:
-            self._client.close()
-            self._client = None
+            self._desert()
+
+    def _desert(self) -> None:
+        """The host has gone."""
+        assert self._client is not None
+        self._client.close()
+        self._client, self._deserted = None, time.monotonic()
+
+    @property
+    def deserted_s(self) -> float:
+        """For how long a host that was connected has been gone; 0 while one is there, and before the first."""
+        return 0.0 if self._deserted is None else time.monotonic() - self._deserted
 
     def _accept(self) -> None:
         with contextlib.suppress(BlockingIOError, OSError):
@@ -241,7 +257,7 @@ class TcpPort:
                 self._client.close()
             client.setblocking(False)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._client = client
+            self._client, self._deserted = client, None
 
 
 def open_port(listen: str | None, folder: Path, name: str = "board") -> Port:

@@ -212,3 +212,16 @@ def test_a_second_stub_does_not_take_over_the_first_ones_sockets(stub, folder):
     assert second.process.wait(60) == 2
     assert "another stub runs" in second.line
     assert ControlClient("stub", 20.0).call("status")["plugged"] is True
+
+
+def test_a_stub_that_its_host_has_left_ends_where_it_is_told_to(other_folder):
+    """In containers its network has gone with the host: started anew, it is in the host's new one."""
+    stub = Process(other_folder, "--listen", "socket://127.0.0.1:0", "--leave", "1")
+    time.sleep(1.5)
+    assert stub.process.poll() is None  # nobody came yet: that is no leaving
+    stub.open().start()
+    time.sleep(1.5)
+    assert stub.process.poll() is None
+    stub.serial.close()
+    assert stub.process.wait(20) == 0
+    assert "no host for 1 s" in stub.process.stderr.read()
