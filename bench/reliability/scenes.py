@@ -6,6 +6,7 @@ solved is kept in bench/work, by a hash of the code that solves.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 from pathlib import Path
@@ -25,6 +26,7 @@ SOLVED_BY = (
     "models/skins/square16.toml",
 )
 METRES = 0.05  # per model unit of square16
+MOST_FILES = 64  # of what was solved; then they are gathered in one
 RAMP_S = 0.1  # a finger's
 PLACE_M = 0.04  # how far from the centre the matrix presses, along each axis
 
@@ -40,9 +42,14 @@ class SolvedSheet(Sheet):
         self._keep, self._code = keep, _code()
         self._known: dict[str, Matrix] = {}
         self._fresh: dict[str, Matrix] = {}
-        for path in sorted(WORK.glob(f"{self._code}-*.npz")) if keep else ():
-            with np.load(path) as kept:
+        files = sorted(WORK.glob(f"{self._code}-*.npz")) if keep else []
+        for path in files:
+            with contextlib.suppress(FileNotFoundError), np.load(path) as kept:  # another process may gather them
                 self._known |= dict(zip(kept["worlds"].tolist(), kept["transfer"], strict=True))
+        if len(files) > MOST_FILES:
+            self._write(self._known)
+            for path in files:
+                path.unlink(missing_ok=True)
 
     def transfer(self, world: World) -> Matrix:
         touches = tuple(touch for touch in world.touches if touch.drop > 0)
@@ -52,20 +59,23 @@ class SolvedSheet(Sheet):
             self.solves += 1
         return self._known[key]
 
-    def close(self) -> None:
-        """Write what is new, if it is to be kept. Solutions of other code are removed."""
-        if not (self._keep and self._fresh):
+    def close(self, least: int = 1) -> None:
+        """Write what is new, if it is to be kept and at least so many. Solutions of other code are removed."""
+        if not self._keep or len(self._fresh) < least:
             return
-        WORK.mkdir(parents=True, exist_ok=True)
         for old in WORK.glob("*.npz"):
             if not old.name.startswith(self._code):
                 old.unlink(missing_ok=True)
-        name = hashlib.sha256("".join(self._fresh).encode()).hexdigest()[:16]
+        self._write(self._fresh)
+        self._fresh = {}
+
+    def _write(self, solved: dict[str, Matrix]) -> None:
+        WORK.mkdir(parents=True, exist_ok=True)
+        name = hashlib.sha256("".join(solved).encode()).hexdigest()[:16]
         part = WORK / f"part-{os.getpid()}"
         with part.open("wb") as file:
-            np.savez_compressed(file, worlds=np.array(list(self._fresh)), transfer=np.array(list(self._fresh.values())))
+            np.savez_compressed(file, worlds=np.array(list(solved)), transfer=np.array(list(solved.values())))
         part.replace(WORK / f"{self._code}-{name}.npz")
-        self._fresh = {}
 
     def impedances(self, world: World, pattern: NDArray[np.integer]) -> NDArray[np.float64]:
         """(K,) |Z| ohm, free of noise."""

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache, partial
+from multiprocessing.util import Finalize
 from typing import TypeVar
 
 import services  # noqa: F401  (one thread for the numerical libraries, before numpy starts them)
@@ -19,11 +20,14 @@ from services.pipeline import Pipeline
 Task = TypeVar("Task")
 Found = TypeVar("Found")
 SAY_EVERY_S = 20.0
+SAVED = 100  # new solutions are written at once
 
 
 @lru_cache(maxsize=1)
 def sheet() -> SolvedSheet:
-    return SolvedSheet()
+    made = SolvedSheet()
+    Finalize(None, made.close, exitpriority=1)  # of this process, worker or not
+    return made
 
 
 @lru_cache(maxsize=8)
@@ -63,4 +67,4 @@ def _kept(work: Callable[[Task], Found], task: Task) -> Found:
     try:
         return work(task)
     finally:
-        sheet().close()
+        sheet().close(least=SAVED)

@@ -230,6 +230,14 @@ def test_what_was_solved_is_kept_and_met_again(tmp_path, monkeypatch):
     second = scenes.SolvedSheet()
     assert np.array_equal(second.transfer(world), solved) and second.solves == 0
     assert second.transfer(World()) is not solved and second.solves == 1
+    second.close(least=2)
+    assert len(list(tmp_path.iterdir())) == 1
+    second.close()
+    assert len(list(tmp_path.iterdir())) == 2
+    monkeypatch.setattr(scenes, "MOST_FILES", 1)
+    assert scenes.SolvedSheet().transfer(world) is not None and len(list(tmp_path.iterdir())) == 1  # gathered
+    third = scenes.SolvedSheet()
+    assert np.array_equal(third.transfer(world), solved) and third.transfer(World()) is not None and not third.solves
 
 
 @pytest.fixture(scope="module")
