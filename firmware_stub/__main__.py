@@ -96,7 +96,7 @@ def main(argv: list[str] | None = None) -> int:
         control = Control(rigs, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context)
         for name, skin in skins.items():
             log.info("board of %s at %s, scene %s", name, skin.port.url, options.scene)
-        _run(list(skins.values()), publisher, begin_ns, stop, parent)
+        _run(list(skins.values()), publisher, stop, parent)
     except (ValueError, OSError, RuntimeDirError, BundleError) as error:
         log.error("%s", error)
         return 2
@@ -150,22 +150,20 @@ def _alone() -> None:
             )
 
 
-def _run(skins: list[StubSkin], publisher: Publisher, begin_ns: int, stop: _Stop, parent: int | None) -> None:
+def _run(skins: list[StubSkin], publisher: Publisher, stop: _Stop, parent: int | None) -> None:
     """Until a signal, or the parent's end."""
     checked = 0.0
     while not stop.asked:
-        now = (time.monotonic_ns() - begin_ns) * 1e-9
         for skin in skins:
-            skin.step(now, publisher)
-        if now - checked > PARENT_CHECK_S:
-            checked = now
+            skin.step(publisher)
+        if time.monotonic() - checked > PARENT_CHECK_S:
+            checked = time.monotonic()
             publisher.poll()
             if parent is not None and os.getppid() != parent:
                 log.info("the parent process has ended")
                 return
-        now = (time.monotonic_ns() - begin_ns) * 1e-9
-        wait_s = min(skin.rig.wake_s(now) for skin in skins)
-        select.select([*(fd for skin in skins for fd in skin.port.filenos()), stop.fileno()], [], [], wait_s)
+        ports = [number for skin in skins for number in skin.port.filenos()]
+        select.select([*ports, stop.fileno()], [], [], min(skin.wake_s for skin in skins))
 
 
 class _Stop:
