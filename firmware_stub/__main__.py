@@ -100,7 +100,7 @@ def main(argv: list[str] | None = None) -> int:
         control = Control(rigs, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context)
         for name, skin in skins.items():
             log.info("board of %s at %s, scene %s", name, skin.port.url, options.scene)
-        _run(list(skins.values()), publisher, begin_ns, stop, parent, options.leave)
+        _run(list(skins.values()), publisher, stop, parent, options.leave)
     except (ValueError, OSError, RuntimeDirError, BundleError) as error:
         log.error("%s", error)
         return 2
@@ -156,21 +156,15 @@ def _alone() -> None:
 
 
 def _run(
-    skins: list[StubSkin],
-    publisher: Publisher,
-    begin_ns: int,
-    stop: _Stop,
-    parent: int | None,
-    leave_s: float | None = None,
+    skins: list[StubSkin], publisher: Publisher, stop: _Stop, parent: int | None, leave_s: float | None = None
 ) -> None:
     """Until a signal, the parent's end, or no host at any port for leave_s."""
     checked = 0.0
     while not stop.asked:
         for skin in skins:
             skin.step(publisher)
-        now = (time.monotonic_ns() - begin_ns) * 1e-9
-        if now - checked > PARENT_CHECK_S:
-            checked = now
+        if time.monotonic() - checked > PARENT_CHECK_S:
+            checked = time.monotonic()
             publisher.poll()
             publisher.mind()
             if parent is not None and os.getppid() != parent:
@@ -179,8 +173,8 @@ def _run(
             if leave_s is not None and all(skin.port.deserted_s > leave_s for skin in skins):
                 log.info("no host for %g s: ending", leave_s)
                 return
-        wait_s = min(skin.rig.wake_s(now) for skin in skins)
-        select.select([*(fd for skin in skins for fd in skin.port.filenos()), stop.fileno()], [], [], wait_s)
+        ports = [number for skin in skins for number in skin.port.filenos()]
+        select.select([*ports, stop.fileno()], [], [], min(skin.wake_s for skin in skins))
 
 
 class _Stop:

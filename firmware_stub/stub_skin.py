@@ -27,7 +27,7 @@ def unique_id(skin: str) -> bytes:
 
 
 class StubSkin:
-    """Hands bytes to and fro between a rig and its port, and publishes what was true. Times are seconds since
+    """Hands bytes to and fro between a rig and its port, and publishes what was true. The rig's time is seconds since
     `begin_ns`.
     """
 
@@ -38,10 +38,18 @@ class StubSkin:
         self._unplugged_as = ""  # the name under which the device is to come back
         self._gone = False
 
+    @property
+    def now(self) -> float:
+        return (time.monotonic_ns() - self._begin_ns) * 1e-9
+
+    @property
+    def wake_s(self) -> float:
+        """Seconds until `step` has something to do, unless the port becomes readable before."""
+        return self.rig.wake_s(self.now)
+
     def step(self, publisher: Publisher) -> None:
         data = self.port.read()
-        # After reading: the board has not read what it is told before it came.
-        now = (time.monotonic_ns() - self._begin_ns) * 1e-9
+        now = self.now  # after: the board has not read what it is told before it came
         if data:
             self.rig.feed(data, now)
         if sent := self.rig.pull(now):

@@ -36,7 +36,7 @@ COMMANDS = (
     Row("make test", "ci", says="make test"),
     Row("make venv-dev", "ci", says="make test"),  # its first prerequisite
     Row("make train SKIN=square16 QUICK=1", "ci", says="models.build --skin square16 --minutes 3"),
-    Row("skin up", "service"),
+    Row("(./)?skin up", "service"),
     Row(
         "export EITSKIN_UID=.*",
         "ends",
@@ -83,7 +83,7 @@ COMMANDS = (
     Row(
         "skin replay",
         "ends",
-        says="contact frames of which",
+        says="contact frames",
         instead="./skin replay {folder}/demo.mcap --private --fast",
     ),
     Row(
@@ -117,7 +117,7 @@ COMMANDS = (
         instead="./skin register {presses} --skin disc16 --out {folder}/my-skin",
     ),
     # the real skin's block, in its order; FILE is the reference data
-    Row(r"\./skin (register|import|replay) .*", "slow", instead="{line}"),
+    Row(r"\./skin (register|import|replay|reconstruct) .*", "slow", instead="{line}"),
     Row(r"\.venv/bin/python -m bench.real_presses FILE", "slow", says="skin register"),
     # examples
     Row(
@@ -132,7 +132,11 @@ COMMANDS = (
         instead=f"{TOUCHED} && {{line}}",
     ),
     Row(r"g\+\+ .* -o /tmp/subscribe && /tmp/subscribe palm", "slow", says=r"frame \d+ valid"),
+    # keys, in the order of their page
+    Row(r"\./skin keys new \w+", "ends", says="public: "),
+    Row("mkdir -p keys/.*", "ends"),
     # offline
+    Row(r"\./skin limits .*", "help"),
     Row("skin limits", "slow", says="position"),
     Row("skin bench", "ends", says="accuracy"),
     Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB"),
@@ -170,3 +174,6 @@ SCENES = (("firmware_stub/README.md", "[[press]]"),)
 
 NOT_RUN = (("protocol/WIRE.md", "01 Hello: "),)
 """Blocks that are nothing to run: (file, how it begins). The link's schema: tests/protocol/test_wire_doc.py has it."""
+
+TRIED_ELSEWHERE = {"docs/security.md": "tests/cli/test_security.py"}
+"""Documents whose blocks of Python and TOML a test of their own runs."""

@@ -14,7 +14,7 @@ import pytest
 
 from protocol.frames import ContactFrame
 from protocol.sockets import ControlClient, NewestReader
-from tests.docs.runners import NOT_RUN, PROGRAMS, SCENES, Row, row_for
+from tests.docs.runners import NOT_RUN, PROGRAMS, SCENES, TRIED_ELSEWHERE, Row, row_for
 from tests.docs.snippets import ROOT, Snippet, in_text, snippets
 from tests.docs.world import START_S, World, world
 
@@ -31,6 +31,10 @@ def shown(how: str) -> list[Snippet]:
         if row is not None and row.how == how:
             found.setdefault(row.instead.replace("{line}", snippet.text) or snippet.text.removeprefix("./"), snippet)
     return list(found.values())
+
+
+def blocks(kind: str) -> list[Snippet]:
+    return [s for s in ALL if s.kind == kind and s.file not in TRIED_ELSEWHERE]
 
 
 def the_row(snippet: Snippet) -> Row:
@@ -132,7 +136,7 @@ def test_ci_has_the_step(snippet: Snippet) -> None:
     assert re.search(the_row(snippet).says, (ROOT / ".ci" / "run").read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("snippet", [s for s in ALL if s.kind == "python"], ids=str)
+@pytest.mark.parametrize("snippet", blocks("python"), ids=str)
 def test_a_program_reads_contacts(place: World, untouched: None, snippet: Snippet) -> None:
     """As an outsider's script: without the checkout on its path, but for the wheel's `eitskin`."""
     known = [p for p in PROGRAMS if p.file == snippet.file and p.marker in snippet.text]
@@ -153,7 +157,7 @@ def test_a_program_reads_contacts(place: World, untouched: None, snippet: Snippe
     assert len(out.splitlines()) >= known[0].lines, f"printed only, in {known[0].seconds:g} s:\n{out}"
 
 
-@pytest.mark.parametrize("snippet", [s for s in ALL if s.kind == "toml"], ids=str)
+@pytest.mark.parametrize("snippet", blocks("toml"), ids=str)
 def test_a_scene_plays(place: World, untouched: None, snippet: Snippet) -> None:
     assert any(snippet.file == file and marker in snippet.text for file, marker in SCENES), snippet
     file = place.folder / "scene.toml"
@@ -163,10 +167,15 @@ def test_a_scene_plays(place: World, untouched: None, snippet: Snippet) -> None:
 
 
 def test_other_blocks_are_nothing_to_run() -> None:
-    for snippet in ALL:
-        if snippet.kind == "text":
-            known = any(snippet.file == file and snippet.text.startswith(start) for file, start in NOT_RUN)
-            assert known, f"{snippet}: add it to NOT_RUN, or say in its fence what it is"
+    for snippet in blocks("text"):
+        known = any(snippet.file == file and snippet.text.startswith(start) for file, start in NOT_RUN)
+        assert known, f"{snippet}: add it to NOT_RUN, or say in its fence what it is"
+
+
+def test_what_is_tried_elsewhere_is() -> None:
+    for document, test in TRIED_ELSEWHERE.items():
+        if (ROOT / document).is_file():
+            assert document.split("/")[-1] in (ROOT / test).read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
