@@ -114,3 +114,18 @@ def test_the_command_writes_a_bundle_and_its_pose(skin, bundle, tmp_path) -> Non
     assert (
         np.allclose(pose.position_m, (0.01, -0.02, 0), atol=1e-3) and abs(pose.quaternion_xyzw[2] - np.sin(0.35)) < 0.01
     )
+
+
+def test_readme_s_real_skin_works_word_for_word(skin, reference, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """On 120 of the presses: registered, imported, replayed through the real processes from another folder."""
+    with np.load(reference / "hydrogel_disc16.npz") as data:
+        np.savez(tmp_path / "FILE", **part(dict(data), slice(0, 120)))
+    monkeypatch.chdir(tmp_path)
+    assert skin("register", "FILE.npz", "--skin", "disc16", "--out", "my-skin").code == 0
+    assert "304 frames" in skin("import", "FILE.npz", "presses.mcap", "--skin", "my-skin").out
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    ran = skin("replay", "../presses.mcap", "--fast")
+    assert ran.code == 0 and "304 of them valid, 120 touched" in ran.out, ran.out + ran.err
+    ran = skin("reconstruct", "../FILE.npz", "images.npz", "--skin", "../my-skin")
+    assert "120 rows, 120 touched, 120 valid" in ran.out, ran.out + ran.err
