@@ -30,7 +30,7 @@ WORK = Path(__file__).with_name("work")
 MADE_BY = (
     *(f"firmware_stub/{n}.py" for n in ("analog", "board", "faults", "field", "rig", "scene", "sheet", "timeline")),
     *(f"models/{n}.py" for n in ("elements", "forward", "geometry", "meshing", "patterns", "shapes")),
-    *(f"services/board/{n}.py" for n in ("boardlink", "clock", "scan_order", "source")),
+    *(f"services/board/{n}.py" for n in ("boardlink", "clock", "scan_check", "scan_order", "source")),
 )
 LAYOUT = 1  # of what is kept: raised when Recorded or what fills it changes
 KEPT = 6  # recorded scenes

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from protocol import link
 from protocol.frames import STATUS_OPEN, STATUS_RTIA
 from services.board.clock import GOOD_NS, DeviceClock
-from services.board.frozen import FrozenScans
 from services.board.line_pace import LinePace
-from services.board.scan_order import ScanOrder
+from services.board.scan_check import ScanCheck
 from services.board.time_questions import TimeQuestions
 
 HELLO_EVERY_S = 0.2
@@ -30,8 +29,6 @@ EXPLAIN_AFTER_S = 1.5  # of unanswered HELLOs
 DEAD_SCANS = 10  # in a row with all measurements out of range: the board may have lost its registers
 DEAD_AGAIN_S = 5.0  # then it is configured again, at most this often
 REFUSED_AGAIN_S = 1.0  # a refused board is tried again, for it may be power-cycled or flashed
-IMPOSSIBLE_SCANS = 3  # in a row whose times cannot be: the board's clock has jumped
-DOUBTED_SCANS = 3  # after that: the clock is to be believed again only once it goes on well
 NO_CURRENT = STATUS_OPEN | STATUS_RTIA
 
 
@@ -66,11 +63,9 @@ class BoardLink:
         self._wanted = scanning
         self.decoder = link.Decoder()
         self.clock = DeviceClock()
-        self.frozen = FrozenScans()
-        self.reasons: dict[int, list[str]] = {}  # of the scans received last, by number: gap, clock, frozen
-        self._order = ScanOrder()
+        self._check = ScanCheck(self.clock)
+        self.reasons = self._check.reasons  # of the scans received last, by number: gap, clock, frozen
         self._questions = TimeQuestions()
-        self._impossible = self._doubted = 0  # scans in a row; scans still to come
         self._heard_us = 0  # newest time of the board's clock
         self._start_s: float | None = None  # when START was sent first in this state
         self._pace = LinePace(now_s)
@@ -90,6 +85,11 @@ class BoardLink:
     def clock_unknown(self) -> bool:
         """Whether it is not known how old the board's scans are."""
         return self.clock.unknown(self._heard_us)
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the board sends the same scan again and again."""
+        return self._check.frozen
 
     @property
     def switches(self) -> bool:
@@ -112,7 +112,7 @@ class BoardLink:
         messages = self.decoder.feed(data)
         dropped, waits = self.decoder.bad > bad, self.decoder.waiting
         began_s = self._pace.first_byte_s(now_s, waited=waited, dropped=dropped, complete=bool(messages), waits=waits)
-        self.reasons = {}
+        self.reasons.clear()
         for n, message in enumerate(messages):
             if isinstance(message, link.Frame):
                 first_byte_s = began_s if n == 0 else now_s
@@ -191,7 +191,7 @@ class BoardLink:
 
     def _clock_jumped(self, now_s: float) -> None:
         self.counts["clock_jumps"] += 1
-        self._doubted = DOUBTED_SCANS
+        self._check.doubt()
         self._restart(now_s, "the board's clock jumped, or runs wrong by more than 1 ms/s: asking it again")
 
     def _switching(self, now_s: float) -> bytes:
@@ -204,7 +204,7 @@ class BoardLink:
 
     def _to(self, now_s: float, state: str) -> None:
         self.state, self._since, self._due_s, self._tries = state, now_s, now_s, 0
-        self._heard_s, self._start_s, self._impossible = now_s, None, 0
+        self._heard_s, self._start_s = now_s, None
         if state == "start":
             self._started = self._wanted = self.scanning
         if state == "hello":
@@ -256,11 +256,11 @@ class BoardLink:
             if self._tries:  # of a switch: scans go on being counted
                 self._tries = 0
             else:
-                self._order.started(ack.device_us)  # a START sent twice: scans count from 0 again
+                self._check.started(ack.device_us)  # a START sent twice: scans count from 0 again
 
     def _begin(self, ack: link.Ack, asked_s: float | None, now_s: float) -> None:
         """START was carried out: what comes now is from after it, and its answer says what the board's clock shows."""
-        self._order.started(ack.device_us)
+        self._check.started(ack.device_us)
         self._questions.begin(now_s)
         self._heard_us = ack.device_us
         if ack.device_us and asked_s is not None:
@@ -302,31 +302,16 @@ class BoardLink:
         if self.state != "running" or not ours:
             self.counts["foreign"] += 1
             return False
-        missing = self._order.missing(scan)
-        if missing < 0:  # repeated or older. If the board began anew without a word, it counts as silent
-            self.counts["repeated"] += 1
-            return False
-        ended_us, arrived_ns = scan.device_us + scan.duration_us, _ns(first_byte_s)
-        if not self._order.consistent(scan) or not self.clock.possible(ended_us, arrived_ns):
-            self.counts["foreign"] += 1  # captured from before, or of a clock that jumped
-            self._impossible += 1
-            if self._impossible >= IMPOSSIBLE_SCANS:
-                self._clock_jumped(now_s)
-            return False
-        self._impossible = 0
-        self._order.take(scan)
-        self._heard_us = max(self._heard_us, ended_us)
         # The first byte leaves as the scan ends; the last one as much later as the line is slow.
-        self.clock.observe(ended_us, arrived_ns, fit=scan.config == self.scanning.config)
-        self.reasons[scan.seq] = ["gap"] if missing else []
-        if self._doubted:
-            self._doubted -= 1
-            self.reasons[scan.seq].append("clock")
-        if self.frozen(scan):
-            self.reasons[scan.seq].append("frozen")
-            self.counts["frozen"] += 1
-        self.counts["missing"] += missing
-        self.counts["scans"] += 1
+        what = self._check(scan, _ns(first_byte_s), fit=scan.config == self.scanning.config)
+        self.counts[what] += 1
+        if self._check.jumped:
+            self._clock_jumped(now_s)
+        if what != "scans":
+            return False
+        self._heard_us = max(self._heard_us, scan.device_us + scan.duration_us)
+        self.counts["missing"] += self._check.missing
+        self.counts["frozen"] += self._check.frozen
         return True
 
     def _why_no_answer(self) -> str:

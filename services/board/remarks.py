@@ -38,7 +38,7 @@ class Remarks:
                 levels[UNTIMED] = "WARN"
             if board.clock_unknown:
                 levels[UNKNOWN] = "ERROR"
-            if board.frozen.frozen:
+            if board.frozen:
                 levels[FROZEN] = "ERROR"
         if now_s - self._stood_still[0] < REMEMBERED_S:
             levels[self._stood_still[1]] = "WARN"

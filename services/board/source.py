@@ -32,6 +32,8 @@ INTRODUCE_S = 0.6  # for a board under another name to say who it is
 COUNT_EVERY_S = 0.1
 MOST_WAITING = 4_000_000  # bytes read in one go after a standstill
 
+LOG_AGAIN_S = 10.0  # the same trouble that comes and goes is logged at most so often
+
 log = logging.getLogger(__name__)
 
 
@@ -72,6 +74,7 @@ class BoardSource(Source):
         super().__init__(name, skin, bundle)
         self.host = host or HostTime()
         self.remarks = Remarks()
+        self._logged: dict[str, float] = {}  # what was logged lately, and when
         self.scanning = Scanning(bundle.pattern, skin.dft_points, skin.rtia_ohm)
         self.idling: Scanning | None = None
         self._verdicts: NewestReader | None = None  # what preprocessing makes of the frames
@@ -243,11 +246,14 @@ class BoardSource(Source):
         """Say what is the matter, once each time it changes."""
         if problem == self.problem:
             return
+        self.problem, now = problem, self._now()
+        if now - self._logged.get(problem, -LOG_AGAIN_S) < LOG_AGAIN_S:
+            return
+        self._logged = {text: t for text, t in self._logged.items() if now - t < LOG_AGAIN_S} | {problem: now}
         if problem:
             log.warning("%s: %s", self.name, problem)
         else:
             log.info("%s: the board is running", self.name)
-        self.problem = problem
 
     def _count(self, board: BoardLink, seen: Counter[str], adaptive: AdaptiveScan | None) -> None:
         """Add what is new in the connection's counts to ours."""

@@ -13,14 +13,15 @@ from models.bundle import Bundle
 from protocol import link
 from protocol.frames import RawFrame
 from services.acquisition import SourceFeed
-from services.board.boardlink import DOUBTED_SCANS, BoardLink
+from services.board.boardlink import BoardLink
 from services.board.clock import MAX_RATE_ERROR, WIDE_NS, DeviceClock
 from services.board.frozen import FROZEN, PROOF, FrozenScans
 from services.board.host_time import HostTime
 from services.board.remarks import FROZEN as FROZEN_TEXT
 from services.board.remarks import UNKNOWN, UNTIMED
+from services.board.scan_check import DOUBTED_SCANS
 from services.board.scan_order import ScanOrder
-from services.board.source import Source
+from services.board.source import BoardSource, Source
 from services.board.time_questions import ASK_EVERY_S, TimeQuestions
 from services.config import Skin
 from tests.services.fake_board import FakeBoard
@@ -307,3 +308,14 @@ def test_frames_that_wait_while_the_machine_sleeps_are_dropped(skin: Skin, bundl
         assert feed.recv() is None
     finally:
         feed.close()
+
+
+def test_trouble_that_comes_and_goes_is_logged_once(
+    skin: Skin, bundle: Bundle, caplog: pytest.LogCaptureFixture
+) -> None:
+    source = BoardSource("palm", skin, bundle, DelayedLine(1))
+    with caplog.at_level("INFO", logger="services.board.source"):
+        for _ in range(50):
+            source._trouble("the board's clock jumped")
+            source._trouble("")
+    assert len(caplog.records) == 2
