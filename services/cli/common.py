@@ -77,7 +77,8 @@ def config_file() -> Path:
 def _configuration() -> dict[str, Any]:
     """The configuration as it stands, unchecked; empty where there is none."""
     try:
-        return tomllib.loads(read_text(config_file()))
+        found = tomllib.loads(read_text(config_file()))
+        return found if isinstance(found.get("skins", {}), dict) else {}
     except (FileError, ValueError, RecursionError):
         return {}
 

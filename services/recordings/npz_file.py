@@ -17,6 +17,8 @@ from models.files import FileError
 
 Array = NDArray[np.float64]
 
+LEAST = 1e-60
+"""|Z| below this is no measurement, in whatever unit."""
 TARE_ROWS = 64
 """Rows of `reference` that come first as frames, from which the noise is found."""
 
@@ -77,6 +79,7 @@ def frames_of(data: Input) -> Iterator[tuple[NDArray[Any], str]]:
 def _amplitudes(arrays: Mapping[str, NDArray[Any]], name: str, k: int) -> Array:
     """|Z| (n, K), of which enough can be compared with: a baseline of fewer than half the measurements is none."""
     a: Array = np.abs(_matrix(arrays, name, k)).astype(float)
+    a[a < LEAST] = 0.0  # squares of what is that small are nothing
     usable = int((np.isfinite(a) & (a > 0)).any(axis=0).sum())
     if usable < k / 2:
         raise InputError(
