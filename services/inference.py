@@ -34,6 +34,8 @@ class Inference(Stage):
         self.config, self.bundle = skin, bundle
         path = None if skin.network == "none" else bundle.network_path(skin.network) or bundle.network_path("full")
         self._network = network(str(path)) if path else OneStep(bundle)
+        if isinstance(self._network, Network):
+            self._network.check(bundle)
         # Only a network's image is meant to explain a frame: a one-step image shows where, not how much.
         self._refuses = isinstance(self._network, Network)
         self._residual = Residual(bundle, to_scale=self._refuses)

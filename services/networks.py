@@ -13,13 +13,13 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from models.bundle import Bundle
+from models.bundle import Bundle, BundleError
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame
 
 WARM_UP_RUNS = 5
 FEWEST_SIGMA = 2  # finite measurements without which there is nothing to reconstruct
-OUTPUTS = ("drop", "log_sigma", "classes")
+INPUTS, OUTPUTS = ("stack", "context"), ("drop", "log_sigma", "classes")
 
 Pictures = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 """Conductivity drop (H, W) and its sigma (H, W) or (0, 0) [S/m], class probabilities (5, h, w) or (0, 0, 0)."""
@@ -39,10 +39,26 @@ class Network:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-        inputs = {i.name: [d if isinstance(d, int) else 1 for d in i.shape] for i in self.session.get_inputs()}
-        for _ in range(WARM_UP_RUNS):
-            self.session.run(None, {name: np.zeros(shape, np.float32) for name, shape in inputs.items()})
+        try:
+            self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            inputs = {i.name: [d if isinstance(d, int) else 1 for d in i.shape] for i in self.session.get_inputs()}
+            for _ in range(WARM_UP_RUNS):
+                self.session.run(OUTPUTS, {name: np.zeros(inputs[name], np.float32) for name in INPUTS})
+        except Exception as why:  # ONNX Runtime has a dozen kinds of them, none of which it documents
+            raise BundleError(
+                f"{path} is no network that can be run ({str(why).splitlines()[0][:160]}): build the bundle again"
+            ) from None
+        self.stack = tuple(inputs["stack"][1:])
+
+    def check(self, bundle: Bundle) -> None:
+        """Raises BundleError where the bundle's matrices make another input than this network reads."""
+        m = bundle.matrices
+        made = (len(m.ladder), *m.inside.shape)
+        if self.stack != made:
+            raise BundleError(
+                f"{bundle.path}: its network reads {list(self.stack)}, its matrices make {list(made)}: "
+                "build the bundle again"
+            )
 
     def run(self, frame: DeltaFrame) -> Pictures:
         drop, log_sigma, logits = self.session.run(

@@ -82,6 +82,9 @@ def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
     except InputError as why:
         raise RegistrationError(str(why)) from None
     touched, untouched, xy = (np.asarray(arrays[name]) for name in ("touched", "untouched", "xy"))
+    for name in ("touched", "untouched", "xy", "depth"):
+        if name in arrays and arrays[name].dtype.kind not in ("iufc" if "touched" in name else "iuf"):
+            raise RegistrationError(f"{name} is {arrays[name].dtype}, expected numbers")
     if touched.shape != untouched.shape or touched.ndim != 2 or touched.shape[1] != len(order):
         raise RegistrationError(
             f"touched {touched.shape} and untouched {untouched.shape}: "
@@ -100,7 +103,7 @@ def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
 
 def part(arrays: Mapping[str, NDArray[Any]], rows: slice) -> dict[str, NDArray[Any]]:
     """The same arrays with some of their presses."""
-    return {name: a if name == "pattern" else a[rows] for name, a in arrays.items()}
+    return {name: a[rows] if name in ("touched", "untouched", "xy", "depth") else a for name, a in arrays.items()}
 
 
 def _strength(arrays: Mapping[str, NDArray[Any]], difference: Array) -> Array:

@@ -130,11 +130,12 @@ def _configuration() -> dict[str, Any]:
     """The configuration as it stands, unchecked; CliError where there is none that can be read."""
     file = config_file()
     try:
-        return tomllib.loads(read_text(file))
+        found = tomllib.loads(read_text(file))
     except FileError as why:
         fail(f"{why}; name the configuration with --config", USAGE)
     except (ValueError, RecursionError) as why:
         fail(f"{file}: is not TOML: {why}", USAGE)
+    return found if isinstance(found.get("skins", {}), dict) else {}
 
 
 def skin_name(given: str) -> str:

@@ -19,6 +19,8 @@ from services.baseline.references import alike
 
 Array = NDArray[np.float64]
 
+LEAST = 1e-60
+"""|Z| below this is no measurement, in whatever unit."""
 TARE_ROWS = 64
 """Rows of `reference` that come first as frames, from which the noise is found: those most alike, in whatever order the
 rows stand.
@@ -126,6 +128,7 @@ def _key(row: list[int]) -> tuple[int, int, frozenset[int]]:
 def _amplitudes(arrays: Mapping[str, NDArray[Any]], name: str, k: int) -> Array:
     """|Z| (n, K), of which enough can be compared with: a baseline of fewer than half the measurements is none."""
     a: Array = np.abs(_matrix(arrays, name, k)).astype(float)
+    a[a < LEAST] = 0.0  # squares of what is that small are nothing
     usable = int((np.isfinite(a) & (a > 0)).any(axis=0).sum())
     if usable < k / 2:
         raise InputError(

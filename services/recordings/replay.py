@@ -212,6 +212,8 @@ class Replayer:
             if error.kind in ("unreachable", "timeout"):
                 raise ReplayError(str(error)) from None
             self.warnings.append(f"{process} could not {command} the recorded state: {error}")
+        except (ValueError, OverflowError) as error:  # nested deeper than msgpack packs
+            self.warnings.append(f"the recorded state of {process} cannot be sent: {error}")
 
     def _report(self) -> None:
         """A status a second, as every process gives."""

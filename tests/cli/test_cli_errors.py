@@ -140,3 +140,25 @@ def test_a_damaged_configuration_is_explained(skin, tmp_path, monkeypatch) -> No
     assert ran.code == 2 and "skins.palm.port" in ran.err
     ran = skin("doctor")
     assert ran.code == 1 and ran.out.startswith("FAIL  configuration")
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "says"),
+    [
+        ("touched", np.full((25, 192), "a"), "touched is <U1, expected numbers"),
+        ("xy", np.full((25, 2), "a"), "xy is <U1, expected numbers"),
+        ("depth", np.full(25, 1j), "depth is complex128, expected numbers"),
+        ("touched", np.array(3.0), "touched ()"),
+    ],
+)
+def test_register_refuses_arrays_that_are_no_presses(skin, tmp_path, name, array, says) -> None:  # type: ignore[no-untyped-def]
+    arrays = {"touched": np.ones((25, 192)), "untouched": np.ones((25, 192)), "xy": np.zeros((25, 2)), name: array}
+    ran = skin("register", npz(tmp_path / "in.npz", **arrays), "--skin", "disc16", "--out", tmp_path / "out")
+    assert ran.code == 2 and says in ran.err and len(ran.err.splitlines()) == 1, ran.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_untouched_frame_too_small_to_square_is_refused(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    arrays = {**GOOD, "untouched": np.full((8, K), 5e-324)}
+    ran = skin("reconstruct", npz(tmp_path / "in.npz", **arrays), tmp_path / "out.npz", "--skin", "square16")
+    assert ran.code == 2 and "in 0 of 120 columns" in ran.err

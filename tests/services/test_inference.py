@@ -177,6 +177,34 @@ def test_a_bundle_that_was_tampered_with_is_refused(networked: Bundle, tmp_path:
     assert onnx.__version__
 
 
+@pytest.mark.parametrize("content", [b"", b"no network", network()[:200]])
+def test_a_file_that_is_no_network_is_an_error_of_the_bundle(
+    skin: Skin, bundle: Bundle, tmp_path: Path, content: bytes
+) -> None:
+    from models.bundle import BundleError
+
+    manifest = {k: v for k, v in bundle.manifest.items() if k not in ("schema", "files")}
+    made = write(tmp_path / "b", manifest, bundle.matrices, {"full": content})
+    with pytest.raises(BundleError, match="network.onnx is no network that can be run"):
+        Inference("palm", skin.model_copy(update={"network": "full"}), made)
+
+
+def test_a_network_of_other_inputs_than_the_matrices_make_is_refused(
+    skin: Skin, networked: Bundle, tmp_path: Path
+) -> None:
+    import dataclasses
+
+    from models.bundle import BundleError
+
+    m = networked.matrices
+    fewer = dataclasses.replace(m, ladder=m.ladder[:5], level=m.level[:5])
+    manifest = {k: v for k, v in networked.manifest.items() if k not in ("schema", "files", "prior", "image")}
+    image = {k: v for k, v in networked.manifest["image"].items() if k != "stack"}
+    made = write(tmp_path / "b", {**manifest, "image": image}, fewer, {"full": network()})
+    with pytest.raises(BundleError, match=r"reads \[9, 24, 24\], its matrices make \[5, 24, 24\]"):
+        Inference("palm", skin.model_copy(update={"network": "full"}), made)
+
+
 def test_what_a_touch_needs_is_made_while_nothing_touches(
     skin: Skin, networked: Bundle, board: Board, monkeypatch: pytest.MonkeyPatch
 ) -> None:
