@@ -110,7 +110,7 @@ def explain(url: str, why: Exception) -> str:
         return f"{url} is held by another program: close that one (`fuser {url}` names it)"
     if number == 2 or "No such file" in text:
         if url.startswith(str(runtime_dir() / STUB_LINKS)):
-            return "the stub board is not there yet: `skin up` starts it, or `python -m firmware_stub`"
+            return "waiting for the stub board, which `skin up` starts"
         return f"{url} is not there: plug the board in, or correct `port` in skin.toml"
     if number == 13 or "Permission denied" in text:
         return f"{url} may not be opened: add yourself to its group (`ls -l {url}`; usually dialout) and log in again"
