@@ -140,8 +140,22 @@ class Admission:
         """All that may connect: who holds our own secret key, clients, operators."""
         return frozenset({self.own, *self.clients.keys(), *(self.operators.keys() if self.operators else ())})
 
+    let_in: set[bytes] = field(default_factory=set, compare=False)
+    """Keys that connected."""
+
     def allows(self, key: bytes) -> bool:
+        """Whether this key may connect now, or stay."""
         return key in self.keys()
+
+    def admit(self, key: bytes) -> bool:
+        """The same at a handshake: noted in `let_in`, before it is decided, lest a key that is taken away just now be
+        forgotten.
+        """
+        self.let_in.add(key)
+        if not self.allows(key):
+            self.let_in.discard(key)
+            return False
+        return True
 
     def operates(self, key: bytes) -> bool:
         """Whether this key may change something."""

@@ -40,7 +40,6 @@ class Listening:
         self._guarded = False
         self.socket: Socket = transport.bind(context, kind, address, options, self.admission)
         self._file = self._inode()
-        self._admitted = self.admission.keys() if self.admission else frozenset()
         self._checked = time.monotonic()
         self._trouble, self._until = "", 0.0
         self._unbound = ""
@@ -65,7 +64,10 @@ class Listening:
         if now - self._checked < (self._retry_s if self._unbound else CHECK_S):
             return False
         self._checked = now
-        trouble = self._wrong()
+        if trouble := self._unlisted() or self._trouble * bool(self._unbound):
+            self.reopen(trouble)
+            return True
+        trouble = self._robbed()
         if not trouble:
             if now - self._mended > 2 * LONGEST_RETRY_S:
                 self._retry_s = CHECK_S
@@ -77,22 +79,23 @@ class Listening:
         self.reopen(trouble)
         return True
 
-    def _wrong(self) -> str:
-        if self._unbound:
-            return self._trouble
-        if self._file is not None and (found := self._inode()) != self._file:
-            path = self.address.removeprefix("ipc://")
-            if found is None:
-                return f"the socket file {path} was deleted; it is there again"
-            owner = transport.listener(self.address)
-            who = f"process {owner}" if owner else "another process"
-            return f"{who} put its own socket at {path}; we took it back: end that process, its readers still read it"
-        if self.admission is not None:
-            keys, before = self.admission.keys(), self._admitted
-            self._admitted = keys
-            if before - keys:
-                return f"{len(before - keys)} key(s) were taken from the list: who held them was disconnected"
-        return ""
+    def _robbed(self) -> str:
+        """What has become of the socket's file; "" while it is there."""
+        if self._file is None or (found := self._inode()) == self._file:
+            return ""
+        path = self.address.removeprefix("ipc://")
+        if found is None:
+            return f"the socket file {path} was deleted; it is there again"
+        owner = transport.listener(self.address)
+        who = f"process {owner}" if owner else "another process"
+        return f"{who} put its own socket at {path}; we took it back: end that process, its readers still read it"
+
+    def _unlisted(self) -> str:
+        """How many keys may no longer connect, though they have; "" where none."""
+        if self.admission is None:
+            return ""
+        gone = self.admission.let_in - self.admission.keys()
+        return f"{len(gone)} key(s) were taken from the list: who held them was disconnected" if gone else ""
 
     def shed(self, peer: str, what: str) -> None:
         """Disconnect everybody, and let `peer`, who did too much of `what`, in no more for a while."""
@@ -111,6 +114,8 @@ class Listening:
         self._trouble, self._until = trouble, time.monotonic() + SPOKEN_OF_S
         self._mended = time.monotonic()
         self.socket.close(0)
+        if self.admission is not None:
+            self.admission.let_in.clear()
         deadline = time.monotonic() + BIND_S
         while True:
             try:

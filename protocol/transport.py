@@ -164,7 +164,7 @@ def bind(
             socket.curve_publickey, socket.curve_secretkey = admitted.own, admitted.secret
             socket.curve_server = True
         if admitted is not None or guarded:
-            gate(context).guard(socket, secrets.token_hex(8), admitted.allows if admitted is not None else None)
+            gate(context).guard(socket, secrets.token_hex(8), admitted.admit if admitted is not None else None)
         taken_by(address)
         socket.bind(address)
     except zmq.ZMQError as bad:
