@@ -11,8 +11,6 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from models.files import FileError, read_text
-
 ROOT = Path(__file__).resolve().parents[2]
 FAILED, USAGE, NOT_RUNNING = 1, 2, 3
 """Exit codes: it did not work, the request itself is wrong, no service answers."""
@@ -76,6 +74,8 @@ def config_file() -> Path:
 
 def _configuration() -> dict[str, Any]:
     """The configuration as it stands, unchecked; empty where there is none."""
+    from models.files import FileError, read_text
+
     try:
         found = tomllib.loads(read_text(config_file()))
         return found if isinstance(found.get("skins", {}), dict) else {}
