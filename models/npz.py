@@ -71,7 +71,7 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> NDArr
         read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
         shape, fortran, dtype = read(member)
         if dtype.kind not in "biufcU" or dtype.hasobject:
-            raise FileError(f"{name}: array {entry.filename!r} is of dtype {dtype}, expected numbers")
+            raise FileError(f"{name}: array {entry.filename!r} is {dtype}, expected numbers")
         if len(shape) > MAX_DIMENSIONS or any(n < 0 for n in shape):
             raise ValueError(shape)
         size, left = dtype.itemsize * math.prod(shape), entry.file_size - member.tell()

@@ -15,8 +15,6 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from models.files import FileError, read_text
-
 ROOT = Path(__file__).resolve().parents[2]
 FAILED, USAGE, NOT_RUNNING = 1, 2, 3
 """Exit codes: it did not work, the request itself is wrong, no service answers."""
@@ -128,6 +126,8 @@ def config_file() -> Path:
 
 def _configuration() -> dict[str, Any]:
     """The configuration as it stands, unchecked; CliError where there is none that can be read."""
+    from models.files import FileError, read_text
+
     file = config_file()
     try:
         found = tomllib.loads(read_text(file))
