@@ -6,9 +6,12 @@ One service for all, started in a copy of the checkout. `-m slow` is what .ci/ru
 from __future__ import annotations
 
 import contextlib
+import os
 import re
+import shutil
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -180,7 +183,7 @@ def test_what_is_tried_elsewhere_is() -> None:
 
 @pytest.mark.slow
 def test_make_up_from_nothing() -> None:
-    """The first command of README, in a copy with no virtual environment; what needs that service beside it."""
+    """The first command of README, in a copy with no virtual environment; what it did not install says so."""
     with world(installed=False) as place, serving(place, "make up", start_s=900):
         assert (place.checkout / ".venv" / ".service").is_file()
         for command in ("./skin press --x 0.02 --y -0.01 --force 3", "./skin compare --seconds 2"):
@@ -189,11 +192,18 @@ def test_make_up_from_nothing() -> None:
         for command in (".venv/bin/python -m bench.picture", "./skin bench accuracy"):
             ran = place.ends(command)
             assert ran.code != 0 and "make venv-dev" in ran.out and "Traceback" not in ran.out, ran.out
-        for snippet in shown("slow"):
-            row = the_row(snippet)
-            if snippet.text.startswith("g++"):
-                ran = place.runs(place.typed(snippet.text, row.instead), row.says)
-                assert re.search(row.says, ran.out, re.MULTILINE), ran.out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("snippet", [s for s in shown("slow") if s.text.startswith("g++")], ids=str)
+def test_the_cpp_line(place: World, untouched: None, snippet: Snippet) -> None:
+    headers = [Path("/usr/include", name) for name in ("zmq.hpp", "msgpack.hpp")]
+    if not (shutil.which("g++") and all(header.is_file() for header in headers)):
+        message = "C++ LINE OF README NOT TRIED: apt-get install g++ cppzmq-dev libmsgpack-cxx-dev"
+        pytest.fail(message) if os.environ.get("EITSKIN_REQUIRE_CPP") else pytest.skip(message)
+    row = the_row(snippet)
+    ran = place.runs(place.typed(snippet.text, row.instead), row.says)
+    assert re.search(row.says, ran.out, re.MULTILINE), ran.out
 
 
 @pytest.mark.slow
