@@ -84,7 +84,7 @@ def run_gains(setting: Setting) -> dict[str, gain_steps.Score]:
     """By situation, and by situation and gain."""
     tasks: list[GainTask] = [
         (setting.bundle, gain, situation, touch, setting.seed + k)
-        for k, touch in enumerate(touches_at_random(setting.gain_places, setting.seed))
+        for k, touch in enumerate(gain_steps.places(setting.gain_places, setting.seed))
         for gain in gain_steps.GAINS
         for situation in gain_steps.SITUATIONS
     ]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bench.reliability.direct import DirectSkin
-from bench.reliability.scenes import SolvedSheet
+from bench.reliability.scenes import SolvedSheet, circle, touches_at_random
 from bench.reliability.session import Moment
 from firmware_stub.world import Touch, World
 from services.pipeline import Pipeline
@@ -21,6 +21,11 @@ REST, HELD = 110, 25  # full scans before the step; those that the touch is held
 LASTS, AFTER = 230, 60  # 10 s of the gain, and what follows
 AGAIN_S = 2.0
 WELL_FRAMES = 5
+
+
+def places(count: int, seed: int) -> list[Touch]:
+    """The first is one whose image a small gain splits most."""
+    return [circle(0.01, 0.01, 3.0, 0.2), *touches_at_random(count - 1, seed)]
 
 
 @dataclass
