@@ -20,10 +20,13 @@ from .transport import Context, Socket
 SEND_QUEUE = 100
 """Messages held for a subscriber that does not read (100 images: 4 MB); its further ones are dropped, nobody else's."""
 
-RECEIVE_QUEUE = 100
-"""Subscriptions held that we have not yet taken in, for each subscriber; it waits with its further ones."""
+RECEIVE_QUEUE = 4
+"""Subscriptions held that we have not yet taken in, for each subscriber; it waits with its further ones. With 100
+libzmq took in a whole flood at one call, before we could count it: 100 MB instead of 20. With 1 readers did not come
+back after the socket was opened anew.
+"""
 
-MAX_SUBSCRIPTION = 1024
+MAX_SUBSCRIPTION = 640
 """Longest subscription in bytes (a topic has 50 at most, a handshake with keys some 400); who sends more is cut off."""
 
 MOST_PREFIXES = 4096
