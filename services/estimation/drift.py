@@ -1,4 +1,4 @@
-"""How an untouched skin changes over time: the sheet's conductivity, 16 contact impedances, and creep, each with its rate.
+"""How an untouched skin changes over time: the sheet's conductivity, contact impedances and creep, each with its rate.
 
 Each quantity is a random motion with friction and a spring, critically damped (an Ornstein-Uhlenbeck process of its
 value and rate; its covariance over time is Matern's with smoothness 3/2):
@@ -37,7 +37,7 @@ class DriftProcess:
     def of_skin(cls, electrodes: int, creep: bool = True, tuning: Tuning = TUNING) -> DriftProcess:
         """Scale, contacts, and (last) creep."""
         sd = [tuning.scale_sd, *[tuning.contact_sd] * electrodes, *[tuning.creep_sd] * creep]
-        time_s = [tuning.scale_s, *[tuning.contact_s] * electrodes, *[tuning.creep_s] * creep]
+        time_s = [*[tuning.drift_s] * (1 + electrodes), *[tuning.creep_s] * creep]
         return cls(np.array(sd), np.array(time_s))
 
     def transition(self, dt: float) -> Array:
