@@ -1,7 +1,7 @@
 """A scripted scene through the stub board and the host's end of its line in simulated time: raw frames, their truth.
 
 Only the operating system is left out: the board's bytes go through the link's decoder, its state machine and the clock
-regression of acquisition; they are read at most READ_LATE_S late. What comes out is kept in bench/work, by a hash of
+regression of acquisition (bench/_host.py). What comes out is kept in bench/work, by a hash of
 the scene and of the code that made it.
 """
 
@@ -17,17 +17,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bench._host import Felt, Host
 from firmware_stub import scene as scenes
 from firmware_stub.rig import Rig
 from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import Script
 from firmware_stub.world import NEWTON, World
-from models.bundle import Bundle
 from protocol.frames import RawFrame
-from services.board.boardlink import BoardLink
-from services.board.clock import DeviceClock
-from services.board.source import BoardSource
-from services.config import Skin
 
 ROOT = Path(__file__).resolve().parents[1]
 WORK = Path(__file__).with_name("work")
@@ -38,7 +34,6 @@ MADE_BY = (
 )
 LAYOUT = 1  # of what is kept: raised when Recorded or what fills it changes
 KEPT = 6  # recorded scenes
-READ_LATE_S = 0.002  # a scheduler's doing
 CONTACT_CHANGED = 0.05  # of its impedance within a second: a contact that drifts, not one that ages
 ELECTRODE_FAULTS = ("electrode_open", "electrodes_shorted", "electrodes_swapped", "mux_stuck", "mux_disabled")
 TOUCHES = ("track", "x", "y", "force", "radius", "area")  # of one true touch; x, y: its area's centroid [m], area [m^2]
@@ -118,56 +113,46 @@ def simulate(name: str, snr_db: float, seed: int, seconds: float | None = None, 
     """Play a scene (name or path) to its end, or for so many seconds."""
     rig = Rig(sheet or "square16", scene=name, snr_db=snr_db, seed=seed)
     script = rig.field.timeline.script
-    host = _Host(rig, seed)
+    recorder = _Recorder(rig, seed)
     end = min(seconds or script.duration, script.duration)
     said = 0.0
-    while host.now < end:
-        host.step()
-        if host.now > said + 30:
-            said = host.now
+    while (now := recorder.host.now) < end:
+        recorder.step()
+        if now > said + 30:
+            said = now
             print(f"simulated {said:.0f} of {end:.0f} s, {rig.field.solves} solves", file=sys.stderr)
     rig.close()
-    return host.recorded(script)
+    return recorder.recorded(script)
 
 
-class _Host:
-    """Acquisition without threads: a rig, the link to it, and what came of it."""
+class _Recorder:
+    """What came of a host's steps."""
 
     def __init__(self, rig: Rig, seed: int) -> None:
-        self.rig, self.now = rig, 0.0
-        skin, bundle = Skin(port="stub", bundle="square16"), Bundle.load("square16")
-        self.source = BoardSource("palm", skin, bundle)
-        self.link, self.clock = BoardLink(self.source.scanning, 0.0), DeviceClock()
-        self._rng = np.random.default_rng([seed, 7])
-        self._felt: dict[int, tuple[float, float, World, dict[str, object]]] = {}
+        self.rig, self.host = rig, Host(rig, seed)
+        self._felt: list[Felt] = []
         self._frames: list[RawFrame] = []
 
     def step(self) -> None:
-        """To when the board has something to do next, and a little later."""
-        self.now += max(1e-3, min(self.rig.wake_s(self.now), 0.02)) + READ_LATE_S * float(self._rng.random()) ** 2
-        if due := self.link.to_send(self.now):
-            self.rig.feed(due, self.now)
-        data = self.rig.pull(self.now)
-        while self.rig.scans:
-            scan, world, middle = self.rig.scans.popleft()
-            in_force = {k: v for k, v in self.rig.faults.listing(scan.start).items() if k in ELECTRODE_FAULTS}
-            self._felt[scan.seq] = scan.start, middle, world, in_force
-        read_ns = round(self.now * 1e9)
-        for scan in self.link.received(data, self.now) if data else []:
-            self._frames.append(self.source.raw_frame(scan, self.link, self.clock, read_ns))
+        for frame, felt in self.host.step():
+            self._frames.append(frame)
+            self._felt.append(felt)
 
     def recorded(self, script: Script) -> Recorded:
-        felt = [self._felt[frame.scan] for frame in self._frames]
-        drifting = _drifting(script, [start for start, *_ in felt])
-        faults = [in_force | drifts for (*_, in_force), drifts in zip(felt, drifting, strict=True)]
-        rows = [row for k, (start, _, world, _) in enumerate(felt) for row in self._touches(script, k, start, world)]
-        names = [([name for t, name in script.sections if t <= middle] or [""])[-1] for _, middle, _, _ in felt]
+        felt = self._felt
+        drifting = _drifting(script, [f.start for f in felt])
+        faults = [
+            {k: v for k, v in f.faults.items() if k in ELECTRODE_FAULTS} | drifts
+            for f, drifts in zip(felt, drifting, strict=True)
+        ]
+        rows = [row for k, f in enumerate(felt) for row in self._touches(script, k, f.start, f.world)]
+        names = [([name for t, name in script.sections if t <= f.middle] or [""])[-1] for f in felt]
         column = lambda of: np.array([of(frame) for frame in self._frames])  # noqa: E731
         return Recorded(
             z=column(lambda f: f.z),
             status=column(lambda f: f.status),
             scan=column(lambda f: f.scan),
-            seconds=np.array([middle for _, middle, _, _ in felt]),
+            seconds=np.array([f.middle for f in felt]),
             sample_ns=column(lambda f: f.stamps["sample"]),
             sigma_ns=column(lambda f: f.sample_sigma_ns),
             read_ns=column(lambda f: f.stamps["read"]),

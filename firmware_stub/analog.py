@@ -190,6 +190,8 @@ class Analog:
         z = impedance(registers[:, :2], registers[:, 2:], rtia) / (INPUT_GAIN * self._gain)
         if (stale := self.faults.active("stale_rtia", now)) is not None:
             z = z * (stale["gain"] * np.exp(1j * stale["phase"]))
+        if (gain := self.faults.active("gain", now)) is not None:
+            z = z * gain["factor"]
         z = np.where(np.isfinite(z), z, OVERRANGE)
         return (z * np.minimum(1.0, OVERRANGE / np.maximum(np.abs(z), 1e-12))).astype(np.complex64), status
 

@@ -41,6 +41,10 @@ FAULTS: dict[str, Fault] = {
         "RTIA is not what was calibrated: all impedances times `gain`, turned by `phase` rad",
         {"gain": 1.05, "phase": 0.02},
     ),
+    "gain": Fault(
+        "an amplifier's gain jumps between two scans: all impedances times `factor`, nothing else, no status bits",
+        {"factor": 1.006},
+    ),
     "clipped": Fault(
         "the voltage channel is `gain` times too sensitive and clips: plausible, low Z; with `silent` no status bits",
         {"gain": 4.0, "silent": False},

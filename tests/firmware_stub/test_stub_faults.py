@@ -114,6 +114,22 @@ def test_stale_rtia_until_the_self_test_calibrates(running):
     assert np.abs(board.z(0.2)[-1] / healthy - 1).max() < 5e-4
 
 
+@pytest.mark.parametrize("factor", [0.95, 1.001, 1.05])
+def test_a_gain_multiplies_every_impedance_from_one_scan_to_the_next(running, factor):
+    board, healthy = running
+    begin = board.now
+    board.rig.fault("gain", {"factor": factor}, begin, SECONDS)
+    frames = board.frames(SECONDS + 0.2)
+    ratios = np.abs([f.z for f in frames]) / healthy
+    first, last = (board.rig.board.device_us(t) for t in (begin, begin + SECONDS))
+    there = np.array([first <= f.device_us + f.duration_us and f.device_us < last for f in frames])
+    assert 8 <= there.sum() < len(frames)
+    assert np.abs(ratios[there] / factor - 1).max() < 5e-4  # whole scans: none is half of each
+    assert np.abs(ratios[~there] - 1).max() < 5e-4
+    assert not any(f.status.any() for f in frames)
+    assert np.angle(frames[1].z).mean() == pytest.approx(-0.03, abs=1e-3)
+
+
 def test_missed_interrupt_repeats_the_result_before(running):
     board, healthy = running
     frame = during(board, "missed_interrupt", fraction=0.3)[-1]
