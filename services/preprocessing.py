@@ -94,7 +94,8 @@ class Preprocessing(Stage):
         if self.untouched.offer(amplitude, frame):
             self._begin_anew()
         if self.untouched.baseline is None:
-            return [_unusable(out, "stale_baseline", len(amplitude))]
+            reason = "touched_at_start" if self.untouched.touched_at_start else "stale_baseline"
+            return [_unusable(out, reason, len(amplitude))]
         if self.untouched.baseline.doubt:
             out.valid = False
             add_reason(out.reasons, "stale_baseline")

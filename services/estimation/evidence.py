@@ -23,6 +23,7 @@ from services.estimation.tuning import TUNING, Tuning
 
 Array = NDArray[np.float64]
 
+FITS = 10.0  # times the noise's energy: touches leave up to 5, faults hundreds
 NEGLIGIBLE = 12.0  # nats below the likeliest disc: numerics, not physics
 
 
@@ -43,11 +44,18 @@ class Explanation(NamedTuple):
     touches: tuple[Found, ...]
     drift: Array  # (N,) posterior mean, touches given
     drift_covariance: Array  # (N, N)
+    left: float  # energy that drift and touches leave, whitened: about the number of measurements where they explain
+    count: int  # of measurements
 
     @property
     def odds(self) -> float:
         """Log evidence of touched against untouched."""
         return self.touched - self.untouched
+
+    @property
+    def fits(self) -> bool:
+        """Whether drift and touches are all that there is: a fault is not explained by them."""
+        return self.left < FITS * self.count
 
 
 class Whitened(NamedTuple):
@@ -107,7 +115,17 @@ class TouchEvidence:
         covariance = prior - gathered.T @ gathered + self._open(gathered.T @ atoms, weights)
         whole = np.zeros(len(d))
         whole[live] = touch
-        return Explanation(untouched, white.density(seen) + gain, whole, self._found(weights), drift, covariance)
+        rest = seen - white(touch)
+        return Explanation(
+            untouched,
+            white.density(seen) + gain,
+            whole,
+            self._found(weights),
+            drift,
+            covariance,
+            float(rest @ rest),
+            len(frame),
+        )
 
     def corrected(
         self, d: Array, error: Array, columns: Array, prior: Array, live: NDArray[np.bool_] | None = None
