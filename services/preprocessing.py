@@ -23,6 +23,7 @@ from services.baseline.tare import Baseline
 from services.baseline.untouched import Untouched
 from services.config import Skin
 from services.describe import describe
+from services.estimation.evidence import Explanation
 from services.faults.contact_drift import Reference
 from services.faults.electrodes import ElectrodeHealth, Verdict
 from services.faults.plausibility import impossible
@@ -144,6 +145,10 @@ class Preprocessing(Stage):
     def _decide(self, d: Array, amplitude: Array, live: NDArray[np.bool_], now_ns: int) -> tuple[Array, Judgement]:
         """Touched or not, and the difference, which a touch that begins has against an older baseline."""
         noise, step = self._noise(), self.judge.step
+        if not self._touched and self.judge.uncertain(self.untouched.since_s(now_ns)):
+            explained = self.untouched.explain(d, live, now_ns)
+            if explained.fits:
+                return self._decide_alone(d, amplitude, live, explained, now_ns)
         found = self.judge(d, live, noise, self.untouched.since_s(now_ns), now_ns, self._touched)
         if found.touched and not self._touched:
             self.untouched.begin_touch()
@@ -153,6 +158,18 @@ class Preprocessing(Stage):
             self.hold.reset()  # the same frames make another image now
         self._touched = found.touched
         return d, found
+
+    def _decide_alone(
+        self, d: Array, amplitude: Array, live: NDArray[np.bool_], explained: Explanation, now_ns: int
+    ) -> tuple[Array, Judgement]:
+        """The same for a frame that no untouched one precedes for long: drift is estimated in the frame itself."""
+        noise, limit = self._noise(), -float(np.log(self.config.touch.false_alarms))
+        self._touched = explained.odds > limit
+        if self._touched:
+            self.untouched.drifted(explained.drift, now_ns)
+            d = self.untouched.difference(amplitude, live)
+        found = self.judge.begin(d, live, noise, self.untouched.since_s(now_ns), now_ns, alone=self._touched)
+        return d, found._replace(touched=self._touched, score=explained.odds, threshold=limit)
 
     def _noise(self) -> Noise:
         assert self.untouched.baseline is not None

@@ -17,9 +17,11 @@ from services.baseline.creep import Creep
 from services.baseline.following import Follower
 from services.baseline.tare import Baseline, noise_of_steps, noisy, plausible_noise, take
 from services.config import Tare
-from services.estimation.evidence import TouchEvidence
+from services.estimation.drift import DriftProcess
+from services.estimation.evidence import Explanation, TouchEvidence
 from services.estimation.physics import SkinPhysics
 from services.estimation.start import Verdict, judge_start
+from services.estimation.tuning import TUNING
 from services.stage import Refused
 
 Array = NDArray[np.float64]
@@ -117,6 +119,13 @@ class Untouched:
         self.drifted(start.explanation.drift, self._last_sample_ns)
         return True
 
+    def explain(self, d: Array, live: NDArray[np.bool_], sample_ns: int) -> Explanation:
+        """A difference (K,), by drift since the last untouched frame and by touches."""
+        assert self.baseline is not None
+        physics, variance = self.evidence.physics, np.where(live, self.sigma, 0.0) ** 2 * (1 + 1 / self.baseline.frames)
+        prior = DriftProcess.of_skin(physics.electrodes, creep=False).value_covariance(self.since_s(sample_ns))
+        return self.evidence(d, np.diag(variance + TUNING.absolute**2), physics.columns(d), prior, live)
+
     def drifted(self, drift: Array, sample_ns: int) -> None:
         """Move the baseline by a drift (1 + E,) that was found under a touch, by the columns of SkinPhysics."""
         assert self.baseline is not None
@@ -126,6 +135,7 @@ class Untouched:
         self.baseline = dataclasses.replace(self.baseline, z0=z0)
         self.normaliser = self.pre.normaliser(z0)
         self.follower.begin(sample_ns, DRIFT_KNOWN_S)
+        self._run = 0
 
     def difference(self, amplitude: Array, live: NDArray[np.bool_]) -> Array:
         """d (K,) = (|Z| - |Z0|) / |Z0|, 0 where a measurement does not count."""
