@@ -153,6 +153,15 @@ class Untouched:
         self.normaliser = self.pre.normaliser(self.baseline.z0)
         self._run = 0
 
+    def rescale(self, factor: float) -> None:
+        """All measurements are so many times what they were: the board's gain stepped."""
+        assert self.baseline is not None
+        z0, sigma = self.baseline.z0 * factor, self.baseline.sigma * factor
+        self.baseline = dataclasses.replace(self.baseline, z0=z0, sigma=sigma)
+        self.normaliser = self.pre.normaliser(self.baseline.z0)
+        self.follower.rescale(factor)
+        self._window = deque((row * factor for row in self._window), maxlen=self._window.maxlen)
+
     def touched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int) -> None:
         """The last frame offered was touched: drift is taken out as far as a held touch shows it."""
         assert self.baseline is not None

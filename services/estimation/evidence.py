@@ -23,7 +23,6 @@ from services.estimation.tuning import TUNING, Tuning
 
 Array = NDArray[np.float64]
 
-FITS = 10.0  # times the noise's energy: touches leave up to 5, faults hundreds
 NEGLIGIBLE = 12.0  # nats below the likeliest disc: numerics, not physics
 
 
@@ -55,7 +54,7 @@ class Explanation(NamedTuple):
     @property
     def fits(self) -> bool:
         """Whether drift and touches are all that there is: a fault is not explained by them."""
-        return self.left < FITS * self.count
+        return self.left < TUNING.fits * self.count
 
 
 class Whitened(NamedTuple):

@@ -44,6 +44,10 @@ class Tuning:
     another: float = _number(30.0, "nats", "gain from which there is one touch more", DRIFT_ROWS)
     apart: float = _number(0.5, "model units", "distance within which discs are of one touch", DRIFT_ROWS)
 
+    fits: float = _number(
+        10.0, "times the noise", "energy that touches and drift may leave", "measured: touches leave 5"
+    )
+
     # start (start.py)
     start_contact_sd: float = _number(0.3, "relative", "contacts of an unknown skin", "training: +-30 %")
     layer_sd: float = _number(0.03, "relative", "series part of a contact against its rest", START_ROWS)
@@ -51,8 +55,10 @@ class Tuning:
     mismatch_most: float = _number(4.0, "times", "mismatch beyond which it may hide a touch", START_ROWS)
     start_nats: float = _number(30.0, "nats", "by which a touch must explain Z0 better", START_ROWS)
 
-    # faults and time (faults.py, posterior.py)
-    gain_sd: float = _number(0.05, "relative", "sd of a step of the board's gain", "sheet: steps of 0.1 to 5 %")
+    # faults and time (gain.py, hypotheses.py, posterior.py)
+    gain_least: float = _number(3e-4, "relative", "least step of the board's gain", "sheet: less is drift's")
+    gain_sigmas: float = _number(6.0, "sd", "of the common factor's noise, from which it is one", "1e-8 a frame")
+    gain_left: float = _number(4.0, "sd of chi-square", "what a common factor may leave", "a touch leaves hundreds")
     lifted_sd: float = _number(2.0, "relative", "sd of a contact that lifts", "sheet: to 3 times and more")
     fault_misfit: float = _number(
         0.05, "of the fault's |d|", "what its prediction gets wrong", "prior: touches meanwhile"
