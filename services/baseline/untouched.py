@@ -44,6 +44,9 @@ class Untouched:
         self.pre = bundle.prereconstructor()
         self.follower = Follower(self.pre, config)
         self._evidence: TouchEvidence | None = None
+        self.baseline: Baseline | None
+        self.normaliser: NDArray[np.floating]
+        self.sigma: Array
         self.reset()
 
     def reset(self) -> None:

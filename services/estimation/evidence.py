@@ -44,7 +44,7 @@ class Explanation(NamedTuple):
     drift: Array  # (N,) posterior mean, touches given
     drift_covariance: Array  # (N, N)
     left: float  # energy that drift and touches leave, whitened: about the number of measurements where they explain
-    count: int  # of measurements
+    measurements: int  # that count
 
     @property
     def odds(self) -> float:
@@ -54,7 +54,7 @@ class Explanation(NamedTuple):
     @property
     def fits(self) -> bool:
         """Whether drift and touches are all that there is: a fault is not explained by them."""
-        return self.left < TUNING.fits * self.count
+        return self.left < TUNING.fits * self.measurements
 
 
 class Whitened(NamedTuple):
