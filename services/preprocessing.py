@@ -175,7 +175,8 @@ class Preprocessing(Stage):
         """Touched or not, and the difference, which a touch that begins has against an older baseline."""
         noise, step = self._noise(), self.judge.step
         if not self._touched and self.judge.uncertain(self.untouched.since_s(now_ns)):
-            explained = self.untouched.explain(d, live, now_ns)
+            creep = self.judge.creep.direction(now_ns)
+            explained = self.untouched.explain(d, live, now_ns, creep)
             if explained.fits:
                 return self._decide_alone(d, amplitude, live, explained, now_ns)
         found = self.judge(d, live, noise, self.untouched.since_s(now_ns), now_ns, self._touched)
@@ -195,7 +196,7 @@ class Preprocessing(Stage):
         noise, limit = self._noise(), -float(np.log(self.config.touch.false_alarms))
         self._touched = explained.odds > limit
         if self._touched:
-            self.untouched.drifted(explained.drift, now_ns)
+            self.untouched.drifted(explained.drift, now_ns, self.judge.creep.direction(now_ns))
             d = self.untouched.difference(amplitude, live)
         found = self.judge.begin(d, live, noise, self.untouched.since_s(now_ns), now_ns, alone=self._touched)
         return d, found._replace(touched=self._touched, score=explained.odds, threshold=limit)

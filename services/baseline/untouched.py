@@ -122,19 +122,28 @@ class Untouched:
         self.drifted(start.explanation.drift, self._last_sample_ns)
         return True
 
-    def explain(self, d: Array, live: NDArray[np.bool_], sample_ns: int) -> Explanation:
-        """A difference (K,), by drift since the last untouched frame and by touches."""
+    def explain(self, d: Array, live: NDArray[np.bool_], sample_ns: int, creep: Array | None = None) -> Explanation:
+        """A difference (K,), by drift since the last untouched frame and by touches. creep (K,): d of a touch that may
+        have left something behind.
+        """
         assert self.baseline is not None
         physics, variance = self.evidence.physics, np.where(live, self.sigma, 0.0) ** 2 * (1 + 1 / self.baseline.frames)
         prior = DriftProcess.of_skin(physics.electrodes, creep=False).value_covariance(self.since_s(sample_ns))
-        return self.evidence(d, np.diag(variance + TUNING.absolute**2), physics.columns(d), prior, live)
+        columns = physics.columns(d)
+        if creep is not None:
+            columns = np.column_stack([columns, creep])
+            prior = np.pad(prior, (0, 1))
+            prior[-1, -1] = TUNING.creep_sd**2
+        return self.evidence(d, np.diag(variance + TUNING.absolute**2), columns, prior, live)
 
-    def drifted(self, drift: Array, sample_ns: int) -> None:
-        """Move the baseline by a drift (1 + E,) that was found under a touch, by the columns of SkinPhysics."""
+    def drifted(self, drift: Array, sample_ns: int, creep: Array | None = None) -> None:
+        """Move the baseline by a drift that was found under a touch, in the order of `explain`'s columns."""
         assert self.baseline is not None
-        scale = 1 / (1 - drift[0])
-        moved = (self.baseline.z0 + self.normaliser * (self.pre.m.contact @ drift[1:])) * scale
-        z0 = np.where(self.baseline.z0 > 0, np.maximum(moved, 0.0), 0.0)
+        change = self.pre.m.contact @ drift[1 : 1 + self.pre.m.contact.shape[1]]
+        if creep is not None:
+            change = change + creep * drift[-1]
+        z0 = (self.baseline.z0 + self.normaliser * change) / (1 - drift[0])
+        z0 = np.where(self.baseline.z0 > 0, np.maximum(z0, 0.0), 0.0)
         self.baseline = dataclasses.replace(self.baseline, z0=z0)
         self.normaliser = self.pre.normaliser(z0)
         self.follower.begin(sample_ns, DRIFT_KNOWN_S)
