@@ -30,7 +30,7 @@ class Tuning:
 
     # errors of the model (physics.py)
     absolute: float = _number(3e-5, "relative", "what no model of |Z| gets right", "measured: meshes that differ")
-    misfit: float = _number(0.03, "of the touch's |d|", "what linear discs get wrong of a touch", DRIFT_ROWS)
+    misfit: float = _number(0.06, "of the touch's |d|", "what linear discs get wrong of a touch", DRIFT_ROWS)
     misfit_power: float = _number(
         0.8, "", "power of the Gram matrix's eigenvalues in it", "measured: looks like touches"
     )
