@@ -27,6 +27,7 @@ STAMPS = ("sample", "read", "preprocess", "infer", "publish")
 SOURCES = ("board", "stub", "replay")
 REASONS = {
     "stale_baseline": "the baseline is too old or does not fit: tare",
+    "touched_at_start": "something has touched the skin since the service began: free it, or tare if nothing touches",
     "saturated": "a measurement's converter was clipped",
     "electrode_open": "an electrode has no contact with the skin",
     "electrode_short": "two electrodes are connected to each other",

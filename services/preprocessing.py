@@ -23,6 +23,8 @@ from services.baseline.tare import Baseline
 from services.baseline.untouched import Untouched
 from services.config import Skin
 from services.describe import describe
+from services.estimation.evidence import Explanation
+from services.estimation.gain import common_factor
 from services.faults.contact_drift import Reference
 from services.faults.electrodes import ElectrodeHealth, Verdict
 from services.faults.plausibility import impossible
@@ -33,6 +35,7 @@ from services.touches.touch import Hold, TouchDecision, sigma_of_mean
 
 Array = NDArray[np.float64]
 
+GROSS = 0.1  # relative: no gain of a sound board steps by more
 LASTING_S = 2.0  # a change that no touch can make, and that lasts so long, is the skin's or the board's new state
 
 
@@ -61,7 +64,9 @@ class Preprocessing(Stage):
         self._touched = False
         self._coarse_scan = 0  # of the coarse touch that no full scan has answered yet
         self._impossible_ns = 0  # since when every frame is of no touch
-        self._counters = {"frames": 0, "touched": 0, "reconstructed": 0, "held": 0, "foreign": 0}
+        self._before: Array | None = None  # (K,) |Z| of the last frame
+        self._gross_ns = 0  # since when all measurements have another gain by far
+        self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
         self._foreign = ""
         self.hold.reset()
         self._live: NDArray[np.bool_] | None = None  # measurements that counted in the last frame
@@ -82,8 +87,11 @@ class Preprocessing(Stage):
         self._foreign = ""
         self.untouched.follow(frame)
         amplitude = np.abs(frame.z.astype(np.complex128))
+        separate = SEPARATE in frame.reasons
+        if not separate:
+            self._follow_gain(amplitude, frame.status, out.stamps.get("sample", 0))
         known = self.untouched.baseline
-        if separate := SEPARATE in frame.reasons:
+        if separate:
             self.electrodes.reset()
             self._begin_anew()
             self._impossible_ns = 0
@@ -99,7 +107,8 @@ class Preprocessing(Stage):
         if self.untouched.offer(amplitude, frame):
             self._begin_anew()
         if self.untouched.baseline is None:
-            return [_unusable(out, "stale_baseline", len(amplitude))]
+            reason = "touched_at_start" if self.untouched.touched_at_start else "stale_baseline"
+            return [_unusable(out, reason, len(amplitude))]
         if self.untouched.baseline.doubt:
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
@@ -108,6 +117,30 @@ class Preprocessing(Stage):
             out.sigma = np.asarray(self.untouched.sigma, np.float32)
             return [out]
         return [self._compare(out, amplitude - found.shift, found, learns=not separate)]
+
+    def _follow_gain(self, amplitude: Array, status: NDArray[np.uint8], now_ns: int) -> None:
+        """A step of the board's gain is taken over by the baseline: at once, or after LASTING_S where it is gross."""
+        known, before = self.untouched.baseline, self._before
+        self._before = amplitude
+        if known is None or before is None or status.any():
+            return
+        live = (known.z0 > 0) & (before > 0) & np.isfinite(amplitude) & np.isfinite(known.sigma)
+        sigma = np.where(live, known.sigma / np.where(live, known.z0, 1.0), np.inf)
+        factor = common_factor(before, amplitude, sigma, live)
+        if factor is None:
+            self._gross_ns = 0
+            return
+        if abs(factor - 1) > GROSS and not self._lasts(now_ns):
+            self._before = before  # what it is held against until then
+            return
+        self._gross_ns = 0
+        self._counters["gain_steps"] += 1
+        self.untouched.rescale(factor)
+        self.electrodes.rescale(factor)
+
+    def _lasts(self, now_ns: int) -> bool:
+        self._gross_ns = self._gross_ns or now_ns
+        return (now_ns - self._gross_ns) * 1e-9 >= 0.5 * LASTING_S
 
     def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict, learns: bool) -> DeltaFrame:
         """Difference, decision, and the stack where one is needed."""
@@ -152,6 +185,11 @@ class Preprocessing(Stage):
     def _decide(self, d: Array, amplitude: Array, live: NDArray[np.bool_], now_ns: int) -> tuple[Array, Judgement]:
         """Touched or not, and the difference, which a touch that begins has against an older baseline."""
         noise, step = self._noise(), self.judge.step
+        if not self._touched and self.judge.uncertain(self.untouched.since_s(now_ns)):
+            creep = self.judge.creep.direction(now_ns)
+            explained = self.untouched.explain(d, live, now_ns, creep)
+            if explained.fits:
+                return self._decide_alone(d, amplitude, live, explained, now_ns)
         found = self.judge(d, live, noise, self.untouched.since_s(now_ns), now_ns, self._touched)
         if found.touched and not self._touched:
             self.untouched.begin_touch()
@@ -161,6 +199,18 @@ class Preprocessing(Stage):
             self.hold.reset()  # the same frames make another image now
         self._touched = found.touched
         return d, found
+
+    def _decide_alone(
+        self, d: Array, amplitude: Array, live: NDArray[np.bool_], explained: Explanation, now_ns: int
+    ) -> tuple[Array, Judgement]:
+        """The same for a frame that no untouched one precedes for long: drift is estimated in the frame itself."""
+        noise, limit = self._noise(), -float(np.log(self.config.touch.false_alarms))
+        self._touched = explained.odds > limit
+        if self._touched:
+            self.untouched.drifted(explained.drift, now_ns, self.judge.creep.direction(now_ns))
+            d = self.untouched.difference(amplitude, live)
+        found = self.judge.begin(d, live, noise, self.untouched.since_s(now_ns), now_ns, alone=self._touched)
+        return d, found._replace(touched=self._touched, score=explained.odds, threshold=limit)
 
     def _noise(self) -> Noise:
         assert self.untouched.baseline is not None
@@ -236,6 +286,8 @@ class Preprocessing(Stage):
             "touched": self._touched,
             "coarse": self._coarse_scan,
             "impossible_ns": self._impossible_ns,
+            "before": None if self._before is None else self._before.copy(),
+            "gross_ns": self._gross_ns,
             "hold": self.hold.state(),
             "electrodes": self.electrodes.state(),
             "judge": self.judge.state(),
@@ -251,6 +303,9 @@ class Preprocessing(Stage):
         self._touched = bool(state["touched"])
         self._coarse_scan = int(state.get("coarse", 0))
         self._impossible_ns = int(state.get("impossible_ns", 0))
+        before = state.get("before")
+        self._before = None if before is None or np.shape(before) != (k,) else np.array(before, dtype=float)
+        self._gross_ns = int(state.get("gross_ns", 0))
         self.hold.load(state["hold"])
         self.judge.reset()
         if "judge" in state:  # older recordings have none

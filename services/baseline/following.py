@@ -56,6 +56,12 @@ class Follower:
         k = self.pre.measurements
         self._sum, self._count, self._since_ns = np.zeros(k), np.zeros(k), 0
 
+    def rescale(self, factor: float) -> None:
+        """All |Z| so far, times this factor."""
+        self._past = deque((at, z0 * factor, covariance) for at, z0, covariance in self._past)
+        self._sum = self._sum * factor
+        self.holding.rescale(factor)
+
     def since_s(self, now_ns: int) -> float:
         """Seconds since the baseline last knew the skin as untouched."""
         if self._at_ns is None:

@@ -47,6 +47,12 @@ class Holding:
         k = self.columns.shape[0]
         self._sum, self._count, self._since_ns = np.zeros(k), np.zeros(k), now_ns
 
+    def rescale(self, factor: float) -> None:
+        """All |Z| so far, times this factor."""
+        self._sum = self._sum * factor
+        if self._reference is not None:
+            self._reference = self._reference * factor
+
     def __call__(
         self,
         z0: Array,

@@ -18,13 +18,24 @@ from services.baseline.following import Follower
 from services.baseline.references import References
 from services.baseline.tare import Baseline, noisy, plausible_noise, take
 from services.config import Tare
+from services.estimation.drift import DriftProcess
+from services.estimation.evidence import Explanation, TouchEvidence
+from services.estimation.physics import SkinPhysics
+from services.estimation.start import Verdict, judge_start
+from services.estimation.tuning import TUNING
 from services.stage import SEPARATE, Refused
 
 Array = NDArray[np.float64]
 
+UNSURE = (
+    "this skin differs from its bundle by as much as a touch may make: see that nothing touches it and run `skin tare` "
+    "once"
+)
+PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare`"
 RETRY_EVERY = 8  # frames between attempts at the first tare
 LONGEST_S = 1e9  # a saved time that is longer is none
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
+DRIFT_KNOWN_S = 4.0  # a drift that was found under a touch leaves as much open as a baseline of this age
 
 
 class Untouched:
@@ -35,6 +46,10 @@ class Untouched:
         self.pre = bundle.prereconstructor()
         self.follower = Follower(self.pre, config)
         self.references = References(len(bundle.pattern))
+        self._evidence: TouchEvidence | None = None
+        self.baseline: Baseline | None
+        self.normaliser: NDArray[np.floating]
+        self.sigma: Array
         self.reset()
 
     def reset(self) -> None:
@@ -47,6 +62,8 @@ class Untouched:
         self._restored_s = 0.0  # age of a baseline that an earlier process took, until the first frame
         self._unsaved = False
         self.problem = ""  # what stands in the way of valid frames, for a person
+        self.touched_at_start = False
+        self._trusted: Baseline | None = None  # the last one without doubt: it judges the start, if it is of this board
         self._use(None)
 
     # frames
@@ -76,12 +93,68 @@ class Untouched:
         self._window.append(amplitude)
         if self.baseline is None and len(self._window) == self.config.frames and self._seen % RETRY_EVERY == 0:
             try:
-                found = take(np.array(self._window), self.pre, frame.board, self._last_sample_ns)
-                self.set_baseline(found, self._last_sample_ns)
-                return True
+                return self._begin(take(np.array(self._window), self.pre, frame.board, self._last_sample_ns))
             except Refused as why:
                 self.problem = f"no baseline yet: {why}"
         return False
+
+    @property
+    def evidence(self) -> TouchEvidence:
+        """Made when it is first asked for: a third of a second."""
+        if self._evidence is None:
+            skin, m = self.bundle.skin, self.bundle.matrices
+            series = None
+            if "contact_impedance" in skin:
+                series = np.asarray(skin["contact_impedance"], float) / np.asarray(skin["electrodes"]["width"], float)
+            half_width = float(self.bundle.manifest["image"].get("half_width", 1.0))
+            self._evidence = TouchEvidence(SkinPhysics.of(m, half_width, series))
+        return self._evidence
+
+    def _begin(self, found: Baseline) -> bool:
+        """Use the first baseline, unless something touches: whether there is one now."""
+        trusted = self._trusted if self._trusted is not None and self._trusted.board == found.board else None
+        start = judge_start(
+            found.z0, found.sigma / np.sqrt(found.frames), self.evidence, None if trusted is None else trusted.z0
+        )
+        self.touched_at_start = start.verdict is Verdict.TOUCHED
+        if start.verdict is Verdict.UNKNOWN and not found.doubt:
+            found = dataclasses.replace(found, doubt=UNSURE)
+        if not self.touched_at_start:
+            self.set_baseline(found, self._last_sample_ns)
+            return True
+        if trusted is None or start.explanation is None or not start.explanation.fits:
+            self.problem = PRESSED
+            return False
+        self.set_baseline(dataclasses.replace(trusted, sigma=found.sigma), self._last_sample_ns)
+        self.drifted(start.explanation.drift, self._last_sample_ns)
+        return True
+
+    def explain(self, d: Array, live: NDArray[np.bool_], sample_ns: int, creep: Array | None = None) -> Explanation:
+        """A difference (K,), by drift since the last untouched frame and by touches. creep (K,): d of a touch that may
+        have left something behind.
+        """
+        assert self.baseline is not None
+        physics, variance = self.evidence.physics, np.where(live, self.sigma, 0.0) ** 2 * (1 + 1 / self.baseline.frames)
+        prior = DriftProcess.of_skin(physics.electrodes, creep=False).value_covariance(self.since_s(sample_ns))
+        columns = physics.columns(d)
+        if creep is not None:
+            columns = np.column_stack([columns, creep])
+            prior = np.pad(prior, (0, 1))
+            prior[-1, -1] = TUNING.creep_sd**2
+        return self.evidence(d, np.diag(variance + TUNING.absolute**2), columns, prior, live)
+
+    def drifted(self, drift: Array, sample_ns: int, creep: Array | None = None) -> None:
+        """Move the baseline by a drift that was found under a touch, in the order of `explain`'s columns."""
+        assert self.baseline is not None
+        change = self.pre.m.contact @ drift[1 : 1 + self.pre.m.contact.shape[1]]
+        if creep is not None:
+            change = change + creep * drift[-1]
+        z0 = (self.baseline.z0 + self.normaliser * change) / (1 - drift[0])
+        z0 = np.where(self.baseline.z0 > 0, np.maximum(z0, 0.0), 0.0)
+        self.baseline = dataclasses.replace(self.baseline, z0=z0)
+        self.normaliser = self.pre.normaliser(z0)
+        self.follower.begin(sample_ns, DRIFT_KNOWN_S)
+        self._run = 0
 
     def difference(self, amplitude: Array, live: NDArray[np.bool_]) -> Array:
         """d (K,) = (|Z| - |Z0|) / |Z0|, 0 where a measurement does not count."""
@@ -98,6 +171,15 @@ class Untouched:
         self.follower.begin_touch(self.baseline.z0)
         self.normaliser = self.pre.normaliser(self.baseline.z0)
         self._run = 0
+
+    def rescale(self, factor: float) -> None:
+        """All measurements are so many times what they were: the board's gain stepped."""
+        assert self.baseline is not None
+        z0, sigma = self.baseline.z0 * factor, self.baseline.sigma * factor
+        self.baseline = dataclasses.replace(self.baseline, z0=z0, sigma=sigma)
+        self.normaliser = self.pre.normaliser(self.baseline.z0)
+        self.follower.rescale(factor)
+        self._window = deque((row * factor for row in self._window), maxlen=self._window.maxlen)
 
     def touched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int) -> None:
         """The last frame offered was touched: drift is taken out as far as a held touch shows it."""
@@ -129,9 +211,10 @@ class Untouched:
         needed = self.config.frames
         if len(self._window) < needed:
             raise Refused(f"only {len(self._window)} of {needed} frames came so far: wait, or look at `skin top`")
-        if touched and not force:
+        sure = self.baseline is not None and not self.baseline.doubt  # else its word against a touch counts for nothing
+        if touched and sure and not force:
             raise Refused("the skin is touched: free it and try again (or --force, if nothing touches it)")
-        if self.baseline is not None and self._run < needed and not force:
+        if sure and self._run < needed and not force:
             raise Refused(f"only {self._run} of {needed} untouched frames since the last touch: wait and try again")
         baseline = take(np.array(self._window), self.pre, self._board, self._last_sample_ns)
         # Whoever gives the command has looked: no doubt, but that of noise, which looking does not mend.
@@ -151,6 +234,9 @@ class Untouched:
             self.sigma = self.baseline.sigma / self.normaliser
             self._unsaved = True
             self.problem = baseline.doubt
+            self.touched_at_start = False
+            if not baseline.doubt:
+                self._trusted = self.baseline
 
     def _refer(self, amplitude: Array, frame: RawFrame) -> bool:
         """An imported file says that this frame is untouched: it is the baseline until the next one."""
@@ -240,9 +326,13 @@ class Untouched:
         if not isinstance(saved, dict) or saved.get("bundle") != self.bundle.hash:
             raise Refused("the saved baseline is of another bundle")
         oldest = self.config.max_age_s
-        if age_s > oldest:
-            raise Refused(f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest / 3600:.1f} h")
         baseline = Baseline.from_dict(saved.get("baseline", {}), len(self.bundle.pattern))
+        if age_s > oldest:
+            self._trusted = None if baseline.doubt else baseline
+            raise Refused(
+                f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest / 3600:.1f} h: another is taken, and "
+                "held against it"
+            )
         try:
             taken_s, quiet_s = (float(saved.get(key, 0.0)) for key in ("taken_s", "quiet_s"))
             if not (0 <= taken_s <= LONGEST_S and 0 <= quiet_s <= LONGEST_S):

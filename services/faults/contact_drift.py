@@ -141,6 +141,11 @@ class ChangedContacts:
         """A frame's |Z| (K,); to be called after each."""
         self._past.append(amplitude.copy())
 
+    def rescale(self, factor: float) -> None:
+        """All |Z| so far, times this factor."""
+        self._before = {k: row * factor for k, row in self._before.items()}
+        self._past = deque((row * factor for row in self._past), maxlen=LOOK_BACK)
+
     def changed(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> int | None:
         """The electrode whose contact this frame shows to have changed."""
         found = self._drift(_difference(amplitude, untouched.z0, untouched, live), untouched.sigma, live)

@@ -104,6 +104,10 @@ class ElectrodeHealth:
         """There is a new baseline: what changed against the old one is forgotten."""
         self._states[(self._states == DRIFTING) | (self._states == UNKNOWN)] = OK
 
+    def rescale(self, factor: float) -> None:
+        """The board's gain stepped by this factor."""
+        self._contacts.rescale(factor)
+
     def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
         """(K,) |Z| and status bits of a frame."""
         found = self._judge(amplitude, status, untouched)

@@ -114,11 +114,21 @@ class Judge:
                 return found
         return None
 
-    def begin(self, d: Array, live: NDArray[np.bool_], noise: Noise, since_s: float, now_ns: int) -> Judgement:
-        """The same for the first frame of a touch, against the baseline from before it was noticed."""
+    def uncertain(self, since_s: float) -> bool:
+        """Whether drift since the last untouched frame may hide a touch, or look like one."""
+        return self.allowance.step(since_s) > STEADY
+
+    def begin(
+        self, d: Array, live: NDArray[np.bool_], noise: Noise, since_s: float, now_ns: int, alone: bool = False
+    ) -> Judgement:
+        """The same for the first frame of a touch, against the baseline from before it was noticed. alone: against one
+        whose drift was found in this very frame.
+        """
         permitted = self._permitted = self.allowance.step(since_s)
         self._gather(now_ns)
-        if permitted > STEADY:
+        if alone:
+            self.step = permitted
+        elif permitted > STEADY:
             self._take(self._explain(d, noise.sigma, live, list(range(permitted + 1))))
         else:
             self.step = min(permitted, 1)

@@ -61,17 +61,58 @@ def test_a_touch_during_the_first_frames_is_no_baseline(stage: Preprocessing, bo
     assert out.valid
 
 
-def test_a_baseline_far_from_the_prediction_is_doubted(stage: Preprocessing, board: Board) -> None:
-    """Touched all the time: the frames agree, so the bundle's prediction must raise the doubt."""
+def test_a_touch_at_the_start_is_named_and_ends_without_a_command(stage: Preprocessing, board: Board) -> None:
+    """Touched all the time: the frames agree, so the bundle's prediction must tell."""
     touch = 3 * board.disc(0.5, -0.3, 0.3, 0.5)
     for _ in range(80):
         out = run(stage, board.frame(touch))
-    assert not out.valid and "stale_baseline" in out.reasons
+    assert not out.valid and out.reasons == ["touched_at_start"]
     assert "skin tare" in stage.health().messages[0]
-    for _ in range(64):
+    outs = [run(stage, board.frame()) for _ in range(96)]
+    assert outs[-1].valid and not outs[-1].touched and stage.health().level == "OK"
+
+
+def test_a_tare_on_command_is_believed_whatever_the_start_says(stage: Preprocessing, board: Board) -> None:
+    touch = 3 * board.disc(0.5, -0.3, 0.3, 0.5)
+    for _ in range(80):
+        run(stage, board.frame(touch))
+    stage.command("tare", {})
+    assert run(stage, board.frame(touch)).valid
+    out = [run(stage, board.frame()) for _ in range(3)][-1]  # no touch lowers an impedance
+    assert not out.valid and "out_of_distribution" in out.reasons
+
+
+def test_a_skin_unlike_its_bundle_is_not_valid_until_one_tare(stage: Preprocessing, board: Board) -> None:
+    """Every |Z| off in its own way. The tare's word is kept, and is enough for the next start."""
+    odd = 0.01 * np.random.default_rng(1).standard_normal(len(board.m.z0))
+    for _ in range(80):
+        out = run(stage, board.frame(odd))
+    assert not out.valid and out.reasons == ["stale_baseline"]
+    assert any("skin tare" in message for message in stage.health().messages)
+    stage.command("tare", {})
+    assert run(stage, board.frame(odd)).valid
+    saved = stage.saved()
+    assert saved is not None
+    stage.reset()
+    with pytest.raises(Refused, match="held against it"):
+        stage.restore(saved, 1e5)
+    outs = [run(stage, board.frame(odd)) for _ in range(80)]
+    assert outs[-1].valid and not outs[-1].touched
+
+
+def test_a_touch_at_the_start_is_a_contact_where_an_old_baseline_is_trusted(stage: Preprocessing, board: Board) -> None:
+    for _ in range(80):
         run(stage, board.frame())
-    stage.command("tare", {"force": True})
-    assert run(stage, board.frame()).valid
+    saved = stage.saved()
+    assert saved is not None
+    stage.reset()
+    with pytest.raises(Refused, match="held against it"):
+        stage.restore(saved, 1e5)
+    touch = board.disc(0.5, -0.3, 0.2, 0.3)
+    outs = [run(stage, board.frame(touch)) for _ in range(80)]
+    assert not any(out.valid for out in outs[:60])
+    assert outs[-1].valid and outs[-1].touched
+    assert not [run(stage, board.frame()) for _ in range(10)][-1].touched
 
 
 def test_identical_frames_tell_no_noise(stage: Preprocessing, board: Board, bundle: Bundle) -> None:

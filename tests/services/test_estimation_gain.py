@@ -1,0 +1,72 @@
+"""Steps of the board's gain: told from touches, and taken over by the baseline."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from models.shapes import Shape
+from services.estimation.gain import common_factor
+from tests.services.stub_skin import StubSkin
+
+NOISE = 1e-4
+K = 120
+LIVE = np.ones(K, dtype=bool)
+SIGMA = np.full(K, NOISE)
+
+
+def frames(change: np.ndarray | float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(1.0, 3.0, K)
+    return z * (1 + NOISE * rng.standard_normal(K)), z * (1 + change) * (1 + NOISE * rng.standard_normal(K))
+
+
+@pytest.mark.parametrize("gain", [-0.3, -0.05, -0.006, -0.001, 0.001, 0.006, 0.05, 0.3])
+def test_a_common_factor_is_found(gain: float) -> None:
+    for seed in range(20):
+        before, now = frames(gain, seed)
+        assert common_factor(before, now, SIGMA, LIVE) == pytest.approx(1 + gain, abs=8e-5 * (1 + gain))
+
+
+def test_no_factor_where_nothing_changed_or_not_all_did() -> None:
+    uneven = np.full(K, 0.006)
+    uneven[:12] = 0.005
+    for seed in range(200):
+        assert common_factor(*frames(0.0, seed), SIGMA, LIVE) is None
+        assert common_factor(*frames(uneven, seed), SIGMA, LIVE) is None
+
+
+def test_a_touch_that_comes_is_no_gain() -> None:
+    """Broad and light, as even as touches get."""
+    skin = StubSkin(80.0)
+    for touch in (Shape("circle", 0, 0, 0.6, 0.05), Shape("circle", 0, 0, 0.3, 0.02), Shape("hertz", 0, 0, 0.5, 0.1)):
+        for _ in range(3):
+            result = skin.feel((touch,))
+        assert result.delta.touched
+        skin.rest(60)
+    assert skin.pipeline.pre.health().counters["gain_steps"] == 0
+
+
+@pytest.mark.parametrize("gain", [-0.05, -0.006, -0.001, 0.001, 0.006, 0.05])
+def test_a_gain_step_makes_no_contact_and_keeps_the_one_that_is_held(gain: float) -> None:
+    skin, touch = StubSkin(80.0), (Shape("circle", 0.3, -0.2, 0.2, 0.3),)
+    skin.faults.inject("gain", {"factor": 1 + gain}, 0.0, 1e9)
+    for _ in range(5):
+        result = skin.rest(1)
+        assert result.contact.valid and not result.contact.contacts and not result.delta.touched
+    held = [skin.feel(touch) for _ in range(12)][-1].contact
+    skin.faults.clear("gain")
+    for _ in range(12):
+        after = skin.feel(touch).contact
+        assert after.valid and len(after.contacts) == 1
+        assert after.contacts[0].position[:2] == pytest.approx(held.contacts[0].position[:2], abs=5e-4)
+        assert after.contacts[0].force_n == pytest.approx(held.contacts[0].force_n, rel=0.1)
+
+
+def test_a_gross_gain_that_lasts_is_valid_again_within_two_seconds() -> None:
+    skin = StubSkin(80.0)
+    skin.faults.inject("gain", {"factor": 1.4}, 0.0, 1e9)
+    seen = [skin.rest(1).contact for _ in range(50)]
+    assert not seen[0].valid
+    assert not any(c.valid and c.contacts for c in seen)
+    assert all(c.valid and not c.contacts for c in seen[44:])
