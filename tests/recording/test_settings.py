@@ -47,7 +47,7 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
             }
         },
         "sockets": {"addresses": {"publisher": "tcp://127.0.0.1:47999"}},
-        "security": {"insecure": True, "secret_key": "SECRET.key_secret"},
+        "security": {"insecure": True, "secret_key": "SECRET.key_secret", "clients": "SECRET-clients"},
         "skip": {"batch": False},
     }
     found = parse(raw, tmp_path / "skin.toml")
