@@ -312,6 +312,7 @@ class Preprocessing(Stage):
         self.untouched.restore(saved, age_s)
 
     def warm_up(self) -> None:
+        _ = self.untouched.evidence
         if self.config.scan == "adaptive":
             self._coarse = Coarse(self.bundle, self.config)
         if self.untouched.baseline is not None:

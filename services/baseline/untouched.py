@@ -31,6 +31,7 @@ UNSURE = (
     "once"
 )
 PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare`"
+_evidence: dict[str, TouchEvidence] = {}  # by the bundle's hash
 RETRY_EVERY = 8  # frames between attempts at the first tare
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
 DRIFT_KNOWN_S = 4.0  # a drift that was found under a touch leaves as much open as a baseline of this age
@@ -43,7 +44,6 @@ class Untouched:
         self.bundle, self.config = bundle, config
         self.pre = bundle.prereconstructor()
         self.follower = Follower(self.pre, config)
-        self._evidence: TouchEvidence | None = None
         self.baseline: Baseline | None
         self.normaliser: NDArray[np.floating]
         self.sigma: Array
@@ -93,15 +93,15 @@ class Untouched:
 
     @property
     def evidence(self) -> TouchEvidence:
-        """Made when it is first asked for: a third of a second."""
-        if self._evidence is None:
+        """Made when it is first asked for, which takes a third of a second, and kept for all skins of the bundle."""
+        if self.bundle.hash not in _evidence:
             skin, m = self.bundle.skin, self.bundle.matrices
             series = None
             if "contact_impedance" in skin:
                 series = np.asarray(skin["contact_impedance"], float) / np.asarray(skin["electrodes"]["width"], float)
             half_width = float(self.bundle.manifest["image"].get("half_width", 1.0))
-            self._evidence = TouchEvidence(SkinPhysics.of(m, half_width, series))
-        return self._evidence
+            _evidence[self.bundle.hash] = TouchEvidence(SkinPhysics.of(m, half_width, series))
+        return _evidence[self.bundle.hash]
 
     def _begin(self, found: Baseline) -> bool:
         """Use the first baseline, unless something touches: whether there is one now."""
