@@ -25,6 +25,7 @@ from services.config import Skin
 from services.describe import describe
 from services.estimation.evidence import Explanation
 from services.estimation.gain import common_factor
+from services.estimation.tuning import TUNING
 from services.faults.contact_drift import Reference
 from services.faults.electrodes import ElectrodeHealth, Verdict
 from services.faults.plausibility import impossible
@@ -65,6 +66,7 @@ class Preprocessing(Stage):
         self._coarse_scan = 0  # of the coarse touch that no full scan has answered yet
         self._impossible_ns = 0  # since when every frame is of no touch
         self._before: Array | None = None  # (K,) |Z| of the last frame
+        self._total = 0.0  # its sum
         self._gross_ns = 0  # since when all measurements have another gain by far
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
         self._foreign = ""
@@ -109,9 +111,9 @@ class Preprocessing(Stage):
 
     def _follow_gain(self, amplitude: Array, status: NDArray[np.uint8], now_ns: int) -> None:
         """A step of the board's gain is taken over by the baseline: at once, or after LASTING_S where it is gross."""
-        known, before = self.untouched.baseline, self._before
-        self._before = amplitude
-        if known is None or before is None or status.any():
+        known, before, total = self.untouched.baseline, self._before, self._total
+        self._before, self._total = amplitude.copy(), float(amplitude.sum())
+        if known is None or before is None or abs(self._total - total) < TUNING.gain_least * total or status.any():
             return
         live = (known.z0 > 0) & (before > 0) & np.isfinite(amplitude) & np.isfinite(known.sigma)
         sigma = np.where(live, known.sigma / np.where(live, known.z0, 1.0), np.inf)
@@ -120,7 +122,7 @@ class Preprocessing(Stage):
             self._gross_ns = 0
             return
         if abs(factor - 1) > GROSS and not self._lasts(now_ns):
-            self._before = before  # what it is held against until then
+            self._before, self._total = before, total  # what it is held against until then
             return
         self._gross_ns = 0
         self._counters["gain_steps"] += 1
@@ -294,6 +296,7 @@ class Preprocessing(Stage):
         self._impossible_ns = int(state.get("impossible_ns", 0))
         before = state.get("before")
         self._before = None if before is None or np.shape(before) != (k,) else np.array(before, dtype=float)
+        self._total = 0.0 if self._before is None else float(self._before.sum())
         self._gross_ns = int(state.get("gross_ns", 0))
         self.hold.load(state["hold"])
         self.judge.reset()

@@ -1,4 +1,4 @@
-"""The stages on a skin that drifted unseen: contacts where it is touched, none where it is not, from the first frame."""
+"""The stages on a skin that drifted unseen: contacts where it is touched, none where it is not, at once."""
 
 from __future__ import annotations
 
