@@ -86,8 +86,8 @@ def drift(count: int, seed: int) -> None:
             alarm.append(judge(free, error, judge.physics.columns(free), prior).odds)
         print(
             f"{other or 'as shipped'!s:20} {np.median(share):6.2f} {np.quantile(share, 0.9):6.2f}   "
-            f"{np.median(stated):5.2f} {np.quantile(stated, 0.9):5.2f}   touches counted right "
-            f"{100 * np.mean(right):3.0f} %   odds touched, least {min(odds):6.1f}, untouched, most {max(alarm):6.1f} nats"
+            f"{np.median(stated):5.2f} {np.quantile(stated, 0.9):5.2f}   count right "
+            f"{100 * np.mean(right):3.0f} %   odds, touched {min(odds):6.1f} or more, free {max(alarm):6.1f} or less"
         )
 
 

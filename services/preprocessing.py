@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
+from services.baseline.gain_steps import GainSteps
 from services.baseline.tare import Baseline
 from services.baseline.untouched import Untouched
 from services.config import Skin
 from services.describe import describe
 from services.estimation.evidence import Explanation
-from services.estimation.gain import common_factor
 from services.faults.contact_drift import Reference
 from services.faults.electrodes import ElectrodeHealth, Verdict
 from services.faults.plausibility import impossible
@@ -35,7 +35,6 @@ from services.touches.touch import Hold, TouchDecision, sigma_of_mean
 
 Array = NDArray[np.float64]
 
-GROSS = 0.1  # relative: no gain of a sound board steps by more
 LASTING_S = 2.0  # a change that no touch can make, and that lasts so long, is the skin's or the board's new state
 
 
@@ -55,6 +54,7 @@ class Preprocessing(Stage):
         self.untouched = Untouched(bundle, skin.tare)
         self.pre = self.untouched.pre
         self.judge = Judge(self.pre, skin)
+        self.gain = GainSteps(len(bundle.pattern))
         self.hold = Hold()
         self._coarse: Coarse | None = None  # made with the first sentinel scan
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
@@ -64,8 +64,7 @@ class Preprocessing(Stage):
         self._touched = False
         self._coarse_scan = 0  # of the coarse touch that no full scan has answered yet
         self._impossible_ns = 0  # since when every frame is of no touch
-        self._before: Array | None = None  # (K,) |Z| of the last frame
-        self._gross_ns = 0  # since when all measurements have another gain by far
+        self.gain.reset()
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
         self._foreign = ""
         self.hold.reset()
@@ -87,10 +86,15 @@ class Preprocessing(Stage):
         self._foreign = ""
         self.untouched.follow(frame)
         amplitude = np.abs(frame.z.astype(np.complex128))
-        separate = SEPARATE in frame.reasons
-        if not separate:
-            self._follow_gain(amplitude, frame.status, out.stamps.get("sample", 0))
         known = self.untouched.baseline
+        separate = SEPARATE in frame.reasons
+        sound = known is not None and not frame.status.any() and not separate
+        factor = self.gain(amplitude, known if sound else None, out.stamps.get("sample", 0))
+        if factor is not None:
+            self._counters["gain_steps"] += 1
+            self.untouched.rescale(factor)
+            self.electrodes.rescale(factor)
+            known = self.untouched.baseline
         if separate:
             self.electrodes.reset()
             self._begin_anew()
@@ -117,30 +121,6 @@ class Preprocessing(Stage):
             out.sigma = np.asarray(self.untouched.sigma, np.float32)
             return [out]
         return [self._compare(out, amplitude - found.shift, found, learns=not separate)]
-
-    def _follow_gain(self, amplitude: Array, status: NDArray[np.uint8], now_ns: int) -> None:
-        """A step of the board's gain is taken over by the baseline: at once, or after LASTING_S where it is gross."""
-        known, before = self.untouched.baseline, self._before
-        self._before = amplitude
-        if known is None or before is None or status.any():
-            return
-        live = (known.z0 > 0) & (before > 0) & np.isfinite(amplitude) & np.isfinite(known.sigma)
-        sigma = np.where(live, known.sigma / np.where(live, known.z0, 1.0), np.inf)
-        factor = common_factor(before, amplitude, sigma, live)
-        if factor is None:
-            self._gross_ns = 0
-            return
-        if abs(factor - 1) > GROSS and not self._lasts(now_ns):
-            self._before = before  # what it is held against until then
-            return
-        self._gross_ns = 0
-        self._counters["gain_steps"] += 1
-        self.untouched.rescale(factor)
-        self.electrodes.rescale(factor)
-
-    def _lasts(self, now_ns: int) -> bool:
-        self._gross_ns = self._gross_ns or now_ns
-        return (now_ns - self._gross_ns) * 1e-9 >= 0.5 * LASTING_S
 
     def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict, learns: bool) -> DeltaFrame:
         """Difference, decision, and the stack where one is needed."""
@@ -286,8 +266,7 @@ class Preprocessing(Stage):
             "touched": self._touched,
             "coarse": self._coarse_scan,
             "impossible_ns": self._impossible_ns,
-            "before": None if self._before is None else self._before.copy(),
-            "gross_ns": self._gross_ns,
+            "gain": self.gain.state(),
             "hold": self.hold.state(),
             "electrodes": self.electrodes.state(),
             "judge": self.judge.state(),
@@ -303,9 +282,6 @@ class Preprocessing(Stage):
         self._touched = bool(state["touched"])
         self._coarse_scan = int(state.get("coarse", 0))
         self._impossible_ns = int(state.get("impossible_ns", 0))
-        before = state.get("before")
-        self._before = None if before is None or np.shape(before) != (k,) else np.array(before, dtype=float)
-        self._gross_ns = int(state.get("gross_ns", 0))
         self.hold.load(state["hold"])
         self.judge.reset()
         if "judge" in state:  # older recordings have none
@@ -313,6 +289,8 @@ class Preprocessing(Stage):
                 self.judge.load(state["judge"])
             except (KeyError, TypeError, ValueError) as wrong:
                 raise Refused(f"the saved decision on drift does not fit ({wrong}): reset") from None
+        if "gain" in state:  # older recordings have none
+            self.gain.load(state["gain"])
         if "electrodes" in state:  # older recordings have none
             self.electrodes.load(state["electrodes"])
 
@@ -323,6 +301,7 @@ class Preprocessing(Stage):
         self.untouched.restore(saved, age_s)
 
     def warm_up(self) -> None:
+        _ = self.untouched.evidence
         if self.config.scan == "adaptive":
             self._coarse = Coarse(self.bundle, self.config)
         if self.untouched.baseline is not None:

@@ -32,6 +32,7 @@ UNSURE = (
     "once"
 )
 PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare`"
+_evidence: dict[str, TouchEvidence] = {}  # by the bundle's hash
 RETRY_EVERY = 8  # frames between attempts at the first tare
 LONGEST_S = 1e9  # a saved time that is longer is none
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
@@ -46,7 +47,6 @@ class Untouched:
         self.pre = bundle.prereconstructor()
         self.follower = Follower(self.pre, config)
         self.references = References(len(bundle.pattern))
-        self._evidence: TouchEvidence | None = None
         self.baseline: Baseline | None
         self.normaliser: NDArray[np.floating]
         self.sigma: Array
@@ -100,15 +100,15 @@ class Untouched:
 
     @property
     def evidence(self) -> TouchEvidence:
-        """Made when it is first asked for: a third of a second."""
-        if self._evidence is None:
+        """Made when it is first asked for, which takes a third of a second, and kept for all skins of the bundle."""
+        if self.bundle.hash not in _evidence:
             skin, m = self.bundle.skin, self.bundle.matrices
             series = None
             if "contact_impedance" in skin:
                 series = np.asarray(skin["contact_impedance"], float) / np.asarray(skin["electrodes"]["width"], float)
             half_width = float(self.bundle.manifest["image"].get("half_width", 1.0))
-            self._evidence = TouchEvidence(SkinPhysics.of(m, half_width, series))
-        return self._evidence
+            _evidence[self.bundle.hash] = TouchEvidence(SkinPhysics.of(m, half_width, series))
+        return _evidence[self.bundle.hash]
 
     def _begin(self, found: Baseline) -> bool:
         """Use the first baseline, unless something touches: whether there is one now."""
