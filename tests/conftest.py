@@ -18,6 +18,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 START_S = 120
 
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background: programs we start would inherit that
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 @pytest.fixture
 def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:

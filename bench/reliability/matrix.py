@@ -125,6 +125,8 @@ ROWS = (
     Row("partial_frames", MEASUREMENT, ("gap",)),
     Row("sequence_gaps", MEASUREMENT, ("gap",)),
     Row("line_noise", MEASUREMENT, ("gap",)),
+    Row("clock_jump", BOARD, ("clock",), board=True),
+    Row("frozen", MEASUREMENT, ("frozen",)),
     Row("wrong_schema", BOARD, board=True),
     Row("hang", BOARD, board=True),
     Row("unplug", BOARD, board=True),

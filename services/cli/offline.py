@@ -141,6 +141,8 @@ def _dispatch(module: str, args: list[str]) -> None:
     try:
         status = importlib.import_module(module).main(args)
     except ImportError as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C while a compiled module was being loaded
+            raise KeyboardInterrupt from None
         said = not_installed(error)
         if not said:
             fail(f"{module} cannot be loaded: {error}")

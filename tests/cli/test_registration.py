@@ -125,7 +125,7 @@ def test_readme_s_real_skin_works_word_for_word(skin, reference, tmp_path, monke
     assert "304 frames" in skin("import", "FILE.npz", "presses.mcap", "--skin", "my-skin").out
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    ran = skin("replay", "../presses.mcap", "--fast")
+    ran = skin("replay", "../presses.mcap", "--bundle", "../my-skin", "--fast")
     assert ran.code == 0 and "304 of them valid, 120 touched" in ran.out, ran.out + ran.err
     ran = skin("reconstruct", "../FILE.npz", "images.npz", "--skin", "../my-skin")
     assert "120 rows, 120 touched, 120 valid" in ran.out, ran.out + ran.err

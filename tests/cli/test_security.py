@@ -160,7 +160,7 @@ def test_the_pages_client_runs_as_it_stands(hosts: tuple[Path, Path], clean: Non
     )
     end = time.monotonic() + 30
     while client.poll() is None and time.monotonic() < end:
-        publisher.send(ContactFrame(skin="palm", valid=True, valid_for_s=1.0, stamps={"publish": time.monotonic_ns()}))
+        publisher.send(ContactFrame(skin="palm", valid=True, valid_for_s=1.0, stamps={"sample": time.monotonic_ns()}))
         time.sleep(0.02)
     client.kill()
     said = client.communicate()[0]

@@ -50,8 +50,8 @@ def image(touched: bool = True, held: bool = False, size: int = 96) -> ImageFram
     )
 
 
-def without_image(touched: bool, held: bool) -> ImageFrame:
-    return ImageFrame(skin="palm", touched=touched, held=held, valid=True)
+def without_image(touched: bool, held: bool, reconstructed: int = 0) -> ImageFrame:
+    return ImageFrame(skin="palm", touched=touched, held=held, reconstructed=reconstructed, valid=True)
 
 
 @pytest.fixture
@@ -98,7 +98,8 @@ def test_a_held_image_stays_and_says_so(monitor: Monitor) -> None:
     monitor.take(without_image(touched=False, held=False), time.monotonic())
     page = drawn(monitor)
     assert not any("@" in line[6:38] for line in page[1:17]) and not any("held" in line for line in page)
-    monitor.take(without_image(touched=True, held=True), time.monotonic())  # a late joiner: it has never seen one
+    # One that we never saw, as a late joiner: it cannot be shown.
+    monitor.take(without_image(touched=True, held=True, reconstructed=7), time.monotonic())
     assert any("shown when it changes" in line for line in drawn(monitor))
 
 

@@ -112,7 +112,7 @@ def _load(args: dict[str, Any]) -> dict[str, Any]:
 def request(data: bytes) -> None:
     """A command. There is an answer to everything, and the answer can be read."""
     _broken.clear()
-    reply = read_map(_server()._answer(data), "reply")
+    reply = read_map(_server()._answer(data, ""), "reply")
     assert reply["ok"] in (True, False)
     if _broken:
         raise _broken[0]

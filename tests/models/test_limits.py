@@ -130,7 +130,7 @@ def test_command_line(capsys, tmp_path):
     assert report["case"]["noise"] == {"snr_db": "Infinity", "floor_ohm": 1e-4, "tare_frames": 64}
     assert report["rows"][0]["pattern"] == "pairs" and len(report["rows"]) == 3
     assert limits.main(["--snr", "inf"]) == 2
-    assert "without noise nothing limits a touch" in capsys.readouterr().out
+    assert "without noise nothing limits a touch" in capsys.readouterr().err
     assert limits.main(["--skin", "hexagon6"]) == 2
     limits.draw(limits.Case(), 0.4, 0.3, 4, tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")

@@ -47,7 +47,7 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
             }
         },
         "sockets": {"addresses": {"publisher": "tcp://127.0.0.1:47999"}},
-        "security": {"insecure": True, "secret_key": "SECRET.key_secret"},
+        "security": {"insecure": True, "secret_key": "SECRET.key_secret", "clients": "SECRET-clients"},
         "skip": {"batch": False},
     }
     found = parse(raw, tmp_path / "skin.toml")
@@ -57,7 +57,8 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
     lines += ['pose = { parent = "wrist", position_m = [0.1, 0.0, -0.2] }', 'network = "fast"']
     lines += ["indenter = { radius_m = 0.01 }", 'calibration = "SECRET.json"', "tare = { frames = 32 }"]
     lines += ["touch = { hold = false }", '[sockets.addresses]\npublisher = "tcp://127.0.0.1:47999"']
-    lines += ['[security]\ninsecure = true\nsecret_key = "SECRET.key_secret"', "[skip]\nbatch = false"]
+    lines += ['[security]\ninsecure = true\nsecret_key = "SECRET.key_secret"\nclients = "SECRET-clients"']
+    lines += ["[skip]\nbatch = false"]
     (tmp_path / "skin.toml").write_text("\n".join(lines))
     monkeypatch.setenv("EITSKIN_CONFIG", str(tmp_path / "skin.toml"))
     return load()
