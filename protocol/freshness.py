@@ -139,7 +139,7 @@ class NewestContacts:
         """The error that says what there is instead of a frame that is new enough."""
         age = self._age()
         if self._frame is None:
-            text = f"no contact frame of {self.skin} yet: is the service running (skin up)?"
+            text = f"no contact frame of {self.skin} yet: does the service run (`skin up`), with a skin of that name?"
         elif age is None:
             text = f"the newest contact frame of {self.skin} does not say when it was measured"
         else:

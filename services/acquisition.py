@@ -47,17 +47,21 @@ class Acquiring(Stage):
 
 
 class SourceFeed:
-    """A source in a thread; `socket` becomes readable when frames wait."""
+    """A source in a thread; `socket` becomes readable when frames wait. ending: to be shared by all of a process: the
+    first that is closed ends them all.
+    """
 
-    def __init__(self, source: Source, host: HostTime | None = None) -> None:
+    def __init__(self, source: Source, host: HostTime | None = None, ending: threading.Event | None = None) -> None:
         self.source = source
+        if ending is not None:
+            source.ending = ending
         self._host = host or HostTime()
         self.slept_over = 0  # frames that waited while the machine was suspended: their stamps do not show it
         self.socket = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self.overrun = 0
         self.malformed = self.skipped = 0
         self._frames: deque[tuple[RawFrame, int]] = deque()  # and for how long the machine had been suspended by then
-        self._stop = threading.Event()
+        self._stop = source.ending
         self._thread = threading.Thread(target=self._run, name=f"source-{source.name}", daemon=True)
         self._thread.start()
 
@@ -107,8 +111,9 @@ class SourceFeed:
 
 
 def run(runner: Runner) -> None:
+    ending = threading.Event()
     for name, skin in runner.config.skins.items():
-        feed = SourceFeed(open_source(name, skin, runner.bundle(name)))
+        feed = SourceFeed(open_source(name, skin, runner.bundle(name)), ending=ending)
         runner.add(Acquiring(name, feed), feed)
 
 

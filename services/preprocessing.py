@@ -21,7 +21,7 @@ from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
 from services.baseline.gain_steps import GainSteps
 from services.baseline.tare import Baseline
-from services.baseline.untouched import Untouched
+from services.baseline.untouched import Untouched, believed
 from services.config import Skin
 from services.describe import describe
 from services.estimation.evidence import Explanation
@@ -120,7 +120,9 @@ class Preprocessing(Stage):
             out.difference = np.zeros(len(amplitude), np.float32)
             out.sigma = np.asarray(self.untouched.sigma, np.float32)
             return [out]
-        return [self._compare(out, amplitude - found.shift, found, learns=not separate)]
+        if not (trusted := believed(frame)):
+            self.hold.reset()  # a mean of the same scan again and again is no surer
+        return [self._compare(out, amplitude - found.shift, found, learns=trusted and not separate)]
 
     def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict, learns: bool) -> DeltaFrame:
         """Difference, decision, and the stack where one is needed."""

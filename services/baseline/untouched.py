@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import RawFrame
+from protocol.frames import RawFrame, as_sent
 from services.baseline.creep import Creep
 from services.baseline.following import Follower
 from services.baseline.references import References
@@ -37,6 +37,11 @@ RETRY_EVERY = 8  # frames between attempts at the first tare
 LONGEST_S = 1e9  # a saved time that is longer is none
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
 DRIFT_KNOWN_S = 4.0  # a drift that was found under a touch leaves as much open as a baseline of this age
+
+
+def believed(frame: RawFrame) -> bool:
+    """Whether acquisition believes this scan: that it is news, and when it was measured."""
+    return as_sent(frame)[0]
 
 
 class Untouched:
@@ -79,7 +84,14 @@ class Untouched:
             self._use(None)
 
     def offer(self, amplitude: Array, frame: RawFrame) -> bool:
-        """A frame's |Z| (K,), NaN where a measurement failed. Whether there is another baseline now."""
+        """A frame's |Z| (K,), NaN where a measurement failed. Whether there is another baseline now.
+
+        A baseline is taken from frames in a row that acquisition believes: scans that repeat tell no noise, and a stamp
+        that is wrong tells no age.
+        """
+        if not believed(frame):
+            self._window.clear()
+            return False
         self._seen += 1
         self._last_sample_ns = frame.stamps.get("sample", 0)
         self._date()

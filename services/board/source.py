@@ -6,6 +6,7 @@ A source blocks for at most POLL_S at a time, and never raises for what its devi
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -44,6 +45,8 @@ class Source(ABC):
         self.name, self.skin, self.bundle = name, skin, bundle
         self.problem = ""
         self.counts: Counter[str] = Counter()
+        self.ending = threading.Event()
+        """The process is on its way out: a board that goes too (the stub does) is nothing to tell a person."""
 
     @abstractmethod
     def frames(self) -> Iterator[RawFrame | None]:
@@ -244,7 +247,7 @@ class BoardSource(Source):
 
     def _trouble(self, problem: str) -> None:
         """Say what is the matter, once each time it changes."""
-        if problem == self.problem:
+        if problem == self.problem or self.ending.is_set():
             return
         self.problem, now = problem, self._now()
         if now - self._logged.get(problem, -LOG_AGAIN_S) < LOG_AGAIN_S:

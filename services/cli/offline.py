@@ -122,7 +122,8 @@ def bench(
     """Run a benchmark: `skin bench accuracy --help` shows its options."""
     from services.cli.common import ROOT
 
-    names = sorted(p.stem for p in (ROOT / "bench").glob("*.py") if "\ndef main(" in p.read_text(encoding="utf-8"))
+    files = (ROOT / "bench").glob("[!_]*.py")
+    names = sorted(p.stem for p in files if "\ndef main(" in p.read_text(encoding="utf-8"))
     if name in ("", "--help"):
         print("skin bench NAME [options], NAME one of: " + ", ".join(names))
         return

@@ -12,7 +12,6 @@ import typer
 from services.cli.common import (
     USAGE,
     JsonOption,
-    SkinOption,
     emit,
     fail,
     load_npz,
@@ -20,6 +19,8 @@ from services.cli.common import (
     skin_name,
     use_configured_sockets,
 )
+
+RecordedSkin = Annotated[str, typer.Option("--skin", help="Which skin; default: all.", metavar="NAME")]
 
 if TYPE_CHECKING:
     from protocol.frames import ContactFrame
@@ -35,7 +36,7 @@ def record(
     file: Annotated[Path, typer.Argument(metavar="FILE.mcap")],
     seconds: Annotated[float, typer.Option(help="Stop after so long; 0: at Ctrl-C.")] = 0.0,
     topics: Annotated[str, typer.Option(help="Which topics; naming a lazy one wakes it.")] = "raw,contact,status,info",
-    skin: SkinOption = "",
+    skin: RecordedSkin = "",
     overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -82,7 +83,7 @@ def replay(
     out: Annotated[Path | None, typer.Option(help="Write the contacts that come out to this recording.")] = None,
     private: Annotated[bool, typer.Option("--private", help="Use a runtime folder of its own.")] = False,
     bundle: Annotated[Path | None, typer.Option(help="Use this one, not the recorded one (found by its hash).")] = None,
-    skin: SkinOption = "",
+    skin: RecordedSkin = "",
     as_json: JsonOption = False,
 ) -> None:
     """Feed a recording's raw frames through the stages, losslessly; contacts come out as usual, marked `replay`.
@@ -118,7 +119,10 @@ def _bar(contacts: Iterator[ContactFrame], total: int) -> Iterator[ContactFrame]
 def import_file(
     source: Annotated[Path, typer.Argument(metavar="FILE.npz")],
     target: Annotated[Path, typer.Argument(metavar="OUT.mcap")],
-    skin: SkinOption = "",
+    skin: Annotated[
+        str,
+        typer.Option("--skin", help="A configured skin, or a bundle; default: the first of skin.toml.", metavar="NAME"),
+    ] = "",
     rate: Annotated[float, typer.Option(help="Frames per second to give the recording.")] = 10.0,
     overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
     as_json: JsonOption = False,

@@ -34,7 +34,7 @@ def top(
     seconds: Annotated[float, typer.Option(help="How long --once watches.")] = 2.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Rates, ages, latencies, drops and CPU of every topic and process, and the skin itself, live."""
+    """The skin as a heat map, its contacts, and every topic's and process's rates, delays, losses and CPU; q leaves."""
     from services.cli.monitor import Monitor
 
     use_configured_sockets()

@@ -121,7 +121,7 @@ class Replayer:
                 continue
             if step.skin not in self._started:
                 self._started.add(step.skin)
-                self._prime(step)
+                self._prime(step.skin)
                 if step.raw is not None:
                     self._begin(step.skin, {})
                     yield self._send(step, step.raw)
@@ -175,24 +175,25 @@ class Replayer:
 
     # getting ready
 
-    def _prime(self, step: Step) -> None:
+    def _prime(self, skin: str) -> None:
         """Sends frames that change nothing until contacts come out: then every socket of the chain is connected."""
         out, self.out = self.out, None
+        counts = self.counts.copy()
         end = time.monotonic() + CHAIN_S
         try:
             while time.monotonic() < end:
-                self.publisher.send(_primer(step.skin))
-                if self._contact(step.skin, 0, PRIME_EVERY_S) is not None:
+                self.publisher.send(_primer(skin))
+                if self._contact(skin, 0, PRIME_EVERY_S) is not None:
                     break
             else:
                 raise ReplayError(
-                    f"no contacts of skin {step.skin!r} came within {CHAIN_S:g} s: is it in the stages' configuration?"
+                    f"no contacts of skin {skin!r} came within {CHAIN_S:g} s: is it in the stages' configuration?"
                 )
             while self.contacts.recv(PRIME_EVERY_S) is not None:  # answers to primers that were under way
                 pass
         finally:
             self.out = out
-            self.counts.clear()
+            self.counts = counts
 
     def _begin(self, skin: str, states: dict[str, Any]) -> None:
         """Every stage forgets what it knew and starts a new session, so that a replay's frames count from 0."""
@@ -205,25 +206,44 @@ class Replayer:
             if process in STAGES:
                 self._call(process, "load", skin=skin, state=state)
 
-    def _call(self, process: str, command: str, **args: Any) -> None:
+    def _connect_anew(self) -> None:
+        """The socket was opened anew: waits for the stages, so that no frame is lost, and has them go on as they were."""
+        for skin in sorted(self._started):
+            states = {process: self._call(process, "state", skin=skin).get("state", {}) for process in STAGES}
+            self._prime(skin)
+            self._load(skin, states)
+
+    def _call(self, process: str, command: str, **args: Any) -> dict[str, Any]:
+        """The answer; empty where the process would not."""
         try:
-            ControlClient(process, 5.0).call(command, **args)
+            return ControlClient(process, 5.0).call(command, **args)
         except ControlError as error:
             if error.kind in ("unreachable", "timeout"):
                 raise ReplayError(str(error)) from None
             self.warnings.append(f"{process} could not {command} the recorded state: {error}")
         except (ValueError, OverflowError) as error:  # nested deeper than msgpack packs
             self.warnings.append(f"the recorded state of {process} cannot be sent: {error}")
+        return {}
 
     def _report(self) -> None:
-        """A status a second, as every process gives."""
+        """A status a second, as every process gives, and a look at the socket."""
         if (now := time.monotonic()) < self._status_due:
             return
         self._status_due = now + 1.0
+        if self.publisher.mind():
+            self._connect_anew()
+        problems, counts = self.publisher.problems, dict(self.counts)
+        level = "WARN" if problems else "OK"
         for skin in self.skins:
             self.publisher.send(
                 StatusFrame(
-                    skin=skin, process="replay", level="OK", source="replay", valid=True, counters=dict(self.counts)
+                    skin=skin,
+                    process="replay",
+                    level=level,
+                    messages=problems,
+                    source="replay",
+                    valid=True,
+                    counters=counts,
                 )
             )
 

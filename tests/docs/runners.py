@@ -117,7 +117,9 @@ COMMANDS = (
         instead="./skin register {presses} --skin disc16 --out {folder}/my-skin",
     ),
     # the real skin's block, in its order; FILE is the reference data
-    Row(r"\./skin (register|import|replay|reconstruct) .*", "slow", instead="{line}"),
+    Row(r"\./skin replay presses.mcap .*", "slow", says="1064 of them valid, 500 touched", instead="{line}"),
+    Row(r"\./skin reconstruct FILE .*", "slow", says="500 rows, 500 touched, 500 valid", instead="{line}"),
+    Row(r"\./skin (register|import) FILE .*", "slow", instead="{line}"),
     Row(r"\.venv/bin/python -m bench.real_presses FILE", "slow", says="skin register"),
     # examples
     Row(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pytest
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, RawFrame, pack, unpack
+from protocol.runtime import runtime_dir
 from services import persistence
 from services.pipeline import Pipeline
 from services.recordings.importing import ImportRefused, import_arrays
@@ -69,6 +72,31 @@ def test_two_replays_give_identical_contacts(runtime: Path, recording: Path, tmp
     assert [s for s in states[88:] if s] == [["end"]], "it ends once, and is not there any more"
     x = [f["contacts"][0]["position"][0] for f in first[72:88]]  # type: ignore[index]
     assert np.corrcoef(x, 0.05 * 0.03 * np.arange(8, 24))[0, 1] > 0.99 and abs(x[0] - 0.012) < 0.004
+
+
+def test_a_socket_file_deleted_during_a_replay_is_there_again_and_no_frame_is_lost(
+    recording: Path, tmp_path: Path
+) -> None:
+    there_again = []
+
+    def deleting(frames: Iterator[ContactFrame], total: int) -> Iterator[ContactFrame]:
+        socket = runtime_dir() / "acquisition.ipc"
+        for n, frame in enumerate(frames):
+            if n == 80:  # something touches
+                socket.unlink()
+                time.sleep(1.2)
+            if n == 82:
+                there_again.append(socket.exists())
+            yield frame
+
+    replay_file(recording, None, out=tmp_path / "one.mcap", private=True)
+    report = replay_file(recording, None, out=tmp_path / "two.mcap", private=True, progress=deleting)
+    assert there_again == [True]
+    assert report["frames"] == report["contacts"] == 94 and report["warnings"] == []
+    one, two = contacts(tmp_path / "one.mcap"), contacts(tmp_path / "two.mcap")
+    for frame in (*one, *two):
+        del frame["seq"]
+    assert one == two
 
 
 def test_a_recording_that_begins_while_a_touch_is_held_is_replayed_as_it_was(runtime: Path, tmp_path: Path) -> None:

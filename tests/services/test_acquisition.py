@@ -469,6 +469,23 @@ def test_a_source_that_blocks_does_not_hold_up_a_stop(skin: Skin, bundle: Bundle
         free.set()
 
 
+def test_boards_that_go_while_the_process_ends_are_no_trouble(
+    skin: Skin, bundle: Bundle, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    ending, names = threading.Event(), ("ttyACM0", "ttyACM1")
+    boards = [PtyBoard(tmp_path / name, FakeBoard()) for name in names]
+    ports = [skin.model_copy(update={"port": str(tmp_path / name)}) for name in names]
+    feeds = [SourceFeed(open_source("palm", port, bundle), ending=ending) for port in ports]
+    for feed in feeds:
+        first_frame(feed)
+    ending.set()  # what closing the first one does
+    for board in boards:
+        board.unplug()
+    for feed in feeds:
+        feed.close()
+    assert "cable" not in caplog.text and [feed.source.problem for feed in feeds] == ["", ""]
+
+
 def test_port_errors_are_their_own_kind(tmp_path: Path) -> None:
     from services.board.port import Port
 

@@ -160,6 +160,54 @@ def test_disagreement_keeps_its_false_alarm_rate(board: Board) -> None:
     assert max(ratios) > 0.6  # the limit is not so far away that nothing would be noticed
 
 
+def not_believed(frame: RawFrame, reason: str) -> RawFrame:
+    """As acquisition sends it on."""
+    frame.valid, frame.reasons = False, [reason]
+    return received(frame)
+
+
+@pytest.mark.parametrize("reason", ["frozen", "clock"])
+def test_frames_that_acquisition_does_not_believe_are_no_baseline(
+    stage: Preprocessing, board: Board, reason: str
+) -> None:
+    for _ in range(144):
+        run(stage, not_believed(board.frame(), reason))
+    assert stage.untouched.baseline is None
+    with pytest.raises(Refused, match="0 of 64 frames"):
+        stage.command("tare", {})
+    tared(stage, board)
+
+
+@pytest.mark.parametrize("reason", ["frozen", "clock"])
+def test_the_baseline_follows_no_frame_that_acquisition_does_not_believe(
+    stage: Preprocessing, board: Board, reason: str
+) -> None:
+    tared(stage, board)
+    assert stage.untouched.baseline is not None
+    z0 = stage.untouched.baseline.z0.copy()
+    for k in range(400):
+        out = run(stage, not_believed(board.frame(1e-5 * min(1.0, k / 200)), reason))
+        assert not out.valid and reason in out.reasons
+    assert np.array_equal(stage.untouched.baseline.z0, z0)
+    for _ in range(200):  # those that it believes are followed
+        run(stage, board.frame(1e-5))
+    assert not np.array_equal(stage.untouched.baseline.z0, z0)
+
+
+def test_a_held_touch_is_not_averaged_over_frozen_frames(stage: Preprocessing, board: Board) -> None:
+    tared(stage, board)
+    touch = board.disc(0.2, 0.1, 0.3, 0.3)
+    for _ in range(3):
+        run(stage, board.frame(touch))
+    again = board.frame(touch)
+    for _ in range(40):
+        frozen = dataclasses.replace(again, scan=again.scan)
+        run(stage, not_believed(frozen, "frozen"))
+    assert stage.hold.averaged <= 1
+    out = run(stage, board.frame(touch))
+    assert out.valid and out.touched and stage.hold.averaged <= 2
+
+
 def test_no_false_touch_and_the_lightest_touch_is_seen(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     assert not any(run(stage, board.frame()).touched for _ in range(300))
