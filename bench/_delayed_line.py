@@ -19,7 +19,7 @@ from protocol import link
 from protocol.frames import RawFrame
 from services.board.host_time import HostTime
 from services.board.source import BoardSource
-from services.config import Skin
+from services.runtime.config import Skin
 
 BOOTED_NS = 1_000_000_000_000  # what the host's clock shows as the simulation begins
 READ_LATE_S = 0.002  # a scheduler's doing

@@ -18,7 +18,7 @@ from models.bundle import Bundle
 from protocol.frames import RawFrame
 from services.board.boardlink import BoardLink
 from services.board.source import REOPEN_S, BoardSource
-from services.config import Skin
+from services.runtime.config import Skin
 
 READ_LATE_S = 0.002  # a scheduler's doing
 IN_FLIGHT = 256  # scans that were measured and have not arrived

@@ -15,8 +15,8 @@ from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame
 from services.board.boardlink import BoardLink
 from services.board.source import BoardSource
-from services.config import Skin
 from services.pipeline import Pipeline
+from services.runtime.config import Skin
 
 CHAIN_S = 0.002  # from a frame read to what preprocessing says of it, and to its contacts
 STEP_S = 2e-4  # of the host's loop

@@ -18,8 +18,8 @@ from models.prereconstruction import Drift
 from models.shapes import Shape
 from protocol.frames import DeltaFrame
 from services.contacts.segmentation import segment
+from services.estimation.sentinel import Verdict, Watch
 from services.inference import Network
-from services.touches.sentinel import Verdict, Watch
 
 Array = NDArray[np.float64]
 

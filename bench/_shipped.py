@@ -16,11 +16,11 @@ from models import fisher, metrics
 from models.bundle import Bundle
 from models.shapes import CLASSES, Array
 from protocol.frames import RawFrame
-from services.baseline.tare import take
-from services.config import Indenter, Skin
+from services.estimation.tare import take
 from services.pipeline import Pipeline
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import reconstruct
+from services.runtime.config import Indenter, Skin
 
 NEWTON_PER_DROP = 10.0  # the default force law: 0.1 S/m is 1 N
 LARGE = 0.25  # radius from which on shape classes are scored

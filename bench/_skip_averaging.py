@@ -15,11 +15,11 @@ from firmware_stub.world import NEWTON
 from models import fisher
 from models.bundle import Bundle
 from models.shapes import Shape
-from services.board.file_source import FILE_RATE_HZ, file_frame
-from services.config import Skin, Touch
-from services.config import Tare as TareConfig
+from services.estimation.touch import MEANS
 from services.pipeline import Pipeline
-from services.touches.touch import MEANS
+from services.recordings.file_source import FILE_RATE_HZ, file_frame
+from services.runtime.config import Skin, Touch
+from services.runtime.config import Tare as TareConfig
 
 SNR_DB = 70.0
 TIMES = 16  # that the touch is met

@@ -10,9 +10,9 @@ from rich.table import Table
 from bench._tracking_scene import Recorded
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame
-from services.config import Skin, Touch
 from services.networks import network
 from services.preprocessing import Preprocessing
+from services.runtime.config import Skin, Touch
 
 TOGETHER = (1, 2, 4, 8)  # skins
 FRAMES, ROUNDS = 64, 3

@@ -23,8 +23,8 @@ from models.files import FileError
 from models.npz import npz
 from protocol.frames import FrameError, RawFrame, pack, unpack
 from protocol.link import Decoder, Frame, encode
-from services import persistence
 from services.recordings.recording import RecordingError, RecordingReader, RecordingWriter
+from services.runtime import persistence
 
 SIZES = {"quick": 100, "full": 2000}
 SHAPES = (

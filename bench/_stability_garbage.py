@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from bench._stability_run import Answer, Row, Runner, Setting, judged, noisy, share, summary
 from models.shapes import Array, Shape
 from protocol.frames import STATUS_CLIPPED, STATUS_OPEN
-from services.baseline.tare import Baseline, take
-from services.stage import Refused
+from services.estimation.tare import Baseline, take
+from services.runtime.stage import Refused
 
 USUAL_DB = 70.0
 COUNTS = (1, 2, 3, 5, 10, 20, 40, 59, 60, 61, 90, 119, 120)

@@ -26,7 +26,7 @@ from models.forward import ForwardModel
 from models.linearise import linearise
 from models.prereconstruction import Operator, PreReconstructor
 from models.shapes import Array, Shape
-from services.stage import Refused
+from services.runtime.stage import Refused
 
 USUAL_DB = 70.0
 SPACING = 0.5  # model units between neighbouring electrodes of a side

@@ -19,9 +19,9 @@ from models.bundle import Bundle
 from models.forward import ForwardModel, shared
 from models.shapes import Array, Shape
 from protocol.frames import Contact, FrameError, RawFrame, pack, unpack
-from services.baseline.tare import Baseline, take
-from services.config import Skin
+from services.estimation.tare import Baseline, take
 from services.pipeline import Pipeline, Result
+from services.runtime.config import Skin
 
 Row = dict[str, Any]
 
@@ -131,7 +131,7 @@ class Runner:
         self.scan = 0
 
     def tare(self, z0: Array, relative: float | Array, rng: np.random.Generator) -> Baseline:
-        """Of TARE_FRAMES frames of the untouched skin. Raises services.stage.Refused."""
+        """Of TARE_FRAMES frames of the untouched skin. Raises services.runtime.stage.Refused."""
         return take(noisy(z0, relative, rng, TARE_FRAMES), self.pipeline.pre.pre, "bench", 0)
 
     def begin(self, baseline: Baseline | None) -> None:

@@ -35,9 +35,9 @@ from bench._machine import machine, provenance
 from bench._service import BEGIN, Outside, Service, end_on_sigterm, running
 from protocol.frames import RawFrame, TruthFrame
 from protocol.sockets import AllReader
-from services.config import Skin
 from services.pipeline import Pipeline
-from services.stage import PROCESSES
+from services.runtime.config import Skin
+from services.runtime.stage import PROCESSES
 
 HOPS = ("acquire", "preprocess", "infer", "publish", "receive")
 TARGET_MS = {"p50": 2.0, "p99": 5.0}

@@ -17,8 +17,8 @@ from bench._json import write_json
 from bench._machine import provenance
 from bench.skip import run_once, scenes
 from models.bundle import Bundle
-from services.config import Skin
 from services.pipeline import build_stages
+from services.runtime.config import Skin
 
 GROWTH = 0.01  # of the memory after a tenth of the frames
 GATE = 0.05  # of a short run, whose tenth is still warming up

@@ -39,9 +39,9 @@ from bench._relay_frames import HOPS, sizes
 from bench._service import end_on_sigterm
 from bench._tracking_scene import Recorded
 from bench.skip import ENDS_S, QUIET_S, scenes
-from services.config import Skin
 from services.pipeline import Pipeline
 from services.recordings.replay_session import stop
+from services.runtime.config import Skin
 
 RELAY = Path(__file__).with_name("_relay.py")
 SYSTEM_PYTHON = "/usr/bin/python3"  # rospy is Debian's

@@ -25,13 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle, BundleError
-from services.board.file_source import FILE_RATE_HZ, file_frame
-from services.calibrating.registration import Presses, Similarity, part, read_presses, register
-from services.calibrating.sensitivity import write_corrected
-from services.config import Skin
+from services.calibration.registration import Presses, Similarity, part, read_presses, register
+from services.calibration.sensitivity import write_corrected
 from services.pipeline import Pipeline
+from services.recordings.file_source import FILE_RATE_HZ, file_frame
 from services.recordings.npz_file import Input, frames_of, read_scans
 from services.recordings.reconstruction import reconstruct
+from services.runtime.config import Skin
 
 Array = NDArray[np.float64]
 

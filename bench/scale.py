@@ -32,7 +32,7 @@ from bench._tracking_scene import Recorded
 from bench.skip import scenes
 from protocol.frames import pack
 from services.recordings.recording import RecordingWriter
-from services.stage import PROCESSES
+from services.runtime.stage import PROCESSES
 
 RATE_HZ = 22.0
 TARGET = {"skins": 32, "p99_ms": 20.0}

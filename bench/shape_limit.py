@@ -48,7 +48,7 @@ def parameters(kind: str) -> int:
 
 
 def difference(bundle: Bundle, kind: str, p: Array) -> Array:
-    """(K,) d of a touch; nearly linear in -log(1 - drop), as services/faults/quality.py has it."""
+    """(K,) d of a touch; nearly linear in -log(1 - drop), as services/estimation/quality.py has it."""
     rotation, aspect = (*p[4:], *(0.0, 1.0)[len(p) - 4 :])
     touch = Shape(kind, p[0], p[1], p[2], p[3], rotation, aspect)
     log_drop = -np.log(1 - p[3]) * touch.fraction(GRID, covered=True)

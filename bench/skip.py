@@ -35,9 +35,9 @@ from bench._skip_batching import TOGETHER, batch_table, batched
 from bench._tracking_scene import Recorded, record
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, Frame, RawFrame, pack, unpack
-from services.config import Skin, Touch
 from services.pipeline import build_stages
-from services.stage import PROCESSES, Stage
+from services.runtime.config import Skin, Touch
+from services.runtime.stage import PROCESSES, Stage
 
 QUIET_S = 5.0  # of each scene, before it begins: the tare
 ROUNDS = 3

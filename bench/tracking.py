@@ -22,8 +22,8 @@ from bench import _tracking_report as report
 from bench._tracking_scene import Recorded, record
 from bench._tracking_scores import Scorer, Seen, all_of
 from models.bundle import Bundle
-from services.config import Skin
 from services.pipeline import Pipeline
+from services.runtime.config import Skin
 
 HOLD = "hold"  # the section whose touch must not fade
 FADE_S = 5.0  # mean of the force over so long, at both ends

@@ -11,18 +11,28 @@ import os
 import sys
 import threading
 from collections import deque
+from pathlib import Path
 
+from models.bundle import Bundle
 from protocol.frames import Frame, RawFrame
 from services.board.host_time import SUSPENDED_NS, HostTime
-from services.board.source import Source, open_source
+from services.board.source import BoardSource, Source
 from services.process import main
+from services.recordings.file_source import FileSource, RecordingSource
 from services.runner import Runner
-from services.stage import Health, Stage
+from services.runtime.config import Skin
+from services.runtime.stage import Health, Stage
 
 CLOSE_S = 0.2  # how long a stop waits for a source that blocks; its thread dies with the process
 QUEUE = 256  # frames that the runner may be behind before the oldest are dropped
 
 log = logging.getLogger(__name__)
+
+
+def open_source(name: str, skin: Skin, bundle: Bundle) -> Source:
+    """The source that a skin's `port` names."""
+    kind = {".mcap": RecordingSource, ".npz": FileSource}.get(Path(skin.port).suffix, BoardSource)
+    return kind(name, skin, bundle)
 
 
 class Acquiring(Stage):

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from models.bundle import Bundle
-from services.baseline.tare import Baseline
-from services.config import Skin
 from services.contacts.force import ForceLaw
+from services.estimation.tare import Baseline
+from services.runtime.config import Skin
 
 CORNERS = 64  # of the polygon that stands for a disc
 

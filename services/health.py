@@ -17,7 +17,7 @@ from protocol import transport
 from protocol.runtime import RuntimeDirError
 from protocol.sockets import ControlClient, ControlError
 from protocol.transport import TransportError
-from services.config import ConfigError, load
+from services.runtime.config import ConfigError, load
 
 TIMEOUT_S = 2.0
 GROWING_S = 0.5  # within which a recording must grow: ten frames of a board

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame, Frame, ImageFrame
-from services.config import Skin
-from services.faults.quality import Residual
+from services.estimation.quality import Residual
+from services.estimation.sentinel import CoarseImage
 from services.networks import Network, OneStep, Pictures, network
-from services.stage import Health, Refused, Stage, add_reason, inherited
-from services.touches.sentinel import CoarseImage
+from services.runtime.config import Skin
+from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
 
 SETTLED = 5  # untouched frames in a row that state the same noise, from which it is taken to be a touch's too
 

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame, ImageFrame, RawFrame
-from services.config import Skin
 from services.inference import Inference
 from services.preprocessing import Preprocessing
 from services.publishing import Publishing
+from services.runtime.config import Skin
 
 ALL = frozenset({"delta", "image", "contact"})
 

@@ -1,8 +1,8 @@
 """Preprocessing: from impedances to the network's input, following the paper's equations, and only where something
 touches.
 
-    d = (|Z| - |Z0|) / |Z0|                     against the untouched baseline (services/baseline/untouched.py)
-    touched = d^T C^-1 d > threshold            C: noise, model error, drift (services/touches/touch.py)
+    d = (|Z| - |Z0|) / |Z0|                     against the untouched baseline (services/estimation/baseline.py)
+    touched = d^T C^-1 d > threshold            C: noise, model error, drift (services/estimation/touch.py)
     stack = RM d for a ladder of lambda         equation 1, RM = (J^T W J + lambda^2 R)^-1 J^T W, W = C^-1
     I_thresh = MReLU(H(I_pre) * I_pre)          equations 2 to 5, where the bundle has no network that does better
 
@@ -19,19 +19,20 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
-from services.baseline.gain_steps import GainSteps
-from services.baseline.tare import Baseline
-from services.baseline.untouched import Untouched, believed
-from services.config import Skin
+from services.board.boardlink import Scanning
 from services.describe import describe
+from services.estimation.baseline import Untouched, believed
+from services.estimation.contact_drift import Reference
+from services.estimation.electrodes import ElectrodeHealth, Verdict
 from services.estimation.evidence import Explanation
-from services.faults.contact_drift import Reference
-from services.faults.electrodes import ElectrodeHealth, Verdict
-from services.faults.plausibility import impossible
-from services.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
-from services.touches.judging import Judge, Judgement, Noise
-from services.touches.sentinel import Coarse
-from services.touches.touch import Hold, TouchDecision, sigma_of_mean
+from services.estimation.gain_steps import GainSteps
+from services.estimation.plausibility import impossible
+from services.estimation.sentinel import Coarse, sentinel_of
+from services.estimation.tare import Baseline
+from services.estimation.touch import Hold, TouchDecision, sigma_of_mean
+from services.estimation.touch_detector import Judge, Judgement, Noise
+from services.runtime.config import Skin
+from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
 
 Array = NDArray[np.float64]
 
@@ -230,7 +231,7 @@ class Preprocessing(Stage):
         valid, known = out.valid, self.untouched.baseline
         _unusable(out, "coarse", len(self.bundle.pattern))
         if self._coarse is None:
-            self._coarse = Coarse(self.bundle, self.config)
+            self._coarse = self._coarse_judge()
         if known is None or known.doubt or not self._coarse.fits(frame):
             return out
         out.valid = valid
@@ -242,6 +243,12 @@ class Preprocessing(Stage):
                 out, frame, known.z0, self.untouched.normaliser, self.untouched.sigma, self._coarse_scan
             )
         return out
+
+    def _coarse_judge(self) -> Coarse:
+        short = Scanning(
+            self.bundle.pattern[sentinel_of(self.bundle).rows], self.config.dft_points, self.config.rtia_ohm
+        )
+        return Coarse(self.bundle, short.config, self.config.touch.false_alarms)
 
     def _begin_anew(self) -> None:
         """There is another baseline."""
@@ -305,7 +312,7 @@ class Preprocessing(Stage):
     def warm_up(self) -> None:
         _ = self.untouched.evidence
         if self.config.scan == "adaptive":
-            self._coarse = Coarse(self.bundle, self.config)
+            self._coarse = self._coarse_judge()
         if self.untouched.baseline is not None:
             operator, decision = self.judge.operator(np.isfinite(self.untouched.sigma), self._noise(), 0)
             nothing = np.zeros(len(self.bundle.pattern))

@@ -11,10 +11,10 @@ from models.bundle import Bundle, BundleError
 from protocol import logs
 from protocol.runtime import AlreadyRunning, RuntimeDirError, lock
 from protocol.transport import TransportError
-from services import realtime
-from services.config import ConfigError, Skin, load
 from services.runner import Runner
-from services.stage import Stage
+from services.runtime import realtime
+from services.runtime.config import ConfigError, Skin, load
+from services.runtime.stage import Stage
 
 
 def main(process: str, setup: Callable[[Runner], None]) -> int:

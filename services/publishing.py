@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame
 from protocol.held import ANY, HeldImage
-from services.config import Skin
 from services.contacts.force import ForceLaw, Look
 from services.contacts.motion import Seen, Track
 from services.contacts.outline import outline
 from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.tracking import Tracker
-from services.stage import SEPARATE, Health, Stage, add_reason, inherited
+from services.runtime.config import Skin
+from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
 UNKNOWN_BELOW = 0.4  # probability of the best class, of five, below which a shape is "unknown"

@@ -26,10 +26,10 @@ from protocol.runtime import host_id
 from protocol.sockets import AllReader, ControlClient, ControlError, ControlServer
 from protocol.topics import TOPICS
 from protocol.transport import TransportError
-from services.config import ConfigError, load
 from services.recordings import settings
 from services.recordings.recording import STATE_TOPIC, RecordingError, RecordingWriter
-from services.stage import STAGES
+from services.runtime.config import ConfigError, load
+from services.runtime.stage import STAGES
 
 DEFAULT_TOPICS = ("raw", "contact", "status", "info")
 POLL_S = 0.05

@@ -23,12 +23,12 @@ from protocol.publishing import covers
 from protocol.runtime import host_id
 from protocol.sockets import ControlError, ControlServer, Publisher
 from protocol.topics import TOPIC_OF
-from services import persistence
-from services.config import Config
-from services.lane import Feed, Lane, Newest
-from services.lateness import Lateness
-from services.stage import Refused, Stage, add_reason
-from services.waiting import Waiter
+from services.runtime import persistence
+from services.runtime.channel import Feed, Lane, Newest
+from services.runtime.config import Config
+from services.runtime.lateness import Lateness
+from services.runtime.stage import Refused, Stage, add_reason
+from services.runtime.waiting import Waiter
 
 HEARTBEAT_S = 1.0
 TICK_S = 0.2  # how often at most silence, changes of health and new subscribers are looked for

@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 import sys
 
-from services.config import ROOT, ConfigError, config_path, load
-from services.supervision import stub_arguments
+from services.runtime.config import ROOT, ConfigError, config_path, load
+from services.runtime.supervision import stub_arguments
 
 
 def main() -> int:

@@ -22,10 +22,10 @@ from models import limits
 from models.bundle import Bundle
 from models.fisher import mean_floor
 from models.prereconstruction import Drift
-from services.config import Skin
 from services.pipeline import Pipeline
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import reconstruct
+from services.runtime.config import Skin
 
 FORCES = (1.0, 3.0, 5.0)
 RADII = (0.1, 0.2, 0.3)

@@ -16,8 +16,8 @@ from firmware_stub.timeline import Script, Timeline
 from firmware_stub.world import NEWTON, World
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame
-from services.config import Skin
 from services.pipeline import Pipeline
+from services.runtime.config import Skin
 
 FAR_M = 0.015  # from every true touch: a contact is wrong
 

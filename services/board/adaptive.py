@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from models.sentinel import Sentinel
 from protocol import link
 from protocol.frames import DeltaFrame
-from services.touches.sentinel import Verdict, Watch
+from services.estimation.sentinel import Verdict, Watch
 
 QUIET_FRAMES = 64  # 3 s: a tare's worth, so that one can be taken while the board idles
 FULL_EVERY_S = 0.5  # as often as preprocessing follows drift: longer gaps would widen what it allows for

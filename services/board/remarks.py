@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from services.board.boardlink import BoardLink
 from services.board.clock import MAX_RATE_ERROR, WIDE_NS
-from services.stage import Health
+from services.runtime.stage import Health
 
 REMEMBERED_S = 5.0  # how long status speaks of a standstill
 

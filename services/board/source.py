@@ -11,7 +11,6 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Generator, Iterator
-from pathlib import Path
 
 from models.bundle import Bundle
 from protocol import link
@@ -23,9 +22,9 @@ from services.board.boardlink import BoardLink, Scanning
 from services.board.clock import UNSETTLED_NS
 from services.board.host_time import STOOD_STILL_S, HostTime, Suspensions
 from services.board.remarks import Remarks
-from services.config import Skin
-from services.stage import Health, add_reason, valid_for_s
-from services.touches.sentinel import sentinel_of
+from services.estimation.sentinel import sentinel_of
+from services.runtime.config import Skin
+from services.runtime.stage import Health, add_reason, valid_for_s
 
 POLL_S = 0.1
 REOPEN_S = 0.2  # between attempts to open a port
@@ -267,11 +266,3 @@ class BoardSource(Source):
             self.counts += now - seen
             seen.clear()
             seen.update(now)
-
-
-def open_source(name: str, skin: Skin, bundle: Bundle) -> Source:
-    """The source that a skin's `port` names."""
-    from services.board.file_source import FileSource, RecordingSource  # here: they are sources themselves
-
-    kind = {".mcap": RecordingSource, ".npz": FileSource}.get(Path(skin.port).suffix, BoardSource)
-    return kind(name, skin, bundle)

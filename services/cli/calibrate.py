@@ -21,7 +21,7 @@ from services.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from services.calibrating.calibration_fit import Press
+    from services.calibration.force_fit import Press
 
 PLAN = ((0, 0, 1), (0, 0, 3), (0, 0, 5), (1, 1, 2), (-1, 1, 4), (-1, -1, 2), (1, -1, 4))
 """Where to press (halves of the way to the edge), and about how firmly [N]; then again from the first."""
@@ -52,9 +52,11 @@ def force(
     force_n,row (from 0).
     """
     from models.bundle import Bundle
-    from services.calibrating import calibration, calibration_csv, calibration_presses
-    from services.calibrating.calibration_fit import CalibrationError, fit
-    from services.config import load
+    from services.calibration import force_presses as calibration_presses
+    from services.calibration import presses_csv as calibration_csv
+    from services.calibration.force_fit import CalibrationError, fit
+    from services.contacts import calibration_file as calibration
+    from services.runtime.config import load
 
     name = skin_name(skin)
     configured = load(config_file()).skin(name)
@@ -110,8 +112,8 @@ def _prompted(name: str, bundle: Any) -> list[Press]:
     import time
 
     from protocol.sockets import AllReader
-    from services.calibrating.calibration_fit import CalibrationError, Press
-    from services.calibrating.calibration_presses import wait_for_press, wait_for_release
+    from services.calibration.force_fit import CalibrationError, Press
+    from services.calibration.force_presses import wait_for_press, wait_for_release
 
     use_configured_sockets()
     quarter = 0.25e3 * bundle.image_size * bundle.metres_per_pixel  # mm, half the way to the edge

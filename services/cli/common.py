@@ -85,12 +85,12 @@ EXPECTED = {
     ("protocol.runtime", "AlreadyRunning"): FAILED,
     ("protocol.frames", "FrameError"): FAILED,
     ("protocol.sockets", "ControlError"): FAILED,
-    ("services.config", "ConfigError"): USAGE,
+    ("services.runtime.config", "ConfigError"): USAGE,
     ("services.recordings.recording", "RecordingError"): USAGE,
     ("services.recordings.replay", "ReplayError"): FAILED,
     ("services.recordings.importing", "ImportRefused"): USAGE,
-    ("services.calibrating.registration", "RegistrationError"): USAGE,
-    ("services.calibrating.calibration_fit", "CalibrationError"): USAGE,
+    ("services.calibration.registration", "RegistrationError"): USAGE,
+    ("services.calibration.force_fit", "CalibrationError"): USAGE,
     ("protocol.transport", "TransportError"): FAILED,
     ("models.bundle", "BundleError"): USAGE,
 }
@@ -154,7 +154,7 @@ def use_configured_sockets() -> None:
     """Our sockets where the configuration puts them; without a word on them, in the runtime folder."""
     if _configuration().get("sockets"):
         from protocol import transport
-        from services.config import load
+        from services.runtime.config import load
 
         transport.configure(load(config_file()).transport())
 

@@ -89,7 +89,7 @@ def register_frame(
     as_json: JsonOption = False,
 ) -> None:
     """Fit the skin's frame, and its sensitivities, to presses at places that a machine knows; say how well they fit."""
-    from services.calibrating.register_command import register_presses
+    from services.calibration.register_command import register_presses
 
     out = out or Path("calibration", Path(skin).name)
     report = register_presses(load_npz(source), skin, presses, out)

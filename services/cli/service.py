@@ -27,9 +27,9 @@ def up(
 ) -> None:
     """Start all processes and keep them alive, in the foreground; Ctrl-C or SIGTERM stops them all."""
     from protocol.runtime import lock
-    from services.config import load
-    from services.supervision import Program, programs
-    from services.supervision import up as supervise
+    from services.runtime.config import load
+    from services.runtime.supervision import Program, programs
+    from services.runtime.supervision import up as supervise
 
     found = load()
     wanted = [p for p in programs(found) if not (no_board and p.name in ("acquisition", "stub"))]
@@ -62,7 +62,7 @@ def doctor(
     as_json: JsonOption = False,
 ) -> None:
     """Say what stands in the way of contacts: configuration, bundle, port, board, clock, electrodes."""
-    from services.doctor import examine
+    from services.cli.doctor import examine
 
     findings = examine(config_file())
     if as_json:

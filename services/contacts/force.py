@@ -21,11 +21,11 @@ from models import uncertainty
 from models.bundle import NETWORKS, Bundle
 from models.uncertainty import Map
 from protocol.frames import ImageFrame
-from services.calibrating import calibration
-from services.calibrating.calibration import Of
-from services.config import ConfigError, Skin
+from services.contacts import calibration_file as calibration
+from services.contacts.calibration_file import Of
 from services.contacts.force_curve import Curve
 from services.contacts.segmentation import Segment
+from services.runtime.config import ConfigError, Skin
 
 NEWTONS_PER_SIEMENS = 10.0  # N per S/m: 0.1 to 0.5 S/m are 1 to 5 N
 MOST_N = calibration.MOST_N

@@ -9,13 +9,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 from protocol.frames import pack
-from services.board.file_source import file_frame
-from services.config import SKIN_NAME
 from services.recordings import settings
+from services.recordings.file_source import file_frame
 from services.recordings.npz_file import InputError, frames_of, read_scans
 from services.recordings.reconstruction import find_skin
 from services.recordings.recording import RecordingWriter
-from services.stage import valid_for_s
+from services.runtime.config import SKIN_NAME
+from services.runtime.stage import valid_for_s
 
 ROWS_PER_CHUNK = 8
 EPOCH_NS = 1_000_000_000_000_000_000

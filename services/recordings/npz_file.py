@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from models import npz
 from models.bundle import Bundle
 from models.files import FileError
-from services.baseline.references import alike
+from services.estimation.references import alike
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from models.bundle import Bundle, BundleError
 from models.prereconstruction import noise_of_frames
 from protocol.frames import RawFrame
-from services.baseline.tare import Baseline, take
-from services.config import ConfigError, Skin, load
+from services.estimation.tare import Baseline, take
 from services.pipeline import ALL, Pipeline, Result
 from services.recordings.npz_file import Input, frames_of
-from services.stage import SEPARATE, Refused
+from services.runtime.config import ConfigError, Skin, load
+from services.runtime.stage import SEPARATE, Refused
 
 Array = NDArray[np.float64]
 

@@ -15,9 +15,9 @@ from typing import Any
 
 from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, read_map, unpack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
-from services.config import SKIN_NAME
 from services.recordings.recording import STATE_TOPIC, Recorded, RecordingError, RecordingReader, RecordingWriter
-from services.stage import STAGES, add_reason
+from services.runtime.config import SKIN_NAME
+from services.runtime.stage import STAGES, add_reason
 
 CHAIN_S = 20.0  # for the stages to start and find each other
 ANSWER_S = 5.0  # for the contacts of one frame

@@ -16,11 +16,11 @@ from typing import Any
 
 from protocol.frames import ContactFrame
 from protocol.runtime import AlreadyRunning, lock, runtime_dir
-from services.config import ROOT, ConfigError, Skin, config_path, load
 from services.recordings import settings
 from services.recordings.recording import RecordingReader, RecordingWriter
 from services.recordings.replay import Replayer, ReplayError, skins_in, steps
-from services.stage import STAGES
+from services.runtime.config import ROOT, ConfigError, Skin, config_path, load
+from services.runtime.stage import STAGES
 
 PR_SET_PDEATHSIG = 1
 STOP_S = 2.0

@@ -20,9 +20,9 @@ from pydantic import Field, ValidationError, field_validator
 
 from models.bundle import BUNDLES, Bundle, BundleError
 from models.files import read_text
-from services.calibrating import calibration
-from services.config import SKIN_NAME, Config, ConfigError, Indenter, Pose, Section, Skin, Skip, Tare, Touch
+from services.contacts import calibration_file as calibration
 from services.recordings.recording import RecordingError
+from services.runtime.config import SKIN_NAME, Config, ConfigError, Indenter, Pose, Section, Skin, Skip, Tare, Touch
 
 KEY = "settings"
 """The key of a recording's metadata."""

@@ -28,8 +28,8 @@ from models.bundle import Bundle
 from models.forward import shared
 from models.shapes import Array
 from protocol.frames import Contact
-from services.baseline.tare import Baseline
-from services.stage import Refused
+from services.estimation.tare import Baseline
+from services.runtime.stage import Refused
 
 RELATIVE = 10 ** (-80 / 20)  # the board's noise
 

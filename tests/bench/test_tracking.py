@@ -13,7 +13,7 @@ from bench._tracking_scene import TOUCHES, Recorded, _drifting, simulate
 from bench._tracking_scores import GRACE, LIGHT_N, Scorer, Seen, all_of
 from firmware_stub.timeline import Curve, Script
 from protocol.frames import ELECTRODE_STATES
-from services.config import Skin
+from services.runtime.config import Skin
 
 N = 60
 ROW = ("index", *TOUCHES)

@@ -37,8 +37,8 @@ def give_up_rights() -> None:
 def read_as_a_port(file: str) -> tuple[int, str]:
     """What acquisition says of `port = FILE`: the problem in its status."""
     from models.bundle import Bundle
-    from services.board.source import open_source
-    from services.config import Skin
+    from services.acquisition import open_source
+    from services.runtime.config import Skin
 
     source = open_source("palm", Skin(port=file, bundle="square16"), Bundle.load("square16"))
     with contextlib.closing(source):

@@ -11,7 +11,7 @@ import pytest
 
 from models.bundle import Bundle
 from protocol import link
-from services.doctor import _key, electrode_order
+from services.cli.doctor import _key, electrode_order
 
 
 @pytest.fixture(scope="module")

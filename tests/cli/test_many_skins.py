@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 
 from protocol.sockets import NewestReader
-from services.config import load
-from services.supervision import programs, stub_arguments
+from services.runtime.config import load
+from services.runtime.supervision import programs, stub_arguments
 
 ROOT = Path(__file__).resolve().parents[2]
 

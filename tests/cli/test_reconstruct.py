@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from services.baseline.references import noise_of_references
-from services.config import Skin
+from services.estimation.references import noise_of_references
 from services.recordings.npz_file import Input, read_input
 from services.recordings.reconstruction import reconstruct, resampled
+from services.runtime.config import Skin
 
 METRES = 0.05  # per model unit
 

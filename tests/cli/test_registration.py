@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from services.calibrating.registration import (
+from services.calibration.registration import (
     RegistrationError,
     Similarity,
     half_width,
@@ -18,7 +18,7 @@ from services.calibrating.registration import (
     sample,
     sensitivities,
 )
-from services.calibrating.sensitivity import corrected, locate, response
+from services.calibration.sensitivity import corrected, locate, response
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_the_command_writes_a_bundle_and_its_pose(skin, bundle, tmp_path) -> Non
     assert ran.code == 0 and "turned by +40." in ran.out
     made = Bundle.load(tmp_path / "mine")  # its hashes are right
     assert abs(made.metres_per_unit / bundle.metres_per_unit - 1.25) < 0.03
-    from services.config import load
+    from services.runtime.config import load
 
     pose = load(tmp_path / "mine" / "skin.toml").skins["disc16"].pose
     assert (

@@ -21,7 +21,7 @@ from protocol import transport
 from protocol.control import ControlClient, ControlError
 from protocol.frames import ContactFrame, pack
 from protocol.sockets import ControlServer, NewestReader, Publisher
-from services.config import ROOT, load
+from services.runtime.config import ROOT, load
 
 DOC = (ROOT / "docs" / "security.md").read_text()
 SKIN_TOML = (ROOT / "skin.toml").read_text()

@@ -34,14 +34,15 @@ from protocol.frames import FrameError, RawFrame, pack, read_map, unpack
 from protocol.link import SCHEMA_HASH, Decoder
 from protocol.link_messages import BY_NUMBER
 from protocol.topics import TOPICS
-from services import persistence
-from services.calibrating import calibration, calibration_csv
-from services.calibrating.calibration_fit import CalibrationError
-from services.config import ConfigError, Skin, load
+from services.calibration import presses_csv as calibration_csv
+from services.calibration.force_fit import CalibrationError
+from services.contacts import calibration_file as calibration
 from services.preprocessing import Preprocessing
 from services.recordings import settings
 from services.recordings.recording import RecordingError, RecordingReader
 from services.recordings.replay import skins_in, steps
+from services.runtime import persistence
+from services.runtime.config import ConfigError, Skin, load
 
 CORPUS = Path(__file__).parent / "corpus"
 ROOT = Path(__file__).resolve().parents[2]
@@ -206,7 +207,7 @@ def state(data: bytes) -> None:
     file.chmod(0o600)
     found = persistence.restore("preprocessing", "palm")
     if found is not None:
-        from services.stage import Refused
+        from services.runtime.stage import Refused
 
         stage = _stage()
         stage.reset()
@@ -323,7 +324,7 @@ def nested(depth: int) -> list[Any]:
 def _kept() -> dict[str, Any]:
     stage = _stage()
     stage.reset()
-    from services.baseline.tare import Baseline
+    from services.estimation.tare import Baseline
 
     z0 = _bundle().z0
     stage.set_baseline(Baseline(z0.copy(), 1e-3 * z0, 64, "board", 10**9))

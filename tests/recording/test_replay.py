@@ -14,12 +14,12 @@ import pytest
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, RawFrame, pack, unpack
 from protocol.runtime import runtime_dir
-from services import persistence
 from services.pipeline import Pipeline
 from services.recordings.importing import ImportRefused, import_arrays
 from services.recordings.recording import RecordingReader, RecordingWriter
 from services.recordings.replay import ReplayError, steps
 from services.recordings.replay_session import replay_file
+from services.runtime import persistence
 
 
 @pytest.fixture(scope="module")

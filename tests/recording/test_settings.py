@@ -16,14 +16,14 @@ import pytest
 from models import bundle as bundles
 from models.bundle import Bundle
 from protocol.frames import RawFrame, pack
-from services.calibrating import calibration
-from services.config import ROOT, Config, load, parse
+from services.contacts import calibration_file as calibration
 from services.contacts.force_curve import Curve
 from services.recorder import _metadata
 from services.recordings import settings
 from services.recordings.recording import RecordingError, RecordingReader, RecordingWriter
 from services.recordings.replay import ReplayError
 from services.recordings.replay_session import _configuration, replay_file
+from services.runtime.config import ROOT, Config, load, parse
 
 HERE = Path("recording.mcap")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import services  # noqa: F401  (one thread for the numerical libraries, before numpy starts them)
 from models.bundle import Bundle
 from protocol.frames import RawFrame
-from services.config import Skin
+from services.runtime.config import Skin
 
 FRAME_NS = 45_000_000
 

@@ -18,14 +18,14 @@ from models.bundle import Bundle
 from models.patterns import pattern
 from protocol import link
 from protocol.frames import STATUS_OPEN, RawFrame, pack
-from services.acquisition import SourceFeed
+from services.acquisition import SourceFeed, open_source
 from services.board.boardlink import ANSWER_S, DEAD_SCANS, REFUSED_AGAIN_S, SILENT_S, BoardLink, Scanning
 from services.board.clock import DeviceClock
-from services.board.file_source import FileSource, RecordingSource
 from services.board.port import PortError, explain
-from services.board.source import Source, open_source
-from services.config import Skin
+from services.board.source import Source
+from services.recordings.file_source import FileSource, RecordingSource
 from services.recordings.recording import RecordingWriter
+from services.runtime.config import Skin
 from tests.services.fake_board import FakeBoard, PtyBoard
 
 SCANNING = Scanning(pattern("pairs"), 128, 40_000.0)

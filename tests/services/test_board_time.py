@@ -23,7 +23,7 @@ from services.board.scan_check import DOUBTED_SCANS
 from services.board.scan_order import ScanOrder
 from services.board.source import BoardSource, Source
 from services.board.time_questions import ASK_EVERY_S, TimeQuestions
-from services.config import Skin
+from services.runtime.config import Skin
 from tests.services.fake_board import FakeBoard
 from tests.services.test_acquisition import SCANNING
 

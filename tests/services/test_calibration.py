@@ -12,13 +12,14 @@ import pytest
 
 from models.bundle import Bundle
 from protocol.frames import ImageFrame
-from services.calibrating import calibration, calibration_csv
-from services.calibrating.calibration_fit import CalibrationError, Press, fit
-from services.calibrating.calibration_presses import laws, wait_for_press, wait_for_release
-from services.config import ConfigError, Indenter, Skin
+from services.calibration import presses_csv as calibration_csv
+from services.calibration.force_fit import CalibrationError, Press, fit
+from services.calibration.force_presses import laws, wait_for_press, wait_for_release
+from services.contacts import calibration_file as calibration
 from services.contacts.force import ForceLaw, Look
 from services.contacts.force_curve import Curve
 from services.describe import describe
+from services.runtime.config import ConfigError, Indenter, Skin
 
 CONSTANT = 40.0  # N per (S/m)^0.8
 

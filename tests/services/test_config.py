@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from models.bundle import Bundle
-from services.config import ROOT, ConfigError, load, parse
 from services.contacts.force import ForceLaw
 from services.contacts.force_curve import Curve
+from services.runtime.config import ROOT, ConfigError, load, parse
 
 NAN, INF = float("nan"), float("inf")
 PALM: dict[str, Any] = {"port": "stub", "bundle": "square16"}

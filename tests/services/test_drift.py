@@ -12,12 +12,12 @@ from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame, RawFrame
-from services.baseline.following import Follower
-from services.baseline.tare import take
-from services.config import Skin
+from services.estimation.following import Follower
+from services.estimation.tare import take
+from services.estimation.touch_detector import Judge, Noise
 from services.preprocessing import Preprocessing
 from services.recordings.reconstruction import reconstruct
-from services.touches.judging import Judge, Noise
+from services.runtime.config import Skin
 from tests.services.conftest import FRAME_NS, Board
 
 Array = NDArray[np.float64]

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from models.shapes import Shape
-from services.config import Skin
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import reconstruct
+from services.runtime.config import Skin
 from tests.services.stub_skin import StubSkin, sheet
 
 Array = NDArray[np.float64]

@@ -16,11 +16,11 @@ from models.calibrate import Presses, solve  # noqa: E402
 from models.forward import shared  # noqa: E402
 from models.shapes import Shape  # noqa: E402
 from protocol.frames import Contact, RawFrame  # noqa: E402
-from services.baseline.tare import take  # noqa: E402
-from services.config import ConfigError, Indenter, Skin  # noqa: E402
 from services.contacts.force import ForceLaw, Look  # noqa: E402
 from services.contacts.force_curve import Curve  # noqa: E402
+from services.estimation.tare import take  # noqa: E402
 from services.pipeline import Pipeline  # noqa: E402
+from services.runtime.config import ConfigError, Indenter, Skin  # noqa: E402
 
 FRAME_NS = 45_000_000
 

@@ -11,11 +11,11 @@ from onnx import TensorProto, helper
 
 from models.bundle import Bundle, write
 from protocol.frames import DeltaFrame, ImageFrame, pack
-from services.config import Skin
-from services.faults.quality import KEPT
+from services.estimation.quality import KEPT
+from services.estimation.touch import MEANS
 from services.inference import SETTLED, Inference
 from services.preprocessing import Preprocessing
-from services.touches.touch import MEANS
+from services.runtime.config import Skin
 from tests.services.conftest import Board
 
 WANTED = frozenset({"image"})

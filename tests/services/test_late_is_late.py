@@ -20,8 +20,8 @@ from protocol.client import Stale
 from protocol.control import ControlClient
 from protocol.frames import ContactFrame
 from protocol.listener import ContactListener
-from services.config import ROOT
-from services.stage import PROCESSES
+from services.runtime.config import ROOT
+from services.runtime.stage import PROCESSES
 
 STOPS_S = (0.45, 2.0)  # not much longer than a frame may be acted on, and much longer
 TOLERANCE_S = 0.1  # between the client's judgement and its callback

@@ -13,7 +13,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from services import persistence
+from services.runtime import persistence
 
 STATE = {"baseline": {"z0": np.linspace(1, 2, 5), "frames": 64}, "quiet_s": 1.5}
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from protocol.frames import RawFrame
-from services.config import Skin
 from services.pipeline import Pipeline, Result
+from services.runtime.config import Skin
 from tests.services.conftest import Board
 
 SCALE = 0.05  # metres per model unit

@@ -9,10 +9,10 @@ import pytest
 
 from models.bundle import Bundle
 from protocol.frames import STATUS_OPEN, DeltaFrame, RawFrame, pack, unpack
-from services.baseline.tare import disagreement, take
-from services.config import Skin
+from services.estimation.tare import disagreement, take
 from services.preprocessing import Preprocessing
-from services.stage import Refused
+from services.runtime.config import Skin
+from services.runtime.stage import Refused
 from tests.services.conftest import Board
 
 WANTED = frozenset({"delta"})

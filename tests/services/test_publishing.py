@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame, pack, unpack
-from services import persistence
-from services.config import Skin
 from services.contacts.outline import outline
 from services.contacts.tracking import LOST_FRAMES
 from services.publishing import Publishing
+from services.runtime import persistence
+from services.runtime.config import Skin
 
 N, M = 96, 0.1 / 96
 CONTACT = frozenset({"contact"})

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.shapes import Shape, drop_image
-from services.faults.quality import REFUSED, Residual
+from services.estimation.quality import REFUSED, Residual
 from tests.services.stub_skin import StubSkin, transfer
 
 TOUCHES = [

@@ -7,14 +7,14 @@ import sys
 
 import pytest
 
-from services.config import ConfigError, parse
-from services.stage import Health
+from services.runtime.config import ConfigError, parse
+from services.runtime.stage import Health
 
 SKINS = {"palm": {"port": "stub", "bundle": "square16"}}
 ASK = """
 import json, os, resource, sys
-from services.config import RealTime
-from services.realtime import apply
+from services.runtime.config import RealTime
+from services.runtime.realtime import apply
 drop, wanted = json.loads(sys.argv[1])
 if drop:
     for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):

@@ -18,10 +18,10 @@ import pytest
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame, Frame, ImageFrame, InfoFrame, RawFrame, StatusFrame, pack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
-from services.config import ROOT, parse
-from services.lateness import Lateness
 from services.runner import Runner
-from services.stage import Stage
+from services.runtime.config import ROOT, parse
+from services.runtime.lateness import Lateness
+from services.runtime.stage import Stage
 from tests.services.conftest import Board
 
 CONFIG = '[skins.palm]\nport = "stub"\nbundle = "square16"\nnetwork = "none"\n'
@@ -341,8 +341,8 @@ def test_who_subscribes_is_told_of_and_what_is_lacking_is_asked_for_by_subscribi
 def test_a_stop_and_a_sleep_of_the_host_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """By the loop's own time; and by the clock that goes on while the host is suspended."""
     now, slept, naps = [100.0], [0.0], []
-    monkeypatch.setattr("services.lateness.time.monotonic", lambda: now[0])
-    monkeypatch.setattr("services.lateness.time.sleep", naps.append)
+    monkeypatch.setattr("services.runtime.lateness.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("services.runtime.lateness.time.sleep", naps.append)
     monkeypatch.setattr("protocol.ages._slept_ns", lambda: int(slept[0] * 1e9))
     lateness = Lateness()
 

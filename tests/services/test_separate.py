@@ -10,16 +10,16 @@ import pytest
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, RawFrame
-from services.baseline.references import alike, noise_of_references
-from services.board import file_source
-from services.board.file_source import FileSource, RecordingSource, file_frame
-from services.calibrating.register_command import register_presses
-from services.calibrating.registration import part
-from services.config import Skin
+from services.calibration.register_command import register_presses
+from services.calibration.registration import part
+from services.estimation.references import alike, noise_of_references
 from services.pipeline import Pipeline
+from services.recordings import file_source
+from services.recordings.file_source import FileSource, RecordingSource, file_frame
 from services.recordings.importing import import_arrays
 from services.recordings.npz_file import Input, frames_of, load_npz, read_scans
 from services.recordings.reconstruction import reconstruct
+from services.runtime.config import Skin
 
 Arrays = dict[str, np.ndarray]
 

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from services.config import ROOT, load
-from services.supervision import programs
+from services.runtime.config import ROOT, load
+from services.runtime.supervision import programs
 
 UP = """
 import sys
-from services.config import load
-from services.supervision import Program, up
+from services.runtime.config import load
+from services.runtime.supervision import Program, up
 from protocol.runtime import AlreadyRunning
 args = [a.split(",") for a in sys.argv[1:]]
 try:

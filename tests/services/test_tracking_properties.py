@@ -19,12 +19,12 @@ from models.bundle import Bundle
 from models.shapes import KINDS, Shape, drop_image
 from models.uncertainty import FLOOR, RELATIVE_FLOOR
 from protocol.frames import SHAPES, ContactFrame, ImageFrame, pack, unpack
-from services import persistence
-from services.config import Skin
 from services.contacts.motion import Seen
 from services.contacts.segmentation import KERNEL, segment
 from services.contacts.tracking import Tracker
 from services.publishing import Publishing
+from services.runtime import persistence
+from services.runtime.config import Skin
 
 FRAME_NS = 45_000_000
 N = 48

@@ -16,8 +16,8 @@ from scipy import ndimage, optimize
 from models.bundle import Bundle
 from models.shapes import KINDS, Shape, drop_image
 from protocol.frames import ContactFrame, ImageFrame
-from services.config import Skin
 from services.publishing import Publishing
+from services.runtime.config import Skin
 
 N = 64
 UNIT_M = 0.05  # metres per model unit

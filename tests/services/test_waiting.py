@@ -8,7 +8,7 @@ import pytest
 import zmq
 
 from protocol.transport import Socket
-from services.waiting import Waiter
+from services.runtime.waiting import Waiter
 
 MANY = 40
 

@@ -1,1 +1,0 @@
-"""What the untouched skin measures, and how that is followed while it drifts."""

@@ -1,0 +1,192 @@
+"""Fits a skin's force law to a handful of presses of known force.
+
+log force = log scale + exponent * log quantity + a few terms of the place: monotone as long as the exponent is above 0,
+and linear in what is sought, so leaving a press out costs nothing (the hat matrix says what it would have been). Which
+quantity, whether the exponent is free, and how many terms: what the presses themselves predict best when each is left
+out, of what their number allows; the simplest of those that are nearly as good. The error stated is that of presses
+that took no part in any of this, the choice included.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.contacts.calibration_file import Calibration, Of
+from services.contacts.force import ForceLaw, Look
+from services.contacts.force_curve import TERMS, Curve, columns
+
+Array = NDArray[np.float64]
+
+FEWEST = 5
+PRESSES_PER_PARAMETER = 2.5
+NEARLY = 1.05  # times the best cross-validated error: the simpler one is taken
+SPREAD = 1.5  # ratio of the largest to the smallest force, at least
+MOST_ERROR = 0.5  # rms of log force, left out: beyond it nothing was learned
+LEAST_EXPONENT = 0.2
+
+
+class CalibrationError(Exception):
+    """The presses make no force law; says what was found, what was expected and what to do."""
+
+
+@dataclass(frozen=True)
+class Press:
+    """One press of known force, and what the image showed of it; `where` names it in errors."""
+
+    force_n: float
+    look: Look
+    where: str
+
+
+@dataclass(frozen=True)
+class Form:
+    """One of the laws that are tried."""
+
+    reads: Of
+    free_exponent: bool
+    correction: str
+
+    @property
+    def parameters(self) -> int:
+        return 1 + self.free_exponent + len(TERMS[self.correction])
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """N presses: log force, log quantity by kind, places [m]."""
+
+    force: Array
+    quantity: dict[Of, Array]
+    x: Array
+    y: Array
+    reach: float
+
+    def design(self, form: Form) -> tuple[Array, Array]:
+        """(N, P) columns and (N,) targets; without a free exponent log quantity is on the left."""
+        q = self.quantity[form.reads]
+        parts = [np.ones((len(q), 1)), columns(TERMS[form.correction], self.x, self.y, self.reach)]
+        if form.free_exponent:
+            return np.hstack([parts[0], q[:, None], parts[1]]), self.force
+        return np.hstack(parts), self.force - q
+
+    def part(self, rows: NDArray[np.bool_]) -> Table:
+        quantity: dict[Of, Array] = {k: v[rows] for k, v in self.quantity.items()}
+        return Table(self.force[rows], quantity, self.x[rows], self.y[rows], self.reach)
+
+
+def fit(presses: Sequence[Press], laws: dict[Of, ForceLaw], most_n: float | None = None) -> Calibration:
+    """The law of N presses. laws: what says each quantity of a look, by kind. Raises CalibrationError."""
+    _check(presses)
+    table = _table(presses, laws)
+    form = _choose(table, laws)
+    left_out = _left_out(table, laws)
+    error = float(np.sqrt(np.mean(left_out**2)))
+    if error > MOST_ERROR:
+        raise CalibrationError(
+            f"the others foretell a press only to {100 * np.expm1(error):.0f} %: check that each force belongs "
+            "to its press, that one thing touched at a time, and that the tare was taken untouched"
+        )
+    found = _solve(table, form)
+    exponent = float(found[1]) if form.free_exponent else 1.0
+    terms = tuple(float(v) for v in found[1 + form.free_exponent :])
+    curve = Curve(float(np.exp(found[0])), exponent, form.correction, terms, table.reach)
+    images = np.array([laws[form.reads].quantity(p.look)[1] or 0.0 for p in presses])
+    own = float(np.sqrt(max(0.0, error**2 - float(np.mean((exponent * images) ** 2)))))
+    forces = [p.force_n for p in presses]
+    said = {
+        "error": {"left_out_rms": error, "left_out_median": float(np.median(np.abs(np.expm1(left_out))))},
+        "presses": len(presses),
+        "forces_n": [min(forces), max(forces)],
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    return Calibration(curve, form.reads, most_n or max(forces), own, said)
+
+
+def _check(presses: Sequence[Press]) -> None:
+    if len(presses) < FEWEST:
+        raise CalibrationError(
+            f"{len(presses)} presses: at least {FEWEST} are needed, over the skin and from light to firm"
+        )
+    for p in presses:
+        if not (np.isfinite(p.force_n) and p.force_n > 0):
+            raise CalibrationError(f"{p.where}: found a force of {p.force_n} N, expected one above 0")
+        values = (p.look.peak, p.look.integral, p.look.area)
+        if not all(np.isfinite(v) and v > 0 for v in values):
+            raise CalibrationError(
+                f"{p.where}: found peak {values[0]}, integral {values[1]}, area {values[2]}; expected all above 0: "
+                "leave this press out"
+            )
+    forces = [p.force_n for p in presses]
+    if max(forces) < SPREAD * min(forces):
+        raise CalibrationError(
+            f"forces from {min(forces):g} to {max(forces):g} N: expected the largest at least {SPREAD} times the "
+            "smallest, or nothing is learned about the law; press lighter and firmer too"
+        )
+
+
+def _table(presses: Sequence[Press], laws: dict[Of, ForceLaw]) -> Table:
+    quantity: dict[Of, Array] = {}
+    for reads, law in laws.items():
+        quantity[reads] = np.log([law.quantity(p.look)[0] for p in presses])
+    x, y = (np.array([getattr(p.look, axis) for p in presses]) for axis in "xy")
+    reach = max(float(np.max(np.abs([x, y]))), 1e-6)
+    return Table(np.log([p.force_n for p in presses]), quantity, x, y, reach)
+
+
+def _forms(n: int, laws: dict[Of, ForceLaw]) -> list[Form]:
+    """What n presses allow, simplest first."""
+    every = [Form(*each) for each in itertools.product(laws, (False, True), TERMS)]
+    return sorted((f for f in every if PRESSES_PER_PARAMETER * f.parameters <= n), key=lambda f: f.parameters)
+
+
+def _solve(table: Table, form: Form) -> Array:
+    """Coefficients (P,)."""
+    a, y = table.design(form)
+    return np.asarray(np.linalg.lstsq(a, y, rcond=None)[0])
+
+
+def _rises(table: Table, form: Form) -> bool:
+    """Whether more of the quantity means more force."""
+    return not form.free_exponent or bool(_solve(table, form)[1] > LEAST_EXPONENT)
+
+
+def _residuals(table: Table, form: Form) -> Array:
+    """(N,) of log force, each press left out."""
+    a, y = table.design(form)
+    hat = a @ np.linalg.pinv(a)
+    slack = np.maximum(1 - np.diag(hat), 1e-6)
+    return np.asarray((y - hat @ y) / slack)
+
+
+def _choose(table: Table, laws: dict[Of, ForceLaw]) -> Form:
+    """The simplest form that is nearly as good as the best. Raises CalibrationError where force does not rise."""
+    # Asked of a quantity by itself: a law of slope 1 rises whatever the presses say.
+    rising = {reads: law for reads, law in laws.items() if _rises(table, Form(reads, True, "none"))}
+    if not rising:
+        raise CalibrationError(
+            "harder presses do not leave larger images, neither in peak nor in integral: expected them to; check that "
+            "each force belongs to its press"
+        )
+    forms = [f for f in _forms(len(table.force), rising) if _rises(table, f)]
+    errors = {f: float(np.sqrt(np.mean(_residuals(table, f) ** 2))) for f in forms}
+    limit = NEARLY * min(errors.values())
+    return next(f for f in forms if errors[f] <= limit)
+
+
+def _left_out(table: Table, laws: dict[Of, ForceLaw]) -> Array:
+    """(N,) errors of log force, each press predicted by a law that was chosen and fitted without it."""
+    n = len(table.force)
+    errors = np.empty(n)
+    for k in range(n):
+        rest = np.arange(n) != k
+        form = _choose(table.part(rest), laws)
+        a, y = table.design(form)
+        found, *_ = np.linalg.lstsq(a[rest], y[rest], rcond=None)
+        errors[k] = y[k] - a[k] @ found
+    return errors

@@ -1,0 +1,148 @@
+"""Presses of known force for a calibration, from a running service or from a file of measurements."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from models.bundle import Bundle
+from protocol.frames import Frame, ImageFrame
+from protocol.held import HeldImage
+from services.calibration.force_fit import CalibrationError
+from services.contacts.calibration_file import Of
+from services.contacts.force import ForceLaw, Look
+from services.contacts.segmentation import segment
+from services.pipeline import Pipeline
+from services.recordings.npz_file import InputError, load_npz, read_input
+from services.recordings.reconstruction import baseline_of, raw_frame
+from services.runtime.config import Skin
+
+STEADY_S = 1.5  # how long a press must have been steady
+STEADY = 0.05  # relative standard deviation of the peak within that time
+FEWEST_FRAMES = 8
+PATIENCE_S = 60.0
+
+
+def laws(skin: Skin, bundle: Bundle) -> dict[Of, ForceLaw]:
+    """What says each quantity of a look, without any calibration there may be already."""
+    law = ForceLaw.of(skin.model_copy(update={"calibration": None}), bundle)
+    kinds: tuple[Of, ...] = ("peak", "integral")
+    return {reads: replace(law, reads=reads) for reads in kinds}
+
+
+def looks(frame: ImageFrame) -> list[Look]:
+    """What an image shows of each touch, strongest first."""
+    if not (frame.touched and frame.image.size):
+        return []
+    return [Look.of(s, frame) for s in segment(frame.image, frame.sigma)]
+
+
+def mean(several: list[Look]) -> Look:
+    """Field by field."""
+    noises = [k.noise for k in several if k.noise is not None]
+    values = {f.name: float(np.mean([getattr(k, f.name) for k in several])) for f in fields(Look) if f.name != "noise"}
+    return Look(**values, noise=float(np.mean(noises)) if noises else None)
+
+
+class Steady:
+    """Images of a press, until it has been steady long enough."""
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[int, Look]] = deque()
+        self._held = HeldImage()
+        self.trouble = "nothing touches"
+
+    def __call__(self, frame: ImageFrame) -> Look | None:
+        """The mean of the steady time, or None while it is not over; `trouble` then says why."""
+        self._held.complete(frame)
+        found = looks(frame)
+        if len(found) != 1 or not frame.valid:
+            self._recent.clear()
+            self.trouble = f"{len(found)} touches at once" if len(found) > 1 else "nothing touches"
+            if found and not frame.valid:
+                self.trouble = f"the frames are not valid: {', '.join(frame.reasons)}"
+            return None
+        now = frame.stamps.get("sample", 0)
+        self._recent.append((now, found[0]))
+        while now - self._recent[0][0] > 2e9 * STEADY_S:
+            self._recent.popleft()
+        lately = [k for t, k in self._recent if now - t <= 1e9 * STEADY_S]
+        peaks = np.array([k.peak for k in lately])
+        scatter = float(peaks.std() / peaks.mean())
+        if scatter > STEADY:
+            self.trouble = f"the touch still changes by {100 * scatter:.0f} %"
+            return None
+        self.trouble = "the touch has not lasted long enough"
+        enough = now - self._recent[0][0] >= 1e9 * STEADY_S and len(lately) >= FEWEST_FRAMES
+        return mean(lately) if enough else None
+
+
+class Reader(Protocol):
+    """protocol.sockets.AllReader, as far as it is needed here."""
+
+    def recv(self, timeout_s: float = 0.0) -> Frame | None: ...
+
+
+def wait_for_press(reader: Reader, clock: Callable[[], float], patience_s: float = PATIENCE_S) -> Look:
+    """The next steady press. Raises CalibrationError where none comes."""
+    steady, end = Steady(), clock() + patience_s
+    heard = False
+    while clock() < end:
+        frame = reader.recv(0.5)
+        if isinstance(frame, ImageFrame):
+            heard = True
+            look = steady(frame)
+            if look is not None:
+                return look
+    if not heard:
+        raise CalibrationError(f"no image came within {patience_s:g} s: start the service with `skin up`")
+    raise CalibrationError(f"no steady press within {patience_s:g} s: {steady.trouble}")
+
+
+def wait_for_release(reader: Reader, clock: Callable[[], float], patience_s: float = PATIENCE_S) -> None:
+    """Until nothing touches. Raises CalibrationError where that does not happen."""
+    end = clock() + patience_s
+    while clock() < end:
+        frame = reader.recv(0.5)
+        if isinstance(frame, ImageFrame) and not frame.touched:
+            return
+    raise CalibrationError(f"something still touches after {patience_s:g} s: free the skin, or tare (`skin tare`)")
+
+
+def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None]) -> Callable[[int], Look]:
+    """What the image of each row of a file of measurements shows; that function raises ValueError.
+
+    Raises CalibrationError.
+    """
+    try:
+        arrays = load_npz(path)
+        if "measurements" not in arrays and "touched" in arrays:
+            arrays = {**arrays, "measurements": arrays["touched"]}
+        data = read_input({k: arrays[k] for k in ("measurements", "untouched") if k in arrays}, len(bundle.pattern))
+    except InputError as why:
+        raise CalibrationError(str(why) if str(path) in str(why) else f"{path}: {why}") from None
+    assert data.untouched is not None  # read_input sees to it
+    skin = skin.model_copy(update={"calibration": None})
+    pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
+    baseline = baseline_of(data.untouched, pipeline, warn)
+
+    def look(row: int) -> Look:
+        if not 0 <= row < len(data.measurements):
+            raise ValueError(f"{path} has rows 0 to {len(data.measurements) - 1}")
+        pipeline.reset()
+        pipeline.pre.set_baseline(replace(baseline, z0=baseline.z0.copy()))
+        image = pipeline.run(raw_frame(data.measurements[row], 0)).image
+        found = looks(replace(image, touched=True))
+        if len(found) != 1:
+            raise ValueError(f"its image shows {len(found)} touches, expected one")
+        if not math.isfinite(found[0].peak):
+            raise ValueError("its image is not finite")
+        return found[0]
+
+    return look

@@ -1,0 +1,181 @@
+"""`skin doctor`: what stands between a skin and its contacts. Works with the service up or down; changes nothing."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle, BundleError
+from protocol import transport
+from protocol.link import SCHEMA_HASH
+from protocol.runtime import RuntimeDirError, runtime_dir
+from services.board import port as ports
+from services.board.boardlink import BoardLink, Scanning
+from services.cli import doctor_live as live
+from services.cli.doctor_live import Finding
+from services.contacts.force import ForceLaw
+from services.estimation.tare import implausibility
+from services.runtime.config import RECORDINGS, Config, ConfigError, Skin, config_path, load
+
+BOARD_S = 2.5  # for a board to say who it is
+LATENCY_TIMER_MS = 1
+GOOD_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page")
+GOOD_FIT = 0.01  # relative misfit of |Z0| to the bundle's prediction
+SWAP_GAIN = 3.0  # a swap of two electrodes is suspected where it makes the fit so many times better
+
+
+def examine(path: Path | None = None) -> list[Finding]:
+    """Everything, in the order in which it must be right."""
+    return list(_examine(path))
+
+
+def _examine(path: Path | None) -> Iterator[Finding]:
+    try:
+        config = load(path)
+        transport.configure(config.transport())
+        yield Finding("OK", "configuration", f"{config_path(path)}: skin {', '.join(config.skins)}")
+    except (ConfigError, transport.TransportError) as why:
+        yield Finding("FAIL", "configuration", str(why).replace("\n", "; "))
+        return
+    try:
+        folder = runtime_dir()
+    except RuntimeDirError as why:
+        yield Finding("FAIL", "runtime folder", str(why))
+        return
+    running = live.running()
+    yield Finding("OK", "runtime folder", f"{folder}, {'a service runs' if running else 'no service runs'} there")
+    if running:
+        yield from live.configuration(config.path)
+    yield _clock()
+    for name, skin in config.skins.items():
+        yield from _skin(name, skin, config, running)
+
+
+def _clock() -> Finding:
+    file = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    try:
+        source = file.read_text().strip()
+    except OSError:
+        return Finding("SKIP", "clock", f"{file} cannot be read here")
+    if source in GOOD_CLOCKS:
+        return Finding("OK", "clock", f"monotonic clock from {source}")
+    return Finding("WARN", "clock", f"the kernel's clock source is {source}, slow to read; expected {GOOD_CLOCKS[0]}")
+
+
+def _skin(name: str, skin: Skin, config: Config, running: bool) -> Iterator[Finding]:
+    try:
+        bundle = Bundle.load(skin.bundle)
+    except BundleError as why:
+        yield Finding("FAIL", f"{name}: bundle", str(why))
+        return
+    network = (
+        "with its network" if bundle.network_path(skin.network if skin.network != "none" else "full") else "no network"
+    )
+    yield Finding("OK", f"{name}: bundle", f"{bundle.name}, every sha256 right ({bundle.hash[:12]}), {network}")
+    if skin.calibration is not None:
+        yield _calibration(name, skin, bundle)
+    if Path(skin.port).suffix in RECORDINGS:
+        found = Path(skin.port).is_file()
+        yield Finding("OK" if found else "FAIL", f"{name}: port", f"{skin.port} {'is' if found else 'is not'} there")
+    elif running:
+        yield from live.port(name, skin)
+    elif skin.port == "stub":
+        yield Finding("OK", f"{name}: port", "the stub board, which `skin up` starts")
+    else:
+        yield from _device(name, skin, bundle)
+    if skin.port != "stub":
+        yield from _latency_timer(name, skin)
+    if running:
+        yield from live.processes(name)
+        info = live.info(name)
+        yield from live.compared(name, skin, bundle, info)
+        yield electrode_order(name, live.baseline(info), bundle)
+    else:
+        yield Finding("SKIP", f"{name}: electrodes", "their order is looked at while the service runs: `skin up`")
+
+
+def _calibration(name: str, skin: Skin, bundle: Bundle) -> Finding:
+    what = f"{name}: calibration"
+    if skin.calibration is None or not skin.calibration.is_file():
+        return Finding("FAIL", what, f"{skin.calibration} is not there: correct `calibration`, or take the line away")
+    try:
+        law = ForceLaw.of(skin, bundle, name)
+    except ConfigError as why:
+        return Finding("FAIL", what, f'{why}; expected JSON such as {{"newtons_per_siemens": 10.0, "most_n": 5.0}}')
+    return Finding("OK", what, f"{skin.calibration}: {law}")
+
+
+def _device(name: str, skin: Skin, bundle: Bundle) -> Iterator[Finding]:
+    what = f"{name}: port"
+    try:
+        port = ports.Port(skin.port)
+    except ports.PortError as why:
+        yield Finding("FAIL", what, str(why))
+        return
+    try:
+        yield Finding("OK", what, f"{skin.port} opens")
+        yield _board(name, skin, bundle, port)
+    finally:
+        port.close()
+
+
+def _latency_timer(name: str, skin: Skin) -> Iterator[Finding]:
+    timer = Path("/sys/bus/usb-serial/devices", Path(os.path.realpath(skin.port)).name, "latency_timer")
+    if timer.is_file():
+        found = int(timer.read_text())
+        good = found <= LATENCY_TIMER_MS
+        todo = "" if good else f": it delays every frame; echo {LATENCY_TIMER_MS} | sudo tee {timer}"
+        yield Finding("OK" if good else "WARN", f"{name}: latency timer", f"{found} ms{todo}")
+
+
+def _board(name: str, skin: Skin, bundle: Bundle, port: ports.Port) -> Finding:
+    """Ask the board who it is; it is not started."""
+    what, began = f"{name}: board", time.monotonic()
+    link = BoardLink(Scanning(bundle.pattern, skin.dft_points, skin.rtia_ohm), began)
+    try:
+        while (now := time.monotonic()) < began + BOARD_S and link.ident is None:
+            if link.state == "hello" and (due := link.to_send(now)):
+                port.write(due)
+            link.received(port.read(0.05), time.monotonic())
+    except ports.PortError as why:
+        return Finding("FAIL", what, str(why))
+    if link.ident is None:
+        return Finding("FAIL", what, link.problem or f"no answer within {BOARD_S:g} s: is this the board's port?")
+    if link.state == "refused":
+        return Finding("FAIL", what, link.problem)
+    return Finding("OK", what, f"{link.board}, firmware {link.ident.firmware!r}, schema {SCHEMA_HASH:08x} as ours")
+
+
+def electrode_order(name: str, z0: NDArray[np.float64] | None, bundle: Bundle) -> Finding:
+    """Whether the baseline looks as the bundle predicts, and whether exchanging two electrodes would make it so."""
+    what, pre = f"{name}: electrodes", bundle.prereconstructor()
+    if z0 is None or len(z0) != len(bundle.pattern):
+        return Finding("SKIP", what, "no baseline yet to see their order by")
+    if pre.m.normalisation != "model":
+        return Finding("SKIP", what, f"bundle {bundle.name} does not predict impedances, so their order cannot be seen")
+    misfit = implausibility(z0, pre)
+    if misfit <= GOOD_FIT:
+        return Finding("OK", what, f"in order: the baseline is {100 * misfit:.2f} % off the bundle's prediction")
+    place = {_key(row): k for k, row in enumerate(bundle.pattern.tolist())}
+    fits = []
+    for i, j in itertools.combinations(range(int(bundle.pattern.max()) + 1), 2):
+        order = [place.get(_key([{i: j, j: i}.get(e, e) for e in row])) for row in bundle.pattern.tolist()]
+        if None not in order:
+            fits.append((implausibility(z0[np.array(order)], pre), i, j))
+    best, i, j = min(fits, default=(np.inf, 0, 0))
+    if best * SWAP_GAIN < misfit:
+        text = f"electrodes {i} and {j} look exchanged: the baseline is {100 * misfit:.0f} % off as it is, "
+        return Finding("FAIL", what, text + f"{100 * best:.1f} % with them exchanged; check their wires")
+    text = f"the baseline is {100 * misfit:.1f} % off the bundle's prediction: free the skin and run `skin tare`; "
+    return Finding("WARN", what, text + "if it stays, check the wiring and that this is the right bundle")
+
+
+def _key(row: list[int]) -> frozenset[frozenset[int]]:
+    """Reciprocity: drive and sense pairs may change places, and each may be turned round."""
+    return frozenset((frozenset(row[:2]), frozenset(row[2:])))

@@ -1,0 +1,149 @@
+"""What `skin doctor` asks a service that runs: whether frames flow, and whether it runs what the files say now."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from protocol.frames import InfoFrame, RawFrame
+from protocol.runtime import CONFIG_LINK, AlreadyRunning, lock, runtime_dir
+from protocol.sockets import AllReader, ControlClient, ControlError, NewestReader
+from services.runtime.config import Skin
+from services.runtime.stage import PROCESSES
+
+ANSWER_S = 1.0
+FRAME_S = 1.5
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line: `level` OK, WARN, FAIL or SKIP (not looked at); what was looked at; what was found and what to do."""
+
+    level: str
+    what: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.level:4s}  {self.what:21s} {self.text}"
+
+    def plain(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def running() -> bool:
+    """Whether `skin up` holds the runtime folder, or a process answers there without it (containers)."""
+    try:
+        with lock():
+            pass
+    except AlreadyRunning:
+        return True
+    if not (runtime_dir() / "acquisition.ctl").exists():
+        return False
+    with contextlib.suppress(ControlError):
+        ControlClient("acquisition", ANSWER_S).call("clock")
+        return True
+    return False
+
+
+def configuration(path: Path) -> Iterator[Finding]:
+    """Whether the service runs this configuration, as it stands now."""
+    link = runtime_dir() / CONFIG_LINK
+    if not link.is_symlink():
+        return
+    theirs = link.readlink()
+    if theirs != path.resolve():
+        text = f"the service runs {theirs}, this is {path}: leave --config away, or restart the service with it"
+        yield Finding("WARN", "configuration", text)
+    elif path.stat().st_mtime > link.lstat().st_mtime:
+        yield Finding("WARN", "configuration", f"{path} was changed since the service started: restart the service")
+
+
+def port(name: str, skin: Skin) -> Iterator[Finding]:
+    """The port, as acquisition finds it."""
+    what = "the stub board" if skin.port == "stub" else skin.port
+    problem = _status("acquisition", name)
+    if problem.level == "FAIL":
+        yield Finding("FAIL", f"{name}: port", f"{what}: {problem.text}")
+    else:
+        yield Finding("OK", f"{name}: port", f"{what}, in use by the service")
+
+
+def processes(name: str) -> Iterator[Finding]:
+    """How each process does with this skin."""
+    for process in PROCESSES:
+        yield _status(process, name)
+    reader = NewestReader("raw", name)
+    frame = reader.recv(FRAME_S)
+    reader.close()
+    if isinstance(frame, RawFrame):
+        known = f"sample times known to {frame.sample_sigma_ns / 1e6:.2f} ms"
+        level = "WARN" if "clock" in frame.reasons else "OK"
+        text = f"{len(frame.z)} measurements from board {frame.board or frame.source}, {known}"
+        yield Finding(level, f"{name}: frames", text)
+    else:
+        yield Finding("FAIL", f"{name}: frames", f"no raw frame came within {FRAME_S:g} s: see the lines above")
+
+
+def _status(process: str, name: str) -> Finding:
+    what = f"{name}: {process}"
+    try:
+        status = ControlClient(process, ANSWER_S).call("status", skin=name)
+    except ControlError as why:
+        return Finding("FAIL", what, str(why))
+    level = {"OK": "OK", "WARN": "WARN"}.get(str(status.get("level")), "FAIL")
+    return Finding(level, what, "; ".join(status.get("messages", [])) or "frames flow")
+
+
+def info(name: str) -> dict[str, Any]:
+    """What info/<skin> says, with a baseline where one comes in time; empty where it says nothing."""
+    reader = AllReader(["info"], name)
+    end, found = time.monotonic() + FRAME_S, dict[str, Any]()
+    try:
+        while (left := end - time.monotonic()) > 0 and "baseline" not in found:
+            frame = reader.recv(left)
+            if isinstance(frame, InfoFrame):
+                found = frame.info
+    finally:
+        reader.close()
+    return found
+
+
+def baseline(info: dict[str, Any]) -> NDArray[np.float64] | None:
+    return np.array(info["baseline"], dtype=float) if "baseline" in info else None
+
+
+def compared(name: str, skin: Skin, bundle: Bundle, info: dict[str, Any]) -> Iterator[Finding]:
+    """What the service runs (info/<skin>) against the files as they are now."""
+    what = f"{name}: runs"
+    if not info:
+        yield Finding("FAIL", what, f"no info/{name} came within {FRAME_S:g} s: does preprocessing run?")
+        return
+    if info.get("bundle_hash") != bundle.hash:
+        theirs = f"{info.get('bundle')} ({str(info.get('bundle_hash'))[:12]})"
+        yield Finding("FAIL", what, f"bundle {theirs}, not {bundle.name} ({bundle.hash[:12]}): restart the service")
+    file = skin.calibration
+    ours = hashlib.sha256(file.read_bytes()).hexdigest() if file is not None and file.is_file() else None
+    if info.get("calibration_hash") != ours:
+        found = str(info.get("calibration_hash") or "no calibration")[:14]
+        expected = f"{file} ({ours[:12]})" if ours else "none, as configured now"
+        yield Finding("FAIL", what, f"calibration {found}, expected {expected}: restart the service")
+    if "baseline" not in info:
+        yield Finding("WARN", f"{name}: baseline", "none yet: nothing may touch the skin for some seconds")
+        return
+    tare = info.get("tare", {})
+    said = f"{str(info.get('baseline_hash'))[:12]}, {tare.get('frames')} frames, by {tare.get('taken_by')}"
+    if tare.get("bundle_hash") not in (None, info.get("bundle_hash")):
+        yield Finding("FAIL", f"{name}: baseline", f"{said}: of another bundle; free the skin and run `skin tare`")
+    elif tare.get("doubt"):
+        yield Finding("WARN", f"{name}: baseline", f"{said}; in doubt: {tare['doubt']}")
+    else:
+        yield Finding("OK", f"{name}: baseline", said)

@@ -1,0 +1,194 @@
+"""One electrode's contact with the skin that changes, told from a touch.
+
+A contact impedance adds to every pair of its electrode alike (a touch near it lets the current go round, and is felt by
+other pairs too), so the difference of a frame is
+
+    d = u a + n b + s        u: the series resistance, n: the rest of the contact's Jacobian, s: global scale
+
+with 0 <= b <= a for a contact that rises: the current between neighbours that takes the short way through the
+electrode, of which n comes, dies out as the contact does. Contacts that rise to 30 times fit within 0.07 % of d. While
+one rises, each measurement of a scan finds it a little higher: a and b are lines along the scan. The best of 2000
+touches on electrodes (radii 0.05 to 0.5, drops to 0.85 S/m) leaves 0.5 %, the best of 20 000 anywhere 10 %. So a rise
+is named where it is large enough against the noise to show that difference. Under a touch that stays as it is, the
+change since a few frames ago is the contact's alone. A fall is named at once: no touch lowers an impedance.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from services.runtime.persistence import shaped
+
+Array = NDArray[np.floating]
+
+MODEL_ERROR = 1.5e-3  # of |d|: what a contact's change may be off the formula
+TELLING = 1500.0  # |d| over the noise of one measurement from which a touch on an electrode would show
+UNTOUCHED = 0.03  # of |d|, what a changed contact leaves of it where nothing else changed
+LEAST_RISE = 0.5  # of the nominal contact impedance
+LOOK_BACK = 3  # frames over which a contact that rises under a touch is told from it
+STEEPEST = 1.2  # of a: it rises from nothing within a scan, at most
+FALL = 0.004  # relative: a pair that fell by more, and by 6 sigma
+SIGMAS = 6.0
+MOST_OF = 0.6  # share of the electrode's pairs that fell (a touch may have raised the others)
+FEW_OF = 0.05  # share of the other pairs that may have
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What is known of the untouched skin, each (K,): |Z0| (0 where unknown), what differences are divided by, and
+    their standard deviation (infinite where unknown).
+    """
+
+    z0: Array
+    normaliser: Array
+    sigma: Array
+
+
+class ContactDrift:
+    """For a bundle that predicts impedances (`knows`); members (E, K): measurement uses electrode."""
+
+    def __init__(self, bundle: Bundle, members: NDArray[np.bool_]) -> None:
+        m = bundle.matrices
+        self.members = members
+        pairs = bool((m.pattern[:, 0] == m.pattern[:, 2]).all() and (m.pattern[:, 1] == m.pattern[:, 3]).all())
+        self.knows = m.normalisation == "model" and pairs
+        if not self.knows:
+            return
+        skin = bundle.skin
+        series = np.asarray(skin["contact_impedance"], dtype=float) / np.asarray(skin["electrodes"]["width"])
+        self._u = np.where(members, series[:, None] / m.z0, 0.0)  # (E, K)
+        self._n = np.asarray(m.contact, dtype=float).T - self._u
+        self._time = np.linspace(-1.0, 1.0, len(m.z0))  # the scan goes through the pattern in its order
+
+    def __call__(self, d: Array, sigma: Array, live: NDArray[np.bool_]) -> int | None:
+        """The electrode, 0-based, whose contact changed, or None. d, sigma (K,); live: measurements that count."""
+        if not self._tells(live):
+            return None
+        fell = live & (d < -np.maximum(FALL, SIGMAS * np.where(live, sigma, 0.0)))
+        if fell.any():
+            return self._fallen(fell, live)
+        return self.risen(d, sigma, live)
+
+    def _tells(self, live: NDArray[np.bool_]) -> bool:
+        return self.knows and bool(live.sum() >= len(live) / 2)
+
+    def _fallen(self, fell: NDArray[np.bool_], live: NDArray[np.bool_]) -> int | None:
+        own = (self.members & fell).sum(axis=1)
+        k = int(own.argmax())
+        mine, others = self.members[k] & live, ~self.members[k] & live
+        if fell[mine].mean() >= MOST_OF and fell[others].mean() <= FEW_OF:
+            return k
+        return None
+
+    def risen(self, d: Array, sigma: Array, live: NDArray[np.bool_]) -> int | None:
+        """The electrode whose contact rose, where that is all that d (K,) shows."""
+        if not self._tells(live):
+            return None
+        noise = float(np.sqrt(np.mean(sigma[live] ** 2)))
+        size = float(np.linalg.norm(d[live]))
+        if size < TELLING * noise:
+            return None
+        strength = self.members @ np.where(live, d, 0.0)
+        k = int(strength.argmax())
+        if strength[k] < 2 * np.partition(strength, -2)[-2]:
+            return None  # the next electrode shares one pair only
+        (a, b, _, slope, _), left = self._fit(k, d, live, [self._u[k] * self._time, self._n[k] * self._time])
+        count = int(live.sum())
+        expected = count * noise**2 * (1 + 4 * np.sqrt(2 / count)) + (MODEL_ERROR * size) ** 2
+        if a >= LEAST_RISE and -0.1 * a <= b <= 1.3 * a and abs(slope) <= STEEPEST * a and left <= expected:
+            return k
+        return None
+
+    def _fit(self, k: int, d: Array, live: NDArray[np.bool_], more: Sequence[Array] = ()) -> tuple[Array, float]:
+        """a, b, s and what there is of `more` (K,) in d; the energy that is left."""
+        columns = np.column_stack([self._u[k], self._n[k], np.ones(len(d)), *more])[live]
+        found, *_ = np.linalg.lstsq(columns, d[live], rcond=None)
+        left = d[live] - columns @ found
+        return found, float(left @ left)
+
+    def felt_by_others(self, k: int, d: Array, live: NDArray[np.bool_]) -> Array | None:
+        """(K,) what the change at electrode k does to the pairs that do not use it; None while something else changes
+        too.
+        """
+        if not self.knows:
+            return None
+        (_, b, _), left = self._fit(k, d, live)
+        if not left <= UNTOUCHED**2 * float(d[live] @ d[live]):  # NaN says nothing
+            return None
+        return np.where(self.members[k], 0.0, b * self._n[k])
+
+
+class ChangedContacts:
+    """Which contacts changed, and what they do to pairs of other electrodes; members (E, K)."""
+
+    def __init__(self, bundle: Bundle, members: NDArray[np.bool_]) -> None:
+        self._drift, self._k = ContactDrift(bundle, members), members.shape[1]
+        self.reset()
+
+    def reset(self) -> None:
+        self.felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
+        self._before: dict[int, Array] = {}  # by contact that rose under a touch: |Z| (K,) from before
+        self._past: deque[Array] = deque(maxlen=LOOK_BACK)  # |Z| (K,) of the frames before, the newest last
+
+    def follow(self, amplitude: Array) -> None:
+        """A frame's |Z| (K,); to be called after each."""
+        self._past.append(amplitude.copy())
+
+    def rescale(self, factor: float) -> None:
+        """All |Z| so far, times this factor."""
+        self._before = {k: row * factor for k, row in self._before.items()}
+        self._past = deque((row * factor for row in self._past), maxlen=LOOK_BACK)
+
+    def changed(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> int | None:
+        """The electrode whose contact this frame shows to have changed."""
+        found = self._drift(_difference(amplitude, untouched.z0, untouched, live), untouched.sigma, live)
+        if found is not None or len(self._past) < LOOK_BACK:
+            return found
+        past = self._past[0]
+        live = live & np.isfinite(past)
+        # Under a touch that stays, what changed is the contact's.
+        found = self._drift.risen(_difference(amplitude, past, untouched, live), np.sqrt(2.0) * untouched.sigma, live)
+        if found is not None:
+            self._before[found] = past
+        return found
+
+    def keep(self, drifting: Sequence[int]) -> None:
+        """Forget the others."""
+        self.felt = {k: felt for k, felt in self.felt.items() if k in drifting}
+        self._before = {k: before for k, before in self._before.items() if k in drifting}
+
+    def shift(self, drifting: Sequence[int], amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Array:
+        """(K,) of |Z|; followed while nothing else changes: untouched, or under the touch it began under."""
+        for k in drifting:
+            for since in (untouched.z0, self._before.get(k)):
+                if since is not None:
+                    both = live & np.isfinite(since)
+                    felt = self._drift.felt_by_others(k, _difference(amplitude, since, untouched, both), both)
+                    if felt is not None:
+                        self.felt[k] = felt
+                        break
+        return np.asarray(untouched.normaliser * np.sum([*self.felt.values(), np.zeros(self._k)], axis=0))
+
+    def state(self) -> dict[str, Any]:
+        felt, before = ([[k, list(row)] for k, row in rows.items()] for rows in (self.felt, self._before))
+        return {"felt": felt, "before": before, "past": np.array(self._past)}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Older recordings lack some. Raises ValueError where it does not fit."""
+        self.reset()
+        shape = (self._k,)
+        self.felt = {int(k): shaped(row, shape) for k, row in state.get("felt", [])}
+        self._before = {int(k): shaped(row, shape, finite=False) for k, row in state.get("before", [])}
+        self._past.extend(shaped(row, shape, finite=False) for row in state.get("past", []))
+
+
+def _difference(amplitude: Array, since: Array, untouched: Reference, live: NDArray[np.bool_]) -> Array:
+    change = np.where(live, amplitude - np.where(live, since, 0.0), 0.0)
+    return change / untouched.normaliser

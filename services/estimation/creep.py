@@ -1,0 +1,69 @@
+"""What a touch leaves behind: foam recovers slowly, and until then looks like a very light touch at the same place.
+
+After a touch was held, a difference that is at most SHARE of the touch's own, and of its shape, is no touch, and the
+baseline follows it: up to SHARE of the touch in all, and back. The price: a touch eased to less than SHARE of its force
+counts as released.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.prereconstruction import Operator
+from services.runtime.persistence import shaped
+
+Array = NDArray[np.float64]
+
+SHARE = 0.05  # of the touch: a foam's set after seconds of load
+LASTS_S = 120.0  # after the release; by then the baseline has followed
+
+
+class Creep:
+    def __init__(self, measurements: int) -> None:
+        self._k = measurements
+        self.reset()
+
+    def reset(self) -> None:
+        self._touch = np.zeros(self._k)  # the strongest difference since the last touch began
+        self._ends_ns = 0
+        self._followed = 0.0  # of the touch, that is in the baseline
+
+    def begin(self, held: Array, now_ns: int) -> None:
+        """A held touch's mean difference (K,)."""
+        if now_ns >= self._ends_ns or float(held @ held) > float(self._touch @ self._touch):
+            self._touch = held.copy()
+            self._followed = 0.0
+        self._ends_ns = now_ns + round(LASTS_S * 1e9)
+
+    def taken_out(self, d: Array, operator: Operator, now_ns: int) -> Array | None:
+        """d (K,) without the creep in it; None where there can be none, or where d is too large for it."""
+        size = float(self._touch @ self._touch)
+        if now_ns >= self._ends_ns or not size or float(d @ d) > 4 * SHARE**2 * size:
+            return None
+        white = operator.whiten @ self._touch
+        share = float(white @ (operator.whiten @ d)) / max(float(white @ white), 1e-30)
+        return d - self._possible(share) * self._touch
+
+    def _possible(self, share: float) -> float:
+        return float(np.clip(share, -self._followed, SHARE - self._followed))
+
+    def direction(self, now_ns: int) -> Array | None:
+        """(K,) d of the touch whose creep goes on; None where none does."""
+        return self._touch if now_ns < self._ends_ns and self._touch.any() else None
+
+    def follow(self, share: float) -> float:
+        """What of a found share of the touch can be creep, from now on in the baseline."""
+        possible = self._possible(share)
+        self._followed += possible
+        return possible
+
+    def state(self) -> dict[str, Any]:
+        return {"touch": self._touch.copy(), "ends_ns": self._ends_ns, "followed": self._followed}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Raises KeyError, TypeError or ValueError where it does not fit."""
+        self._touch = shaped(state["touch"], (self._k,))
+        self._ends_ns, self._followed = int(state["ends_ns"]), float(state["followed"])

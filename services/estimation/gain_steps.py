@@ -1,0 +1,64 @@
+"""Steps of the board's gain over a skin's frames: taken over at once, or, where one is gross, once it has lasted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.estimation.gain import common_factor
+from services.estimation.tare import Baseline
+from services.estimation.tuning import TUNING
+from services.runtime.persistence import shaped
+
+Array = NDArray[np.float64]
+
+GROSS = 0.1  # relative: no gain of a sound board steps by more
+LASTING_S = 1.0
+
+
+class GainSteps:
+    def __init__(self, measurements: int) -> None:
+        self._k = measurements
+        self.reset()
+
+    def reset(self) -> None:
+        self._before: Array | None = None  # (K,) |Z| of the last frame
+        self._total = 0.0  # its sum
+        self._gross_ns = 0  # since when all measurements have another gain by far
+
+    def __call__(self, amplitude: Array, baseline: Baseline | None, now_ns: int) -> float | None:
+        """The factor that a frame's |Z| (K,) has in common against the one before, to be taken over by the baseline.
+        baseline: None where there is none, or where measurements of the frame failed.
+        """
+        before, total = self._before, self._total
+        self._before, self._total = amplitude.copy(), float(amplitude.sum())
+        if baseline is None or before is None or len(before) != len(amplitude):
+            return None
+        if abs(self._total - total) < TUNING.gain_least * total:
+            return None
+        live = (baseline.z0 > 0) & (before > 0) & np.isfinite(amplitude) & np.isfinite(baseline.sigma)
+        sigma = np.where(live, baseline.sigma / np.where(live, baseline.z0, 1.0), np.inf)
+        factor = common_factor(before, amplitude, sigma, live)
+        if factor is None:
+            self._gross_ns = 0
+            return None
+        if abs(factor - 1) > GROSS:
+            self._gross_ns = self._gross_ns or now_ns
+            if (now_ns - self._gross_ns) * 1e-9 < LASTING_S:
+                self._before, self._total = before, total  # what it is held against until then
+                return None
+        self._gross_ns = 0
+        return factor
+
+    def state(self) -> dict[str, Any]:
+        return {"before": None if self._before is None else self._before.copy(), "gross_ns": self._gross_ns}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Raises KeyError, TypeError or ValueError where it does not fit."""
+        self.reset()
+        if state["before"] is not None:
+            self._before = shaped(state["before"], (self._k,), finite=False)
+            self._total = float(self._before.sum())
+        self._gross_ns = int(state["gross_ns"])

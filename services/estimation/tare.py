@@ -1,0 +1,163 @@
+"""The untouched baseline: when frames agree well enough to be one, what their noise is, and whether the skin was
+really untouched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.prereconstruction import PreReconstructor, noise_of_frames
+from services.runtime.stage import Refused
+
+Array = NDArray[np.float64]
+
+DISAGREEMENT = 1e-5  # probability that quiet frames are refused
+HARMLESS = 5e-5  # relative change of a measurement within the frames that does no harm as part of a baseline
+TOO_NOISY = 0.05  # median relative noise beyond which no touch could be told from it
+UNTRAINED = 0.0056  # the same (45 dB), beyond which no network was trained: models/augmentation.py
+IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
+QUARTERS = 4
+ASSUMED_NOISE = 1e-3  # relative (60 dB), where frames do not tell
+LEAST_NOISE = 2e-6  # relative: about half a step of the board's 18 bits
+IDENTICAL = 1e-12  # relative scatter below which frames are the same but for the arithmetic of their mean
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """|Z0| of the untouched skin. K measurements."""
+
+    z0: Array  # (K,) unit of the raw frames
+    sigma: Array  # (K,) standard deviation of one frame's |Z|, same unit
+    frames: int  # how many it is the mean of
+    board: str  # unique id of the board
+    taken_ns: int  # `sample` of the newest frame in it
+    doubt: str = ""  # why the skin may have been touched meanwhile; empty: no doubt
+    taken_by: str = "start"  # or "command", "file"
+    restored: bool = False  # an earlier process took it
+    noise_frames: int = 0  # how many frames sigma was found from; 0: those of the mean
+
+    @property
+    def hash(self) -> str:
+        return hashlib.sha256(self.z0.tobytes() + self.sigma.tobytes()).hexdigest()
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, saved: dict[str, Any], measurements: int) -> Baseline:
+        """Raises Refused where `saved` is no baseline of that many measurements."""
+        try:
+            z0, sigma = np.array(saved["z0"], dtype=float), np.array(saved["sigma"], dtype=float)
+            rest = int(saved["frames"]), str(saved["board"]), int(saved["taken_ns"]), str(saved["doubt"])
+            provenance = str(saved.get("taken_by", "start")), bool(saved.get("restored", False))
+            noise_frames = int(saved.get("noise_frames", 0))
+        except (KeyError, TypeError, ValueError) as wrong:
+            raise Refused(f"no baseline in the saved state ({wrong}): tare again") from None
+        if z0.shape != (measurements,) or sigma.shape != (measurements,):
+            raise Refused(f"the saved baseline has {z0.size} measurements, this skin {measurements}: tare again")
+        if not (np.isfinite(z0).all() and (z0 >= 0).all() and (sigma > 0).all()):
+            raise Refused("the saved baseline has impedances or noises that are not possible: tare again")
+        known = int(((z0 > 0) & np.isfinite(sigma)).sum())
+        if known < 0.5 * measurements:
+            raise Refused(f"the saved baseline knows only {known} of {measurements} measurements: tare again")
+        return cls(z0, sigma, *rest, *provenance, noise_frames)
+
+
+def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Baseline:
+    """The baseline of (N, K) |Z|. Raises Refused where the frames do not agree with each other.
+
+    A measurement that is not finite in every frame gets an infinite sigma: it is left out until the next tare.
+    """
+    live = np.isfinite(frames).all(axis=0) & (frames > 0).all(axis=0)
+    if live.sum() < 0.5 * frames.shape[1]:
+        raise Refused(
+            f"only {int(live.sum())} of {frames.shape[1]} measurements give values: check the cable and the electrodes"
+        )
+    good = frames[:, live]
+    mean = good.mean(axis=0)
+    noise = float(np.median(good.std(axis=0, ddof=1) / mean))
+    if noise > TOO_NOISY:
+        raise Refused(
+            f"the frames scatter by {100 * noise:.1f} % (at most {100 * TOO_NOISY:.0f} %): check grounding and cable"
+        )
+    found, limit = disagreement(good)
+    if found > limit:
+        raise Refused(
+            f"the frames disagree (statistic {found:.0f}, limit {limit:.0f}): something touched or moved meanwhile"
+        )
+    z0, sigma = np.zeros(frames.shape[1]), np.full(frames.shape[1], np.inf)
+    z0[live], sigma[live] = mean, noise_of_frames(good, mean)
+    sigma = plausible_noise(z0, sigma)
+    doubt = ""
+    if noise < IDENTICAL:
+        doubt = (
+            f"the {len(frames)} untouched frames are identical, as measured ones never are: a noise of "
+            f"{ASSUMED_NOISE:g} of each measurement is assumed; check the source and run `skin tare`"
+        )
+    doubt = noisy(z0, sigma, pre) or doubt
+    misfit = implausibility(z0, pre)
+    if misfit > IMPLAUSIBLE:
+        doubt = f"the baseline is {100 * misfit:.1f} % off what the bundle predicts: free the skin and run `skin tare`"
+    return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
+
+
+def noisy(z0: Array, sigma: Array, pre: PreReconstructor) -> str:
+    """ "" or why no touch that is measured with this noise is to be believed. A measured bundle knows its own noise."""
+    live = np.isfinite(sigma) & (z0 > 0)
+    share = float(np.median(sigma[live] / z0[live])) if live.any() else 0.0
+    if pre.m.normalisation != "model" or share <= UNTRAINED:
+        return ""
+    return (
+        f"the frames scatter by {100 * share:.1f} %, networks were trained for {100 * UNTRAINED:.2f} % at most: check "
+        "grounding and cable, then run `skin tare`"
+    )
+
+
+def plausible_noise(z0: Array, sigma: Array) -> Array:
+    """(K,) standard deviations of |Z|: at least LEAST_NOISE, and ASSUMED_NOISE where none was found (identical frames,
+    NaN); infinite ones stay.
+    """
+    found = np.isfinite(sigma) & (sigma > IDENTICAL * np.abs(z0))
+    finite = np.where(found, np.maximum(sigma, LEAST_NOISE * np.abs(z0)), ASSUMED_NOISE * np.abs(z0))
+    # A measurement that has no baseline either is not used.
+    return np.where(np.isposinf(sigma) | ~(np.abs(z0) > 0), np.inf, finite)
+
+
+def disagreement(frames: Array) -> tuple[float, float]:
+    """Chi-square statistic of the quarters' means against the noise within them, and the limit it keeps to when all
+    is quiet.
+    """
+    n = len(frames) // QUARTERS * QUARTERS
+    quarters = frames[-n:].reshape(QUARTERS, n // QUARTERS, -1)
+    mean = frames.mean(axis=0)
+    # Presses that come and go make the quarters scatter within as well; from frame to frame they seldom do.
+    noise = np.minimum(quarters.var(axis=1, ddof=1).mean(axis=0), 0.5 * (np.diff(frames, axis=0) ** 2).mean(axis=0))
+    within = noise / (n // QUARTERS) + (HARMLESS * mean) ** 2
+    statistic = float((((quarters.mean(axis=1) - quarters.mean(axis=(0, 1))) ** 2).sum(axis=0) / within).sum())
+    dof_within = n - QUARTERS
+    f_mean = dof_within / (dof_within - 2)  # the noise within is estimated too
+    dof = (QUARTERS - 1) * frames.shape[1]
+    quantile = NormalDist().inv_cdf(1 - DISAGREEMENT)
+    chi_square = dof * (1 - 2 / (9 * dof) + quantile * (2 / (9 * dof)) ** 0.5) ** 3  # Wilson-Hilferty
+    return statistic, float(chi_square * f_mean * (1 + 2 / dof_within))
+
+
+def implausibility(z0: Array, pre: PreReconstructor) -> float:
+    """rms relative misfit of |Z0| to the bundle's prediction, up to gain and contact impedances; 0 where the bundle
+    predicts none.
+    """
+    if pre.m.normalisation != "model":
+        return 0.0
+    live = z0 > 0
+    relative = z0[live] / pre.m.z0[live]
+    gain = float(np.median(relative))
+    residual = relative / gain - 1
+    columns = np.column_stack([np.ones(int(live.sum())), pre.m.contact[live]])
+    fitted, *_ = np.linalg.lstsq(columns, residual, rcond=1e-6)
+    return float(np.sqrt(np.mean((residual - columns @ fitted) ** 2)))

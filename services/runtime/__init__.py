@@ -1,0 +1,1 @@
+"""What every process needs: configuration, stages and their channels, waiting, heartbeat, state kept, supervision."""

@@ -1,0 +1,68 @@
+"""One skin in a process: its stage, where its frames come from, how it does."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from protocol.frames import Frame
+from protocol.sockets import NewestReader
+from protocol.topics import wire_topic
+from services.runtime.heartbeat import Heartbeat
+from services.runtime.stage import Stage
+
+
+class Feed(Protocol):
+    """Where a stage's frames come from."""
+
+    @property
+    def malformed(self) -> int: ...
+    @property
+    def skipped(self) -> int: ...
+    @property
+    def socket(self) -> Any: ...
+
+    def recv(self) -> Frame | None: ...
+    def close(self) -> None: ...
+
+
+class Lane:
+    """One skin in this process: its stage, where its frames come from, how it does."""
+
+    def __init__(self, process: str, stage: Stage, feed: Feed) -> None:
+        self.stage, self.feed = stage, feed
+        self.heartbeat = Heartbeat(process, stage.skin)
+        self.heads = {topic: wire_topic(topic, stage.skin) + b"\0" for topic in stage.writes}  # of its messages
+        self.asleep = False
+        self.wanted: frozenset[str] = frozenset()  # topics somebody subscribes to, as of the last tick
+        self.errors: set[str] = set()
+
+
+class Newest:
+    """A stage's input from a socket: the newest frame."""
+
+    def __init__(self, topic: str, skin: str) -> None:
+        self.reader = NewestReader(topic, skin)
+        self.socket = self.reader.socket
+        self._name = f"{topic}/{skin}\0".encode()
+
+    @property
+    def malformed(self) -> int:
+        return self.reader.malformed
+
+    @property
+    def skipped(self) -> int:
+        return self.reader.skipped
+
+    def recv(self) -> Frame | None:
+        return self.reader.recv()
+
+    def listen(self, on: bool) -> None:
+        (self.socket.subscribe if on else self.socket.unsubscribe)(self._name)
+
+    def ask_again(self) -> None:
+        """Have upstream send again what it sends to who has just come: nothing else is heard of a subscription."""
+        self.listen(False)
+        self.listen(True)
+
+    def close(self) -> None:
+        self.reader.close()

@@ -1,0 +1,328 @@
+"""skin.toml: which skins there are, where their boards are, who may listen. Validated before anything starts.
+
+An error names the file, the key, what was found and what is allowed; see `ConfigError`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from models.files import FileError, read_text
+from protocol.topics import PRODUCERS
+from protocol.transport import Transport, half
+from services.runtime.stage import PROCESSES
+
+ROOT = Path(__file__).resolve().parents[1]
+BUNDLES, MANIFEST = ROOT / "models" / "bundles", "manifest.json"
+SKIN_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
+
+Switch = Annotated[bool, Field(strict=True)]  # true or false; no word, which would be taken for true
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class ConfigError(Exception):
+    """The configuration cannot be used. The text is for the person who must mend the file."""
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Pose(Section):
+    """Where the skin's frame (origin at its centre, x right, y up, z out) sits in its parent frame."""
+
+    parent: str = "base"
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+    @field_validator("quaternion_xyzw")
+    @classmethod
+    def unit_length(cls, q: Quaternion) -> Quaternion:
+        if abs(sum(v * v for v in q) - 1) > 1e-3:
+            raise ValueError("a quaternion of length 1")
+        return q
+
+
+class Tare(Section):
+    """How the untouched baseline is taken and kept."""
+
+    frames: Annotated[int, Field(ge=8, le=4096)] = 64
+    max_age_s: Annotated[float, Field(gt=0)] = 3600.0  # an older persisted baseline is not loaded
+    tracking_s: Annotated[float, Field(gt=0)] = 120.0  # time constant of what drift does not explain, while untouched
+    # How fast an untouched skin may change, relative; see services/estimation/drift_prior.py. A foam that dries by 6 %,
+    # electrodes whose contacts change by a quarter, within five minutes.
+    scale_per_s: Annotated[float, Field(gt=0, le=1e-2)] = 2e-4  # the sheet's conductivity
+    contact_per_s: Annotated[float, Field(gt=0, le=1e-1)] = 8e-4  # each electrode's contact impedance
+
+
+class Touch(Section):
+    """The touch decision: see services/estimation/touch.py."""
+
+    false_alarms: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
+    hold: Switch = True  # switch of the rule "nothing changed: do not reconstruct again"
+    skip_untouched: Switch = True  # switch of the rule "nothing touches: do not reconstruct"
+
+
+class Indenter(Section):
+    """What presses this skin, where that is always the same: its area fixes the drop (contacts/force.py)."""
+
+    radius_m: Annotated[float, Field(gt=0, le=1)]
+    shape: Literal["circle"] = "circle"
+
+
+class Skin(Section):
+    """One skin: one board on one port, one bundle."""
+
+    port: str  # "stub", a device path, a pyserial URL, or a file (*.mcap, *.npz)
+    bundle: str  # the name of a folder of models/bundles, else a path
+    frame_id: str = ""  # default: the skin's name
+    pose: Pose = Pose()
+    calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
+    indenter: Indenter | None = None
+    network: Literal["full", "fast", "int8", "none"] = "int8"
+    dft_points: Literal[128, 256, 512] = 128
+    scan: Literal["full", "adaptive"] = "full"  # a short list while nothing touches: board/adaptive.py
+    rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
+    tare: Tare = Tare()
+    touch: Touch = Touch()
+
+    @field_validator("port")
+    @classmethod
+    def some_port(cls, port: str) -> str:
+        if port == "stub" or port.startswith("/") or "://" in port or Path(port).suffix in RECORDINGS:
+            return port
+        raise ValueError(
+            '"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000), a recording (*.mcap) or a file '
+            "of measurements (*.npz)"
+        )
+
+
+RECORDINGS = (".mcap", ".npz")
+
+
+def _one_board(port: str, other: str) -> bool:
+    """Whether two ports are the same board: a device may have several names."""
+    if port == "stub" or Path(port).suffix in RECORDINGS:  # a stub is started for each skin, a file read by each
+        return False
+    return port == other or (port.startswith("/") and os.path.realpath(port) == os.path.realpath(other))
+
+
+class Sockets(Section):
+    """Where processes publish and take commands: ipc sockets in the runtime folder, or the addresses given here."""
+
+    addresses: dict[str, str] = {}  # producer, or "<process>.ctl" for its control socket -> tcp://host:port
+
+    @field_validator("addresses")
+    @classmethod
+    def known(cls, addresses: dict[str, str]) -> dict[str, str]:
+        for name, address in addresses.items():
+            if name.removesuffix(".ctl") not in (*PRODUCERS, "recorder"):
+                raise ValueError(f"producers {', '.join(PRODUCERS)}, or one of these with .ctl (found {name!r})")
+            port = address.rpartition(":")[2] if address.startswith("tcp://") else "1"
+            if not re.fullmatch(r"(tcp://\S+:\d{1,5}|ipc://\S+)", address) or not 1 <= int(port) <= 65535:
+                raise ValueError(f"tcp://HOST:PORT or ipc://PATH (found {address!r} for {name})")
+        for (name, address), (other, same) in itertools.combinations(addresses.items(), 2):
+            if _overlap(address, same):
+                raise ValueError(
+                    f"an address of its own for each socket ({name} has {address!r}, {other} has {same!r}: "
+                    "only one of them could listen there)"
+                )
+        return addresses
+
+
+def _overlap(one: str, other: str) -> bool:
+    """Whether two addresses cannot both be listened at."""
+    if not (one.startswith("tcp://") and other.startswith("tcp://")):
+        return one == other
+    (host, _, port), (other_host, _, other_port) = (a.removeprefix("tcp://").rpartition(":") for a in (one, other))
+    host, other_host = (name.replace("localhost", "127.0.0.1") for name in (host, other_host))
+    every = {"*", "0.0.0.0", "[::]"}
+    return int(port) == int(other_port) and (host == other_host or bool(every & {host, other_host}))
+
+
+class Security(Section):
+    """Of tcp addresses: CURVE keys (`skin keys new`). Unencrypted beyond this host is refused unless `insecure` says
+    so.
+    """
+
+    secret_key: Path | None = None  # our own key pair
+    server_keys: dict[str, Path] = {}  # producer -> its public key
+    clients: Path | None = None  # folder with the public keys that may connect
+    operators: Path | None = None  # folder with those that may also give commands that change something
+    insecure: Annotated[bool, Field(strict=True)] = False
+
+    @field_validator("server_keys")
+    @classmethod
+    def known(cls, keys: dict[str, Path]) -> dict[str, Path]:
+        for name in keys:
+            if name not in (*PRODUCERS, "recorder"):
+                raise ValueError(f"producers {', '.join(PRODUCERS)} or recorder (found {name!r})")
+        return keys
+
+    @model_validator(mode="after")
+    def whole(self) -> Security:
+        if missing := half(self.transport({}, Path())):
+            raise ValueError(missing)
+        return self
+
+    def transport(self, addresses: dict[str, str], folder: Path) -> Transport:
+        """For `protocol.transport.configure`; relative paths are relative to `folder`."""
+        return Transport(
+            addresses=addresses,
+            secret_key=folder / self.secret_key if self.secret_key else None,
+            server_keys={name: folder / key for name, key in self.server_keys.items()},
+            clients=folder / self.clients if self.clients else None,
+            operators=folder / self.operators if self.operators else None,
+            insecure=self.insecure,
+        )
+
+
+class Logging(Section):
+    level: Literal["debug", "info", "warning", "error"] = "info"
+
+
+class RealTime(Section):
+    """What each process asks of the kernel: services/runtime/realtime.py. What is refused is said in `status`."""
+
+    priority: Annotated[int, Field(ge=0, le=99, strict=True)] = 0  # of SCHED_FIFO; 0: the ordinary scheduler
+    lock_memory: Switch = False  # mlockall: no page of it is ever swapped out
+    cpus: dict[str, list[Annotated[int, Field(ge=0)]]] = {}  # process -> processors it may run on
+
+    @field_validator("cpus")
+    @classmethod
+    def known(cls, cpus: dict[str, list[int]]) -> dict[str, list[int]]:
+        for name, numbers in cpus.items():
+            if name not in PROCESSES:
+                raise ValueError(f"processes {', '.join(PROCESSES)} (found {name!r})")
+            if not numbers:
+                raise ValueError(f"at least one processor, counted from 0 (found none for {name})")
+        return cpus
+
+
+class Skip(Section):
+    """Switches of the skip rules that are not one skin's own (those are `touch` and `scan`). All on, but to measure."""
+
+    batch: Switch = True  # skins whose frames wait at once share a run of the network
+    unwanted: Switch = True  # what nobody subscribes to (force, shape) is not made
+
+
+class Config(Section):
+    """The whole file. `path` is where it was read from; relative paths in it are relative to its folder."""
+
+    skins: Annotated[dict[str, Skin], Field(min_length=1)]
+    sockets: Sockets = Sockets()
+    security: Security = Security()
+    realtime: RealTime = RealTime()
+    skip: Skip = Skip()
+    logging: Logging = Logging()
+    path: Annotated[Path, Field(exclude=True)] = Path("skin.toml")
+
+    @field_validator("skins")
+    @classmethod
+    def names(cls, skins: dict[str, Skin]) -> dict[str, Skin]:
+        for name in skins:
+            if not SKIN_NAME.fullmatch(name):
+                raise ValueError(f"skin names of lower-case letters, digits, - and _ (found {name!r})")
+        for (name, skin), (other, same) in itertools.combinations(skins.items(), 2):
+            if _one_board(skin.port, same.port):
+                raise ValueError(
+                    f"a port of its own for each skin ({name} has {skin.port!r}, {other} has {same.port!r}: "
+                    "one board measures one skin)"
+                )
+        return {name: s if s.frame_id else s.model_copy(update={"frame_id": name}) for name, s in skins.items()}
+
+    def transport(self) -> Transport:
+        """For `protocol.transport.configure`."""
+        return self.security.transport(self.sockets.addresses, self.path.parent)
+
+    def relative(self, path: Path | None) -> Path | None:
+        """A path of the file: relative ones are relative to its folder."""
+        return None if path is None else self.path.parent / path
+
+    def _resolved(self, skin: Skin) -> Skin:
+        """The skin with its paths relative to our folder made whole. A bundle's name stays a name."""
+        paths: dict[str, Any] = {"calibration": self.relative(skin.calibration)}
+        if Path(skin.port).suffix in RECORDINGS and "://" not in skin.port:
+            paths["port"] = str(self.relative(Path(skin.port)))
+        beside = self.path.parent / skin.bundle
+        shipped = (BUNDLES / skin.bundle / MANIFEST).is_file()
+        if "/" in skin.bundle or ((beside / MANIFEST).is_file() and not shipped):
+            paths["bundle"] = str(beside)
+        return skin.model_copy(update=paths)
+
+    def skin(self, name: str) -> Skin:
+        """The skin called `name`; ConfigError names those there are."""
+        if name not in self.skins:
+            raise ConfigError(f"{self.path}: no skin called {name!r}; configured: {', '.join(self.skins)}")
+        return self.skins[name]
+
+
+def config_path(path: str | Path | None = None) -> Path:
+    """The file in force: the argument, else $EITSKIN_CONFIG, else skin.toml of the checkout."""
+    return Path(path or os.environ.get("EITSKIN_CONFIG") or ROOT / "skin.toml")
+
+
+def load(path: str | Path | None = None) -> Config:
+    """Read and check the configuration. Raises ConfigError, one line for each thing that is wrong."""
+    file = config_path(path)
+    try:
+        raw = tomllib.loads(read_text(file))
+    except FileError as why:
+        raise ConfigError(str(why)) from None
+    except (ValueError, RecursionError) as why:  # TOMLDecodeError; a number of ten thousand digits
+        raise ConfigError(f"{file}: is not TOML: {why}") from None
+    return parse(raw, file)
+
+
+def parse(raw: dict[str, Any], file: Path = Path("skin.toml")) -> Config:
+    """Check a configuration that is already a dict; `file` is named in errors."""
+    try:
+        config = Config.model_validate(raw | {"path": file})
+        return config.model_copy(update={"skins": {n: config._resolved(s) for n, s in config.skins.items()}})
+    except ValidationError as wrong:
+        raise ConfigError("\n".join(_explain(file, e) for e in wrong.errors())) from None
+
+
+def _explain(file: Path, error: Any) -> str:
+    key = ".".join(str(part) for part in error["loc"]) or "(top level)"
+    if error["type"] == "missing":
+        return f"{file}: {key}: is missing; add it"
+    if error["type"] == "extra_forbidden":
+        return f"{file}: {key}: unknown key; allowed here: {', '.join(_allowed(error['loc'][:-1]))}"
+    found = _shown(error["input"])
+    allowed = error["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    return f"{file}: {key}: found {found}; allowed: {allowed}"
+
+
+def _shown(value: Any) -> str:
+    try:
+        found = repr(value)
+    except (ValueError, RecursionError):  # a number of ten thousand digits, a list a thousand deep
+        return f"a {type(value).__name__} too long to show"
+    return found if len(found) < 80 else found[:77] + "..."
+
+
+def _allowed(location: tuple[int | str, ...]) -> list[str]:
+    """Keys that the section at `location` knows."""
+    model: Any = Config
+    for part in location:
+        if model is Config and part == "skins":
+            continue
+        if location[0] == "skins" and part == location[1] and model is Config:
+            model = Skin
+            continue
+        model = _section(model.model_fields[str(part)].annotation)
+    return [name for name, field in model.model_fields.items() if not field.exclude]
+
+
+def _section(annotation: Any) -> type[BaseModel]:
+    options = getattr(annotation, "__args__", (annotation,))
+    return next(o for o in options if isinstance(o, type) and issubclass(o, BaseModel))

@@ -1,0 +1,153 @@
+"""How a process does with one skin: counts, rates, latencies, and the status frames that say so."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter, deque
+from typing import Any
+
+from protocol.frames import Frame, StatusFrame
+from protocol.runtime import host_id
+from services.runtime.stage import Health
+
+LATENCIES = 256  # frames over which p50 and p99 are taken
+LEVELS = ("OK", "WARN", "ERROR", "STALE")
+LATE_S = 2.0  # how long a late frame is spoken of
+FAILURE_S = 5.0  # how long a frame that could not be processed is spoken of
+
+
+class Heartbeat:
+    def __init__(self, process: str, skin: str) -> None:
+        self.process, self.skin = process, skin
+        self.sent: Counter[str] = Counter()
+        self.drops: Counter[str] = Counter({"late": 0, "failed": 0})
+        self.late = 0  # frames that were sent too old to be acted on
+        self._late_at, self._late_by_s = -math.inf, 0.0
+        self._failure, self._failed_at = "", 0.0
+        self._since = self._heard = time.monotonic()
+        self._heard_any = False
+        self._latency: deque[float] = deque(maxlen=LATENCIES)
+        self._work: deque[float] = deque(maxlen=LATENCIES)
+        self._last: StatusFrame | None = None
+        self._next = 0.0
+        self._rate_at = time.monotonic()
+        self._rate_sent: Counter[str] = Counter()
+        self._rates: dict[str, float] = {}
+        self._cpu_at = time.process_time()
+        self._cpu = 0.0
+
+    @property
+    def failure(self) -> str:
+        return self._failure if time.monotonic() - self._failed_at < FAILURE_S else ""
+
+    @failure.setter
+    def failure(self, text: str) -> None:
+        self._failure, self._failed_at = text, time.monotonic()
+
+    def heard(self, frame: Frame, now_ns: int) -> None:
+        """A frame came."""
+        self._heard, self._heard_any = now_ns * 1e-9, True
+
+    def done(self, frame: Frame, began_ns: int, now_ns: int, late: bool = False) -> None:
+        """It was processed and its successors sent, too old to be acted on where `late`."""
+        since = frame.stamps.get("sample")
+        if since is not None and frame.source != "replay" and frame.host in ("", host_id()):
+            self._latency.append((now_ns - since) * 1e-6)
+            if late:
+                self.late += 1
+                self._late_at, self._late_by_s = now_ns * 1e-9, (now_ns - since) * 1e-9
+        self._work.append((now_ns - began_ns) * 1e-6)
+
+    def silence(self, limit_s: float, upstream: str) -> str:
+        """What to say of an input that gives nothing; "" while it does."""
+        quiet = time.monotonic() - self._heard
+        if quiet < limit_s:
+            return ""
+        what = f"{upstream}/{self.skin}" if upstream else "frames from the source"
+        return f"no {what} for {int(quiet)} s" if self._heard_any and quiet >= 1 else f"no {what}"
+
+    def deadline(self, limit_s: float) -> float:
+        """When the next status is due, or the silence since the last frame becomes one to speak of."""
+        silent_at = self._heard + limit_s
+        spoken_of = self._last is not None and self._last.stamps["publish"] * 1e-9 > silent_at
+        return self._next if spoken_of else min(self._next, silent_at)
+
+    def status(
+        self, health: Health, silent: str, now: float, every_s: float, asleep: bool = False
+    ) -> StatusFrame | None:
+        """The status frame that is due: once every_s, and at once when level or messages changed; else None."""
+        level, messages = health.level, list(health.messages)
+        if self.failure:
+            level, messages = "ERROR", [*messages, self.failure]
+        if silent and level != "ERROR":
+            level = "STALE"
+        if silent:
+            messages.append(silent)
+        if now - self._late_at < LATE_S:
+            level = "WARN" if level == "OK" else level
+            messages.append(
+                f"frames come {self._late_by_s:.1f} s after they were measured, too late to be acted on: "
+                "what is slow is the line to the board, or a process before this one"
+            )
+        if asleep:
+            messages.append("idle: nobody subscribes")
+        last = self._last
+        changed = last is None or level != last.level or _kinds(messages) != _kinds(last.messages)
+        if not changed and now < self._next:
+            return None
+        self._measure(now)
+        self._next = now + every_s
+        self._last = StatusFrame(
+            skin=self.skin,
+            process=self.process,
+            valid=True,
+            valid_for_s=3 * every_s,
+            level=level,
+            messages=messages,
+            rates=dict(self._rates),
+            drops=dict(self.drops),
+            counters={**health.counters, "late": self.late},
+            latency=self._quantiles(),
+            cpu=self._cpu,
+            stamps={"publish": time.monotonic_ns()},
+        )
+        return self._last
+
+    def summary(self, asleep: bool, silent_s: float) -> dict[str, Any]:
+        """For the control command `status`."""
+        quiet = time.monotonic() - self._heard
+        last = self._last
+        return {
+            "flowing": asleep or (self._heard_any and quiet < silent_s),
+            "idle": asleep,
+            "quiet_s": quiet,
+            "level": last.level if last else "STALE",
+            "messages": list(last.messages) if last else [],
+            "rates": dict(self._rates),
+            "drops": dict(self.drops),
+            "latency": self._quantiles(),
+        }
+
+    def _measure(self, now: float) -> None:
+        seconds = now - self._rate_at
+        if seconds < 0.5:
+            return
+        self._rates = {topic: (n - self._rate_sent[topic]) / seconds for topic, n in self.sent.items()}
+        cpu = time.process_time()
+        self._cpu = max(0.0, cpu - self._cpu_at) / seconds
+        self._rate_at, self._rate_sent, self._cpu_at = now, self.sent.copy(), cpu
+
+    def _quantiles(self) -> dict[str, float]:
+        found = {}
+        for name, values in (("", self._latency), ("work_", self._work)):
+            if values:
+                ordered = sorted(values)
+                found[name + "p50"] = ordered[len(ordered) // 2]
+                found[name + "p99"] = ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]
+        return found
+
+
+def _kinds(messages: list[str]) -> list[str]:
+    """Messages without their numbers: a count that goes up is no change worth a frame of its own."""
+    return ["".join(c for c in m if not c.isdigit()) for m in messages]

@@ -1,1 +1,0 @@
-"""Whether something touches, and whether it changed."""
