@@ -15,7 +15,7 @@ from firmware_stub.world import NEWTON
 from models import fisher
 from models.bundle import Bundle
 from models.shapes import Shape
-from services.estimation.touch import MEANS
+from services.estimation.touch_decision import MEANS
 from services.pipeline import Pipeline
 from services.recordings.file_source import FILE_RATE_HZ, file_frame
 from services.runtime.config import Skin, Touch

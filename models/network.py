@@ -64,7 +64,7 @@ class CBAM(nn.Module):
         return x * torch.sigmoid(self.place(where))
 
 
-class Told(nn.Module):
+class FiLM(nn.Module):
     """x (1 + gain(context)) + offset(context) + place: what the noise and where on the skin do to features (FiLM)."""
 
     def __init__(self, channels: int, side: int) -> None:
@@ -90,7 +90,7 @@ class Stage(nn.Module):
 
     def __init__(self, blocks: int, channels: int, side: int, lean: bool, attention: bool = False) -> None:
         super().__init__()
-        self.told = None if lean else Told(channels, side)
+        self.told = None if lean else FiLM(channels, side)
         self.blocks = nn.ModuleList(_convolution(channels, channels) for _ in range(blocks))
         self.attention = CBAM(channels) if attention else nn.Identity()
 
@@ -110,7 +110,7 @@ class MMCNN(nn.Module):
         a, b, c = config.channels
         n = config.grid
         self.context = nn.Sequential(nn.Linear(CONTEXT, TOLD), nn.ReLU(), nn.Linear(TOLD, TOLD), nn.ReLU())
-        self.stem, self.told = _convolution(config.stack, a), Told(a, n)
+        self.stem, self.told = _convolution(config.stack, a), FiLM(a, n)
         self.down1 = _convolution(a, b, stride=2)
         self.stage1 = Stage(config.blocks[0], b, n // 2, config.lean)
         self.down2 = _convolution(b, c, stride=2)

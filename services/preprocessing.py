@@ -2,7 +2,7 @@
 touches.
 
     d = (|Z| - |Z0|) / |Z0|                     against the untouched baseline (services/estimation/baseline.py)
-    touched = d^T C^-1 d > threshold            C: noise, model error, drift (services/estimation/touch.py)
+    touched = d^T C^-1 d > threshold            C: noise, model error, drift (services/estimation/touch_decision.py)
     stack = RM d for a ladder of lambda         equation 1, RM = (J^T W J + lambda^2 R)^-1 J^T W, W = C^-1
     I_thresh = MReLU(H(I_pre) * I_pre)          equations 2 to 5, where the bundle has no network that does better
 
@@ -21,7 +21,7 @@ from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
 from services.board.boardlink import Scanning
 from services.describe import describe
-from services.estimation.baseline import Untouched, believed
+from services.estimation.baseline import BaselineEstimator, believed
 from services.estimation.contact_drift import Reference
 from services.estimation.electrodes import ElectrodeHealth, Verdict
 from services.estimation.evidence import Explanation
@@ -29,8 +29,8 @@ from services.estimation.gain_steps import GainSteps
 from services.estimation.plausibility import impossible
 from services.estimation.sentinel import Coarse, sentinel_of
 from services.estimation.tare import Baseline
-from services.estimation.touch import Hold, TouchDecision, sigma_of_mean
-from services.estimation.touch_detector import Judge, Judgement, Noise
+from services.estimation.touch_decision import FrameAverager, TouchDecision, sigma_of_mean
+from services.estimation.touch_detector import Noise, TouchDetector, TouchVerdict
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
 
@@ -52,11 +52,11 @@ class Preprocessing(Stage):
         super().__init__(name)
         self.config, self.bundle = skin, bundle
         self.electrodes = ElectrodeHealth(bundle)
-        self.untouched = Untouched(bundle, skin.tare)
+        self.untouched = BaselineEstimator(bundle, skin.tare)
         self.pre = self.untouched.pre
-        self.judge = Judge(self.pre, skin)
+        self.judge = TouchDetector(self.pre, skin)
         self.gain = GainSteps(len(bundle.pattern))
-        self.hold = Hold()
+        self.hold = FrameAverager()
         self._coarse: Coarse | None = None  # made with the first sentinel scan
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
         self.reset()
@@ -165,7 +165,7 @@ class Preprocessing(Stage):
             self._reconstruct(out, d, found_now.operator, found_now.decision)
         return out
 
-    def _decide(self, d: Array, amplitude: Array, live: NDArray[np.bool_], now_ns: int) -> tuple[Array, Judgement]:
+    def _decide(self, d: Array, amplitude: Array, live: NDArray[np.bool_], now_ns: int) -> tuple[Array, TouchVerdict]:
         """Touched or not, and the difference, which a touch that begins has against an older baseline."""
         noise, step = self._noise(), self.judge.step
         if not self._touched and self.judge.uncertain(self.untouched.since_s(now_ns)):
@@ -185,7 +185,7 @@ class Preprocessing(Stage):
 
     def _decide_alone(
         self, d: Array, amplitude: Array, live: NDArray[np.bool_], explained: Explanation, now_ns: int
-    ) -> tuple[Array, Judgement]:
+    ) -> tuple[Array, TouchVerdict]:
         """The same for a frame that no untouched one precedes for long: drift is estimated in the frame itself."""
         noise, limit = self._noise(), -float(np.log(self.config.touch.false_alarms))
         self._touched = explained.odds > limit

@@ -18,7 +18,7 @@ from services.runtime.stage import Stage
 
 
 def main(process: str, setup: Callable[[Runner], None]) -> int:
-    """A process's main: configuration, sockets, lanes, loop. Returns the exit status; says on stderr what stands in
+    """A process's main: configuration, sockets, channels, loop. Returns the exit status; says on stderr what stands in
     the way.
     """
     logs.setup(f"{process}: %(message)s")

@@ -24,7 +24,7 @@ from protocol.runtime import host_id
 from protocol.sockets import ControlError, ControlServer, Publisher
 from protocol.topics import TOPIC_OF
 from services.runtime import persistence
-from services.runtime.channel import Feed, Lane, Newest
+from services.runtime.channel import Channel, Feed, Newest
 from services.runtime.config import Config
 from services.runtime.lateness import Lateness
 from services.runtime.stage import Refused, Stage, add_reason
@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 
 
 class Runner:
-    """A process: its sockets and its lanes. `run` returns when SIGINT or SIGTERM came."""
+    """A process: its sockets and its channels. `run` returns when SIGINT or SIGTERM came."""
 
     def __init__(self, process: str, config: Config, problems: Sequence[str] = ()) -> None:
         """problems: what the process as a whole goes without, for its status."""
@@ -51,16 +51,16 @@ class Runner:
         self.publisher = Publisher(process)
         commands = {"status": self._status, "state": self._state, "load": self._load, "reset": self._reset}
         self.control = ControlServer(process, commands)
-        self.lanes: dict[str, Lane] = {}
+        self.channels: dict[str, Channel] = {}
         self._bundles: dict[str, Bundle] = {}
         self._waiter = Waiter()
         self._lateness = Lateness()
         self.publisher.on_join = self._joined
         self._minded: list[tuple[Publisher | ControlServer, Any]] = []  # what listens, with the socket we wait for
-        self._by_socket: dict[Any, Lane] = {}
+        self._by_socket: dict[Any, Channel] = {}
         self._stop = False
         self._frames = 0
-        self._turns: Iterator[Lane] = iter(())  # who may prepare next
+        self._turns: Iterator[Channel] = iter(())  # who may prepare next
         self._settled = False  # what was made while warming up is out of the garbage collector's sight
 
     def bundle(self, skin: str) -> Bundle:
@@ -72,22 +72,22 @@ class Runner:
 
     def add(self, stage: Stage, feed: Feed | None = None) -> None:
         """Drive this stage; without a feed, from the topic that it reads."""
-        lane = Lane(self.process, stage, Newest(stage.reads, stage.skin) if feed is None else feed)
-        self.lanes[stage.skin] = lane
-        self._by_socket[lane.feed.socket] = lane
+        channel = Channel(self.process, stage, Newest(stage.reads, stage.skin) if feed is None else feed)
+        self.channels[stage.skin] = channel
+        self._by_socket[channel.feed.socket] = channel
         for command in stage.commands:
             self.control.handlers[command] = self._commander(command)
         if stage.persists:
-            self._restore(lane)
+            self._restore(channel)
         stage.warm_up()
 
     def run(self) -> None:
-        """Drive the lanes until told to stop."""
+        """Drive the channels until told to stop."""
         wake = _wake_on_signals(self._on_signal)
         for socket in (wake, self.control.socket, self.publisher.socket, *self._by_socket):
             self._waiter.register(socket)
         self._minded = [(self.publisher, self.publisher.socket), (self.control, self.control.socket)]
-        self._turns = cycle(self.lanes.values())
+        self._turns = cycle(self.channels.values())
         _settle()
         next_tick = deadline = 0.0
         while not self._stop:
@@ -111,11 +111,11 @@ class Runner:
 
     def _next_deadline(self) -> float:
         """When there is something to do if nothing arrives: a heartbeat, or silence to be noticed."""
-        return min((lane.heartbeat.deadline(SILENT_S) for lane in self.lanes.values()), default=0.0)
+        return min((channel.heartbeat.deadline(SILENT_S) for channel in self.channels.values()), default=0.0)
 
     def close(self) -> None:
-        for lane in self.lanes.values():
-            lane.feed.close()
+        for channel in self.channels.values():
+            channel.feed.close()
         self._lateness.close()
         self.control.close()
         self.publisher.close()
@@ -123,36 +123,36 @@ class Runner:
 
     # frames
 
-    def _serve(self, lanes: list[Lane], stood: bool = False) -> None:
-        """What waits at these lanes, newest frames of several skins together."""
-        work = [(lane, frame) for lane in lanes for frame in self._waiting(lane, stood)]
+    def _serve(self, channels: list[Channel], stood: bool = False) -> None:
+        """What waits at these channels, newest frames of several skins together."""
+        work = [(channel, frame) for channel in channels for frame in self._waiting(channel, stood)]
         if len(work) > 1 and self.config.skip.batch:
             try:
-                type(work[0][0].stage).together([(lane.stage, frame) for lane, frame in work])
+                type(work[0][0].stage).together([(channel.stage, frame) for channel, frame in work])
             except Exception as why:  # each frame is still processed by itself
                 log.exception("%d frames could not be processed together", len(work), exc_info=why)
-        for lane, frame in work:
-            self._handle(lane, frame)
+        for channel, frame in work:
+            self._handle(channel, frame)
 
-    def _waiting(self, lane: Lane, stood: bool) -> list[Frame]:
+    def _waiting(self, channel: Channel, stood: bool) -> list[Frame]:
         """Frames to process: the newest of a socket, all of a feed but what it is too late for."""
         frames: list[Frame] = []
-        while len(frames) < AT_ONCE and (frame := lane.feed.recv()) is not None:
+        while len(frames) < AT_ONCE and (frame := channel.feed.recv()) is not None:
             frames.append(frame)
-            if isinstance(lane.feed, Newest):
+            if isinstance(channel.feed, Newest):
                 return frames
         news = self._lateness.news(frames, stood)
-        lane.heartbeat.drops["late"] += len(frames) - len(news)
+        channel.heartbeat.drops["late"] += len(frames) - len(news)
         return news
 
-    def _handle(self, lane: Lane, frame: Frame) -> None:
-        beat, stage = lane.heartbeat, lane.stage
+    def _handle(self, channel: Channel, frame: Frame) -> None:
+        beat, stage = channel.heartbeat, channel.stage
         now = time.monotonic_ns()
         beat.heard(frame, now)
         try:
-            made = stage.process(frame, lane.wanted)
+            made = stage.process(frame, channel.wanted)
         except Exception as why:
-            self._failed(lane, why)
+            self._failed(channel, why)
             return
         done = time.monotonic_ns()
         late = False
@@ -164,37 +164,37 @@ class Runner:
             if late:
                 out.valid = False
                 add_reason(out.reasons, "late")
-            self._send(lane, out)
+            self._send(channel, out)
         beat.done(frame, now, time.monotonic_ns(), late)
-        if stage.lacks and not lane.asleep and isinstance(lane.feed, Newest):
-            lane.feed.ask_again()
+        if stage.lacks and not channel.asleep and isinstance(channel.feed, Newest):
+            channel.feed.ask_again()
         self._frames += 1
 
     def _joined(self, prefix: bytes) -> None:
         """Somebody subscribes to what begins so."""
-        for lane in self.lanes.values():
-            for topic, head in lane.heads.items():
+        for channel in self.channels.values():
+            for topic, head in channel.heads.items():
                 if covers(prefix, head):
-                    lane.stage.joined(topic)
+                    channel.stage.joined(topic)
 
     def _prepare(self) -> None:
-        """One piece of work for later, while nobody waits: the lanes take turns, for even asking all of them costs."""
+        """One piece of work for later, while nobody waits: the channels take turns, for even asking all of them costs."""
         if self._frames >= WARM_FRAMES and not self._settled:
             self._settled = True
             _settle()
         else:
-            lane = next(self._turns)
+            channel = next(self._turns)
             try:
-                lane.stage.prepare()
+                channel.stage.prepare()
             except Exception as why:  # what could not be made ahead is made when it is needed, or fails then
-                self._log_once(lane, why, "%s: could not prepare (further such failures are not logged)")
+                self._log_once(channel, why, "%s: could not prepare (further such failures are not logged)")
 
-    def _send(self, lane: Lane, frame: Frame) -> None:
+    def _send(self, channel: Channel, frame: Frame) -> None:
         try:
             self.publisher.send(frame)
-            lane.heartbeat.sent[TOPIC_OF[type(frame)].name] += 1
+            channel.heartbeat.sent[TOPIC_OF[type(frame)].name] += 1
         except (FrameError, zmq.ZMQError) as why:
-            self._failed(lane, why)
+            self._failed(channel, why)
 
     def _wanted(self, stage: Stage) -> frozenset[str]:
         """Topics that the stage is to make: those somebody subscribes to, unless skin.toml says all."""
@@ -202,16 +202,16 @@ class Runner:
             return frozenset(stage.writes)
         return frozenset(topic for topic in stage.writes if self.publisher.wanted(topic, stage.skin))
 
-    def _failed(self, lane: Lane, why: Exception) -> None:
-        lane.heartbeat.drops["failed"] += 1
-        lane.heartbeat.failure = f"a frame could not be processed: {type(why).__name__}: {why}"
-        self._log_once(lane, why, "%s: a frame was dropped (further ones of this kind are only counted)")
+    def _failed(self, channel: Channel, why: Exception) -> None:
+        channel.heartbeat.drops["failed"] += 1
+        channel.heartbeat.failure = f"a frame could not be processed: {type(why).__name__}: {why}"
+        self._log_once(channel, why, "%s: a frame was dropped (further ones of this kind are only counted)")
 
     @staticmethod
-    def _log_once(lane: Lane, why: Exception, text: str) -> None:
-        if str(why) not in lane.errors and len(lane.errors) < 100:
-            lane.errors.add(str(why))
-            log.exception(text, lane.stage.skin, exc_info=why)
+    def _log_once(channel: Channel, why: Exception, text: str) -> None:
+        if str(why) not in channel.errors and len(channel.errors) < 100:
+            channel.errors.add(str(why))
+            log.exception(text, channel.stage.skin, exc_info=why)
 
     # housekeeping
 
@@ -227,64 +227,66 @@ class Runner:
         self.publisher.poll()
         problems = self.problems + self._mind_sockets()
         now = time.monotonic()
-        for lane in self.lanes.values():
-            lane.wanted = self._wanted(lane.stage)
-            self._sleep_or_wake(lane)
-            beat = lane.heartbeat
-            beat.drops["malformed"], beat.drops["skipped"] = lane.feed.malformed, lane.feed.skipped
-            silent = "" if lane.asleep else beat.silence(SILENT_S, lane.stage.reads)
-            health = lane.stage.health().with_problems(problems)
-            status = beat.status(health, silent, now, HEARTBEAT_S, asleep=lane.asleep)
+        for channel in self.channels.values():
+            channel.wanted = self._wanted(channel.stage)
+            self._sleep_or_wake(channel)
+            beat = channel.heartbeat
+            beat.drops["malformed"], beat.drops["skipped"] = channel.feed.malformed, channel.feed.skipped
+            silent = "" if channel.asleep else beat.silence(SILENT_S, channel.stage.reads)
+            health = channel.stage.health().with_problems(problems)
+            status = beat.status(health, silent, now, HEARTBEAT_S, asleep=channel.asleep)
             if status is not None:
-                self._send(lane, status)
-            info = lane.stage.info()
+                self._send(channel, status)
+            info = channel.stage.info()
             if info is not None:
                 age = (
                     {"tare_age_s": (time.monotonic_ns() - info["tare_sample_ns"]) * 1e-9}
                     if info.get("tare_sample_ns")
                     else {}
                 )
-                self._send(lane, InfoFrame(skin=lane.stage.skin, process=self.process, valid=True, info=info | age))
-            if lane.stage.persists and (saved := lane.stage.saved()) is not None:
-                persistence.save(self.process, lane.stage.skin, saved)
+                self._send(
+                    channel, InfoFrame(skin=channel.stage.skin, process=self.process, valid=True, info=info | age)
+                )
+            if channel.stage.persists and (saved := channel.stage.saved()) is not None:
+                persistence.save(self.process, channel.stage.skin, saved)
 
-    def _sleep_or_wake(self, lane: Lane) -> None:
+    def _sleep_or_wake(self, channel: Channel) -> None:
         """A stage whose frames nobody reads does not read either, so that upstream need not work for it."""
-        if not lane.stage.sleeps or not isinstance(lane.feed, Newest):
+        if not channel.stage.sleeps or not isinstance(channel.feed, Newest):
             return
-        idle = not lane.wanted
-        if idle != lane.asleep:
-            lane.asleep = idle
-            lane.feed.listen(not idle)
+        idle = not channel.wanted
+        if idle != channel.asleep:
+            channel.asleep = idle
+            channel.feed.listen(not idle)
             if not idle:
-                lane.stage.wake()
+                channel.stage.wake()
 
-    def _restore(self, lane: Lane) -> None:
-        found = persistence.restore(self.process, lane.stage.skin)
+    def _restore(self, channel: Channel) -> None:
+        found = persistence.restore(self.process, channel.stage.skin)
         if found is None:
             return
         try:
-            lane.stage.restore(*found)
-            log.info("%s: took over the baseline of %.0f s ago", lane.stage.skin, found[1])
+            channel.stage.restore(*found)
+            log.info("%s: took over the baseline of %.0f s ago", channel.stage.skin, found[1])
         except Refused as why:
-            log.warning("%s: %s", lane.stage.skin, why)
+            log.warning("%s: %s", channel.stage.skin, why)
 
     def _on_signal(self) -> None:
         self._stop = True
 
     # commands
 
-    def _lane(self, args: dict[str, Any]) -> Lane:
-        name = args.get("skin") or next(iter(self.lanes))
-        if not isinstance(name, str) or name not in self.lanes:
-            raise ControlError("bad_request", f"no skin called {name!r}; configured: {', '.join(self.lanes)}")
-        return self.lanes[name]
+    def _channel(self, args: dict[str, Any]) -> Channel:
+        name = args.get("skin") or next(iter(self.channels))
+        if not isinstance(name, str) or name not in self.channels:
+            raise ControlError("bad_request", f"no skin called {name!r}; configured: {', '.join(self.channels)}")
+        return self.channels[name]
 
     def _commander(self, command: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
         def carry_out(args: dict[str, Any]) -> dict[str, Any]:
-            lane = self._lane(args)
+            channel = self._channel(args)
             try:
-                result: dict[str, Any] = persistence.plain(lane.stage.command(command, args))
+                result: dict[str, Any] = persistence.plain(channel.stage.command(command, args))
                 return result
             except Refused as why:
                 raise ControlError("refused", str(why)) from None
@@ -293,18 +295,18 @@ class Runner:
 
     def _status(self, args: dict[str, Any]) -> dict[str, Any]:
         """`flowing`: whether a frame came within SILENT_S (or nobody wants one); what status/<skin> said last."""
-        lane = self._lane(args)
-        return lane.heartbeat.summary(asleep=lane.asleep, silent_s=SILENT_S)
+        channel = self._channel(args)
+        return channel.heartbeat.summary(asleep=channel.asleep, silent_s=SILENT_S)
 
     def _state(self, args: dict[str, Any]) -> dict[str, Any]:
         """The stage's temporal state, for a recording."""
-        return {"state": persistence.plain(self._lane(args).stage.state())}
+        return {"state": persistence.plain(self._channel(args).stage.state())}
 
     def _load(self, args: dict[str, Any]) -> dict[str, Any]:
         """Take over a state that `state` gave."""
         if not isinstance(args.get("state"), dict):
             raise ControlError("bad_request", "load needs `state`, a map as the command state gives it")
-        stage = self._lane(args).stage
+        stage = self._channel(args).stage
         try:
             stage.load(persistence.arrays(args["state"]))
         except Exception as why:  # whatever was in the state, the stage goes on, with none
@@ -315,7 +317,7 @@ class Runner:
 
     def _reset(self, args: dict[str, Any]) -> dict[str, Any]:
         """Forget all temporal state; with `new_session` also begin a session, whose frames count from 0."""
-        stage = self._lane(args).stage
+        stage = self._channel(args).stage
         stage.reset()
         if args.get("new_session"):
             stage.new_session()

@@ -15,8 +15,8 @@ from models.bundle import Bundle
 from protocol.frames import RawFrame, as_sent
 from services.estimation.creep import Creep
 from services.estimation.drift import DriftProcess
+from services.estimation.drift_filter import DriftFilter
 from services.estimation.evidence import Explanation, TouchEvidence
-from services.estimation.following import Follower
 from services.estimation.physics import SkinPhysics
 from services.estimation.references import References
 from services.estimation.start import Verdict, judge_start
@@ -44,13 +44,13 @@ def believed(frame: RawFrame) -> bool:
     return as_sent(frame)[0]
 
 
-class Untouched:
+class BaselineEstimator:
     """Baseline |Z0| (K,), what differences are divided by, and their noise."""
 
     def __init__(self, bundle: Bundle, config: Tare) -> None:
         self.bundle, self.config = bundle, config
         self.pre = bundle.prereconstructor()
-        self.follower = Follower(self.pre, config)
+        self.follower = DriftFilter(self.pre, config)
         self.references = References(len(bundle.pattern))
         self.baseline: Baseline | None
         self.normaliser: NDArray[np.floating]

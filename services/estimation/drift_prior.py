@@ -33,7 +33,7 @@ ABSOLUTE = 3e-5  # of |Z|: no model of a skin is better
 COARSE = 2  # pixels of the reconstruction matrices to one of the non-negative fit, along each axis
 
 
-class Allowance:
+class DriftPrior:
     """The law of `Drift` over time, in steps 0 ... STEPS - 1."""
 
     def __init__(self, config: Tare) -> None:
@@ -55,10 +55,10 @@ class Allowance:
         return np.asarray(np.hypot(sigma, LINEARISATION * spread))
 
 
-class Evidence:
+class MarginalLikelihood:
     """How well each step of the allowance explains a frame, touches being free to be any drop >= 0."""
 
-    def __init__(self, pre: PreReconstructor, allowance: Allowance) -> None:
+    def __init__(self, pre: PreReconstructor, allowance: DriftPrior) -> None:
         self.m, self.allowance = pre.m, allowance
         (h, w), k = self.m.inside.shape, pre.measurements
         blocks = (h // COARSE, COARSE, w // COARSE, COARSE)

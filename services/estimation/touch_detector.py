@@ -1,7 +1,7 @@
 """Touched or not, and by how much drift the frame is to be explained: the operators for it, made ahead of need.
 
-`Judge` compares a difference under the step of the drift allowance (services/estimation/drift_prior.py) that explains it best,
-of those that the time since the last untouched frame permits. A touch keeps its step until another one explains it
+`TouchDetector` compares a difference under the step of the drift prior (services/estimation/drift_prior.py) that
+explains it best, of those that the time since the last untouched frame permits. A touch keeps its step until another one explains it
 clearly better: a held touch must not fade because time goes on.
 """
 
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from models.prereconstruction import Operator, PreReconstructor
 from services.estimation.creep import Creep
-from services.estimation.drift_prior import Allowance, Evidence
-from services.estimation.touch import TouchDecision
+from services.estimation.drift_prior import DriftPrior, MarginalLikelihood
+from services.estimation.touch_decision import TouchDecision
 from services.runtime.config import Skin
 from services.runtime.persistence import shaped
 
@@ -45,7 +45,7 @@ class Noise(NamedTuple):
         return self if n == 1 else Noise(self.sigma / np.sqrt(n), max(1, self.frames // n), self.found_from)
 
 
-class Judgement(NamedTuple):
+class TouchVerdict(NamedTuple):
     touched: bool
     score: float
     threshold: float
@@ -53,11 +53,11 @@ class Judgement(NamedTuple):
     decision: TouchDecision
 
 
-class Judge:
+class TouchDetector:
     def __init__(self, pre: PreReconstructor, skin: Skin) -> None:
         self.pre, self.config = pre, skin.touch
-        self.allowance = Allowance(skin.tare)
-        self._evidence: Evidence | None = None
+        self.allowance = DriftPrior(skin.tare)
+        self._evidence: MarginalLikelihood | None = None
         self.creep = Creep(pre.measurements)
         self._operators: dict[tuple[bytes, bytes, int, int, int], tuple[Operator, TouchDecision]] = {}
         self.reset()
@@ -77,7 +77,7 @@ class Judge:
 
     def __call__(
         self, d: Array, live: NDArray[np.bool_], noise: Noise, since_s: float, now_ns: int, touched: bool
-    ) -> Judgement:
+    ) -> TouchVerdict:
         """Judge the difference (K,) of a frame `since_s` after the last untouched one; touched: the frame before."""
         permitted = self._permitted = self.allowance.step(since_s)
         if not np.array_equal(live, self._live):
@@ -101,7 +101,7 @@ class Judge:
             self._question = None
         return found
 
-    def _drift_or_touch(self, d: Array, live: NDArray[np.bool_], noise: Noise, touched: bool) -> Judgement | None:
+    def _drift_or_touch(self, d: Array, live: NDArray[np.bool_], noise: Noise, touched: bool) -> TouchVerdict | None:
         """Untouched, under the likeliest step that says so, unless a touch is likelier by far."""
         cost = self._explain(d, noise.sigma, live, list(range(self._permitted + 1)))
         likeliest = sorted(cost, key=lambda step: cost[step])
@@ -120,7 +120,7 @@ class Judge:
 
     def begin(
         self, d: Array, live: NDArray[np.bool_], noise: Noise, since_s: float, now_ns: int, alone: bool = False
-    ) -> Judgement:
+    ) -> TouchVerdict:
         """The same for the first frame of a touch, against the baseline from before it was noticed. alone: against one
         whose drift was found in this very frame.
         """
@@ -137,9 +137,9 @@ class Judge:
 
     def _judge(
         self, d: Array, live: NDArray[np.bool_], noise: Noise, touched: bool, step: int | None = None
-    ) -> Judgement:
+    ) -> TouchVerdict:
         operator, decision = self.operator(live, noise, self.step if step is None else step)
-        return Judgement(*decision(d, touched), operator, decision)
+        return TouchVerdict(*decision(d, touched), operator, decision)
 
     # which step explains a touch
 
@@ -173,7 +173,7 @@ class Judge:
 
     def _explain(self, d: Array, sigma: Array, live: NDArray[np.bool_], steps: list[int]) -> dict[int, float]:
         if self._evidence is None:
-            self._evidence = Evidence(self.pre, self.allowance)
+            self._evidence = MarginalLikelihood(self.pre, self.allowance)
         if not self._evidence.speaks:
             return {step: float(step == max(steps)) * -2 * CLEARLY for step in steps}
         return {step: self._evidence(d, sigma, live, step) for step in steps}
@@ -219,7 +219,7 @@ class Judge:
                 self.operator(live, noise, step)
                 return True
         if self._evidence is None:
-            self._evidence = Evidence(self.pre, self.allowance)
+            self._evidence = MarginalLikelihood(self.pre, self.allowance)
             return True
         return self._answer_one()
 

@@ -25,7 +25,7 @@ class Feed(Protocol):
     def close(self) -> None: ...
 
 
-class Lane:
+class Channel:
     """One skin in this process: its stage, where its frames come from, how it does."""
 
     def __init__(self, process: str, stage: Stage, feed: Feed) -> None:

@@ -64,7 +64,7 @@ class Tare(Section):
 
 
 class Touch(Section):
-    """The touch decision: see services/estimation/touch.py."""
+    """The touch decision: see services/estimation/touch_decision.py."""
 
     false_alarms: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
     hold: Switch = True  # switch of the rule "nothing changed: do not reconstruct again"

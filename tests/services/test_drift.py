@@ -12,9 +12,9 @@ from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame, RawFrame
-from services.estimation.following import Follower
+from services.estimation.drift_filter import DriftFilter
 from services.estimation.tare import take
-from services.estimation.touch_detector import Judge, Noise
+from services.estimation.touch_detector import Noise, TouchDetector
 from services.preprocessing import Preprocessing
 from services.recordings.reconstruction import reconstruct
 from services.runtime.config import Skin
@@ -56,7 +56,7 @@ def test_no_false_alarm_in_three_hours_of_drift(skin: Skin, bundle: Bundle, seed
     rng, directed, k = np.random.default_rng(seed), directions(bundle), len(bundle.pattern)
     pre, truth, live = bundle.prereconstructor(), np.asarray(bundle.z0, float), np.ones(len(bundle.pattern), bool)
     rates = np.array([skin.tare.scale_per_s] + [skin.tare.contact_per_s] * 16)
-    judge, follower, noise_level = Judge(pre, skin), Follower(pre, skin.tare), 1e-4
+    judge, follower, noise_level = TouchDetector(pre, skin), DriftFilter(pre, skin.tare), 1e-4
     frame_s, block, worst, frames = FRAME_NS * 1e-9, 12, 0.0, 0
     for _ in range(3):
         drift, rate, now = np.zeros(17), np.zeros(17), FRAME_NS

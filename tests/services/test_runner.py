@@ -215,8 +215,8 @@ def test_rules_that_no_skin_owns_have_their_switches(runtime: Path, skip: bool) 
         Counting.groups.clear()
         for name in skins:
             runner.add(Counting(name), OneFrame(name))
-        assert runner._wanted(runner.lanes["arm"].stage) == (frozenset() if skip else {"delta"})
-        runner._serve(list(runner.lanes.values()))
+        assert runner._wanted(runner.channels["arm"].stage) == (frozenset() if skip else {"delta"})
+        runner._serve(list(runner.channels.values()))
         assert Counting.groups == ([2] if skip else [])
         assert runner.publisher.sent == {"delta/palm": 1, "delta/arm": 1}
     finally:
@@ -261,8 +261,8 @@ def passed(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
 
     def serve(feed: Waiting, stood: bool = False) -> list[RawFrame]:
         runner.add(Passing("palm"), feed)
-        runner._serve(list(runner.lanes.values()), stood)
-        assert sum(runner.lanes["palm"].heartbeat.drops.values()) == feed.count - len(sent)
+        runner._serve(list(runner.channels.values()), stood)
+        assert sum(runner.channels["palm"].heartbeat.drops.values()) == feed.count - len(sent)
         return sent
 
     yield serve
@@ -319,7 +319,7 @@ def test_who_subscribes_is_told_of_and_what_is_lacking_is_asked_for_by_subscribi
             runner._tick()
             upstream.poll()
             upstream.send(ImageFrame(skin="palm"))
-            runner._serve(list(runner.lanes.values()))
+            runner._serve(list(runner.channels.values()))
             time.sleep(0.01)
 
     try:
@@ -327,7 +327,7 @@ def test_who_subscribes_is_told_of_and_what_is_lacking_is_asked_for_by_subscribi
         until(lambda: "contact" in stage.told)
         until(lambda: len(asked) >= 5 and set(asked) == {b"image/palm\0"})
         contacts.close()
-        until(lambda: runner.lanes["palm"].asleep)
+        until(lambda: runner.channels["palm"].asleep)
         asked.clear()
         contacts = AllReader(["contact"], "palm")
         until(lambda: asked)

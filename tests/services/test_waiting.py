@@ -52,7 +52,7 @@ def test_what_is_not_read_empty_comes_again(context: "zmq.Context[Socket]", wait
     waiter.register(receive)
     for _ in range(5):
         send.send(b"x")
-    for _ in range(5):  # one each time, as a lane that takes the newest does
+    for _ in range(5):  # one each time, as a channel that takes the newest does
         assert receive in waiter.wait(1.0)
         assert receive.recv(zmq.NOBLOCK) == b"x"
     assert waiter.wait(0.0) == [] or waiter.wait(0.0) == []  # asked once more, then silent

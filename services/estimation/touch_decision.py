@@ -43,7 +43,7 @@ class TouchDecision:
         return score > threshold, score, threshold
 
 
-class Hold:
+class FrameAverager:
     """Decides which frames of a touch are reconstructed, and from what.
 
     While nothing changes against the frame last reconstructed (not the previous frame: creep must be seen), frames are

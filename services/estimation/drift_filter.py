@@ -33,7 +33,7 @@ LONGEST_STEP_S = 1.0  # of the slow part: a longer gap counts as this
 MOST_S = 600.0  # of drift: a longer gap counts as this
 
 
-class Follower:
+class DriftFilter:
     """Follows (K,) |Z0|. Times are `sample` stamps [ns]; 0: not known yet."""
 
     def __init__(self, pre: PreReconstructor, config: Tare) -> None:
