@@ -24,10 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench._goals import Goal
-from bench._service import end_on_sigterm
+from bench import REPORTS, ROOT, commands
+from bench.goals import Goal
+from bench.speed.service import end_on_sigterm
 
-ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 3600.0  # for one benchmark
 LONG = 12_000  # characters of its tables beyond which the page only names the file
 
@@ -103,7 +103,7 @@ BENCHMARKS = (
 
 def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
     """Runs it; its tables go to our output and to NAME.txt. Returns what went wrong, or ""."""
-    command = [sys.executable, "-m", f"bench.{benchmark.name}", *(benchmark.quick if quick else ())]
+    command = [sys.executable, "-m", commands()[benchmark.name], *(benchmark.quick if quick else ())]
     print(f"\n=== {benchmark.title}: {' '.join(command[2:])}", flush=True)
     for suffix in ("json", "txt"):  # what an earlier run left is not this one's
         (folder / f"{benchmark.name}.{suffix}").unlink(missing_ok=True)
@@ -189,7 +189,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="short forms; fails where a ratio is beyond its gate")
     parser.add_argument("--reuse", action="store_true", help="run nothing: the page from the reports there are")
     parser.add_argument("--only", nargs="+", metavar="NAME", choices=[b.name for b in BENCHMARKS])
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "reports")
+    parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()
     chosen = [b for b in BENCHMARKS if args.only is None or b.name in args.only]

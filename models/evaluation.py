@@ -1,4 +1,4 @@
-"""Quick figures on held-out scenes, while training and for the manifest; bench/accuracy.py has the full table."""
+"""Quick figures on held-out scenes, while training and for the manifest; bench/accuracy/ has the full table."""
 
 from __future__ import annotations
 

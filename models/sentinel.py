@@ -28,7 +28,7 @@ from models.prereconstruction import Matrices
 Array = npt.NDArray[np.floating]
 Rows = npt.NDArray[np.integer]
 
-LENGTH = 12  # measurements: a tenth of `pairs`; bench/sentinel.py shows what longer and shorter ones would give
+LENGTH = 12  # measurements: a tenth of `pairs`; bench/speed/sentinel.py shows what longer and shorter ones would give
 NEWTON = 0.1  # S/m of drop
 RADIUS = 0.2  # model units, of the touch that must be seen
 RADII = (0.1, 0.2, 0.4)  # model units, of the touches that are told apart

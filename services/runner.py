@@ -178,7 +178,7 @@ class Runner:
                     channel.stage.joined(topic)
 
     def _prepare(self) -> None:
-        """One piece of work for later, while nobody waits: the channels take turns, for even asking all of them costs."""
+        """One piece of work for later, while nobody waits: channels take turns, for even asking all of them costs."""
         if self._frames >= WARM_FRAMES and not self._settled:
             self._settled = True
             _settle()

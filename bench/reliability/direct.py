@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bench._host import Felt
 from bench.reliability.scenes import Matrix, SolvedSheet
 from bench.reliability.session import Moment, moment
+from bench.tracking.host import Felt
 from firmware_stub.analog import Analog, Noise
 from firmware_stub.faults import Faults
 from firmware_stub.world import World

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from bench._goals import Goal
+from bench.goals import Goal
 from bench.reliability.report import Column, console, table_of
 
 Found = Mapping[str, Mapping[str, Mapping[str, Any]]]

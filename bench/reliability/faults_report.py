@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
-from bench._goals import Goal
+from bench.goals import Goal
 from bench.reliability.matrix import ROWS, SITUATIONS, Score
 from bench.reliability.report import cell, console, table_of
 

@@ -12,9 +12,9 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.table import Table
 
-from bench._goals import Goal, table
-from bench._json import write_json
-from bench._machine import provenance
+from bench.goals import Goal, table
+from bench.json_file import write_json
+from bench.machine import provenance
 from models.bundle import Bundle
 
 Column = tuple[str, str, str]  # heading, key, format

@@ -9,16 +9,15 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench import ROOT
 from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import Cue, Curve, Script, Track
 from firmware_stub.world import NEWTON, Touch, World
 
-ROOT = Path(__file__).resolve().parents[2]
 WORK = ROOT / "bench" / "work" / "reliability"
 SOLVED_BY = (
     *(f"firmware_stub/{name}.py" for name in ("sheet", "world")),

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench._host import Felt, Host
 from bench.reliability.scenes import SolvedSheet
+from bench.tracking.host import Felt, Host
 from firmware_stub.rig import Rig
 from firmware_stub.timeline import Script, Timeline
 from firmware_stub.world import NEWTON, World

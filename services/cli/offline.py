@@ -120,16 +120,15 @@ def bench(
     name: Annotated[str, typer.Argument(help="Which one; its own options follow.")] = "",
 ) -> None:
     """Run a benchmark: `skin bench accuracy --help` shows its options."""
-    from services.cli.common import ROOT
+    from bench import commands
 
-    files = (ROOT / "bench").glob("[!_]*.py")
-    names = sorted(p.stem for p in files if "\ndef main(" in p.read_text(encoding="utf-8"))
+    names = commands()
     if name in ("", "--help"):
         print("skin bench NAME [options], NAME one of: " + ", ".join(names))
         return
     if name not in names:
         fail(f"no benchmark {name!r}: expected one of {', '.join(names)}", USAGE)
-    _dispatch(f"bench.{name}", context.args)
+    _dispatch(names[name], context.args)
 
 
 def _dispatch(module: str, args: list[str]) -> None:

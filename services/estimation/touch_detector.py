@@ -1,8 +1,8 @@
 """Touched or not, and by how much drift the frame is to be explained: the operators for it, made ahead of need.
 
 `TouchDetector` compares a difference under the step of the drift prior (services/estimation/drift_prior.py) that
-explains it best, of those that the time since the last untouched frame permits. A touch keeps its step until another one explains it
-clearly better: a held touch must not fade because time goes on.
+explains it best, of those that the time since the last untouched frame permits. A touch keeps its step until another
+one explains it clearly better: a held touch must not fade because time goes on.
 """
 
 from __future__ import annotations

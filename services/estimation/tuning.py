@@ -15,8 +15,8 @@ def _number(value: Any, unit: str, meaning: str, origin: str) -> Any:
     return field(default=value, metadata={"unit": unit, "meaning": meaning, "origin": origin})
 
 
-DRIFT_ROWS = "bench/estimation.py drift"
-START_ROWS = "bench/estimation.py start"
+DRIFT_ROWS = "bench/reliability/estimation.py drift"
+START_ROWS = "bench/reliability/estimation.py start"
 
 
 @dataclass(frozen=True)

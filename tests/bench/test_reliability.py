@@ -10,12 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench import drift, faults
-from bench._goals import Goal
+from bench.goals import Goal
 from bench.reliability import (
     availability,
+    drift,
     drift_report,
     drifted,
+    faults,
     faults_report,
     gain_steps,
     matrix,

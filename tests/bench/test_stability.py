@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench import _stability_bytes as bytes_of_others
-from bench import _stability_garbage as garbage
-from bench import _stability_report as report
-from bench import _stability_time as held_up
-from bench._stability_matrices import solved_long
-from bench._stability_run import (
+from bench.stability.__main__ import changed_bytes as bytes_of_others
+from bench.stability.__main__ import garbage, report
+from bench.stability.__main__ import time as held_up
+from bench.stability.matrices import solved_long
+from bench.stability.run import (
     METRES,
     NEWTONS_PER_DROP,
     TOUCHES,
@@ -169,14 +168,14 @@ def test_extended_precision_solves_what_double_cannot() -> None:
 def test_pytorch_evaluates_a_shipped_file_as_onnx_runtime_does(setting: Setting, scene: Scene) -> None:
     pytest.importorskip("torch")
     pytest.importorskip("onnx")
-    from bench import _stability_precision as precision
+    from bench.stability.__main__ import precision
 
     path = setting.bundle.network_path("full")
     if path is None:
         pytest.skip("this bundle has no network")
     import torch
 
-    from bench._stability_graph import Graph
+    from bench.stability.graph import Graph
 
     pre = setting.bundle.prereconstructor()
     stack, context, scale = pre.condition(np.full(120, RELATIVE)).stack(pre.difference(scene.z, scene.z0))

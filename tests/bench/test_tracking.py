@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench import _tracking_faults as faults
-from bench import _tracking_report as report
-from bench import tracking
-from bench._tracking_scene import TOUCHES, Recorded, _drifting, simulate
-from bench._tracking_scores import GRACE, LIGHT_N, Scorer, Seen, all_of
+from bench.tracking.__main__ import __main__ as tracking
+from bench.tracking.__main__ import faults, report
+from bench.tracking.scene import TOUCHES, Recorded, _drifting, simulate
+from bench.tracking.scores import GRACE, LIGHT_N, Scorer, Seen, all_of
 from firmware_stub.timeline import Curve, Script
 from protocol.frames import ELECTRODE_STATES
 from services.runtime.config import Skin

@@ -72,7 +72,7 @@ def test_examples(runtime: Path, name: str) -> None:
     assert code in LEFT and "Traceback" not in out, (code, out)
 
 
-@pytest.mark.parametrize("module", ["bench.picture", "bench.tracking", "models.limits"])
+@pytest.mark.parametrize("module", ["bench.picture", "bench.tracking.__main__", "models.limits"])
 def test_offline_programs(runtime: Path, module: str) -> None:
     code, out = interrupted([sys.executable, "-m", module], RUNS, runtime)
     assert code in LEFT and "Traceback" not in out, (code, out)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench._sentinel_host import CHAIN_S, Host
+from bench.speed.sentinel_host import CHAIN_S, Host
 from protocol import link
 from protocol.frames import DeltaFrame
 from services.board.adaptive import DEAF_S, FULL_EVERY_S, AdaptiveScan

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from bench._delayed_line import DelayedLine, Seen, listen
+from bench.stability.delayed_line import DelayedLine, Seen, listen
 from models.bundle import Bundle
 from protocol import link
 from protocol.frames import RawFrame

@@ -1,0 +1,167 @@
+"""The rows of the accuracy benchmark: every method as a function of one frame, with what it may be tuned by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from bench import ROOT
+from bench.accuracy import peers as _peers
+from models import baselines
+from models.bundle import Bundle
+from models.forward import ForwardModel
+from models.prereconstruction import THRESHOLD_T, noise_of_frames
+from models.shapes import Array
+
+PUBLISHED = ROOT / "bench" / "published"
+N = 48  # pixels a side of the classical images
+
+
+@dataclass(frozen=True, eq=False)
+class Tare:
+    """What a method knows before the frames: untouched |Z| (64, 120) and the means of both patterns."""
+
+    untouched: Array
+    pairs0: Array
+    adjacent0: Array
+
+    @property
+    def sigma(self) -> Array:
+        """(120,) relative noise of a frame, as found at tare; never quite zero, which no method could weigh by."""
+        return np.maximum(noise_of_frames(self.untouched, self.pairs0) / self.pairs0, 1e-7)
+
+
+Image = Callable[[Array], Array]  # |Z| (K,) -> drop (n, n)
+
+
+@dataclass(frozen=True)
+class Method:
+    """`build(tare, value)` prepares for a noise level; `values` are the hyperparameters to choose from.
+
+    gain: scaled so that the touch in the centre, noise-free, has its true drop (what a linear method's amplitude means
+    depends on its regularisation). slow: run on a part of the frames.
+    """
+
+    name: str
+    build: Callable[[Tare, float | None], Image]
+    values: tuple[float, ...] = ()
+    pattern: str = "pairs"
+    gain: bool = True
+    slow: bool = False
+
+
+def _difference(method: Callable[[Array], Array], z0: Array) -> Image:
+    return lambda z: method(z / z0 - 1)
+
+
+def classical() -> list[Method]:
+    """The baselines of models/baselines.py, each also with its hyperparameter tuned to the noise."""
+    physics = baselines.Linearisation(ForwardModel("square16", mesh="inverse"))
+    made: dict[tuple[str, float | None], Callable[[Array], Array]] = {}
+
+    def row(
+        name: str,
+        make: Callable[[float | None], Callable[[Array], Array]],
+        values: tuple[float, ...] = (),
+        slow: bool = False,
+    ) -> Method:
+        def build(tare: Tare, value: float | None) -> Image:
+            if (name, value) not in made:
+                made[name, value] = make(value)
+            return _difference(made[name, value], tare.pairs0)
+
+        return Method(name, build, values, slow=slow)
+
+    return [
+        row("NOSER, lambda 0.15 (published)", lambda v: baselines.noser(physics, n=N)),
+        row(
+            "NOSER, best lambda",
+            lambda v: baselines.noser(physics, v or 0.01, n=N, units="relative"),
+            (1e-3, 3e-3, 0.01, 0.03, 0.1),
+        ),
+        row(
+            "total variation",
+            lambda v: baselines.TotalVariation(physics, v or 1e-6),
+            (1e-8, 1e-7, 1e-6, 4e-6, 2e-5),
+            slow=True,
+        ),
+        row(
+            "Gauss-Newton, 3 steps",
+            lambda v: baselines.GaussNewton(physics, v or 0.01, n=N, steps=3),
+            (1e-3, 3e-3, 0.01, 0.03, 0.1),
+            slow=True,
+        ),
+        row("GREIT", lambda v: baselines.greit(physics, n=N, noise_figure=v or 1.0), (0.5, 1.0, 2.0, 4.0)),
+    ]
+
+
+def peers() -> list[Method]:
+    """pyEIT's three, on the adjacent pattern's frames."""
+    made: dict[tuple[str, float | None], _peers.PyEIT] = {}
+
+    def row(label: str, method: str, values: tuple[float, ...] = ()) -> Method:
+        def build(tare: Tare, value: float | None) -> Image:
+            if (method, value) not in made:
+                made[method, value] = _peers.PyEIT(method, value, N)
+            return _difference(made[method, value], tare.adjacent0)
+
+        return Method(f"{_peers.name()} {label}", build, values, pattern="adjacent")
+
+    return [row("JAC", "jac", (1e-3, 0.01, 0.1, 1.0)), row("GREIT", "greit", (1e-3, 0.01, 0.1)), row("BP", "bp")]
+
+
+def session(path: Path) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def published(bundle: Bundle) -> list[Method]:
+    """The paper's network and its twin without attention, where models/published.py has trained them."""
+
+    def row(name: str, path: Path) -> Method:
+        network = session(path)
+
+        def build(tare: Tare, value: float | None) -> Image:
+            pre = bundle.prereconstructor()
+            operator = pre.condition(tare.sigma)
+
+            def image(z: Array) -> Array:
+                step = operator.one_step(pre.difference(z, tare.pairs0), N, THRESHOLD_T)
+                found = network.run(None, {"image": step[None, None].astype(np.float32)})[0]
+                return np.asarray(found[0, 0], float)
+
+            return image
+
+        return Method(name, build, gain=False)
+
+    files = {"MM-CNN as published": "mmcnn.onnx", "the same without attention": "cnn.onnx"}
+    return [row(name, PUBLISHED / file) for name, file in files.items() if (PUBLISHED / file).exists()]
+
+
+def shipped(bundle: Bundle) -> list[Method]:
+    """The bundle's networks as mere images, without the stages that make contacts of them."""
+
+    def row(variant: str) -> Method:
+        path = bundle.network_path(variant)
+        assert path is not None
+        network = session(path)
+
+        def build(tare: Tare, value: float | None) -> Image:
+            pre = bundle.prereconstructor()
+            operator = pre.condition(tare.sigma)
+
+            def image(z: Array) -> Array:
+                stack, context, scale = operator.stack(pre.difference(z, tare.pairs0))
+                drop = network.run(["drop"], {"stack": stack[None], "context": context[None]})[0]
+                return np.asarray(drop[0, 0] * scale)
+
+            return image
+
+        return Method(f"shipped, {variant}: image alone", build, gain=False)
+
+    return [row(variant) for variant in ("full", "fast") if bundle.network_path(variant) is not None]

@@ -1,0 +1,171 @@
+"""The accuracy benchmark's table, JSON and plot."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from bench.accuracy.frames import REFERENCE, Frames, Level
+from bench.accuracy.scores import Row
+from bench.goals import Goal, table
+from bench.json_file import write_json
+from bench.machine import machine, provenance
+from models.bundle import Bundle
+
+COLUMNS = (  # heading, key, format
+    ("ms", "ms", "{:.2f}"),
+    ("IoU", "mean_iou", "{:.3f}"),
+    ("contact IoU", "contact_iou", "{:.3f}"),
+    ("LDCI", "ldci-0.2-0.15", "{:.3f}"),
+    ("wide", "ldci-0.25-0.15", "{:.3f}"),
+    ("0.15 S/m", "ldci-0.2-0.85", "{:.3f}"),
+    ("position % side", "position_%", "{:.2f}"),
+    ("p95", "position_p95_%", "{:.2f}"),
+    ("force %", "force_%", "{:.1f}"),
+    ("integral %", "integral_%", "{:.1f}"),
+    ("corr.", "correlation", "{:.3f}"),
+    ("SSIM", "ssim", "{:.3f}"),
+    ("count %", "count_%", "{:.0f}"),
+    ("shape %", "shape_%", "{:.0f}"),
+    ("frames", "frames", "{:.0f}"),
+)
+# key, figure, target noise-free, at 70 dB: at least (>=) or at most (<=) so much, or so many Bayesian floors.
+TARGETS = (
+    ("mean_iou", "mean IoU, five shapes", ">= 0.94", ">= 0.88"),
+    ("contact_iou", "contact IoU", ">= 0.88", ">= 0.78"),
+    ("ldci-0.2-0.15", "LDCI, 0.85 S/m inside", "<= 0.02", ""),
+    ("force_%", "force from peak, size unknown, %", "<= 3", "1.3 floors"),
+    ("known_force_%", "force, known indenter, %", "<= 2", "<= 3"),
+    ("force_within_%", "presses within one sigma of force, %", "", ""),
+    ("integral_%", "integrated drop, %", "<= 2", "1.3 floors"),
+    ("position_%", "position, % of side", "<= 0.3", "1.3 floors"),
+    ("position_p95_%", "position, p95, % of side", "", "<= 2"),
+    ("shape_%", "shape class, radius >= 0.25, %", ">= 97", ">= 85"),
+    ("count_%", "two or three touches counted right, %", ">= 97", ">= 93"),
+    ("false_touches_h", "false touches an hour", "", ""),
+    ("network_ms", "network alone, ms", "<= 1", "<= 1"),
+)
+CLASSICAL = ("NOSER", "total variation", "Gauss-Newton", "GREIT", "pyEIT")
+OF_CLASSICAL = 0.75  # the short form's gate: mean IoU missed, of what the best classical method misses
+RMS = {
+    "position_%": "position_rms_%",
+    "force_%": "force_rms_%",
+    "known_force_%": "known_force_rms_%",
+    "integral_%": "integral_rms_%",
+}
+
+
+def progress(row: Row) -> None:
+    """A line on standard error as each row is done."""
+    print(f"{row['level']:>5} {row['method']}: IoU {row['mean_iou']:.3f}, {row['ms']:.2f} ms", file=sys.stderr)
+
+
+def text(row: Row, key: str, form: str) -> str:
+    value = row.get(key)
+    return "" if value is None or not np.isfinite(value) else form.format(value)
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    rows: list[Row]
+    floors: dict[str, Row]
+    frames: Frames
+    mesh: str
+    seed: int
+    bundle: Bundle
+
+    @property
+    def head(self) -> dict[str, object]:
+        names, counts = np.unique(self.frames.group, return_counts=True)
+        return {
+            **provenance("accuracy", None),
+            "bundle": {"name": self.bundle.name, "hash": self.bundle.hash},
+            "mesh": self.mesh,
+            "seed": self.seed,
+            "frames": {str(name): int(count) for name, count in zip(names, counts, strict=True)},
+            "eidors": REFERENCE.exists(),
+            "time": "CPU time of one thread per frame, median; shipped: the whole pipeline, mean",
+        }
+
+    def print(self) -> None:
+        console = Console(width=200) if not sys.stdout.isatty() else Console()
+        for level in dict.fromkeys(row["level"] for row in self.rows):
+            made = Table(title=f"{Level(level).title}, {self.mesh} mesh, {machine()}", title_justify="left")
+            made.add_column("method")
+            for heading, _, _ in COLUMNS:
+                made.add_column(heading, justify="right")
+            for row in (r for r in self.rows if r["level"] == level):
+                name = row["method"] + (f" ({row['value']:g})" if row["value"] is not None else "")
+                made.add_row(name, *(text(row, key, form) for _, key, form in COLUMNS))
+            floor = self.floors.get(level)
+            if floor:
+                shown = {key: floor.get(rms) for key, rms in RMS.items()}
+                made.add_row("Bayesian floor (rms)", *(text(shown, key, form) for _, key, form in COLUMNS), style="dim")
+            console.print(made)
+        console.print(table(self.goals()))
+
+    def goals(self) -> list[Goal]:
+        """The shipped network against its targets, and against the best of the classical methods."""
+        found = []
+        for level, column in (("none", 2), ("70", 3)):
+            title = Level(level).title
+            row = next((r for r in self.rows if r["method"] == "shipped, full" and r["level"] == level), {})
+            for target in TARGETS:
+                found.append(self._goal(target[0], f"{target[1]}, {title}", target[column], row, level))
+            others = [r["mean_iou"] for r in self.rows if r["method"].startswith(CLASSICAL) and r["level"] == level]
+            if row and others:
+                missed = (1 - row["mean_iou"]) / (1 - max(others))
+                figure = f"mean IoU missed, of the best classical method's, {title}"
+                found.append(Goal(figure, missed, gate=OF_CLASSICAL))
+        return [goal for goal in found if goal.value is not None or goal.wanted]
+
+    def _goal(self, key: str, figure: str, target: str, row: Row, level: str) -> Goal:
+        if target.endswith("floors"):
+            rms, floor = row.get(RMS[key]), self.floors.get(level, {}).get(RMS[key])
+            ratio = rms / floor if rms is not None and floor else None
+            return Goal(f"{figure}: rms over its floor", ratio, at_most=float(target.split()[0]))
+        value = row.get(key)
+        if not target:
+            return Goal(figure, value)
+        sign, bound = target.split()
+        return Goal(figure, value, **{"at_least" if sign == ">=" else "at_most": float(bound)})
+
+    def write(self, folder: Path) -> None:
+        """accuracy.json and accuracy.png in `folder`."""
+        targets = [goal.to_dict() for goal in self.goals()]
+        write_json(
+            folder / "accuracy.json", {**self.head, "targets": targets, "floors": self.floors, "rows": self.rows}
+        )
+        self.draw(folder / "accuracy.png")
+
+    def draw(self, path: Path) -> None:
+        """Run time against error: mean IoU missed and position, a panel a noise level for the first."""
+        import matplotlib
+
+        matplotlib.use("Agg")
+        import matplotlib.pyplot as plt
+
+        levels = [v for v in ("none", "70") if any(r["level"] == v for r in self.rows)]
+        panels = [(v, key, label) for v in levels for key, label in (("mean_iou", "1 - mean IoU"), ("position_%", ""))]
+        figure, axes = plt.subplots(len(levels), 2, figsize=(11, 4.2 * len(levels)), squeeze=False)
+        for axis, (level, key, _) in zip(axes.ravel(), panels, strict=True):
+            for row in (r for r in self.rows if r["level"] == level and r.get(key) is not None):
+                error = 1 - row[key] if key == "mean_iou" else row[key]
+                shipped = row["method"].startswith("shipped")
+                axis.plot(
+                    row["ms"], error, "*" if shipped else "o", ms=13 if shipped else 6, c="C3" if shipped else "C0"
+                )
+                axis.annotate(row["method"], (row["ms"], error), (4, 4), textcoords="offset points", fontsize=7)
+            axis.margins(x=0.25, y=0.1)
+            axis.set(xscale="log", yscale="log", xlabel="CPU time per frame, one thread [ms]")
+            axis.set_ylabel("1 - mean IoU" if key == "mean_iou" else "position error [% of side]")
+            axis.set_title(Level(level).title)
+            axis.grid(True, which="both", alpha=0.3)
+        figure.tight_layout()
+        figure.savefig(path, dpi=120)
+        plt.close(figure)

@@ -1,0 +1,122 @@
+"""Faults of the board against what the service says, in simulated time: the matrix, availability, random frames.
+
+    skin bench faults                     every fault x (untouched, held, sliding, begins) x 20 places, and availability
+    skin bench faults --quick             two places, and 20 000 frames of random faults and presses: for CI
+    skin bench faults --only gain hang    some rows of the matrix, nothing else
+    skin bench faults --frames 1000000    that many frames of random faults and presses, nothing else
+
+The stub board's bytes go through line, link, clock regression and the stages that the services run. Prints figures
+beside targets and writes faults.json (--frames: soak.json). Exit status 1 where what held when the gate was set, a
+constant beside each target, does not hold any more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from bench import REPORTS
+from bench.reliability import availability, faults_report, matrix, report, soak, workers
+from bench.reliability.matrix import ROWS, SITUATIONS, Score
+from bench.speed.service import end_on_sigterm
+from firmware_stub.world import Touch
+
+PLACES, QUICK_PLACES = 20, 2
+SESSIONS, QUICK_SESSIONS = 8, 1  # of each state of availability, soak.CHUNK frames each
+QUICK_FRAMES = 20_000  # of random faults and presses
+Cells = dict[tuple[str, str], Score]  # (row's title, situation)
+
+
+def run_place(task: tuple[Touch, int, tuple[str, ...], str]) -> Cells:
+    """All rows and situations at one place: (touch, seed, titles, bundle)."""
+    touch, seed, titles, bundle = task
+    sheet, pipeline = workers.sheet(), workers.pipeline(bundle)
+    return {
+        (row.title, situation): matrix.run_case(sheet, pipeline, row, situation, touch, seed)
+        for row in ROWS
+        if row.title in titles
+        for situation in SITUATIONS
+    }
+
+
+def run_matrix(places: int, seed: int, titles: tuple[str, ...], bundle: str, cores: int) -> Cells:
+    found: Cells = {}
+    tasks = [(touch, seed + k, titles, bundle) for k, touch in enumerate(matrix.places(places, seed))]
+    for cells in workers.spread(run_place, tasks, cores, "places of the matrix"):
+        for key, score in cells.items():
+            found.setdefault(key, Score()).add(score)
+    return found
+
+
+def run_chunk(task: tuple[int, int, str]) -> soak.Tally:
+    """One start and the frames after it: (frames, seed, bundle)."""
+    frames, seed, bundle = task
+    return soak.chunk(workers.sheet(), workers.pipeline(bundle), frames, seed)
+
+
+def run_soak(frames: int, seed: int, bundle: str, cores: int) -> soak.Tally:
+    counts = [soak.CHUNK] * (frames // soak.CHUNK) + [frames % soak.CHUNK] * (frames % soak.CHUNK > 0)
+    tasks = [(count, 1000 * seed + k, bundle) for k, count in enumerate(counts)]
+    whole = soak.Tally()
+    for tally in workers.spread(run_chunk, tasks, cores, "random faults and presses"):
+        whole.add(tally)
+    return whole
+
+
+def run_session(task: tuple[str, int, str]) -> tuple[str, availability.Score]:
+    """One session: (state, seed, bundle)."""
+    state, seed, bundle = task
+    sheet, pipeline = workers.sheet(), workers.pipeline(bundle)
+    return state, availability.session(sheet, pipeline, state, availability.FRAMES, seed)
+
+
+def run_availability(sessions: int, seed: int, bundle: str, cores: int) -> dict[str, availability.Score]:
+    found = {state: availability.Score() for state in availability.STATES}
+    tasks = [(state, 1000 * seed + k, bundle) for k in range(sessions) for state in availability.STATES]
+    for state, score in workers.spread(run_session, tasks, cores, "availability"):
+        found[state].add(score)
+    return found
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="skin bench faults", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--quick", action="store_true", help="two places, fewer frames: two minutes on two cores")
+    parser.add_argument("--places", type=int, help=f"default: {PLACES}, with --quick {QUICK_PLACES}")
+    parser.add_argument("--only", nargs="+", metavar="FAULT", help="rows of the matrix that begin so; writes no report")
+    parser.add_argument("--frames", type=int, help="random faults and presses instead of the matrix")
+    parser.add_argument("--bundle", default="square16")
+    parser.add_argument("--seed", type=int, default=5, help="of places, arguments and noise")
+    parser.add_argument("--cores", type=int, default=workers.cores())
+    parser.add_argument("--out", type=Path, default=REPORTS)
+    args = parser.parse_args(argv)
+    titles = tuple(r.title for r in ROWS if args.only is None or any(r.title.startswith(word) for word in args.only))
+    if not titles:
+        parser.error(f"--only {' '.join(args.only)}: expected the beginning of {', '.join(r.title for r in ROWS)}")
+    if args.frames is not None and not soak.LEAST <= args.frames <= soak.MOST:
+        parser.error(f"--frames {args.frames}: expected {soak.LEAST} to {soak.MOST}")
+    end_on_sigterm()
+    began = time.perf_counter()
+    found: dict[str, Any] = {}
+    if args.frames is None:
+        places = args.places or (QUICK_PLACES if args.quick else PLACES)
+        found["matrix"] = faults_report.matrix_rows(run_matrix(places, args.seed, titles, args.bundle, args.cores))
+    if args.frames is None and args.only is None:
+        sessions = QUICK_SESSIONS if args.quick else SESSIONS
+        scores = run_availability(sessions, args.seed, args.bundle, args.cores)
+        found["availability"] = {state: score.row() for state, score in scores.items()}
+    if args.frames or (args.quick and args.only is None):
+        found["soak"] = run_soak(args.frames or QUICK_FRAMES, args.seed, args.bundle, args.cores).row()
+    goals = faults_report.goals(found, args.quick)
+    head = report.head("faults", argv, args, time.perf_counter() - began)
+    faults_report.show(found)
+    report.show(head, goals)
+    if args.only is None:
+        report.write(args.out / ("soak.json" if args.frames else "faults.json"), head, found, goals)
+    return report.status(goals, sys.stderr)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

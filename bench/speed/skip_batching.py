@@ -1,0 +1,54 @@
+"""What one run of the network for several skins saves, whose frames wait at once."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from rich.table import Table
+
+from bench.tracking.scene import Recorded
+from models.bundle import Bundle
+from protocol.frames import DeltaFrame
+from services.networks import network
+from services.preprocessing import Preprocessing
+from services.runtime.config import Skin, Touch
+
+TOGETHER = (1, 2, 4, 8)  # skins
+FRAMES, ROUNDS = 64, 3
+
+
+def batched(recorded: Recorded, bundle: Bundle) -> dict[str, dict[str, float]]:
+    """Skins that wait at once -> CPU of a frame's network [ms], one run for all of them and one for each; and by how
+    much the images differ at most [S/m].
+    """
+    pre = Preprocessing("palm", Skin(port="stub", bundle="square16", touch=Touch(hold=False)), bundle)
+    made = [pre.process(recorded.frame(k), frozenset({"delta"}))[0] for k in range(len(recorded))]
+    deltas = [delta for delta in made if isinstance(delta, DeltaFrame) and delta.stack.size]
+    shared = network(str(bundle.network_path("int8")))
+    found = {}
+    for n in TOGETHER:
+        rounds = [deltas[k : k + n] for k in range(0, min(len(deltas), FRAMES) // n * n, n)]
+        times: dict[str, list[float]] = {"one run": [], "each alone": []}
+        differ = 0.0
+        for _ in range(ROUNDS):
+            for each in rounds:
+                began = time.thread_time()
+                together = shared.run_many(each)
+                between = time.thread_time()
+                alone = [shared.run(delta) for delta in each]
+                ended = time.thread_time()
+                times["one run"].append(1e3 * (between - began) / n)
+                times["each alone"].append(1e3 * (ended - between) / n)
+                differ = max(differ, *(float(np.abs(a[0] - b[0]).max()) for a, b in zip(together, alone, strict=True)))
+        found[str(n)] = {name: float(np.median(values)) for name, values in times.items()} | {"differ": differ}
+    return found
+
+
+def batch_table(batches: dict[str, dict[str, float]]) -> Table:
+    table = Table(title="frames that wait at once: CPU of the network, ms a frame", title_justify="left")
+    for heading in ("skins", "one run", "each alone", "images differ by, S/m"):
+        table.add_column(heading, justify="right")
+    for n, row in batches.items():
+        table.add_row(n, f"{row['one run']:.2f}", f"{row['each alone']:.2f}", f"{row['differ']:.1g}")
+    return table

@@ -1,0 +1,77 @@
+"""Numerical stability: everything that goes in made worse, step by step, until the answer or the promise breaks.
+
+    skin bench stability [--quick] [--only PART ...] [--out bench/reports]
+
+For each case: error against truth where there is one, and whether the promise was kept: no exception, no NaN or
+infinity out, never `valid` on garbage, no contact that jumps by more than 2 mm for a change within noise (or by four
+times what no estimator can beat, where that is more: a light touch under much noise), no frame to act on that is older
+than its `valid_for_s` and 0.1 s. Prints tables, writes stability.json and stability.png. Exit status 1 where the
+promise was broken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import services  # noqa: F401, I001  (one thread for the numerical libraries, before numpy starts them)
+from bench import REPORTS
+from bench.stability.__main__ import change as _stability_change
+from bench.stability.__main__ import changed_bytes as _stability_bytes
+from bench.stability.__main__ import garbage as _stability_garbage
+from bench.stability.__main__ import matrices as _stability_matrices
+from bench.stability.__main__ import physics as _stability_physics
+from bench.stability.__main__ import precision as _stability_precision
+from bench.stability.__main__ import report as _stability_report
+from bench.stability.__main__ import time as _stability_time
+from bench.stability.run import SKIN, Row, Setting
+from models.bundle import Bundle
+
+PARTS = {
+    **_stability_matrices.PARTS,
+    **_stability_physics.PARTS,
+    **_stability_precision.PARTS,
+    **_stability_garbage.PARTS,
+    **_stability_bytes.PARTS,
+    **_stability_change.PARTS,
+    **_stability_time.PARTS,
+}
+
+
+def run(setting: Setting, only: Sequence[str] = ()) -> dict[str, list[Row]]:
+    """The rows of each part whose name contains one of `only`; all parts where that is empty."""
+    found: dict[str, list[Row]] = {}
+    for name, part in PARTS.items():
+        if only and not any(word in name for word in only):
+            continue
+        began = time.process_time()
+        found[name] = list(part(setting))
+        faults = len(_stability_report.broken({name: found[name]}))
+        took = time.process_time() - began
+        print(f"{name}: {len(found[name])} cases, {faults} broken, {took:.1f} s of CPU", file=sys.stderr)
+    return found
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="skin bench stability", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--quick", action="store_true", help="fewer cases and frames: under a minute on one core")
+    parser.add_argument("--only", nargs="*", default=(), metavar="PART", help="parts whose name contains one of these")
+    parser.add_argument("--bundle", default=SKIN, help=f"a bundle of the skin {SKIN}")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=REPORTS)
+    args = parser.parse_args(argv)
+    began, cpu = time.perf_counter(), time.process_time()
+    setting = Setting(Bundle.load(args.bundle), args.quick, args.seed)
+    found = run(setting, args.only)
+    _stability_report.show(found)
+    top = _stability_report.head(setting, time.perf_counter() - began, time.process_time() - cpu)
+    _stability_report.write(args.out, top, found)
+    print(f"{top['seconds']:.0f} s ({top['cpu_seconds']:.0f} s of CPU); wrote {args.out}/stability.json")
+    return 1 if _stability_report.broken(found) else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
