@@ -5,8 +5,8 @@
 For each case: error against truth where there is one, and whether the promise was kept: no exception, no NaN or
 infinity out, never `valid` on garbage, no contact that jumps by more than 2 mm for a change within noise (or by four
 times what no estimator can beat, where that is more: a light touch under much noise), no frame to act on that is older
-than its `valid_for_s` and 0.1 s. Prints tables, writes stability.json and stability.png. Exit status 1 where the
-promise was broken.
+than its `valid_for_s` and 0.1 s; over TCP nobody reads, sends or commands without the key for it. Prints tables, writes
+stability.json and stability.png. Exit status 1 where the promise was broken.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from bench import (
     _stability_bytes,
     _stability_change,
     _stability_garbage,
+    _stability_keys,
     _stability_matrices,
     _stability_physics,
     _stability_precision,
@@ -39,6 +40,7 @@ PARTS = {
     **_stability_bytes.PARTS,
     **_stability_change.PARTS,
     **_stability_time.PARTS,
+    **_stability_keys.PARTS,
 }
 
 

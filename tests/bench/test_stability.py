@@ -9,6 +9,7 @@ import pytest
 
 from bench import _stability_bytes as bytes_of_others
 from bench import _stability_garbage as garbage
+from bench import _stability_keys as keys
 from bench import _stability_report as report
 from bench import _stability_time as held_up
 from bench._stability_matrices import solved_long
@@ -268,3 +269,20 @@ def test_time_that_is_believed_wrongly_breaks_the_promise(monkeypatch) -> None:
     monkeypatch.setattr("services.board.frozen.PROOF", 10**9)
     for case in (growing, frozen):
         assert held_up.judged(case, seed=1)["broken"]["a frame to act on is older than it may be"] > 20
+
+
+def test_keys_open_what_they_are_for_and_nothing_else(setting: Setting) -> None:
+    rows = list(keys.attacked(setting))
+    assert not report.broken({"keys": rows})
+    assert len(rows) == len(keys.ATTACKS) and all(row["refused_%"] == 100 for row in rows)
+
+
+def test_a_gate_that_lets_everybody_in_breaks_the_promise(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("protocol.keys.Admission.allows", lambda admission, key: True)
+    monkeypatch.setattr("protocol.keys.Admission.operates", lambda admission, key: True)
+    monkeypatch.setattr("protocol.transport.check", lambda transport: None)
+    wanted = ("a reader with a key that is not listed", "a client that gives commands", "keys configured by half")
+    monkeypatch.setattr(keys, "ATTACKS", {n: a for n, a in keys.ATTACKS.items() if n.startswith(wanted)})
+    found = " ".join(report.broken({"keys": list(keys.attacked(setting))}))
+    assert "read by a stranger" in found and "a client changed something" in found
+    assert "half a configuration was used" in found
