@@ -4,8 +4,8 @@
 
 Frames are solved on the reference mesh, which no training and no inverse uses, and read from bench/work where they are
 there (bench/accuracy/frames.py says what they are). Noise: |Z| 10^(-dB/20) on each measurement, and on the 64 untouched
-frames of the tare; "70f" is the same ohm on all. Hyperparameters of the classical methods are chosen for each noise level on
-frames of their own. Prints tables, writes accuracy.json and draws accuracy.png.
+frames of the tare; "70f" is the same ohm on all. Hyperparameters of the classical methods are chosen for each noise
+level on frames of their own. Prints tables, writes accuracy.json and draws accuracy.png.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from bench import REPORTS
 from bench.accuracy import frames as _frames
+from bench.accuracy import methods as _methods
 from bench.accuracy import report as _report
-from bench.accuracy.__main__ import methods as _methods
-from bench.accuracy.__main__ import shipped as _shipped
+from bench.accuracy import shipped as _shipped
 from bench.accuracy.frames import Frames
 from bench.accuracy.methods import Image, Method, Tare
 from bench.accuracy.scores import Row, score_mask, summarise

@@ -122,7 +122,9 @@ def start(count: int, seed: int) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="skin bench estimation", description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = argparse.ArgumentParser(
+        prog="skin bench estimation", description=__doc__.splitlines()[0] if __doc__ else ""
+    )
     parser.add_argument("part", choices=("drift", "start"))
     parser.add_argument("--count", type=int, default=120, help="scenes, or untouched starts")
     parser.add_argument("--seed", type=int, default=7)

@@ -5,8 +5,8 @@
 For each case: error against truth where there is one, and whether the promise was kept: no exception, no NaN or
 infinity out, never `valid` on garbage, no contact that jumps by more than 2 mm for a change within noise (or by four
 times what no estimator can beat, where that is more: a light touch under much noise), no frame to act on that is older
-than its `valid_for_s` and 0.1 s. Prints tables, writes stability.json and stability.png. Exit status 1 where the
-promise was broken.
+than its `valid_for_s` and 0.1 s; over TCP nobody reads, sends or commands without the key for it. Prints tables, writes
+stability.json and stability.png. Exit status 1 where the promise was broken.
 """
 
 from __future__ import annotations
@@ -19,25 +19,29 @@ from pathlib import Path
 
 import services  # noqa: F401, I001  (one thread for the numerical libraries, before numpy starts them)
 from bench import REPORTS
-from bench.stability.__main__ import change as _stability_change
-from bench.stability.__main__ import changed_bytes as _stability_bytes
-from bench.stability.__main__ import garbage as _stability_garbage
-from bench.stability.__main__ import matrices as _stability_matrices
-from bench.stability.__main__ import physics as _stability_physics
-from bench.stability.__main__ import precision as _stability_precision
-from bench.stability.__main__ import report as _stability_report
-from bench.stability.__main__ import time as _stability_time
+from bench.stability import (
+    change,
+    changed_bytes,
+    garbage,
+    key_attacks,
+    late_bytes,
+    matrices,
+    physics,
+    precision,
+    report,
+)
 from bench.stability.run import SKIN, Row, Setting
 from models.bundle import Bundle
 
 PARTS = {
-    **_stability_matrices.PARTS,
-    **_stability_physics.PARTS,
-    **_stability_precision.PARTS,
-    **_stability_garbage.PARTS,
-    **_stability_bytes.PARTS,
-    **_stability_change.PARTS,
-    **_stability_time.PARTS,
+    **matrices.PARTS,
+    **physics.PARTS,
+    **precision.PARTS,
+    **garbage.PARTS,
+    **changed_bytes.PARTS,
+    **change.PARTS,
+    **late_bytes.PARTS,
+    **key_attacks.PARTS,
 }
 
 
@@ -49,7 +53,7 @@ def run(setting: Setting, only: Sequence[str] = ()) -> dict[str, list[Row]]:
             continue
         began = time.process_time()
         found[name] = list(part(setting))
-        faults = len(_stability_report.broken({name: found[name]}))
+        faults = len(report.broken({name: found[name]}))
         took = time.process_time() - began
         print(f"{name}: {len(found[name])} cases, {faults} broken, {took:.1f} s of CPU", file=sys.stderr)
     return found
@@ -66,11 +70,11 @@ def main(argv: list[str] | None = None) -> int:
     began, cpu = time.perf_counter(), time.process_time()
     setting = Setting(Bundle.load(args.bundle), args.quick, args.seed)
     found = run(setting, args.only)
-    _stability_report.show(found)
-    top = _stability_report.head(setting, time.perf_counter() - began, time.process_time() - cpu)
-    _stability_report.write(args.out, top, found)
+    report.show(found)
+    top = report.head(setting, time.perf_counter() - began, time.process_time() - cpu)
+    report.write(args.out, top, found)
     print(f"{top['seconds']:.0f} s ({top['cpu_seconds']:.0f} s of CPU); wrote {args.out}/stability.json")
-    return 1 if _stability_report.broken(found) else 0
+    return 1 if report.broken(found) else 0
 
 
 if __name__ == "__main__":

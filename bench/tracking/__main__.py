@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from bench import REPORTS
-from bench.tracking.__main__ import faults, report
+from bench.tracking import faults, report
 from bench.tracking.scene import Recorded, record
 from bench.tracking.scores import Scorer, Seen, all_of
 from models.bundle import Bundle

@@ -8,11 +8,11 @@ import pytest
 
 pytest.importorskip("pyeit")
 
+from bench.accuracy import __main__ as accuracy  # noqa: E402
 from bench.accuracy import frames as _frames
 from bench.accuracy import peers as _peers
 from bench.accuracy import report as _report
 from bench.accuracy import scores as _scores
-from bench.accuracy.__main__ import __main__ as accuracy  # noqa: E402
 from bench.accuracy.frames import Frames  # noqa: E402
 from bench.accuracy.methods import Method, Tare  # noqa: E402
 from models import metrics, patterns  # noqa: E402

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.stability.__main__ import changed_bytes as bytes_of_others
-from bench.stability.__main__ import garbage, report
-from bench.stability.__main__ import time as held_up
+from bench.stability import changed_bytes as bytes_of_others
+from bench.stability import garbage, report
+from bench.stability import key_attacks as keys
+from bench.stability import late_bytes as held_up
 from bench.stability.matrices import solved_long
 from bench.stability.run import (
     METRES,
@@ -168,7 +169,7 @@ def test_extended_precision_solves_what_double_cannot() -> None:
 def test_pytorch_evaluates_a_shipped_file_as_onnx_runtime_does(setting: Setting, scene: Scene) -> None:
     pytest.importorskip("torch")
     pytest.importorskip("onnx")
-    from bench.stability.__main__ import precision
+    from bench.stability import precision
 
     path = setting.bundle.network_path("full")
     if path is None:
@@ -267,3 +268,20 @@ def test_time_that_is_believed_wrongly_breaks_the_promise(monkeypatch) -> None:
     monkeypatch.setattr("services.board.frozen.PROOF", 10**9)
     for case in (growing, frozen):
         assert held_up.judged(case, seed=1)["broken"]["a frame to act on is older than it may be"] > 20
+
+
+def test_keys_open_what_they_are_for_and_nothing_else(setting: Setting) -> None:
+    rows = list(keys.attacked(setting))
+    assert not report.broken({"keys": rows})
+    assert len(rows) == len(keys.ATTACKS) and all(row["refused_%"] == 100 for row in rows)
+
+
+def test_a_gate_that_lets_everybody_in_breaks_the_promise(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("protocol.keys.Admission.allows", lambda admission, key: True)
+    monkeypatch.setattr("protocol.keys.Admission.operates", lambda admission, key: True)
+    monkeypatch.setattr("protocol.transport.check", lambda transport: None)
+    wanted = ("a reader with a key that is not listed", "a client that gives commands", "keys configured by half")
+    monkeypatch.setattr(keys, "ATTACKS", {n: a for n, a in keys.ATTACKS.items() if n.startswith(wanted)})
+    found = " ".join(report.broken({"keys": list(keys.attacked(setting))}))
+    assert "read by a stranger" in found and "a client changed something" in found
+    assert "half a configuration was used" in found

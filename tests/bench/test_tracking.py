@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.tracking.__main__ import __main__ as tracking
-from bench.tracking.__main__ import faults, report
+from bench.tracking import __main__ as tracking
+from bench.tracking import faults, report
 from bench.tracking.scene import TOUCHES, Recorded, _drifting, simulate
 from bench.tracking.scores import GRACE, LIGHT_N, Scorer, Seen, all_of
 from firmware_stub.timeline import Curve, Script
