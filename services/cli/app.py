@@ -8,7 +8,7 @@ import sys
 import typer
 
 from services.cli import board, calibrate, offline, recordings, service, watch
-from services.cli.common import FAILED, expected_code
+from services.cli.common import FAILED, expected_code, interrupted
 
 app = typer.Typer(
     name="skin",
@@ -34,6 +34,8 @@ def run() -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
+        if interrupted(error):
+            return 130
         code = expected_code(error)
         if os.environ.get("EITSKIN_DEBUG"):
             raise

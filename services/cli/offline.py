@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from services.cli.common import FAILED, USAGE, JsonOption, emit, fail, load_npz
+from services.cli.common import FAILED, USAGE, JsonOption, emit, fail, interrupted, load_npz
 
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
@@ -140,7 +140,7 @@ def _dispatch(module: str, args: list[str]) -> None:
     try:
         status = importlib.import_module(module).main(args)
     except ImportError as error:
-        if isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C while a compiled module was being loaded
+        if interrupted(error):
             raise KeyboardInterrupt from None
         said = not_installed(error)
         if not said:

@@ -88,9 +88,8 @@ def _bundle() -> bundles.Bundle:
 
 @cache
 def _server() -> ControlServer:
-    """Commands without a socket; `load` as the runner's, which takes over what a recording holds."""
-    server = object.__new__(ControlServer)
-    server.process, server.malformed = "preprocessing", 0
+    """`load` as the runner's, which takes over what a recording holds. Its socket is of this process alone."""
+    server = ControlServer("preprocessing", {}, address="inproc://fuzz")
     server.handlers = {"load": _load, "tare": lambda args: _stage().command("tare", args)}
     return server
 

@@ -246,7 +246,7 @@ def test_intact_messages_with_any_fields_do_no_harm(messages: list[link.Message]
     for message in messages:
         for scan in host.received(link.encode(message), now):
             middle_us = scan.device_us + scan.duration_us // 2
-            assert -(2**63) <= host.clock.host_ns(middle_us) <= now * 1e9
+            assert -(2**63) <= host.clock.host_ns(middle_us) <= round(now * 1e9)
             assert host.clock.sigma_ns(middle_us) > 0
         host.received(board.receive(host.to_send(now)), now)
         now += 0.05
