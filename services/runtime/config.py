@@ -19,7 +19,7 @@ from protocol.topics import PRODUCERS
 from protocol.transport import Transport, half
 from services.runtime.stage import PROCESSES
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 BUNDLES, MANIFEST = ROOT / "models" / "bundles", "manifest.json"
 SKIN_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 
