@@ -24,14 +24,18 @@ STILL = 0.0005  # m/s: slower than this is standing
 def follow(robot: Robot, skin: ContactSubscriber, max_age: float | None = None, seconds: float = math.inf) -> None:
     velocity: Vector = (0.0, 0.0, 0.0)
     then = began = time.monotonic()
+    trusted: bool | None = None  # what was said last of the skin
     while then - began < seconds:
         try:
             frame = skin.next_frame(max_age, valid=True)
         except Stale as why:
-            if any(velocity):
+            if trusted is not False:
                 print(f"holding still: {why}", flush=True)
-            velocity = (0.0, 0.0, 0.0)
+            trusted, velocity = False, (0.0, 0.0, 0.0)
         else:
+            if not trusted:
+                print("following: push the skin", flush=True)
+            trusted = True
             velocity = answer(velocity, push(frame.contacts), min(time.monotonic() - then, LONGEST_STEP_S))
         then = time.monotonic()
         robot.move(velocity)

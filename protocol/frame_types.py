@@ -163,7 +163,7 @@ class DeltaFrame(Frame):
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class ImageFrame(Frame):
-    """The conductivity drop over the skin's bounding box. That of a held frame was sent before: see the rules for
+    """The conductivity drop over the skin's bounding box. A held frame's image was sent before: see the rules for
     readers.
     """
 

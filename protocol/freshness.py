@@ -49,8 +49,8 @@ class NotValid(Stale):
 class NewestContacts:
     """The newest contact frame of a skin and when it was measured, as far as this host can know (ages.py).
 
-    Of another host's frame that may have lain in the socket it is known only that it came after the socket was last
-    seen empty.
+    A frame of another host may have lain in the socket: it came after the socket was last seen empty, and more is not
+    known.
     """
 
     def __init__(self, skin: str, endpoint: str | None = None, *, replay: bool = False) -> None:

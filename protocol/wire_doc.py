@@ -6,6 +6,7 @@ python -m protocol.wire_doc --check    exits 1 where WIRE.md is not current
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import struct
@@ -84,7 +85,7 @@ def frame_tables() -> str:
     """One table per topic, with the records inside a frame beneath it."""
     out = []
     for topic in topics.TOPICS.values():
-        out.append(f"### {topic.name}: {topic.frame.__name__}\n\n{topic.frame.__doc__}\n\n")
+        out.append(f"### {topic.name}: {topic.frame.__name__}\n\n{inspect.getdoc(topic.frame)}\n\n")
         out.append(field_table(topic.frame, frame_types.Frame))
         if same := getattr(topic.frame, "same_length", ()):
             out.append(f"\nEqually long: {', '.join(f'`{name}`' for name in same)}.\n")

@@ -140,7 +140,7 @@ class Preprocessing(Stage):
         d, found_now = self._decide(d, amplitude, live, out.stamps.get("sample", 0))
         now_ns = out.stamps.get("sample", 0)
         teaches = learns  # whether the baseline is to learn from this frame
-        # Of a measured bundle it is not known which way its material goes.
+        # Measured bundles have no sign model, so this check is skipped.
         if self.bundle.matrices.normalisation == "model" and impossible(
             d, self.untouched.sigma, live & self.electrodes.self_sensing, self._touched
         ):

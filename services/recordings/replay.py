@@ -207,7 +207,7 @@ class Replayer:
                 self._call(process, "load", skin=skin, state=state)
 
     def _connect_anew(self) -> None:
-        """The socket was opened anew: wait for the stages, that no frame is lost, and have them go on as they were."""
+        """The socket was opened anew: wait for the stages, lest a frame be lost, and have them go on as they were."""
         for skin in sorted(self._started):
             states = {process: self._call(process, "state", skin=skin).get("state", {}) for process in STAGES}
             self._prime(skin)

@@ -149,8 +149,8 @@ def _overlap(one: str, other: str) -> bool:
 
 
 class Security(Section):
-    """Of tcp addresses: CURVE keys (`skin keys new`). Unencrypted beyond this host is refused unless `insecure` says
-    so.
+    """CURVE keys for tcp addresses (`skin keys new`). Unencrypted connections beyond this host are refused unless
+    `insecure` says so.
     """
 
     secret_key: Path | None = None  # our own key pair

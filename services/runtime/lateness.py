@@ -12,8 +12,8 @@ ARRIVING_S = 0.01  # for what has piled up in sockets and threads meanwhile to b
 
 
 class Lateness:
-    """Of one process. A frame from a recording is never late here: a replay gives the same frames however slow the
-    machine; who asks for replays judges them by their stamp `read`.
+    """Lateness in one process. A frame from a recording is never late here: a replay gives the same frames however slow
+    the machine; readers of replays judge them by their stamp `read`.
     """
 
     def __init__(self) -> None:

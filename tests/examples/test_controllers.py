@@ -123,6 +123,14 @@ def test_following_holds_still_as_soon_as_the_skin_is_not_trusted(monkeypatch, c
     assert "holding still" in capsys.readouterr().out
 
 
+def test_following_says_from_the_first_moment_whether_it_can(monkeypatch, capsys):
+    ticks = iter(range(10_000))
+    monkeypatch.setattr("examples.follow_the_finger.time.monotonic", lambda: next(ticks) * 0.02)
+    follow(Drive(), Skin(frame(valid=False), frame(valid=False), frame(), frame()), 0.1, 0.4)
+    said = [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()]
+    assert said == ["holding still", "following", "holding still"]
+
+
 def test_a_robot_that_is_told_nothing_more_stops_by_itself(monkeypatch):
     now = [0.0]
     monkeypatch.setattr("examples.robot.time.monotonic", lambda: now[0])
