@@ -182,7 +182,7 @@ class BoardLink:
         return self._questions.to_send(now_s, width_ns is not None and width_ns < GOOD_NS, self.decoder.waiting)
 
     def _told_time(self, answer: link.Time, now_s: float) -> None:
-        asked_s = self._questions.asked_s(answer, now_s)
+        asked_s = self._questions.asked_s(answer)
         if asked_s is None or self.state != "running":
             return
         self._heard_us = max(self._heard_us, answer.device_us)

@@ -85,7 +85,6 @@ class BoardSource(Source):
         self._port: ports.Port | None = None
         self._board = ""  # unique id of the board that we know
         self._usb_serial: str | None = None
-        self._lost = ""
         self._full_s = 0.0  # duration of the last full scan
 
     def frames(self) -> Iterator[RawFrame | None]:

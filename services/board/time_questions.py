@@ -18,7 +18,6 @@ class TimeQuestions:
     def __init__(self) -> None:
         self._asked_s: dict[int, float] = {}
         self._due_s = 0.0
-        self.answered_s = -1e9  # when an answer came last
 
     def begin(self, now_s: float) -> None:
         """The board has been started: ask it soon. What was asked before counts no more."""
@@ -36,9 +35,6 @@ class TimeQuestions:
             self._asked_s.pop(next(iter(self._asked_s)))
         return link.encode(link.TimeAsk(nonce=nonce))
 
-    def asked_s(self, answer: link.Time, now_s: float) -> float | None:
+    def asked_s(self, answer: link.Time) -> float | None:
         """When the question was asked that this answers; None for no question of ours, or one answered before."""
-        asked_s = self._asked_s.pop(answer.nonce, None)
-        if asked_s is not None:
-            self.answered_s = now_s
-        return asked_s
+        return self._asked_s.pop(answer.nonce, None)
