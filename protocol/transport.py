@@ -225,9 +225,7 @@ def connect(context: Context, kind: int, addresses: Mapping[str, str], options: 
                 socket.setsockopt(option, PATIENCE_MS)
         # ipc first: keys, once set, hold for all that is connected after.
         for name, address in sorted(addresses.items(), key=lambda item: item[1].startswith("tcp://")):
-            if address.startswith("tcp://"):
-                _use_keys(socket, name, address)
-            socket.connect(_reachable(address))
+            attach(socket, name, address)
     except zmq.ZMQError as bad:
         socket.close(0)
         raise TransportError(
@@ -237,6 +235,13 @@ def connect(context: Context, kind: int, addresses: Mapping[str, str], options: 
         socket.close(0)
         raise
     return socket
+
+
+def attach(socket: Socket, name: str, address: str) -> None:
+    """Connect a socket to one more. Raises TransportError, zmq.ZMQError."""
+    if address.startswith("tcp://"):
+        _use_keys(socket, name, address)
+    socket.connect(reachable(address))
 
 
 def _use_keys(socket: Socket, name: str, address: str) -> None:
@@ -266,7 +271,7 @@ def _use_keys(socket: Socket, name: str, address: str) -> None:
         )
 
 
-def _reachable(address: str) -> str:
+def reachable(address: str) -> str:
     """Where to connect to what listens at `address`: on this host, where it listens on every interface."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     if not address.startswith("tcp://") or host not in ("*", "0.0.0.0", "[::]"):

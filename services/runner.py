@@ -230,6 +230,8 @@ class Runner:
         for lane in self.lanes.values():
             lane.wanted = self._wanted(lane.stage)
             self._sleep_or_wake(lane)
+            if isinstance(lane.feed, Newest):
+                lane.feed.mind()
             beat = lane.heartbeat
             beat.drops["malformed"], beat.drops["skipped"] = lane.feed.malformed, lane.feed.skipped
             silent = "" if lane.asleep else beat.silence(SILENT_S, lane.stage.reads)
