@@ -160,7 +160,7 @@ def test_the_pages_client_runs_as_it_stands(hosts: tuple[Path, Path], clean: Non
     )
     end = time.monotonic() + 30
     while client.poll() is None and time.monotonic() < end:
-        publisher.send(ContactFrame(skin="palm", valid=True, valid_for_s=1.0, stamps={"publish": time.monotonic_ns()}))
+        publisher.send(ContactFrame(skin="palm", valid=True, valid_for_s=1.0, stamps={"sample": time.monotonic_ns()}))
         time.sleep(0.02)
     client.kill()
     said = client.communicate()[0]
@@ -208,6 +208,12 @@ def test_up_refuses_what_a_process_would_die_of(runtime: Path, tmp_path: Path) -
     publisher = Publisher("inference")
     assert "does already" in refused(tmp_path, "")
     publisher.close()
+    twice = f'publisher = "tcp://127.0.0.1:{free}"\n"publisher.ctl" = "tcp://lo:{free}"\n'  # by another name
+    assert "another of our sockets" in refused(tmp_path, f"[sockets.addresses]\n{twice}")
+    others = f'[sockets.addresses]\npublisher = "ipc://{runtime}/acquisition.ipc"\n'
+    assert "publisher cannot listen at" in (said := refused(tmp_path, others)) and "acquisition is to" in said
+    nowhere = f'[sockets.addresses]\npublisher = "ipc://{tmp_path}/nowhere/x.ipc"\n'
+    assert "there is no such folder" in refused(tmp_path, nowhere)
 
 
 def test_up_says_the_addresses_it_really_uses(runtime: Path, tmp_path: Path) -> None:
