@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import zmq
 
@@ -19,6 +19,7 @@ from .control import ControlClient, ControlError, ControlServer, clock_offset
 from .frames import Frame, FrameError, unpack
 from .logs import foreign
 from .publishing import Publisher
+from .reconnecting import Connections
 from .topics import TOPIC_OF, TOPICS, wire_topic
 from .transport import Context, Socket
 
@@ -36,9 +37,9 @@ log = logging.getLogger(__name__)
 class _Reader:
     """What both readers share: receiving until a frame comes, and what to do with what is none."""
 
-    socket: Socket
-
-    def __init__(self, where: str) -> None:
+    def __init__(self, where: str, socket: Socket, addresses: Mapping[str, str]) -> None:
+        self.socket = socket
+        self._connections = Connections(socket, addresses)
         self.malformed = 0
         """Messages dropped because they were no frames."""
         self.last_error: FrameError | None = None
@@ -52,6 +53,7 @@ class _Reader:
             try:
                 message = self.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
+                self.mind()
                 left = deadline - time.monotonic()
                 if left <= 0 or not self.socket.poll(max(1, int(left * 1000 + 0.5))):
                     return None
@@ -71,8 +73,13 @@ class _Reader:
                     )
         return None
 
+    def mind(self) -> None:
+        """Connect anew where ZeroMQ has given up. To be called now and then by who waits for the socket himself."""
+        self._connections.mind()
+
     def close(self) -> None:
         """Close the socket."""
+        self._connections.close()
         self.socket.close(0)
 
 
@@ -88,14 +95,13 @@ class NewestReader(_Reader):
         if endpoint is None and len(producers) > 1:
             raise ValueError(f"{topic} has several producers: name an endpoint, or read it with AllReader")
         address = endpoint or transport.current().data_address(producers[0])
-        super().__init__(address)
+        addresses = {producers[0]: address}
+        socket = transport.connect(context or zmq.Context.instance(), zmq.SUB, addresses, {zmq.CONFLATE: 1})
+        super().__init__(address, socket, addresses)
         self.topic, self.skin = topic, skin
         self.skipped = 0
         """Frames that were overtaken by newer ones before we read them (or lost on the way)."""
         self._last: tuple[str, int] | None = None
-        self.socket = transport.connect(
-            context or zmq.Context.instance(), zmq.SUB, {producers[0]: address}, {zmq.CONFLATE: 1}
-        )
         self.socket.subscribe(wire_topic(topic, skin) + b"\0")
 
     def recv(self, timeout_s: float = 0.0) -> Frame | None:
@@ -130,7 +136,8 @@ class AllReader(_Reader):
         addresses = {name: endpoint or transport.current().data_address(name) for name in names}
         if endpoint:
             addresses = dict(list(addresses.items())[:1])
-        super().__init__(endpoint or ", ".join(addresses))
+        socket = transport.connect(context or zmq.Context.instance(), zmq.SUB, addresses, {zmq.RCVHWM: ALL_QUEUE})
+        super().__init__(endpoint or ", ".join(addresses), socket, addresses)
         self.gaps = 0
         """Frames that are missing between those received."""
         self.lost: Counter[str] = Counter()
@@ -138,7 +145,6 @@ class AllReader(_Reader):
         self.repeated = 0
         """Frames received again (latched values sent for others), and dropped."""
         self._last: dict[tuple[str, str, str], int] = {}
-        self.socket = transport.connect(context or zmq.Context.instance(), zmq.SUB, addresses, {zmq.RCVHWM: ALL_QUEUE})
         for topic in topics:
             self.socket.subscribe(wire_topic(topic, skin) + b"\0" if skin else wire_topic(topic, ""))
 

@@ -7,6 +7,8 @@ traffic is encrypted and both ends known to each other by CURVE, or, beyond the 
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import ipaddress
 import os
 import secrets
@@ -169,7 +171,11 @@ def bind(
         socket.bind(address)
     except zmq.ZMQError as bad:
         socket.close(0)
-        hint = ": another program uses it; end that one, or choose another port" if bad.errno == zmq.EADDRINUSE else ""
+        hints = {
+            zmq.EADDRINUSE: ": another program uses it, or another of our sockets; end it, or choose another port",
+            errno.ENOENT: ": there is no such folder",
+        }
+        hint = hints.get(bad.errno or 0, "")
         raise TransportError(f"cannot listen at {address}: {bad.strerror}{hint}") from None
     except TransportError:
         socket.close(0)
@@ -203,14 +209,20 @@ def taken_by(address: str) -> None:
         )
 
 
-def try_out(address: str, transport: Transport) -> None:
-    """Raises TransportError where a process that is to listen at `address` would fail."""
-    admission(address, transport)
-    if address.startswith("ipc://"):
-        taken_by(address)
-        return
-    with zmq.Context() as context:
-        bind(context, zmq.XPUB, address, {}).close(0)
+def try_out(addresses: Mapping[str, str], transport: Transport) -> None:
+    """Raises TransportError where processes that are to listen at these addresses, all at once, would fail."""
+    with contextlib.ExitStack() as until_all_are_bound:
+        context = until_all_are_bound.enter_context(zmq.Context())
+        listening: dict[str, str] = {}
+        for name, address in addresses.items():
+            admission(address, transport)
+            if address in listening:  # of ipc, ZeroMQ would take it over silently
+                raise TransportError(f"{name} cannot listen at {address}: {listening[address]} is to listen there too")
+            listening[address] = name
+            try:
+                until_all_are_bound.callback(bind(context, zmq.XPUB, address, {}).close, 0)
+            except TransportError as bad:
+                raise TransportError(f"{name}: {bad}") from None
 
 
 def connect(context: Context, kind: int, addresses: Mapping[str, str], options: Mapping[int, Any]) -> Socket:
@@ -225,9 +237,7 @@ def connect(context: Context, kind: int, addresses: Mapping[str, str], options: 
                 socket.setsockopt(option, PATIENCE_MS)
         # ipc first: keys, once set, hold for all that is connected after.
         for name, address in sorted(addresses.items(), key=lambda item: item[1].startswith("tcp://")):
-            if address.startswith("tcp://"):
-                _use_keys(socket, name, address)
-            socket.connect(_reachable(address))
+            attach(socket, name, address)
     except zmq.ZMQError as bad:
         socket.close(0)
         raise TransportError(
@@ -237,6 +247,13 @@ def connect(context: Context, kind: int, addresses: Mapping[str, str], options: 
         socket.close(0)
         raise
     return socket
+
+
+def attach(socket: Socket, name: str, address: str) -> None:
+    """Connect a socket to one more. Raises TransportError, zmq.ZMQError."""
+    if address.startswith("tcp://"):
+        _use_keys(socket, name, address)
+    socket.connect(reachable(address))
 
 
 def _use_keys(socket: Socket, name: str, address: str) -> None:
@@ -266,7 +283,7 @@ def _use_keys(socket: Socket, name: str, address: str) -> None:
         )
 
 
-def _reachable(address: str) -> str:
+def reachable(address: str) -> str:
     """Where to connect to what listens at `address`: on this host, where it listens on every interface."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     if not address.startswith("tcp://") or host not in ("*", "0.0.0.0", "[::]"):

@@ -230,6 +230,8 @@ class Runner:
         for channel in self.channels.values():
             channel.wanted = self._wanted(channel.stage)
             self._sleep_or_wake(channel)
+            if isinstance(channel.feed, Newest):
+                channel.feed.mind()
             beat = channel.heartbeat
             beat.drops["malformed"], beat.drops["skipped"] = channel.feed.malformed, channel.feed.skipped
             silent = "" if channel.asleep else beat.silence(SILENT_S, channel.stage.reads)

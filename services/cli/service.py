@@ -51,10 +51,9 @@ def _addresses(transport: Transport, processes: list[str]) -> str:
     from protocol.transport import check, try_out
 
     check(transport)
-    for name in processes:
-        for address in (transport.data_address(name), transport.control_address(name)):
-            if name != "stub":  # it keeps to the runtime folder, and waits for its place by itself
-                try_out(address, transport)
+    ours = [name for name in processes if name != "stub"]  # it keeps to the runtime folder, and waits for its place
+    data = {name: transport.data_address(name) for name in ours}
+    try_out(data | {f"{name}.ctl": transport.control_address(name) for name in ours}, transport)
     return transport.data_address("publisher")
 
 

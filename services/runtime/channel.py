@@ -59,6 +59,10 @@ class Newest:
     def listen(self, on: bool) -> None:
         (self.socket.subscribe if on else self.socket.unsubscribe)(self._name)
 
+    def mind(self) -> None:
+        """Connect anew where ZeroMQ has given up: no frame that comes would have us look."""
+        self.reader.mind()
+
     def ask_again(self) -> None:
         """Have upstream send again what it sends to who has just come: nothing else is heard of a subscription."""
         self.listen(False)

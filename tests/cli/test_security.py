@@ -208,6 +208,12 @@ def test_up_refuses_what_a_process_would_die_of(runtime: Path, tmp_path: Path) -
     publisher = Publisher("inference")
     assert "does already" in refused(tmp_path, "")
     publisher.close()
+    twice = f'publisher = "tcp://127.0.0.1:{free}"\n"publisher.ctl" = "tcp://lo:{free}"\n'  # by another name
+    assert "another of our sockets" in refused(tmp_path, f"[sockets.addresses]\n{twice}")
+    others = f'[sockets.addresses]\npublisher = "ipc://{runtime}/acquisition.ipc"\n'
+    assert "publisher cannot listen at" in (said := refused(tmp_path, others)) and "acquisition is to" in said
+    nowhere = f'[sockets.addresses]\npublisher = "ipc://{tmp_path}/nowhere/x.ipc"\n'
+    assert "there is no such folder" in refused(tmp_path, nowhere)
 
 
 def test_up_says_the_addresses_it_really_uses(runtime: Path, tmp_path: Path) -> None:
