@@ -21,7 +21,7 @@ from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
 from services.board.boardlink import Scanning
 from services.describe import describe
-from services.estimation.baseline import BaselineEstimator, believed
+from services.estimation.baseline import STEADY_S, BaselineEstimator, believed
 from services.estimation.contact_drift import Reference
 from services.estimation.electrodes import ElectrodeHealth, Verdict
 from services.estimation.evidence import Explanation
@@ -170,7 +170,7 @@ class Preprocessing(Stage):
         noise, step = self._noise(), self.judge.step
         if not self._touched and self.judge.uncertain(self.untouched.since_s(now_ns)):
             creep = self.judge.creep.direction(now_ns)
-            explained = self.untouched.explain(d, live, now_ns, creep)
+            explained = self.untouched.explain(d, live, self.untouched.since_s(now_ns), creep)
             if explained.fits:
                 return self._decide_alone(d, amplitude, live, explained, now_ns)
         found = self.judge(d, live, noise, self.untouched.since_s(now_ns), now_ns, self._touched)
@@ -190,8 +190,12 @@ class Preprocessing(Stage):
         noise, limit = self._noise(), -float(np.log(self.config.touch.false_alarms))
         self._touched = explained.odds > limit
         if self._touched:
-            self.untouched.drifted(explained.drift, now_ns, self.judge.creep.direction(now_ns))
-            d = self.untouched.difference(amplitude, live)
+            creep = self.judge.creep.direction(now_ns)
+            if self.untouched.explain(d, live, STEADY_S, creep).touched >= explained.touched:
+                self.untouched.steady(now_ns)  # the simpler explanation is as good: no drift is read into noise
+            else:
+                self.untouched.drifted(explained.drift, now_ns, creep)
+                d = self.untouched.difference(amplitude, live)
         found = self.judge.begin(d, live, noise, self.untouched.since_s(now_ns), now_ns, alone=self._touched)
         return d, found._replace(touched=self._touched, score=explained.odds, threshold=limit)
 

@@ -36,6 +36,7 @@ _evidence: dict[str, TouchEvidence] = {}  # by the bundle's hash
 RETRY_EVERY = 8  # frames between attempts at the first tare
 LONGEST_S = 1e9  # a saved time that is longer is none
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
+STEADY_S = 0.25  # what is known not to have drifted is as good as a baseline of this age
 DRIFT_KNOWN_S = 4.0  # a drift that was found under a touch leaves as much open as a baseline of this age
 
 
@@ -141,13 +142,13 @@ class BaselineEstimator:
         self.drifted(start.explanation.drift, self._last_sample_ns)
         return True
 
-    def explain(self, d: Array, live: NDArray[np.bool_], sample_ns: int, creep: Array | None = None) -> Explanation:
-        """A difference (K,), by drift since the last untouched frame and by touches. creep (K,): d of a touch that may
-        have left something behind.
+    def explain(self, d: Array, live: NDArray[np.bool_], since_s: float, creep: Array | None = None) -> Explanation:
+        """A difference (K,), by touches and by as much drift as `since_s` seconds permit. creep (K,): d of a touch that
+        may have left something behind.
         """
         assert self.baseline is not None
         physics, variance = self.evidence.physics, np.where(live, self.sigma, 0.0) ** 2 * (1 + 1 / self.baseline.frames)
-        prior = DriftProcess.of_skin(physics.electrodes, creep=False).value_covariance(self.since_s(sample_ns))
+        prior = DriftProcess.of_skin(physics.electrodes, creep=False).value_covariance(since_s)
         columns = physics.columns(d)
         if creep is not None:
             columns = np.column_stack([columns, creep])
@@ -167,6 +168,10 @@ class BaselineEstimator:
         self.normaliser = self.pre.normaliser(z0)
         self.follower.begin(sample_ns, DRIFT_KNOWN_S)
         self._run = 0
+
+    def steady(self, sample_ns: int) -> None:
+        """Nothing has drifted: a frame under a touch says so."""
+        self.follower.begin(sample_ns, STEADY_S)
 
     def difference(self, amplitude: Array, live: NDArray[np.bool_]) -> Array:
         """d (K,) = (|Z| - |Z0|) / |Z0|, 0 where a measurement does not count."""
