@@ -40,9 +40,7 @@ messages = st.one_of(
     st.builds(link.Start, config=st.integers(0, 65535)),
     st.builds(link.Stop),
     st.builds(link.SelfTest),
-    st.builds(
-        link.Ack, of=st.integers(0, 255), value=st.integers(0, 2**32 - 1), device_us=st.integers(0, 2**64 - 1)
-    ),
+    st.builds(link.Ack, of=st.integers(0, 255), value=st.integers(0, 2**32 - 1), device_us=st.integers(0, 2**64 - 1)),
     st.builds(link.TimeAsk, nonce=st.integers(0, 2**32 - 1)),
     st.builds(link.Time, nonce=st.integers(0, 2**32 - 1), device_us=st.integers(0, 2**64 - 1)),
     st.builds(link.Nak, of=st.integers(0, 255), reason=st.integers(0, 255), text=st.text(max_size=40)),
