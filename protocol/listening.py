@@ -15,6 +15,7 @@ from typing import Any
 
 from . import transport
 from .gate import described, is_one
+from .runtime import RuntimeDirError, runtime_dir
 from .transport import Context, Socket, TransportError
 
 CHECK_S = 0.5
@@ -120,13 +121,14 @@ class Listening:
         while True:
             try:
                 if self.address.startswith("ipc://"):
+                    runtime_dir()  # there again, where the whole folder was deleted
                     _remove(self.address)  # it may be another's: a bound file is what `transport.bind` refuses
                 self.socket = transport.bind(
                     self._context, self._kind, self.address, self._options, self.admission, guarded=self._guarded
                 )
                 self._unbound = ""
                 break
-            except TransportError as why:
+            except (TransportError, RuntimeDirError) as why:
                 if time.monotonic() > deadline:
                     self.socket = self._context.socket(self._kind)  # bound by a later `mind`
                     self.socket.linger = 0

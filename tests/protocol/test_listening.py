@@ -2,6 +2,8 @@
 
 import contextlib
 import os
+import shutil
+import stat
 import subprocess
 import sys
 import time
@@ -219,6 +221,27 @@ def test_a_flood_of_commands_is_answered_one_by_one_named_and_bounded(runtime, c
         until(lambda: control.serve_once(0.1) and stranger.poll(0))
         stranger.close(0)
     control.close()
+
+
+def test_a_deleted_runtime_folder_is_there_again(publisher, context, runtime):
+    reader = NewestReader("contact", "palm", context=context)
+    until(lambda: step(publisher, reader))
+    shutil.rmtree(runtime)
+    until(lambda: publisher.mind())
+    assert stat.S_IMODE(os.stat(runtime).st_mode) == 0o700 and not publisher._listening._unbound
+    until(lambda: step(publisher, reader))
+
+
+def test_a_folder_of_somebody_else_in_its_place_ends_nothing(publisher, context, runtime):
+    reader = NewestReader("contact", "palm", context=context)
+    until(lambda: step(publisher, reader))
+    shutil.rmtree(runtime)
+    os.mkdir(runtime)
+    os.chmod(runtime, 0o777)
+    until(lambda: publisher.mind())
+    assert "expected 0700" in " ".join(publisher.problems)
+    os.chmod(runtime, 0o700)
+    until(lambda: step(publisher, reader))
 
 
 def test_commands_go_on_after_the_control_socket_was_deleted(runtime, context):
