@@ -168,9 +168,13 @@ def folder_graph(files: Graph) -> Graph:
 
 
 def top_graph(files: Graph) -> Graph:
-    """The same between protocol, models, services, firmware_stub, bench."""
+    """The same between protocol, models, services, firmware_stub, bench; the command line, which hands over to the
+    offline tools, apart from the services.
+    """
     graph: Graph = {name.split(".")[0]: set() for name in files}
     for name, others in files.items():
+        if any(name.replace(".", "/").startswith(door) for door in OFFLINE_DOORS):
+            continue
         graph[name.split(".")[0]] |= {other.split(".")[0] for other in others} - {name.split(".")[0]}
     return graph
 
