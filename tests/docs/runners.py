@@ -184,5 +184,8 @@ SCENES = (("firmware_stub/README.md", "[[press]]"),)
 NOT_RUN = (("protocol/WIRE.md", "01 Hello: "),)
 """Blocks that are nothing to run: (file, how it begins). The link's schema: tests/protocol/test_wire_doc.py has it."""
 
-TRIED_ELSEWHERE = {"docs/security.md": "tests/cli/test_security.py", "docs/extending.md": "tests/docs/test_extending.py"}
+TRIED_ELSEWHERE = {
+    "docs/security.md": "tests/cli/test_security.py",
+    "docs/extending.md": "tests/docs/test_extending.py",
+}
 """Documents whose blocks a test of their own runs, or applies where they are changes of the code."""
