@@ -36,7 +36,7 @@ test: venv-dev lint
 
 lint: venv-dev
 	$(BIN)/ruff check .
-	$(BIN)/mypy protocol services examples
+	$(BIN)/mypy protocol services examples firmware_stub
 
 # geometry -> forward model -> data -> network -> bundle in models/bundles/$(SKIN)
 train: venv-dev

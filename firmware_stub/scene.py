@@ -8,6 +8,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from protocol.errors import EitskinError
+
 from .timeline import Cue, Curve, Script, Track
 from .world import NEWTON, Touch
 
@@ -15,7 +17,7 @@ FOLDER = Path(__file__).with_name("scenes")
 POSE = {f.name for f in fields(Touch)} - {"kind", "drop"}
 
 
-class SceneError(ValueError):
+class SceneError(EitskinError, ValueError):
     """A scene that cannot be played: says which file, which key, what was found and what is allowed."""
 
 

@@ -33,6 +33,7 @@ from models.bundle_check import Wrong, check
 from models.files import FileError, read_bytes
 from models.npz import read_npz
 from models.prereconstruction import Matrices, PreReconstructor
+from protocol.errors import EitskinError
 
 SCHEMA = 1
 BUNDLES = Path(__file__).parent / "bundles"
@@ -44,7 +45,7 @@ NETWORKS = {"full": "network.onnx", "fast": "network_fast.onnx", "int8": "networ
 CLASSES = ("circle", "triangle", "rectangle", "square", "L")
 
 
-class BundleError(Exception):
+class BundleError(EitskinError):
     """The bundle cannot be used; says what was found, what was expected and what to do."""
 
 

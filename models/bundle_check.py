@@ -15,6 +15,7 @@ import numpy as np
 from models import geometry
 from models.patterns import PatternError
 from models.prereconstruction import Matrices
+from protocol.errors import EitskinError
 
 MAX_MEASUREMENTS = 512  # of a board's scan list
 MAX_ELECTRODES = 256
@@ -24,7 +25,7 @@ MAX_DEPTH = 32
 NORMALISATIONS = ("model", "measured")
 
 
-class Wrong(Exception):
+class Wrong(EitskinError):
     """What is wrong with a bundle: `place`, what was found there, what is allowed."""
 
     def __init__(self, place: str, found: object, allowed: str) -> None:

@@ -17,6 +17,7 @@ from onnxruntime import quantization
 
 from models.network import CONTEXT, MMCNN
 from models.prereconstruction import Array
+from protocol.errors import EitskinError
 
 OPSET = 17  # onnxruntime 1.20 and later read it
 INPUTS, OUTPUTS = ("stack", "context"), ("drop", "log_sigma", "classes")
@@ -24,7 +25,7 @@ PARITY = 1e-5
 FLOAT = ("/stem/", "/stage2/attention", "/up2/", "/stage3/", "/classes/", "/up1/", "/out/", "/aside/")  # not in int8
 
 
-class ParityError(Exception):
+class ParityError(EitskinError):
     """The exported network does not compute what PyTorch computes."""
 
 

@@ -9,11 +9,13 @@ import os
 import stat
 from typing import BinaryIO
 
+from protocol.errors import EitskinError
+
 MAX_TEXT = 4 * 1024 * 1024
 """Bytes of a file of text: TOML, JSON, CSV."""
 
 
-class FileError(Exception):
+class FileError(EitskinError):
     """The file cannot be used: names it, says what was found and what was expected."""
 
 

@@ -14,9 +14,10 @@ from scipy.spatial import Delaunay
 from skfem import MeshTri
 
 from models.geometry import Skin
+from protocol.errors import EitskinError
 
 
-class MeshError(RuntimeError):
+class MeshError(EitskinError, RuntimeError):
     """An outline that could not be meshed at the wanted spacing."""
 
 

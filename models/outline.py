@@ -8,10 +8,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from protocol.errors import EitskinError
+
 Array = NDArray[np.float64]
 
 
-class GeometryError(ValueError):
+class GeometryError(EitskinError, ValueError):
     """A skin that cannot exist; the message says which part and what was expected."""
 
 

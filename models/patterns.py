@@ -12,10 +12,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from protocol.errors import EitskinError
+
 NAMES = ("pairs", "adjacent", "opposite")
 
 
-class PatternError(ValueError):
+class PatternError(EitskinError, ValueError):
     """A pattern that cannot be measured or cannot be inverted; the message says which entry or which rank."""
 
 

@@ -32,7 +32,8 @@ def _corners(kind: str, aspect: float) -> Array | None:
         return np.column_stack([np.cos(angles), np.sin(angles)])
     if kind in ("rectangle", "square"):
         half = np.array([aspect, 1.0] if kind == "rectangle" else [1.0, 1.0])
-        return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half / np.linalg.norm(half)
+        corners: Array = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half / np.linalg.norm(half)
+        return corners
     if kind == "L":
         h = np.sqrt(0.5)
         inner = -h + 2 * h * L_ARM
@@ -110,7 +111,8 @@ class Shape:
         if unit is None:
             return None
         c, s = np.cos(self.rotation), np.sin(self.rotation)
-        return self.radius * unit @ np.array([[c, s], [-s, c]]) + (self.x, self.y)
+        corners: Array = self.radius * unit @ np.array([[c, s], [-s, c]]) + (self.x, self.y)
+        return corners
 
     def outline(self, n: int = 64) -> Array:
         """Outline polygon, counter-clockwise: the corners, or n points of the circle."""

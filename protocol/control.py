@@ -15,6 +15,7 @@ import msgpack
 import zmq
 
 from . import transport
+from .errors import EitskinError
 from .fields import brief
 from .frames import FrameError, read_map
 from .gate import described, peer_of
@@ -39,7 +40,7 @@ Handler = Callable[[dict[str, Any]], dict[str, Any]]
 log = logging.getLogger(__name__)
 
 
-class ControlError(RuntimeError):
+class ControlError(EitskinError, RuntimeError):
     """A command was not carried out.
 
     `kind` is `unreachable` (no such process), `timeout` (no answer), `bad_reply`, `bad_request`, `unknown_command`,

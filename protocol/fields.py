@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import EitskinError
+
 INT64_MAX = 2**63 - 1
 UINT64_MAX = 2**64 - 1
 MAX_LIST = 4096
@@ -29,7 +31,7 @@ MAX_EXTENT = 2**31
 REMEMBERED = 64  # texts that a checker has accepted and need not look at again
 
 
-class Mismatch(Exception):
+class Mismatch(EitskinError):
     """A value is not what its field allows: `path` inside the field ("" for the field itself), `found`, `expected`."""
 
     def __init__(self, found: str, expected: str, path: str = "") -> None:

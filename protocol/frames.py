@@ -12,6 +12,7 @@ from typing import Any
 import msgpack
 
 from . import fields as _fields
+from .errors import EitskinError
 from .fields import Mismatch, brief
 from .frame_types import (
     ELECTRODE_STATES,
@@ -56,7 +57,7 @@ _RECORDS = {name: Record(topic.frame) for name, topic in TOPICS.items()}
 _TOPIC = re.compile(rf"([a-z]{{1,16}})/({NAME})".encode())
 
 
-class FrameError(ValueError):
+class FrameError(EitskinError, ValueError):
     """A message is not a frame. `topic` and `field` name the place, `found` and `expected` what is wrong there.
 
     `topic` is "" where the message does not even begin with one; `field` is "" for the message as a whole.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 
 from .ages import Ages
+from .errors import EitskinError
 from .frames import ContactFrame
 from .runtime import host_id
 from .sockets import NewestReader
@@ -23,7 +24,7 @@ WAIT_SLICE_S = 0.1
 """Longest single wait for a frame: what a longer one wakes to has come while the whole process was stopped."""
 
 
-class Stale(RuntimeError):
+class Stale(EitskinError, RuntimeError):
     """There is no contact frame that is new enough: stop, or fall back.
 
     `age_s` is the age of the newest one, None where there was none.

@@ -16,11 +16,13 @@ from pathlib import Path
 import zmq
 from zmq.utils import z85
 
+from .errors import EitskinError
+
 MAX_FILE = 64 * 1024
 _LINE = re.compile(rb'^\s*(public|secret)-key\s*=\s*"([^"]*)"', re.MULTILINE)
 
 
-class TransportError(RuntimeError):
+class TransportError(EitskinError, RuntimeError):
     """A socket cannot be opened as configured, or a key file cannot be used: the message says what was found and what
     to do.
     """

@@ -15,6 +15,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import EitskinError
+
 LINK_VERSION = 1
 MAX_SCAN = 512
 """Most measurements in a scan list."""
@@ -26,7 +28,7 @@ CHIP_ID = 0x5502
 """What a healthy AD5940 says it is."""
 
 
-class LinkError(ValueError):
+class LinkError(EitskinError, ValueError):
     """A message's fields cannot be sent, or do not fit their message: says which, what was found, what is allowed."""
 
 

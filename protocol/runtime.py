@@ -15,17 +15,19 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+from .errors import EitskinError
+
 CONFIG_LINK = "config"
 """Name of the link, in the runtime folder, to the configuration of the service that runs there."""
 MAX_SOCKET_PATH = 107
 """Longest path of a Unix socket on Linux, in bytes (sun_path less its final 0)."""
 
 
-class RuntimeDirError(RuntimeError):
+class RuntimeDirError(EitskinError, RuntimeError):
     """The runtime folder cannot be used: not ours, open to others, a link, not a folder, or its path too long."""
 
 
-class AlreadyRunning(RuntimeError):
+class AlreadyRunning(EitskinError, RuntimeError):
     """Another service holds the runtime folder, or another process of this name runs there (`process`, else "");
     `pid` is its number, 0 where that is not known.
     """

@@ -13,10 +13,12 @@ import os
 import sys
 from pathlib import Path, PurePosixPath
 
+from protocol.errors import EitskinError
+
 MODE = 0o700
 
 
-class NotOurs(Exception):
+class NotOurs(EitskinError):
     """A folder that is not to be touched. The text says what was found and what to do."""
 
 

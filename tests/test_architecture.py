@@ -1,4 +1,5 @@
-"""Who may import whom: protocol <- models <- services; firmware_stub uses protocol and models, never services.
+"""Who may import whom: protocol <- models <- services; firmware_stub uses protocol and models, never services; and no
+circle of files or folders.
 
 The running services read bundles and do pure numerics; they must start without PyTorch or a mesh.
 """
@@ -6,6 +7,7 @@ The running services read bundles and do pure numerics; they must start without 
 import ast
 import pathlib
 import sys
+from collections.abc import Iterator, Mapping
 
 import pytest
 
@@ -31,6 +33,25 @@ SERVICES_USE_OF_MODELS = {
     "models.sentinel",
     "models.uncertainty",
 }
+
+WITHOUT_CIRCLES = ("protocol", "models", "services", "firmware_stub", "bench")
+NUMERICS = ("numpy", "scipy", "models", "services.estimation", "protocol.frames", "protocol.frame_types")
+"""What services/estimation may import: numerics, and the frames that name what a scan holds."""
+NOT_YET_PURE = {
+    "services/estimation/baseline.py": {"services.runtime.config", "services.runtime.stage"},
+    "services/estimation/contact_drift.py": {"services.runtime.persistence"},
+    "services/estimation/creep.py": {"services.runtime.persistence"},
+    "services/estimation/drift_filter.py": {"services.runtime.config", "services.runtime.persistence"},
+    "services/estimation/drift_prior.py": {"services.runtime.config"},
+    "services/estimation/gain_steps.py": {"services.runtime.persistence"},
+    "services/estimation/holding.py": {"services.runtime.persistence"},
+    "services/estimation/references.py": {"services.runtime.persistence"},
+    "services/estimation/tare.py": {"services.runtime.stage"},
+    "services/estimation/touch_detector.py": {"services.runtime.config", "services.runtime.persistence"},
+}
+"""Files of services/estimation that still import more than numerics, and what. This list may only shrink: a line that
+is no longer true fails the test, and no line is to be added.
+"""
 
 
 def imports(path: pathlib.Path) -> set[str]:
@@ -104,3 +125,135 @@ def test_services_take_only_bundle_and_numerics_from_models() -> None:
         for module in closure(direct):
             heavy = {n.split(".")[0] for n in imports(ROOT / (module.replace(".", "/") + ".py"))} & {"torch", "skfem"}
             assert not heavy, f"{path.relative_to(ROOT)} reaches {sorted(heavy)} through {module}"
+
+
+Graph = dict[str, set[str]]
+
+
+def module_graph(root: pathlib.Path, folders: tuple[str, ...]) -> Graph:
+    """Module -> the modules of `folders` that it imports, wherever in the file and whether for types only or not.
+
+    `from package import part` is an import of the part where that is a module, else of the package's __init__.
+    """
+    files = [p.relative_to(root) for folder in folders for p in sorted((root / folder).rglob("*.py"))]
+    names = {".".join(p.with_suffix("").parts).removesuffix(".__init__"): p for p in files if "work" not in p.parts}
+    modules = {name: root / path for name, path in names.items()}
+    graph: Graph = {}
+    for name, path in modules.items():
+        package = path.relative_to(root).parent.parts
+        found = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                base = package[: len(package) - node.level + 1] if node.level else ()
+                module = ".".join([*base, *([node.module] if node.module else [])])
+                parts = {f"{module}.{alias.name}" for alias in node.names}
+                found |= {part if part in modules else module for part in parts}
+        graph[name] = {other for other in found if other in modules} - {name}
+    # protocol/__init__ only lends names of its modules, each loaded when it is first used
+    return {name: set() if name == "protocol" else others for name, others in graph.items()}
+
+
+def folder_graph(files: Graph) -> Graph:
+    """The same, folder by folder: services.board stands for all of its files, a file beside the folders for itself."""
+
+    def unit(module: str) -> str:
+        return ".".join(module.split(".")[:2])
+
+    graph: Graph = {unit(name): set() for name in files}
+    for name, others in files.items():
+        graph[unit(name)] |= {unit(other) for other in others} - {unit(name)}
+    return graph
+
+
+def top_graph(files: Graph) -> Graph:
+    """The same between protocol, models, services, firmware_stub, bench; the command line, which hands over to the
+    offline tools, apart from the services.
+    """
+    graph: Graph = {name.split(".")[0]: set() for name in files}
+    for name, others in files.items():
+        if any(name.replace(".", "/").startswith(door) for door in OFFLINE_DOORS):
+            continue
+        graph[name.split(".")[0]] |= {other.split(".")[0] for other in others} - {name.split(".")[0]}
+    return graph
+
+
+def circles(graph: Mapping[str, set[str]]) -> Iterator[list[str]]:
+    """One circle, [a, b, ..., a], of each strongly connected part of more than one node."""
+
+    def reached(start: str) -> dict[str, str]:
+        """What `start` imports, directly or not: node -> the node it was first seen from."""
+        seen: dict[str, str] = {}
+        todo = [start]
+        for node in todo:
+            for other in sorted(graph[node] - seen.keys()):
+                seen[other] = node
+                todo.append(other)
+        return seen
+
+    named: set[str] = set()
+    for start in sorted(graph):
+        seen = reached(start)
+        if start in seen and start not in named:
+            back = [start, seen[start]]
+            while back[-1] != start:
+                back.append(seen[back[-1]])
+            named |= {node for node in seen if start in reached(node)}
+            yield back[::-1]
+
+
+def told(graph: Graph) -> list[str]:
+    return [" -> ".join(circle) for circle in circles(graph)]
+
+
+def test_no_circle_of_files_or_folders() -> None:
+    files = module_graph(ROOT, WITHOUT_CIRCLES)
+    assert len(files) > 150 and files["services.cli.common"] >= {"services.runtime.config"}
+    found = [*told(files), *told(folder_graph(files)), *told(top_graph(files))]
+    assert not found, "circles of imports: " + "; ".join(found)
+
+
+def test_a_circle_is_found_and_named(tmp_path: pathlib.Path) -> None:
+    for file, text in {
+        "services/__init__.py": "",
+        "services/board/__init__.py": "",
+        "services/board/port.py": "from services.board import clock\nfrom services.touches.late import late\n",
+        "services/board/clock.py": "",
+        "services/touches/__init__.py": "",
+        "services/touches/late.py": "def late() -> None: ...\n",
+        "services/touches/early.py": "def f() -> None:\n    import services.board.clock\n",
+        "services/a.py": "from . import b\n",
+        "services/b.py": "from .c import x\n",
+        "services/c.py": "from services.a import y\n",
+    }.items():
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text(text)
+    files = module_graph(tmp_path, ("services",))
+    assert told(files) == ["services.a -> services.b -> services.c -> services.a"]
+    assert told(folder_graph(files)) == [
+        "services.a -> services.b -> services.c -> services.a",
+        "services.board -> services.touches -> services.board",
+    ]
+
+
+def test_estimation_imports_numerics_only() -> None:
+    used = set()
+    for path in sources("services/estimation"):
+        relative = str(path.relative_to(ROOT))
+        ours = {n for n in imports(path) if n.split(".")[0] in FOLDERS}
+        more = {n for n in ours if not any(n == ok or n.startswith(f"{ok}.") for ok in NUMERICS)} - {"services"}
+        modules = {n for n in more if (ROOT / (n.replace(".", "/") + ".py")).exists()}
+        known = NOT_YET_PURE.get(relative, set())
+        assert modules <= known, f"{relative} imports {sorted(modules - known)}: estimation imports numerics only"
+        assert known <= modules, f"{relative} no longer imports {sorted(known - modules)}: take it off NOT_YET_PURE"
+        outside = {n.split(".")[0] for n in imports(path)} - FOLDERS - set(sys.stdlib_module_names) - {""}
+        assert outside <= {"numpy", "scipy"}, f"{relative} imports {sorted(outside)}"
+        assert not outside_world(path), f"{relative} imports {sorted(outside_world(path))}"
+        used.add(relative)
+    assert NOT_YET_PURE.keys() <= used, f"no such files: {sorted(NOT_YET_PURE.keys() - used)}"
+
+
+def outside_world(path: pathlib.Path) -> set[str]:
+    """What of the standard library a file imports that reads or writes files, sockets or processes."""
+    return imports(path) & {"os", "socket", "pathlib", "tempfile", "shutil", "subprocess", "threading", "time"}

@@ -21,6 +21,7 @@ from bench.stability.run import Row, Setting
 from models.bundle import Bundle, BundleError
 from models.files import FileError
 from models.npz import npz
+from protocol.errors import EitskinError
 from protocol.frames import FrameError, RawFrame, pack, unpack
 from protocol.link import Decoder, Frame, encode
 from services.recordings.recording import RecordingError, RecordingReader, RecordingWriter
@@ -45,7 +46,7 @@ Feed = Callable[[bytes], object]
 """Whether bytes were refused: False, None or 0; anything else where something was read. Raises Broken."""
 
 
-class Broken(Exception):
+class Broken(EitskinError):
     """A promise was broken: how."""
 
 

@@ -13,13 +13,14 @@ from typing import Any
 import serial
 from serial.tools import list_ports
 
+from protocol.errors import EitskinError
 from protocol.runtime import runtime_dir
 
 BAUD = 921_600
 STUB_LINKS = "board-"  # and the skin's name: the link to the stub's pty in the runtime folder
 
 
-class PortError(Exception):
+class PortError(EitskinError):
     """The port cannot be opened, or is gone. The text is for a person."""
 
 

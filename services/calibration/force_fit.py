@@ -17,6 +17,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.errors import EitskinError
 from services.contacts.calibration_file import Calibration, Of
 from services.contacts.force import ForceLaw, Look
 from services.contacts.force_curve import TERMS, Curve, columns
@@ -31,7 +32,7 @@ MOST_ERROR = 0.5  # rms of log force, left out: beyond it nothing was learned
 LEAST_EXPONENT = 0.2
 
 
-class CalibrationError(Exception):
+class CalibrationError(EitskinError):
     """The presses make no force law; says what was found, what was expected and what to do."""
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 from models.bundle import Bundle
+from protocol.errors import EitskinError
 from services.estimation.references import noise_of_references
 from services.recordings.npz_file import InputError, measurement_order
 
@@ -26,7 +27,7 @@ PRESS_BLUR = 2.0
 MOST_DEPTHS = 8
 
 
-class RegistrationError(ValueError):
+class RegistrationError(EitskinError, ValueError):
     """The presses cannot be registered; says what was found, what was expected and what to do."""
 
 

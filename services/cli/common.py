@@ -15,6 +15,8 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from protocol.errors import EitskinError
+
 ROOT = Path(__file__).resolve().parents[2]
 FAILED, USAGE, NOT_RUNNING = 1, 2, 3
 """Exit codes: it did not work, the request itself is wrong, no service answers."""
@@ -29,7 +31,7 @@ SkinOption = Annotated[str, typer.Option("--skin", help="Which skin; default: th
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 
 
-class CliError(Exception):
+class CliError(EitskinError):
     """Ends a command: one line of text, what was found, what was expected, what to do; and the exit code."""
 
     def __init__(self, message: str, code: int = FAILED) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from protocol.errors import EitskinError
 from protocol.frames import pack
 from services.recordings import settings
 from services.recordings.file_source import file_frame
@@ -22,7 +23,7 @@ EPOCH_NS = 1_000_000_000_000_000_000
 """A file of measurements knows no time; its recording begins here (2001-09-09), so that importing is reproducible."""
 
 
-class ImportRefused(ValueError):
+class ImportRefused(EitskinError, ValueError):
     """The file cannot become a recording; says which array, what was found and what is expected."""
 
 

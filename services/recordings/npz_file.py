@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from models import npz
 from models.bundle import Bundle
 from models.files import FileError
+from protocol.errors import EitskinError
 from services.estimation.references import alike
 
 Array = NDArray[np.float64]
@@ -27,7 +28,7 @@ rows stand.
 """
 
 
-class InputError(ValueError):
+class InputError(EitskinError, ValueError):
     """The file's arrays are not what is needed; says which, what was found and what is expected."""
 
 

@@ -23,6 +23,7 @@ from mcap.stream_reader import lz4, zstandard  # type: ignore[attr-defined]  # w
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from models.files import FileError, open_file
+from protocol.errors import EitskinError
 from services.recordings.patient_file import PatientFile
 
 FLUSH_S = 0.1
@@ -39,7 +40,7 @@ _RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
-class RecordingError(ValueError):
+class RecordingError(EitskinError, ValueError):
     """A file that cannot be read as a recording, or cannot be written; the text says what was found and what to do."""
 
 

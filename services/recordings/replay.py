@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+from protocol.errors import EitskinError
 from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, read_map, unpack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
 from services.recordings.recording import STATE_TOPIC, Recorded, RecordingError, RecordingReader, RecordingWriter
@@ -26,7 +27,7 @@ LONGEST_PAUSE_S = 10.0  # between two recorded frames: a file's times are its ma
 MOST_SKINS = 64
 
 
-class ReplayError(Exception):
+class ReplayError(EitskinError):
     """The replay cannot begin or go on; the text says why and what to do."""
 
 

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from models.files import FileError, read_text
+from protocol.errors import EitskinError
 from protocol.topics import PRODUCERS
 from protocol.transport import Transport, half
 from services.runtime.stage import PROCESSES
@@ -28,7 +29,7 @@ Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
-class ConfigError(Exception):
+class ConfigError(EitskinError):
     """The configuration cannot be used. The text is for the person who must mend the file."""
 
 

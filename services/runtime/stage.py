@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from protocol.errors import EitskinError
 from protocol.frames import Frame
 
 STAGES = ("preprocessing", "inference", "publisher")
@@ -21,7 +22,7 @@ SEPARATE = "separate"
 """Reason that a source of scans which do not follow each other in time gives to each of them, and stages hand on."""
 
 
-class Refused(Exception):
+class Refused(EitskinError):
     """A command that the stage will not carry out now. The text says why and what to do."""
 
 

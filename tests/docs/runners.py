@@ -34,6 +34,7 @@ COMMANDS = (
     # starting, testing
     Row("make up", "slow", says="contacts at"),
     Row("make test", "ci", says="make test"),
+    Row("make lint", "ci", says="make test"),  # which begins with it
     Row("make venv-dev", "ci", says="make test"),  # its first prerequisite
     Row("make train SKIN=square16 QUICK=1", "ci", says="models.build --skin square16 --minutes 3"),
     Row("(./)?skin up", "service"),
@@ -76,6 +77,11 @@ COMMANDS = (
         "runs",
         says="board of palm at",
         instead="EITSKIN_RUNTIME={folder}/stub .venv/bin/python -m firmware_stub",
+    ),
+    Row(
+        "python -m services.alarm|python -m services.health alarm",  # the process that docs/extending.md adds
+        "ends",
+        instead=".venv/bin/python -m services.health publisher",
     ),
     Row("skin (up|down|press|top|release|replay|doctor)", "ends", instead="./skin --help"),
     # recordings, files
@@ -144,6 +150,7 @@ COMMANDS = (
     Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB"),
     Row(r"(\./)?skin bench (?P<name>\w+)( .*)?", "help"),
     Row("python -m models.average", "help"),
+    Row("python -m models.build .*", "help"),
     Row("python -m protocol.wire_doc", "ends", instead=".venv/bin/python -m protocol.wire_doc"),
 )
 
@@ -177,5 +184,8 @@ SCENES = (("firmware_stub/README.md", "[[press]]"),)
 NOT_RUN = (("protocol/WIRE.md", "01 Hello: "),)
 """Blocks that are nothing to run: (file, how it begins). The link's schema: tests/protocol/test_wire_doc.py has it."""
 
-TRIED_ELSEWHERE = {"docs/security.md": "tests/cli/test_security.py"}
-"""Documents whose blocks of Python and TOML a test of their own runs."""
+TRIED_ELSEWHERE = {
+    "docs/security.md": "tests/cli/test_security.py",
+    "docs/extending.md": "tests/docs/test_extending.py",
+}
+"""Documents whose blocks a test of their own runs, or applies where they are changes of the code."""

@@ -21,6 +21,7 @@ sys.meta_path.insert(0, Only())
 import eitskin
 for module in pkgutil.iter_modules(eitskin.__path__):
     __import__(f"eitskin.{module.name}")
+assert all(getattr(eitskin, name) for name in eitskin.__all__) and issubclass(eitskin.Stale, eitskin.EitskinError)
 assert eitskin.aio.AsyncContactSubscriber and eitskin.listener.ContactListener and eitskin.client.ContactSubscriber
 """
 

@@ -9,10 +9,16 @@ import tempfile
 import threading
 import time
 
-from eitskin.aio import AsyncContactSubscriber
-from eitskin.client import ContactSubscriber, NotValid, Stale
-from eitskin.frames import ContactFrame
-from eitskin.listener import ContactListener
+import eitskin
+from eitskin import (
+    AsyncContactSubscriber,
+    ContactFrame,
+    ContactListener,
+    ContactSubscriber,
+    EitskinError,
+    NotValid,
+    Stale,
+)
 from eitskin.sockets import Publisher
 
 
@@ -46,6 +52,7 @@ def main() -> None:
             try:
                 frame: ContactFrame = skin.latest(wait_s=5.0, valid=True)
             except NotValid as why:
+                assert isinstance(why, EitskinError)
                 raise SystemExit(f"{why.frame.reasons}") from None
             print("client:", frame.seq, [contact.position for contact in frame.contacts])
         asyncio.run(by_asyncio())
@@ -59,7 +66,7 @@ def main() -> None:
         done.set()
         sending.join()
         publisher.close()
-    print("the wheel works")
+    print(f"the wheel of {eitskin.__version__} works")
 
 
 if __name__ == "__main__":

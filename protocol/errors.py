@@ -1,0 +1,41 @@
+"""The base of the project's exceptions."""
+
+from __future__ import annotations
+
+
+class EitskinError(Exception):
+    """What eitskin raises where something cannot be used or done. The text is for the person who must act.
+
+    Beside this base each keeps the built-in one that its name is followed by::
+
+        EitskinError
+        ├── Stale (RuntimeError)              no contact frame is new enough: stop, or fall back
+        │   └── NotValid                      the newest frame is new and says that it must not be acted on
+        ├── FrameError (ValueError)           a message is not a frame
+        ├── Mismatch                          a value is not what its field allows; a FrameError names frame and field
+        ├── ControlError (RuntimeError)       a command was not carried out
+        ├── TransportError (RuntimeError)     a socket or a key file cannot be used as configured
+        ├── RuntimeDirError (RuntimeError)    the runtime folder cannot be used
+        ├── AlreadyRunning (RuntimeError)     another service holds the runtime folder
+        ├── LinkError (ValueError)            a message of the board link cannot be sent or does not fit
+        ├── FileError                         models: a file cannot be read
+        ├── BundleError                       a bundle cannot be used
+        ├── Wrong                             what is wrong in a bundle; a BundleError names the bundle
+        ├── GeometryError (ValueError)        a skin that cannot exist
+        ├── PatternError (ValueError)         a drive pattern that cannot be measured or inverted
+        ├── MeshError (RuntimeError)          an outline that cannot be meshed
+        ├── ParityError                       an exported network does not compute what PyTorch computes
+        ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
+        ├── ConfigError                       services: skin.toml cannot be used
+        ├── Refused                           a stage does not carry out a command now
+        ├── PortError                         the board's port cannot be opened, or is gone
+        ├── RecordingError (ValueError)       a file is not a recording, or cannot be written
+        ├── ReplayError                       a replay cannot begin or go on
+        ├── InputError (ValueError)           arrays of a file are not what is needed
+        ├── ImportRefused (ValueError)        a file cannot become a recording
+        ├── RegistrationError (ValueError)    presses at known places do not register a skin
+        ├── CalibrationError                  presses of known force make no force law
+        ├── NotOurs                           a folder that must not be handed over
+        ├── CliError                          ends a command with one line and an exit code
+        └── Broken                            bench: a promise was broken under changed bytes
+    """
