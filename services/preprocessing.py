@@ -191,8 +191,8 @@ class Preprocessing(Stage):
         self._touched = explained.odds > limit
         if self._touched:
             creep = self.judge.creep.direction(now_ns)
-            if self.untouched.explain(d, live, STEADY_S, creep).touched >= explained.touched:
-                self.untouched.steady(now_ns)  # the simpler explanation is as good: no drift is read into noise
+            if self.untouched.explain(d, live, STEADY_S, creep).as_good(explained):
+                self.untouched.steady(now_ns)  # no drift is read into noise
             else:
                 self.untouched.drifted(explained.drift, now_ns, creep)
                 d = self.untouched.difference(amplitude, live)

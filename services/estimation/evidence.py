@@ -51,6 +51,13 @@ class Explanation(NamedTuple):
         """Log evidence of touched against untouched."""
         return self.touched - self.untouched
 
+    def as_good(self, other: Explanation) -> bool:
+        """Whether this explanation, which permits less drift, does for the frame: likelier, and not by a touch that
+        stands for the drift, unless that leaves less.
+        """
+        likelier = self.touched - other.touched >= TUNING.steady_nats
+        return likelier and (len(self.touches) <= len(other.touches) or self.left <= other.left)
+
     @property
     def fits(self) -> bool:
         """Whether drift and touches are all that there is: a fault is not explained by them."""

@@ -48,6 +48,8 @@ class Tuning:
         10.0, "times the noise", "energy that touches and drift may leave", "measured: touches leave 5"
     )
 
+    steady_nats: float = _number(10.0, "nats", "by which no drift must be likelier than some", DRIFT_ROWS)
+
     # start (start.py)
     start_contact_sd: float = _number(0.3, "relative", "contacts of an unknown skin", "training: +-30 %")
     layer_sd: float = _number(0.03, "relative", "series part of a contact against its rest", START_ROWS)
