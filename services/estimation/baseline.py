@@ -16,8 +16,7 @@ from protocol.frames import RawFrame, as_sent
 from services.estimation.creep import Creep
 from services.estimation.drift import DriftProcess
 from services.estimation.drift_filter import DriftFilter
-from services.estimation.evidence import Explanation, TouchEvidence
-from services.estimation.physics import SkinPhysics
+from services.estimation.evidence import Explanation, TouchEvidence, evidence_of
 from services.estimation.references import References
 from services.estimation.start import Verdict, judge_start
 from services.estimation.tare import Baseline, noisy, plausible_noise, take
@@ -32,7 +31,6 @@ UNSURE = (
     "once"
 )
 PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare`"
-_evidence: dict[str, TouchEvidence] = {}  # by the bundle's hash
 RETRY_EVERY = 8  # frames between attempts at the first tare
 LONGEST_S = 1e9  # a saved time that is longer is none
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
@@ -114,14 +112,7 @@ class BaselineEstimator:
     @property
     def evidence(self) -> TouchEvidence:
         """Made when it is first asked for, which takes a third of a second, and kept for all skins of the bundle."""
-        if self.bundle.hash not in _evidence:
-            skin, m = self.bundle.skin, self.bundle.matrices
-            series = None
-            if "contact_impedance" in skin:
-                series = np.asarray(skin["contact_impedance"], float) / np.asarray(skin["electrodes"]["width"], float)
-            half_width = float(self.bundle.manifest["image"].get("half_width", 1.0))
-            _evidence[self.bundle.hash] = TouchEvidence(SkinPhysics.of(m, half_width, series))
-        return _evidence[self.bundle.hash]
+        return evidence_of(self.bundle)
 
     def _begin(self, found: Baseline) -> bool:
         """Use the first baseline, unless something touches: whether there is one now."""
