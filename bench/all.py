@@ -103,7 +103,8 @@ BENCHMARKS = (
 
 def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
     """Runs it; its tables go to our output and to NAME.txt. Returns what went wrong, or ""."""
-    command = [sys.executable, "-m", commands().get(benchmark.name, f"bench.{benchmark.name}"), *(benchmark.quick if quick else ())]
+    module = commands().get(benchmark.name, f"bench.{benchmark.name}")
+    command = [sys.executable, "-m", module, *(benchmark.quick if quick else ())]
     print(f"\n=== {benchmark.title}: {' '.join(command[2:])}", flush=True)
     for suffix in ("json", "txt"):  # what an earlier run left is not this one's
         (folder / f"{benchmark.name}.{suffix}").unlink(missing_ok=True)

@@ -28,7 +28,8 @@ SOURCES = ("board", "stub", "replay")
 REASONS = {
     "stale_baseline": "the baseline is too old or does not fit: tare",
     "touched_at_start": "something has touched the skin since the service began: free it, or tare if nothing touches",
-    "saturated": "a measurement's converter was clipped",
+    "saturated": "a measurement was beyond what the board measures: converter clipped, or RTIA overrange",
+    "fifo": "the board lost or mixed up measurements: FIFO error or missed interrupt",
     "electrode_open": "an electrode has no contact with the skin",
     "electrode_short": "two electrodes are connected to each other",
     "electrode_swapped": "two electrodes' wires are exchanged",
@@ -287,9 +288,11 @@ INFO_KEYS = {
     "units": "map: name of a field -> its unit",
     "force_law": "map: kind and parameters of the force law, or nil",
     "calibration_hash": "sha256 of the calibration file, or nil",
-    "baseline": "array (K,): |Z0|",
+    "baseline": "array (K,): |Z0| as frames are compared with it; sent again when drift moved it by 2e-4, at most "
+    "every 5 s",
     "baseline_sigma": "array (K,): standard deviation of the frames that the baseline was taken from",
-    "baseline_hash": "sha256 of the baseline's bytes",
+    "baseline_hash": "sha256 of the bytes of `baseline` and `baseline_sigma`",
+    "baseline_revision": "counts up whenever another baseline is used, or drift moves it; of this `baseline`",
     "tare_sample_ns": "stamp `sample` of the newest frame of the tare, or what it would be by this host's clock",
     "tare_age_s": "seconds since the tare when this frame was made",
     "tare": "map: taken_by (start, command, file), restored (by a later process), frames, board, bundle_hash, doubt",

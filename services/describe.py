@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,12 +13,13 @@ from services.estimation.tare import Baseline
 from services.runtime.config import Skin
 
 CORNERS = 64  # of the polygon that stands for a disc
-
+MOVED = 2e-4  # relative: as two frames of 80 dB differ; a baseline that drifted by more is told again
+EVERY_S = 5.0  # but that at most so often
 
 UNITS = {"z": "ohm", "image": "S/m", "position": "m", "velocity": "m/s", "area_m2": "m^2", "force_n": "N"}
 
 
-def describe(skin: Skin, bundle: Bundle, baseline: Baseline | None) -> dict[str, Any]:
+def describe(skin: Skin, bundle: Bundle, baseline: Baseline | None, revision: int = 0) -> dict[str, Any]:
     """The map of an InfoFrame: bundle, geometry, pose, units and, once there is one, the baseline."""
     found: dict[str, Any] = {
         "bundle": bundle.name,
@@ -35,9 +36,40 @@ def describe(skin: Skin, bundle: Bundle, baseline: Baseline | None) -> dict[str,
         else hashlib.sha256(skin.calibration.read_bytes()).hexdigest(),
     }
     if baseline is not None:
-        found |= {"baseline": baseline.z0.copy(), "baseline_sigma": baseline.sigma, "baseline_hash": baseline.hash}
+        found |= {"baseline": baseline.z0, "baseline_sigma": baseline.sigma, "baseline_hash": baseline.hash}
+        found["baseline_revision"] = revision
         found |= {"tare_sample_ns": baseline.taken_ns, "tare": provenance(baseline, bundle)}
     return found
+
+
+class _Told(NamedTuple):
+    baseline: Baseline | None
+    origin: tuple[Any, ...]
+    at_ns: int
+
+
+class BaselineNews:
+    """Whether info/<skin> is to be sent again: at once for another baseline, by its size for drift of the same one."""
+
+    def __init__(self) -> None:
+        self._told: _Told | None = None
+
+    def __call__(self, baseline: Baseline | None, now_ns: int) -> bool:
+        """True: the caller tells it now. now_ns: stamp `sample` of the newest frame."""
+        told = self._told
+        found = _Told(baseline, () if baseline is None else _origin(baseline), now_ns)
+        if told is not None and told.origin == found.origin:
+            if told.baseline is None or baseline is None or abs(now_ns - told.at_ns) < EVERY_S * 1e9:
+                return False
+            if not (np.abs(baseline.z0 - told.baseline.z0) > MOVED * np.abs(told.baseline.z0)).any():
+                return False
+        self._told = found
+        return True
+
+
+def _origin(baseline: Baseline) -> tuple[Any, ...]:
+    """Of the tare: what drift leaves as it is."""
+    return (baseline.taken_ns, baseline.taken_by, baseline.restored, baseline.frames, baseline.board, baseline.doubt)
 
 
 def provenance(baseline: Baseline, bundle: Bundle) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from models.bundle import Bundle
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
 from services.board.boardlink import Scanning
-from services.describe import describe
+from services.describe import BaselineNews, describe
+from services.estimation import checks
 from services.estimation.baseline import STEADY_S, BaselineEstimator, believed
 from services.estimation.contact_drift import Reference
 from services.estimation.electrodes import ElectrodeHealth, Verdict
@@ -28,6 +29,7 @@ from services.estimation.evidence import Explanation
 from services.estimation.gain_steps import GainSteps
 from services.estimation.plausibility import impossible
 from services.estimation.sentinel import Coarse, sentinel_of
+from services.estimation.status_bits import reasons_of
 from services.estimation.tare import Baseline
 from services.estimation.touch_decision import FrameAverager, TouchDecision, sigma_of_mean
 from services.estimation.touch_detector import Noise, TouchDetector, TouchVerdict
@@ -57,6 +59,8 @@ class Preprocessing(Stage):
         self.judge = TouchDetector(self.pre, skin)
         self.gain = GainSteps(len(bundle.pattern))
         self.hold = FrameAverager()
+        self._news = BaselineNews()
+        self._unchecked = checks.sentence(bundle)
         self._coarse: Coarse | None = None  # made with the first sentinel scan
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
         self.reset()
@@ -79,6 +83,8 @@ class Preprocessing(Stage):
         out = DeltaFrame(**inherited(frame))
         self._counters["frames"] += 1
         out.valid, out.reasons = as_sent(frame)  # measurements that failed are left out below
+        for reason in reasons_of(frame.status):
+            add_reason(out.reasons, reason)
         if frame.kind == "sentinel":
             return [self._sentinel(out, frame)]
         self._coarse_scan = 0
@@ -324,17 +330,17 @@ class Preprocessing(Stage):
             decision(nothing, False)
 
     def info(self) -> dict[str, Any] | None:
-        if not self.untouched.changed:
+        if not self._news(self.untouched.baseline, self.untouched.last_sample_ns):
             return None
-        self.untouched.changed = False
-        return describe(self.config, self.bundle, self.untouched.baseline)
+        return describe(self.config, self.bundle, self.untouched.baseline, self.untouched.revision)
 
     def health(self) -> Health:
         problem = self._foreign or self.untouched.problem
         if not problem and self.untouched.baseline is None:
             problem = self.untouched.progress()
         problems = [*([problem] if problem else []), *self.electrodes.problems()]
-        return Health("WARN" if problems else "OK", problems, dict(self._counters))
+        unchecked = [self._unchecked] if self._unchecked else []  # as the bundle is made: no warning
+        return Health("WARN" if problems else "OK", [*problems, *unchecked], dict(self._counters))
 
 
 def _unusable(out: DeltaFrame, reason: str, measurements: int) -> DeltaFrame:

@@ -85,11 +85,11 @@ class Recorder:
         return f"{lost}: the disk was full" if self.writer.lost else ""
 
     def _ask_states(self, frame: Frame) -> None:
-        """At the first frame of a skin, and when its baseline has changed."""
+        """At the first frame of a skin, and when it was tared; the state holds what drift does from there."""
         if frame.skin not in self._skins and len(self._skins) < MOST_SKINS:
             self._skins.add(frame.skin)
             self.states.ask(frame.skin)
-        if isinstance(frame, InfoFrame) and (found := frame.info.get("baseline_hash")):
+        if isinstance(frame, InfoFrame) and (found := frame.info.get("tare_sample_ns")) is not None:
             if self._baselines.setdefault(frame.skin, found) != found:
                 self._baselines[frame.skin] = found
                 self.states.ask(frame.skin)

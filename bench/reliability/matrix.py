@@ -91,8 +91,7 @@ def _rises(rng: np.random.Generator) -> dict[str, Any]:
     return {"electrode": int(rng.integers(16)), "times": float(1.15 * 9.0 ** rng.random())}
 
 
-# The board marks these measurements and says so in an event. No reason has that name yet; this is the one to be.
-FIFO = ("fifo", "out_of_distribution")
+FIFO = ("fifo",)
 ROWS = (
     Row("wrong_chip_id", BOARD, board=True),
     Row("brown_out", BOARD, ("multiplexer",), board=True),

@@ -20,6 +20,7 @@ from services.board.boardlink import BoardLink, Scanning
 from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
 from services.contacts.force import ForceLaw
+from services.estimation import checks
 from services.estimation.tare import implausibility
 from services.runtime.config import RECORDINGS, Config, ConfigError, Skin, config_path, load
 
@@ -78,6 +79,7 @@ def _skin(name: str, skin: Skin, config: Config, running: bool) -> Iterator[Find
         "with its network" if bundle.network_path(skin.network if skin.network != "none" else "full") else "no network"
     )
     yield Finding("OK", f"{name}: bundle", f"{bundle.name}, every sha256 right ({bundle.hash[:12]}), {network}")
+    yield Finding("OK", f"{name}: checks", checks.sentence(bundle) or "all of them, on every frame")
     if skin.calibration is not None:
         yield _calibration(name, skin, bundle)
     if Path(skin.port).suffix in RECORDINGS:

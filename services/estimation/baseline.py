@@ -16,8 +16,7 @@ from protocol.frames import RawFrame, as_sent
 from services.estimation.creep import Creep
 from services.estimation.drift import DriftProcess
 from services.estimation.drift_filter import DriftFilter
-from services.estimation.evidence import Explanation, TouchEvidence
-from services.estimation.physics import SkinPhysics
+from services.estimation.evidence import Explanation, TouchEvidence, evidence_of
 from services.estimation.references import References
 from services.estimation.start import Verdict, judge_start
 from services.estimation.tare import Baseline, noisy, plausible_noise, take
@@ -32,7 +31,6 @@ UNSURE = (
     "once"
 )
 PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare`"
-_evidence: dict[str, TouchEvidence] = {}  # by the bundle's hash
 RETRY_EVERY = 8  # frames between attempts at the first tare
 LONGEST_S = 1e9  # a saved time that is longer is none
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is saved again
@@ -53,6 +51,7 @@ class BaselineEstimator:
         self.pre = bundle.prereconstructor()
         self.follower = DriftFilter(self.pre, config)
         self.references = References(len(bundle.pattern))
+        self.revision = 0  # of the baseline: counts up whenever another one is used, or drift moves it
         self.baseline: Baseline | None
         self.normaliser: NDArray[np.floating]
         self.sigma: Array
@@ -64,7 +63,7 @@ class BaselineEstimator:
         self._run = 0  # untouched frames since the last touch
         self._seen = 0
         self._source = self._board = ""
-        self._last_sample_ns = 0
+        self.last_sample_ns = 0  # stamp `sample` of the newest frame that was believed
         self._restored_s = 0.0  # age of a baseline that an earlier process took, until the first frame
         self._unsaved = False
         self.problem = ""  # what stands in the way of valid frames, for a person
@@ -94,7 +93,7 @@ class BaselineEstimator:
             self._window.clear()
             return False
         self._seen += 1
-        self._last_sample_ns = frame.stamps.get("sample", 0)
+        self.last_sample_ns = frame.stamps.get("sample", 0)
         self._date()
         if frame.kind == "reference":
             self._window.append(amplitude)
@@ -106,7 +105,7 @@ class BaselineEstimator:
         self._window.append(amplitude)
         if self.baseline is None and len(self._window) == self.config.frames and self._seen % RETRY_EVERY == 0:
             try:
-                return self._begin(take(np.array(self._window), self.pre, frame.board, self._last_sample_ns))
+                return self._begin(take(np.array(self._window), self.pre, frame.board, self.last_sample_ns))
             except Refused as why:
                 self.problem = f"no baseline yet: {why}"
         return False
@@ -114,14 +113,7 @@ class BaselineEstimator:
     @property
     def evidence(self) -> TouchEvidence:
         """Made when it is first asked for, which takes a third of a second, and kept for all skins of the bundle."""
-        if self.bundle.hash not in _evidence:
-            skin, m = self.bundle.skin, self.bundle.matrices
-            series = None
-            if "contact_impedance" in skin:
-                series = np.asarray(skin["contact_impedance"], float) / np.asarray(skin["electrodes"]["width"], float)
-            half_width = float(self.bundle.manifest["image"].get("half_width", 1.0))
-            _evidence[self.bundle.hash] = TouchEvidence(SkinPhysics.of(m, half_width, series))
-        return _evidence[self.bundle.hash]
+        return evidence_of(self.bundle)
 
     def _begin(self, found: Baseline) -> bool:
         """Use the first baseline, unless something touches: whether there is one now."""
@@ -133,13 +125,13 @@ class BaselineEstimator:
         if start.verdict is Verdict.UNKNOWN and not found.doubt:
             found = dataclasses.replace(found, doubt=UNSURE)
         if not self.touched_at_start:
-            self.set_baseline(found, self._last_sample_ns)
+            self.set_baseline(found, self.last_sample_ns)
             return True
         if trusted is None or start.explanation is None or not start.explanation.fits:
             self.problem = PRESSED
             return False
-        self.set_baseline(dataclasses.replace(trusted, sigma=found.sigma), self._last_sample_ns)
-        self.drifted(start.explanation.drift, self._last_sample_ns)
+        self.set_baseline(dataclasses.replace(trusted, sigma=found.sigma), self.last_sample_ns)
+        self.drifted(start.explanation.drift, self.last_sample_ns)
         return True
 
     def explain(self, d: Array, live: NDArray[np.bool_], since_s: float, creep: Array | None = None) -> Explanation:
@@ -164,8 +156,7 @@ class BaselineEstimator:
             change = change + creep * drift[-1]
         z0 = (self.baseline.z0 + self.normaliser * change) / (1 - drift[0])
         z0 = np.where(self.baseline.z0 > 0, np.maximum(z0, 0.0), 0.0)
-        self.baseline = dataclasses.replace(self.baseline, z0=z0)
-        self.normaliser = self.pre.normaliser(z0)
+        self._move(z0)
         self.follower.begin(sample_ns, DRIFT_KNOWN_S)
         self._run = 0
 
@@ -185,31 +176,33 @@ class BaselineEstimator:
     def begin_touch(self) -> None:
         """The last frame offered was touched, the one before was not."""
         assert self.baseline is not None
-        self.follower.begin_touch(self.baseline.z0)
-        self.normaliser = self.pre.normaliser(self.baseline.z0)
+        z0 = self.baseline.z0.copy()
+        self.follower.begin_touch(z0)
+        self._move(z0)
         self._run = 0
 
     def rescale(self, factor: float) -> None:
         """All measurements are so many times what they were: the board's gain stepped."""
         assert self.baseline is not None
-        z0, sigma = self.baseline.z0 * factor, self.baseline.sigma * factor
-        self.baseline = dataclasses.replace(self.baseline, z0=z0, sigma=sigma)
-        self.normaliser = self.pre.normaliser(self.baseline.z0)
+        self.baseline = dataclasses.replace(self.baseline, sigma=self.baseline.sigma * factor)
+        self._move(self.baseline.z0 * factor)
         self.follower.rescale(factor)
         self._window = deque((row * factor for row in self._window), maxlen=self._window.maxlen)
 
     def touched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int) -> None:
         """The last frame offered was touched: drift is taken out as far as a held touch shows it."""
         assert self.baseline is not None
-        self.follower.holding(self.baseline.z0, amplitude, live, self.sigma, self.normaliser, sample_ns)
+        z0 = self.baseline.z0.copy()
+        if self.follower.holding(z0, amplitude, live, self.sigma, self.normaliser, sample_ns):
+            self._move(z0)
 
     def untouched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int, creep: Creep | None = None) -> None:
         """The last frame offered was not: slow drift is followed."""
         assert self.baseline is not None
         self._run += 1
-        z0 = self.baseline.z0
+        z0 = self.baseline.z0.copy()
         if self.follower.untouched(z0, amplitude, live, self.sigma, sample_ns, creep):
-            self.normaliser = self.pre.normaliser(z0)
+            self._move(z0)
         if self._run % SAVE_EVERY == 0:
             self._unsaved = True
 
@@ -233,18 +226,27 @@ class BaselineEstimator:
             raise Refused("the skin is touched: free it and try again (or --force, if nothing touches it)")
         if sure and self._run < needed and not force:
             raise Refused(f"only {self._run} of {needed} untouched frames since the last touch: wait and try again")
-        baseline = take(np.array(self._window), self.pre, self._board, self._last_sample_ns)
+        baseline = take(np.array(self._window), self.pre, self._board, self.last_sample_ns)
         # Whoever gives the command has looked: no doubt, but that of noise, which looking does not mend.
         doubt = noisy(baseline.z0, baseline.sigma, self.pre)
-        self.set_baseline(dataclasses.replace(baseline, doubt=doubt, taken_by="command"), self._last_sample_ns)
+        self.set_baseline(dataclasses.replace(baseline, doubt=doubt, taken_by="command"), self.last_sample_ns)
         return baseline
 
     def progress(self) -> str:
         return f"taking the baseline: {len(self._window)} of {self.config.frames} frames"
 
+    def _move(self, z0: Array) -> None:
+        """The same baseline, moved by what drifted."""
+        assert self.baseline is not None
+        self.baseline = dataclasses.replace(self.baseline, z0=z0)
+        self.normaliser = self.pre.normaliser(z0)
+        self.revision += 1
+        if not self.baseline.doubt:
+            self._trusted = self.baseline
+
     def _use(self, baseline: Baseline | None) -> None:
         self.baseline = baseline
-        self.changed = True  # since the last `info`
+        self.revision += 1
         if baseline is not None:
             self.baseline = dataclasses.replace(baseline, sigma=plausible_noise(baseline.z0, baseline.sigma))
             self.normaliser = self.pre.normaliser(baseline.z0)
@@ -257,7 +259,7 @@ class BaselineEstimator:
 
     def _refer(self, amplitude: Array, frame: RawFrame) -> bool:
         """An imported file says that this frame is untouched: it is the baseline until the next one."""
-        found = self.references.baseline(amplitude, frame.scan, frame.board, self._last_sample_ns)
+        found = self.references.baseline(amplitude, frame.scan, frame.board, self.last_sample_ns)
         if found is None:
             self._use(None)
             self.problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"
@@ -288,7 +290,7 @@ class BaselineEstimator:
             "window": np.array(self._window),
             "run": self._run,
             "seen": self._seen,
-            "last_sample_ns": self._last_sample_ns,
+            "last_sample_ns": self.last_sample_ns,
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -320,8 +322,8 @@ class BaselineEstimator:
             raise Refused(f"the saved frames are of shape {window.shape}, expected (n, {k}): tare again")
         self._window.extend(window if window.size else [])
         self._run, self._seen = int(state["run"]), int(state["seen"])
-        self._last_sample_ns = int(state["last_sample_ns"])
-        self.follower.begin(self._last_sample_ns)
+        self.last_sample_ns = int(state["last_sample_ns"])
+        self.follower.begin(self.last_sample_ns)
         if "follower" in state and state["bundle"] == self.bundle.hash:
             try:
                 self.follower.load(state["follower"])
@@ -333,8 +335,8 @@ class BaselineEstimator:
         if not self._unsaved or self.baseline is None or self._source == "replay":
             return None
         self._unsaved = False
-        taken_s = self._restored_s or max(0.0, (self._last_sample_ns - self.baseline.taken_ns) * 1e-9)
-        quiet_s = self.since_s(self._last_sample_ns)
+        taken_s = self._restored_s or max(0.0, (self.last_sample_ns - self.baseline.taken_ns) * 1e-9)
+        quiet_s = self.since_s(self.last_sample_ns)
         saved = {"bundle": self.bundle.hash, "baseline": self.baseline.to_dict()}
         return saved | {"taken_s": taken_s, "quiet_s": quiet_s}
 
@@ -363,7 +365,6 @@ class BaselineEstimator:
     def _date(self) -> None:
         """Stamps begin anew with a boot: with the first frame it is known when a restored baseline was taken."""
         if self._restored_s and self.baseline is not None:
-            taken_ns = self._last_sample_ns - round(self._restored_s * 1e9)
+            taken_ns = self.last_sample_ns - round(self._restored_s * 1e9)
             self.baseline = dataclasses.replace(self.baseline, taken_ns=taken_ns)
             self._restored_s = 0.0
-            self.changed = True

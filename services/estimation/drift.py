@@ -58,6 +58,15 @@ class DriftProcess:
         q = np.array([[value, cross], [cross, rate]]) * self.sd**2
         return np.asarray(q.transpose(2, 0, 1))
 
+    def walked(self, dt: float, density: Array) -> Array:
+        """What dt seconds add where the values also walk at random, by density (N,) 1/s: the integral over them of
+        Phi diag(density, 0) Phi^T.
+        """
+        x = 2 * dt / self.time_s
+        g0, g1, g2 = gammainc(1, x) / 2, gammainc(2, x) / 4, gammainc(3, x) / 4  # of u^n exp(-2 u), u up to dt / T
+        value, cross, rate = self.time_s * (g0 + 2 * g1 + g2), -(g1 + g2), g2 / self.time_s
+        return np.asarray((np.array([[value, cross], [cross, rate]]) * density).transpose(2, 0, 1))
+
     def stationary(self) -> Array:
         """P (N, 2, 2)."""
         p = np.zeros((len(self.sd), 2, 2))
@@ -98,7 +107,7 @@ class DriftFilter:
 
     def predict(self, dt: float) -> None:
         """Time goes on by dt seconds."""
-        phi, q = (_spread(v) for v in (self.process.transition(dt), self.process.noise(dt)))
+        phi, q = (spread(v) for v in (self.process.transition(dt), self.process.noise(dt)))
         self.mean = phi @ self.mean
         self.covariance = phi @ self.covariance @ phi.T + q
 
@@ -124,7 +133,7 @@ class DriftFilter:
         self.mean, self.covariance = mean, covariance
 
 
-def _spread(blocks: Array) -> Array:
+def spread(blocks: Array) -> Array:
     """(N, 2, 2) -> (2 N, 2 N), values first."""
     n = len(blocks)
     full = np.zeros((2, n, 2, n))

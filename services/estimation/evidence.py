@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.optimize import nnls
 
+from models.bundle import Bundle
 from services.estimation.physics import SkinPhysics
 from services.estimation.tuning import TUNING, Tuning
 
@@ -216,3 +217,17 @@ def _restricted(error: Array, columns: Array, prior: Array, live: NDArray[np.boo
         raise ValueError(f"only {int(live.sum())} of {len(live)} measurements count: nothing can be explained")
     b = columns[live]
     return np.asarray(error[np.ix_(live, live)] + b @ prior @ b.T)
+
+
+_made: dict[str, TouchEvidence] = {}  # by the bundle's hash
+
+
+def evidence_of(bundle: Bundle) -> TouchEvidence:
+    """Made when it is first asked for, which takes a third of a second, and kept for all skins of the bundle."""
+    if bundle.hash not in _made:
+        skin, series = bundle.skin, None
+        if "contact_impedance" in skin:
+            series = np.asarray(skin["contact_impedance"], float) / np.asarray(skin["electrodes"]["width"], float)
+        half_width = float(bundle.manifest["image"].get("half_width", 1.0))
+        _made[bundle.hash] = TouchEvidence(SkinPhysics.of(bundle.matrices, half_width, series))
+    return _made[bundle.hash]

@@ -42,6 +42,13 @@ class Baseline:
     restored: bool = False  # an earlier process took it
     noise_frames: int = 0  # how many frames sigma was found from; 0: those of the mean
 
+    def __post_init__(self) -> None:
+        """Whoever holds a baseline holds what its hash says: the arrays are its own, and nobody writes to them."""
+        for name in ("z0", "sigma"):
+            array = np.array(getattr(self, name), dtype=float)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
     @property
     def hash(self) -> str:
         return hashlib.sha256(self.z0.tobytes() + self.sigma.tobytes()).hexdigest()

@@ -24,6 +24,13 @@ def test_the_service_being_down_is_no_failure(skin) -> None:  # type: ignore[no-
     assert ran.code == 0 and "no service runs" in ran.out and "every sha256 right" in ran.out
 
 
+def test_what_the_bundle_cannot_tell_is_said(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    assert "checks all of them" in " ".join(skin("doctor").out.split())
+    file = tmp_path / "disc.toml"
+    file.write_text('[skins.palm]\nport = "stub"\nbundle = "disc16"\n')
+    assert "not checked with the bundle disc16: shorts" in " ".join(skin("doctor", "--config", file).out.split())
+
+
 def test_electrodes_in_order(bundle: Bundle) -> None:
     noise = 1 + 1e-4 * np.random.default_rng(0).standard_normal(120)
     assert electrode_order("palm", 3.0 * bundle.z0 * noise, bundle).level == "OK"

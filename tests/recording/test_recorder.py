@@ -82,7 +82,9 @@ def test_messages_are_recorded_byte_for_byte(runtime: Path, tmp_path: Path) -> N
 
 
 def test_the_stages_state_is_recorded_and_again_after_a_tare(stages: dict[str, int], tmp_path: Path) -> None:
-    infos = [InfoFrame(skin="palm", info={"baseline_hash": text}) for text in ("one", "one", "two")]
+    """Not where the baseline only drifted: all stages would be asked every few seconds."""
+    told = [("one", 1), ("drifted", 1), ("two", 2)]
+    infos = [InfoFrame(skin="palm", info={"baseline_hash": text, "tare_sample_ns": at}) for text, at in told]
     record(tmp_path / "a.mcap", infos, "preprocessing", topics=["info"])
     states = [msgpack.unpackb(m.data) for m in RecordingReader(tmp_path / "a.mcap").messages({"state"})]
     assert [state["preprocessing"]["time"] for state in states] == [1, 2]

@@ -283,3 +283,47 @@ def test_a_restored_baseline_is_as_old_as_it_is(stage: Preprocessing, skin: Skin
         "bundle_hash": bundle.hash,
         "doubt": "",
     }
+
+
+def test_how_far_drift_may_have_gone_does_not_depend_on_how_time_is_cut(skin: Skin, bundle: Bundle) -> None:
+    """After a long gap as after the same time in pieces: 256 s at once gave 5.1 %, in half seconds 0.23 %."""
+    whole, pieces = (DriftFilter(bundle.prereconstructor(), skin.tare) for _ in range(2))
+    expected, variance = whole.predicted(256.0)
+    for _ in range(512):
+        pieces.mean, pieces.covariance = pieces.predicted(0.5)
+    assert pieces.mean == pytest.approx(expected)
+    assert np.allclose(pieces.covariance, variance, rtol=1e-8, atol=1e-16)
+    assert 0.01 < variance[0, 0] ** 0.5 < 0.06  # of the sheet: no more than it ever drifts
+
+
+def test_a_drift_that_was_seen_is_expected_to_go_on(skin: Skin, bundle: Bundle) -> None:
+    """A minute of steady drift, then a minute without frames: what is expected is nearer than that nothing changed."""
+    filter_, k = DriftFilter(bundle.prereconstructor(), skin.tare), len(bundle.pattern)
+    rng, truth, live = np.random.default_rng(0), np.asarray(bundle.z0, float), np.ones(k, bool)
+    z0, sigma, per_s = truth.copy(), np.full(k, 1e-4), 1e-4
+    filter_.begin(FRAME_NS)
+    for n in range(2, 1300):
+        z = truth * (1 + per_s * n * FRAME_NS * 1e-9) * (1 + 1e-4 * rng.standard_normal(k))
+        filter_.untouched(z0, z, live, sigma, n * FRAME_NS)
+    change = filter_.predicted(60.0)[0] - filter_.mean
+    assert change[0] == pytest.approx(60 * per_s, rel=0.5)
+
+
+def test_the_filter_goes_on_from_its_state(skin: Skin, bundle: Bundle) -> None:
+    filters, k = [DriftFilter(bundle.prereconstructor(), skin.tare) for _ in range(2)], len(bundle.pattern)
+    rng, truth, live = np.random.default_rng(0), np.asarray(bundle.z0, float), np.ones(k, bool)
+    z0s = [truth.copy(), truth.copy()]
+    filters[0].begin(FRAME_NS)
+    for n in range(2, 200):
+        z = truth * (1 + 1e-5 * n) * (1 + 1e-4 * rng.standard_normal(k))
+        filters[0].untouched(z0s[0], z, live, np.full(k, 1e-4), n * FRAME_NS)
+        if n == 100:
+            filters[1].load(filters[0].state())
+            z0s[1] = z0s[0].copy()
+        if n > 100:
+            filters[1].untouched(z0s[1], z, live, np.full(k, 1e-4), n * FRAME_NS)
+    assert np.array_equal(*z0s) and filters[0].mean[17]  # the sheet's rate
+    old = {key: value for key, value in filters[0].state().items() if key != "mean"}
+    filters[1].begin(0)
+    filters[1].load(old)
+    assert filters[1].since_s(300 * FRAME_NS) == filters[0].since_s(300 * FRAME_NS)

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from protocol.frames import STATUS_OPEN, DeltaFrame, RawFrame, pack, unpack
-from services.estimation.tare import disagreement, take
+from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA, DeltaFrame, RawFrame, pack, unpack
+from services.board.boardlink import Scanning
+from services.describe import EVERY_S, MOVED
+from services.estimation import checks
+from services.estimation.sentinel import sentinel_of
+from services.estimation.tare import Baseline, disagreement, take
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
 from services.runtime.stage import Refused
-from tests.services.conftest import Board
+from tests.services.conftest import FRAME_NS, Board
 
 WANTED = frozenset({"delta"})
 
@@ -450,3 +456,109 @@ def test_take_refuses_noise_and_missing_measurements(bundle: Bundle) -> None:
     half = np.where(np.arange(120) < 70, np.nan, bundle.z0 * np.ones((64, 120)))
     with pytest.raises(Refused, match="measurements give values"):
         take(half, pre, "", 0)
+
+
+def test_info_says_what_frames_are_compared_with(stage: Preprocessing, board: Board) -> None:
+    """Its hash is that of its arrays, drift is told as it is followed, and nothing that was told changes."""
+    tared(stage, board)
+    first = stage.info()
+    assert first is not None
+    told, copies, per_scan = [first], [first["baseline"].copy()], 2e-5
+    for n in range(1, 600):
+        run(stage, board.frame(per_scan * n))
+        if (info := stage.info()) is not None:
+            told.append(info)
+            copies.append(info["baseline"].copy())
+        off = np.abs(stage.untouched.baseline.z0 / told[-1]["baseline"] - 1)  # type: ignore[union-attr]
+        assert np.median(off) < 1.5 * per_scan * EVERY_S * 1e9 / FRAME_NS + MOVED
+    seconds = 600 * FRAME_NS * 1e-9
+    assert seconds / EVERY_S / 2 <= len(told) <= 1 + seconds / EVERY_S
+    for info, copy in zip(told, copies, strict=True):
+        assert np.array_equal(info["baseline"], copy)
+        expected = hashlib.sha256(info["baseline"].tobytes() + info["baseline_sigma"].tobytes()).hexdigest()
+        assert info["baseline_hash"] == expected
+    revisions = [info["baseline_revision"] for info in told]
+    assert revisions == sorted(set(revisions)) and len({info["baseline_hash"] for info in told}) == len(told)
+    assert len({info["tare_sample_ns"] for info in told}) == 1
+
+
+def test_a_tare_is_told_at_once_and_a_still_baseline_once(stage: Preprocessing, board: Board) -> None:
+    tared(stage, board)
+    infos = [stage.info()]
+    for _ in range(300):
+        run(stage, board.frame())
+        infos.append(stage.info())
+    assert infos[0] is not None and not any(infos[1:])
+    stage.command("tare", {})
+    again = stage.info()
+    assert again is not None and again["baseline_hash"] != infos[0]["baseline_hash"]
+    assert again["baseline_revision"] > infos[0]["baseline_revision"] and stage.info() is None
+
+
+def test_a_baseline_is_its_own(bundle: Bundle) -> None:
+    """Neither who made it nor who was given it changes it: its hash stays true."""
+    z0 = np.asarray(bundle.z0, dtype=float).copy()
+    baseline = Baseline(z0, 1e-4 * z0, 64, "b1", 0)
+    before = baseline.hash
+    z0 *= 2
+    assert baseline.hash == before
+    with pytest.raises(ValueError, match="read-only"):
+        baseline.z0[0] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("bit", "reason"), [(STATUS_CLIPPED, "saturated"), (STATUS_RTIA, "saturated"), (STATUS_FIFO, "fifo")]
+)
+def test_a_measurement_that_the_board_doubts_is_left_out_by_name(
+    stage: Preprocessing, board: Board, bit: int, reason: str
+) -> None:
+    tared(stage, board)
+    frame = board.frame()
+    frame.status[[7, 30]] = bit
+    frame.z[30] *= 1.5  # a number, but another measurement's
+    out = run(stage, frame)
+    assert out.valid and not out.touched and out.reasons == [reason]
+    assert np.flatnonzero(~np.isfinite(out.sigma)).tolist() == [7, 30]
+    frame = board.frame()
+    frame.status[:] = bit
+    out = run(stage, frame)
+    assert not out.valid and reason in out.reasons
+
+
+def test_what_a_bundle_cannot_tell_is_said_and_is_no_warning(skin: Skin, bundle: Bundle) -> None:
+    assert checks.sentence(bundle) == ""
+    found = Bundle.load("disc16")
+    measured = Preprocessing("disc", skin.model_copy(update={"bundle": "disc16"}), found)
+    measured.set_baseline(Baseline(found.z0, 1e-4 * found.z0, 64, "b1", 0))
+    assert measured.health().level == "OK"
+    (message,) = measured.health().messages
+    assert message.startswith("not checked with the bundle disc16")
+    assert all(check in message for check in ("shorts", "exchanged wires", "contacts that change", "no touch can make"))
+
+
+def test_what_a_bundle_cannot_tell_follows_from_its_pattern(bundle: Bundle) -> None:
+    """Not from its name: a model of some pairs only, and one whose impedances were measured."""
+    assert not checks.skipped(bundle)
+
+    def like(rows: slice, normalisation: str) -> dict[str, str]:
+        matrices = SimpleNamespace(normalisation=normalisation)
+        return checks.skipped(SimpleNamespace(pattern=bundle.pattern[rows], matrices=matrices))  # type: ignore[arg-type]
+
+    assert list(like(slice(0, None, 2), "model")) == ["exchanged wires and stuck multiplexers"]
+    assert list(like(slice(None), "measured")) == [
+        "exchanged wires and stuck multiplexers",
+        "contacts that change",
+        "changes that no touch can make",
+    ]
+
+
+def test_a_short_scan_that_the_board_doubts_is_not_valid(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
+    tared(stage, board)
+    rows = sentinel_of(bundle).rows
+    short = Scanning(bundle.pattern[rows], stage.config.dft_points, stage.config.rtia_ohm).config
+    for bit, reasons in ((0, ["coarse"]), (STATUS_FIFO, ["fifo", "coarse"])):
+        frame = board.frame()
+        frame.z, frame.status = frame.z[rows], np.zeros(len(rows), np.uint8)
+        frame.status[0], frame.kind, frame.config = bit, "sentinel", short
+        out = run(stage, frame)
+        assert out.valid == (not bit) and out.reasons == reasons
