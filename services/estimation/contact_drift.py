@@ -113,8 +113,7 @@ class ContactDrift:
         k = int(strength.argmax())
         if strength[k] < 2 * np.partition(strength, -2)[-2]:
             return None  # the next electrode shares one pair only
-        count = int(live.sum())
-        expected = count * noise**2 * (1 + 4 * np.sqrt(2 / count)) + (MODEL_ERROR * size) ** 2
+        expected = _most_noise(sigma[live]) + (MODEL_ERROR * size) ** 2
         sure = size >= TELLING * noise
         if self._left_by_rise(k, d, live) <= expected or (sure and self._rises_within(k, d, live, expected)):
             return Changed(k, sure)
@@ -147,16 +146,25 @@ class ContactDrift:
         left = d[live] - columns @ found
         return found, float(left @ left)
 
-    def felt_by_others(self, k: int, d: Array, live: NDArray[np.bool_]) -> Array | None:
+    def felt_by_others(self, k: int, d: Array, sigma: Array, live: NDArray[np.bool_]) -> Array | None:
         """(K,) what the change at electrode k does to the pairs that do not use it; None while something else changes
         too.
         """
-        if not self.knows:
+        if not self.knows or not live.any():
             return None
+        energy = float(d[live] @ d[live])
+        noise = _most_noise(sigma[live])
+        if energy <= noise:
+            return np.zeros(len(d))
         (_, b, _), left = self._fit(k, d, live)
-        if not left <= UNTOUCHED**2 * float(d[live] @ d[live]):  # NaN says nothing
+        if not left <= UNTOUCHED**2 * energy + noise:  # NaN says nothing
             return None
         return np.where(self.members[k], 0.0, b * self._n[k])
+
+
+def _most_noise(sigma: Array) -> float:
+    """Energy that noise alone may come to."""
+    return float(sigma @ sigma) * (1 + 4 * float(np.sqrt(2 / len(sigma))))
 
 
 class ChangedContacts:
@@ -199,6 +207,9 @@ class ChangedContacts:
 
     def keep(self, drifting: Sequence[int]) -> None:
         """Forget the others."""
+        for k in drifting:  # what was wrong at once may have begun under a touch too
+            if k not in self._before and len(self._past) == LOOK_BACK:
+                self._before[k] = self._past[0]
         self.felt = {k: felt for k, felt in self.felt.items() if k in drifting}
         self._before = {k: before for k, before in self._before.items() if k in drifting}
 
@@ -208,7 +219,8 @@ class ChangedContacts:
             for since in (untouched.z0, self._before.get(k)):
                 if since is not None:
                     both = live & np.isfinite(since)
-                    felt = self._drift.felt_by_others(k, _difference(amplitude, since, untouched, both), both)
+                    d = _difference(amplitude, since, untouched, both)
+                    felt = self._drift.felt_by_others(k, d, untouched.sigma, both)
                     if felt is not None:
                         self.felt[k] = felt
                         break
