@@ -40,6 +40,7 @@ SUSPECT = 60.0  # from which one elsewhere would
 UNTOUCHED = 0.03  # of |d|, what a changed contact leaves of it where nothing else changed
 LEAST_RISE = 0.03  # of the nominal contact impedance
 LOOK_BACK = 3  # frames over which a contact that rises under a touch is told from it
+LOOK_FAR_BACK = 24  # the same, where it rises slowly
 RISES_WITHIN = 0.5  # the same, where it rises within a scan
 STEEPEST = 1.2  # of a: it rises from nothing within a scan, at most
 FALL = 0.004  # relative: a pair that fell by more, and by 6 sigma
@@ -101,27 +102,33 @@ class ContactDrift:
             return k
         return None
 
-    def risen(self, d: Array, sigma: Array, live: NDArray[np.bool_]) -> Changed | None:
-        """The electrode whose contact rose, where that is all that d (K,) shows."""
+    def risen(
+        self, d: Array, sigma: Array, live: NDArray[np.bool_], aside: Array | None = None
+    ) -> Changed | None:
+        """The electrode whose contact rose, where that is all that d (K,) shows beside directions `aside` (K, n),
+        which are orthonormal.
+        """
         if not self._tells(live):
             return None
         noise = float(np.sqrt(np.mean(sigma[live] ** 2)))
-        size = float(np.linalg.norm(d[live]))
+        size = float(np.linalg.norm(_without(aside, d)[live]))
         if size < SUSPECT * noise:
             return None
-        strength = self.members @ np.where(live, d, 0.0)
+        strength = self.members @ np.where(live, _without(aside, d), 0.0)
         k = int(strength.argmax())
         if strength[k] < 2 * np.partition(strength, -2)[-2]:
             return None  # the next electrode shares one pair only
         expected = _most_noise(sigma[live]) + (MODEL_ERROR * size) ** 2
         sure = size >= TELLING * noise
-        if self._left_by_rise(k, d, live) <= expected or (sure and self._rises_within(k, d, live, expected)):
+        if self._left_by_rise(k, d, live, aside) <= expected:
             return Changed(k, sure)
-        return None
+        within = sure and aside is None and self._rises_within(k, d, live, expected)
+        return Changed(k, True) if within else None
 
-    def _left_by_rise(self, k: int, d: Array, live: NDArray[np.bool_]) -> float:
+    def _left_by_rise(self, k: int, d: Array, live: NDArray[np.bool_], aside: Array | None) -> float:
         """The energy that a rise of electrode k's contact leaves of d; infinite where it is no rise."""
-        (a, b, s), left = self._fit(k, d, live)
+        beside = [] if aside is None else list(aside.T)
+        (a, b, *_), left = self._fit(k, d, live, beside)
         if a < LEAST_RISE:
             return np.inf
         short = a / (1 + a / SHORT_WAY)
@@ -129,7 +136,7 @@ class ContactDrift:
         if most == b:
             return left
         rest = d[live] - most * self._n[k][live]
-        columns = np.column_stack([self._u[k], np.ones(len(d))])[live]
+        columns = np.column_stack([self._u[k], np.ones(len(d)), *beside])[live]
         found, *_ = np.linalg.lstsq(columns, rest, rcond=None)
         rest = rest - columns @ found
         return float(rest @ rest)
@@ -162,6 +169,10 @@ class ContactDrift:
         return np.where(self.members[k], 0.0, b * self._n[k])
 
 
+def _without(aside: Array | None, d: Array) -> Array:
+    return d if aside is None else np.asarray(d - aside @ (aside.T @ d))
+
+
 def _most_noise(sigma: Array) -> float:
     """Energy that noise alone may come to."""
     return float(sigma @ sigma) * (1 + 4 * float(np.sqrt(2 / len(sigma))))
@@ -177,7 +188,7 @@ class ChangedContacts:
     def reset(self) -> None:
         self.felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
         self._before: dict[int, Array] = {}  # by contact that rose under a touch: |Z| (K,) from before
-        self._past: deque[Array] = deque(maxlen=LOOK_BACK)  # |Z| (K,) of the frames before, the newest last
+        self._past: deque[Array] = deque(maxlen=LOOK_FAR_BACK)  # |Z| (K,) of the frames before, the newest last
 
     def follow(self, amplitude: Array) -> None:
         """A frame's |Z| (K,); to be called after each."""
@@ -186,30 +197,54 @@ class ChangedContacts:
     def rescale(self, factor: float) -> None:
         """All |Z| so far, times this factor."""
         self._before = {k: row * factor for k, row in self._before.items()}
-        self._past = deque((row * factor for row in self._past), maxlen=LOOK_BACK)
+        self._past = deque((row * factor for row in self._past), maxlen=LOOK_FAR_BACK)
 
     def changed(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
         """The electrode whose contact this frame shows to have changed."""
         found = self._drift(_difference(amplitude, untouched.z0, untouched, live), untouched.sigma, live)
         if found is not None or len(self._past) < LOOK_BACK:
             return found
-        past = self._past[0]
-        live = live & np.isfinite(past)
         # Under a touch that stays, what changed is the contact's.
-        found = self._drift.risen(_difference(amplitude, past, untouched, live), np.sqrt(2.0) * untouched.sigma, live)
-        if found is not None:
-            self._before.setdefault(found.electrode, past)
-        return found
+        sigma = np.sqrt(2.0) * untouched.sigma
+        for past in (self._past[-LOOK_BACK], self._past[0]):
+            both = live & np.isfinite(past)
+            found = self._drift.risen(_difference(amplitude, past, untouched, both), sigma, both)
+            if found is not None:
+                self._before.setdefault(found.electrode, past)
+                return found
+        return self._changed_under_motion(amplitude, untouched, live)
+
+    def _changed_under_motion(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
+        """The same under a touch that moves: steadily, so the frames before say which change is its own."""
+        back = 2 * LOOK_BACK
+        if len(self._past) < 2 * back + LOOK_BACK:
+            return None
+        now, middle, first = (self._past[-LOOK_BACK - k * back] for k in range(3))
+        live = live & np.isfinite(now) & np.isfinite(middle) & np.isfinite(first)
+        velocity = _difference(now, middle, untouched, live)
+        bend = velocity - _difference(middle, first, untouched, live)
+        aside, _ = np.linalg.qr(np.column_stack([velocity, bend]))
+        d = _difference(amplitude, now, untouched, live)
+        found = self._drift.risen(d, np.sqrt(2.0) * untouched.sigma, live, aside)
+        if found is None:
+            return None
+        self._before.setdefault(found.electrode, now)
+        return found._replace(sure=False)
 
     def before(self, k: int) -> Array | None:
         """|Z| (K,) of the touch under which the contact of electrode k rose."""
         return self._before.get(k)
 
+    def forget(self, k: int) -> None:
+        """The contact of electrode k is what it was."""
+        self.felt.pop(k, None)
+        self._before.pop(k, None)
+
     def keep(self, drifting: Sequence[int]) -> None:
         """Forget the others."""
         for k in drifting:  # what was wrong at once may have begun under a touch too
-            if k not in self._before and len(self._past) == LOOK_BACK:
-                self._before[k] = self._past[0]
+            if k not in self._before and len(self._past) >= LOOK_BACK:
+                self._before[k] = self._past[-LOOK_BACK]
         self.felt = {k: felt for k, felt in self.felt.items() if k in drifting}
         self._before = {k: before for k, before in self._before.items() if k in drifting}
 

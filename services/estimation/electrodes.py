@@ -292,6 +292,7 @@ class ElectrodeHealth:
             self._well[k] = self._well[k] + 1 if self._is_well(int(k), seen.amplitude, seen.failed, untouched) else 0
             if self._well[k] >= WELL_FRAMES:
                 self._states[k], self._unsure[k] = OK, False
+                self._contacts.forget(int(k))
 
     def _is_well(self, k: int, amplitude: Array, failed: Mask, untouched: Reference | None) -> bool:
         """An open wire or a short is seen directly; the others must measure what they did before, untouched."""
