@@ -36,6 +36,7 @@ MODEL_ERROR = 1.5e-3  # of |d|: what a contact's change may be off the formula
 SHORT_WAY = 4.7  # times the nominal contact impedance: what the current's short way through an electrode comes to
 OTHER_BEFORE = 1.25  # b may be so many times what follows of a, and its inverse
 TELLING = 800.0  # |d| over the noise of one measurement from which a touch on an electrode would show
+LIKELY = 300.0  # from which 1 % of touches within 1 mm of an electrode would not show
 SUSPECT = 60.0  # from which one elsewhere would
 UNTOUCHED = 0.03  # of |d|, what a changed contact leaves of it where nothing else changed
 LEAST_RISE = 0.03  # of the nominal contact impedance
@@ -52,6 +53,7 @@ FEW_OF = 0.05  # share of the other pairs that may have
 class Changed(NamedTuple):
     electrode: int
     sure: bool  # whether it is no touch on this electrode
+    likely: bool = True  # whether few touches on this electrode look so: sure where it lasts
 
 
 @dataclass(frozen=True)
@@ -102,9 +104,7 @@ class ContactDrift:
             return k
         return None
 
-    def risen(
-        self, d: Array, sigma: Array, live: NDArray[np.bool_], aside: Array | None = None
-    ) -> Changed | None:
+    def risen(self, d: Array, sigma: Array, live: NDArray[np.bool_], aside: Array | None = None) -> Changed | None:
         """The electrode whose contact rose, where that is all that d (K,) shows beside directions `aside` (K, n),
         which are orthonormal.
         """
@@ -121,7 +121,7 @@ class ContactDrift:
         expected = _most_noise(sigma[live]) + (MODEL_ERROR * size) ** 2
         sure = size >= TELLING * noise
         if self._left_by_rise(k, d, live, aside) <= expected:
-            return Changed(k, sure)
+            return Changed(k, sure, size >= LIKELY * noise)
         within = sure and aside is None and self._rises_within(k, d, live, expected)
         return Changed(k, True) if within else None
 
@@ -206,7 +206,7 @@ class ChangedContacts:
             return found
         # Under a touch that stays, what changed is the contact's.
         sigma = np.sqrt(2.0) * untouched.sigma
-        for past in (self._past[-LOOK_BACK], self._past[0]):
+        for past in (*self._before.values(), self._past[-LOOK_BACK], self._past[0]):
             both = live & np.isfinite(past)
             found = self._drift.risen(_difference(amplitude, past, untouched, both), sigma, both)
             if found is not None:

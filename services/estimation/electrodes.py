@@ -43,6 +43,7 @@ NOTHING_ANSWERS = 0.7  # fraction of all measurements that failed where it is no
 TOO_MANY = 2  # electrodes at fault with which contacts can still be given
 WELL_FRAMES = 3  # in a row, after which an electrode counts again
 UNDONE = 3.0  # of the untouched |Z|, beyond which a measurement that clips is of an electrode off the skin
+LASTING = 23  # frames in a row after which it is, where few touches look so
 SUSPECTED = 3  # frames in a row after which a change that may be a touch on the electrode is the contact's
 WELL = 0.0015  # relative: how near its baseline a measurement of a well electrode is, and within 6 sigma more
 FALLS = 0.03  # relative fall that no touch, warmth or noise makes: the wiring is looked at
@@ -73,6 +74,7 @@ class _Look:
     failed: Mask  # (K,)
     order: NDArray[np.intp] | None = None
     fault: str = ""  # of the board as a whole
+    likely: bool = False  # that few touches look so
     suspect: int | None = None  # an electrode whose contact changed, if nobody presses right on it
 
 
@@ -170,7 +172,9 @@ class ElectrodeHealth:
 
     def _nothing_wrong(self, seen: _Look, status: NDArray[np.uint8], untouched: Reference) -> bool:
         """Most touched frames: what follows would find that all is well too, at twice the work."""
-        quiet = seen.suspect is None and not (seen.states.any() or status.any() or seen.failed.any() or self._states.any())
+        quiet = seen.suspect is None and not (
+            seen.states.any() or status.any() or seen.failed.any() or self._states.any()
+        )
         return quiet and not self._contacts.felt and bool(np.isfinite(untouched.sigma).all())
 
     def problems(self) -> list[str]:
@@ -227,14 +231,14 @@ class ElectrodeHealth:
         states[shorted] = SHORT
         self._open(seen.failed & (low | no_current), seen.failed, states)
         if untouched is not None and not np.isin(states, (SHORT, OPEN)).any():
-            well = (self._states == OK) | ((self._states == SWAPPED) & (states == SWAPPED))
+            well = (self._states == OK) | self._unsure | ((self._states == SWAPPED) & (states == SWAPPED))
             live = ~seen.failed & np.isfinite(untouched.sigma) & ~self.member[~well].any(axis=0)
             changed = self._contacts.changed(seen.amplitude, untouched, live)
             if changed is not None and states[changed.electrode] == OK:
                 if changed.sure:
                     states[changed.electrode] = DRIFTING
                 else:
-                    seen.suspect = changed.electrode
+                    seen.suspect, seen.likely = changed.electrode, changed.likely
         return seen
 
     def _short(self, low: Mask) -> list[int]:
@@ -286,7 +290,9 @@ class ElectrodeHealth:
         self._suspected = np.where(again, self._suspected + 1, 0)
         lasts = (self._suspected >= SUSPECTED) & (self._states == OK)
         self._states[lasts], self._unsure[lasts] = DRIFTING, True
-        self._suspected[self._states != OK] = 0
+        self._suspected[(self._states != OK) & ~self._unsure] = 0
+        if seen.likely:
+            self._unsure &= self._suspected < LASTING
         ailing = (self._states != OK) & ~faulty & ~lasts
         for k in np.flatnonzero(ailing):
             self._well[k] = self._well[k] + 1 if self._is_well(int(k), seen.amplitude, seen.failed, untouched) else 0
