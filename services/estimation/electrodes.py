@@ -112,6 +112,7 @@ class ElectrodeHealth:
         """There is a new baseline: what changed against the old one is forgotten."""
         self._states[(self._states == DRIFTING) | (self._states == UNKNOWN)] = OK
         self._unsure[:], self._suspected[:] = False, 0
+        self._contacts.keep(())
 
     def rescale(self, factor: float) -> None:
         """The board's gain stepped by this factor."""
@@ -172,9 +173,8 @@ class ElectrodeHealth:
 
     def _nothing_wrong(self, seen: _Look, status: NDArray[np.uint8], untouched: Reference) -> bool:
         """Most touched frames: what follows would find that all is well too, at twice the work."""
-        quiet = seen.suspect is None and not (
-            seen.states.any() or status.any() or seen.failed.any() or self._states.any()
-        )
+        wrong = seen.states.any() or status.any() or seen.failed.any() or self._states.any() or self._suspected.any()
+        quiet = seen.suspect is None and not wrong
         return quiet and not self._contacts.felt and bool(np.isfinite(untouched.sigma).all())
 
     def problems(self) -> list[str]:
