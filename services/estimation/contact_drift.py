@@ -5,12 +5,16 @@ other pairs too), so the difference of a frame is
 
     d = u a + n b + s        u: the series resistance, n: the rest of the contact's Jacobian, s: global scale
 
-with 0 <= b <= a for a contact that rises: the current between neighbours that takes the short way through the
-electrode, of which n comes, dies out as the contact does. Contacts that rise to 30 times fit within 0.07 % of d. While
-one rises, each measurement of a scan finds it a little higher: a and b are lines along the scan. The best of 2000
-touches on electrodes (radii 0.05 to 0.5, drops to 0.85 S/m) leaves 0.5 %, the best of 20 000 anywhere 10 %. So a rise
-is named where it is large enough against the noise to show that difference. Under a touch that stays as it is, the
-change since a few frames ago is the contact's alone. A fall is named at once: no touch lowers an impedance.
+with a the relative change of the contact impedance. The current between neighbours that takes the short way through
+the electrode, of which n comes, dies out as the contact does: b = a / (1 + a / SHORT_WAY), within 0.1 % of d from 1.05
+to 100 times; less or more by up to a quarter where the contact was not the nominal one before. While one rises, each
+measurement of a scan finds it a little higher: a and b are lines along the scan.
+
+Of 120 touches within 1 mm of an electrode (radii 0.05 to 0.5, drops to 0.85 S/m) the most alike is off this line by
+1.4 % of its d, of 120 anywhere within 40 mm of the centre by 37 %. So there are two answers: from SUSPECT on a change
+is a contact's unless somebody presses right on the electrode (`sure` is False: nothing is valid), from TELLING on it is
+a contact's. Under a touch that stays as it is, the change since a few frames ago is the contact's alone. A fall is
+named at once: no touch lowers an impedance.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,15 +33,27 @@ from services.runtime.persistence import shaped
 Array = NDArray[np.floating]
 
 MODEL_ERROR = 1.5e-3  # of |d|: what a contact's change may be off the formula
-TELLING = 1500.0  # |d| over the noise of one measurement from which a touch on an electrode would show
+SHORT_WAY = 4.7  # times the nominal contact impedance: what the current's short way through an electrode comes to
+OTHER_BEFORE = 1.25  # b may be so many times what follows of a, and its inverse
+TELLING = 800.0  # |d| over the noise of one measurement from which a touch on an electrode would show
+LIKELY = 300.0  # from which 1 % of touches within 1 mm of an electrode would not show
+SUSPECT = 60.0  # from which one elsewhere would
 UNTOUCHED = 0.03  # of |d|, what a changed contact leaves of it where nothing else changed
-LEAST_RISE = 0.5  # of the nominal contact impedance
+LEAST_RISE = 0.03  # of the nominal contact impedance
 LOOK_BACK = 3  # frames over which a contact that rises under a touch is told from it
+LOOK_FAR_BACK = 24  # the same, where it rises slowly
+RISES_WITHIN = 0.5  # the same, where it rises within a scan
 STEEPEST = 1.2  # of a: it rises from nothing within a scan, at most
 FALL = 0.004  # relative: a pair that fell by more, and by 6 sigma
 SIGMAS = 6.0
 MOST_OF = 0.6  # share of the electrode's pairs that fell (a touch may have raised the others)
 FEW_OF = 0.05  # share of the other pairs that may have
+
+
+class Changed(NamedTuple):
+    electrode: int
+    sure: bool  # whether it is no touch on this electrode
+    likely: bool = True  # whether few touches on this electrode look so: sure where it lasts
 
 
 @dataclass(frozen=True)
@@ -67,13 +83,14 @@ class ContactDrift:
         self._n = np.asarray(m.contact, dtype=float).T - self._u
         self._time = np.linspace(-1.0, 1.0, len(m.z0))  # the scan goes through the pattern in its order
 
-    def __call__(self, d: Array, sigma: Array, live: NDArray[np.bool_]) -> int | None:
+    def __call__(self, d: Array, sigma: Array, live: NDArray[np.bool_]) -> Changed | None:
         """The electrode, 0-based, whose contact changed, or None. d, sigma (K,); live: measurements that count."""
         if not self._tells(live):
             return None
         fell = live & (d < -np.maximum(FALL, SIGMAS * np.where(live, sigma, 0.0)))
         if fell.any():
-            return self._fallen(fell, live)
+            fallen = self._fallen(fell, live)
+            return None if fallen is None else Changed(fallen, True)
         return self.risen(d, sigma, live)
 
     def _tells(self, live: NDArray[np.bool_]) -> bool:
@@ -87,24 +104,47 @@ class ContactDrift:
             return k
         return None
 
-    def risen(self, d: Array, sigma: Array, live: NDArray[np.bool_]) -> int | None:
-        """The electrode whose contact rose, where that is all that d (K,) shows."""
+    def risen(self, d: Array, sigma: Array, live: NDArray[np.bool_], aside: Array | None = None) -> Changed | None:
+        """The electrode whose contact rose, where that is all that d (K,) shows beside directions `aside` (K, n),
+        which are orthonormal.
+        """
         if not self._tells(live):
             return None
         noise = float(np.sqrt(np.mean(sigma[live] ** 2)))
-        size = float(np.linalg.norm(d[live]))
-        if size < TELLING * noise:
+        size = float(np.linalg.norm(_without(aside, d)[live]))
+        if size < SUSPECT * noise:
             return None
-        strength = self.members @ np.where(live, d, 0.0)
+        strength = self.members @ np.where(live, _without(aside, d), 0.0)
         k = int(strength.argmax())
         if strength[k] < 2 * np.partition(strength, -2)[-2]:
             return None  # the next electrode shares one pair only
+        expected = _most_noise(sigma[live]) + (MODEL_ERROR * size) ** 2
+        sure = size >= TELLING * noise
+        if self._left_by_rise(k, d, live, aside) <= expected:
+            return Changed(k, sure, size >= LIKELY * noise)
+        within = sure and aside is None and self._rises_within(k, d, live, expected)
+        return Changed(k, True) if within else None
+
+    def _left_by_rise(self, k: int, d: Array, live: NDArray[np.bool_], aside: Array | None) -> float:
+        """The energy that a rise of electrode k's contact leaves of d; infinite where it is no rise."""
+        beside = [] if aside is None else list(aside.T)
+        (a, b, *_), left = self._fit(k, d, live, beside)
+        if a < LEAST_RISE:
+            return np.inf
+        short = a / (1 + a / SHORT_WAY)
+        most = float(np.clip(b, short / OTHER_BEFORE, short * OTHER_BEFORE))
+        if most == b:
+            return left
+        rest = d[live] - most * self._n[k][live]
+        columns = np.column_stack([self._u[k], np.ones(len(d)), *beside])[live]
+        found, *_ = np.linalg.lstsq(columns, rest, rcond=None)
+        rest = rest - columns @ found
+        return float(rest @ rest)
+
+    def _rises_within(self, k: int, d: Array, live: NDArray[np.bool_], expected: float) -> bool:
+        """Whether electrode k's contact rose in the course of the scan."""
         (a, b, _, slope, _), left = self._fit(k, d, live, [self._u[k] * self._time, self._n[k] * self._time])
-        count = int(live.sum())
-        expected = count * noise**2 * (1 + 4 * np.sqrt(2 / count)) + (MODEL_ERROR * size) ** 2
-        if a >= LEAST_RISE and -0.1 * a <= b <= 1.3 * a and abs(slope) <= STEEPEST * a and left <= expected:
-            return k
-        return None
+        return bool(a >= RISES_WITHIN and -0.1 * a <= b <= 1.3 * a and abs(slope) <= STEEPEST * a and left <= expected)
 
     def _fit(self, k: int, d: Array, live: NDArray[np.bool_], more: Sequence[Array] = ()) -> tuple[Array, float]:
         """a, b, s and what there is of `more` (K,) in d; the energy that is left."""
@@ -113,16 +153,29 @@ class ContactDrift:
         left = d[live] - columns @ found
         return found, float(left @ left)
 
-    def felt_by_others(self, k: int, d: Array, live: NDArray[np.bool_]) -> Array | None:
+    def felt_by_others(self, k: int, d: Array, sigma: Array, live: NDArray[np.bool_]) -> Array | None:
         """(K,) what the change at electrode k does to the pairs that do not use it; None while something else changes
         too.
         """
-        if not self.knows:
+        if not self.knows or not live.any():
             return None
+        energy = float(d[live] @ d[live])
+        noise = _most_noise(sigma[live])
+        if energy <= noise:
+            return np.zeros(len(d))
         (_, b, _), left = self._fit(k, d, live)
-        if not left <= UNTOUCHED**2 * float(d[live] @ d[live]):  # NaN says nothing
+        if not left <= UNTOUCHED**2 * energy + noise:  # NaN says nothing
             return None
         return np.where(self.members[k], 0.0, b * self._n[k])
+
+
+def _without(aside: Array | None, d: Array) -> Array:
+    return d if aside is None else np.asarray(d - aside @ (aside.T @ d))
+
+
+def _most_noise(sigma: Array) -> float:
+    """Energy that noise alone may come to."""
+    return float(sigma @ sigma) * (1 + 4 * float(np.sqrt(2 / len(sigma))))
 
 
 class ChangedContacts:
@@ -135,7 +188,7 @@ class ChangedContacts:
     def reset(self) -> None:
         self.felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
         self._before: dict[int, Array] = {}  # by contact that rose under a touch: |Z| (K,) from before
-        self._past: deque[Array] = deque(maxlen=LOOK_BACK)  # |Z| (K,) of the frames before, the newest last
+        self._past: deque[Array] = deque(maxlen=LOOK_FAR_BACK)  # |Z| (K,) of the frames before, the newest last
 
     def follow(self, amplitude: Array) -> None:
         """A frame's |Z| (K,); to be called after each."""
@@ -144,23 +197,54 @@ class ChangedContacts:
     def rescale(self, factor: float) -> None:
         """All |Z| so far, times this factor."""
         self._before = {k: row * factor for k, row in self._before.items()}
-        self._past = deque((row * factor for row in self._past), maxlen=LOOK_BACK)
+        self._past = deque((row * factor for row in self._past), maxlen=LOOK_FAR_BACK)
 
-    def changed(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> int | None:
+    def changed(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
         """The electrode whose contact this frame shows to have changed."""
         found = self._drift(_difference(amplitude, untouched.z0, untouched, live), untouched.sigma, live)
         if found is not None or len(self._past) < LOOK_BACK:
             return found
-        past = self._past[0]
-        live = live & np.isfinite(past)
         # Under a touch that stays, what changed is the contact's.
-        found = self._drift.risen(_difference(amplitude, past, untouched, live), np.sqrt(2.0) * untouched.sigma, live)
-        if found is not None:
-            self._before[found] = past
-        return found
+        sigma = np.sqrt(2.0) * untouched.sigma
+        for past in (*self._before.values(), self._past[-LOOK_BACK], self._past[0]):
+            both = live & np.isfinite(past)
+            found = self._drift.risen(_difference(amplitude, past, untouched, both), sigma, both)
+            if found is not None:
+                self._before.setdefault(found.electrode, past)
+                return found
+        return self._changed_under_motion(amplitude, untouched, live)
+
+    def _changed_under_motion(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
+        """The same under a touch that moves: steadily, so the frames before say which change is its own."""
+        back = 2 * LOOK_BACK
+        if len(self._past) < 2 * back + LOOK_BACK:
+            return None
+        now, middle, first = (self._past[-LOOK_BACK - k * back] for k in range(3))
+        live = live & np.isfinite(now) & np.isfinite(middle) & np.isfinite(first)
+        velocity = _difference(now, middle, untouched, live)
+        bend = velocity - _difference(middle, first, untouched, live)
+        aside, _ = np.linalg.qr(np.column_stack([velocity, bend]))
+        d = _difference(amplitude, now, untouched, live)
+        found = self._drift.risen(d, np.sqrt(2.0) * untouched.sigma, live, aside)
+        if found is None:
+            return None
+        self._before.setdefault(found.electrode, now)
+        return found._replace(sure=False)
+
+    def before(self, k: int) -> Array | None:
+        """|Z| (K,) of the touch under which the contact of electrode k rose."""
+        return self._before.get(k)
+
+    def forget(self, k: int) -> None:
+        """The contact of electrode k is what it was."""
+        self.felt.pop(k, None)
+        self._before.pop(k, None)
 
     def keep(self, drifting: Sequence[int]) -> None:
         """Forget the others."""
+        for k in drifting:  # what was wrong at once may have begun under a touch too
+            if k not in self._before and len(self._past) >= LOOK_BACK:
+                self._before[k] = self._past[-LOOK_BACK]
         self.felt = {k: felt for k, felt in self.felt.items() if k in drifting}
         self._before = {k: before for k, before in self._before.items() if k in drifting}
 
@@ -170,7 +254,8 @@ class ChangedContacts:
             for since in (untouched.z0, self._before.get(k)):
                 if since is not None:
                     both = live & np.isfinite(since)
-                    felt = self._drift.felt_by_others(k, _difference(amplitude, since, untouched, both), both)
+                    d = _difference(amplitude, since, untouched, both)
+                    felt = self._drift.felt_by_others(k, d, untouched.sigma, both)
                     if felt is not None:
                         self.felt[k] = felt
                         break

@@ -31,6 +31,7 @@ from services.estimation.advice import (
 )
 from services.estimation.contact_drift import ChangedContacts, Reference
 from services.estimation.wiring import Exchanged, StuckBit, Wiring
+from services.runtime.persistence import shaped
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -41,7 +42,10 @@ MOSTLY = 0.8  # fraction of an electrode's measurements that must have failed fo
 NOTHING_ANSWERS = 0.7  # fraction of all measurements that failed where it is not the electrodes
 TOO_MANY = 2  # electrodes at fault with which contacts can still be given
 WELL_FRAMES = 3  # in a row, after which an electrode counts again
-WELL = 0.005  # relative: how near its baseline a measurement of a well electrode is, and within 6 sigma more
+UNDONE = 3.0  # of the untouched |Z|, beyond which a measurement that clips is of an electrode off the skin
+LASTING = 23  # frames in a row after which it is, where few touches look so
+SUSPECTED = 3  # frames in a row after which a change that may be a touch on the electrode is the contact's
+WELL = 0.0015  # relative: how near its baseline a measurement of a well electrode is, and within 6 sigma more
 FALLS = 0.03  # relative fall that no touch, warmth or noise makes: the wiring is looked at
 FALLS_UNTARED = 0.06  # against the bundle's prediction, contacts unknown
 
@@ -70,6 +74,8 @@ class _Look:
     failed: Mask  # (K,)
     order: NDArray[np.intp] | None = None
     fault: str = ""  # of the board as a whole
+    likely: bool = False  # that few touches look so
+    suspect: int | None = None  # an electrode whose contact changed, if nobody presses right on it
 
 
 class ElectrodeHealth:
@@ -96,6 +102,8 @@ class ElectrodeHealth:
     def reset(self) -> None:
         self._states = np.zeros(self.electrodes, dtype=np.uint8)
         self._well = np.zeros(self.electrodes, dtype=np.int64)  # frames in a row
+        self._unsure = np.zeros(self.electrodes, dtype=bool)  # drifting, unless somebody presses right on it
+        self._suspected = np.zeros(self.electrodes, dtype=np.int64)  # frames in a row
         self._shown = self._states
         self._fault = ""  # of the board as a whole
         self._contacts.reset()
@@ -103,6 +111,8 @@ class ElectrodeHealth:
     def tared(self) -> None:
         """There is a new baseline: what changed against the old one is forgotten."""
         self._states[(self._states == DRIFTING) | (self._states == UNKNOWN)] = OK
+        self._unsure[:], self._suspected[:] = False, 0
+        self._contacts.keep(())
 
     def rescale(self, factor: float) -> None:
         """The board's gain stepped by this factor."""
@@ -139,7 +149,10 @@ class ElectrodeHealth:
         reasons = ["saturated"] if (status & STATUS_CLIPPED).any() else []
         reasons += [reason for state, reason in REASONS.items() if (states == state).any()]
         bad = int((states != OK).sum())
-        usable = bad <= TOO_MANY and bool(live.sum() >= len(live) / 2)
+        doubtful = bool(self._unsure.any() or self._suspected.any())
+        if doubtful and "electrode_drift" not in reasons:
+            reasons.append("electrode_drift")
+        usable = bad <= TOO_MANY and not doubtful and bool(live.sum() >= len(live) / 2)
         if bad == TOO_MANY:
             reasons.append("degraded")
         if not usable and not reasons:
@@ -160,7 +173,8 @@ class ElectrodeHealth:
 
     def _nothing_wrong(self, seen: _Look, status: NDArray[np.uint8], untouched: Reference) -> bool:
         """Most touched frames: what follows would find that all is well too, at twice the work."""
-        quiet = not (seen.states.any() or status.any() or seen.failed.any() or self._states.any())
+        wrong = seen.states.any() or status.any() or seen.failed.any() or self._states.any() or self._suspected.any()
+        quiet = seen.suspect is None and not wrong
         return quiet and not self._contacts.felt and bool(np.isfinite(untouched.sigma).all())
 
     def problems(self) -> list[str]:
@@ -192,6 +206,8 @@ class ElectrodeHealth:
             known = ~failed & (reference > 0)
             low = known & (amplitude < reference / FAR)
             no_current |= known & (amplitude > FAR * reference)
+            clipped = (status & STATUS_CLIPPED) != 0
+            no_current |= clipped & np.isfinite(amplitude) & (amplitude > UNDONE * reference) & (reference > 0)
         failed = failed | low | no_current
         seen = _Look(states, amplitude, failed)
         if (low | no_current).mean() > NOTHING_ANSWERS:
@@ -215,11 +231,14 @@ class ElectrodeHealth:
         states[shorted] = SHORT
         self._open(seen.failed & (low | no_current), seen.failed, states)
         if untouched is not None and not np.isin(states, (SHORT, OPEN)).any():
-            well = (self._states == OK) | ((self._states == SWAPPED) & (states == SWAPPED))
+            well = (self._states == OK) | self._unsure | ((self._states == SWAPPED) & (states == SWAPPED))
             live = ~seen.failed & np.isfinite(untouched.sigma) & ~self.member[~well].any(axis=0)
             changed = self._contacts.changed(seen.amplitude, untouched, live)
-            if changed is not None and states[changed] == OK:
-                states[changed] = DRIFTING
+            if changed is not None and states[changed.electrode] == OK:
+                if changed.sure:
+                    states[changed.electrode] = DRIFTING
+                else:
+                    seen.suspect, seen.likely = changed.electrode, changed.likely
         return seen
 
     def _short(self, low: Mask) -> list[int]:
@@ -266,11 +285,20 @@ class ElectrodeHealth:
         faulty = seen.states != OK
         self._states[faulty] = seen.states[faulty]
         self._well[faulty] = 0
-        ailing = (self._states != OK) & ~faulty
+        self._unsure &= (self._states == DRIFTING) & ~faulty
+        again = np.arange(self.electrodes) == seen.suspect
+        self._suspected = np.where(again, self._suspected + 1, 0)
+        lasts = (self._suspected >= SUSPECTED) & (self._states == OK)
+        self._states[lasts], self._unsure[lasts] = DRIFTING, True
+        self._suspected[(self._states != OK) & ~self._unsure] = 0
+        if seen.likely:
+            self._unsure &= self._suspected < LASTING
+        ailing = (self._states != OK) & ~faulty & ~lasts
         for k in np.flatnonzero(ailing):
             self._well[k] = self._well[k] + 1 if self._is_well(int(k), seen.amplitude, seen.failed, untouched) else 0
             if self._well[k] >= WELL_FRAMES:
-                self._states[k] = OK
+                self._states[k], self._unsure[k] = OK, False
+                self._contacts.forget(int(k))
 
     def _is_well(self, k: int, amplitude: Array, failed: Mask, untouched: Reference | None) -> bool:
         """An open wire or a short is seen directly; the others must measure what they did before, untouched."""
@@ -279,12 +307,17 @@ class ElectrodeHealth:
         rows = self.member[k] & ~failed & np.isfinite(untouched.sigma)
         if not rows.any():
             return True
-        off = np.abs(amplitude[rows] - untouched.z0[rows]) / untouched.normaliser[rows]
-        return bool((off <= WELL + 6 * untouched.sigma[rows]).mean() >= MOSTLY)
+        within = WELL + 6 * untouched.sigma[rows]
+        for since in (untouched.z0, self._contacts.before(k)):
+            if since is not None:
+                off = np.abs(amplitude[rows] - since[rows]) / untouched.normaliser[rows]
+                if (off <= within).mean() >= MOSTLY:
+                    return True
+        return False
 
     def _shift(self, seen: _Look, untouched: Reference | None) -> Array:
         """What the drifting electrodes do to the pairs of the others."""
-        drifting = np.flatnonzero(self._states == DRIFTING).tolist()
+        drifting = np.flatnonzero(np.isin(self._states, (DRIFTING, OPEN))).tolist()
         self._contacts.keep(drifting)
         if untouched is None or not drifting:
             return np.zeros(len(seen.amplitude))
@@ -305,7 +338,13 @@ class ElectrodeHealth:
     # state
 
     def state(self) -> dict[str, Any]:
-        return {"states": self._states.copy(), "well": self._well.copy(), **self._contacts.state()}
+        return {
+            "states": self._states.copy(),
+            "well": self._well.copy(),
+            "unsure": self._unsure.astype(np.uint8),
+            "suspected": self._suspected.copy(),
+            **self._contacts.state(),
+        }
 
     def load(self, state: dict[str, Any]) -> None:
         """Raises ValueError where it is of other electrodes."""
@@ -314,4 +353,7 @@ class ElectrodeHealth:
             raise ValueError(f"the saved health is of {states.size} electrodes, expected {self.electrodes}")
         self.reset()
         self._states, self._well = states, well
+        if "unsure" in state:  # older recordings have neither
+            self._unsure = shaped(state["unsure"], states.shape) > 0
+            self._suspected = shaped(state["suspected"], states.shape).astype(np.int64)
         self._contacts.load(state)

@@ -95,6 +95,34 @@ def test_a_contact_that_rises_under_a_touch_is_named_and_makes_no_second_one(ski
     assert states(skin.rest(BACK_WITHIN + 3)) == {}
 
 
+@pytest.mark.parametrize("times", [1.15, 1.75])
+@pytest.mark.parametrize("held", [False, True])
+def test_a_contact_that_rises_a_little_is_named_and_makes_no_contact(skin: StubSkin, times: float, held: bool) -> None:
+    """It may be a finger right on the electrode as well, so nothing is valid at first."""
+    touch = PRESS if held else ()
+    before = [skin.feel(touch) for _ in range(30)]
+    assert before[-1].contact.valid and states(before[-1]) == {}
+    lifted = [skin.feel(touch, ((12, times),)) for _ in range(30)]
+    assert all(states(r) == {"drifting": [12]} for r in lifted[NAMED_WITHIN:])
+    assert not lifted[5].contact.valid and "electrode_drift" in lifted[5].contact.reasons
+    assert all(not r.contact.valid or len(r.contact.contacts) == len(touch) for r in lifted)
+    assert lifted[-1].contact.valid == (times > 1.3)  # few touches look so for so long
+    back = [skin.feel(touch) for _ in range(BACK_WITHIN + 3)]
+    assert states(back[-1]) == {}
+    assert states(skin.rest(BACK_WITHIN + 6)) == {}
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_an_electrode_off_the_skin_is_named_though_its_pairs_clip(skin: StubSkin, held: bool) -> None:
+    touch = PRESS if held else ()
+    for _ in range(10):
+        skin.feel(touch)
+    off = [skin.feel(touch, ((9, 1000.0),)) for _ in range(10)]
+    assert all(states(r) == {"open": [9]} for r in off)
+    assert off[-1].contact.valid and len(off[-1].contact.contacts) == len(touch)
+    assert states(skin.rest(BACK_WITHIN + 6)) == {}
+
+
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
 def test_a_channel_that_comes_back_under_a_lifted_contact_blinds_nobody(broken: float) -> None:
     own, lifted = StubSkin(80.0), ((9, 6.0),)
