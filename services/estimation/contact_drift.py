@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from services.runtime.persistence import shaped
+from services.estimation.saved import shaped
 
 Array = NDArray[np.floating]
 

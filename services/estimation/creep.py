@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import Operator
-from services.runtime.persistence import shaped
+from services.estimation.saved import shaped
 
 Array = NDArray[np.float64]
 

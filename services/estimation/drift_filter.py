@@ -23,9 +23,9 @@ from services.estimation.creep import SHARE, Creep
 from services.estimation.drift import DriftProcess, spread
 from services.estimation.drift_prior import REST_S
 from services.estimation.holding import Holding
+from services.estimation.saved import shaped
 from services.estimation.tuning import TUNING
 from services.runtime.config import Tare
-from services.runtime.persistence import shaped
 
 Array = NDArray[np.float64]
 

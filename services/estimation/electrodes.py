@@ -30,8 +30,8 @@ from services.estimation.advice import (
     stuck_bit,
 )
 from services.estimation.contact_drift import ChangedContacts, Reference
+from services.estimation.saved import shaped
 from services.estimation.wiring import Exchanged, StuckBit, Wiring
-from services.runtime.persistence import shaped
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.estimation.gain import common_factor
+from services.estimation.saved import shaped
 from services.estimation.tare import Baseline
 from services.estimation.tuning import TUNING
-from services.runtime.persistence import shaped
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import PreReconstructor
-from services.runtime.persistence import shaped
+from services.estimation.saved import shaped
 
 Array = NDArray[np.float64]
 

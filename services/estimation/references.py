@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.estimation.saved import shaped
 from services.estimation.tare import ASSUMED_NOISE, LEAST_NOISE, Baseline
-from services.runtime.persistence import shaped
 
 Array = NDArray[np.float64]
 

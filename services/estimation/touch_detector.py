@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from models.prereconstruction import Operator, PreReconstructor
 from services.estimation.creep import Creep
 from services.estimation.drift_prior import DriftPrior, MarginalLikelihood
+from services.estimation.saved import shaped
 from services.estimation.touch_decision import TouchDecision
 from services.runtime.config import Skin
-from services.runtime.persistence import shaped
 
 Array = NDArray[np.float64]
 

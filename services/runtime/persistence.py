@@ -16,7 +16,6 @@ from typing import Any
 
 import msgpack
 import numpy as np
-from numpy.typing import NDArray
 
 from models.files import check
 from protocol.fields import Mismatch, decode_array, encode_array
@@ -125,11 +124,3 @@ def arrays(value: Any) -> Any:
                 raise ValueError(f"found {wrong.found}, expected {wrong.expected}") from None
         return {key: arrays(inner) for key, inner in value.items()}
     return [arrays(inner) for inner in value] if isinstance(value, list) else value
-
-
-def shaped(values: Any, shape: tuple[int, ...], finite: bool = True) -> NDArray[np.float64]:
-    """The array of a saved state, checked. Raises ValueError."""
-    found = np.array(values, dtype=np.float64)
-    if found.shape != shape or (finite and not np.isfinite(found).all()):
-        raise ValueError(f"found an array of shape {found.shape}, expected {shape}, finite")
-    return found
