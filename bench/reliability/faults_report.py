@@ -48,9 +48,11 @@ SOAK = (
 # What held in the quick form on 22 November 2026, by the goal's key: to be tightened as the figures get better. Goals
 # that are not here have no gate yet.
 GATES: dict[str, float] = {
-    "matrix wrong": 120,
-    "matrix unnamed": 30,
-    "matrix late": 0,
+    "matrix wrong": 5,
+    "matrix unnamed": 5,
+    # A contact that rises under a touch that moves is named, and its frames are not valid, until the touch ends: late,
+    # where before it gave a contact that was none (85 frames of the quick form).
+    "matrix late": 4,
     "ok valid": 98,
     "ok changing": 4,
     "electrode open valid": 95,

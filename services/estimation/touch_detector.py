@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 OPERATORS = 16  # kept; 0.4 MB each
 ASK_S = 1.0  # how often a touch's drift is asked for, and over how long its frames are averaged
 AGAIN_S, AGAIN_MOST_S = 0.25, 4.0  # how soon a touch that drift alone may be is looked at again, doubling
+ALONE_S = 60.0  # without an untouched frame: contacts may have drifted by 5 % (contact_per_s of skin.toml)
 STEADY = 2  # steps that are taken without asking: those of the baseline's own delay
 DECISIVE = 45.0  # log likelihood by which a touch must explain a frame better than drift that time permits
 SUREST = 1e-4  # relative: below it drift and the model are what a mean is wrong by, and they do not average out
@@ -115,8 +116,12 @@ class TouchDetector:
         return None
 
     def uncertain(self, since_s: float) -> bool:
-        """Whether drift since the last untouched frame may hide a touch, or look like one."""
-        return self.allowance.step(since_s) > STEADY
+        """Whether so much may have drifted since the last untouched frame that drift is read from a touched one.
+
+        After a shorter gap (a fault, a board that was gone) it is not: one frame of a touch that just begins would be
+        read as drift, and the baseline moved by it shows phantoms for as long as anything touches.
+        """
+        return since_s > ALONE_S
 
     def begin(
         self, d: Array, live: NDArray[np.bool_], noise: Noise, since_s: float, now_ns: int, alone: bool = False
