@@ -15,7 +15,7 @@ from services.estimation.tuning import TUNING
 Array = NDArray[np.float64]
 
 GROSS = 0.1  # relative: no gain of a sound board steps by more
-LASTING_S = 0.8
+LASTING_S = 1.0
 
 
 class GainSteps:
