@@ -95,9 +95,10 @@ class Preprocessing(Stage):
         amplitude = np.abs(frame.z.astype(np.complex128))
         known = self.untouched.baseline
         separate = SEPARATE in frame.reasons
-        sound = known is not None and not frame.status.any() and not separate
-        factor = self.gain(amplitude, known if sound else None, out.stamps.get("sample", 0))
-        if factor is not None:
+        if known is None or separate:
+            self.gain.reset()
+        elif not frame.status.any() and (factor := self.gain(amplitude, known, out.stamps.get("sample", 0))):
+            # Frames with marks are passed over: their end would be taken for a step back from a gain never taken over.
             self._counters["gain_steps"] += 1
             self.untouched.rescale(factor)
             self.electrodes.rescale(factor)
@@ -264,6 +265,7 @@ class Preprocessing(Stage):
         """There is another baseline."""
         self.electrodes.tared()
         self.judge.reset()
+        self.gain.reset()
         self._touched = False
         self.hold.reset()
 

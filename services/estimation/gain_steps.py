@@ -14,7 +14,7 @@ from services.estimation.tuning import TUNING
 
 Array = NDArray[np.float64]
 
-GROSS = 0.1  # relative: no gain of a sound board steps by more
+GROSS = 0.15  # relative: no gain of a sound board steps by more (RTIA and its calibration, a tenth)
 LASTING_S = 1.0
 
 
@@ -28,13 +28,13 @@ class GainSteps:
         self._total = 0.0  # its sum
         self._gross_ns = 0  # since when all measurements have another gain by far
 
-    def __call__(self, amplitude: Array, baseline: Baseline | None, now_ns: int) -> float | None:
-        """The factor that a frame's |Z| (K,) has in common against the one before, to be taken over by the baseline.
-        baseline: None where there is none, or where measurements of the frame failed.
+    def __call__(self, amplitude: Array, baseline: Baseline, now_ns: int) -> float | None:
+        """The factor that a sound frame's |Z| (K,) has in common against the sound one before, to be taken over by the
+        baseline.
         """
         before, total = self._before, self._total
         self._before, self._total = amplitude.copy(), float(amplitude.sum())
-        if baseline is None or before is None or len(before) != len(amplitude):
+        if before is None or len(before) != len(amplitude):
             return None
         if abs(self._total - total) < TUNING.gain_least * total:
             return None

@@ -104,3 +104,20 @@ def test_the_hardest_touches_are_no_fault(
     found = [skin.feel(shapes) for _ in range(4)]
     assert all(r.delta.touched and r.delta.valid for r in found)
     skin.feel()
+
+
+@pytest.mark.parametrize("gain", [2.5, 3.9])
+def test_the_end_of_marked_frames_is_no_step_of_the_gain(tared: dict[float, StubSkin], gain: float) -> None:
+    """An overrange scales the measurements that it marks; the baseline never followed, so it must not follow back."""
+    skin = tared[80.0]
+    skin.rest(QUIET)
+    steps = skin.pipeline.pre.health().counters.get("gain_steps", 0)
+    skin.faults.inject("rtia_overrange", {"gain": gain}, 0.0, 1.0)
+    try:
+        marked = [skin.feel() for _ in range(6)]
+    finally:
+        skin.faults.clear()
+    assert not any(r.contact.valid for r in marked)
+    after = [skin.feel() for _ in range(60)]  # longer than a gross step takes to be believed
+    assert all(r.contact.valid and not r.contact.contacts for r in after[5:])
+    assert skin.pipeline.pre.health().counters.get("gain_steps", 0) == steps
