@@ -1,4 +1,6 @@
-"""Steps of the board's gain over a skin's frames: taken over at once, or, where one is gross, once it has lasted."""
+"""Steps of the board's gain over a skin's frames: taken over at once, or, where the gain is grossly off, once it has
+lasted.
+"""
 
 from __future__ import annotations
 
@@ -36,21 +38,35 @@ class GainSteps:
         self._before, self._total = amplitude.copy(), float(amplitude.sum())
         if before is None or len(before) != len(amplitude):
             return None
+        gross = self._gross(amplitude, baseline)
+        if gross is not None:
+            self._gross_ns = self._gross_ns or now_ns
+            if (now_ns - self._gross_ns) * 1e-9 < LASTING_S:
+                self._before, self._total = before, total  # a fault, which may end
+                return None
+        self._gross_ns = 0
+        if gross is not None:
+            return gross
         if abs(self._total - total) < TUNING.gain_least * total:
             return None
         live = (baseline.z0 > 0) & (before > 0) & np.isfinite(amplitude) & np.isfinite(baseline.sigma)
         sigma = np.where(live, baseline.sigma / np.where(live, baseline.z0, 1.0), np.inf)
         factor = common_factor(before, amplitude, sigma, live)
         if factor is None:
-            self._gross_ns = 0
             return None
-        if abs(factor - 1) > GROSS:
-            self._gross_ns = self._gross_ns or now_ns
-            if (now_ns - self._gross_ns) * 1e-9 < LASTING_S:
-                self._before, self._total = before, total  # what it is held against until then
-                return None
-        self._gross_ns = 0
-        return factor
+        return factor if abs(factor - 1) <= GROSS else None
+
+    @staticmethod
+    def _gross(amplitude: Array, baseline: Baseline) -> float | None:
+        """The factor against the baseline itself where it is gross: many faults come and go with gross steps between
+        frames, and errors of steps would add up.
+        """
+        live = (baseline.z0 > 0) & np.isfinite(amplitude) & np.isfinite(baseline.sigma)
+        least, most = 1 - GROSS, 1 + GROSS
+        if least * baseline.z0[live].sum() < amplitude[live].sum() < most * baseline.z0[live].sum():
+            return None
+        sigma = np.where(live, baseline.sigma / np.where(live, baseline.z0, 1.0), np.inf)
+        return common_factor(baseline.z0, amplitude, sigma, live)
 
     def state(self) -> dict[str, Any]:
         return {"before": None if self._before is None else self._before.copy(), "gross_ns": self._gross_ns}
