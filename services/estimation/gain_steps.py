@@ -49,12 +49,8 @@ class GainSteps:
             return gross
         if abs(self._total - total) < TUNING.gain_least * total:
             return None
-        live = (baseline.z0 > 0) & (before > 0) & np.isfinite(amplitude) & np.isfinite(baseline.sigma)
-        sigma = np.where(live, baseline.sigma / np.where(live, baseline.z0, 1.0), np.inf)
-        factor = common_factor(before, amplitude, sigma, live)
-        if factor is None:
-            return None
-        return factor if abs(factor - 1) <= GROSS else None
+        factor = _common(before, amplitude, baseline)
+        return factor if factor is not None and abs(factor - 1) <= GROSS else None
 
     @staticmethod
     def _gross(amplitude: Array, baseline: Baseline) -> float | None:
@@ -65,8 +61,7 @@ class GainSteps:
         least, most = 1 - GROSS, 1 + GROSS
         if least * baseline.z0[live].sum() < amplitude[live].sum() < most * baseline.z0[live].sum():
             return None
-        sigma = np.where(live, baseline.sigma / np.where(live, baseline.z0, 1.0), np.inf)
-        return common_factor(baseline.z0, amplitude, sigma, live)
+        return _common(baseline.z0, amplitude, baseline)
 
     def state(self) -> dict[str, Any]:
         return {"before": None if self._before is None else self._before.copy(), "gross_ns": self._gross_ns}
@@ -78,3 +73,10 @@ class GainSteps:
             self._before = shaped(state["before"], (self._k,), finite=False)
             self._total = float(self._before.sum())
         self._gross_ns = int(state["gross_ns"])
+
+
+def _common(before: Array, now: Array, baseline: Baseline) -> float | None:
+    """now / before of two frames' |Z| (K,), where it is common to the measurements that count in both."""
+    live = (baseline.z0 > 0) & (before > 0) & np.isfinite(now) & np.isfinite(baseline.sigma)
+    sigma = np.where(live, baseline.sigma / np.where(live, baseline.z0, 1.0), np.inf)
+    return common_factor(before, now, sigma, live)
