@@ -6,13 +6,15 @@ ONNX Runtime on one thread, warmed up before the stage is ready. A bundle withou
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import DeltaFrame, Frame, ImageFrame
+from models.locator import Located, Locator
+from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
 from services.estimation.quality import Residual
 from services.estimation.sentinel import CoarseImage
 from services.networks import Network, OneStep, Pictures, network
@@ -41,6 +43,7 @@ class Inference(Stage):
         self._residual = Residual(bundle, to_scale=self._refuses)
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
+        self._locator = None if bundle.locator is None else Locator(bundle.locator)
         self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
@@ -111,6 +114,9 @@ class Inference(Stage):
         out.image, out.sigma, out.classes = ahead[1] if ahead and ahead[0] is frame else self._network.run(frame)
         out.noise = _rms(frame.sigma)
         out.residual = self._residual(frame.difference, frame.sigma, out.image)
+        if self._locator is not None and frame.touched:
+            quantity = self._locator.quantity
+            out.touches = [_touch(each, quantity) for each in self._locator.locate(frame.difference, frame.sigma)]
         self._refused = self._refuses and frame.touched and out.residual is not None and self._residual.refused
         self._judge(out)
         self._counters["networks_run"] += 1
@@ -145,6 +151,7 @@ class Inference(Stage):
             out.reconstructed, out.noise, out.residual = self._last_scan, last.noise, last.residual
             if self._again:
                 out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
+                out.touches = last.touches
                 self._again = False
             self._judge(out)
             self._counters["held"] += 1
@@ -157,8 +164,8 @@ class Inference(Stage):
         last = self._last
         if last is None:
             return {"last": None}
-        kept = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
-        kept |= {"residual": last.residual, "refused": self._refused}
+        kept: dict[str, Any] = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
+        kept |= {"residual": last.residual, "refused": self._refused, "touches": [asdict(t) for t in last.touches]}
         return {"last": {"scan": self._last_scan, **kept}}
 
     def load(self, state: dict[str, Any]) -> None:
@@ -170,6 +177,7 @@ class Inference(Stage):
             image, sigma, classes = (np.asarray(last[name], np.float32) for name in ("image", "sigma", "classes"))
             self._last = ImageFrame(skin=self.skin, image=image, sigma=sigma, classes=classes)
             self._last.noise, self._last_scan = last.get("noise"), int(last["scan"])
+            self._last.touches = [LocatedTouch(**each) for each in last.get("touches", [])]
             self._last.residual, self._refused = last.get("residual"), bool(last.get("refused", False))
         except (KeyError, TypeError, ValueError) as wrong:
             raise Refused(f"no image in the saved state ({wrong})") from None
@@ -178,6 +186,14 @@ class Inference(Stage):
         if isinstance(self._network, OneStep):
             return Health("OK", [f"bundle {self.bundle.name} has no network: one-step images"], dict(self._counters))
         return Health("OK", [], dict(self._counters))
+
+
+def _touch(found: Located, quantity: str) -> LocatedTouch:
+    made = LocatedTouch(position=[found.x, found.y], sigma=found.sigma, amplitude=found.amplitude)
+    if found.value is not None:
+        setattr(made, quantity, found.value)
+        made.value_sigma = found.value_sigma
+    return made
 
 
 def _rms(sigma: NDArray[np.float32]) -> float | None:

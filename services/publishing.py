@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame
+from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, LocatedTouch, ShapeFrame
 from protocol.held import ANY, HeldImage
 from services.contacts.force import ForceLaw, Look
 from services.contacts.motion import Seen, Track
 from services.contacts.outline import outline
-from services.contacts.segmentation import Segment, readable, segment
+from services.contacts.segmentation import Segment, divided, readable, segment
 from services.contacts.tracking import Tracker
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
@@ -111,10 +111,17 @@ class Publishing(Stage):
         """Contacts of a new image."""
         m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
         segments: list[Segment] = []
-        if frame.touched and frame.image.size:
+        located = frame.touches if frame.touched and frame.image.size else []
+        if located:
+            places = [(t.position[0], t.position[1]) for t in located]
+            segments = divided(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
+            reach = [s.reach * m for s in segments]
+            seen = [Seen(*at, t.amplitude, r) for at, t, r in zip(places, located, reach, strict=True)]
+        elif frame.touched and frame.image.size:
             places = [] if self._alone(frame) else self.tracker.expected(now)
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
-        seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
+        if not located:
+            seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
         tracks: Sequence[Track | None]
         ended: list[Track] = []
         if self._alone(frame):
@@ -122,10 +129,11 @@ class Publishing(Stage):
         else:
             tracks, ended = self.tracker.update(seen, now, _explained(frame))
         present = []
-        for track, place, s in zip(tracks, seen, segments, strict=True):
+        said: Sequence[LocatedTouch | None] = located or [None] * len(segments)
+        for track, place, s, touch in zip(tracks, seen, segments, said, strict=True):
             if track is not None:
                 classes = _class_probabilities(s, frame.classes)
-                present.append((self._contact(track, place, s, classes, frame), s, classes))
+                present.append((_with(touch, self._contact(track, place, s, classes, frame)), s, classes))
         present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
         self._segments, self._classes = [s for _, s, _ in present], [classes for _, _, classes in present]
         self._geometry, self._known = (m, [x0, y0]), True
@@ -233,6 +241,19 @@ class Publishing(Stage):
 
     def health(self) -> Health:
         return Health("OK", [], dict(self._counters))
+
+
+def _with(touch: LocatedTouch | None, contact: Contact) -> Contact:
+    """The contact with what a registered skin's response map says of it."""
+    if touch is None:
+        return contact
+    contact.position_sigma = list(touch.sigma)
+    if touch.indentation_m is not None:
+        contact.indentation_m, contact.indentation_sigma_m = touch.indentation_m, touch.value_sigma
+    if touch.force_n is not None and contact.force_n is None:
+        contact.force_n, contact.force_sigma_n = touch.force_n, touch.value_sigma
+        contact.wrench = _wrench(contact.position[0], contact.position[1], touch.force_n)
+    return contact
 
 
 def _sound(frame: ImageFrame) -> bool:

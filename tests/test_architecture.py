@@ -27,6 +27,8 @@ OFFLINE_DOORS = {"services/cli"}
 SERVICES_USE_OF_MODELS = {
     "models.bundle",
     "models.files",
+    "models.locator",
+    "models.locator_arrays",
     "models.npz",
     "models.prereconstruction",
     "models.patterns",
