@@ -153,7 +153,7 @@ class Preprocessing(Stage):
         teaches = learns  # whether the baseline is to learn from this frame
         # Measured bundles have no sign model, so this check is skipped.
         if self.bundle.matrices.normalisation == "model" and impossible(
-            d, self.untouched.sigma, live & self.electrodes.self_sensing, self._touched
+            d, self.untouched.sigma, live & self.electrodes.check.self_sensing, self._touched
         ):
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
