@@ -90,6 +90,7 @@ class Skin(Section):
     bundle: str  # the name of a folder of models/bundles, else a path
     frame_id: str = ""  # default: the skin's name
     pose: Pose = Pose()
+    mismatch: str = "none"  # of the stub's sheet: by what it differs from the bundle, a name of models/mismatch.py
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
     indenter: Indenter | None = None
     network: NetworkFile = "int8"
@@ -108,6 +109,12 @@ class Skin(Section):
             '"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000), a recording (*.mcap) or a file '
             "of measurements (*.npz)"
         )
+
+    @model_validator(mode="after")
+    def mismatch_of_a_stub(self) -> Skin:
+        if self.mismatch != "none" and self.port != "stub":
+            raise ValueError(f'`mismatch` with port = "stub" alone: a real skin has its own (found {self.port!r})')
+        return self
 
 
 RECORDINGS = (".mcap", ".npz")

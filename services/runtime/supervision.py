@@ -55,9 +55,14 @@ def programs(config: Config) -> list[Program]:
 
 
 def stub_arguments(config: Config) -> tuple[str, ...]:
-    """What `python -m firmware_stub` is told: a board for each skin whose port is "stub", with that skin's bundle."""
+    """What `python -m firmware_stub` is told: a board for each skin whose port is "stub", with that skin's bundle and
+    by what its sheet differs from it.
+    """
     skins = [(name, skin) for name, skin in config.skins.items() if skin.port == "stub"]
-    return tuple(part for name, skin in skins for part in ("--skin", f"{name}={_folder(skin.bundle)}"))
+    said = [part for name, skin in skins for part in ("--skin", f"{name}={_folder(skin.bundle)}")]
+    for name, skin in skins:
+        said += ["--mismatch", f"{name}={skin.mismatch}"] if skin.mismatch != "none" else []
+    return tuple(said)
 
 
 def _folder(bundle: str) -> Path:
