@@ -4,6 +4,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 SKIN ?= square16
+# Bridges that `make venv` installs the packages of too: EXTRAS=ros2,foxglove
+EXTRAS ?=
+comma := ,
+BRIDGES := $(subst $(comma), ,$(EXTRAS))
 # The CPU build of PyTorch by its full version: plain "torch" would bring several GB of CUDA.
 TORCH := torch==2.13.0+cpu
 export OMP_NUM_THREADS ?= 1
@@ -14,7 +18,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 up: venv
 	./skin up
 
-venv: $(VENV)/.service
+venv: $(VENV)/.service $(BRIDGES:%=$(VENV)/.%)
 venv-dev: $(VENV)/.dev
 
 $(BIN)/python:
@@ -22,6 +26,10 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.service: requirements/service.lock | $(BIN)/python
+	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
+	@touch $@
+
+$(VENV)/.ros2 $(VENV)/.foxglove: $(VENV)/.%: requirements/%.lock | $(VENV)/.service
 	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
 	@touch $@
 
@@ -36,7 +44,7 @@ test: venv-dev lint
 
 lint: venv-dev
 	$(BIN)/ruff check .
-	$(BIN)/mypy protocol services examples firmware_stub
+	$(BIN)/mypy protocol services bridges examples firmware_stub
 
 # geometry -> forward model -> data -> network -> bundle in models/bundles/$(SKIN)
 train: venv-dev
@@ -46,7 +54,9 @@ train: venv-dev
 LOCK := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 lock:
 	$(LOCK) --extra service --extra stub -o requirements/service.lock pyproject.toml
-	$(LOCK) -c requirements/service.lock --extra service --extra stub --extra offline --extra dev \
+	for bridge in ros2 foxglove; do \
+	  $(LOCK) -c requirements/service.lock --extra $$bridge -o requirements/$$bridge.lock pyproject.toml || exit 1; done
+	$(LOCK) -c requirements/service.lock --extra service --extra stub --extra offline --extra ros2 --extra foxglove --extra dev \
 	  -o requirements/dev.lock pyproject.toml requirements/torch-needs.in
 
 clean:
