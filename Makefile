@@ -44,7 +44,7 @@ test: venv-dev lint
 
 lint: venv-dev
 	$(BIN)/ruff check .
-	$(BIN)/mypy protocol services bridges examples firmware_stub
+	$(BIN)/mypy protocol services bridges examples firmware_stub models bench
 
 # geometry -> forward model -> data -> network -> bundle in models/bundles/$(SKIN)
 train: venv-dev

@@ -79,6 +79,10 @@ class Indenter(Section):
     shape: Literal["circle"] = "circle"
 
 
+NetworkFile = Literal["full", "fast", "int8", "none"]
+ScanMode = Literal["full", "adaptive"]
+
+
 class Skin(Section):
     """One skin: one board on one port, one bundle."""
 
@@ -88,9 +92,9 @@ class Skin(Section):
     pose: Pose = Pose()
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
     indenter: Indenter | None = None
-    network: Literal["full", "fast", "int8", "none"] = "int8"
+    network: NetworkFile = "int8"
     dft_points: Literal[128, 256, 512] = 128
-    scan: Literal["full", "adaptive"] = "full"  # a short list while nothing touches: board/adaptive.py
+    scan: ScanMode = "full"  # a short list while nothing touches: board/adaptive.py
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
     tare: Tare = Tare()
     touch: Touch = Touch()
