@@ -13,7 +13,7 @@ TORCH := torch==2.13.0+cpu
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: up venv venv-dev test lint train lock wire clean
+.PHONY: up venv venv-dev ros-venv test lint train lock wire clean
 
 up: venv
 	./skin up
@@ -38,6 +38,15 @@ $(VENV)/.dev: requirements/dev.lock requirements/service.lock | $(BIN)/python
 	$(BIN)/python -m pip install -q --disable-pip-version-check "$(TORCH)" || { echo \
 	  "no wheel of $(TORCH) found: install PyTorch's CPU build 2.13.0 into $(VENV) as pytorch.org describes, then run make again"; exit 1; }
 	@touch $@ $(VENV)/.service
+
+# ROS 2 itself, as wheels, in an environment of its own: what tests/bridges/test_ros2_node.py listens with. 270 MB.
+ros-venv: .venv-ros/.done
+.venv-ros/.done:
+	$(PYTHON) -m venv .venv-ros
+	.venv-ros/bin/python -m pip install -q --disable-pip-version-check numpy ros-kilted-rclpy ros-kilted-rmw-fastrtps-cpp \
+	  ros-kilted-geometry-msgs ros-kilted-sensor-msgs ros-kilted-diagnostic-msgs ros-kilted-visualization-msgs \
+	  ros-kilted-std-msgs ros-kilted-std-srvs
+	@touch $@
 
 test: venv-dev lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile
