@@ -18,10 +18,10 @@ from services.estimation.drift import DriftProcess
 from services.estimation.drift_filter import DriftFilter
 from services.estimation.evidence import Explanation, TouchEvidence, evidence_of
 from services.estimation.references import References
-from services.estimation.start import Verdict, judge_start
+from services.estimation.start import StartVerdict, judge_start
 from services.estimation.tare import Baseline, noisy, plausible_noise, take
 from services.estimation.tuning import TUNING
-from services.runtime.config import Tare
+from services.runtime.config import TareConfig
 from services.runtime.stage import SEPARATE, Refused
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ def believed(frame: RawFrame) -> bool:
 class BaselineEstimator:
     """Baseline |Z0| (K,), what differences are divided by, and their noise."""
 
-    def __init__(self, bundle: Bundle, config: Tare) -> None:
+    def __init__(self, bundle: Bundle, config: TareConfig) -> None:
         self.bundle, self.config = bundle, config
         self.pre = bundle.prereconstructor()
         self.follower = DriftFilter(self.pre, config)
@@ -121,8 +121,8 @@ class BaselineEstimator:
         start = judge_start(
             found.z0, found.sigma / np.sqrt(found.frames), self.evidence, None if trusted is None else trusted.z0
         )
-        self.touched_at_start = start.verdict is Verdict.TOUCHED
-        if start.verdict is Verdict.UNKNOWN and not found.doubt:
+        self.touched_at_start = start.verdict is StartVerdict.TOUCHED
+        if start.verdict is StartVerdict.UNKNOWN and not found.doubt:
             found = dataclasses.replace(found, doubt=UNSURE)
         if not self.touched_at_start:
             self.set_baseline(found, self.last_sample_ns)

@@ -25,7 +25,7 @@ from services.estimation.drift_prior import REST_S
 from services.estimation.holding import Holding
 from services.estimation.saved import shaped
 from services.estimation.tuning import TUNING
-from services.runtime.config import Tare
+from services.runtime.config import TareConfig
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ MOST_S = 600.0  # of drift: a longer gap counts as this
 class DriftFilter:
     """Follows (K,) |Z0|. Times are `sample` stamps [ns]; 0: not known yet."""
 
-    def __init__(self, pre: PreReconstructor, config: Tare) -> None:
+    def __init__(self, pre: PreReconstructor, config: TareConfig) -> None:
         self.pre, self.config = pre, config
         self._columns = np.column_stack([np.ones(pre.measurements), pre.m.contact])  # d per relative change
         self._rates = np.array([config.scale_per_s] + [config.contact_per_s] * pre.m.contact.shape[1])

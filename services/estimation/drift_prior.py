@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 from models.prereconstruction import Drift, PreReconstructor
-from services.runtime.config import Tare
+from services.runtime.config import TareConfig
 
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ COARSE = 2  # pixels of the reconstruction matrices to one of the non-negative f
 class DriftPrior:
     """The law of `Drift` over time, in steps 0 ... STEPS - 1."""
 
-    def __init__(self, config: Tare) -> None:
+    def __init__(self, config: TareConfig) -> None:
         self.scale_per_s, self.contact_per_s = config.scale_per_s, config.contact_per_s
         self.widest = STEPS - 1
 
