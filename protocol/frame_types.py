@@ -311,7 +311,7 @@ class InfoFrame(Frame):
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class Touch:
+class TrueTouch:
     """What the stub's skin is really touched by."""
 
     shape: str = wire(Text(32), "kind: circle, triangle, rectangle, square, L, hertz")
@@ -331,4 +331,4 @@ class Touch:
 class TruthFrame(Frame):
     """What really touches at the middle of the scan; only a stub knows. `publish`: the scan's last byte had left."""
 
-    touches: list[Touch] = wire(ListOf(Record(Touch), 256), "the touches", list, always=True)
+    touches: list[TrueTouch] = wire(ListOf(Record(TrueTouch), 256), "the touches", list, always=True)

@@ -3,8 +3,8 @@
 A touch that comes, goes or moves changes pairs near it more than others; so does a contact. Two frames are compared,
 not a frame and the baseline: so a step is told under a held touch as well. A factor is named where the common change is
 six standard deviations of its own noise and what it leaves is no more than noise. An unchanged gain passes for a step
-with a probability below 1e-8 a frame. A touch that moves on changes a frame nearly as it
-changed the frame before: that is told apart as well.
+with a probability below 1e-8 a frame. While a touch moves, it changes the frame by nearly what it changed the frame
+before by: that is told apart as well.
 """
 
 from __future__ import annotations
