@@ -36,5 +36,5 @@ class TimeQuestions:
         return link.encode(link.TimeAsk(nonce=nonce))
 
     def asked_s(self, answer: link.Time) -> float | None:
-        """Returns when the question was asked that this answers; None for one that is not ours, or was answered before."""
+        """Returns when the question that this answers was asked; None for no question of ours."""
         return self._asked_s.pop(answer.nonce, None)
