@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from models.forward import ForwardModel
 from models.linearise import linearise
 from models.network import MMCNN, NetworkConfig, multiply_accumulates
 from models.prereconstruction import Array, Matrices, PreReconstructor
+from protocol.errors import EitskinError
 
 VALID = 1000
 
@@ -172,4 +174,7 @@ def make_scenes(skin: str, work: Path, scenes: int, valid: int, args: argparse.N
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except EitskinError as why:  # its text is for the person who started the build
+        sys.exit(f"models.build: {why}")

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from bench.stability.run import Answer, InProcessStages, Row, Setting, judged, noisy, share, summary
 from models.shapes import Array, Shape
 from protocol.frames import STATUS_CLIPPED, STATUS_OPEN
-from services.estimation.tare import Baseline, take
-from services.runtime.stage import Refused
+from services.estimation.tare import Baseline, NoBaseline, take
 
 USUAL_DB = 70.0
 COUNTS = (1, 2, 3, 5, 10, 20, 40, 59, 60, 61, 90, 119, 120)
@@ -109,7 +108,7 @@ def constant(setting: Setting) -> Iterator[Row]:
         saved = Baseline(zeroed, sigma, baseline.frames, "bench", 0).to_dict()
         try:
             answer = runner.once(Baseline.from_dict(saved, len(z0)), noisy(touched.z, share(USUAL_DB), rng))
-        except Refused:  # as a process would find it at start
+        except NoBaseline:  # as a process would find it at start
             answer = Answer()
         truth = touched.touch if count < len(z0) else None
         yield {"case": f"reference zero in {count}", "value": count, **summary([(answer, truth)])}
@@ -155,7 +154,7 @@ def _random_tares(runner: InProcessStages, z0: Array, rng: np.random.Generator, 
             with np.errstate(all="ignore"):
                 baseline = take(frames, runner.pipeline.pre.pre, "bench", 0)
             answers.append((runner.once(baseline, frames[0], status), None))
-        except Refused:
+        except NoBaseline:
             answers.append((Answer(), None))
         except Exception as error:  # the promise is that there is none
             answers.append((Answer(broken=[f"crash: {type(error).__name__}: {error}"]), None))

@@ -27,7 +27,7 @@ from models.forward import ForwardModel
 from models.linearise import linearise
 from models.prereconstruction import Operator, PreReconstructor
 from models.shapes import Array, Shape
-from services.runtime.stage import Refused
+from services.estimation.tare import NoBaseline
 
 USUAL_DB = 70.0
 SPACING = 0.5  # model units between neighbouring electrodes of a side
@@ -57,7 +57,7 @@ def answers(
     for scene in scenes:
         try:
             baseline = runner.tare(scale * scene.z0, relative, rng)
-        except Refused as why:
+        except NoBaseline as why:
             found += [(Answer(reasons=(f"tare refused: {why}",)), scene.touch)] * draws
             continue
         for _ in range(draws):
