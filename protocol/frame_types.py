@@ -44,6 +44,7 @@ REASONS = {
     "extrapolated": "a force beyond the calibrated range",
     "late": "measured longer ago than it may be acted on: what brought it was held up",
     "clock": "the sample time is uncertain: the board's clock is not known well enough, or it jumped",
+    "gain": "all measurements changed by one common factor: the board's gain stepped, and the baseline with it",
     "frozen": "the board sends the same scan again and again, with new numbers and times",
     "uncalibrated_force": "the skin has no force law: forces are nil",
     "replay": "from a recording",
