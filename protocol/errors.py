@@ -28,6 +28,7 @@ class EitskinError(Exception):
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── ConfigError                       services: skin.toml cannot be used
         ├── Refused                           a stage does not carry out a command now
+        ├── NoBaseline (ValueError)           frames, or a saved state, do not make a baseline
         ├── PortError                         the board's port cannot be opened, or is gone
         ├── RecordingError (ValueError)       a file is not a recording, or cannot be written
         ├── ReplayError                       a replay cannot begin or go on
@@ -35,7 +36,9 @@ class EitskinError(Exception):
         ├── ImportRefused (ValueError)        a file cannot become a recording
         ├── RegistrationError (ValueError)    presses at known places do not register a skin
         ├── CalibrationError                  presses of known force make no force law
+        ├── MissingExtra                      the packages that a bridge needs are not installed
         ├── NotOurs                           a folder that must not be handed over
+        ├── BridgeError                       bridges: a bridge cannot start
         ├── CliError                          ends a command with one line and an exit code
         └── Broken                            bench: a promise was broken under changed bytes
     """

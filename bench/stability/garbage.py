@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from bench.stability.run import Answer, Row, Runner, Setting, judged, noisy, share, summary
 from models.shapes import Array, Shape
 from protocol.frames import STATUS_CLIPPED, STATUS_OPEN
-from services.estimation.tare import Baseline, take
-from services.runtime.stage import Refused
+from services.estimation.tare import Baseline, NoBaseline, take
 
 USUAL_DB = 70.0
 COUNTS = (1, 2, 3, 5, 10, 20, 40, 59, 60, 61, 90, 119, 120)
@@ -109,7 +108,7 @@ def constant(setting: Setting) -> Iterator[Row]:
         saved = Baseline(zeroed, sigma, baseline.frames, "bench", 0).to_dict()
         try:
             answer = runner.once(Baseline.from_dict(saved, len(z0)), noisy(touched.z, share(USUAL_DB), rng))
-        except Refused:  # as a process would find it at start
+        except NoBaseline:  # as a process would find it at start
             answer = Answer()
         truth = touched.touch if count < len(z0) else None
         yield {"case": f"reference zero in {count}", "value": count, **summary([(answer, truth)])}
@@ -133,10 +132,10 @@ def random_frames(setting: Setting) -> Iterator[Row]:
         broken.update(judged(answer, None))
         valid += answer.valid
     yield {"case": "all kinds in one stream", "frames": n // 10, "valid_%": 1000 * valid / n, "broken": dict(broken)}
-    answers = [runner.see(noisy(z0, share(USUAL_DB), rng)) for _ in range(200)]
-    answers += [runner.see(noisy(scenes[1].z, share(USUAL_DB), rng)) for _ in range(20)]
-    well = summary([(a, scenes[1].touch) for a in answers[-20:]])
-    if not answers[-1].valid or not answers[-1].contacts:
+    after = [runner.see(noisy(z0, share(USUAL_DB), rng)) for _ in range(200)]
+    after += [runner.see(noisy(scenes[1].z, share(USUAL_DB), rng)) for _ in range(20)]
+    well = summary([(a, scenes[1].touch) for a in after[-20:]])
+    if not after[-1].valid or not after[-1].contacts:
         well["broken"]["not well again after 200 good frames"] = 1
     yield {"case": "a touch, 200 good frames later", **well}
     yield {"case": "random tares", **_random_tares(runner, z0, rng, max(2 * len(FAMILIES), n // 400))}
@@ -155,7 +154,7 @@ def _random_tares(runner: Runner, z0: Array, rng: np.random.Generator, n: int) -
             with np.errstate(all="ignore"):
                 baseline = take(frames, runner.pipeline.pre.pre, "bench", 0)
             answers.append((runner.once(baseline, frames[0], status), None))
-        except Refused:
+        except NoBaseline:
             answers.append((Answer(), None))
         except Exception as error:  # the promise is that there is none
             answers.append((Answer(broken=[f"crash: {type(error).__name__}: {error}"]), None))

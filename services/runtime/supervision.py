@@ -47,17 +47,23 @@ class Program:
 
 
 def programs(config: Config) -> list[Program]:
-    """What a configuration needs: the stages, and the stub where a skin's port is "stub"."""
+    """What a configuration needs: the stages, its bridges, and the stub where a skin's port is "stub"."""
     found = [Program(name, f"services.{name}") for name in PROCESSES]
+    found += [Program(name, "services.bridge", (name,)) for name in config.bridges]
     if on_stub := stub_arguments(config):
         found.insert(0, Program("stub", "firmware_stub", on_stub))
     return found
 
 
 def stub_arguments(config: Config) -> tuple[str, ...]:
-    """What `python -m firmware_stub` is told: a board for each skin whose port is "stub", with that skin's bundle."""
+    """What `python -m firmware_stub` is told: a board for each skin whose port is "stub", with that skin's bundle and
+    by what its sheet differs from it.
+    """
     skins = [(name, skin) for name, skin in config.skins.items() if skin.port == "stub"]
-    return tuple(part for name, skin in skins for part in ("--skin", f"{name}={_folder(skin.bundle)}"))
+    said = [part for name, skin in skins for part in ("--skin", f"{name}={_folder(skin.bundle)}")]
+    for name, skin in skins:
+        said += ["--mismatch", f"{name}={skin.mismatch}"] if skin.mismatch != "none" else []
+    return tuple(said)
 
 
 def _folder(bundle: str) -> Path:

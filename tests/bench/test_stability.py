@@ -28,8 +28,7 @@ from models.bundle import Bundle
 from models.forward import shared
 from models.shapes import Array
 from protocol.frames import Contact
-from services.estimation.tare import Baseline
-from services.runtime.stage import Refused
+from services.estimation.tare import Baseline, NoBaseline
 
 RELATIVE = 10 ** (-80 / 20)  # the board's noise
 
@@ -125,7 +124,7 @@ def test_a_saved_baseline_of_too_few_measurements_is_refused(
     saved = baseline.to_dict()
     saved["z0"] = np.where(np.arange(120) < lost, 0.0, baseline.z0)
     if lost > 60:
-        with pytest.raises(Refused, match=f"only {120 - lost} of 120"):
+        with pytest.raises(NoBaseline, match=f"only {120 - lost} of 120"):
             Baseline.from_dict(saved, 120)
         return
     answer = runner.once(Baseline.from_dict(saved, 120), noisy(scene.z, RELATIVE, np.random.default_rng(8)))

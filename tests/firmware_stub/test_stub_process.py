@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import serial
 
+from firmware_stub.__main__ import arguments
 from models.patterns import pattern
 from protocol import link
 from protocol.control import ControlClient, ControlError
@@ -182,6 +183,22 @@ def test_wrong_options_are_explained(other_folder, options, says):
     stub = Process(other_folder, *options)
     assert stub.process.wait(60) == 2
     assert says in stub.line
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [(("--mismatch", "wild"), "anisotropy5"), (("--mismatch", "sole=mild"), "no skin 'sole'; expected one of palm")],
+)
+def test_a_mismatch_that_there_is_not(capsys, options, says):
+    with pytest.raises(SystemExit):
+        arguments([*options])
+    assert says in capsys.readouterr().err
+
+
+def test_a_mismatch_is_one_skins_or_everyones():
+    skins = ("--skin", "a", "--skin", "b")
+    assert arguments([*skins, "--mismatch", "b=mild"]).mismatches == {"a": "none", "b": "mild"}
+    assert arguments([*skins, "--mismatch", "field5"]).mismatches == {"a": "field5", "b": "field5"}
 
 
 def test_it_ends_with_its_parent(other_folder):

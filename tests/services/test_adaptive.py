@@ -114,7 +114,7 @@ def verdict(**values: object) -> DeltaFrame:
 
 
 def test_only_sound_quiet_full_frames_let_the_board_rest(pair: tuple[Host, Host]) -> None:
-    sentinel = pair[0].pipeline.pre._coarse.sentinel  # type: ignore[union-attr]
+    sentinel = pair[0].pipeline.pre.sentinel_scans._coarse.sentinel  # type: ignore[union-attr]
     rng = np.random.default_rng(0)
     for spoiler in (verdict(touched=True), DeltaFrame(skin="palm"), verdict(electrodes=np.eye(1, 16, dtype="u1")[0])):
         adaptive, now = AdaptiveScan(sentinel, 7, quiet_frames=10), 0.0
