@@ -109,7 +109,7 @@ class Elements:
         return sparse.csr_array(sparse.coo_array(entries, shape=(n * n, self.n_elements)))
 
     def _at_samples(self, n: int) -> NDArray[np.int64]:
-        """(n*n,) element that holds each centre of an n x n grid of the square, raveled [iy, ix]; -1 where none does."""
+        """(n*n,) element that holds each centre of an n x n grid of the square, raveled [iy, ix]; -1: none does."""
         place = (self.corners + 1) * n / 2 - 0.5  # of corners, in samples
         low = np.clip(np.ceil(place.min(axis=1) - 1e-9), 0, n).astype(int)
         high = np.clip(np.floor(place.max(axis=1) + 1e-9), -1, n - 1).astype(int)

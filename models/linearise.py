@@ -37,7 +37,8 @@ def linearise(
     signed = solution.impedances()
     z0 = np.abs(signed)
     per_area = zip(solution.products(), (tensors / model.areas[:, None]).T, strict=True)
-    density: Array = np.sum([part * share for part, share in per_area], axis=0) / signed[:, None]  # of d = |Z|/|Z0| - 1 to a drop, per area
+    # of d = |Z|/|Z0| - 1 to a drop, per area
+    density: Array = np.sum([part * share for part, share in per_area], axis=0) / signed[:, None]
     prior = (density**2).sum(axis=0) ** NOSER_POWER
     prior /= (prior * model.areas).sum() / model.areas.sum()
     # The singular points at electrode ends would make one element rule the image: nothing is asked to be stiffer than

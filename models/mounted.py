@@ -96,7 +96,7 @@ class Mounting:
         a, b = self.anisotropy
         size = float(np.hypot(a, b))
         grow = np.sinh(size) / size if size > 1e-12 else 1.0
-        return np.cosh(size) * np.array([1.0, 0.0, 1.0]) + grow * np.array([a, b, -a])
+        return np.asarray(np.cosh(size) * np.array([1.0, 0.0, 1.0]) + grow * np.array([a, b, -a]))
 
     def skin(self, nominal: Skin) -> Skin:
         """The electrodes where they are, with the contact impedances that they have."""
