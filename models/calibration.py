@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.geometry import Skin
+from models.geometry import SkinGeometry
 from models.linearise import linearise
 from models.mounted import FieldModes, Mounting, Predicted, most_shift
 from models.prereconstruction import Matrices
@@ -52,7 +52,7 @@ class Fit:
     held_out: tuple[float, ...]  # of the held-out parts after each step that counted
 
 
-def fit(skin: Skin, matrices: Matrices, z0: Array, sigma: Array, mesh: str = STEPS_MESH) -> Fit:
+def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: str = STEPS_MESH) -> Fit:
     """z0 (K,): |Z| of the untouched skin in the order of its pattern, 0 where not measured; any unit. sigma (K,): its
     standard deviation, same unit, infinite where not measured. matrices: the bundle's. Raises CalibrationError.
     """
@@ -97,7 +97,7 @@ def fit(skin: Skin, matrices: Matrices, z0: Array, sigma: Array, mesh: str = STE
     return Fit(now.mounting, sd, before, _rms(seen - now.log, live), tuple(held_out))
 
 
-def calibrated(matrices: Matrices, skin: Skin, mounting: Mounting, mesh: str = MESH) -> Matrices:
+def calibrated(matrices: Matrices, skin: SkinGeometry, mounting: Mounting, mesh: str = MESH) -> Matrices:
     """The bundle's matrices, linearised about the skin as it is mounted. What the network was trained to see, the
     ladder of lambda and the levels of its images, stays.
     """

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.forward import ForwardModel, Solution
-from models.geometry import Skin
+from models.geometry import SkinGeometry
 from models.patterns import incidence
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ GRID = 17  # points a side on which the field's modes are found
 class FieldModes:
     """Modes of a smooth field over a skin, each scaled to its prior's standard deviation; their means are taken out."""
 
-    def __init__(self, skin: Skin) -> None:
+    def __init__(self, skin: SkinGeometry) -> None:
         axis = np.linspace(-1, 1, GRID)
         grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         self._points: Array = grid[skin.inside(grid)]
@@ -71,7 +71,7 @@ class Mounting:
     anisotropy: Array
 
     @classmethod
-    def nominal(cls, skin: Skin, modes: int) -> Mounting:
+    def nominal(cls, skin: SkinGeometry, modes: int) -> Mounting:
         n = skin.n_electrodes
         return cls(0.0, np.zeros(n), np.zeros(n), np.zeros(modes), np.zeros(2))
 
@@ -98,7 +98,7 @@ class Mounting:
         grow = np.sinh(size) / size if size > 1e-12 else 1.0
         return np.asarray(np.cosh(size) * np.array([1.0, 0.0, 1.0]) + grow * np.array([a, b, -a]))
 
-    def skin(self, nominal: Skin) -> Skin:
+    def skin(self, nominal: SkinGeometry) -> SkinGeometry:
         """The electrodes where they are, with the contact impedances that they have."""
         return nominal.moved(self.shift, nominal.contact_impedance * np.exp(self.contact))
 
@@ -107,7 +107,7 @@ class Mounting:
         return np.asarray(np.exp(modes @ self.field)[:, None] * self.tensor)
 
 
-def most_shift(skin: Skin) -> Array:
+def most_shift(skin: SkinGeometry) -> Array:
     """(E,) how far an electrode may be thought off its place: MOST_SHIFT, and less where its neighbours are near."""
     order = np.argsort(np.mod(skin.electrodes, skin.perimeter))
     gap = np.empty(len(order))
@@ -121,7 +121,7 @@ def most_shift(skin: Skin) -> Array:
 class Predicted:
     """|Z| (K,) of a mounted skin and the derivative (K, P) of its logarithm to `Mounting.vector`."""
 
-    def __init__(self, nominal: Skin, mounting: Mounting, modes: FieldModes, mesh: str) -> None:
+    def __init__(self, nominal: SkinGeometry, mounting: Mounting, modes: FieldModes, mesh: str) -> None:
         self.mounting = mounting
         self.model = ForwardModel(mounting.skin(nominal), mesh=mesh)
         self.modes: Array = modes(self.model.centroids)

@@ -20,7 +20,7 @@ MESH = "inverse"  # the fit's steps are taken on it; the sheets are of the mesh 
 
 
 @pytest.fixture(scope="module")
-def skin() -> geometry.Skin:
+def skin() -> geometry.SkinGeometry:
     return geometry.load("square16")
 
 
@@ -33,7 +33,7 @@ def measured(mismatch: Mismatch, shapes: tuple[Shape, ...] = ()) -> np.ndarray:
     return np.abs(MismatchedSheet("square16", mismatch).solve(shapes).impedances())
 
 
-def test_derivatives_are_those_of_the_forward_model(skin: geometry.Skin) -> None:
+def test_derivatives_are_those_of_the_forward_model(skin: geometry.SkinGeometry) -> None:
     modes, rng = FieldModes(skin), np.random.default_rng(0)
     nominal = Mounting.nominal(skin, modes.count)
     state = nominal.with_vector(0.3 * rng.standard_normal(len(nominal.vector)) * nominal.prior_sd)
@@ -54,7 +54,7 @@ def test_derivatives_are_those_of_the_forward_model(skin: geometry.Skin) -> None
         assert np.linalg.norm(found - slopes[mesh][:, column]) < within * np.linalg.norm(found), column
 
 
-def test_a_fit_finds_anisotropy_contacts_and_shifts(skin: geometry.Skin, matrices: Matrices) -> None:
+def test_a_fit_finds_anisotropy_contacts_and_shifts(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     mismatch = Mismatch(anisotropy=0.05, contacts=3, contact_factor=3.0)
     z0 = 7.3 * measured(mismatch)  # a board in any unit
     found = fit(skin, matrices, z0, 1e-5 * z0)
@@ -71,7 +71,7 @@ def test_a_fit_finds_anisotropy_contacts_and_shifts(skin: geometry.Skin, matrice
     assert left.std() < 0.6 * true.std()  # turning all of them alike, which anisotropy resembles, is hardly seen
 
 
-def test_an_even_well_made_skin_is_left_as_it_is(skin: geometry.Skin, matrices: Matrices) -> None:
+def test_an_even_well_made_skin_is_left_as_it_is(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     z0 = measured(named("none"))
     mounting = fit(skin, matrices, z0, 1e-5 * z0).mounting
     assert np.abs(mounting.shift).max() < 2e-3
@@ -80,7 +80,9 @@ def test_an_even_well_made_skin_is_left_as_it_is(skin: geometry.Skin, matrices: 
     assert np.abs(mounting.field).max() < 0.1
 
 
-def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(skin: geometry.Skin, matrices: Matrices) -> None:
+def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(
+    skin: geometry.SkinGeometry, matrices: Matrices
+) -> None:
     touch = (Shape("circle", 0.45, 0.3, 0.2, 0.05),)
     mismatch = named("mild")
     z0, z = measured(mismatch), measured(mismatch, touch)
@@ -95,13 +97,13 @@ def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(skin: geom
     assert (made.level == matrices.level).all() and made.scale_index == matrices.scale_index
 
 
-def test_linearising_about_the_file_gives_the_files_matrices(skin: geometry.Skin, matrices: Matrices) -> None:
+def test_linearising_about_the_file_gives_the_files_matrices(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     made = calibrated(matrices, skin, Mounting.nominal(skin, FieldModes(skin).count))
     for name in ("z0", "gram", "back", "jacobian", "contact"):
         np.testing.assert_allclose(getattr(made, name), getattr(matrices, name), rtol=1e-5, atol=1e-7)
 
 
-def test_large_shifts_stay_bounded_and_never_make_it_worse(skin: geometry.Skin, matrices: Matrices) -> None:
+def test_large_shifts_stay_bounded_and_never_make_it_worse(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     mismatch = named("shift3").seeded(1)
     z0 = measured(mismatch)
     found = fit(skin, matrices, z0, 1e-5 * z0)
@@ -113,14 +115,14 @@ def test_large_shifts_stay_bounded_and_never_make_it_worse(skin: geometry.Skin, 
     assert found.after <= found.before and np.isfinite(found.mounting.vector).all()
 
 
-def test_too_few_measurements_are_refused(skin: geometry.Skin, matrices: Matrices) -> None:
+def test_too_few_measurements_are_refused(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     z0 = measured(named("none"))
     z0[:30] = 0.0
     with pytest.raises(CalibrationError, match="90 of 120"):
         fit(skin, matrices, z0, 1e-5 * z0)
 
 
-def test_a_pixel_knows_its_elements_without_a_plotting_library(skin: geometry.Skin) -> None:
+def test_a_pixel_knows_its_elements_without_a_plotting_library(skin: geometry.SkinGeometry) -> None:
     """Against a point-by-point search: the triangle whose edges have the pixel's samples on their left."""
     model = ForwardModel(geometry.load("disc16"), mesh=MESH)
     found = model._at_samples(20)
