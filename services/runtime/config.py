@@ -95,7 +95,7 @@ class Skin(Section):
     bundle: str  # the name of a folder of models/bundles, else a path
     frame_id: str = ""  # default: the skin's name
     pose: Pose = Pose()
-    mismatch: str = "none"  # of the stub's sheet: by what it differs from the bundle, a name of models/mismatch.py
+    mismatch: str = "none"  # how the stub's sheet differs from the bundle: a name of models/mismatch.py
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
     indenter: Indenter | None = None
     network: NetworkFile = "int8"
