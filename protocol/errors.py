@@ -6,7 +6,7 @@ from __future__ import annotations
 class EitskinError(Exception):
     """What eitskin raises where something cannot be used or done. The text is for the person who must act.
 
-    Beside this base each keeps the built-in one that its name is followed by::
+    Each also derives from the built-in exception in parentheses::
 
         EitskinError
         ├── Stale (RuntimeError)              no contact frame is new enough: stop, or fall back
