@@ -54,9 +54,9 @@ def needs_fit(baseline: Baseline, bundle: Bundle) -> bool:
 class MountingFit:
     """One fit at a time, in a process of its own. `poll` never waits."""
 
-    def __init__(self, bundle: Bundle) -> None:
-        """bundle: as it was loaded, not calibrated."""
-        self.bundle = bundle
+    def __init__(self, bundle: Bundle, keep_as: str = "") -> None:
+        """bundle: as it was loaded, not calibrated. keep_as: the skin under whose name what is found is kept."""
+        self.bundle, self._keep_as = bundle, keep_as
         self.problem = ""  # why the last fit gave nothing, for a person
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -121,6 +121,11 @@ class MountingFit:
                 said = (folder / "said").read_text(errors="replace").strip().splitlines()
                 raise CalibrationFileError(said[-1] if said else f"the fit ended with exit code {code}")
             found = MountedSkin(read_bytes(folder / "out", MOST_BYTES), self.bundle)
+            if self._keep_as:
+                keep(self._keep_as, found)
+                read = kept(self._keep_as, self.bundle)
+                if read is None or read.bundle.hash != found.bundle.hash:  # inference could not follow
+                    raise CalibrationFileError("what was found could not be kept in the runtime folder: is it full?")
             evidence_of(found.bundle)
             self._read = found
         except (CalibrationFileError, FileError, OSError) as why:
