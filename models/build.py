@@ -28,7 +28,7 @@ from models.augmentation import random_condition
 from models.evaluation import LEVELS, evaluate, predict
 from models.forward import ForwardModel
 from models.linearise import linearise
-from models.network import MMCNN, Config, multiply_accumulates
+from models.network import MMCNN, NetworkConfig, multiply_accumulates
 from models.prereconstruction import Array, Matrices, PreReconstructor
 from protocol.errors import EitskinError
 
@@ -61,7 +61,7 @@ class Plan:
 FULL, QUICK = Plan(57000, 214.0, 13.0), Plan.of(12.5)  # packaging takes another two minutes
 
 
-def physics(skin: geometry.Skin, scenes: Path) -> tuple[Matrices, samples.Samples]:
+def physics(skin: geometry.SkinGeometry, scenes: Path) -> tuple[Matrices, samples.Samples]:
     """Matrices of a skin, and the held-out scenes in their normalisation."""
     # With z0 of the model as the divisor, contact impedances off by 30 % change d by 0.2 % instead of 0.5 %; but it
     # takes a converter that reads ohm. Skins recorded in counts of unknown gain a channel divide by their own baseline.
@@ -112,7 +112,7 @@ def networks(folder: Path, pre: PreReconstructor, held_out: samples.Samples) -> 
 def restore(checkpoint: Path) -> tuple[MMCNN, dict[str, Any]]:
     """The network a checkpoint ships (averaged weights, best on held-out scenes), and all of its state."""
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    model = MMCNN(Config.from_dict(state["config"]))
+    model = MMCNN(NetworkConfig.from_dict(state["config"]))
     model.load_state_dict(state["best"] or state["average"])
     return model.eval(), state
 
@@ -181,7 +181,9 @@ def main(argv: list[str] | None = None) -> None:
         print(f"verdict: {said['full']['verdict']['text']}")
 
 
-def _verdict(skin: str, pre: PreReconstructor, held_out: samples.Samples, said: dict[str, Any]) -> verdict.Verdict:
+def _verdict(
+    skin: str, pre: PreReconstructor, held_out: samples.Samples, said: dict[str, Any]
+) -> verdict.TrainingVerdict:
     training = said["training"]
     without, floor = verdict.one_step(held_out, pre), verdict.position_floor(skin, held_out)
     return verdict.judge(said["held_out"], training["batches"], training["minutes"], without, floor)

@@ -26,7 +26,7 @@ from models import data, geometry, manifest, samples
 from models.bundle import Bundle
 from models.evaluation import LEVELS, evaluate, predict
 from models.losses import losses, total
-from models.network import FAST, FULL, MMCNN, Config, laid_out
+from models.network import FAST, FULL, MMCNN, NetworkConfig, laid_out
 from models.optim import Muon
 from models.pace import Pace, TrainingBar
 from models.prereconstruction import PreReconstructor
@@ -39,7 +39,9 @@ AVERAGE = 0.999
 class Trainer:
     """One network's training state: everything that a checkpoint holds."""
 
-    def __init__(self, config: Config, batches: samples.Batches, held_out: samples.Samples, seed: int = 0) -> None:
+    def __init__(
+        self, config: NetworkConfig, batches: samples.Batches, held_out: samples.Samples, seed: int = 0
+    ) -> None:
         torch.manual_seed(seed)
         self.seed, self.commit = seed, manifest.commit()
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -218,7 +220,7 @@ def plot(curve: list[dict[str, Any]], path: Path) -> None:
 
 def train(
     variant: str,
-    skin: geometry.Skin,
+    skin: geometry.SkinGeometry,
     pre: PreReconstructor,
     scenes: samples.Samples,
     held_out: samples.Samples,
