@@ -27,6 +27,7 @@ class EitskinError(Exception):
         ├── MismatchError (ValueError)        a sheet that differs from its model in a way that cannot be
         ├── TooFewMeasured                    an untouched frame in which too little was measured to calibrate on
         ├── OtherScenes (ValueError)          training scenes of another skin, or of this one as it was
+        ├── OtherScenes (ValueError)          training scenes that must not be mixed with those of this run
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── ConfigError                       services: skin.toml cannot be used
