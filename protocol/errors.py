@@ -12,7 +12,7 @@ class EitskinError(Exception):
         ├── Stale (RuntimeError)              no contact frame is new enough: stop, or fall back
         │   └── NotValid                      the newest frame is new and says that it must not be acted on
         ├── FrameError (ValueError)           a message is not a frame
-        ├── Mismatch                          a value is not what its field allows; a FrameError names frame and field
+        ├── FieldError                        a value is not what its field allows; a FrameError names frame and field
         ├── ControlError (RuntimeError)       a command was not carried out
         ├── TransportError (RuntimeError)     a socket or a key file cannot be used as configured
         ├── RuntimeDirError (RuntimeError)    the runtime folder cannot be used
@@ -28,6 +28,7 @@ class EitskinError(Exception):
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── ConfigError                       services: skin.toml cannot be used
         ├── Refused                           a stage does not carry out a command now
+        ├── NoBaseline (ValueError)           frames, or a saved state, do not make a baseline
         ├── PortError                         the board's port cannot be opened, or is gone
         ├── RecordingError (ValueError)       a file is not a recording, or cannot be written
         ├── ReplayError                       a replay cannot begin or go on
