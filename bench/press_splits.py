@@ -11,8 +11,8 @@ import numpy as np
 from models.bundle import Bundle
 from models.locator import NINETY, Locator
 from services.calibration.locating import build, true_places
-from services.calibration.presses import part, read_presses
-from services.calibration.registration import RegistrationError, register
+from services.calibration.presses import RegistrationError, part, read_presses
+from services.calibration.registration import register
 from services.recordings.npz_file import load_npz
 
 SUPERPOSE, CONCENTRIC = "hydrogel_disc16", "hydrogel_vse_concentric"

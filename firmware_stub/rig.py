@@ -1,4 +1,4 @@
-"""Sheet, board and line in one: what a host has at the other end of its cable. Driven by time, at any speed.
+"""Sheet, board and line in one: what is at the other end of a host's cable. Its caller sets the time, at any speed.
 
 rig = Rig("square16", scene="slide", seed=1)
 rig.feed(link.encode(link.Hello()), 0.0)
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from . import scene as scenes
-from .analog import Analog, Noise
+from .analog import Analog, BoardNoise
 from .board import Board, Scan, measurement_s
 from .faults import FAULTS, Faults
 from .field import Field
@@ -25,20 +25,21 @@ from .timeline import Timeline, press_track
 from .world import World
 
 UNTOUCHED = "demo"  # the scene in which nothing touches
-SLEPT_S = 1.0  # a longer pause between two calls was the machine's sleep, not the board's
+SLEPT_S = 1.0  # after a longer pause between two calls the machine slept, not the board
 
 
 class Rig:
     """A stub board on a sheet. Times are seconds since it was made; nothing in here looks at a clock.
 
     rate_hz: full scans per second instead of the real board's. threaded: solve ahead in a thread (see Field), and skip
-    the scans of a pause instead of making up for them.
+    the scans of a pause instead of making up for them. mismatch: see Sheet.
     """
 
     def __init__(
         self,
         geometry: str | Sheet = "square16",
         *,
+        mismatch: str = "none",
         scene: str = "demo",
         snr_db: float = 80.0,
         floor_ohm: float = 0.0,
@@ -51,7 +52,7 @@ class Rig:
         answers_time: bool = True,
     ) -> None:
         script = scenes.load(scene)  # first, since it fails fast
-        self.sheet = geometry if isinstance(geometry, Sheet) else Sheet(geometry)
+        self.sheet = geometry if isinstance(geometry, Sheet) else Sheet(geometry, mismatch)
         self.faults = Faults()
         timeline = Timeline(script, 0.0, (), self.sheet.electrodes)
         self.field = Field(self.sheet.transfer, timeline, threaded=threaded)
@@ -59,7 +60,7 @@ class Rig:
         self.line = Line(baud)
         self._rng = np.random.default_rng(seed)
         self._realtime = threaded
-        noise = Noise(10 ** (-snr_db / 20), floor_ohm)
+        noise = BoardNoise(10 ** (-snr_db / 20), floor_ohm)
         full_s = len(self.sheet.skin.pattern) * measurement_s(128)
         self.board = Board(
             self.field,

@@ -59,7 +59,7 @@ class Likely:
     misfit: float  # mean square of the whitened residual there
 
 
-class Conditioned:
+class WhitenedMap:
     """The map for one noise and one set of live measurements, whitened."""
 
     def __init__(self, arrays: LocatorArrays, live: npt.NDArray[np.bool_], extra: Array) -> None:
@@ -91,13 +91,13 @@ class Locator:
         self.a = arrays
         iy, ix = np.divmod(np.flatnonzero(arrays.allowed), int(arrays.shape[1]))
         self.places = arrays.corner + float(arrays.spacing) * np.stack([ix, iy], axis=1)
-        self._conditioned: Conditioned | None = None
+        self._conditioned: WhitenedMap | None = None
         self._key = b""
-        self._trained = Conditioned(arrays, np.asarray(arrays.measured), np.zeros(len(arrays.noise)))
+        self._trained = WhitenedMap(arrays, np.asarray(arrays.measured), np.zeros(len(arrays.noise)))
         self._place, self._press = arrays.machine("place"), arrays.machine("press")
         self.quantity = QUANTITIES[int(arrays.quantity)]
 
-    def condition(self, sigma: Array) -> Conditioned | None:
+    def condition(self, sigma: Array) -> WhitenedMap | None:
         """For a frame that states this noise (K,), infinite where not measured; None where too little is left."""
         live = self.a.measured & np.isfinite(sigma)
         if live.sum() < FEWEST_LIVE:
@@ -107,7 +107,7 @@ class Locator:
             return self._trained
         key = live.tobytes() + extra.tobytes()
         if self._conditioned is None or key != self._key:
-            self._conditioned, self._key = Conditioned(self.a, live, extra), key
+            self._conditioned, self._key = WhitenedMap(self.a, live, extra), key
         return self._conditioned
 
     def locate(self, difference: Array, sigma: Array) -> list[Located]:
@@ -128,7 +128,7 @@ class Locator:
             found.append(self.single(now, own, len(chosen)))
         return sorted((touch for touch in found if touch is not None), key=lambda touch: -touch.amplitude)
 
-    def single(self, now: Conditioned, z: Array, touches: int = 1) -> Located | None:
+    def single(self, now: WhitenedMap, z: Array, touches: int = 1) -> Located | None:
         """The one touch that explains a whitened difference."""
         seen = self.seen(now, z)
         if seen is None:
@@ -145,7 +145,7 @@ class Locator:
         whole = doubt * (factor * seen.covariance + floor * np.eye(2))
         return Located(float(place[0]), float(place[1]), whole, seen.amplitude, value, value_sigma)
 
-    def seen(self, now: Conditioned, z: Array) -> Likely | None:
+    def seen(self, now: WhitenedMap, z: Array) -> Likely | None:
         """What the likelihood alone says of a single touch."""
         weight = posterior(now, z)
         if weight is None:
@@ -157,7 +157,7 @@ class Locator:
         misfit = float(((z - amplitude * now.r[best]) ** 2).mean())
         return Likely(place, (weight[:, None] * apart).T @ apart, best, amplitude, misfit)
 
-    def features(self, now: Conditioned, z: Array, seen: Likely) -> Array:
+    def features(self, now: WhitenedMap, z: Array, seen: Likely) -> Array:
         """What the kernel machines read: the form of the whole whitened difference, the place, log of the amplitude.
 
         What is not measured now is what the measured part leads to expect (the conditional mean).
@@ -174,7 +174,7 @@ class Locator:
         at = (seen.place - self.a.reach[1:]) * self.a.reach[0]
         return np.concatenate([form, at, [float(self.a.loudness) * np.log(max(seen.amplitude, LEAST_LOUD))]])
 
-    def places_of(self, now: Conditioned, z: Array) -> npt.NDArray[np.intp]:
+    def places_of(self, now: WhitenedMap, z: Array) -> npt.NDArray[np.intp]:
         """Indices of the places of one, two or three touches; [] where nothing is explained."""
         b = now.r @ z
         gain = np.where(b > 0, b * b, 0.0) / now.q
@@ -195,7 +195,7 @@ class Locator:
         return chosen
 
 
-def posterior(now: Conditioned, z: Array) -> Array | None:
+def posterior(now: WhitenedMap, z: Array) -> Array | None:
     """(P,) probability of each place, for one touch of unknown amplitude; None where nothing is explained."""
     b, q = now.r @ z + AMPLITUDE_SIGMA**-2, now.q + AMPLITUDE_SIGMA**-2
     log = np.where(b > 0, 0.5 * b * b / q - 0.5 * np.log(q), -np.inf)
@@ -211,7 +211,7 @@ def share(total: float, before: float, after: float, k: int) -> float:
     return (after - before) / max(total - after, 0.1 * k)
 
 
-def second_of(now: Conditioned, b: Array) -> tuple[npt.NDArray[np.intp], float]:
+def second_of(now: WhitenedMap, b: Array) -> tuple[npt.NDArray[np.intp], float]:
     """The pair that explains most, and how much; b: R^T C^-1 d at all places."""
     i, j = now.first, now.second
     few, q = b[now.few], now.q[now.few]
@@ -225,7 +225,7 @@ def second_of(now: Conditioned, b: Array) -> tuple[npt.NDArray[np.intp], float]:
     return now.few[[i[best], j[best]]], float(gain[best])
 
 
-def one_more(now: Conditioned, z: Array, chosen: npt.NDArray[np.intp]) -> tuple[npt.NDArray[np.intp], float]:
+def one_more(now: WhitenedMap, z: Array, chosen: npt.NDArray[np.intp]) -> tuple[npt.NDArray[np.intp], float]:
     """The place that explains most beside those chosen, each of which may then move once; and what all explain."""
     places = np.append(chosen, -1)
     for turn in (len(chosen), *range(len(chosen))):
@@ -242,7 +242,7 @@ def one_more(now: Conditioned, z: Array, chosen: npt.NDArray[np.intp]) -> tuple[
     return places, float(amplitudes @ (now.r[places] @ z))
 
 
-def _amplitudes(now: Conditioned, z: Array, chosen: npt.NDArray[np.intp]) -> Array:
+def _amplitudes(now: WhitenedMap, z: Array, chosen: npt.NDArray[np.intp]) -> Array:
     r = now.r[chosen]
     return np.linalg.lstsq(r.T, z, rcond=None)[0]
 

@@ -13,7 +13,7 @@ channels (FiLM).
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -24,9 +24,11 @@ TOLD = 32  # features of the context
 CLASSES = 5
 UPSCALE = 4
 
+Model = TypeVar("Model", bound=nn.Module)
+
 
 @dataclass(frozen=True)
-class Config:
+class NetworkConfig:
     """Sizes of the network. channels: at 24, 12 and 6 pixels a side; blocks: residual blocks at 12 down, 6, 12 up."""
 
     stack: int = 9
@@ -39,12 +41,12 @@ class Config:
         return asdict(self)
 
     @staticmethod
-    def from_dict(values: dict[str, Any]) -> Config:
-        return Config(**{**values, "channels": tuple(values["channels"]), "blocks": tuple(values["blocks"])})
+    def from_dict(values: dict[str, Any]) -> NetworkConfig:
+        return NetworkConfig(**{**values, "channels": tuple(values["channels"]), "blocks": tuple(values["blocks"])})
 
 
-FULL = Config()
-FAST = Config(channels=(8, 24, 48), blocks=(1, 1, 1), lean=True)
+FULL = NetworkConfig()
+FAST = NetworkConfig(channels=(8, 24, 48), blocks=(1, 1, 1), lean=True)
 
 
 class CBAM(nn.Module):
@@ -61,7 +63,8 @@ class CBAM(nn.Module):
         gate = self.excite(F.relu(self.squeeze(mean))) + self.excite(F.relu(self.squeeze(peak)))
         x = x * torch.sigmoid(gate)
         where = torch.cat([x.mean(1, keepdim=True), x.amax(1, keepdim=True)], 1)
-        return x * torch.sigmoid(self.place(where))
+        attended: Tensor = x * torch.sigmoid(self.place(where))
+        return attended
 
 
 class FiLM(nn.Module):
@@ -75,7 +78,8 @@ class FiLM(nn.Module):
         nn.init.zeros_(self.film.bias)
 
     def forward(self, x: Tensor, told: Tensor) -> Tensor:
-        gain, offset = self.film(told)[:, :, None, None].chunk(2, 1)
+        film: Tensor = self.film(told)
+        gain, offset = film[:, :, None, None].chunk(2, 1)
         return x * (1 + gain) + (offset + self.place)
 
 
@@ -85,7 +89,7 @@ def _convolution(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> n
     )
 
 
-class Stage(nn.Module):
+class ResidualStage(nn.Module):
     """Residual 3x3 convolutions at one resolution; context and place come in at the first."""
 
     def __init__(self, blocks: int, channels: int, side: int, lean: bool, attention: bool = False) -> None:
@@ -98,13 +102,14 @@ class Stage(nn.Module):
         x = F.relu(self.told(x, told) if self.told else x)
         for block in self.blocks:
             x = x + F.relu(block(x))
-        return self.attention(x)
+        attended: Tensor = self.attention(x)
+        return attended
 
 
 class MMCNN(nn.Module):
     """See the module's docstring."""
 
-    def __init__(self, config: Config = FULL) -> None:
+    def __init__(self, config: NetworkConfig = FULL) -> None:
         super().__init__()
         self.config = config
         a, b, c = config.channels
@@ -112,11 +117,11 @@ class MMCNN(nn.Module):
         self.context = nn.Sequential(nn.Linear(CONTEXT, TOLD), nn.ReLU(), nn.Linear(TOLD, TOLD), nn.ReLU())
         self.stem, self.told = _convolution(config.stack, a), FiLM(a, n)
         self.down1 = _convolution(a, b, stride=2)
-        self.stage1 = Stage(config.blocks[0], b, n // 2, config.lean)
+        self.stage1 = ResidualStage(config.blocks[0], b, n // 2, config.lean)
         self.down2 = _convolution(b, c, stride=2)
-        self.stage2 = Stage(config.blocks[1], c, n // 4, config.lean, attention=not config.lean)
+        self.stage2 = ResidualStage(config.blocks[1], c, n // 4, config.lean, attention=not config.lean)
         self.up2 = _convolution(c, 4 * b, 1)
-        self.stage3 = Stage(config.blocks[2], b, n // 2, config.lean)
+        self.stage3 = ResidualStage(config.blocks[2], b, n // 2, config.lean)
         self.up1 = _convolution(b, 4 * a, 1)
         # per pixel of 24 x 24: 16 mask logits and the amplitude; 16 log sigmas. What shape it is shows in the wider
         # features.
@@ -125,6 +130,7 @@ class MMCNN(nn.Module):
         self.classes = nn.Conv2d(b, 4 * CLASSES, 1)
         with torch.no_grad():
             for layer in (self.out, self.aside):
+                assert layer.bias is not None
                 layer.weight *= 0.3
                 layer.bias.zero_()
                 layer.bias[: UPSCALE**2] = -2.0
@@ -157,7 +163,17 @@ def compose(mask: Tensor, amplitude: Tensor, sigma: Tensor) -> tuple[Tensor, Ten
     return torch.exp(log_amplitude) * torch.sigmoid(mask), log_amplitude + sigma.clamp(-8.0, 2.0)
 
 
-def multiply_accumulates(config: Config) -> int:
+def laid_out(model: Model, layout: torch.memory_format) -> Model:
+    """The model, its convolutions' weights in this order of memory; what Module.to does, which takes no layout by its
+    annotations.
+    """
+    for weight in model.parameters():
+        if weight.ndim == 4:
+            weight.data = weight.data.to(memory_format=layout)
+    return model
+
+
+def multiply_accumulates(config: NetworkConfig) -> int:
     """Multiply-accumulates of one frame, convolutions only."""
     model, total = MMCNN(config).eval(), 0
 

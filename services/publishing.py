@@ -14,10 +14,14 @@ from models.bundle import Bundle
 from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, LocatedTouch, ShapeFrame
 from protocol.held import ANY, HeldImage
 from services.contacts.force import ForceLaw, Look
-from services.contacts.motion import Seen, Track
+from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
-from services.contacts.segmentation import Segment, divided, readable, segment
+from services.contacts.placing import placement
+from services.contacts.registered import measures_force, patches, registered
+from services.contacts.segmentation import Segment, readable, segment
+from services.contacts.surface import Placed
 from services.contacts.tracking import Tracker
+from services.describe import geometry
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
 
@@ -39,6 +43,10 @@ class Publishing(Stage):
         super().__init__(name)
         self.config = skin
         self.law = ForceLaw.of(skin, bundle, name)
+        self.place, self.frame_id = placement(skin, geometry(bundle)["outline"], name)
+        by_registration = measures_force(bundle)
+        self._tells_force = self.law.exists or by_registration
+        self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
         self.tracker = Tracker()
         self.each_alone = False  # offline: frames that do not follow each other
         self.reset()
@@ -68,8 +76,8 @@ class Publishing(Stage):
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, ImageFrame)
         self._counters["frames"] += 1
-        out = ContactFrame(**inherited(frame), frame_id=self.config.frame_id, force_calibrated=self.law.calibrated)
-        if not self.law.exists:
+        out = ContactFrame(**inherited(frame), frame_id=self.frame_id, force_calibrated=self._calibrated)
+        if not self._tells_force:
             add_reason(out.reasons, "uncalibrated_force")
         self.lacks = not self.held.complete(frame)
         if not frame.valid and "out_of_distribution" in frame.reasons:
@@ -108,20 +116,17 @@ class Publishing(Stage):
         return frames
 
     def _see(self, frame: ImageFrame) -> None:
-        """Contacts of a new image."""
+        """Find the contacts of a new image."""
         m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
         segments: list[Segment] = []
         located = frame.touches if frame.touched and frame.image.size else []
         if located:
-            places = [(t.position[0], t.position[1]) for t in located]
-            segments = divided(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
-            reach = [s.reach * m for s in segments]
-            seen = [Seen(*at, t.amplitude, r) for at, t, r in zip(places, located, reach, strict=True)]
+            segments, seen = patches(frame)
         elif frame.touched and frame.image.size:
             places = [] if self._alone(frame) else self.tracker.expected(now)
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
         if not located:
-            seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
+            seen = [Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
         tracks: Sequence[Track | None]
         ended: list[Track] = []
         if self._alone(frame):
@@ -133,8 +138,9 @@ class Publishing(Stage):
         for track, place, s, touch in zip(tracks, seen, segments, said, strict=True):
             if track is not None:
                 classes = _class_probabilities(s, frame.classes)
-                present.append((_with(touch, self._contact(track, place, s, classes, frame)), s, classes))
-        present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
+                present.append((self._contact(track, place, s, classes, frame, touch), s, classes))
+        if not located:  # those come strongest first
+            present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
         self._segments, self._classes = [s for _, s, _ in present], [classes for _, _, classes in present]
         self._geometry, self._known = (m, [x0, y0]), True
         self._seen_in = frame.session, frame.reconstructed
@@ -146,8 +152,8 @@ class Publishing(Stage):
         return self.each_alone or SEPARATE in frame.reasons
 
     def _knows(self, frame: ImageFrame) -> bool:
-        """Whether our contacts are those of this held image: frames in between may have passed us by, and what waits
-        to be seen twice is seen again in it.
+        """Whether our contacts are those of this held image. They are not if frames in between were missed, or if a
+        touch waits for its second frame.
         """
         recent = not self.tracker.forgotten(frame.stamps.get("sample", 0))
         session, scan = self._seen_in
@@ -161,30 +167,44 @@ class Publishing(Stage):
         self._contacts = [replace(c, state="hold", velocity=[0.0, 0.0, 0.0]) for c in present] + self._ends(ended)
 
     def _miss(self, out: ContactFrame, reason: str) -> None:
-        """A frame that says nothing of what touches: not even that a contact ended."""
+        """Make a frame that says nothing about touches, not even that a contact ended."""
         out.valid = False
         if not out.reasons:
             add_reason(out.reasons, reason)
         self._forget()
         self._counters["unknown"] += 1
 
-    def _contact(self, track: Track, seen: Seen, s: Segment, classes: list[float], frame: ImageFrame) -> Contact:
+    def _contact(
+        self,
+        track: Track,
+        seen: Patch,
+        s: Segment,
+        classes: list[float],
+        frame: ImageFrame,
+        touch: LocatedTouch | None,
+    ) -> Contact:
         force, sigma = self.law.force(Look.of(s, frame))
+        if touch is not None and not self.law.exists:
+            force, sigma = touch.force_n, None if touch.force_n is None else touch.value_sigma
         best = int(np.argmax(classes)) if classes else -1
         known = bool(classes) and classes[best] >= UNKNOWN_BELOW
+        at = self.place(seen.x, seen.y)
         return Contact(
             id=track.id,
             state="begin" if track.age == 1 and track.begins else "hold",
-            position=[seen.x, seen.y, 0.0],
-            velocity=[track.vx, track.vy, 0.0],
+            position=at.point.tolist(),
+            velocity=(track.vx * at.along_x + track.vy * at.along_y).tolist(),
+            normal=at.normal.tolist(),
             orientation=s.orientation,
             area_m2=s.area * frame.metres_per_pixel**2,
             force_n=force,
             force_sigma_n=sigma,
-            wrench=_wrench(seen.x, seen.y, force or 0.0),
+            wrench=_wrench(at, force or 0.0),
             shape=SHAPES[best] if known else "unknown",
             shape_probability=classes[best] if classes else None,
             confidence=_confidence(s),
+            sheet=None if self.place.flat else [seen.x, seen.y],
+            **({} if touch is None else registered(touch)),
         )
 
     def _drops(self) -> list[tuple[float, float | None]]:
@@ -192,14 +212,21 @@ class Publishing(Stage):
         return [(s.peak, c.force_n) for s, c in zip(self._segments, self._contacts, strict=False)]
 
     def _ends(self, tracks: list[Track]) -> list[Contact]:
-        """The last word on touches that ended: where they were; they do not press any more."""
-        force = None if not self.law.exists else 0.0
-        return [Contact(id=t.id, state="end", position=[t.x, t.y, 0.0], force_n=force, confidence=0.0) for t in tracks]
+        """The last contacts of touches that ended: their last places, without force."""
+        force = 0.0 if self._tells_force else None
+        ends = []
+        for t in tracks:
+            at, sheet = self.place(t.x, t.y), None if self.place.flat else [t.x, t.y]
+            where, normal = at.point.tolist(), at.normal.tolist()
+            ends.append(
+                Contact(id=t.id, state="end", position=where, normal=normal, force_n=force, confidence=0.0, sheet=sheet)
+            )
+        return ends
 
     def _force(self, frame: ContactFrame) -> ForceFrame:
-        """As valid as the contacts are."""
+        """The total force; valid if the contacts are."""
         present = [c for c in self._contacts if c.state != "end"]
-        total = None if not self.law.exists else sum(c.force_n or 0.0 for c in present)
+        total = None if not self._tells_force else sum(c.force_n or 0.0 for c in present)
         wrench = np.sum([c.wrench for c in present], axis=0).tolist() if present else [0.0] * 6
         return ForceFrame(**inherited(frame), wrench=wrench, force_n=total)
 
@@ -243,19 +270,6 @@ class Publishing(Stage):
         return Health("OK", [], dict(self._counters))
 
 
-def _with(touch: LocatedTouch | None, contact: Contact) -> Contact:
-    """The contact with what a registered skin's response map says of it."""
-    if touch is None:
-        return contact
-    contact.position_sigma = list(touch.sigma)
-    if touch.indentation_m is not None:
-        contact.indentation_m, contact.indentation_sigma_m = touch.indentation_m, touch.value_sigma
-    if touch.force_n is not None and contact.force_n is None:
-        contact.force_n, contact.force_sigma_n = touch.force_n, touch.value_sigma
-        contact.wrench = _wrench(contact.position[0], contact.position[1], touch.force_n)
-    return contact
-
-
 def _sound(frame: ImageFrame) -> bool:
     """Whether image and geometry are numbers that can be those of a skin."""
     places = np.abs([frame.metres_per_pixel, *frame.origin])
@@ -266,13 +280,17 @@ def _kept(frame: ImageFrame) -> dict[str, Any]:
     return {
         "scan": frame.reconstructed,
         **{name: np.array(getattr(frame, name), np.float32) for name in ("image", "sigma", "classes")},
+        "touches": [asdict(each) for each in frame.touches],
     }
 
 
 def _image_of(skin: str, kept: dict[str, Any]) -> ImageFrame:
     image, sigma, classes = (np.asarray(kept[name], np.float32) for name in ("image", "sigma", "classes"))
+    touches = [LocatedTouch(**each) for each in kept.get("touches", [])]
     scan = int(kept["scan"])
-    return ImageFrame(skin=skin, session=ANY, reconstructed=scan, image=image, sigma=sigma, classes=classes)
+    return ImageFrame(
+        skin=skin, session=ANY, reconstructed=scan, image=image, sigma=sigma, classes=classes, touches=touches
+    )
 
 
 def _explained(frame: ImageFrame) -> bool:
@@ -293,11 +311,12 @@ def _class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float
     return [min(1.0, float(p)) for p in total / max(float(total.sum()), 1e-9)]
 
 
-def _wrench(x: float, y: float, force: float) -> list[float]:
-    """On the skin, at its frame's origin: the touch presses along -z at (x, y)."""
-    return [0.0, 0.0, -force, -y * force, x * force, 0.0]
+def _wrench(at: Placed, force: float) -> list[float]:
+    """On the skin, at its frame's origin: the touch presses against the normal."""
+    pressed = -force * at.normal
+    return [*pressed.tolist(), *np.cross(at.point, pressed).tolist()]
 
 
 def _confidence(s: Segment) -> float:
-    """Probability that the peak is no noise, from its own standard deviation."""
+    """Probability that the peak is not noise, from its own standard deviation."""
     return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))

@@ -11,8 +11,10 @@ import hashlib
 import json
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +31,7 @@ from protocol.frames import RawFrame
 MADE_BY = (
     *(f"firmware_stub/{n}.py" for n in ("analog", "board", "faults", "field", "rig", "scene", "sheet", "timeline")),
     *(f"models/{n}.py" for n in ("elements", "forward", "geometry", "meshing", "patterns", "shapes")),
-    *(f"services/board/{n}.py" for n in ("boardlink", "clock", "scan_check", "scan_order", "source")),
+    *(f"services/board/{n}.py" for n in ("boardlink", "clock", "scan_check", "scan_order", "scanning", "source")),
 )
 LAYOUT = 1  # of what is kept: raised when Recorded or what fills it changes
 KEPT = 6  # recorded scenes
@@ -146,7 +148,10 @@ class _Recorder:
         ]
         rows = [row for k, f in enumerate(felt) for row in self._touches(script, k, f.start, f.world)]
         names = [([name for t, name in script.sections if t <= f.middle] or [""])[-1] for f in felt]
-        column = lambda of: np.array([of(frame) for frame in self._frames])  # noqa: E731
+
+        def column(of: Callable[[RawFrame], object]) -> NDArray[Any]:
+            return np.array([of(frame) for frame in self._frames])
+
         return Recorded(
             z=column(lambda f: f.z),
             status=column(lambda f: f.status),
