@@ -136,13 +136,13 @@ def run(file: Path, skin: str) -> tuple[list[dict[str, Any]], dict[str, int]]:
     bundle = Bundle.load(skin)
     first, others = slice(0, TRAINING), slice(TRAINING, None)
     train, test = (read_presses(part(arrays, rows), bundle) for rows in (first, others))
-    touched, untouched = arrays["touched"], arrays["untouched"]
+    touched, untouched, xy = arrays["touched"], arrays["untouched"], arrays["xy"]  # in the file's order, as frames are
     rows = []
     linear = dataclasses.replace(bundle, manifest={**bundle.manifest, "files": {"matrices.npz": ""}})
     found, seen, seconds = positions(linear, touched, untouched)
-    fitted = similarity_of(found[first], train.xy)
+    fitted = similarity_of(found[first], xy[first])
     rows.append(
-        summary("uniform disc, one step; similarity", errors(found[others], fitted, test.xy), seen[others], seconds)
+        summary("uniform disc, one step; similarity", errors(found[others], fitted, xy[others]), seen[others], seconds)
     )
     similarity = register(train, bundle).similarity
     true_size = dataclasses.replace(similarity, scale=1.0)
@@ -157,7 +157,7 @@ def run(file: Path, skin: str) -> tuple[list[dict[str, Any]], dict[str, int]]:
             own = write_corrected(Path(folder) / "own", train, map_, shipped, {})
             found, seen, seconds = positions(own, touched[others], untouched[others])
             live = live_path(own, arrays) if shipped is not None else {}
-        rows.append(summary(name, errors(found, true_size, test.xy), seen, seconds))
+        rows.append(summary(name, errors(found, true_size, xy[others]), seen, seconds))
     began = time.perf_counter()
     guess = kernel_ridge(train, test)
     seconds = (time.perf_counter() - began) / len(test)
