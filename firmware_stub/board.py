@@ -32,7 +32,7 @@ def measurement_s(points: int) -> float:
 
 @dataclass(frozen=True)
 class Scan:
-    """One that was measured, whether or not it reached the host. Times in seconds since the stub started."""
+    """A scan that was measured, whether or not it reached the host. Times in seconds since the stub started."""
 
     seq: int
     start: float
@@ -67,7 +67,7 @@ class Board:
     # --- life ---
 
     def power_cycle(self, now: float) -> None:
-        """As after power came back: nothing is configured, the clock is at zero."""
+        """Begin again as after power came back: nothing is configured, the clock is at zero."""
         self.faults.power_cycled()
         self._decoder = link.Decoder()
         self._booted = now
@@ -115,7 +115,7 @@ class Board:
         return out
 
     def skip_to(self, now: float) -> None:
-        """The host machine slept: count the scans that nobody measured."""
+        """Go on after the host machine slept, and count the scans that nobody measured."""
         if self._running is not None and (missed := int((now - self._scan_start) / self._duration(self._running))) > 0:
             self._seq += missed
             self._scan_start += missed * self._duration(self._running)
@@ -138,7 +138,7 @@ class Board:
                 now,
             )
         elif kind.sender != "host":
-            self._refuse(message, NakReason.UNKNOWN, f"{kind.__name__} is the board's to send", now)
+            self._refuse(message, NakReason.UNKNOWN, f"{kind.wire_name} is the board's to send", now)
         elif self.faults.active("wrong_schema", now) is not None:
             self._refuse(message, NakReason.SCHEMA, f"this firmware has schema {self._schema(now):08x}", now)
         elif isinstance(message, link.Config):
@@ -254,7 +254,7 @@ class Board:
         if gap is not None and self.analog.rng.random() < gap["fraction"]:
             return
         duration_us = round((end - start) * 1e6)
-        self._say(link.Frame(seq, self.device_us(start), duration_us, config.config, z, status), end)
+        self._say(link.ScanFrame(seq, self.device_us(start), duration_us, config.config, z, status), end)
 
     def device_us(self, t: float) -> int:
         """The microcontroller's clock at time t."""

@@ -1,4 +1,4 @@
-"""What can go wrong with the board: one table, and which of it is going wrong now.
+"""What can go wrong with the board: the table of faults, and those in force.
 
 A fault lasts for its seconds; one marked `sticky` lasts until the board is power-cycled (`power_cycle`, `unplug`). The
 code that a fault disturbs asks `Faults.active(name)` at that point and nowhere else.
@@ -65,7 +65,7 @@ FAULTS: dict[str, Fault] = {
     ),
     # electrodes and multiplexers
     "electrode_open": Fault(
-        "the wire of `electrode` (0-based; and of `second`) is broken: no current, a floating voltage",
+        "the wire of `electrode` (and of `second`) is broken: no current, a floating voltage",
         {"electrode": 0, "second": -1},
     ),
     "electrodes_shorted": Fault("the wires of two `electrodes` touch each other", {"electrodes": [0, 1]}),

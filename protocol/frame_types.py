@@ -44,6 +44,7 @@ REASONS = {
     "extrapolated": "a force beyond the calibrated range",
     "late": "measured longer ago than it may be acted on: what brought it was held up",
     "clock": "the sample time is uncertain: the board's clock is not known well enough, or it jumped",
+    "gain": "all measurements changed by one common factor: the board's gain stepped, and the baseline with it",
     "frozen": "the board sends the same scan again and again, with new numbers and times",
     "uncalibrated_force": "the skin has no force law: forces are nil",
     "replay": "from a recording",
@@ -160,6 +161,9 @@ class DeltaFrame(Frame):
         "state of each electrode: " + ", ".join(f"{k} {state}" for k, state in enumerate(ELECTRODE_STATES)),
         lambda: np.zeros(16, "u1"),
     )
+    calibration: str = wire(
+        Text(64, form="(?:[0-9a-f]{64})?"), "hash of the bundle as it was calibrated to this skin; empty: as it is", ""
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -204,7 +208,7 @@ class Contact:
         "first frame of the touch; in between, or not known to be the first; last one",
         "hold",
     )
-    position: list[float] = wire(Vector(3, "m"), "centroid of the contact patch, in the skin's frame")
+    position: list[float] = wire(Vector(3, "m"), "centroid of the contact patch, in the frame `frame_id`")
     velocity: list[float] = wire(Vector(3, "m/s"), "of `position`", lambda: [0.0] * 3)
     normal: list[float] = wire(Vector(3), "unit vector out of the skin", lambda: [0.0, 0.0, 1.0])
     orientation: float = wire(Float(unit="rad"), "angle of the patch's longest axis to x, -pi/2 to pi/2", 0.0)
@@ -217,6 +221,15 @@ class Contact:
     shape: str = wire(Text(32), "most probable of " + ", ".join(SHAPES) + "; or unknown", "unknown")
     shape_probability: float | None = wire(Maybe(Float(0, 1)), "of `shape`, or nil", None)
     confidence: float = wire(Float(0, 1), "probability that this is a touch", 1.0)
+    sheet: list[float] | None = wire(
+        Maybe(Vector(2, "m")), "x, y on the unrolled sheet, as images have it; nil: those of `position`", None
+    )
+
+    @property
+    def on_sheet(self) -> tuple[float, float]:
+        """x, y [m] on the sheet, as images and the stub's truth have it, whatever the skin is wrapped round."""
+        x, y = self.position[:2] if self.sheet is None else self.sheet
+        return x, y
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -285,8 +298,11 @@ INFO_KEYS = {
     "frame_id": "name of the skin's coordinate frame",
     "parent_frame_id": "name of the frame that `pose` is given in",
     "pose": "x, y, z [m], qx, qy, qz, qw: the skin's frame in its parent",
+    "surface": "map: kind (cylinder), radius_m, axis_degrees: what the sheet is wrapped round; or nil: it lies flat",
     "units": "map: name of a field -> its unit",
     "force_law": "map: kind and parameters of the force law, or nil",
+    "mounting": "map: what the calibration to this very skin found (contacts, shifts, field, anisotropy, remarks); "
+    "missing where the bundle is used as it is. `bundle_hash` covers it",
     "calibration_hash": "sha256 of the calibration file, or nil",
     "baseline": "array (K,): |Z0| as frames are compared with it; sent again when drift moved it by 2e-4, at most "
     "every 5 s",
@@ -310,7 +326,7 @@ class InfoFrame(Frame):
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class Touch:
+class TrueTouch:
     """What the stub's skin is really touched by."""
 
     shape: str = wire(Text(32), "kind: circle, triangle, rectangle, square, L, hertz")
@@ -330,4 +346,4 @@ class Touch:
 class TruthFrame(Frame):
     """What really touches at the middle of the scan; only a stub knows. `publish`: the scan's last byte had left."""
 
-    touches: list[Touch] = wire(ListOf(Record(Touch), 256), "the touches", list, always=True)
+    touches: list[TrueTouch] = wire(ListOf(Record(TrueTouch), 256), "the touches", list, always=True)

@@ -21,11 +21,12 @@ from protocol import transport
 from protocol.frames import Frame, FrameError, InfoFrame
 from protocol.publishing import covers
 from protocol.runtime import host_id
-from protocol.sockets import ControlError, ControlServer, Publisher
+from protocol.sockets import ControlServer, Publisher
 from protocol.topics import TOPIC_OF
 from services.runtime import persistence
 from services.runtime.channel import Channel, Feed, Newest
-from services.runtime.config import Config
+from services.runtime.commands import Commands
+from services.runtime.config import ConfigFile
 from services.runtime.lateness import Lateness
 from services.runtime.stage import Refused, Stage, add_reason
 from services.runtime.waiting import Waiter
@@ -34,7 +35,7 @@ HEARTBEAT_S = 1.0
 TICK_S = 0.2  # how often at most silence, changes of health and new subscribers are looked for
 SILENT_S = 0.5  # without frames from upstream: status STALE
 AT_ONCE = 256  # frames taken from a feed before any is processed
-WARM_FRAMES = 50  # frames after which what lives is taken to live for ever (garbage collection)
+WARM_FRAMES = 50  # frames after which the living objects are taken to be permanent (garbage collection)
 
 log = logging.getLogger(__name__)
 
@@ -42,16 +43,16 @@ log = logging.getLogger(__name__)
 class Runner:
     """A process: its sockets and its channels. `run` returns when SIGINT or SIGTERM came."""
 
-    def __init__(self, process: str, config: Config, problems: Sequence[str] = ()) -> None:
-        """problems: what the process as a whole goes without, for its status."""
+    def __init__(self, process: str, config: ConfigFile, problems: Sequence[str] = ()) -> None:
+        """problems: what the process as a whole lacks, for its status."""
         self.process, self.config, self.problems = process, config, list(problems)
         for problem in problems:
             log.warning("%s", problem)
         transport.configure(config.transport())
         self.publisher = Publisher(process)
-        commands = {"status": self._status, "state": self._state, "load": self._load, "reset": self._reset}
-        self.control = ControlServer(process, commands)
         self.channels: dict[str, Channel] = {}
+        self._commands = Commands(self.channels, self.publisher, SILENT_S)
+        self.control = ControlServer(process, self._commands.handlers())
         self._bundles: dict[str, Bundle] = {}
         self._waiter = Waiter()
         self._lateness = Lateness()
@@ -61,7 +62,7 @@ class Runner:
         self._stop = False
         self._frames = 0
         self._turns: Iterator[Channel] = iter(())  # who may prepare next
-        self._settled = False  # what was made while warming up is out of the garbage collector's sight
+        self._settled = False  # the garbage collector no longer walks what was made while warming up
 
     def bundle(self, skin: str) -> Bundle:
         """The bundle of a skin, loaded once."""
@@ -76,7 +77,7 @@ class Runner:
         self.channels[stage.skin] = channel
         self._by_socket[channel.feed.socket] = channel
         for command in stage.commands:
-            self.control.handlers[command] = self._commander(command)
+            self.control.handlers[command] = self._commands.of_the_stage(command)
         if stage.persists:
             self._restore(channel)
         stage.warm_up()
@@ -110,7 +111,7 @@ class Runner:
         self.close()
 
     def _next_deadline(self) -> float:
-        """When there is something to do if nothing arrives: a heartbeat, or silence to be noticed."""
+        """When there is something to do even if nothing arrives: a heartbeat is due, or silence has to be reported."""
         return min((channel.heartbeat.deadline(SILENT_S) for channel in self.channels.values()), default=0.0)
 
     def close(self) -> None:
@@ -124,7 +125,7 @@ class Runner:
     # frames
 
     def _serve(self, channels: list[Channel], stood: bool = False) -> None:
-        """What waits at these channels, newest frames of several skins together."""
+        """Process what waits at these channels; the newest frames of several skins together."""
         work = [(channel, frame) for channel in channels for frame in self._waiting(channel, stood)]
         if len(work) > 1 and self.config.skip.batch:
             try:
@@ -135,7 +136,7 @@ class Runner:
             self._handle(channel, frame)
 
     def _waiting(self, channel: Channel, stood: bool) -> list[Frame]:
-        """Frames to process: the newest of a socket, all of a feed but what it is too late for."""
+        """The frames to process: the newest one of a socket, or all of a feed's that are not late."""
         frames: list[Frame] = []
         while len(frames) < AT_ONCE and (frame := channel.feed.recv()) is not None:
             frames.append(frame)
@@ -171,14 +172,16 @@ class Runner:
         self._frames += 1
 
     def _joined(self, prefix: bytes) -> None:
-        """Somebody subscribes to what begins so."""
+        """Somebody has subscribed to topics with this prefix."""
         for channel in self.channels.values():
             for topic, head in channel.heads.items():
                 if covers(prefix, head):
                     channel.stage.joined(topic)
 
     def _prepare(self) -> None:
-        """One piece of work for later, while nobody waits: channels take turns, for even asking all of them costs."""
+        """Do one piece of work for later, while no frame waits. Channels take turns, because asking all of them costs
+        time.
+        """
         if self._frames >= WARM_FRAMES and not self._settled:
             self._settled = True
             _settle()
@@ -186,7 +189,7 @@ class Runner:
             channel = next(self._turns)
             try:
                 channel.stage.prepare()
-            except Exception as why:  # what could not be made ahead is made when it is needed, or fails then
+            except Exception as why:  # the work is done when it is needed, or fails then
                 self._log_once(channel, why, "%s: could not prepare (further such failures are not logged)")
 
     def _send(self, channel: Channel, frame: Frame) -> None:
@@ -197,7 +200,7 @@ class Runner:
             self._failed(channel, why)
 
     def _wanted(self, stage: Stage) -> frozenset[str]:
-        """Topics that the stage is to make: those somebody subscribes to, unless skin.toml says all."""
+        """The topics that the stage is to make: those with subscribers, unless skin.toml asks for all."""
         if not self.config.skip.unwanted:
             return frozenset(stage.writes)
         return frozenset(topic for topic in stage.writes if self.publisher.wanted(topic, stage.skin))
@@ -216,7 +219,7 @@ class Runner:
     # housekeeping
 
     def _mind_sockets(self) -> list[str]:
-        """Mend what has become of our sockets; what to say of it in status."""
+        """Mend our sockets where needed; returns what status should say about them."""
         for place, (owner, socket) in enumerate(self._minded):
             if owner.mind():
                 self._waiter.exchange(socket, owner.socket)
@@ -235,6 +238,10 @@ class Runner:
             beat = channel.heartbeat
             beat.drops["malformed"], beat.drops["skipped"] = channel.feed.malformed, channel.feed.skipped
             silent = "" if channel.asleep else beat.silence(SILENT_S, channel.stage.reads)
+            try:
+                channel.stage.between_frames()
+            except Exception as why:  # what could not be adopted is not in use
+                self._log_once(channel, why, "%s: could not adopt (further such failures are not logged)")
             health = channel.stage.health().with_problems(problems)
             status = beat.status(health, silent, now, HEARTBEAT_S, asleep=channel.asleep)
             if status is not None:
@@ -276,60 +283,10 @@ class Runner:
     def _on_signal(self) -> None:
         self._stop = True
 
-    # commands
-
-    def _channel(self, args: dict[str, Any]) -> Channel:
-        name = args.get("skin") or next(iter(self.channels))
-        if not isinstance(name, str) or name not in self.channels:
-            raise ControlError("bad_request", f"no skin called {name!r}; configured: {', '.join(self.channels)}")
-        return self.channels[name]
-
-    def _commander(self, command: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
-        def carry_out(args: dict[str, Any]) -> dict[str, Any]:
-            channel = self._channel(args)
-            try:
-                result: dict[str, Any] = persistence.plain(channel.stage.command(command, args))
-                return result
-            except Refused as why:
-                raise ControlError("refused", str(why)) from None
-
-        return carry_out
-
-    def _status(self, args: dict[str, Any]) -> dict[str, Any]:
-        """`flowing`: whether a frame came within SILENT_S (or nobody wants one); what status/<skin> said last."""
-        channel = self._channel(args)
-        return channel.heartbeat.summary(asleep=channel.asleep, silent_s=SILENT_S)
-
-    def _state(self, args: dict[str, Any]) -> dict[str, Any]:
-        """The stage's temporal state, for a recording."""
-        return {"state": persistence.plain(self._channel(args).stage.state())}
-
-    def _load(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Take over a state that `state` gave."""
-        if not isinstance(args.get("state"), dict):
-            raise ControlError("bad_request", "load needs `state`, a map as the command state gives it")
-        stage = self._channel(args).stage
-        try:
-            stage.load(persistence.arrays(args["state"]))
-        except Exception as why:  # whatever was in the state, the stage goes on, with none
-            stage.reset()
-            what = str(why) if isinstance(why, Refused) else f"{type(why).__name__}: {why}"
-            raise ControlError("refused", f"the state does not fit: {what}") from None
-        return {}
-
-    def _reset(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Forget all temporal state; with `new_session` also begin a session, whose frames count from 0."""
-        stage = self._channel(args).stage
-        stage.reset()
-        if args.get("new_session"):
-            stage.new_session()
-            self.publisher.renew()
-        return {"session": self.publisher.session}
-
 
 def _settle() -> None:
-    """What lives now is taken to live for ever: the garbage collector never walks it again, and seldom the rest. The
-    first call takes some ten milliseconds, a later one a fraction.
+    """Take all living objects to be permanent: the garbage collector never walks them again, and the others seldom. The
+    first call takes some ten milliseconds, later ones a fraction of that.
     """
     gc.collect()
     gc.freeze()

@@ -1,17 +1,17 @@
-"""Scans of the short list of an adaptive board: whether something begins to touch, between two full scans."""
+"""Scans of an adaptive board's short list: they say whether a touch begins between two full scans."""
 
 from __future__ import annotations
 
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame, RawFrame
-from services.board.boardlink import Scanning
+from services.board.scanning import Scanning
 from services.estimation.baseline import BaselineEstimator
 from services.estimation.sentinel import Coarse, sentinel_of
 from services.runtime.config import Skin
 
 
 class SentinelScans:
-    """`scan`: that of the coarse touch that no full scan has answered yet; 0: there is none."""
+    """`scan`: the number of the sentinel scan with a touch that no full scan has confirmed or refuted yet; 0: none."""
 
     def __init__(self, skin: Skin, bundle: Bundle) -> None:
         self.config, self.bundle = skin, bundle

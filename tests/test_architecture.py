@@ -23,12 +23,13 @@ ALLOWED = {
 }
 WIRE_NEEDS = {"numpy", "zmq", "msgpack"}
 RUNTIME_NEEDS = WIRE_NEEDS | {"serial", "onnxruntime", "scipy", "pydantic", "typer", "rich", "supervisor", "mcap"}
-BRIDGES_NEED = {"ros2": {"cyclonedds"}, "foxglove": {"foxglove"}}
+BRIDGES_NEED = {"ros2": {"cyclonedds"}, "foxglove": {"foxglove"}, "export": {"mcap", "foxglove", "rerun"}}
 """What each bridge needs beside what protocol needs: an extra of its own."""
 # The command line hands these over to the offline tools on demand.
 OFFLINE_DOORS = {"services/cli"}
 SERVICES_USE_OF_MODELS = {
     "models.bundle",
+    "models.calibration_file",
     "models.files",
     "models.npz",
     "models.prereconstruction",
@@ -122,6 +123,18 @@ def test_services_take_only_bundle_and_numerics_from_models() -> None:
         for module in closure(direct):
             heavy = {n.split(".")[0] for n in imports(ROOT / (module.replace(".", "/") + ".py"))} & {"torch", "skfem"}
             assert not heavy, f"{path.relative_to(ROOT)} reaches {sorted(heavy)} through {module}"
+
+
+def test_a_class_name_is_defined_once() -> None:
+    places: dict[str, list[str]] = {}
+    for folder in ("protocol", "models", "services", "firmware_stub", "bench", "examples", "bridges"):
+        for path in sources(folder):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef):
+                    places.setdefault(node.name, []).append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert len(places) > 300
+    twice = {name: found for name, found in places.items() if len(found) > 1}
+    assert not twice, f"a class of this name is there already, choose another: {twice}"
 
 
 Graph = dict[str, set[str]]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.reliability.counts import Counts
 from bench.reliability.direct import DirectSkin
 from bench.reliability.scenes import SolvedSheet, circle, contacts_at_random
 from firmware_stub.world import World
@@ -28,7 +29,7 @@ FREE = FREE_WITHIN + 2 * FREE_FOR
 
 
 @dataclass
-class Score:
+class StartScore(Counts):
     """Of one start, or of several (`add`)."""
 
     starts: int = 0
@@ -41,10 +42,6 @@ class Score:
     free_scans: list[float] = field(default_factory=list)
     free_phantoms: int = 0  # valid frames with a contact after the touch was lifted
     reasons: Counter[str] = field(default_factory=Counter)
-
-    def add(self, other: Score) -> None:
-        for name, value in vars(other).items():
-            setattr(self, name, getattr(self, name) + value)
 
     def row(self) -> dict[str, Any]:
         return {
@@ -68,7 +65,7 @@ def start(
     newtons: float,
     radius: float,
     seed: int,
-) -> Score:
+) -> StartScore:
     rng = np.random.default_rng([seed, 3])
     contact = contacts_at_random(rng, IMPEDANCES)
     touch = circle(*place, newtons, radius)
@@ -91,7 +88,7 @@ def start(
     scans = _free_after([m.valid and not m.contacts for m in after])
     without = sum(m.valid and bool(m.unseen()) for m in touched)
     phantoms = sum(bool(m.phantoms()) for m in touched)
-    return Score(
+    return StartScore(
         starts=1,
         touched=len(touched),
         touched_valid=sum(m.valid for m in touched),

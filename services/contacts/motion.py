@@ -1,5 +1,5 @@
-"""One touch in motion: seen now and then, in between where its velocity takes it (a Kalman filter, the same for x and
-y: constant velocity, random acceleration).
+"""The motion of one touch: a Kalman filter of place and velocity, the same for x and y (constant velocity, random
+acceleration). Between images the touch is where its velocity takes it.
 """
 
 from __future__ import annotations
@@ -8,16 +8,16 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-ACCELERATION = 0.3  # m/s^2, standard deviation: how a finger changes its mind
+ACCELERATION = 0.3  # m/s^2, standard deviation of a finger's acceleration
 PLACE_SIGMA_M = 0.0012  # of a centroid from one image
-FIRST_SPEED = 0.1  # m/s, standard deviation of a velocity of which nothing is known
+FIRST_SPEED = 0.1  # m/s, standard deviation of an unknown velocity
 LONGEST_PREDICTION_S = 0.2  # a velocity says nothing about longer gaps
 SIZE_SIGMA = 0.4  # of the logarithm of an integrated drop, from frame to frame
 SIZE_SHARE = 0.3  # of what is seen, in the running mean of the size
 MOST_FOR_SIZE = 9.0  # a touch may grow quickly: its size alone makes it no other touch
 
 
-class Seen(NamedTuple):
+class Patch(NamedTuple):
     """One patch in one image."""
 
     x: float  # m, area centroid
@@ -56,8 +56,8 @@ class Track:
         seconds = self.seconds_to(sample_ns)
         return self.x + self.vx * seconds, self.y + self.vy * seconds
 
-    def move(self, seen: Seen, sample_ns: int) -> None:
-        """It was seen there."""
+    def move(self, seen: Patch, sample_ns: int) -> None:
+        """Update with where an image shows it."""
         real = max(0.0, (sample_ns - self.seen_ns) * 1e-9)
         if real > 1e-6:
             self._filter(seen, real)
@@ -69,7 +69,7 @@ class Track:
         self.reach, self.missing = seen.reach, 0
         self.age += 1
 
-    def _filter(self, seen: Seen, seconds: float) -> None:
+    def _filter(self, seen: Patch, seconds: float) -> None:
         noise = ACCELERATION**2 * seconds**2
         pp = self.pp + 2 * seconds * self.pv + seconds**2 * self.vv + noise * seconds**2 / 4
         pv = self.pv + seconds * self.vv + noise * seconds / 2
@@ -82,11 +82,11 @@ class Track:
         self.pp, self.pv, self.vv = (1 - place) * pp, (1 - place) * pv, vv - speed * pv
 
     def ghost(self) -> Track:
-        """Itself as one of its own `inside`: what it was before others came."""
+        """A copy of it as one of its own `inside`: what it was before others came."""
         return replace(self, inside=[])
 
 
-def cost(track: Track, seen: Seen, sample_ns: int) -> tuple[float, float]:
+def cost(track: Track, seen: Patch, sample_ns: int) -> tuple[float, float]:
     """(distance [m] from where the track should be, how unlikely it is that this is the track: chi-squared)."""
     x, y = track.ahead(sample_ns)
     distance = math.hypot(seen.x - x, seen.y - y)
@@ -95,7 +95,7 @@ def cost(track: Track, seen: Seen, sample_ns: int) -> tuple[float, float]:
     return distance, distance**2 / variance + size_cost(track, seen)
 
 
-def size_cost(track: Track, seen: Seen) -> float:
+def size_cost(track: Track, seen: Patch) -> float:
     if track.size <= 0 or seen.size <= 0:
         return 0.0
     return min((math.log(seen.size / track.size) / SIZE_SIGMA) ** 2, MOST_FOR_SIZE)

@@ -36,7 +36,6 @@ MODEL_ERROR = 1.5e-3  # of |d|: what a contact's change may be off the formula
 SHORT_WAY = 4.7  # times the nominal contact impedance: what the current's short way through an electrode comes to
 OTHER_BEFORE = 1.25  # b may be so many times what follows of a, and its inverse
 TELLING = 800.0  # |d| over the noise of one measurement from which a touch on an electrode would show
-LIKELY = 300.0  # from which 1 % of touches within 1 mm of an electrode would not show
 SUSPECT = 60.0  # from which one elsewhere would
 UNTOUCHED = 0.03  # of |d|, what a changed contact leaves of it where nothing else changed
 LEAST_RISE = 0.03  # of the nominal contact impedance
@@ -53,7 +52,6 @@ FEW_OF = 0.05  # share of the other pairs that may have
 class Changed(NamedTuple):
     electrode: int
     sure: bool  # whether it is no touch on this electrode
-    likely: bool = True  # whether few touches on this electrode look so: sure where it lasts
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class ContactDrift:
         expected = _most_noise(sigma[live]) + (MODEL_ERROR * size) ** 2
         sure = size >= TELLING * noise
         if self._left_by_rise(k, d, live, aside) <= expected:
-            return Changed(k, sure, size >= LIKELY * noise)
+            return Changed(k, sure)
         within = sure and aside is None and self._rises_within(k, d, live, expected)
         return Changed(k, True) if within else None
 
@@ -185,6 +183,11 @@ class ChangedContacts:
         self._drift, self._k = ContactDrift(bundle, members), members.shape[1]
         self.reset()
 
+    @property
+    def knows(self) -> bool:
+        """Whether the bundle predicts what a contact does."""
+        return self._drift.knows
+
     def reset(self) -> None:
         self.felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
         self._before: dict[int, Array] = {}  # by contact that rose under a touch: |Z| (K,) from before
@@ -198,6 +201,10 @@ class ChangedContacts:
         """All |Z| so far, times this factor."""
         self._before = {k: row * factor for k, row in self._before.items()}
         self._past = deque((row * factor for row in self._past), maxlen=LOOK_FAR_BACK)
+
+    def forget_past(self) -> None:
+        """The frames so far say nothing of those to come: some had another gain."""
+        self._past.clear()
 
     def changed(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
         """The electrode whose contact this frame shows to have changed."""

@@ -1,9 +1,9 @@
 """Recordings: MCAP files that hold frames exactly as they crossed the sockets.
 
 One channel a topic (``raw/palm``), message encoding ``msgpack``, the msgpack map of a frame as its data: any MCAP tool
-reads it. ``state/<skin>`` holds what the stages' state was, by process. Nothing stays in memory longer than `FLUSH_S`:
-what a killed recorder loses. A file that ends anywhere is read up to its last whole chunk: `RecordingReader` never
-needs the index at the end. A file may come from anybody: what a chunk unpacks to is bounded before it is unpacked.
+reads it. ``state/<skin>`` holds what the stages' state was, by process. Nothing stays in memory longer than `FLUSH_S`,
+so a killed recorder loses no more. A file that ends anywhere can be read up to its last whole chunk: `RecordingReader`
+never needs the index at the end. A file may come from anybody, so the size of a chunk is checked before it is unpacked.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class RecordingError(EitskinError, ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class RecordedMessage:
     """One message: `topic` as on the wire without its NUL (``raw/palm``), Unix `log_time_ns`, msgpack map `data`."""
 
     topic: str
@@ -185,7 +185,7 @@ class RecordingReader:
             elif opcode == Opcode.CHUNK:
                 return
 
-    def messages(self, topics: set[str] | None = None, start_s: float = 0.0) -> Iterator[Recorded]:
+    def messages(self, topics: set[str] | None = None, start_s: float = 0.0) -> Iterator[RecordedMessage]:
         """Messages in file order; of those topics only (names without the skin), from `start_s` after the first one.
 
         Raises RecordingError where the file unpacks to more than any recording does.
@@ -221,7 +221,7 @@ class RecordingReader:
                     if topic is None or log_time_ns - first_ns < start_s * 1e9:
                         continue
                     if topics is None or topic.partition("/")[0] in topics:
-                        yield Recorded(topic, log_time_ns, data)
+                        yield RecordedMessage(topic, log_time_ns, data)
 
     def _unpacked(self, chunk: Chunk | None) -> bytes:
         """The records of a chunk; none where it is damaged."""

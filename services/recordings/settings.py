@@ -1,10 +1,10 @@
-"""What a recording carries of its configuration: what the stages need to give the same contacts again, and no more.
+"""The part of the configuration that a recording carries: what the stages need to give the same contacts again.
 
     {"skins": {"palm": {"bundle": "square16", "bundle_hash": ..., "frame_id": ..., "pose": ..., "network": ...,
      "indenter": ..., "dft_points": ..., "scan": ..., "rtia_ohm": ..., "tare": ..., "touch": ...,
      "calibration": {...}}}, "skip": {...}}
 
-No address, no key, no port and no path: a recording may come from anybody, and what it says is checked like a
+It holds no address, key, port or path. A recording may come from anybody, so its settings are checked like a
 configuration. Its bundle is looked for among the installed ones by its hash.
 """
 
@@ -22,7 +22,17 @@ from models.bundle import BUNDLES, Bundle, BundleError
 from models.files import read_text
 from services.contacts import calibration_file as calibration
 from services.recordings.recording import RecordingError
-from services.runtime.config import SKIN_NAME, Config, ConfigError, Indenter, Pose, Section, Skin, Skip, Tare, Touch
+from services.runtime.config import (
+    SKIN_NAME,
+    ConfigError,
+    ConfigFile,
+    Indenter,
+    Pose,
+    Skin,
+    TareConfig,
+    TouchConfig,
+)
+from services.runtime.config_sections import Section, Skip
 
 KEY = "settings"
 """The key of a recording's metadata."""
@@ -48,8 +58,8 @@ class RecordedSkin(Section):
     dft_points: Literal[128, 256, 512] = 128
     scan: Literal["full", "adaptive"] = "full"
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0
-    tare: Tare = Tare()
-    touch: Touch = Touch()
+    tare: TareConfig = TareConfig()
+    touch: TouchConfig = TouchConfig()
     calibration: dict[str, Any] | None = None  # the content of its file, which calibration.load checks
 
 
@@ -111,7 +121,7 @@ class Known:
     given: Bundle | None = None
 
     @staticmethod
-    def here(config: Config | None, given: Path | None = None) -> Known:
+    def here(config: ConfigFile | None, given: Path | None = None) -> Known:
         """Raises BundleError where `given` cannot be used."""
         named: Iterable[str] = [skin.bundle for skin in config.skins.values()] if config is not None else ()
         paths: dict[str, Path] = {}
@@ -119,7 +129,7 @@ class Known:
         for place in (*installed, *named):
             try:
                 bundle = Bundle.load(place)
-            except BundleError:  # it is another skin's, perhaps, and `skin doctor` speaks of it
+            except BundleError:  # it may be another skin's; `skin doctor` reports it
                 continue
             paths.setdefault(bundle.hash, bundle.path)
         return Known(paths, Bundle.load(given) if given is not None else None)
@@ -136,7 +146,7 @@ class Known:
         return self.paths[skin.bundle_hash]
 
     def differs(self, name: str, skin: RecordedSkin) -> str:
-        """ "" or what to say of a bundle that was given and is not the recorded one."""
+        """A warning where the given bundle is not the recorded one; else ""."""
         if self.given is None or self.given.hash == skin.bundle_hash:
             return ""
         return (
@@ -146,7 +156,7 @@ class Known:
 
 
 def configuration(settings: Settings, known: Known, folder: Path) -> dict[str, Any]:
-    """A configuration of these skins, as skin.toml would hold it: sockets and all else as they are without a word.
+    """A configuration of these skins, as skin.toml would hold it, with the defaults for sockets and all else.
 
     Calibrations are written to `folder`. Raises RecordingError, BundleError.
     """

@@ -10,7 +10,7 @@ import ctypes
 import os
 import resource
 
-from services.runtime.config import RealTime
+from services.runtime.config_sections import RealTime
 
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4  # linux/mman.h
 CAP_IPC_LOCK = 14  # linux/capability.h
@@ -44,7 +44,9 @@ def apply(wanted: RealTime, process: str) -> list[str]:
 
 
 def _lock_memory() -> str:
-    """ "" or what stands in the way. Pages stay in RAM once they were used; what nobody uses is not brought there."""
+    """Lock memory; returns "" or what stands in the way. Pages stay in RAM once they were used; unused ones are not
+    loaded.
+    """
     if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY and not _may_lock():
         return "its amount is limited, and a process that reaches the limit gets no memory at all"
     libc = ctypes.CDLL(None, use_errno=True)
