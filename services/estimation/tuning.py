@@ -78,6 +78,9 @@ class Tuning:
     fault_misfit: float = _number(
         0.05, "of the fault's |d|", "what its prediction gets wrong", "prior: touches meanwhile"
     )
+    touch_rate: float = _number(0.2, "1/s", "touches begin and end so often", "prior")
+    fault_rate: float = _number(1e-4, "1/s", "each kind of fault begins so often", "prior: once in three hours")
+    mend_rate: float = _number(0.1, "1/s", "and ends so often", "prior")
 
 
 TUNING = Tuning()

@@ -27,7 +27,7 @@ TINY = 1e-300  # keeps a touch out that no measurement counts of
 RIDGE = 1e-6  # of a touch's own energy: keeps the fit of its sizes solvable where few measurements count
 
 
-class Change(NamedTuple):
+class ScanChange(NamedTuple):
     left: float  # share of |d|^2 that a touch which changed during the scan leaves, noise apart
     ended: bool  # whether nothing of it was left when the scan ended
 
@@ -56,7 +56,7 @@ class ChangingTouch:
         gain = float(((response @ d) ** 2 / ((response**2).sum(axis=1) + TINY)).max())
         return float(d @ d) - gain - noise <= AS_WELL * changed.left * float(d @ d)
 
-    def __call__(self, difference: NDArray[np.floating], sigma: NDArray[np.floating]) -> Change | None:
+    def __call__(self, difference: NDArray[np.floating], sigma: NDArray[np.floating]) -> ScanChange | None:
         """The change that explains a difference (K,); None where it leaves too much."""
         live, d, noise = _counted(difference, sigma)
         energy = float(d @ d)
@@ -80,7 +80,7 @@ class ChangingTouch:
             share = max(0.0, float(left @ left) - noise) / energy
             if share <= TUNING.changing_left:
                 course = np.array(strength) @ sizes.reshape(-1, KNOTS)
-                return Change(share, bool(course[-1] <= ENDED * course.max()))
+                return ScanChange(share, bool(course[-1] <= ENDED * course.max()))
         return None
 
     @staticmethod
