@@ -15,11 +15,12 @@ from models.bundle import Bundle
 from protocol.frames import DeltaFrame, Frame, ImageFrame
 from services.estimation.quality import Residual
 from services.estimation.sentinel import CoarseImage
+from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
 from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
 
-SETTLED = 5  # untouched frames in a row that state the same noise, from which it is taken to be a touch's too
+SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
 
 class Inference(Stage):
@@ -38,6 +39,7 @@ class Inference(Stage):
             self._network.check(bundle)
         # Only a network's image is meant to explain a frame: a one-step image shows where, not how much.
         self._refuses = isinstance(self._network, Network)
+        self.linearisation = Linearisation(name, bundle)
         self._residual = Residual(bundle, to_scale=self._refuses)
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
@@ -47,14 +49,15 @@ class Inference(Stage):
 
     def reset(self) -> None:
         self._last: ImageFrame | None = None  # of the touch that is being held
-        self._refused = False  # whether it explains its frame too badly to be of a touch
+        self._refused = False  # whether it explains its frame too badly to be that of a touch
         self._last_scan = 0  # of the frame that it was reconstructed from
-        self._again = True  # whether somebody may not have it: the next frame that holds it brings it
+        self._again = True  # whether a subscriber may not have it: the next held frame brings it
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
         self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
         self._quiet: NDArray[np.float32] | None = None  # standard deviation that untouched frames state
         self._stated = 0  # how many have stated it, one after the other
         self._counters = {"networks_run": 0, "held": 0, "untouched": 0, "unwanted": 0, "missed": 0, "refused": 0}
+        self._counters["uncalibrated"] = 0  # frames whose calibration could not be found
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, DeltaFrame)
@@ -63,6 +66,10 @@ class Inference(Stage):
             self._unseen = frame if frame.stack.size else self._unseen
             return []
         out = ImageFrame(**inherited(frame), touched=frame.touched)
+        if frame.calibration != self.linearisation.name and not self._follow(frame.calibration):
+            out.valid = False
+            add_reason(out.reasons, "stale_baseline")
+            self._counters["uncalibrated"] += 1
         out.metres_per_pixel, out.origin = self._metres_per_pixel, self._origin
         if frame.stack.size:
             self._run(frame, out)
@@ -77,6 +84,20 @@ class Inference(Stage):
             self._last = None
             self._rest(frame.sigma)
         return [out]
+
+    def _follow(self, calibration: str) -> bool:
+        """Use the matrices that frames are made with from now on; False where they cannot be found."""
+        followed = self.linearisation.follow(calibration)
+        if followed:
+            self._build()
+        return followed is not None
+
+    def _build(self) -> None:
+        """What stands on the matrices in use."""
+        self._residual = Residual(self.linearisation.bundle, to_scale=self._refuses)
+        if isinstance(self._network, OneStep):
+            self._network = OneStep(self.linearisation.bundle)
+        self._last, self._quiet, self._stated = None, None, 0
 
     def joined(self, topic: str) -> None:
         self._again = True
@@ -96,14 +117,14 @@ class Inference(Stage):
                     stage._ahead = frame, pictures
 
     def _rest(self, sigma: NDArray[np.float32]) -> None:
-        """An untouched frame stated this. One of a sentinel scan states nothing."""
+        """Learn the noise from an untouched frame. Sentinel scans do not state it."""
         if self._quiet is not None and np.array_equal(sigma, self._quiet):
             self._stated += 1
         elif np.isfinite(sigma).any():
             self._quiet, self._stated = sigma, 1
 
     def prepare(self) -> bool:
-        """What a touch would need that began now: not for a noise that changes from frame to frame."""
+        """Make the matrices that a touch would need now; not while the noise changes from frame to frame."""
         return self._quiet is not None and self._stated >= SETTLED and self._residual.prepare(self._quiet)
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
@@ -129,15 +150,15 @@ class Inference(Stage):
         self._again = False
 
     def _judge(self, out: ImageFrame) -> None:
-        """An image that does not explain the measurements is of no touch."""
+        """Judge whether the image explains the measurements: else it is not that of a touch."""
         if self._refused:
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
             self._counters["refused"] += 1
 
     def _hold(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        """The image of the frame last reconstructed, if we have seen that one. It was sent then, and is sent again only
-        to who has come since.
+        """Hold the image of the frame last reconstructed, if this process has it. It is sent again only for new
+        subscribers.
         """
         last = self._last
         if last is not None and self._last_scan == frame.reconstructed:
@@ -154,15 +175,17 @@ class Inference(Stage):
             self._counters["missed"] += 1
 
     def state(self) -> dict[str, Any]:
-        last = self._last
+        last, calibration = self._last, self.linearisation.state()
         if last is None:
-            return {"last": None}
+            return {"last": None, **calibration}
         kept = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
         kept |= {"residual": last.residual, "refused": self._refused}
-        return {"last": {"scan": self._last_scan, **kept}}
+        return {"last": {"scan": self._last_scan, **kept}, **calibration}
 
     def load(self, state: dict[str, Any]) -> None:
         self.reset()
+        if self.linearisation.load(state):
+            self._build()
         last = state.get("last")
         if last is None:
             return
@@ -181,7 +204,7 @@ class Inference(Stage):
 
 
 def _rms(sigma: NDArray[np.float32]) -> float | None:
-    """Of what is finite; None where nothing is."""
+    """Root mean square of the finite values; None without any."""
     finite = sigma[np.isfinite(sigma)].astype(float)
     return float(np.sqrt((finite**2).mean())) if finite.size else None
 
