@@ -26,7 +26,9 @@ class EitskinError(Exception):
         ├── MeshError (RuntimeError)          an outline that cannot be meshed
         ├── MismatchError (ValueError)        a sheet that differs from its model in a way that cannot be
         ├── TooFewMeasured                    an untouched frame in which too little was measured to calibrate on
+        ├── CalibrationFileError              what a calibration found cannot be read, kept or used
         ├── OtherScenes (ValueError)          training scenes of another skin, or of this one as it was
+        ├── CalibrationFileError              what a calibration found cannot be read, kept or used
         ├── OtherScenes (ValueError)          training scenes that must not be mixed with those of this run
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
