@@ -27,7 +27,7 @@ from protocol.errors import EitskinError
 
 Array = NDArray[np.float64]
 
-NICE = 15
+NICE = 5  # after the service's own processes, yet done in seconds on a busy machine
 PICTURE = 24  # pixels a side of the field that a person is shown
 # From where the mounting is worth a word, and then only if it is found to this many standard deviations.
 SURE = 2.0
