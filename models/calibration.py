@@ -37,7 +37,7 @@ MOST_FIELD = 6.0  # of a mode's prior
 MOST_ANISOTROPY = 0.4
 
 
-class CalibrationError(EitskinError):
+class TooFewMeasured(EitskinError):
     """A frame that no calibration can be fitted to; says what was found and what to do."""
 
 
@@ -54,12 +54,12 @@ class CalibrationFit:
 
 def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: str = STEPS_MESH) -> CalibrationFit:
     """z0 (K,): |Z| of the untouched skin in the order of its pattern, 0 where not measured; any unit. sigma (K,): its
-    standard deviation, same unit, infinite where not measured. matrices: the bundle's. Raises CalibrationError.
+    standard deviation, same unit, infinite where not measured. matrices: the bundle's. Raises TooFewMeasured.
     """
     z0, sigma = np.asarray(z0, dtype=float), np.asarray(sigma, dtype=float)
     live = np.isfinite(z0) & (z0 > 0) & np.isfinite(sigma)
     if z0.shape != (len(skin.pattern),) or live.sum() < 0.8 * len(z0):
-        raise CalibrationError(
+        raise TooFewMeasured(
             f"{int(live.sum())} of {len(skin.pattern)} measurements are usable, at least four fifths are needed to fit "
             "how the skin is mounted: mend what `skin doctor` names, then run `skin tare` again"
         )

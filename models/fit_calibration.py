@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from models import geometry
 from models.bundle import Bundle
-from models.calibration import CalibrationError, CalibrationFit, calibrated, fit
+from models.calibration import CalibrationFit, TooFewMeasured, calibrated, fit
 from models.calibration_file import pack
 from models.geometry import SkinGeometry
 from models.mounted import FieldModes
@@ -39,16 +39,16 @@ WORTH_MISFIT = 2e-3  # rms of |Z0|, relative: what nothing here explains
 
 
 def calibrate(bundle: Bundle, z0: Array, sigma: Array, baseline_hash: str = "") -> bytes:
-    """A packed calibration of this bundle. Raises CalibrationError."""
+    """A packed calibration of this bundle. Raises TooFewMeasured."""
     if bundle.matrices.normalisation != "model":
-        raise CalibrationError(
+        raise TooFewMeasured(
             f"the bundle {bundle.name} divides by its own baseline and predicts no impedances: there is nothing to "
             "calibrate it against; calibration needs a bundle of the drive pattern `pairs`"
         )
     try:
         skin = geometry.from_dict(bundle.skin)
     except EitskinError as why:
-        raise CalibrationError(f"the bundle {bundle.name} has no geometry to calibrate ({why})") from None
+        raise TooFewMeasured(f"the bundle {bundle.name} has no geometry to calibrate ({why})") from None
     found = fit(skin, bundle.matrices, z0, sigma)
     matrices = calibrated(bundle.matrices, skin, found.mounting)
     said = {"bundle_hash": bundle.hash, "baseline_hash": baseline_hash, **describe(skin, found)}

@@ -20,7 +20,7 @@ from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
 from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
 
-SETTLED = 5  # untouched frames in a row that state the same noise, from which it is taken to be a touch's too
+SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
 
 class Inference(Stage):
@@ -49,9 +49,9 @@ class Inference(Stage):
 
     def reset(self) -> None:
         self._last: ImageFrame | None = None  # of the touch that is being held
-        self._refused = False  # whether it explains its frame too badly to be of a touch
+        self._refused = False  # whether it explains its frame too badly to be that of a touch
         self._last_scan = 0  # of the frame that it was reconstructed from
-        self._again = True  # whether somebody may not have it: the next frame that holds it brings it
+        self._again = True  # whether a subscriber may not have it: the next held frame brings it
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
         self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
         self._quiet: NDArray[np.float32] | None = None  # standard deviation that untouched frames state
@@ -117,14 +117,14 @@ class Inference(Stage):
                     stage._ahead = frame, pictures
 
     def _rest(self, sigma: NDArray[np.float32]) -> None:
-        """An untouched frame stated this. One of a sentinel scan states nothing."""
+        """Learn the noise from an untouched frame. Sentinel scans do not state it."""
         if self._quiet is not None and np.array_equal(sigma, self._quiet):
             self._stated += 1
         elif np.isfinite(sigma).any():
             self._quiet, self._stated = sigma, 1
 
     def prepare(self) -> bool:
-        """What a touch would need that began now: not for a noise that changes from frame to frame."""
+        """Make the matrices that a touch would need now; not while the noise changes from frame to frame."""
         return self._quiet is not None and self._stated >= SETTLED and self._residual.prepare(self._quiet)
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
@@ -150,15 +150,15 @@ class Inference(Stage):
         self._again = False
 
     def _judge(self, out: ImageFrame) -> None:
-        """An image that does not explain the measurements is of no touch."""
+        """Judge whether the image explains the measurements: else it is not that of a touch."""
         if self._refused:
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
             self._counters["refused"] += 1
 
     def _hold(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        """The image of the frame last reconstructed, if we have seen that one. It was sent then, and is sent again only
-        to who has come since.
+        """Hold the image of the frame last reconstructed, if this process has it. It is sent again only for new
+        subscribers.
         """
         last = self._last
         if last is not None and self._last_scan == frame.reconstructed:
@@ -204,7 +204,7 @@ class Inference(Stage):
 
 
 def _rms(sigma: NDArray[np.float32]) -> float | None:
-    """Of what is finite; None where nothing is."""
+    """Root mean square of the finite values; None without any."""
     finite = sigma[np.isfinite(sigma)].astype(float)
     return float(np.sqrt((finite**2).mean())) if finite.size else None
 

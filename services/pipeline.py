@@ -54,7 +54,7 @@ class Pipeline:
         return Result(delta, image, contact)
 
     def prepare(self) -> None:
-        """What the processes do while no frame waits."""
+        """Do the work that the processes do while no frame waits."""
         for stage in (self.pre, self.inference, self.publishing):
             stage.between_frames()
             stage.prepare()

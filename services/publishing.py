@@ -112,7 +112,7 @@ class Publishing(Stage):
         return frames
 
     def _see(self, frame: ImageFrame) -> None:
-        """Contacts of a new image."""
+        """Find the contacts of a new image."""
         m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
         segments: list[Segment] = []
         if frame.touched and frame.image.size:
@@ -142,8 +142,8 @@ class Publishing(Stage):
         return self.each_alone or SEPARATE in frame.reasons
 
     def _knows(self, frame: ImageFrame) -> bool:
-        """Whether our contacts are those of this held image: frames in between may have passed us by, and what waits
-        to be seen twice is seen again in it.
+        """Whether our contacts are those of this held image. They are not if frames in between were missed, or if a
+        touch waits for its second frame.
         """
         recent = not self.tracker.forgotten(frame.stamps.get("sample", 0))
         session, scan = self._seen_in
@@ -157,7 +157,7 @@ class Publishing(Stage):
         self._contacts = [replace(c, state="hold", velocity=[0.0, 0.0, 0.0]) for c in present] + self._ends(ended)
 
     def _miss(self, out: ContactFrame, reason: str) -> None:
-        """A frame that says nothing of what touches: not even that a contact ended."""
+        """Make a frame that says nothing about touches, not even that a contact ended."""
         out.valid = False
         if not out.reasons:
             add_reason(out.reasons, reason)
@@ -191,7 +191,7 @@ class Publishing(Stage):
         return [(s.peak, c.force_n) for s, c in zip(self._segments, self._contacts, strict=False)]
 
     def _ends(self, tracks: list[Track]) -> list[Contact]:
-        """The last word on touches that ended: where they were; they do not press any more."""
+        """The last contacts of touches that ended: their last places, without force."""
         force = None if not self.law.exists else 0.0
         ends = []
         for t in tracks:
@@ -203,7 +203,7 @@ class Publishing(Stage):
         return ends
 
     def _force(self, frame: ContactFrame) -> ForceFrame:
-        """As valid as the contacts are."""
+        """The total force; valid if the contacts are."""
         present = [c for c in self._contacts if c.state != "end"]
         total = None if not self.law.exists else sum(c.force_n or 0.0 for c in present)
         wrench = np.sum([c.wrench for c in present], axis=0).tolist() if present else [0.0] * 6
@@ -293,5 +293,5 @@ def _wrench(at: Placed, force: float) -> list[float]:
 
 
 def _confidence(s: Segment) -> float:
-    """Probability that the peak is no noise, from its own standard deviation."""
+    """Probability that the peak is not noise, from its own standard deviation."""
     return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))

@@ -29,7 +29,7 @@ def press(
     skin: SkinOption = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Press the stub's skin. Returns as soon as the board has taken it; the press goes on for its seconds."""
+    """Press the stub's skin. Returns as soon as the board has accepted it; the press lasts for its seconds."""
     args: dict[str, Any] = {"x": x, "y": y, "force": force, "radius": radius, "shape": shape, "seconds": seconds}
     if (to_x is None) != (to_y is None):
         fail("a slide needs both --to-x and --to-y: found only one of them", USAGE)

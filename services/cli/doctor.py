@@ -34,7 +34,7 @@ SWAP_GAIN = 3.0  # a swap of two electrodes is suspected where it makes the fit 
 
 
 def examine(path: Path | None = None) -> list[Finding]:
-    """Everything, in the order in which it must be right."""
+    """Examine everything, in the order in which it must be right."""
     return list(_examine(path))
 
 

@@ -17,7 +17,7 @@ from models.bundle import Bundle
 from services.estimation.advice import ADVICE, DRIFTING, OK, OPEN, REASONS, SHORT, SWAPPED, UNKNOWN, listed
 from services.estimation.contact_drift import ChangedContacts, Reference
 from services.estimation.contact_evidence import ContactEvidence, ContactOpinion
-from services.estimation.frame_check import MOSTLY, FrameCheck, Look
+from services.estimation.frame_check import MOSTLY, FrameCheck, FrameFindings
 from services.estimation.gain_steps import GainStep
 from services.estimation.saved import shaped
 from services.estimation.status_bits import reasons_of
@@ -136,7 +136,7 @@ class ElectrodeHealth:
         self._fault, self._shown = "", self._all_well.states
         return bool(quiet.all() and np.isfinite(noise).all())
 
-    def _nothing_wrong(self, seen: Look, status: NDArray[np.uint8], untouched: Reference) -> bool:
+    def _nothing_wrong(self, seen: FrameFindings, status: NDArray[np.uint8], untouched: Reference) -> bool:
         """Most touched frames: what follows would find that all is well too, at twice the work."""
         wrong = seen.states.any() or status.any() or seen.failed.any() or self._states.any() or self._suspected.any()
         quiet = seen.suspect is None and not wrong
@@ -155,7 +155,7 @@ class ElectrodeHealth:
 
     # over time
 
-    def _contact_changes(self, seen: Look, untouched: Reference | None) -> None:
+    def _contact_changes(self, seen: FrameFindings, untouched: Reference | None) -> None:
         """Adds to what a frame shows an electrode whose contact changed."""
         if untouched is None or seen.fault or np.isin(seen.states, (SHORT, OPEN)).any():
             return
@@ -167,11 +167,11 @@ class ElectrodeHealth:
             else:
                 seen.suspect = changed.electrode
 
-    def _live(self, seen: Look, untouched: Reference, counts: Mask) -> Mask:
+    def _live(self, seen: FrameFindings, untouched: Reference, counts: Mask) -> Mask:
         """(K,) measurements between electrodes that count."""
         return ~seen.failed & np.isfinite(untouched.sigma) & ~self.member[~counts].any(axis=0)
 
-    def _remember(self, seen: Look, untouched: Reference | None) -> None:
+    def _remember(self, seen: FrameFindings, untouched: Reference | None) -> None:
         """Faults at once, recovery after WELL_FRAMES."""
         faulty = seen.states != OK
         self._states[faulty] = seen.states[faulty]
@@ -185,7 +185,7 @@ class ElectrodeHealth:
         for k in np.flatnonzero((self._states != OK) & ~faulty):
             self._look_again(int(k), seen, untouched)
 
-    def _look_again(self, k: int, seen: Look, untouched: Reference | None) -> None:
+    def _look_again(self, k: int, seen: FrameFindings, untouched: Reference | None) -> None:
         """An electrode that is at fault, and whose fault this frame does not show by itself."""
         if self._is_well(k, seen.amplitude, seen.failed, untouched):
             self._well[k] += 1
@@ -203,7 +203,7 @@ class ElectrodeHealth:
             self._states[k], self._unsure[k] = OK, False
             self._contacts.forget(k)
 
-    def _ask(self, k: int, seen: Look, untouched: Reference) -> ContactOpinion | None:
+    def _ask(self, k: int, seen: FrameFindings, untouched: Reference) -> ContactOpinion | None:
         """Whether the contact of electrode k is changed, whatever touches; None where nothing tells."""
         counts = self._states == OK
         counts[k] = True
@@ -229,7 +229,7 @@ class ElectrodeHealth:
                     return True
         return False
 
-    def _shift(self, seen: Look, untouched: Reference | None) -> Array:
+    def _shift(self, seen: FrameFindings, untouched: Reference | None) -> Array:
         """What the drifting electrodes do to the pairs of the others."""
         drifting = np.flatnonzero(np.isin(self._states, (DRIFTING, OPEN))).tolist()
         self._contacts.keep(drifting)

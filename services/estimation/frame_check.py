@@ -26,7 +26,7 @@ TROUBLE = STATUS_OPEN | STATUS_RTIA | STATUS_FIFO | STATUS_CLIPPED
 
 
 @dataclass
-class Look:
+class FrameFindings:
     """What one frame shows; measurements in `order` (None: as they came)."""
 
     states: NDArray[np.uint8]  # (E,) ELECTRODE_STATES
@@ -52,7 +52,7 @@ class FrameCheck:
         self._predicted = np.asarray(bundle.z0, dtype=float) if bundle.matrices.normalisation == "model" else None
         self._wiring = Wiring(pattern)
 
-    def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Look:
+    def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> FrameFindings:
         """(K,) |Z| and status bits of a frame."""
         failed = ~np.isfinite(amplitude) | (amplitude <= 0) | ((status & TROUBLE) != 0)
         reference = self._reference(amplitude, failed, untouched)
@@ -66,7 +66,7 @@ class FrameCheck:
             clipped = (status & STATUS_CLIPPED) != 0
             no_current |= clipped & np.isfinite(amplitude) & (amplitude > UNDONE * reference) & (reference > 0)
         failed = failed | low | no_current
-        seen = Look(states, amplitude, failed)
+        seen = FrameFindings(states, amplitude, failed)
         if (low | no_current).mean() > NOTHING_ANSWERS:
             states[:] = STUCK
             seen.fault = NO_ANSWER

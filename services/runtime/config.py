@@ -106,7 +106,7 @@ class Skin(Section):
     pose: Pose = Pose()
     surface: Surface | None = None  # what the sheet is wrapped round
     contacts_in: Literal["skin", "parent"] = "skin"  # "parent": contacts come in the frame that `pose` names
-    mismatch: str = "none"  # of the stub's sheet: by what it differs from the bundle, a name of models/mismatch.py
+    mismatch: str = "none"  # how the stub's sheet differs from the bundle: a name of models/mismatch.py
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
     indenter: Indenter | None = None
     network: NetworkFile = "int8"
