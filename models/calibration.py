@@ -37,12 +37,12 @@ MOST_FIELD = 6.0  # of a mode's prior
 MOST_ANISOTROPY = 0.4
 
 
-class SkinFitError(EitskinError):
+class TooFewMeasured(EitskinError):
     """A frame that no calibration can be fitted to; says what was found and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class CalibrationFit:
     """mounting, its standard deviations (a Mounting too), and the relative rms misfit of |Z0| before and after."""
 
     mounting: Mounting
@@ -52,14 +52,14 @@ class Fit:
     held_out: tuple[float, ...]  # of the held-out parts after each step that counted
 
 
-def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: str = STEPS_MESH) -> Fit:
+def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: str = STEPS_MESH) -> CalibrationFit:
     """z0 (K,): |Z| of the untouched skin in the order of its pattern, 0 where not measured; any unit. sigma (K,): its
-    standard deviation, same unit, infinite where not measured. matrices: the bundle's. Raises SkinFitError.
+    standard deviation, same unit, infinite where not measured. matrices: the bundle's. Raises TooFewMeasured.
     """
     z0, sigma = np.asarray(z0, dtype=float), np.asarray(sigma, dtype=float)
     live = np.isfinite(z0) & (z0 > 0) & np.isfinite(sigma)
     if z0.shape != (len(skin.pattern),) or live.sum() < 0.8 * len(z0):
-        raise SkinFitError(
+        raise TooFewMeasured(
             f"{int(live.sum())} of {len(skin.pattern)} measurements are usable, at least four fifths are needed to fit "
             "how the skin is mounted: mend what `skin doctor` names, then run `skin tare` again"
         )
@@ -94,7 +94,7 @@ def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: s
             if misses == PATIENCE:
                 break
     sd = now.mounting.with_vector(_spread(derivative, variance, live, now.mounting))
-    return Fit(now.mounting, sd, before, _rms(seen - now.log, live), tuple(held_out))
+    return CalibrationFit(now.mounting, sd, before, _rms(seen - now.log, live), tuple(held_out))
 
 
 def calibrated(matrices: Matrices, skin: SkinGeometry, mounting: Mounting, mesh: str = MESH) -> Matrices:

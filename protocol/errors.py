@@ -24,6 +24,12 @@ class EitskinError(Exception):
         ├── GeometryError (ValueError)        a skin that cannot exist
         ├── PatternError (ValueError)         a drive pattern that cannot be measured or inverted
         ├── MeshError (RuntimeError)          an outline that cannot be meshed
+        ├── MismatchError (ValueError)        a sheet that differs from its model in a way that cannot be
+        ├── TooFewMeasured                    an untouched frame in which too little was measured to calibrate on
+        ├── CalibrationFileError              what a calibration found cannot be read, kept or used
+        ├── OtherScenes (ValueError)          training scenes of another skin, or of this one as it was
+        ├── CalibrationFileError              what a calibration found cannot be read, kept or used
+        ├── OtherScenes (ValueError)          training scenes that must not be mixed with those of this run
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── ConfigError                       services: skin.toml cannot be used
@@ -36,7 +42,6 @@ class EitskinError(Exception):
         ├── ImportRefused (ValueError)        a file cannot become a recording
         ├── RegistrationError (ValueError)    presses at known places do not register a skin
         ├── CalibrationError                  presses of known force make no force law
-        ├── SkinFitError                      an untouched frame has too few values to fit a skin to
         ├── MissingExtra                      the packages that a bridge needs are not installed
         ├── NotOurs                           a folder that must not be handed over
         ├── BridgeError                       bridges: a bridge cannot start

@@ -15,6 +15,7 @@ from models.bundle import Bundle
 from protocol.frames import DeltaFrame, Frame, ImageFrame
 from services.estimation.quality import Residual
 from services.estimation.sentinel import CoarseImage
+from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
 from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
@@ -38,6 +39,7 @@ class Inference(Stage):
             self._network.check(bundle)
         # Only a network's image is meant to explain a frame: a one-step image shows where, not how much.
         self._refuses = isinstance(self._network, Network)
+        self.linearisation = Linearisation(name, bundle)
         self._residual = Residual(bundle, to_scale=self._refuses)
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
@@ -55,6 +57,7 @@ class Inference(Stage):
         self._quiet: NDArray[np.float32] | None = None  # standard deviation that untouched frames state
         self._stated = 0  # how many have stated it, one after the other
         self._counters = {"networks_run": 0, "held": 0, "untouched": 0, "unwanted": 0, "missed": 0, "refused": 0}
+        self._counters["uncalibrated"] = 0  # frames whose calibration could not be found
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, DeltaFrame)
@@ -63,6 +66,10 @@ class Inference(Stage):
             self._unseen = frame if frame.stack.size else self._unseen
             return []
         out = ImageFrame(**inherited(frame), touched=frame.touched)
+        if frame.calibration != self.linearisation.name and not self._follow(frame.calibration):
+            out.valid = False
+            add_reason(out.reasons, "stale_baseline")
+            self._counters["uncalibrated"] += 1
         out.metres_per_pixel, out.origin = self._metres_per_pixel, self._origin
         if frame.stack.size:
             self._run(frame, out)
@@ -77,6 +84,20 @@ class Inference(Stage):
             self._last = None
             self._rest(frame.sigma)
         return [out]
+
+    def _follow(self, calibration: str) -> bool:
+        """Use the matrices that frames are made with from now on; False where they cannot be found."""
+        followed = self.linearisation.follow(calibration)
+        if followed:
+            self._build()
+        return followed is not None
+
+    def _build(self) -> None:
+        """What stands on the matrices in use."""
+        self._residual = Residual(self.linearisation.bundle, to_scale=self._refuses)
+        if isinstance(self._network, OneStep):
+            self._network = OneStep(self.linearisation.bundle)
+        self._last, self._quiet, self._stated = None, None, 0
 
     def joined(self, topic: str) -> None:
         self._again = True
@@ -154,15 +175,17 @@ class Inference(Stage):
             self._counters["missed"] += 1
 
     def state(self) -> dict[str, Any]:
-        last = self._last
+        last, calibration = self._last, self.linearisation.state()
         if last is None:
-            return {"last": None}
+            return {"last": None, **calibration}
         kept = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
         kept |= {"residual": last.residual, "refused": self._refused}
-        return {"last": {"scan": self._last_scan, **kept}}
+        return {"last": {"scan": self._last_scan, **kept}, **calibration}
 
     def load(self, state: dict[str, Any]) -> None:
         self.reset()
+        if self.linearisation.load(state):
+            self._build()
         last = state.get("last")
         if last is None:
             return

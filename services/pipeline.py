@@ -56,6 +56,7 @@ class Pipeline:
     def prepare(self) -> None:
         """Do the work that the processes do while no frame waits."""
         for stage in (self.pre, self.inference, self.publishing):
+            stage.between_frames()
             stage.prepare()
 
     def reset(self) -> None:

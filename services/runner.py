@@ -238,6 +238,10 @@ class Runner:
             beat = channel.heartbeat
             beat.drops["malformed"], beat.drops["skipped"] = channel.feed.malformed, channel.feed.skipped
             silent = "" if channel.asleep else beat.silence(SILENT_S, channel.stage.reads)
+            try:
+                channel.stage.between_frames()
+            except Exception as why:  # what could not be adopted is not in use
+                self._log_once(channel, why, "%s: could not adopt (further such failures are not logged)")
             health = channel.stage.health().with_problems(problems)
             status = beat.status(health, silent, now, HEARTBEAT_S, asleep=channel.asleep)
             if status is not None:

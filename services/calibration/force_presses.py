@@ -130,7 +130,7 @@ def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None])
     assert data.untouched is not None  # read_input sees to it
     skin = skin.model_copy(update={"calibration": None})
     pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
-    baseline = baseline_of(data.untouched, pipeline, warn)
+    baseline = baseline_of(data.untouched, pipeline.pre.pre, warn)
 
     def look(row: int) -> Look:
         if not 0 <= row < len(data.measurements):

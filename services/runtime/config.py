@@ -70,6 +70,7 @@ class TareConfig(Section):
 
     frames: Annotated[int, Field(ge=8, le=4096)] = 64
     max_age_s: Annotated[float, Field(gt=0)] = 3600.0  # an older persisted baseline is not loaded
+    calibrate: Switch = True  # after `skin tare`: fit how the skin is mounted, and use matrices that fit it
     tracking_s: Annotated[float, Field(gt=0)] = 120.0  # time constant of what drift does not explain, while untouched
     # How fast an untouched skin may change, relative; see services/estimation/drift_prior.py. A foam that dries by 6 %,
     # electrodes whose contacts change by a quarter, within five minutes.

@@ -113,6 +113,9 @@ class Stage(ABC):
         """
         return False
 
+    def between_frames(self) -> None:  # noqa: B027
+        """Called a few times a second: adopt what other processes have made meanwhile. Never waits."""
+
     def warm_up(self) -> None:  # noqa: B027
         """Do once what is slow the first time."""
 

@@ -9,7 +9,7 @@ import pytest
 
 from models import geometry
 from models.bundle import Bundle
-from models.calibration import SkinFitError, calibrated, fit
+from models.calibration import TooFewMeasured, calibrated, fit
 from models.forward import ForwardModel
 from models.mismatch import Mismatch, MismatchedSheet, mounted, named
 from models.mounted import FieldModes, Mounting, Predicted, most_shift
@@ -118,7 +118,7 @@ def test_large_shifts_stay_bounded_and_never_make_it_worse(skin: geometry.SkinGe
 def test_too_few_measurements_are_refused(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     z0 = measured(named("none"))
     z0[:30] = 0.0
-    with pytest.raises(SkinFitError, match="90 of 120"):
+    with pytest.raises(TooFewMeasured, match="90 of 120"):
         fit(skin, matrices, z0, 1e-5 * z0)
 
 
