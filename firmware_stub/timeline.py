@@ -17,6 +17,7 @@ class Track:
 
     times: tuple[float, ...]  # s, not decreasing
     poses: tuple[Touch, ...]
+    finger: str = ""  # of a press that its maker goes on moving: the next one of this name takes its place
 
     def pose(self, t: float, inside: float) -> Touch | None:
         """The pose at t on the leg that holds the instant `inside`; None where the touch is not there then."""
@@ -138,7 +139,9 @@ class Timeline:
         return self.segment(t).at(t)
 
 
-def press_track(start: float, seconds: float, touch: Touch, to: Sequence[float] | None = None) -> Track:
+def press_track(
+    start: float, seconds: float, touch: Touch, to: Sequence[float] | None = None, finger: str = ""
+) -> Track:
     """A press from `start` on, sliding to the point `to` (metres) where one is given."""
     end = replace(touch, x=to[0], y=to[1]) if to else touch
-    return Track((start, start + seconds), (touch, end))
+    return Track((start, start + seconds), (touch, end), finger)

@@ -1,0 +1,1 @@
+"""Processes that show or translate: ordinary clients, which use protocol/ alone."""

@@ -1,0 +1,178 @@
+"""The newest messages of one skin, read only while somebody looks."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from protocol.ages import Ages
+from protocol.frames import DeltaFrame, Frame, ImageFrame, InfoFrame, StatusFrame
+from protocol.runtime import host_id
+from protocol.sockets import AllReader, NewestReader
+from protocol.topics import TOPIC_OF
+
+NEWEST = ("contact", "image", "delta", "truth", "shape")
+"""Topics that a viewer may ask for. Status and info come with any of them."""
+LOOK_S = 0.1
+"""How often sockets are looked at that did not speak up."""
+GATHER_S = 0.03
+"""How long what comes before a scan's contacts waits for them, so that a scan is one message."""
+ASK_AGAIN_S = 0.5
+
+Picture = tuple[str, int]
+"""Which picture a frame shows: the session and scan that it was reconstructed from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Latest:
+    """The newest message of a topic. `measured_ns`: by this host's clock, None where that is not known."""
+
+    version: int
+    measured_ns: int | None
+    message: bytes
+    picture: Picture | None = None
+
+
+class SkinFeed:
+    """Belongs to one event loop. `tell` is called when there is news for viewers."""
+
+    def __init__(self, skin: str, tell: Callable[[], None]) -> None:
+        self.skin, self._tell = skin, tell
+        self.latest: dict[str, Latest] = {}
+        """By topic; of status by "status/PROCESS"."""
+        self.pictures: dict[str, Latest] = {}
+        """The frames of `image` and `delta` that brought the newest picture: those that hold it come without."""
+        self.source = ""
+        """Of the newest contact frame: board, stub, replay; "" while nobody looks, or nothing has come."""
+        self._watched: Counter[str] = Counter()
+        self._readers: dict[str, NewestReader | AllReader] = {}
+        self._files: dict[str, int] = {}
+        self._ages: Ages | None = None
+        self._version = 0
+        self._empty_ns = 0
+        self._asked = 0.0
+        self._look: asyncio.TimerHandle | None = None
+        self._gathering: asyncio.TimerHandle | None = None
+
+    def watch(self, topics: Iterable[str]) -> None:
+        """Somebody looks at these."""
+        self._watched.update(topic for topic in topics if topic in NEWEST)
+        self._adjust()
+
+    def unwatch(self, topics: Iterable[str]) -> None:
+        """He does no more."""
+        self._watched.subtract(topic for topic in topics if topic in NEWEST)
+        self._watched = +self._watched
+        self._adjust()
+
+    def _adjust(self) -> None:
+        wanted = {*self._watched, "status"} if self._watched else set()
+        for topic in wanted - self._readers.keys():
+            self._open(topic)
+        for topic in self._readers.keys() - wanted:
+            self._close(topic)
+        if not wanted:
+            self._forget()
+        elif self._look is None:
+            self._empty_ns = time.monotonic_ns()
+            self._looked()
+
+    def _open(self, topic: str) -> None:
+        every = topic == "status"
+        reader = AllReader(["status", "info"], self.skin) if every else NewestReader(topic, self.skin)
+        self._readers[topic], self._files[topic] = reader, int(reader.socket.fileno())
+        asyncio.get_running_loop().add_reader(self._files[topic], self._drain)
+
+    def _close(self, topic: str) -> None:
+        asyncio.get_running_loop().remove_reader(self._files.pop(topic))
+        self._readers.pop(topic).close()
+        for known in (self.latest, self.pictures):
+            for key in list(known):
+                if key.partition("/")[0] == topic or (topic == "status" and key == "info"):
+                    del known[key]
+
+    def _forget(self) -> None:
+        """Nobody looks: no socket, no timer, no thread."""
+        for timer in (self._look, self._gathering):
+            if timer is not None:
+                timer.cancel()
+        self._look = self._gathering = None
+        if self._ages is not None:
+            self._ages.close()
+            self._ages = None
+        self.source = ""
+
+    def _looked(self) -> None:
+        self._drain()
+        self._look = asyncio.get_running_loop().call_later(LOOK_S, self._looked)
+
+    def _drain(self) -> None:
+        """Take in what has arrived. ZeroMQ tells of it at the edge only, so all of it, from all sockets."""
+        now, heard = time.monotonic_ns(), set()
+        for reader in list(self._readers.values()):
+            while (got := reader.recv_message()) is not None:
+                heard.add(self._take(*got, now))
+        self._empty_ns = now
+        if "contact" in heard:
+            self._news()
+        elif heard and self._gathering is None:
+            self._gathering = asyncio.get_running_loop().call_later(GATHER_S, self._news)
+
+    def _news(self) -> None:
+        if self._gathering is not None:
+            self._gathering.cancel()
+            self._gathering = None
+        self._tell()
+
+    def _take(self, frame: Frame, message: bytes, now: int) -> str:
+        topic = key = TOPIC_OF[type(frame)].name
+        if self._ages is None:
+            self._ages = Ages()
+        # Another host's frame may have lain in the socket since that was last seen empty; our own say when.
+        measured = self._ages.measured_ns(frame, now if frame.host == host_id() else self._empty_ns)
+        if isinstance(frame, StatusFrame):
+            key = f"status/{frame.process}"
+        elif topic == "contact":
+            self.source = frame.source
+        self._version += 1
+        shown = picture(frame)
+        self.latest[key] = Latest(self._version, measured, message, shown)
+        if isinstance(frame, (ImageFrame, DeltaFrame)):
+            if brings(frame):
+                self.pictures[topic] = self.latest[key]
+            elif isinstance(frame, ImageFrame) and shown is not None and not self._has(topic, shown):
+                self._ask_again(topic)
+        return "info" if isinstance(frame, InfoFrame) else topic
+
+    def _has(self, topic: str, shown: Picture) -> bool:
+        return topic in self.pictures and self.pictures[topic].picture == shown
+
+    def _ask_again(self, topic: str) -> None:
+        """Subscribe anew: whoever subscribes is sent the held picture with the next frame."""
+        now, reader = time.monotonic(), self._readers.get(topic)
+        if now - self._asked < ASK_AGAIN_S or reader is None:
+            return
+        self._asked, name = now, f"{topic}/{self.skin}\0".encode()
+        reader.socket.unsubscribe(name)
+        reader.socket.subscribe(name)
+
+    def close(self) -> None:
+        self._watched.clear()
+        self._adjust()
+
+
+def brings(frame: Frame) -> bool:
+    """Whether a frame brings a picture of its own."""
+    if isinstance(frame, ImageFrame):
+        return frame.image.size > 0
+    return isinstance(frame, DeltaFrame) and frame.stack.size > 0
+
+
+def picture(frame: Frame) -> Picture | None:
+    """Which picture a frame brings or holds; None where nothing is to be shown."""
+    if not isinstance(frame, (ImageFrame, DeltaFrame)) or not (brings(frame) or frame.held):
+        return None
+    return frame.session, frame.reconstructed
