@@ -4,17 +4,21 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 SKIN ?= square16
+# Bridges that `make venv` installs the packages of too: EXTRAS=ros2,foxglove
+EXTRAS ?=
+comma := ,
+BRIDGES := $(subst $(comma), ,$(EXTRAS))
 # The CPU build of PyTorch by its full version: plain "torch" would bring several GB of CUDA.
 TORCH := torch==2.13.0+cpu
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: up venv venv-dev test lint train lock wire clean
+.PHONY: up venv venv-dev ros-venv test lint train lock wire clean
 
 up: venv
 	./skin up
 
-venv: $(VENV)/.service
+venv: $(VENV)/.service $(BRIDGES:%=$(VENV)/.%)
 venv-dev: $(VENV)/.dev
 
 $(BIN)/python:
@@ -25,18 +29,31 @@ $(VENV)/.service: requirements/service.lock | $(BIN)/python
 	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
 	@touch $@
 
+$(VENV)/.ros2 $(VENV)/.foxglove: $(VENV)/.%: requirements/%.lock | $(VENV)/.service
+	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
+	@touch $@
+
 $(VENV)/.dev: requirements/dev.lock requirements/service.lock | $(BIN)/python
 	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
 	$(BIN)/python -m pip install -q --disable-pip-version-check "$(TORCH)" || { echo \
 	  "no wheel of $(TORCH) found: install PyTorch's CPU build 2.13.0 into $(VENV) as pytorch.org describes, then run make again"; exit 1; }
 	@touch $@ $(VENV)/.service
 
+# ROS 2 itself, as wheels, in an environment of its own: what tests/bridges/test_ros2_node.py listens with. 270 MB.
+ros-venv: .venv-ros/.done
+.venv-ros/.done:
+	$(PYTHON) -m venv .venv-ros
+	.venv-ros/bin/python -m pip install -q --disable-pip-version-check numpy ros-kilted-rclpy ros-kilted-rmw-fastrtps-cpp \
+	  ros-kilted-geometry-msgs ros-kilted-sensor-msgs ros-kilted-diagnostic-msgs ros-kilted-visualization-msgs \
+	  ros-kilted-std-msgs ros-kilted-std-srvs
+	@touch $@
+
 test: venv-dev lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: venv-dev
 	$(BIN)/ruff check .
-	$(BIN)/mypy protocol services examples firmware_stub
+	$(BIN)/mypy protocol services bridges examples firmware_stub models bench
 
 # geometry -> forward model -> data -> network -> bundle in models/bundles/$(SKIN)
 train: venv-dev
@@ -46,7 +63,9 @@ train: venv-dev
 LOCK := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 lock:
 	$(LOCK) --extra service --extra stub -o requirements/service.lock pyproject.toml
-	$(LOCK) -c requirements/service.lock --extra service --extra stub --extra offline --extra dev \
+	for bridge in ros2 foxglove; do \
+	  $(LOCK) -c requirements/service.lock --extra $$bridge -o requirements/$$bridge.lock pyproject.toml || exit 1; done
+	$(LOCK) -c requirements/service.lock --extra service --extra stub --extra offline --extra ros2 --extra foxglove --extra dev \
 	  -o requirements/dev.lock pyproject.toml requirements/torch-needs.in
 
 clean:

@@ -8,6 +8,7 @@ The frames are computed on the reference mesh, which neither training nor invers
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 
 import matplotlib
@@ -18,7 +19,7 @@ import numpy as np
 
 from models.bundle import Bundle
 from models.forward import ForwardModel
-from models.prereconstruction import PreReconstructor
+from models.prereconstruction import Array, PreReconstructor
 from models.shapes import Shape, drop_image
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import find_skin, reconstruct
@@ -57,7 +58,7 @@ def main(argv: list[str] | None = None) -> int:
     operator = PreReconstructor(Bundle.load("square16").matrices).condition(np.full(len(z0), 10 ** (-options.snr / 20)))
     one_step = [operator.one_step(z / z0 - 1, 96) for z in touched]
     figure, axes = plt.subplots(3, len(TOUCHES), figsize=(2 * len(TOUCHES), 6.2), layout="constrained")
-    rows = (
+    rows: tuple[tuple[str, Iterable[Array]], ...] = (
         ("truth", [drop_image(shapes, 96) for shapes in TOUCHES]),
         ("one-step (NOSER)", one_step),
         ("eitskin", images),

@@ -72,7 +72,7 @@ def similarity_of(found: Array, xy: Array) -> Similarity:
 
 def errors(found: Array, similarity: Similarity, xy: Array) -> Array:
     """(N,) m; a press that was not found counts as found at the skin's centre."""
-    return np.linalg.norm(similarity.to_machine(np.nan_to_num(found)) - xy, axis=1)
+    return np.asarray(np.linalg.norm(similarity.to_machine(np.nan_to_num(found)) - xy, axis=1))
 
 
 def summary(name: str, distance: Array, touched: NDArray[np.bool_] | None, seconds: float) -> dict[str, Any]:
@@ -97,7 +97,7 @@ def kernel_ridge(presses: Presses, test: Presses) -> Array:
 
 
 def _rbf(a: Array, b: Array) -> Array:
-    return np.exp(-((a[:, None] - b[None]) ** 2).sum(axis=-1))
+    return np.asarray(np.exp(-((a[:, None] - b[None]) ** 2).sum(axis=-1)))
 
 
 def live_path(bundle: Bundle, arrays: dict[str, NDArray[Any]]) -> dict[str, int]:

@@ -5,6 +5,7 @@ Afresh each batch.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,8 @@ from models.prereconstruction import Array, Drift, Operator, PreReconstructor
 MODEL_ERROR, MODEL_ERROR_POWER = 1.2e-3, 0.4
 SERVICE_DRIFT = Drift(scale=2e-5, contact=1e-4)  # a little less than services allow for at rest
 
+Pixel = TypeVar("Pixel", bound=np.generic)
+
 
 @dataclass(frozen=True)
 class Symmetry:
@@ -28,7 +31,7 @@ class Symmetry:
     flip_y: bool
     flip_x: bool
 
-    def image(self, images: npt.NDArray) -> npt.NDArray:
+    def image(self, images: npt.NDArray[Pixel]) -> npt.NDArray[Pixel]:
         """Transforms (..., n, n) images [iy, ix]."""
         if self.transpose:
             images = np.swapaxes(images, -1, -2)
@@ -111,7 +114,7 @@ def condition(
     live = np.ones(k, dtype=bool)
     if dead:
         electrodes = rng.choice(m.contact.shape[1], dead, replace=False)
-        live = ~np.isin(m.pattern, electrodes).any(axis=1)
+        live[np.isin(m.pattern, electrodes).any(axis=1)] = False
     estimate = sigma * np.clip(1 + 0.06 * rng.standard_normal(k), 0.7, 1.3)
     operator = pre.condition(estimate, drift=drift, weights=live.astype(float))
     return Condition(operator, sigma, drift, m.contact, _error(m.gram) * (not exact), live, 64)
@@ -120,4 +123,4 @@ def condition(
 def _error(gram: Array) -> Array:
     values, vectors = np.linalg.eigh(gram)
     profile = np.maximum(values, 0) ** MODEL_ERROR_POWER
-    return MODEL_ERROR * vectors * (profile / np.linalg.norm(profile))
+    return np.asarray(MODEL_ERROR * vectors * (profile / np.linalg.norm(profile)))

@@ -27,7 +27,7 @@ from models.evaluation import LEVELS, evaluate, predict
 from models.forward import ForwardModel
 from models.linearise import linearise
 from models.network import MMCNN, Config, multiply_accumulates
-from models.prereconstruction import Array, PreReconstructor
+from models.prereconstruction import Array, Matrices, PreReconstructor
 
 VALID = 1000
 
@@ -49,7 +49,7 @@ class Plan:
 FULL, QUICK = Plan(57000, 214.0, 13.0), Plan.of(12.5)  # packaging takes another two minutes
 
 
-def physics(skin: geometry.Skin, scenes: Path) -> tuple[bundle.Matrices, samples.Samples]:
+def physics(skin: geometry.Skin, scenes: Path) -> tuple[Matrices, samples.Samples]:
     """Matrices of a skin, and the held-out scenes in their normalisation."""
     # With z0 of the model as the divisor, contact impedances off by 30 % change d by 0.2 % instead of 0.5 %; but it
     # takes a converter that reads ohm. Skins recorded in counts of unknown gain a channel divide by their own baseline.

@@ -15,7 +15,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -107,7 +107,7 @@ def make_chunk(spec: ChunkSpec) -> dict[str, NDArray[Any]]:
 @contextmanager
 def _backend(name: str, scheduler: str | None) -> Iterator[None]:
     """joblib's configuration for a backend by name; "dask" joins the scheduler's cluster, "ray" the running one."""
-    client: Any = nullcontext()
+    client: AbstractContextManager[object] = nullcontext()
     if name == "dask":
         from distributed import Client
 

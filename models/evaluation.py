@@ -27,7 +27,7 @@ def predict(model: MMCNN | onnxruntime.InferenceSession) -> Predict:
         device = next(model.parameters()).device
         model.eval()
         found = model(torch.from_numpy(stack).to(device), torch.from_numpy(context).to(device))
-        return tuple(t.float().cpu().numpy() for t in found)  # type: ignore[return-value]
+        return tuple(t.float().cpu().numpy() for t in found)
 
     return run
 

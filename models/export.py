@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ import onnx
 import onnxruntime
 import torch
 from onnxruntime import quantization
+from torch import Tensor, nn
 
 from models.network import CONTEXT, MMCNN
 from models.prereconstruction import Array
@@ -29,6 +29,24 @@ class ParityError(EitskinError):
     """The exported network does not compute what PyTorch computes."""
 
 
+def exported(model: nn.Module, example: tuple[Tensor, ...], inputs: Sequence[str], outputs: Sequence[str]) -> bytes:
+    """ONNX of a network that takes and gives tensors by these names; the first axis of each is free."""
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
+        warnings.simplefilter("ignore")  # the TorchScript exporter announces its successor, which needs onnxscript
+        path = Path(folder, "network.onnx")
+        torch.onnx.export(
+            model,
+            example,
+            path,
+            input_names=list(inputs),
+            output_names=list(outputs),
+            dynamic_axes={name: {0: "frames"} for name in (*inputs, *outputs)},
+            opset_version=OPSET,
+            dynamo=False,
+        )
+        return path.read_bytes()
+
+
 def to_onnx(model: MMCNN, stack: Array, context: Array) -> bytes:
     """ONNX of a network in eval mode, checked against PyTorch on (N, C, h, w), (N, n). Raises ParityError.
 
@@ -36,20 +54,7 @@ def to_onnx(model: MMCNN, stack: Array, context: Array) -> bytes:
     """
     model = model.eval()
     example = (torch.zeros(1, *stack.shape[1:]), torch.zeros(1, CONTEXT))
-    buffer = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the TorchScript exporter announces its successor, which needs onnxscript
-        torch.onnx.export(
-            model,
-            example,
-            buffer,
-            input_names=list(INPUTS),
-            output_names=list(OUTPUTS),
-            dynamic_axes={name: {0: "frames"} for name in (*INPUTS, *OUTPUTS)},
-            opset_version=OPSET,
-            dynamo=False,
-        )
-    content = buffer.getvalue()
+    content = exported(model, example, INPUTS, OUTPUTS)
     onnx.checker.check_model(onnx.load_model_from_string(content))
     with torch.no_grad():
         expected = [t.numpy() for t in model(torch.from_numpy(stack), torch.from_numpy(context))]
@@ -91,7 +96,9 @@ def to_int8(content: bytes, stack: Array, context: Array) -> bytes:
         return target.read_bytes()
 
 
-class _Calibration(quantization.CalibrationDataReader):
+class _Calibration:
+    """Batches of stacks and contexts, as onnxruntime's quantisation asks for them."""
+
     def __init__(self, stack: Array, context: Array, size: int = 16) -> None:
         self._feeds: Iterator[dict[str, Array]] = (
             {"stack": stack[k : k + size], "context": context[k : k + size]}
@@ -111,7 +118,8 @@ def session(content: bytes | Path, threads: int = 1) -> onnxruntime.InferenceSes
 
 
 def run(network: onnxruntime.InferenceSession, stack: Array, context: Array) -> list[Array]:
-    return network.run(list(OUTPUTS), {"stack": stack, "context": context})
+    found: list[Array] = network.run(list(OUTPUTS), {"stack": stack, "context": context})
+    return found
 
 
 def run_time_ms(content: bytes, stack: Array, context: Array, repeats: int = 400) -> dict[str, float]:

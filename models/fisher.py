@@ -39,7 +39,7 @@ class Noise:
 
     snr_db: float = 70.0
     floor_ohm: float = 0.0
-    tare_frames: int = 64
+    tare_frames: float = 64  # a mean of several frames against 64 is as one frame against fewer
 
     def sigma(self, z: Array) -> Array:
         """(K,) standard deviation [ohm] of a difference between one frame and the tare."""

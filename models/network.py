@@ -13,7 +13,7 @@ channels (FiLM).
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -23,6 +23,8 @@ CONTEXT = 4
 TOLD = 32  # features of the context
 CLASSES = 5
 UPSCALE = 4
+
+Model = TypeVar("Model", bound=nn.Module)
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ class CBAM(nn.Module):
         gate = self.excite(F.relu(self.squeeze(mean))) + self.excite(F.relu(self.squeeze(peak)))
         x = x * torch.sigmoid(gate)
         where = torch.cat([x.mean(1, keepdim=True), x.amax(1, keepdim=True)], 1)
-        return x * torch.sigmoid(self.place(where))
+        attended: Tensor = x * torch.sigmoid(self.place(where))
+        return attended
 
 
 class FiLM(nn.Module):
@@ -75,7 +78,8 @@ class FiLM(nn.Module):
         nn.init.zeros_(self.film.bias)
 
     def forward(self, x: Tensor, told: Tensor) -> Tensor:
-        gain, offset = self.film(told)[:, :, None, None].chunk(2, 1)
+        film: Tensor = self.film(told)
+        gain, offset = film[:, :, None, None].chunk(2, 1)
         return x * (1 + gain) + (offset + self.place)
 
 
@@ -98,7 +102,8 @@ class Stage(nn.Module):
         x = F.relu(self.told(x, told) if self.told else x)
         for block in self.blocks:
             x = x + F.relu(block(x))
-        return self.attention(x)
+        attended: Tensor = self.attention(x)
+        return attended
 
 
 class MMCNN(nn.Module):
@@ -125,6 +130,7 @@ class MMCNN(nn.Module):
         self.classes = nn.Conv2d(b, 4 * CLASSES, 1)
         with torch.no_grad():
             for layer in (self.out, self.aside):
+                assert layer.bias is not None
                 layer.weight *= 0.3
                 layer.bias.zero_()
                 layer.bias[: UPSCALE**2] = -2.0
@@ -155,6 +161,16 @@ def compose(mask: Tensor, amplitude: Tensor, sigma: Tensor) -> tuple[Tensor, Ten
         amplitude.clamp(-6.0, 6.0), scale_factor=UPSCALE, mode="bilinear", align_corners=False
     )
     return torch.exp(log_amplitude) * torch.sigmoid(mask), log_amplitude + sigma.clamp(-8.0, 2.0)
+
+
+def laid_out(model: Model, layout: torch.memory_format) -> Model:
+    """The model, its convolutions' weights in this order of memory; what Module.to does, which takes no layout by its
+    annotations.
+    """
+    for weight in model.parameters():
+        if weight.ndim == 4:
+            weight.data = weight.data.to(memory_format=layout)
+    return model
 
 
 def multiply_accumulates(config: Config) -> int:

@@ -4,8 +4,8 @@ Adam on a CPU budget.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import overload
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +17,7 @@ def orthogonalise(g: Tensor, steps: int = 5) -> Tensor:
     """
     a, b, c = 3.4445, -4.7750, 2.0315
     tall = g.shape[0] > g.shape[1]
-    x = g.T if tall else g
+    x: Tensor = g.T if tall else g
     x = x / (x.norm() + 1e-7)
     for _ in range(steps):
         s = x @ x.T
@@ -33,8 +33,19 @@ class Muon(torch.optim.Optimizer):
     ) -> None:
         super().__init__(params, {"lr": lr, "momentum": momentum, "decay": decay})
 
+    @overload
+    def step(self, closure: None = None) -> None: ...
+
+    @overload
+    def step(self, closure: Callable[[], float]) -> float: ...
+
     @torch.no_grad()
-    def step(self, closure: Any = None) -> None:  # noqa: ARG002
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+        """One step; with a closure, which evaluates the model anew, its loss."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
         for group in self.param_groups:
             for p in group["params"]:
                 if p.grad is None:
@@ -49,3 +60,4 @@ class Muon(torch.optim.Optimizer):
                 scale = max(1.0, matrix.shape[0] / matrix.shape[1]) ** 0.5
                 p.mul_(1 - group["lr"] * group["decay"])
                 p.add_(matrix.reshape(p.shape), alpha=-group["lr"] * scale)
+        return loss

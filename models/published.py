@@ -14,10 +14,8 @@ noise, 50 to 100 dB, which the network is not told: neither is the published one
 from __future__ import annotations
 
 import argparse
-import io
 import math
 import time
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +24,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from models import geometry, samples
-from models.augmentation import Condition, condition, symmetries
+from models.augmentation import Condition, Symmetry, condition, symmetries
 from models.bundle import Bundle
 from models.data import WORK
-from models.network import CBAM
+from models.export import exported
+from models.network import CBAM, laid_out
 from models.prereconstruction import THRESHOLD_T, Array, Drift, Operator, PreReconstructor
 
 IN, OUT = 48, 96
@@ -55,7 +54,8 @@ class PublishedMMCNN(nn.Module):
         self.decoder = nn.Sequential(*up, nn.Conv2d(UP[-1], 1, 1))
 
     def forward(self, image: Tensor) -> Tensor:
-        return self.decoder(self.attention(self.encoder(image)))
+        drop: Tensor = self.decoder(self.attention(self.encoder(image)))
+        return drop
 
 
 def inputs(operator: Operator, d: Array) -> Array:
@@ -70,7 +70,7 @@ def train(
     torch.manual_seed(seed)
     rng, turns = np.random.default_rng(seed), symmetries(skin)
     bank = [_condition(pre, rng) for _ in range(32)]
-    model = PublishedMMCNN(attention).to(memory_format=torch.channels_last)
+    model = laid_out(PublishedMMCNN(attention), torch.channels_last)
     optimizer = torch.optim.Adam(model.parameters(), RATE)
     began, step, mean = time.perf_counter(), 0, 0.0
     while (done := (time.perf_counter() - began) / (60 * minutes)) < 1:
@@ -85,14 +85,16 @@ def train(
         step, mean = step + 1, 0.98 * mean + 0.02 * float(loss.detach())
         if step % 200 == 0:
             print(f"{60 * minutes * done:.0f} s, step {step}: {mean / (1 - 0.98**step):.5f}", flush=True)
-    return model.eval().to(memory_format=torch.contiguous_format)
+    return laid_out(model.eval(), torch.contiguous_format)
 
 
 def _condition(pre: PreReconstructor, rng: np.random.Generator) -> Condition:
     return condition(pre, rng, np.full(pre.measurements, 10 ** (-rng.uniform(50, 100) / 20)), Drift())
 
 
-def _batch(scenes: samples.Samples, spoiled: Condition, rng: np.random.Generator, turns: list) -> tuple[Tensor, Tensor]:
+def _batch(
+    scenes: samples.Samples, spoiled: Condition, rng: np.random.Generator, turns: list[Symmetry]
+) -> tuple[Tensor, Tensor]:
     index = rng.integers(len(scenes), size=64)
     turned = [turns[k] for k in rng.integers(len(turns), size=64)]
     d = np.stack([scenes.d[i][t.measurements] for i, t in zip(index, turned, strict=True)])
@@ -102,13 +104,7 @@ def _batch(scenes: samples.Samples, spoiled: Condition, rng: np.random.Generator
 
 
 def to_onnx(model: PublishedMMCNN) -> bytes:
-    buffer = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        axes = {"image": {0: "frames"}, "drop": {0: "frames"}}
-        names = {"input_names": ["image"], "output_names": ["drop"], "dynamic_axes": axes}
-        torch.onnx.export(model, (torch.zeros(1, 1, IN, IN),), buffer, opset_version=17, dynamo=False, **names)
-    return buffer.getvalue()
+    return exported(model, (torch.zeros(1, 1, IN, IN),), ["image"], ["drop"])
 
 
 def main(argv: list[str] | None = None) -> None:

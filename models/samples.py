@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from models import data, geometry
-from models.augmentation import Condition, Symmetry, random_condition, symmetries
+from models.augmentation import Condition, Pixel, Symmetry, random_condition, symmetries
 from models.losses import IGNORE, Target
 from models.prereconstruction import Array, PreReconstructor
 from models.shapes import from_rows
@@ -51,7 +51,9 @@ def load(folder: Path, split: str, pre: PreReconstructor, limit: int | None = No
     return Samples(d.astype(np.float32), drop, mask, classes, raw.shapes)
 
 
-def picture(shapes: npt.NDArray) -> tuple[npt.NDArray, npt.NDArray, npt.NDArray]:
+def picture(
+    shapes: npt.NDArray[np.floating],
+) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
     """Drop, mask and class pictures of (M, 3, 7) shape rows; see Samples."""
     m = len(shapes)
     drop = np.zeros((m, N, N), np.float16)
@@ -134,13 +136,17 @@ class Batches:
 
 
 def make(
-    samples: Samples, index: npt.NDArray, turned: list[Symmetry] | None, condition: Condition, rng: np.random.Generator
+    samples: Samples,
+    index: npt.NDArray[np.integer],
+    turned: list[Symmetry] | None,
+    condition: Condition,
+    rng: np.random.Generator,
 ) -> Batch:
     """The samples of `index` under one condition, each turned by its symmetry."""
     s, same = samples, [None] * len(index)
     d = np.stack([s.d[i] if t is None else s.d[i][t.measurements] for i, t in zip(index, turned or same, strict=True)])
 
-    def pictures(images: npt.NDArray) -> npt.NDArray:
+    def pictures(images: npt.NDArray[Pixel]) -> npt.NDArray[Pixel]:
         return np.stack(
             [images[i] if t is None else t.image(images[i]) for i, t in zip(index, turned or same, strict=True)]
         )
@@ -171,4 +177,5 @@ def levels(samples: Samples, pre: PreReconstructor) -> Array:
     operator = pre.condition(np.full(pre.measurements, 1e-9))
     images = operator.images(samples.d)
     scale = images[:, operator.scale_index].max(axis=1)
-    return np.sqrt(((images / scale[:, None, None]) ** 2)[:, :, operator.inside.ravel()].mean(axis=(0, 2)))
+    inside = (images / scale[:, None, None])[:, :, operator.inside.ravel()]
+    return np.asarray(np.sqrt((inside**2).mean(axis=(0, 2))))

@@ -27,7 +27,7 @@ from models import data, geometry, manifest, samples
 from models.bundle import Bundle
 from models.evaluation import LEVELS, evaluate, predict
 from models.losses import losses, total
-from models.network import FAST, FULL, MMCNN, Config
+from models.network import FAST, FULL, MMCNN, Config, laid_out
 from models.optim import Muon
 from models.prereconstruction import PreReconstructor
 
@@ -43,7 +43,7 @@ class Trainer:
         torch.manual_seed(seed)
         self.seed, self.commit = seed, manifest.commit()
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.model = MMCNN(config).to(self.device, memory_format=torch.channels_last)
+        self.model = laid_out(MMCNN(config).to(self.device), torch.channels_last)
         self.average = copy.deepcopy(self.model)
         self.config, self.batches, self.held_out = config, batches, held_out
         hidden = [
@@ -73,7 +73,8 @@ class Trainer:
         self.model.train()
         with torch.autocast("cuda", torch.bfloat16, enabled=self.device.type == "cuda"):
             parts = self.model.parts(batch.stack, batch.context)
-        terms = losses(tuple(p.float() for p in parts), batch.target)  # type: ignore[arg-type]
+        mask, amplitude, sigma, classes = (p.float() for p in parts)
+        terms = losses((mask, amplitude, sigma, classes), batch.target)
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
         total(terms).backward()
@@ -134,7 +135,7 @@ class Trainer:
         """The averaged network that was best on held-out scenes, on the CPU, for inference."""
         model = copy.deepcopy(self.average)
         model.load_state_dict(self.best or self.average.state_dict())
-        return model.cpu().to(memory_format=torch.contiguous_format).eval()
+        return laid_out(model.cpu(), torch.contiguous_format).eval()
 
     def save(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)

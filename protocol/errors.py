@@ -35,7 +35,9 @@ class EitskinError(Exception):
         ├── ImportRefused (ValueError)        a file cannot become a recording
         ├── RegistrationError (ValueError)    presses at known places do not register a skin
         ├── CalibrationError                  presses of known force make no force law
+        ├── MissingExtra                      the packages that a bridge needs are not installed
         ├── NotOurs                           a folder that must not be handed over
+        ├── BridgeError                       bridges: a bridge cannot start
         ├── CliError                          ends a command with one line and an exit code
         └── Broken                            bench: a promise was broken under changed bytes
     """

@@ -66,6 +66,11 @@ class NewestContacts:
         self._session = ""
         self._seen: dict[int, None] = {}  # ids of contacts that were given out, oldest first
 
+    @property
+    def measured_ns(self) -> int | None:
+        """When the newest frame was measured, by our monotonic clock; None where it does not say."""
+        return self._measured_ns
+
     def take(self) -> bool:
         """Take in the newest frame that has arrived; whether there was one."""
         looked_ns = time.monotonic_ns()

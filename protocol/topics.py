@@ -11,7 +11,9 @@ from typing import Literal
 
 from . import frame_types as f
 
-PRODUCERS = ("acquisition", "preprocessing", "inference", "publisher", "stub")
+BRIDGES = ("ros2", "foxglove")
+"""Processes that hand contacts on to other worlds. On our side they publish their status alone."""
+PRODUCERS = ("acquisition", "preprocessing", "inference", "publisher", "stub", *BRIDGES)
 """Processes that own a data socket `<producer>.ipc`. A replay stands in for acquisition and binds its socket."""
 
 

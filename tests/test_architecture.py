@@ -12,16 +12,19 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-FOLDERS = {"protocol", "models", "services", "firmware_stub", "bench", "examples", "tests"}
+FOLDERS = {"protocol", "models", "services", "firmware_stub", "bridges", "bench", "examples", "tests"}
 ALLOWED = {
     "protocol": {"protocol"},
     "models": {"protocol", "models"},
     "services": {"protocol", "models", "services"},
     "firmware_stub": {"protocol", "models", "firmware_stub"},
     "examples": {"protocol", "examples"},
+    "bridges": {"protocol", "bridges"},
 }
 WIRE_NEEDS = {"numpy", "zmq", "msgpack"}
 RUNTIME_NEEDS = WIRE_NEEDS | {"serial", "onnxruntime", "scipy", "pydantic", "typer", "rich", "supervisor", "mcap"}
+BRIDGES_NEED = {"ros2": {"cyclonedds"}, "foxglove": {"foxglove"}}
+"""What each bridge needs beside what protocol needs: an extra of its own."""
 # The command line hands these over to the offline tools on demand.
 OFFLINE_DOORS = {"services/cli"}
 SERVICES_USE_OF_MODELS = {
@@ -34,7 +37,7 @@ SERVICES_USE_OF_MODELS = {
     "models.uncertainty",
 }
 
-WITHOUT_CIRCLES = ("protocol", "models", "services", "firmware_stub", "bench")
+WITHOUT_CIRCLES = ("protocol", "models", "services", "firmware_stub", "bridges", "bench")
 NUMERICS = ("numpy", "scipy", "models", "services.estimation", "protocol.frames", "protocol.frame_types")
 """What services/estimation may import: numerics, and the frames that name what a scan holds."""
 NOT_YET_PURE = {
@@ -109,6 +112,13 @@ def test_only_runtime_dependencies(folder: str, allowed: set[str]) -> None:
     for path in sources(folder):
         outside = {n.split(".")[0] for n in imports(path)} - set(sys.stdlib_module_names) - FOLDERS - {""}
         assert outside <= allowed, f"{path.relative_to(ROOT)} imports {sorted(outside - allowed)}"
+
+
+def test_a_bridge_needs_what_protocol_needs_and_its_own_extra() -> None:
+    for path in sources("bridges"):
+        own = BRIDGES_NEED.get(path.relative_to(ROOT).parts[1], set())
+        outside = {n.split(".")[0] for n in imports(path)} - set(sys.stdlib_module_names) - FOLDERS - {""}
+        assert outside <= WIRE_NEEDS | own, f"{path.relative_to(ROOT)} imports {sorted(outside - WIRE_NEEDS - own)}"
 
 
 def test_services_take_only_bundle_and_numerics_from_models() -> None:

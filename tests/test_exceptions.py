@@ -17,7 +17,7 @@ import protocol
 from protocol.errors import EitskinError
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-FOLDERS = ("protocol", "models", "services", "firmware_stub", "bench", "examples")
+FOLDERS = ("protocol", "models", "services", "firmware_stub", "bridges", "bench", "examples")
 BUILT_IN = {n for n, what in vars(builtins).items() if isinstance(what, type) and issubclass(what, BaseException)}
 ENTRY = re.compile(r"^ *((?:[│├└]| {4})[│├└─ ]*) (\w+)(?: \((\w+)\))?  ", re.MULTILINE)
 

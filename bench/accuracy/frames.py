@@ -74,7 +74,7 @@ def scenes(seed: int, n: int) -> list[tuple[str, list[Shape]]]:
     for gap in np.linspace(0.02, 0.6, n):
         turn, middle = rng.uniform(0, np.pi), rng.uniform(-0.2, 0.2, 2)
         step = (0.3 + gap) / 2 * np.array([np.cos(turn), np.sin(turn)])
-        pair = [Shape("circle", *(middle + sign * step), 0.15, 0.3) for sign in (-1, 1)]
+        pair = [Shape("circle", x, y, 0.15, 0.3) for x, y in (middle - step, middle + step)]
         made.append(("apart", pair))
     force = replace(TARGETS, kinds=("circle",), radius=(0.2, 0.2))
     made += [("force", random_scene(rng, force, n=1)) for _ in range(n)]

@@ -20,11 +20,11 @@ from services.estimation.tare import take
 from services.pipeline import Pipeline
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import reconstruct
-from services.runtime.config import Indenter, Skin
+from services.runtime.config import Indenter, NetworkFile, Skin
 
 NEWTON_PER_DROP = 10.0  # the default force law: 0.1 S/m is 1 N
 LARGE = 0.25  # radius from which on shape classes are scored
-VARIANTS = ("full", "fast", "int8")
+VARIANTS: tuple[NetworkFile, ...] = ("full", "fast", "int8")
 RATE_HZ = 22.0  # the board's full scan
 
 
@@ -62,8 +62,8 @@ def network_ms(bundle: Bundle, variant: str, runs: int = 200) -> float:
 
 def run(frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int, untouched_frames: int) -> list[Row]:
     """One row a level and network file: figures of the image, and of the contacts a controller would get."""
-    variants = [v for v in VARIANTS if bundle.network_path(v) is not None] or ["none"]
-    alone = {v: network_ms(bundle, v) for v in variants if v != "none"}
+    variants: list[NetworkFile] = [v for v in VARIANTS if bundle.network_path(v) is not None] or ["none"]
+    alone: dict[NetworkFile, float] = {v: network_ms(bundle, v) for v in variants if v != "none"}
     rows = []
     for level in levels:
         noisy, untouched = _frames.noisy(frames, level, seed)

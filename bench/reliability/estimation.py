@@ -33,13 +33,17 @@ NOISE, FRAMES, MESH = 1e-4, 64, "inverse"
 SCENES = Prior(
     radius=(0.1, 0.3), drop=(0.1, 0.5), tail=0.0, touches=(0.7, 0.2, 0.1), kinds=("circle", "hertz"), gap=0.1
 )
-OTHERS: tuple[dict[str, float], ...] = ({}, {"misfit": 0.02}, {"misfit": 0.03}, {"misfit": 0.1}, {"another": 10.0})
+OTHERS = {
+    "as shipped": TUNING,
+    **{f"misfit {misfit:g}": dataclasses.replace(TUNING, misfit=misfit) for misfit in (0.02, 0.03, 0.1)},
+    "another 10": dataclasses.replace(TUNING, another=10.0),
+}
 PRESSES = ((0.1, 0.1), (0.3, 0.1), (0.5, 0.1), (0.1, 0.2), (0.3, 0.2), (0.5, 0.2), (0.05, 0.2))  # S/m, radius
 SHIFTS = (0.0, 0.001, 0.004)  # model units, standard deviation of an electrode's place: 0, 0.05, 0.2 % of the side
 
 
 def noisy(z: Array, rng: np.random.Generator, frames: int = 1) -> Array:
-    return z * (1 + NOISE / np.sqrt(frames) * rng.standard_normal(z.shape))
+    return np.asarray(z * (1 + NOISE / np.sqrt(frames) * rng.standard_normal(z.shape)))
 
 
 def evidence(tuning: Tuning = TUNING) -> TouchEvidence:
@@ -70,8 +74,7 @@ def drift(count: int, seed: int) -> None:
         pressed, free = (noisy(impedances(model, s, background, contact), rng) for s in (shapes, ()))
         scenes.append((len(shapes), truth, (pressed - base) / normaliser, (free - base) / normaliser))
     print(f"{count} scenes; |error| of d after the correction: of |d| of the touch, % (median, p90); of what is stated")
-    for other in OTHERS:
-        tuning = dataclasses.replace(TUNING, **other)
+    for name, tuning in OTHERS.items():
         judge = evidence(tuning)
         error = np.diag(np.full(len(z0), NOISE**2 * (1 + 1 / FRAMES) + tuning.absolute**2))
         prior = np.diag([tuning.scale_sd**2, *[tuning.contact_sd**2] * 16])
@@ -85,7 +88,7 @@ def drift(count: int, seed: int) -> None:
             odds.append(found.odds)
             alarm.append(judge(free, error, judge.physics.columns(free), prior).odds)
         print(
-            f"{other or 'as shipped'!s:20} {np.median(share):6.2f} {np.quantile(share, 0.9):6.2f}   "
+            f"{name:20} {np.median(share):6.2f} {np.quantile(share, 0.9):6.2f}   "
             f"{np.median(stated):5.2f} {np.quantile(stated, 0.9):5.2f}   count right "
             f"{100 * np.mean(right):3.0f} %   odds, touched {min(odds):6.1f} or more, free {max(alarm):6.1f} or less"
         )
@@ -116,7 +119,9 @@ def start(count: int, seed: int) -> None:
             for _ in range(max(count // 5, 4))
         ]
         line(f"electrodes off by {shift:g}: untouched", [look(model, ()) for model in models])
-        touches = [Shape("circle", *rng.uniform(-0.6, 0.6, 2), radius, drop) for drop, radius in PRESSES]
+        touches = [
+            Shape("circle", x, y, radius, drop) for drop, radius in PRESSES for x, y in [rng.uniform(-0.6, 0.6, 2)]
+        ]
         seen = [look(model, [touches[k % len(touches)]]) for k, model in enumerate(models)]
         line(f"electrodes off by {shift:g}: touched", seen)
 

@@ -55,7 +55,7 @@ class Zmq(Bytes):
         import zmq
 
         super().__init__(size)
-        context = zmq.Context.instance()
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self.out, self.into = context.socket(zmq.PUB), context.socket(zmq.SUB)
         self.out.bind(f"ipc://{where}/zmq{writes}")
         self.into.connect(f"ipc://{where}/zmq{reads}")

@@ -32,6 +32,7 @@ from bench.speed.service import Outside, Service, end_on_sigterm, running
 from bench.speed.skip import scenes
 from bench.tracking.scene import Recorded
 from protocol.frames import pack
+from protocol.transport import Context
 from services.recordings.recording import RecordingWriter
 from services.runtime.stage import PROCESSES
 
@@ -68,7 +69,7 @@ def _write(path: Path, skin: str, recorded: Recorded, phase_s: float) -> None:
 
 def measure(service: Service, n: int, seconds: float, rate_hz: float) -> dict[str, Any]:
     """What one controller that takes everything sees of n skins."""
-    socket = zmq.Context.instance().socket(zmq.SUB)
+    socket = Context.instance().socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, 100_000)
     for process in PROCESSES:
         socket.connect(f"ipc://{service.folder}/{process}.ipc")

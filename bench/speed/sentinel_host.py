@@ -16,7 +16,7 @@ from protocol.frames import ContactFrame, DeltaFrame
 from services.board.boardlink import BoardLink
 from services.board.source import BoardSource
 from services.pipeline import Pipeline
-from services.runtime.config import Skin
+from services.runtime.config import ScanMode, Skin
 
 CHAIN_S = 0.002  # from a frame read to what preprocessing says of it, and to its contacts
 STEP_S = 2e-4  # of the host's loop
@@ -26,7 +26,7 @@ STEP_S = 2e-4  # of the host's loop
 class Host:
     """A skin that nothing touches until `press` says so; `contacts` (when, frame) as a controller would get them."""
 
-    scan: str = "adaptive"
+    scan: ScanMode = "adaptive"
     snr_db: float = 70.0
     seed: int = 0
     now: float = 0.0

@@ -19,7 +19,7 @@ from models.shapes import Shape
 from protocol.frames import DeltaFrame
 from services.contacts.segmentation import segment
 from services.estimation.sentinel import Verdict, Watch
-from services.inference import Network
+from services.networks import Network
 
 Array = NDArray[np.float64]
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from bench.speed.sentinel_host import Host
 from protocol.frames import ContactFrame
+from services.runtime.config import ScanMode
 
 SETTLE_S = 3.6  # for the board to idle again
 HELD_S = 0.4
@@ -27,7 +28,7 @@ def presses(count: int, seed: int, light: bool) -> list[dict[str, float]]:
     return found
 
 
-def latencies(scan: str, count: int, seed: int, light: bool = False) -> dict[str, Any]:
+def latencies(scan: ScanMode, count: int, seed: int, light: bool = False) -> dict[str, Any]:
     """Seconds (n,) from each press to its contacts of each of KINDS, NaN where none came; position errors [m]."""
     host, rng = Host(scan, seed=seed), np.random.default_rng([seed, 5])
     host.until(3.0 + SETTLE_S)

@@ -19,6 +19,7 @@ import zmq
 
 from bench import ROOT
 from protocol.sockets import ControlClient
+from protocol.transport import Context
 
 START_S = 60.0
 
@@ -120,7 +121,7 @@ class Outside:
     """A controller that has none of the project's code: the newest message of a topic, and when it came."""
 
     def __init__(self, topic: str, skin: str, folder: Path, producer: str = "publisher") -> None:
-        self.socket = zmq.Context.instance().socket(zmq.SUB)
+        self.socket = Context.instance().socket(zmq.SUB)
         self.socket.setsockopt(zmq.CONFLATE, 1)
         self.socket.connect(f"ipc://{folder}/{producer}.ipc")
         self.socket.subscribe(f"{topic}/{skin}\0".encode())

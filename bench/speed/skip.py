@@ -233,9 +233,9 @@ def goals(
     falls = f"still: position error after {list(held)[-1]} frames, of the first one's"
     found.append(Goal(falls, end["averaged"] / start["averaged"], at_most=1.0, gate=0.7))
     found.append(Goal("the same, floors", end["averaged, floor"] / start["averaged, floor"]))
-    most = batches[str(TOGETHER[-1])]
+    largest = batches[str(TOGETHER[-1])]
     saved = f"network's CPU a frame, {TOGETHER[-1]} skins in one run, of each alone's"
-    found.append(Goal(saved, most["one run"] / most["each alone"], gate=1.1))
+    found.append(Goal(saved, largest["one run"] / largest["each alone"], gate=1.1))
     for scene in ("untouched", "still", "moving"):
         found.append(Goal(f"{scene}: frames a second on one core, stages alone", 1e3 / ours[scene]["cpu_ms"]))
     return found

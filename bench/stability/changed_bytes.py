@@ -28,7 +28,7 @@ from services.recordings.recording import RecordingError, RecordingReader, Recor
 from services.runtime import persistence
 
 SIZES = {"quick": 100, "full": 2000}
-SHAPES = (
+SHAPES: tuple[list[int], ...] = (
     [2**40, 2**40, 0],
     [0, 2**63],
     [2**62, 2**62],

@@ -26,7 +26,7 @@ READ_LATE_S = 0.002  # a scheduler's doing
 LEAST_STEP_S = 2e-4
 
 Delay = Callable[[float], float]
-Happening = Callable[["DelayedLine"], None]
+Happening = Callable[["DelayedLine"], object]
 
 
 @dataclass(frozen=True)

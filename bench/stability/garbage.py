@@ -133,10 +133,10 @@ def random_frames(setting: Setting) -> Iterator[Row]:
         broken.update(judged(answer, None))
         valid += answer.valid
     yield {"case": "all kinds in one stream", "frames": n // 10, "valid_%": 1000 * valid / n, "broken": dict(broken)}
-    answers = [runner.see(noisy(z0, share(USUAL_DB), rng)) for _ in range(200)]
-    answers += [runner.see(noisy(scenes[1].z, share(USUAL_DB), rng)) for _ in range(20)]
-    well = summary([(a, scenes[1].touch) for a in answers[-20:]])
-    if not answers[-1].valid or not answers[-1].contacts:
+    after = [runner.see(noisy(z0, share(USUAL_DB), rng)) for _ in range(200)]
+    after += [runner.see(noisy(scenes[1].z, share(USUAL_DB), rng)) for _ in range(20)]
+    well = summary([(a, scenes[1].touch) for a in after[-20:]])
+    if not after[-1].valid or not after[-1].contacts:
         well["broken"]["not well again after 200 good frames"] = 1
     yield {"case": "a touch, 200 good frames later", **well}
     yield {"case": "random tares", **_random_tares(runner, z0, rng, max(2 * len(FAMILIES), n // 400))}

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from onnx import numpy_helper
 from torch import Tensor
 
-from models.shapes import Array
+from models.prereconstruction import Array
 
 
 class Graph:
@@ -65,7 +65,8 @@ def _conv(x: list[Any], a: dict[str, Any]) -> Tensor:
 def _gemm(x: list[Any], a: dict[str, Any]) -> Tensor:
     left = x[0].T if a.get("transA") else x[0]
     right = x[1].T if a.get("transB") else x[1]
-    return a.get("alpha", 1.0) * left @ right + a.get("beta", 1.0) * x[2]
+    product: Tensor = a.get("alpha", 1.0) * left @ right + a.get("beta", 1.0) * x[2]
+    return product
 
 
 def _slice(x: list[Any], a: dict[str, Any]) -> Tensor:
@@ -73,13 +74,15 @@ def _slice(x: list[Any], a: dict[str, Any]) -> Tensor:
     at = [slice(None)] * x[0].ndim
     for axis, start, end in zip(axes, x[1].tolist(), x[2].tolist(), strict=True):
         at[axis] = slice(start, end)
-    return x[0][tuple(at)]
+    part: Tensor = x[0][tuple(at)]
+    return part
 
 
 def _unsqueeze(x: list[Any], a: dict[str, Any]) -> Tensor:
+    found: Tensor = x[0]
     for axis in sorted(x[1].tolist()):
-        x[0] = x[0].unsqueeze(axis)
-    return x[0]
+        found = found.unsqueeze(axis)
+    return found
 
 
 def _divide(x: list[Any], a: dict[str, Any]) -> Tensor:

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import zmq
 
@@ -52,8 +53,8 @@ class Site:
         if not name:
             transport.configure(Transport(addresses=addresses))
         elif name == "robot":
-            listed = {"clients": self.folder / "clients", "operators": self.folder / "operators"}
-            transport.configure(Transport(secret_key=secret, **listed))
+            clients, operators = self.folder / "clients", self.folder / "operators"
+            transport.configure(Transport(secret_key=secret, clients=clients, operators=operators))
         else:
             keys = {"publisher": self.folder / "keys" / "robot.key"}
             transport.configure(Transport(addresses=addresses, secret_key=secret, server_keys=keys))
@@ -168,7 +169,12 @@ def commands(site: Site) -> Row:
     """`tare` from a client, which may only look; the operator's is carried out."""
     carried_out: list[str] = []
     site.use("robot")
-    handlers = {"tare": lambda args: carried_out.append(str(args.get("by"))) or {}, "status": lambda args: {}}
+
+    def tare(args: dict[str, Any]) -> dict[str, Any]:
+        carried_out.append(str(args.get("by")))
+        return {}
+
+    handlers = {"tare": tare, "status": lambda args: {}}
     server = ControlServer("publisher", handlers, address=site.address, context=site.context)
     answers: dict[str, str] = {}
 

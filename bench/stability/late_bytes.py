@@ -63,6 +63,14 @@ def fault(name: str, seconds: float = 5.0, **args: object) -> Happening:
     return lambda line: line.rig.fault(name, args, line.true_s, seconds)
 
 
+def stopped(seconds: float) -> Happening:
+    return lambda line: line.stop(seconds)
+
+
+def suspended(seconds: float) -> Happening:
+    return lambda line: line.suspend(seconds)
+
+
 def again(first: int, last: int) -> Happening:
     """Scans captured before are sent to the host once more."""
 
@@ -101,8 +109,8 @@ AGAIN = [
     Case("scans from long before a restart", 20.0, at=[(9.0, fault("power_cycle")), (11.0, again(150, 190))]),
 ]
 STANDS_STILL = [
-    *(Case(f"stopped for {s:g} s", 12.0, at=[(BEGIN_S, lambda line, s=s: line.stop(s))]) for s in (0.3, 2.0, 5.0)),
-    *(Case(f"suspended for {s:g} s", 10.0 + s, at=[(BEGIN_S, lambda line, s=s: line.suspend(s))]) for s in (0.5, 20.0)),
+    *(Case(f"stopped for {s:g} s", 12.0, at=[(BEGIN_S, stopped(s))]) for s in (0.3, 2.0, 5.0)),
+    *(Case(f"suspended for {s:g} s", 10.0 + s, at=[(BEGIN_S, suspended(s))]) for s in (0.5, 20.0)),
 ]
 UNTIMED = [  # what a board that does not tell its time is seen by all the same
     Case("0.9 s from now on", 10.0, step(0.9), answers_time=False, well=False),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from bench.stability.run import Row, Setting, share
@@ -115,7 +116,7 @@ def _inverted(pre: PreReconstructor, relative: float, drift: Drift, d: Array) ->
     }
 
 
-def solved_long(matrix: Array, right: Array) -> Array:
+def solved_long(matrix: Array, right: Array) -> NDArray[np.longdouble]:
     """Cholesky solution of a symmetric positive definite system in extended precision (64 bits of mantissa)."""
     a, x, n = np.asarray(matrix, LONG).copy(), np.asarray(right, LONG).copy(), len(matrix)
     for k in range(n):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.stability.run import (
     SKIN,
@@ -39,6 +40,7 @@ GRADINGS = {  # coarse to fine, between them the meshes that the project uses
     "training": meshing.USES["training"],
     "fine": meshing.Grading(edge=2e-4, growth=0.28, interior=0.021, offset=0.53),
 }
+Images = NDArray[np.floating]
 LAMBDAS = 10.0 ** np.arange(-8, 1.01, 0.5)
 
 
@@ -192,7 +194,7 @@ def lambdas(setting: Setting) -> Iterator[Row]:
         relative = share(decibel)
         operator = pre.condition(np.full(pre.measurements, relative))
 
-        def images(scene: Scene, operator: Operator = operator, relative: float = relative) -> Array:
+        def images(scene: Scene, operator: Operator = operator, relative: float = relative) -> Images:
             d = pre.difference(noisy(scene.z, relative, rng), noisy(scene.z0, relative / 8, rng))
             return np.asarray(operator.images(d[None])).reshape(len(LAMBDAS), *operator.shape)
 
@@ -208,7 +210,7 @@ def lambdas(setting: Setting) -> Iterator[Row]:
             }
 
 
-def _of_images(pairs: list[tuple[Shape, Array]]) -> Row:
+def _of_images(pairs: Sequence[tuple[Shape, Images]]) -> Row:
     """Errors of plain images; broken where one is not finite."""
     bad = sum(not np.isfinite(image).all() for _, image in pairs)
     good = [(touch, np.asarray(image, float)) for touch, image in pairs if np.isfinite(image).all()]

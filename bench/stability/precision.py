@@ -16,6 +16,7 @@ from models.shapes import Shape
 from services.contacts.segmentation import segment
 
 USUAL_DB = 70.0
+FLOATS: tuple[type[np.floating], ...] = (np.float64, np.float32)
 PARITY_MM = 0.05  # what ONNX Runtime and PyTorch may differ by in position
 OUTPUTS = ["drop", "log_sigma", "classes"]
 
@@ -29,7 +30,7 @@ def stages(setting: Setting) -> Iterator[Row]:
     d = z / z0 - 1
     wire = np.abs(z.astype(np.complex64).astype(complex)) / z0 - 1
     yield {"case": "Z on the wire (float32)", **_errors(wire, d), "of_noise": _rms(wire - d) / relative}
-    small = (z.astype(np.float32) - z0.astype(np.float32)) / z0.astype(np.float32)
+    small: Array = np.divide(z.astype(np.float32) - z0.astype(np.float32), z0.astype(np.float32))
     yield {"case": "difference", **_errors(small, d), "of_noise": _rms(small - d) / relative}
     frames = noisy(z0, relative, rng, 64)
     mean = frames.astype(np.float32).mean(axis=0, dtype=np.float32)
@@ -161,7 +162,7 @@ def _operator(pre: PreReconstructor, relative: float, drift: Drift, d: Array) ->
     noise = sigma**2 * (1 + 1 / 64) + m.model_error**2
     covariance = np.diag(noise) + drift.scale**2 + drift.contact**2 * m.contact @ m.contact.T
     images = []
-    for dtype in (np.float64, np.float32):
+    for dtype in FLOATS:
         try:
             inverse = np.linalg.inv(np.linalg.cholesky(covariance.astype(dtype)))
         except np.linalg.LinAlgError:

@@ -56,7 +56,8 @@ class Event:
 
 
 def events(recorded: Recorded) -> list[Event]:
-    found, open_ = [], {}
+    found: list[Event] = []
+    open_: dict[str, tuple[int, str]] = {}  # first frame, arguments
     for k in range(len(recorded) + 1):
         now = json.loads(str(recorded.faults[k])) if k < len(recorded) else {}
         texts = {name: json.dumps(args, sort_keys=True) for name, args in now.items()}

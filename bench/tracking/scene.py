@@ -11,8 +11,10 @@ import hashlib
 import json
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,7 +148,10 @@ class _Recorder:
         ]
         rows = [row for k, f in enumerate(felt) for row in self._touches(script, k, f.start, f.world)]
         names = [([name for t, name in script.sections if t <= f.middle] or [""])[-1] for f in felt]
-        column = lambda of: np.array([of(frame) for frame in self._frames])  # noqa: E731
+
+        def column(of: Callable[[RawFrame], object]) -> NDArray[Any]:
+            return np.array([of(frame) for frame in self._frames])
+
         return Recorded(
             z=column(lambda f: f.z),
             status=column(lambda f: f.status),

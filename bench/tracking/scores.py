@@ -38,7 +38,7 @@ class Seen:
     @classmethod
     def of(cls, delta: DeltaFrame, contact: ContactFrame) -> Seen:
         lasting = [c for c in contact.contacts if c.state != "end"]
-        rows = tuple((c.id, *c.position[:2], c.force_n, c.force_sigma_n) for c in lasting)
+        rows = tuple((c.id, c.position[0], c.position[1], c.force_n, c.force_sigma_n) for c in lasting)
         return cls(contact.valid, tuple(contact.reasons), tuple(delta.electrodes.tolist()), rows)
 
 

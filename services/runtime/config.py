@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from models.files import FileError, read_text
 from protocol.errors import EitskinError
-from protocol.topics import PRODUCERS
+from protocol.topics import BRIDGES, PRODUCERS
 from protocol.transport import Transport, half
 from services.runtime.stage import PROCESSES
 
@@ -79,6 +79,10 @@ class Indenter(Section):
     shape: Literal["circle"] = "circle"
 
 
+NetworkFile = Literal["full", "fast", "int8", "none"]
+ScanMode = Literal["full", "adaptive"]
+
+
 class Skin(Section):
     """One skin: one board on one port, one bundle."""
 
@@ -88,9 +92,9 @@ class Skin(Section):
     pose: Pose = Pose()
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
     indenter: Indenter | None = None
-    network: Literal["full", "fast", "int8", "none"] = "int8"
+    network: NetworkFile = "int8"
     dft_points: Literal[128, 256, 512] = 128
-    scan: Literal["full", "adaptive"] = "full"  # a short list while nothing touches: board/adaptive.py
+    scan: ScanMode = "full"  # a short list while nothing touches: board/adaptive.py
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
     tare: Tare = Tare()
     touch: Touch = Touch()
@@ -215,6 +219,23 @@ class Skip(Section):
     unwanted: Switch = True  # what nobody subscribes to (force, shape) is not made
 
 
+class Ros2Section(Section):
+    """Topics for ROS 2: bridges/ros2, docs/ros.md."""
+
+    domain: Annotated[int, Field(ge=0, le=232, strict=True)] | None = None  # default: $ROS_DOMAIN_ID, else 0
+    interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:@-]{0,64}$")] = ""  # the only one; "lo": this host
+    commands: Switch = False  # the service `tare`: anybody in the ROS domain may call it
+    replay: Switch = False  # replayed frames are published too
+
+
+class FoxgloveSection(Section):
+    """The live server for Foxglove: bridges/foxglove."""
+
+    host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535, strict=True)] = 8765
+    replay: Switch = False  # replayed frames are shown too
+
+
 class Config(Section):
     """The whole file. `path` is where it was read from; relative paths in it are relative to its folder."""
 
@@ -223,6 +244,9 @@ class Config(Section):
     security: Security = Security()
     realtime: RealTime = RealTime()
     skip: Skip = Skip()
+    bridges: tuple[Literal["ros2", "foxglove"], ...] = ()  # that `skin up` starts too
+    ros2: Ros2Section = Ros2Section()
+    foxglove: FoxgloveSection = FoxgloveSection()
     logging: Logging = Logging()
     path: Annotated[Path, Field(exclude=True)] = Path("skin.toml")
 
@@ -239,6 +263,13 @@ class Config(Section):
                     "one board measures one skin)"
                 )
         return {name: s if s.frame_id else s.model_copy(update={"frame_id": name}) for name, s in skins.items()}
+
+    @field_validator("bridges")
+    @classmethod
+    def each_once(cls, bridges: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(bridges)) < len(bridges):
+            raise ValueError(f"each of {', '.join(BRIDGES)} at most once")
+        return bridges
 
     def transport(self) -> Transport:
         """For `protocol.transport.configure`."""

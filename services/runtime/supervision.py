@@ -47,8 +47,9 @@ class Program:
 
 
 def programs(config: Config) -> list[Program]:
-    """What a configuration needs: the stages, and the stub where a skin's port is "stub"."""
+    """What a configuration needs: the stages, its bridges, and the stub where a skin's port is "stub"."""
     found = [Program(name, f"services.{name}") for name in PROCESSES]
+    found += [Program(name, "services.bridge", (name,)) for name in config.bridges]
     if on_stub := stub_arguments(config):
         found.insert(0, Program("stub", "firmware_stub", on_stub))
     return found

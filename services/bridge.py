@@ -1,0 +1,81 @@
+"""Starts a bridge: `python -m services.bridge NAME` becomes `python -m bridges.NAME`, with its settings as JSON.
+
+A bridge is a client: it knows `protocol` alone, and is told by us what skin.toml says.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import sys
+from typing import Any
+
+from protocol import logs
+from protocol.errors import EitskinError
+from protocol.topics import BRIDGES
+from services.runtime.config import ROOT, Config, ConfigError, load
+
+NEEDS = {"ros2": "cyclonedds", "foxglove": "foxglove"}
+"""What each needs beside the service's own packages: an extra of its own in pyproject.toml."""
+
+
+class MissingExtra(EitskinError):
+    """A bridge's packages are not installed. The text says what to do."""
+
+
+def check(name: str) -> None:
+    """Raises MissingExtra where the bridge cannot run here."""
+    if importlib.util.find_spec(NEEDS[name]) is None:
+        raise MissingExtra(
+            f"the bridge {name} needs the package {NEEDS[name]}, which is not installed: run `make venv EXTRAS={name}`"
+        )
+
+
+def settings(name: str, config: Config) -> str:
+    """What the bridge is told, as JSON."""
+    reach = config.transport()
+    told: dict[str, Any] = {
+        "skins": {
+            skin: {"frame_id": found.frame_id, "stub": found.port == "stub"} for skin, found in config.skins.items()
+        },
+        "transport": {
+            "addresses": dict(reach.addresses),
+            "secret_key": _absolute(reach.secret_key),
+            "server_keys": {name: _absolute(key) for name, key in reach.server_keys.items()},
+            "clients": _absolute(reach.clients),
+            "operators": _absolute(reach.operators),
+            "insecure": reach.insecure,
+        },
+        "options": getattr(config, name).model_dump(mode="json"),
+        "log_level": config.logging.level,
+    }
+    return json.dumps(told)
+
+
+def _absolute(path: Any) -> str | None:
+    return None if path is None else os.path.abspath(path)
+
+
+def become(name: str, config: Config) -> None:
+    """Go on as the bridge, in this very process. Raises MissingExtra."""
+    check(name)
+    environment = {**os.environ, "EITSKIN_BRIDGE": settings(name, config)}
+    os.chdir(ROOT)
+    os.execve(sys.executable, [sys.executable, "-m", f"bridges.{name}"], environment)
+
+
+def main() -> int:
+    if len(sys.argv) != 2 or sys.argv[1] not in BRIDGES:
+        print(f"usage: python -m services.bridge {'|'.join(BRIDGES)}", file=sys.stderr)
+        return 2
+    logs.setup(f"{sys.argv[1]}: %(message)s")
+    try:
+        become(sys.argv[1], load())
+    except (ConfigError, MissingExtra) as why:
+        print(f"{sys.argv[1]}: {why}", file=sys.stderr)
+    return 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

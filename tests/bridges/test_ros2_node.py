@@ -1,0 +1,213 @@
+"""The bridge to ROS 2 beside the whole service, heard by a genuine ROS 2 node: rclpy, Fast DDS (ros_node.py).
+
+`make ros-venv` makes the virtual environment that node needs; without it these tests say so, and .ci/run has it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridges.ros2.definitions import type_hash
+from protocol.control import ControlClient
+from protocol.frames import ContactFrame
+from protocol.sockets import AllReader
+
+ROOT = Path(__file__).resolve().parents[2]
+ROS_PYTHON = Path(os.environ.get("EITSKIN_ROS_PYTHON") or ROOT / ".venv-ros" / "bin" / "python")
+BASE = "/eitskin/palm"
+CONFIG = """
+bridges = ["ros2"]
+[skins.palm]
+port = "stub"
+bundle = "square16"
+frame_id = "palm"
+[ros2]
+interface = "lo"
+domain = {domain}
+commands = true
+"""
+TYPES = {
+    "/wrench": "geometry_msgs/WrenchStamped",
+    "/contacts/slot0": "geometry_msgs/WrenchStamped",
+    "/contacts": "visualization_msgs/MarkerArray",
+    "/contacts/poses": "geometry_msgs/PoseArray",
+    "/pressure": "sensor_msgs/PointCloud2",
+    "/image": "sensor_msgs/Image",
+    "/valid": "std_msgs/Bool",
+}
+EVERY_S = 0.25  # far more than from one scan to the next: two messages of one stamp are one frame's
+
+
+def ros_python() -> Path:
+    """The Python that has ROS 2's packages; says so where there is none."""
+    if not ROS_PYTHON.exists():
+        message = f"ROS 2 MISSING: no {ROS_PYTHON}: `make ros-venv` makes it (270 MB), or set EITSKIN_ROS_PYTHON"
+        if os.environ.get("EITSKIN_REQUIRE_ROS"):
+            pytest.fail(message)
+        pytest.skip(message)
+    return ROS_PYTHON
+
+
+class World:
+    """The service with its bridge, the ROS node, and a client of ours that keeps every contact frame."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.folder = folder
+        config = folder / "skin.toml"
+        config.write_text(CONFIG.format(domain=domain))
+        told = {
+            "EITSKIN_CONFIG": str(config),
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
+        environment = {**os.environ, **told}
+        self._log = open(folder / "log.txt", "wb")
+        python = ros_python()
+        self._up = subprocess.Popen(
+            [sys.executable, str(ROOT / "skin"), "up"], cwd=ROOT, env=environment, stdout=self._log, stderr=self._log
+        )
+        self._node = subprocess.Popen(
+            [str(python), str(ROOT / "tests/bridges/ros_node.py"), BASE],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+        )
+        self.heard: list[dict[str, Any]] = []
+        self.frames: list[ContactFrame] = []
+        self._reader = AllReader(["contact"], "palm")
+        self._closing = False
+        self._threads = [threading.Thread(target=self._listen), threading.Thread(target=self._keep)]
+        for thread in self._threads:
+            thread.start()
+
+    def _listen(self) -> None:
+        assert self._node.stdout is not None
+        for line in self._node.stdout:
+            self.heard.append(json.loads(line))
+
+    def _keep(self) -> None:
+        while not self._closing:
+            if isinstance(frame := self._reader.recv(0.1), ContactFrame):
+                self.frames.append(frame)
+        self._reader.close()
+
+    def of(self, topic: str, since: float = 0.0) -> list[dict[str, Any]]:
+        name = topic if topic in ("/diagnostics", "hashes", "tare", "service") else BASE + topic
+        return [message for message in list(self.heard) if message["topic"] == name and message["at"] >= since]
+
+    def until(
+        self, what: str, topic: str, since: float, fits: Any = lambda message: True, seconds: float = 60.0
+    ) -> Any:
+        """The first message of a topic that fits."""
+        end = time.monotonic() + seconds
+        while not (found := [message for message in self.of(topic, since) if fits(message["value"])]):
+            assert time.monotonic() < end, f"never: {what}\n{(self.folder / 'log.txt').read_text()[-2000:]}"
+            time.sleep(0.05)
+        return found[0]
+
+    def order(self, text: str) -> None:
+        assert self._node.stdin is not None
+        self._node.stdin.write(text.encode() + b"\n")
+        self._node.stdin.flush()
+
+    def close(self) -> None:
+        self._closing = True
+        assert self._node.stdin is not None
+        self._node.stdin.close()
+        try:
+            self._node.wait(20)
+        except subprocess.TimeoutExpired:
+            self._node.kill()
+        self._up.send_signal(signal.SIGTERM)
+        self._up.wait(20)
+        for thread in self._threads:
+            thread.join(10)
+        self._log.close()
+
+
+@pytest.fixture
+def world(runtime: Path) -> Iterator[World]:
+    made = World(runtime, 20 + os.getpid() % 80)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def stub(command: str, **args: Any) -> dict[str, Any]:
+    return ControlClient("stub", 5.0).call(command, skin="palm", **args)
+
+
+@pytest.mark.parametrize(
+    "seconds", [pytest.param(3.0, id="short"), pytest.param(60.0, id="minute", marks=pytest.mark.slow)]
+)
+def test_a_ros_node_hears_what_the_service_says_and_nothing_while_it_is_not_valid(world: World, seconds: float) -> None:
+    world.until("a wrench", "/wrench", 0.0, seconds=120.0)
+    for topic in TYPES:
+        world.until(f"a message on {topic}", topic, 0.0)
+
+    # types: as ROS 2's own type support knows them
+    hashes = world.until("hashes", "hashes", 0.0, lambda found: all(found.values()))["value"]
+    assert {topic: hashes[BASE + topic] for topic in TYPES} == {
+        topic: [type_hash(message)] for topic, message in TYPES.items()
+    }
+    assert hashes["/diagnostics"] == [type_hash("diagnostic_msgs/DiagnosticArray")]
+
+    # a press, against the truth
+    began = time.time()
+    stub("press", x=0.02, y=-0.01, force=3.0, radius=0.01, shape="circle", seconds=seconds)
+    pressed = world.until("a pressed wrench", "/wrench", began, lambda w: abs(-w[2] - 3.0) < 0.6)
+    assert pressed["frame"] == "palm" and 0 < pressed["at"] - pressed["stamp"] < 1.0
+    fz, tx, ty = pressed["value"][2:5]
+    assert abs(ty / -fz - 0.02) < 0.003 and abs(tx / fz + 0.01) < 0.003  # where it presses, by its moments
+    slot = world.until("a slot", "/contacts/slot0", began, lambda w: w[2] < -2)
+    assert abs(slot["value"][2] + 3) < 0.6
+    x, y, _, _ = world.until("a pose", "/contacts/poses", began, bool)["value"][0]
+    assert abs(x - 0.02) < 0.003 and abs(y + 0.01) < 0.003
+    marks = world.until("markers", "/contacts", began, lambda found: any("N" in m[4] for m in found))["value"]
+    assert {mark[0] for mark in marks} == {"patch", "force", "label"}
+    cloud = world.until("a cloud with the touch", "/pressure", began, lambda c: c["peak"][3] > 0)["value"]
+    assert abs(cloud["peak"][0] - 0.02) < 0.01 and abs(cloud["peak"][1] + 0.01) < 0.01
+    picture = world.until("an image with the touch", "/image", began, lambda i: i["most"] > 0)["value"]
+    rows, columns = picture["size"]
+    assert picture["encoding"] == "32FC1" and picture["peak"][0] > rows / 2 and picture["peak"][1] > columns / 2
+    time.sleep(seconds)
+    world.until("released", "/wrench", time.time(), lambda w: w[2] == 0.0)
+
+    # a fault: nothing of what is not valid is published, and diagnostics say why
+    faulty = time.time()
+    stub("faults", name="frozen", args={}, clear=False, seconds=2.0)
+    world.until("not valid", "/valid", faulty, lambda valid: valid is False)
+    world.until("why", "/diagnostics", faulty, lambda found: any("not published" in d["message"] for d in found))
+    world.until("valid again", "/valid", faulty + 2.0, lambda valid: valid is True)
+    hung = time.time()
+    stub("faults", name="hang", args={}, clear=False, seconds=2.0)
+    world.until("silent", "/valid", hung, lambda valid: valid is False)
+    world.until("valid after the silence", "/valid", hung + 2.0, lambda valid: valid is True)
+
+    # each valid frame became one wrench, and no other frame did
+    time.sleep(0.5)
+    offset = time.time() - time.monotonic()
+    wrenches = world.of("/wrench")
+    first, last = wrenches[0]["stamp"], wrenches[-1]["stamp"]
+    sampled = {f.scan: (f.stamps["sample"] * 1e-9 + offset, f.valid) for f in world.frames if "sample" in f.stamps}
+    within = [(at, valid) for at, valid in sampled.values() if first - 0.01 < at < last + 0.01]
+    valid_at = [at for at, valid in within if valid]
+    refused = [at for at, valid in within if not valid]
+    assert refused, "the fault made no frame invalid"
+    published = [message["stamp"] for message in wrenches]
+    assert not [at for at in refused if min(abs(at - stamp) for stamp in published) < 0.01]
+    missing = [at for at in valid_at if min(abs(at - stamp) for stamp in published) > 0.01]
+    assert len(missing) <= 0.02 * len(valid_at), f"{len(missing)} of {len(valid_at)} valid frames gave no wrench"
