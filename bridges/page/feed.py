@@ -22,7 +22,7 @@ GATHER_S = 0.03
 """How long what comes before a scan's contacts waits for them, so that a scan is one message."""
 ASK_AGAIN_S = 0.5
 
-Picture = tuple[str, int]
+Reconstruction = tuple[str, int]
 """Which picture a frame shows: the session and scan that it was reconstructed from."""
 
 
@@ -33,13 +33,13 @@ class Latest:
     version: int
     measured_ns: int | None
     message: bytes
-    picture: Picture | None = None
+    picture: Reconstruction | None = None
 
 
 class SkinFeed:
-    """Belongs to one event loop. `tell` is called when there is news for viewers."""
+    """Belongs to one event loop. `tell` is called when there is news for viewers, and whether contacts are among it."""
 
-    def __init__(self, skin: str, tell: Callable[[], None]) -> None:
+    def __init__(self, skin: str, tell: Callable[[bool], None]) -> None:
         self.skin, self._tell = skin, tell
         self.latest: dict[str, Latest] = {}
         """By topic; of status by "status/PROCESS"."""
@@ -117,15 +117,15 @@ class SkinFeed:
                 heard.add(self._take(*got, now))
         self._empty_ns = now
         if "contact" in heard:
-            self._news()
+            self._news(True)
         elif heard and self._gathering is None:
-            self._gathering = asyncio.get_running_loop().call_later(GATHER_S, self._news)
+            self._gathering = asyncio.get_running_loop().call_later(GATHER_S, self._news, False)
 
-    def _news(self) -> None:
+    def _news(self, contacts: bool) -> None:
         if self._gathering is not None:
             self._gathering.cancel()
             self._gathering = None
-        self._tell()
+        self._tell(contacts)
 
     def _take(self, frame: Frame, message: bytes, now: int) -> str:
         topic = key = TOPIC_OF[type(frame)].name
@@ -147,7 +147,7 @@ class SkinFeed:
                 self._ask_again(topic)
         return "info" if isinstance(frame, InfoFrame) else topic
 
-    def _has(self, topic: str, shown: Picture) -> bool:
+    def _has(self, topic: str, shown: Reconstruction) -> bool:
         return topic in self.pictures and self.pictures[topic].picture == shown
 
     def _ask_again(self, topic: str) -> None:
@@ -171,7 +171,7 @@ def brings(frame: Frame) -> bool:
     return isinstance(frame, DeltaFrame) and frame.stack.size > 0
 
 
-def picture(frame: Frame) -> Picture | None:
+def picture(frame: Frame) -> Reconstruction | None:
     """Which picture a frame brings or holds; None where nothing is to be shown."""
     if not isinstance(frame, (ImageFrame, DeltaFrame)) or not (brings(frame) or frame.held):
         return None

@@ -13,14 +13,17 @@ import tarfile
 import tempfile
 from pathlib import Path
 
-from .settings import three_folder
-
 VERSION = "0.180.0"
 SHA256 = {
     "three.core.min.js": "61ba0df005b05991361d040d8ff670e1aadfd0ce7aeebd1fdb0725957a8957de",
     "three.module.min.js": "e2b5ee6bccd38fd6d8a2428546b83c5f2426d84b152ef82be8055556e3b40eb6",
 }
 TIMEOUT_S = 120
+
+
+def three_folder() -> Path:
+    """Where it is put: in the virtual environment."""
+    return Path(sys.prefix) / "share" / "eitskin-page"
 
 
 def verified(folder: Path) -> dict[str, bytes]:
@@ -62,7 +65,7 @@ def fetch(folder: Path) -> str:
 
 
 def main() -> int:
-    folder = three_folder(sys.prefix)
+    folder = three_folder()
     if not verified(folder) and (why := fetch(folder)):
         print(f"page: no three.js, since {why}: the page shows the flat map alone")
     return 0

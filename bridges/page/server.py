@@ -4,11 +4,14 @@ refuses.
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import logging
 import socket
-import sys
 import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from aiohttp import web
@@ -21,8 +24,8 @@ from protocol.runtime import host_id
 from .advice import ADVICE
 from .commands import BUTTONS, Buttons
 from .feed import SkinFeed
-from .fetch_three import verified
-from .settings import LOOPBACK, PageSettings, three_folder
+from .fetch_three import three_folder, verified
+from .settings import LOOPBACK, PageSettings
 from .viewer import Viewer
 
 WEB = Path(__file__).with_name("web")
@@ -39,12 +42,13 @@ log = logging.getLogger(__name__)
 class PageServer:
     """`listen`, `application`, and `close`."""
 
-    def __init__(self, settings: PageSettings, secret: str) -> None:
-        self.settings, self.port = settings, 0
-        self.feeds = {skin: SkinFeed(skin, lambda skin=skin: self._tell(skin)) for skin in settings.skins}  # type: ignore[misc]
+    def __init__(self, settings: PageSettings, secret: str, handed_on: Callable[[str, int | None], None]) -> None:
+        """handed_on: called with the skin, and when it was measured, of each scan that goes to the browsers."""
+        self.settings, self.port, self._handed_on = settings, 0, handed_on
+        self.feeds = {skin: SkinFeed(skin, partial(self._tell, skin)) for skin in settings.skins}
         self.buttons = Buttons(secret, self.feeds, settings.recordings)
         self._viewers: set[Viewer] = set()
-        self._three = verified(three_folder(sys.prefix))
+        self._three = verified(three_folder())
         self._files = {f"/{path.name}": path.read_bytes() for path in WEB.iterdir() if path.suffix in TYPES}
         self._files |= {f"/three/{name}": content for name, content in self._three.items()}
         self._files["/"] = self._files["/index.html"]
@@ -142,11 +146,21 @@ class PageServer:
             "buttons": [name for name in BUTTONS if name != "record" or self.buttons.recording is not None],
         }
 
-    def _tell(self, skin: str) -> None:
-        for viewer in self._viewers:
-            viewer.tell()
+    @property
+    def looking(self) -> Counter[str]:
+        """How many browsers look at each skin."""
+        return Counter(viewer.skin for viewer in list(self._viewers))
 
-    def close(self) -> None:
+    def _tell(self, skin: str, contacts: bool) -> None:
+        if contacts:
+            self._handed_on(skin, self.feeds[skin].latest["contact"].measured_ns)
+        for viewer in self._viewers:
+            if viewer.skin == skin:
+                viewer.tell()
+
+    async def close(self) -> None:
+        """Send the browsers away."""
+        await asyncio.gather(*(viewer.close() for viewer in list(self._viewers)), return_exceptions=True)
         for feed in self.feeds.values():
             feed.close()
-        self.buttons.close()
+        await asyncio.to_thread(self.buttons.close)

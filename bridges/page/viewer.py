@@ -10,11 +10,11 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 import msgpack
-from aiohttp import WSMsgType, web
+from aiohttp import WSCloseCode, WSMsgType, web
 
 from protocol.logs import foreign
 
-from .feed import NEWEST, Latest, Picture, SkinFeed
+from .feed import NEWEST, Latest, Reconstruction, SkinFeed
 
 MOST_UNREAD = 2
 """Messages on their way that the browser has not yet said to have read; further frames replace each other here."""
@@ -35,10 +35,15 @@ class Viewer:
         self._feed: SkinFeed | None = None
         self._topics: frozenset[str] = frozenset()
         self._sent: dict[str, int] = {}  # version by key
-        self._pictures: dict[str, Picture | None] = {}  # that the browser has, by topic
+        self._pictures: dict[str, Reconstruction | None] = {}  # that the browser has, by topic
         self._unread = 0
         self._go = asyncio.Event()
         self._under_way: set[asyncio.Task[None]] = set()
+
+    @property
+    def skin(self) -> str:
+        """Which one it looks at; "" for none yet."""
+        return "" if self._feed is None else self._feed.skin
 
     def tell(self) -> None:
         """There is news."""
@@ -127,6 +132,10 @@ class Viewer:
     async def _answer(self, answer: dict[str, Any]) -> None:
         if not self._socket.closed:
             await self._socket.send_bytes(msgpack.packb(answer))
+
+    async def close(self) -> None:
+        """Send the browser away; it will look for us again."""
+        await self._socket.close(code=WSCloseCode.GOING_AWAY)
 
     def _look_at(self, feed: SkinFeed | None, topics: frozenset[str], anew: bool = False) -> None:
         """Look at these topics of this skin, and no more at others. anew: the browser knows nothing of them yet."""

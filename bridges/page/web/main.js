@@ -21,7 +21,7 @@ const still = matchMedia("(prefers-reduced-motion: reduce)");
 const token = keptToken();
 const map = new SkinMap(by("map"));
 const timeline = new Timeline(by("timeline"));
-const state = { skin: "", hello: null, newest: {}, pictures: {}, statuses: new Map(), info: null, session: "" };
+const state = { skin: "", hello: null, newest: {}, pictures: {}, statuses: new Map(), info: null, session: "", noise: 0 };
 const recent = { scans: new panels.Recent(), latency: new panels.Recent(), shown: new panels.Recent() };
 let surface = null, verdict = { ok: false }, undrawn = false;
 const drawn = { ms: 0, words: 0, summary: 0 };
@@ -111,6 +111,7 @@ function image(frame) {
 }
 
 function delta(frame) {
+  if (!frame.held) state.noise = panels.noiseOf(frame.sigma); // of one scan: a held touch's is that of a mean
   if (frame.stack.length) state.pictures.delta = frame;
 }
 
@@ -172,15 +173,14 @@ function news(now) {
   if (change) map.electrodes(change.frame.electrodes, state.hello?.electrode_states ?? []);
   panels.compare(state.pictures.delta, state.pictures.image, state.info?.stack);
   panels.fade("one-step", !change?.frame.touched || change.frame.stack.length === 0);
-  panels.fade("network", !picture?.frame.touched || picture.frame.held);
+  panels.fade("network", !picture?.frame.touched);
 }
 
 function words(now) {
   drawn.words = now;
-  const change = state.newest.delta?.frame;
   panels.numbers({
     rate: verdict.ok ? recent.scans.rate : null, latency: verdict.ok ? recent.latency.median : null,
-    shown: verdict.ok ? recent.shown.median : null, noise: verdict.ok && change ? panels.noiseOf(change.sigma) : 0,
+    shown: verdict.ok ? recent.shown.median : null, noise: verdict.ok ? state.noise : 0,
   });
   panels.processes(state.statuses, link.clock, state.hello?.host);
   if (now - drawn.summary > SUMMARY_MS) {

@@ -95,7 +95,7 @@ export class Press {
       const place = this.map.metres(event.clientX, event.clientY);
       if (!this.enabled || event.button !== 0 || !this.inside(place)) return;
       event.preventDefault();
-      root.focus({ preventScroll: true });
+      root.focus({ preventScroll: true, focusVisible: false });
       try {
         root.setPointerCapture(event.pointerId);
       } catch { /* it has gone up already */ }

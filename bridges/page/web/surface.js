@@ -85,11 +85,14 @@ export class Surface {
 
   bend(values, rows, columns, top) {
     const place = this.plane.attributes.position, tint = this.plane.attributes.color;
+    const at = (row, column) => values[Math.min(rows - 1, Math.max(0, row)) * columns + Math.min(columns - 1, Math.max(0, column))];
     for (let i = 0; i < GRID; i++) { // from the highest y down, as the plane is made
       const row = Math.round(((GRID - 1 - i) * (rows - 1)) / (GRID - 1));
       for (let j = 0; j < GRID; j++) {
         const k = i * GRID + j, column = Math.round((j * (columns - 1)) / (GRID - 1));
-        const drop = values ? Math.max(0, values[row * columns + column] / top) : 0;
+        // A foam has no steps: each place is the mean of itself and its neighbours.
+        const mean = values ? (2 * at(row, column) + at(row - 2, column) + at(row + 2, column) + at(row, column - 2) + at(row, column + 2)) / 6 : 0;
+        const drop = Math.max(0, mean / top);
         place.setZ(k, -2 * DEPTH * drop);
         tint.setXYZ(k, ...TINTS[Math.min(64, Math.round(64 * drop))]);
       }
@@ -168,7 +171,7 @@ export class Surface {
     this.dirty = false;
     if (this.late) this.bend(...this.late);
     this.late = null;
-    const far = this.camera.aspect < 1 ? 5.6 / this.camera.aspect : 5.2, flat = Math.cos(this.tilt) * far;
+    const far = this.camera.aspect < 1 ? 4.9 / this.camera.aspect : 4.5, flat = Math.cos(this.tilt) * far;
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(flat * Math.sin(this.turn), -flat * Math.cos(this.turn), Math.sin(this.tilt) * far);
     this.camera.lookAt(0, 0, 0);

@@ -35,7 +35,10 @@ export class Timeline {
   }
 
   /** Another producer: its ids have nothing to do with those before. */
-  anew() { for (const points of this.lines.values()) points.ended = true; this.lines = new Map([...this.lines].map(([id, p]) => [`${id}.${performance.now()}`, p])); }
+  anew() {
+    for (const points of this.lines.values()) points.ended = true;
+    this.lines = new Map([...this.lines].map(([id, points]) => [`${id}.${performance.now()}`, points]));
+  }
 
   event(nowMs, sign, text) { this.events.push({ nowMs, sign, text }); }
 
@@ -89,6 +92,11 @@ export class Timeline {
     c.fillStyle = ink;
     c.textAlign = "center";
     c.font = "9px system-ui, sans-serif";
-    for (const e of this.events) c.fillText(e.sign, x(e.nowMs), 7);
+    let before = -Infinity;
+    for (const e of this.events) {
+      if (x(e.nowMs) - before < 9) continue;
+      before = x(e.nowMs);
+      c.fillText(e.sign, before, 7);
+    }
   }
 }
