@@ -16,6 +16,7 @@ import time
 import zmq
 
 from models.bundle import BundleError
+from models.mismatch import NAMED
 from protocol import logs
 from protocol.frame_types import NAME
 from protocol.runtime import RuntimeDirError, control_endpoint, runtime_dir
@@ -47,6 +48,12 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         help="sheet of skins that name none: a skin of models/skins, a .toml file or a bundle's folder "
         "(default: %(default)s)",
     )
+    add(
+        "--mismatch",
+        action="append",
+        metavar="[SKIN=]NAME",
+        help="by what a sheet, or every sheet, differs from what its file says: a name of models/mismatch.py (mild)",
+    )
     add("--scene", default="demo", help=f"one of {', '.join(scenes.names())}, or a .toml file (default: %(default)s)")
     add("--snr", type=float, default=80.0, help="signal over noise in dB, at 128 DFT points (default: %(default)s)")
     add("--floor", type=float, default=0.0, help="noise floor in ohm (default: %(default)s)")
@@ -68,6 +75,14 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         if name in options.skins:
             parser.error(f"--skin {name!r} is given twice: expected one board for each skin")
         options.skins[name] = sheet or options.geometry
+    options.mismatches = dict.fromkeys(options.skins, "none")
+    for text in options.mismatch or []:
+        name, _, mismatch = text.rpartition("=")
+        if name and name not in options.skins:
+            parser.error(f"--mismatch {text!r}: no skin {name!r}; expected one of {', '.join(options.skins)}")
+        if mismatch not in NAMED:
+            parser.error(f"--mismatch {text!r}: expected one of {', '.join(NAMED)}")
+        options.mismatches |= dict.fromkeys([name] if name else options.skins, mismatch)
     if options.rate is not None and not 0.1 <= options.rate <= 10_000:
         parser.error(f"--rate {options.rate:g}: expected 0.1 to 10000 full scans per second")
     for name, value, low, high in (
@@ -99,7 +114,8 @@ def main(argv: list[str] | None = None) -> int:
         rigs = {name: skin.rig for name, skin in skins.items()}
         control = Control(rigs, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context)
         for name, skin in skins.items():
-            log.info("board of %s at %s, scene %s", name, skin.port.url, options.scene)
+            sheet = "" if skin.rig.sheet.mismatch == "none" else f", mismatch {skin.rig.sheet.mismatch}"
+            log.info("board of %s at %s, scene %s%s", name, skin.port.url, options.scene, sheet)
         _run(list(skins.values()), publisher, stop, parent, options.leave)
     except (ValueError, OSError, RuntimeDirError, BundleError) as error:
         log.error("%s", error)
@@ -125,6 +141,7 @@ def _open(options: argparse.Namespace, skins: dict[str, StubSkin]) -> int:
     rigs = {
         name: Rig(
             sheet,
+            mismatch=options.mismatches[name],
             scene=options.scene,
             snr_db=options.snr,
             floor_ohm=options.floor,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from . import scene as scenes
-from .analog import Analog, Noise
+from .analog import Analog, BoardNoise
 from .board import Board, Scan, measurement_s
 from .faults import FAULTS, Faults
 from .field import Field
@@ -33,13 +33,14 @@ class Rig:
     """A stub board on a sheet. Times are seconds since it was made; nothing in here looks at a clock.
 
     rate_hz: full scans per second instead of the real board's. threaded: solve ahead in a thread (see Field), and skip
-    the scans of a pause instead of making up for them.
+    the scans of a pause instead of making up for them. mismatch: see Sheet.
     """
 
     def __init__(
         self,
         geometry: str | Sheet = "square16",
         *,
+        mismatch: str = "none",
         scene: str = "demo",
         snr_db: float = 80.0,
         floor_ohm: float = 0.0,
@@ -52,7 +53,7 @@ class Rig:
         answers_time: bool = True,
     ) -> None:
         script = scenes.load(scene)  # first, since it fails fast
-        self.sheet = geometry if isinstance(geometry, Sheet) else Sheet(geometry)
+        self.sheet = geometry if isinstance(geometry, Sheet) else Sheet(geometry, mismatch)
         self.faults = Faults()
         timeline = Timeline(script, 0.0, (), self.sheet.electrodes)
         self.field = Field(self.sheet.transfer, timeline, threaded=threaded)
@@ -60,7 +61,7 @@ class Rig:
         self.line = Line(baud)
         self._rng = np.random.default_rng(seed)
         self._realtime = threaded
-        noise = Noise(10 ** (-snr_db / 20), floor_ohm)
+        noise = BoardNoise(10 ** (-snr_db / 20), floor_ohm)
         full_s = len(self.sheet.skin.pattern) * measurement_s(128)
         self.board = Board(
             self.field,

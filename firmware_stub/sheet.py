@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from models import geometry
 from models.bundle import Bundle
-from models.forward import ForwardModel
+from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
 
 from .world import Touch, World
@@ -21,12 +21,17 @@ class Sheet:
     """Forward model on the mesh "stub", which nothing is trained or inverted on. Units: ohm, metres.
 
     `of`: a skin of models/skins, a TOML file, or the folder of a bundle, whose manifest says its geometry.
+    `mismatch`: by what the sheet differs from that, one of models.mismatch.NAMED. `skin` is as the file says it,
+    `model` as it is.
     """
 
-    def __init__(self, of: str = "square16") -> None:
+    def __init__(self, of: str = "square16", mismatch: str = "none") -> None:
+        self.mismatch = mismatch
+        differs = named(mismatch)  # first, since it fails fast
         in_bundle = (Path(of) / "manifest.json").is_file()
         self.skin = geometry.from_dict(Bundle.load(of).skin) if in_bundle else geometry.load(of)
-        self.model = ForwardModel(self.skin, mesh="stub")
+        self._real = MismatchedSheet(self.skin, differs, mesh="stub")
+        self.model = self._real.model
 
     @property
     def electrodes(self) -> int:
@@ -52,8 +57,11 @@ class Sheet:
     def transfer(self, world: World) -> NDArray[np.float64]:
         """(n, n) ohm: potential of each electrode over the last, for unit currents from each of them to the last."""
         shapes = [self.shape(touch) for touch in world.touches if touch.drop > 0]
-        contact = self.skin.contact_impedance * (np.array(world.contact) if world.contact else 1.0)
-        return self.model.solve(self.model.touched(shapes, world.background), contact).transfer
+        contact = np.array(world.contact) if world.contact else 1.0
+        if self.mismatch == "none":
+            plain = self.model.touched(shapes, world.background)
+            return self.model.solve(plain, self.skin.contact_impedance * contact).transfer
+        return self._real.solve(shapes, world.background, contact).transfer
 
     def inside(self, x: float, y: float) -> bool:
         """Whether the point (metres) is on the skin."""

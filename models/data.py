@@ -11,6 +11,7 @@ files. Noise and drift are not in the data: training adds them, afresh each time
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import time
@@ -30,6 +31,12 @@ from models import geometry
 from models.forward import ForwardModel
 from models.scenes import TRAINING, random_scene
 from models.shapes import drop_image, from_rows, to_rows
+from protocol.errors import EitskinError
+
+
+class OtherScenes(EitskinError, ValueError):
+    """The folder holds scenes that must not be mixed with those of this run."""
+
 
 WORK = Path(__file__).parent / "work"
 SPLITS = ("test", "train", "valid")
@@ -155,15 +162,28 @@ def generate(
     return sum(s.size for s in todo)
 
 
+def chunk_size(folder: Path) -> int:
+    """Scenes of a chunk of the folder; 0 where it has none yet."""
+    path = folder / "data.json"
+    return int(json.loads(path.read_text())["chunk"]) if path.exists() else 0
+
+
 def _check_same_run(folder: Path, spec: ChunkSpec) -> None:
     """Chunks of another seed, skin or mesh must not be mixed in: samples could repeat, or not mean the same."""
+    skin = json.dumps(geometry.load(spec.skin).to_dict(), sort_keys=True)
+    digest = hashlib.sha256(skin.encode()).hexdigest()[:16]
     wanted = {"schema": SCHEMA, "skin": spec.skin, "mesh": spec.mesh, "seed": spec.seed, "chunk": spec.size}
     path = folder / "data.json"
     if not path.exists():
-        path.write_text(json.dumps(wanted, indent=1) + "\n")
+        path.write_text(json.dumps(wanted | {"geometry": digest}, indent=1) + "\n")
     found = json.loads(path.read_text())
+    if found.pop("geometry", digest) != digest:  # older folders do not say
+        raise OtherScenes(
+            f"{folder} holds scenes of skin '{spec.skin}' as it was before its outline, electrodes or pattern changed: "
+            f"remove that folder, or name another with --work"
+        )
     if found != wanted:
-        raise ValueError(f"{path} says {found}, this run is {wanted}: use another folder, or remove this one")
+        raise OtherScenes(f"{path} says {found}, this run is {wanted}: use another folder, or remove this one")
 
 
 @dataclass(frozen=True, eq=False)

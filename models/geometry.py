@@ -1,6 +1,7 @@
 """A skin as data: outline, electrodes, contact impedance, drive pattern; read from TOML and checked.
 
-Lengths are in model units (the skin fits the square [-1, 1] x [-1, 1]); `metres_per_unit` turns them into metres.
+Lengths are in model units (the skin fits the square [-1, 1] x [-1, 1]); `metres_per_unit` turns them into metres. A
+TOML with `unit = "mm"` (or m, cm, inch) in its place gives its lengths in that unit, wherever its origin is.
 """
 
 from __future__ import annotations
@@ -16,14 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 from models import patterns
 from models.outline import Array, GeometryError, Outline
 
-__all__ = ["GeometryError", "Outline", "Skin", "from_dict", "load", "shipped"]
+__all__ = ["GeometryError", "Outline", "SkinGeometry", "from_dict", "load", "shipped"]
 
 SKINS = Path(__file__).parent / "skins"
 ON_OUTLINE = 1e-6  # how far from the outline an electrode's centre may be given, model units
+DRAWN_ON_OUTLINE = 0.02  # the same where lengths were drawn or measured: 0.6 mm of a disc of 60 mm
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
+SMALLEST_M, LARGEST_M = 5e-3, 3.0  # a skin's longer side; beyond it a length was given in another unit than is said
 
 
 @dataclass(frozen=True, eq=False)
-class Skin:
+class SkinGeometry:
     """electrodes (n,): arc length of each centre along the outline; widths, contact_impedance (n,); pattern (K, 4).
 
     Lengths are model units along the outline, contact impedance is ohm m (2-D: with the sheet's conductivity in S).
@@ -56,7 +60,11 @@ class Skin:
             between = np.mod(self.electrodes[b] - self.electrodes[a], self.perimeter)
             gap = between - (self.widths[a] + self.widths[b]) / 2
             if gap <= 1e-9:
-                raise GeometryError(f"{where}electrodes {min(a, b)} and {max(a, b)} overlap by {-gap:.3g} model units")
+                raise GeometryError(
+                    f"{where}electrodes {min(a, b)} and {max(a, b)} overlap by {-gap:.3g} model units "
+                    f"({-1e3 * gap * self.metres_per_unit:.2g} mm): expected a gap between them; make their width "
+                    "smaller, or move them apart"
+                )
 
     # --- the outline ---
 
@@ -99,7 +107,7 @@ class Skin:
 
     # --- variations and storage ---
 
-    def moved(self, shift: ArrayLike, contact_impedance: ArrayLike | None = None) -> Skin:
+    def moved(self, shift: ArrayLike, contact_impedance: ArrayLike | None = None) -> SkinGeometry:
         """A copy whose electrodes are shifted along the outline by `shift` (n,) model units: a mounting error."""
         contact = self.contact_impedance if contact_impedance is None else contact_impedance
         return replace(
@@ -108,7 +116,7 @@ class Skin:
             contact_impedance=np.broadcast_to(np.asarray(contact, dtype=float), self.electrodes.shape).copy(),
         )
 
-    def with_pattern(self, spec: str | ArrayLike) -> Skin:
+    def with_pattern(self, spec: str | ArrayLike) -> SkinGeometry:
         """A copy with another drive pattern: a name or a (K, 4) list."""
         name = spec if isinstance(spec, str) else "custom"
         return replace(self, pattern_name=name, pattern=patterns.pattern(spec, self.n_electrodes))
@@ -131,7 +139,7 @@ def shipped() -> list[str]:
     return sorted(path.stem for path in SKINS.glob("*.toml"))
 
 
-def load(name: str | Path) -> Skin:
+def load(name: str | Path) -> SkinGeometry:
     """A shipped skin by name ("square16", "disc16") or any TOML file by path. Raises GeometryError, PatternError."""
     path = Path(name) if str(name).endswith(".toml") else SKINS / f"{name}.toml"
     if not path.is_file():
@@ -142,29 +150,58 @@ def load(name: str | Path) -> Skin:
         data = tomllib.loads(path.read_text())
     except tomllib.TOMLDecodeError as error:
         raise GeometryError(f"{path}: not valid TOML: {error}") from None
-    return from_dict(data)
+    skin = from_dict(data)
+    said = f"unit = {data['unit']!r}" if "unit" in data else "metres_per_unit, half its longer side in metres"
+    check_size(skin, f"correct {said} in {path}")
+    return skin
 
 
-def from_dict(data: dict[str, Any]) -> Skin:
+def check_size(skin: SkinGeometry, do: str) -> None:
+    """Whether the skin is as large as one can be: else lengths were given in another unit. Raises GeometryError, which
+    ends with what to `do`.
+    """
+    width, height = np.ptp(skin.polygon(), axis=0) * skin.metres_per_unit
+    if not SMALLEST_M <= max(width, height) <= LARGEST_M:
+        raise GeometryError(
+            f"skin '{skin.name}': found {width:.4g} m x {height:.4g} m, expected a longer side of {SMALLEST_M:g} to "
+            f"{LARGEST_M:g} m: {do}"
+        )
+
+
+def from_dict(data: dict[str, Any]) -> SkinGeometry:
     """The skin of a TOML's content (see skins/square16.toml). Raises GeometryError, PatternError."""
     where = f"skin '{data.get('name', 'unnamed')}': "
-    needed = {"name", "metres_per_unit", "contact_impedance", "electrodes"}
+    needed = {"name", "unit" if "unit" in data else "metres_per_unit", "contact_impedance", "electrodes"}
     known = needed | {"outline", "radius", "pattern"}
     for wrong, what in ((needed - set(data), "missing"), (set(data) - known, "unknown")):
         if wrong:
             raise GeometryError(f"{where}{what} key {min(wrong)!r}; expected {', '.join(sorted(known))}")
     if ("outline" in data) == ("radius" in data):
         raise GeometryError(f"{where}give either outline (a polygon) or radius (a disc)")
+    if not isinstance(data["electrodes"], dict):
+        raise GeometryError(f"{where}electrodes: found {data['electrodes']!r:.40}, expected a table [electrodes]")
+    on_outline = DRAWN_ON_OUTLINE if "unit" in data else ON_OUTLINE
+    try:
+        data = _in_model_units(data) if "unit" in data else data
+    except (TypeError, ValueError) as error:
+        raise GeometryError(f"{where}{error}") from None
     spec = data["electrodes"]
-    if not isinstance(spec, dict) or "width" not in spec or ("centre" in spec) == ("count" in spec):
-        raise GeometryError(f"{where}[electrodes] needs width, and either centre (points) or count (evenly spaced)")
+    if unknown := set(spec) - {"width", "centre", "count", "first"}:
+        raise GeometryError(f"{where}[electrodes]: unknown key {min(unknown)!r}; expected width, centre, count, first")
+    if "width" not in spec or ("centre" in spec) == ("count" in spec) or ("first" in spec and "centre" in spec):
+        raise GeometryError(
+            f"{where}[electrodes] needs width, and either centre (points) or count (evenly spaced; with it `first`, "
+            "how far along the outline the first one is)"
+        )
     try:
         corners = np.array(data["outline"], dtype=float) if "outline" in data else None
         curve = Outline(corners, float(data.get("radius", 0.0)))
         if "count" in spec:
-            centres = np.arange(int(spec["count"])) * curve.perimeter / int(spec["count"])
+            n = _count(spec["count"])
+            centres = float(spec.get("first", 0.0)) + np.arange(n) * curve.perimeter / n
         else:
-            centres = _on_curve(curve, np.array(spec["centre"], dtype=float).reshape(-1, 2))
+            points = np.array(spec["centre"], dtype=float).reshape(-1, 2)
+            centres = _on_curve(curve, points, on_outline, float(data["metres_per_unit"]))
         widths, contact = (_each(value, len(centres)) for value in (spec["width"], data["contact_impedance"]))
         drive = data.get("pattern", "pairs")
         pattern = patterns.pattern(drive, len(centres))
@@ -172,7 +209,7 @@ def from_dict(data: dict[str, Any]) -> Skin:
         raise
     except (TypeError, ValueError) as error:
         raise GeometryError(f"{where}{error}") from None
-    return Skin(
+    return SkinGeometry(
         name=str(data["name"]),
         curve=curve,
         electrodes=centres,
@@ -184,12 +221,49 @@ def from_dict(data: dict[str, Any]) -> Skin:
     )
 
 
-def _on_curve(curve: Outline, points: Array) -> Array:
-    """Arc lengths of electrode centres that must lie on the outline."""
+def _in_model_units(data: dict[str, Any]) -> dict[str, Any]:
+    """The same skin with its lengths in model units, its bounding box centred. Raises ValueError, TypeError."""
+    unit = data["unit"]
+    if unit not in UNITS:
+        raise ValueError(f"unit: found {unit!r}, expected one of {', '.join(UNITS)}")
+    found = {key: value for key, value in data.items() if key != "unit"}
+    if "outline" in data:
+        corners = np.array(data["outline"], dtype=float)
+        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+            raise ValueError(f"an outline is at least three corners [x, y], found shape {corners.shape}")
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        centre, half = (low + high) / 2, float((high - low).max()) / 2
+        if not 0 < half < np.inf:
+            raise ValueError(f"the outline's corners are all at {corners[0].tolist()}: expected an area")
+        found["outline"] = ((corners - centre) / half).tolist()
+    else:
+        centre, half = np.zeros(2), float(data["radius"])
+        if not 0 < half < np.inf:
+            raise ValueError(f"radius: found {half}, expected a length above 0")
+        found["radius"] = 1.0
+    spec = dict(data["electrodes"])
+    for key in {"width", "first"} & set(spec):
+        spec[key] = (np.array(spec[key], dtype=float) / half).tolist()
+    if "centre" in spec:
+        spec["centre"] = ((np.array(spec["centre"], dtype=float).reshape(-1, 2) - centre) / half).tolist()
+    return {**found, "electrodes": spec, "metres_per_unit": half * UNITS[unit]}
+
+
+def _count(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 1000:
+        raise ValueError(f"[electrodes] count: found {value!r}, expected a whole number of electrodes")
+    return value
+
+
+def _on_curve(curve: Outline, points: Array, most: float, metres: float) -> Array:
+    """Arc lengths of electrode centres that must lie on the outline, or no further from it than `most`."""
     off = curve.distance(points)
-    if off.size and off.max() > ON_OUTLINE:
+    if off.size and not off.max() <= most:
         bad = int(off.argmax())
-        raise GeometryError(f"electrode {bad} at {points[bad].tolist()} is {off[bad]:.3g} away from the outline")
+        raise GeometryError(
+            f"electrode {bad} at {points[bad].tolist()} is {off[bad]:.3g} away from the outline "
+            f"({1e3 * off[bad] * metres:.3g} mm): expected its centre on the outline; move it there"
+        )
     return curve.arc(points)
 
 

@@ -115,9 +115,13 @@ def _check_polygon(corners: Array) -> None:
         raise GeometryError(f"corner {int(np.flatnonzero(twice)[0])} of the outline is given twice")
     crossing = _self_crossing(corners)
     if crossing:
-        raise GeometryError(f"sides {crossing[0]} and {crossing[1]} of the outline cross")
+        near = [tuple(round(float(v), 4) for v in corners[side]) for side in crossing]
+        raise GeometryError(
+            f"sides {crossing[0]} and {crossing[1]} of the outline cross (they begin at {near[0]} and {near[1]}): "
+            "expected one closed line that nowhere meets itself; check the order of its corners"
+        )
     if (corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]).sum() <= 0:
-        raise GeometryError("the outline's corners must run counter-clockwise; they run clockwise")
+        raise GeometryError("the outline's corners must run counter-clockwise; they run clockwise: reverse their order")
 
 
 def _self_crossing(corners: Array) -> tuple[int, int] | None:

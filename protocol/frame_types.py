@@ -44,6 +44,7 @@ REASONS = {
     "extrapolated": "a force beyond the calibrated range",
     "late": "measured longer ago than it may be acted on: what brought it was held up",
     "clock": "the sample time is uncertain: the board's clock is not known well enough, or it jumped",
+    "gain": "all measurements changed by one common factor: the board's gain stepped, and the baseline with it",
     "frozen": "the board sends the same scan again and again, with new numbers and times",
     "uncalibrated_force": "the skin has no force law: forces are nil",
     "replay": "from a recording",
@@ -312,7 +313,7 @@ class InfoFrame(Frame):
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class Touch:
+class TrueTouch:
     """What the stub's skin is really touched by."""
 
     shape: str = wire(Text(32), "kind: circle, triangle, rectangle, square, L, hertz")
@@ -332,4 +333,4 @@ class Touch:
 class TruthFrame(Frame):
     """What really touches at the middle of the scan; only a stub knows. `publish`: the scan's last byte had left."""
 
-    touches: list[Touch] = wire(ListOf(Record(Touch), 256), "the touches", list, always=True)
+    touches: list[TrueTouch] = wire(ListOf(Record(TrueTouch), 256), "the touches", list, always=True)

@@ -37,7 +37,7 @@ from .frame_types import (
     RawFrame,
     ShapeFrame,
     StatusFrame,
-    Touch,
+    TrueTouch,
     TruthFrame,
 )
 from .records import Record
@@ -47,7 +47,7 @@ __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
     "Contact", "ContactFrame", "DeltaFrame", "ForceFrame", "Frame", "FrameError", "ImageFrame", "InfoFrame",
-    "RawFrame", "ShapeFrame", "StatusFrame", "Touch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
+    "RawFrame", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
 ]  # fmt: skip
 
 MAX_MESSAGE = 4 * 1024 * 1024

@@ -14,7 +14,7 @@ from models.bundle import Bundle
 from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame
 from protocol.held import ANY, HeldImage
 from services.contacts.force import ForceLaw, Look
-from services.contacts.motion import Seen, Track
+from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
 from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.tracking import Tracker
@@ -114,7 +114,7 @@ class Publishing(Stage):
         if frame.touched and frame.image.size:
             places = [] if self._alone(frame) else self.tracker.expected(now)
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
-        seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
+        seen = [Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
         tracks: Sequence[Track | None]
         ended: list[Track] = []
         if self._alone(frame):
@@ -160,7 +160,7 @@ class Publishing(Stage):
         self._forget()
         self._counters["unknown"] += 1
 
-    def _contact(self, track: Track, seen: Seen, s: Segment, classes: list[float], frame: ImageFrame) -> Contact:
+    def _contact(self, track: Track, seen: Patch, s: Segment, classes: list[float], frame: ImageFrame) -> Contact:
         force, sigma = self.law.force(Look.of(s, frame))
         best = int(np.argmax(classes)) if classes else -1
         known = bool(classes) and classes[best] >= UNKNOWN_BELOW

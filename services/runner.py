@@ -25,7 +25,7 @@ from protocol.sockets import ControlError, ControlServer, Publisher
 from protocol.topics import TOPIC_OF
 from services.runtime import persistence
 from services.runtime.channel import Channel, Feed, Newest
-from services.runtime.config import Config
+from services.runtime.config import ConfigFile
 from services.runtime.lateness import Lateness
 from services.runtime.stage import Refused, Stage, add_reason
 from services.runtime.waiting import Waiter
@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 class Runner:
     """A process: its sockets and its channels. `run` returns when SIGINT or SIGTERM came."""
 
-    def __init__(self, process: str, config: Config, problems: Sequence[str] = ()) -> None:
+    def __init__(self, process: str, config: ConfigFile, problems: Sequence[str] = ()) -> None:
         """problems: what the process as a whole goes without, for its status."""
         self.process, self.config, self.problems = process, config, list(problems)
         for problem in problems:

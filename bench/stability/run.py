@@ -122,7 +122,7 @@ class Answer:
         return self.contacts[0].force_n if self.contacts else None
 
 
-class Runner:
+class InProcessStages:
     """The stages of one skin, in this process."""
 
     def __init__(self, bundle: Bundle, network: str = "full") -> None:
@@ -131,7 +131,7 @@ class Runner:
         self.scan = 0
 
     def tare(self, z0: Array, relative: float | Array, rng: np.random.Generator) -> Baseline:
-        """Of TARE_FRAMES frames of the untouched skin. Raises services.runtime.stage.Refused."""
+        """Of TARE_FRAMES frames of the untouched skin. Raises services.estimation.tare.NoBaseline."""
         return take(noisy(z0, relative, rng, TARE_FRAMES), self.pipeline.pre.pre, "bench", 0)
 
     def begin(self, baseline: Baseline | None) -> None:

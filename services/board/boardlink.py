@@ -105,7 +105,7 @@ class BoardLink:
         """Have the running board scan this one of the configurations; `to_send` tells it."""
         self._wanted = to
 
-    def received(self, data: bytes, now_s: float) -> list[link.Frame]:
+    def received(self, data: bytes, now_s: float) -> list[link.ScanFrame]:
         """Scans that `data` completes, in order; everything else is dealt with here."""
         scans = []
         waited, bad = self.decoder.waiting, self.decoder.bad
@@ -114,7 +114,7 @@ class BoardLink:
         began_s = self._pace.first_byte_s(now_s, waited=waited, dropped=dropped, complete=bool(messages), waits=waits)
         self.reasons.clear()
         for n, message in enumerate(messages):
-            if isinstance(message, link.Frame):
+            if isinstance(message, link.ScanFrame):
                 first_byte_s = began_s if n == 0 else now_s
                 self._pace.took(now_s - first_byte_s)
                 if self._is_ours(message, first_byte_s, now_s):
@@ -286,7 +286,7 @@ class BoardLink:
         if event.code in (link.EventCode.BOOT, link.EventCode.BROWN_OUT):
             self._restart(now_s, f"the board lost its configuration ({event.text or link.EventCode(event.code).name})")
 
-    def _watch(self, scan: link.Frame, now_s: float) -> None:
+    def _watch(self, scan: link.ScanFrame, now_s: float) -> None:
         """A brown-out may lose the registers without a word: then there is no current through anything."""
         self._dead_scans = self._dead_scans + 1 if (scan.status & NO_CURRENT).all() else 0
         if self._dead_scans >= DEAD_SCANS and now_s - self._dead_s >= DEAD_AGAIN_S:
@@ -295,7 +295,7 @@ class BoardLink:
                 now_s, "no current through any electrode: configuring the board again; is the skin connected?"
             )
 
-    def _is_ours(self, scan: link.Frame, first_byte_s: float, now_s: float) -> bool:
+    def _is_ours(self, scan: link.ScanFrame, first_byte_s: float, now_s: float) -> bool:
         """Whether to believe that this is the board's next scan; counts what it is otherwise."""
         known = (self.scanning, self._idle) if self.switches else (self.scanning,)
         ours = any(s is not None and scan.config == s.config and len(scan.z) == len(s.pattern) for s in known)

@@ -214,7 +214,7 @@ class BoardSource(Source):
             if isinstance(delta, DeltaFrame):
                 adaptive.heard(delta, now_s)
 
-    def raw_frame(self, scan: link.Frame, board: BoardLink, read_ns: int, kind: str = "full") -> RawFrame:
+    def raw_frame(self, scan: link.ScanFrame, board: BoardLink, read_ns: int, kind: str = "full") -> RawFrame:
         """A scan of the board with this host's stamps; `read_ns`: when its last byte was read."""
         if kind == "full":
             self._full_s = scan.duration_us * 1e-6

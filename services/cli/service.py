@@ -11,6 +11,7 @@ from services.cli.common import FAILED, USAGE, JsonOption, config_file, emit, fa
 
 if TYPE_CHECKING:
     from protocol.transport import Transport
+    from services.runtime.config import ConfigFile
 
 
 def register(app: typer.Typer) -> None:
@@ -32,6 +33,7 @@ def up(
     from services.runtime.supervision import up as supervise
 
     found = load()
+    _check_mismatches(found)
     wanted = [p for p in programs(found) if not (no_board and p.name in ("acquisition", "stub"))]
     extra = [Program("recorder", "services.recorder", ("--folder", str(record.resolve())))] if record else []
     with lock():  # said before anything else where a service runs here already
@@ -42,6 +44,18 @@ def up(
         "look with `./skin top`, press with `./skin press --x 0.02 --y -0.01 --force 3`, stop with Ctrl-C", flush=True
     )
     raise typer.Exit(supervise(found, extra, wanted))
+
+
+def _check_mismatches(config: ConfigFile) -> None:
+    """Said before anything starts: the stub would end at once, again and again."""
+    for name, skin in config.skins.items():
+        if skin.mismatch != "none":
+            from models.mismatch import NAMED
+
+            if skin.mismatch not in NAMED:
+                fail(
+                    f"{config.path}: skins.{name}.mismatch: found {skin.mismatch!r}; allowed: {', '.join(NAMED)}", USAGE
+                )
 
 
 def _addresses(transport: Transport, processes: list[str]) -> str:

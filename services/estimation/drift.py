@@ -14,7 +14,7 @@ Q is exact: to predict over dt1 and then dt2 is to predict over dt1 + dt2.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,57 +80,11 @@ class DriftProcess:
         return np.diag((phi @ start @ phi.transpose(0, 2, 1) + self.noise(since_s))[:, 0, 0])
 
 
-class DriftFilter:
-    """Kalman filter of a DriftProcess. mean (2 N,): values, then rates; covariance (2 N, 2 N)."""
+class DriftRates(NamedTuple):
+    """How fast an untouched skin may change, relative, 1/s: `[skins.NAME.tare]` in skin.toml."""
 
-    def __init__(self, process: DriftProcess) -> None:
-        self.process = process
-        self.tared()
-
-    def tared(self) -> None:
-        """The values are 0 by definition of the baseline; the rates are unknown."""
-        n = len(self.process.sd)
-        self.mean = np.zeros(2 * n)
-        self.covariance = np.zeros((2 * n, 2 * n))
-        self.covariance[n:, n:] = np.diag(self.process.stationary()[:, 1, 1])
-
-    @property
-    def value(self) -> Array:
-        """(N,)"""
-        return self.mean[: len(self.process.sd)]
-
-    @property
-    def value_covariance(self) -> Array:
-        """(N, N)"""
-        n = len(self.process.sd)
-        return self.covariance[:n, :n]
-
-    def predict(self, dt: float) -> None:
-        """Time goes on by dt seconds."""
-        phi, q = (spread(v) for v in (self.process.transition(dt), self.process.noise(dt)))
-        self.mean = phi @ self.mean
-        self.covariance = phi @ self.covariance @ phi.T + q
-
-    def update(self, columns: Array, d: Array, covariance: Array) -> None:
-        """A difference d (K,) = columns (K, N) @ value, and an error of this covariance (K, K)."""
-        h = np.hstack([columns, np.zeros_like(columns)])
-        gathered = h @ self.covariance
-        gain = np.linalg.solve(gathered @ h.T + covariance, gathered).T
-        self.mean = self.mean + gain @ (d - h @ self.mean)
-        left = np.eye(len(self.mean)) - gain @ h
-        self.covariance = left @ self.covariance @ left.T + gain @ covariance @ gain.T  # Joseph: stays symmetric
-
-    def state(self) -> dict[str, Any]:
-        return {"mean": self.mean.copy(), "covariance": self.covariance.copy()}
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Raises KeyError or ValueError where it does not fit."""
-        mean, covariance = (np.array(state[key], dtype=float) for key in ("mean", "covariance"))
-        if mean.shape != self.mean.shape or covariance.shape != self.covariance.shape:
-            raise ValueError(f"a drift of {mean.size} numbers, expected {self.mean.size}")
-        if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
-            raise ValueError("a drift that is not finite")
-        self.mean, self.covariance = mean, covariance
+    scale_per_s: float  # the sheet's conductivity
+    contact_per_s: float  # each electrode's contact impedance
 
 
 def spread(blocks: Array) -> Array:

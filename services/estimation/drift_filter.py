@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 
 from models.prereconstruction import PreReconstructor
 from services.estimation.creep import SHARE, Creep
-from services.estimation.drift import DriftProcess, spread
+from services.estimation.drift import DriftProcess, DriftRates, spread
 from services.estimation.drift_prior import REST_S
 from services.estimation.holding import Holding
 from services.estimation.saved import shaped
 from services.estimation.tuning import TUNING
-from services.runtime.config import Tare
 
 Array = NDArray[np.float64]
 
@@ -40,10 +39,11 @@ MOST_S = 600.0  # of drift: a longer gap counts as this
 class DriftFilter:
     """Follows (K,) |Z0|. Times are `sample` stamps [ns]; 0: not known yet."""
 
-    def __init__(self, pre: PreReconstructor, config: Tare) -> None:
-        self.pre, self.config = pre, config
+    def __init__(self, pre: PreReconstructor, rates: DriftRates, tracking_s: float) -> None:
+        """tracking_s: time constant with which the baseline follows what drift does not explain."""
+        self.pre, self.tracking_s = pre, tracking_s
         self._columns = np.column_stack([np.ones(pre.measurements), pre.m.contact])  # d per relative change
-        self._rates = np.array([config.scale_per_s] + [config.contact_per_s] * pre.m.contact.shape[1])
+        self._rates = np.array([rates.scale_per_s] + [rates.contact_per_s] * pre.m.contact.shape[1])
         self.process = DriftProcess(self._rates * TUNING.drift_s, np.full(len(self._rates), TUNING.drift_s))
         self.holding = Holding(pre, self._columns, self._rates)
         self.begin(0)
@@ -146,7 +146,7 @@ class DriftFilter:
         self.mean, self.covariance = expected + found[: 2 * n], covariance[: 2 * n, : 2 * n]
         drift = ahead + columns @ found
         step_s = min(gap_s, LONGEST_STEP_S)
-        slow = np.where(live, d - drift, 0.0) * (step_s / (step_s + self.config.tracking_s))
+        slow = np.where(live, d - drift, 0.0) * (step_s / (step_s + self.tracking_s))
         z0 += np.where(z0 > 0, normaliser * (drift + slow), 0.0)
 
     def predicted(self, dt: float) -> tuple[Array, Array]:

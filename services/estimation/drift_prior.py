@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 from models.prereconstruction import Drift, PreReconstructor
-from services.runtime.config import Tare
+from services.estimation.drift import DriftRates
 
 Array = NDArray[np.float64]
 
@@ -36,8 +36,8 @@ COARSE = 2  # pixels of the reconstruction matrices to one of the non-negative f
 class DriftPrior:
     """The law of `Drift` over time, in steps 0 ... STEPS - 1."""
 
-    def __init__(self, config: Tare) -> None:
-        self.scale_per_s, self.contact_per_s = config.scale_per_s, config.contact_per_s
+    def __init__(self, rates: DriftRates) -> None:
+        self.rates = rates
         self.widest = STEPS - 1
 
     def step(self, since_s: float) -> int:
@@ -46,7 +46,7 @@ class DriftPrior:
 
     def drift(self, step: int) -> Drift:
         seconds = REST_S * STEP**step
-        return Drift(scale=self.scale_per_s * seconds, contact=self.contact_per_s * seconds)
+        return Drift(scale=self.rates.scale_per_s * seconds, contact=self.rates.contact_per_s * seconds)
 
     def sigma(self, sigma: Array, contact: NDArray[np.floating], step: int) -> Array:
         """(K,) noise of d with what the linear drift of this step leaves unsaid. contact (K, E): d per change."""
@@ -58,8 +58,8 @@ class DriftPrior:
 class MarginalLikelihood:
     """How well each step of the allowance explains a frame, touches being free to be any drop >= 0."""
 
-    def __init__(self, pre: PreReconstructor, allowance: DriftPrior) -> None:
-        self.m, self.allowance = pre.m, allowance
+    def __init__(self, pre: PreReconstructor, drift_prior: DriftPrior) -> None:
+        self.m, self.drift_prior = pre.m, drift_prior
         (h, w), k = self.m.inside.shape, pre.measurements
         blocks = (h // COARSE, COARSE, w // COARSE, COARSE)
         jacobian = self.m.jacobian.reshape(k, *blocks).sum(axis=(2, 4)).reshape(k, -1)
@@ -72,9 +72,9 @@ class MarginalLikelihood:
 
     def __call__(self, d: Array, sigma: Array, live: NDArray[np.bool_], step: int) -> float:
         """-log p of (K,) d with noise sigma (K,), up to what all steps have in common. Some milliseconds."""
-        drift = self.allowance.drift(step)
+        drift = self.drift_prior.drift(step)
         contact, on = self.m.contact[live], np.ix_(live, live)
-        covariance = np.diag(self.allowance.sigma(sigma, self.m.contact, step)[live] ** 2 + ABSOLUTE**2)
+        covariance = np.diag(self.drift_prior.sigma(sigma, self.m.contact, step)[live] ** 2 + ABSOLUTE**2)
         covariance += drift.scale**2 + drift.contact**2 * contact @ contact.T
         covariance += MISFIT**2 * float(d[live] @ d[live]) * self._misfit[on]
         root = np.linalg.cholesky(covariance)

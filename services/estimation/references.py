@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from models.prereconstruction import PreReconstructor
 from services.estimation.saved import shaped
 from services.estimation.tare import ASSUMED_NOISE, LEAST_NOISE, Baseline
 
@@ -54,6 +55,12 @@ class References:
         z0, sigma = np.where(good, amplitude, 0.0), np.where(good, self.noise * amplitude, np.inf)
         # Two scans share each of the differences that it was found from.
         return Baseline(z0, sigma, 1, board, sample_ns, taken_by="file", noise_frames=self._found_from // 2)
+
+    def sigma(self, baseline: Baseline, pre: PreReconstructor) -> Array:
+        """(K,) noise of d against this baseline: that of a typical scan, so that operators are made once for all."""
+        known = self.typical > 0
+        share = np.divide(self.typical, pre.normaliser(self.typical), out=np.zeros(len(self.typical)), where=known)
+        return np.where(np.isfinite(baseline.sigma) & known, self.noise * share, np.inf)
 
     def state(self) -> dict[str, Any]:
         state = {"row": np.array(self._row), "noise": self.noise, "typical": self.typical}

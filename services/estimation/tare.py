@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import PreReconstructor, noise_of_frames
-from services.runtime.stage import Refused
+from protocol.errors import EitskinError
 
 Array = NDArray[np.float64]
 
@@ -26,6 +26,10 @@ QUARTERS = 4
 ASSUMED_NOISE = 1e-3  # relative (60 dB), where frames do not tell
 LEAST_NOISE = 2e-6  # relative: about half a step of the board's 18 bits
 IDENTICAL = 1e-12  # relative scatter below which frames are the same but for the arithmetic of their mean
+
+
+class NoBaseline(EitskinError, ValueError):
+    """Frames, or a saved state, do not make a baseline. The text says why and what to do."""
 
 
 @dataclass(frozen=True)
@@ -58,44 +62,44 @@ class Baseline:
 
     @classmethod
     def from_dict(cls, saved: dict[str, Any], measurements: int) -> Baseline:
-        """Raises Refused where `saved` is no baseline of that many measurements."""
+        """Raises NoBaseline where `saved` is no baseline of that many measurements."""
         try:
             z0, sigma = np.array(saved["z0"], dtype=float), np.array(saved["sigma"], dtype=float)
             rest = int(saved["frames"]), str(saved["board"]), int(saved["taken_ns"]), str(saved["doubt"])
             provenance = str(saved.get("taken_by", "start")), bool(saved.get("restored", False))
             noise_frames = int(saved.get("noise_frames", 0))
         except (KeyError, TypeError, ValueError) as wrong:
-            raise Refused(f"no baseline in the saved state ({wrong}): tare again") from None
+            raise NoBaseline(f"no baseline in the saved state ({wrong}): tare again") from None
         if z0.shape != (measurements,) or sigma.shape != (measurements,):
-            raise Refused(f"the saved baseline has {z0.size} measurements, this skin {measurements}: tare again")
+            raise NoBaseline(f"the saved baseline has {z0.size} measurements, this skin {measurements}: tare again")
         if not (np.isfinite(z0).all() and (z0 >= 0).all() and (sigma > 0).all()):
-            raise Refused("the saved baseline has impedances or noises that are not possible: tare again")
+            raise NoBaseline("the saved baseline has impedances or noises that are not possible: tare again")
         known = int(((z0 > 0) & np.isfinite(sigma)).sum())
         if known < 0.5 * measurements:
-            raise Refused(f"the saved baseline knows only {known} of {measurements} measurements: tare again")
+            raise NoBaseline(f"the saved baseline knows only {known} of {measurements} measurements: tare again")
         return cls(z0, sigma, *rest, *provenance, noise_frames)
 
 
 def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Baseline:
-    """The baseline of (N, K) |Z|. Raises Refused where the frames do not agree with each other.
+    """The baseline of (N, K) |Z|. Raises NoBaseline where the frames do not agree with each other.
 
     A measurement that is not finite in every frame gets an infinite sigma: it is left out until the next tare.
     """
     live = np.isfinite(frames).all(axis=0) & (frames > 0).all(axis=0)
     if live.sum() < 0.5 * frames.shape[1]:
-        raise Refused(
+        raise NoBaseline(
             f"only {int(live.sum())} of {frames.shape[1]} measurements give values: check the cable and the electrodes"
         )
     good = frames[:, live]
     mean = good.mean(axis=0)
     noise = float(np.median(good.std(axis=0, ddof=1) / mean))
     if noise > TOO_NOISY:
-        raise Refused(
+        raise NoBaseline(
             f"the frames scatter by {100 * noise:.1f} % (at most {100 * TOO_NOISY:.0f} %): check grounding and cable"
         )
     found, limit = disagreement(good)
     if found > limit:
-        raise Refused(
+        raise NoBaseline(
             f"the frames disagree (statistic {found:.0f}, limit {limit:.0f}): something touched or moved meanwhile"
         )
     z0, sigma = np.zeros(frames.shape[1]), np.full(frames.shape[1], np.inf)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import Operator
+from services.estimation.saved import shaped
 
 Array = NDArray[np.float64]
 
@@ -54,11 +55,22 @@ class FrameAverager:
         self.reset()
 
     def reset(self) -> None:
+        self._live: NDArray[np.bool_] | None = None  # measurements that count in it
+        self._step = 0  # of the allowance for drift under which it is reconstructed
+        self._forget()
+
+    def _forget(self) -> None:
         self._reference: Array | None = None  # the difference last reconstructed
         self.averaged = 0  # frames in it
         self._recent: deque[Array] = deque(maxlen=LONGEST_MEAN)
         self._count = 0  # frames since the last change
         self.scan = 0  # of the frame last reconstructed
+
+    def under(self, live: NDArray[np.bool_], step: int) -> None:
+        """What the next frame is reconstructed under. Frames under anything else make another image."""
+        if self._live is None or step != self._step or (live != self._live).any():
+            self._forget()
+        self._live, self._step = live, step
 
     def __call__(self, d: Array, scan: int, decision: TouchDecision) -> Array | None:
         """The difference (K,) to reconstruct now, or None to hold."""
@@ -83,14 +95,19 @@ class FrameAverager:
             "recent": np.array(self._recent),
             "count": self._count,
             "scan": self.scan,
+            "live": None if self._live is None else self._live.astype(np.uint8),
+            "step": self._step,
         }
 
-    def load(self, state: dict[str, Any]) -> None:
+    def load(self, state: dict[str, Any], measurements: int) -> None:
+        """Raises KeyError, TypeError or ValueError where it does not fit."""
         self.reset()
         reference = state["reference"]
-        self._reference = None if reference is None else np.array(reference, dtype=float)
+        self._reference = None if reference is None else shaped(reference, (measurements,))
         self.averaged, self._count, self.scan = int(state["averaged"]), int(state["count"]), int(state["scan"])
-        self._recent.extend(np.array(state["recent"], dtype=float))
+        self._recent.extend(shaped(row, (measurements,)) for row in state["recent"])
+        if (live := state.get("live")) is not None:  # older recordings have none
+            self._live, self._step = shaped(live, (measurements,)) > 0, int(state["step"])
         if self.scan < 0 or (self._reference is not None and self.averaged < 1):
             raise ValueError(f"a hold of {self.averaged} frames since scan {self.scan}: expected 1 or more, from 0 on")
 

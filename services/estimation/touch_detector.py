@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from models.prereconstruction import Operator, PreReconstructor
 from services.estimation.creep import Creep
+from services.estimation.drift import DriftRates
 from services.estimation.drift_prior import DriftPrior, MarginalLikelihood
 from services.estimation.saved import shaped
 from services.estimation.touch_decision import TouchDecision
-from services.runtime.config import Skin
 
 Array = NDArray[np.float64]
 
@@ -55,9 +55,10 @@ class TouchVerdict(NamedTuple):
 
 
 class TouchDetector:
-    def __init__(self, pre: PreReconstructor, skin: Skin) -> None:
-        self.pre, self.config = pre, skin.touch
-        self.allowance = DriftPrior(skin.tare)
+    def __init__(self, pre: PreReconstructor, rates: DriftRates, false_alarms: float) -> None:
+        """false_alarms: probability that an untouched frame counts as touched."""
+        self.pre, self.false_alarms = pre, false_alarms
+        self.drift_prior = DriftPrior(rates)
         self._evidence: MarginalLikelihood | None = None
         self.creep = Creep(pre.measurements)
         self._operators: dict[tuple[bytes, bytes, int, int, int], tuple[Operator, TouchDecision]] = {}
@@ -80,7 +81,7 @@ class TouchDetector:
         self, d: Array, live: NDArray[np.bool_], noise: Noise, since_s: float, now_ns: int, touched: bool
     ) -> TouchVerdict:
         """Judge the difference (K,) of a frame `since_s` after the last untouched one; touched: the frame before."""
-        permitted = self._permitted = self.allowance.step(since_s)
+        permitted = self._permitted = self.drift_prior.step(since_s)
         if not np.array_equal(live, self._live):
             self._live = live.copy()
             self._gather(now_ns)
@@ -129,7 +130,7 @@ class TouchDetector:
         """The same for the first frame of a touch, against the baseline from before it was noticed. alone: against one
         whose drift was found in this very frame.
         """
-        permitted = self._permitted = self.allowance.step(since_s)
+        permitted = self._permitted = self.drift_prior.step(since_s)
         self._gather(now_ns)
         if alone:
             self.step = permitted
@@ -178,7 +179,7 @@ class TouchDetector:
 
     def _explain(self, d: Array, sigma: Array, live: NDArray[np.bool_], steps: list[int]) -> dict[int, float]:
         if self._evidence is None:
-            self._evidence = MarginalLikelihood(self.pre, self.allowance)
+            self._evidence = MarginalLikelihood(self.pre, self.drift_prior)
         if not self._evidence.speaks:
             return {step: float(step == max(steps)) * -2 * CLEARLY for step in steps}
         return {step: self._evidence(d, sigma, live, step) for step in steps}
@@ -197,13 +198,13 @@ class TouchDetector:
             if len(self._operators) >= OPERATORS:
                 self._operators.pop(next(iter(self._operators)))
             operator = self.pre.condition(
-                self.allowance.sigma(noise.sigma, self.pre.m.contact, step),
-                drift=self.allowance.drift(step),
+                self.drift_prior.sigma(noise.sigma, self.pre.m.contact, step),
+                drift=self.drift_prior.drift(step),
                 weights=live.astype(float),
                 tare_frames=noise.frames,
             )
             known_from = noise.found_from or noise.frames
-            self._operators[key] = operator, TouchDecision(operator, self.config.false_alarms, known_from)
+            self._operators[key] = operator, TouchDecision(operator, self.false_alarms, known_from)
         return self._operators[key]
 
     @staticmethod
@@ -218,13 +219,13 @@ class TouchDetector:
     def prepare(self, noise: Noise) -> bool:
         """Do one piece of what will be needed next; False where nothing is left. Changes no result."""
         live = self._live & np.isfinite(noise.sigma)
-        near = {self.step, max(self.step - 1, 0), self._permitted, min(self._permitted + 1, self.allowance.widest)}
+        near = {self.step, max(self.step - 1, 0), self._permitted, min(self._permitted + 1, self.drift_prior.widest)}
         for step in sorted(near):
             if self._key(live, noise, step) not in self._operators:
                 self.operator(live, noise, step)
                 return True
         if self._evidence is None:
-            self._evidence = MarginalLikelihood(self.pre, self.allowance)
+            self._evidence = MarginalLikelihood(self.pre, self.drift_prior)
             return True
         return self._answer_one()
 
@@ -266,6 +267,6 @@ class TouchDetector:
             self._question = shaped(asked["d"], k), sigma, shaped(asked["live"], k) > 0, steps
 
     def _checked(self, step: int) -> int:
-        if not 0 <= step <= self.allowance.widest:
-            raise ValueError(f"step {step} of the drift allowance, expected 0 to {self.allowance.widest}")
+        if not 0 <= step <= self.drift_prior.widest:
+            raise ValueError(f"step {step} of the drift allowance, expected 0 to {self.drift_prior.widest}")
         return step

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from models.bundle import Bundle, BundleError
 from models.prereconstruction import noise_of_frames
 from protocol.frames import RawFrame
-from services.estimation.tare import Baseline, take
+from services.estimation.tare import Baseline, NoBaseline, take
 from services.pipeline import ALL, Pipeline, Result
 from services.recordings.npz_file import Input, frames_of
 from services.runtime.config import ConfigError, Skin, load
-from services.runtime.stage import SEPARATE, Refused
+from services.runtime.stage import SEPARATE
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ def baseline_of(frames: Array, pipeline: Pipeline, warn: Callable[[str], None]) 
     if len(frames) >= FEWEST_FOR_TARE:
         try:
             return take(frames, pipeline.pre.pre, "file", 0)
-        except Refused as why:
+        except NoBaseline as why:
             doubt = f"`untouched`: {why}"
             warn(doubt + "; using their mean")
     frames = np.where(np.isfinite(frames), frames, np.nan)
@@ -139,7 +139,7 @@ def _beside_references(
             pipeline.pre.process(frame, ALL)
         frame.scan += 1
         _store(out, row, pipeline.run(frame))
-        lost += pipeline.pre.untouched.baseline is None
+        lost += pipeline.pre.baseline_estimator.baseline is None
     if lost:
         warn(f"{lost} of {len(out['valid'])} rows are not valid: their `reference` gives too few measurements")
 

@@ -52,7 +52,7 @@ class Pose(Section):
         return q
 
 
-class Tare(Section):
+class TareConfig(Section):
     """How the untouched baseline is taken and kept."""
 
     frames: Annotated[int, Field(ge=8, le=4096)] = 64
@@ -64,7 +64,7 @@ class Tare(Section):
     contact_per_s: Annotated[float, Field(gt=0, le=1e-1)] = 8e-4  # each electrode's contact impedance
 
 
-class Touch(Section):
+class TouchConfig(Section):
     """The touch decision: see services/estimation/touch_decision.py."""
 
     false_alarms: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
@@ -90,14 +90,15 @@ class Skin(Section):
     bundle: str  # the name of a folder of models/bundles, else a path
     frame_id: str = ""  # default: the skin's name
     pose: Pose = Pose()
+    mismatch: str = "none"  # of the stub's sheet: by what it differs from the bundle, a name of models/mismatch.py
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
     indenter: Indenter | None = None
     network: NetworkFile = "int8"
     dft_points: Literal[128, 256, 512] = 128
     scan: ScanMode = "full"  # a short list while nothing touches: board/adaptive.py
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
-    tare: Tare = Tare()
-    touch: Touch = Touch()
+    tare: TareConfig = TareConfig()
+    touch: TouchConfig = TouchConfig()
 
     @field_validator("port")
     @classmethod
@@ -108,6 +109,12 @@ class Skin(Section):
             '"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000), a recording (*.mcap) or a file '
             "of measurements (*.npz)"
         )
+
+    @model_validator(mode="after")
+    def mismatch_of_a_stub(self) -> Skin:
+        if self.mismatch != "none" and self.port != "stub":
+            raise ValueError(f'`mismatch` with port = "stub" alone: a real skin has its own (found {self.port!r})')
+        return self
 
 
 RECORDINGS = (".mcap", ".npz")
@@ -245,7 +252,7 @@ class FoxgloveSection(Section):
     replay: Switch = False  # replayed frames are shown too
 
 
-class Config(Section):
+class ConfigFile(Section):
     """The whole file. `path` is where it was read from; relative paths in it are relative to its folder."""
 
     skins: Annotated[dict[str, Skin], Field(min_length=1)]
@@ -312,7 +319,7 @@ def config_path(path: str | Path | None = None) -> Path:
     return Path(path or os.environ.get("EITSKIN_CONFIG") or ROOT / "skin.toml")
 
 
-def load(path: str | Path | None = None) -> Config:
+def load(path: str | Path | None = None) -> ConfigFile:
     """Read and check the configuration. Raises ConfigError, one line for each thing that is wrong."""
     file = config_path(path)
     try:
@@ -324,10 +331,10 @@ def load(path: str | Path | None = None) -> Config:
     return parse(raw, file)
 
 
-def parse(raw: dict[str, Any], file: Path = Path("skin.toml")) -> Config:
+def parse(raw: dict[str, Any], file: Path = Path("skin.toml")) -> ConfigFile:
     """Check a configuration that is already a dict; `file` is named in errors."""
     try:
-        config = Config.model_validate(raw | {"path": file})
+        config = ConfigFile.model_validate(raw | {"path": file})
         return config.model_copy(update={"skins": {n: config._resolved(s) for n, s in config.skins.items()}})
     except ValidationError as wrong:
         raise ConfigError("\n".join(_explain(file, e) for e in wrong.errors())) from None
@@ -354,11 +361,11 @@ def _shown(value: Any) -> str:
 
 def _allowed(location: tuple[int | str, ...]) -> list[str]:
     """Keys that the section at `location` knows."""
-    model: Any = Config
+    model: Any = ConfigFile
     for part in location:
-        if model is Config and part == "skins":
+        if model is ConfigFile and part == "skins":
             continue
-        if location[0] == "skins" and part == location[1] and model is Config:
+        if location[0] == "skins" and part == location[1] and model is ConfigFile:
             model = Skin
             continue
         model = _section(model.model_fields[str(part)].annotation)

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from protocol.sockets import NewestReader
-from services.runtime.config import load
+from services.runtime.config import ConfigError, load
 from services.runtime.supervision import programs, stub_arguments
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -172,3 +172,14 @@ def test_the_supervisor_gives_each_skin_its_bundle(tmp_path: Path) -> None:
     told = stub_arguments(config)
     assert told == ("--skin", f"a={ROOT / 'models/bundles/disc16'}", "--skin", f"c={tmp_path / 'mine'}")
     assert [p.arguments for p in programs(config) if p.name == "stub"] == [told]
+
+
+def test_the_supervisor_tells_the_stub_by_what_a_sheet_differs_from_its_bundle(tmp_path: Path) -> None:
+    file = tmp_path / "skin.toml"
+    file.write_text('[skins.a]\nport = "stub"\nbundle = "disc16"\n[skins.b]\nport = "stub"\nbundle = "disc16"\n')
+    assert "--mismatch" not in stub_arguments(load(file))
+    file.write_text(file.read_text() + 'mismatch = "mild"\n')
+    assert stub_arguments(load(file))[-2:] == ("--mismatch", "b=mild")
+    file.write_text('[skins.a]\nport = "/dev/ttyACM0"\nbundle = "disc16"\nmismatch = "mild"\n')
+    with pytest.raises(ConfigError, match='port = "stub" alone: a real skin has its own'):
+        load(file)

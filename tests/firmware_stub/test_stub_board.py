@@ -6,7 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_stub.sheet import Sheet
+from firmware_stub.world import Touch, World
+from models.mismatch import MismatchedSheet, named
 from models.patterns import pattern
+from models.shapes import Shape
 from protocol import link
 
 PAIRS = pattern("pairs").astype("u1")
@@ -125,6 +129,28 @@ def test_an_untouched_skin_measures_as_eidors_says(host, name):
     assert np.abs(z / np.abs(reference[f"impedance_{name}"][0]) - 1).max() < 0.01
 
 
+def test_a_mismatched_sheet_is_measured_as_it_is_not_as_its_file_says():
+    real = MismatchedSheet("square16", named("mild"), mesh="inverse")
+    press = Touch("circle", 0.02, -0.01, 0.01, 0.3)
+    for world, touches in ((World(), ()), (World(touches=(press,)), (Shape("circle", 0.4, -0.2, 0.2, 0.3),))):
+        z = np.abs(real.solve(touches).impedances())
+        mild, plain = (
+            np.abs(read(sheet.transfer(world), sheet.skin.pattern))
+            for sheet in (Sheet("square16", "mild"), Sheet("square16"))
+        )
+        assert np.abs(mild / z - 1).max() < 0.01  # two meshes
+        assert np.abs(plain / z - 1).max() > 0.05
+    with pytest.raises(ValueError, match="no mismatch 'wild': expected one of none"):
+        Sheet("square16", "wild")
+
+
+def read(transfer, pairs):
+    """Impedances that a board reads of a transfer matrix."""
+    t = transfer[pairs[:, 0]] - transfer[pairs[:, 1]]
+    rows = np.arange(len(pairs))
+    return t[rows, pairs[:, 2]] - t[rows, pairs[:, 3]]
+
+
 def test_a_press_is_in_the_next_scan_and_gone_after_its_seconds(host):
     board = host(snr_db=100.0)
     board.start()
@@ -199,7 +225,7 @@ def test_interpolation_between_key_poses_stays_below_the_noise(host):
 def test_simulated_time_runs_ahead_in_any_steps_and_a_still_scene_is_solved_once(host):
     board = host()
     board.start()
-    frames = [m for m in board.wait(30.0, step=0.5) if isinstance(m, link.Frame)]
+    frames = [m for m in board.wait(30.0, step=0.5) if isinstance(m, link.ScanFrame)]
     assert len(frames) / 30.0 == pytest.approx(22.9, rel=0.02)
     assert frames[-1].seq - frames[0].seq == len(frames) - 1
     assert board.rig.field.solves == 1

@@ -101,3 +101,19 @@ def test_loading_joins_chunks(folder):
 def test_splits_do_not_share_scenes():
     rows = [data.make_chunk(specs(split, 1, 2)[0])["shapes"] for split in ("train", "valid")]
     assert not np.allclose(rows[0][:, 0, 1:3], rows[1][:, 0, 1:3])
+
+
+def test_scenes_of_a_skin_that_has_changed_since_are_refused(tmp_path):
+    skin = tmp_path / "mine.toml"
+
+    def make(width):
+        skin.write_text(
+            'name = "mine"\nunit = "mm"\nradius = 30\ncontact_impedance = 0.01\n'
+            f"[electrodes]\nwidth = {width}\ncount = 8\n"
+        )
+        data.generate(tmp_path / "work", data.specs(str(skin), "train", 1, 1, 1, "inverse"), quiet=True)
+
+    make(5)
+    make(5)
+    with pytest.raises(ValueError, match="as it was before its outline, electrodes or pattern changed: remove that"):
+        make(6)

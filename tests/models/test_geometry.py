@@ -97,3 +97,74 @@ def test_a_missing_key_and_a_missing_file():
         geometry.from_dict(data)
     with pytest.raises(GeometryError, match="no skin 'hexagon6': expected one of disc16, square16"):
         geometry.load("hexagon6")
+
+
+def drawn(**change):
+    """A disc of 60 mm with 12 electrodes, as somebody writes it who has a ruler."""
+    return {
+        "name": "mine",
+        "unit": "mm",
+        "radius": 30,
+        "contact_impedance": 0.01,
+        "electrodes": {"width": 5, "count": 12},
+    } | change
+
+
+def test_a_skin_in_millimetres():
+    skin = geometry.from_dict(drawn())
+    assert skin.metres_per_unit == pytest.approx(0.03) and skin.radius == 1.0
+    np.testing.assert_allclose(skin.widths * skin.metres_per_unit, 0.005)
+    np.testing.assert_allclose(skin.point(skin.electrodes)[3] * skin.metres_per_unit, [0, 0.03], atol=1e-9)
+    again = geometry.from_dict(skin.to_dict())
+    np.testing.assert_allclose(again.electrodes, skin.electrodes, atol=1e-9)
+
+
+def test_a_drawn_outline_is_centred_and_its_electrodes_put_on_it():
+    ell = [[10, 10], [110, 10], [110, 60], [60, 60], [60, 110], [10, 110]]
+    places = [[35, 10.4], [110.3, 35], [60, 85], [9.8, 60]]  # read off by eye
+    data = drawn(outline=ell, electrodes={"width": 6, "centre": places})
+    del data["radius"]
+    skin = geometry.from_dict(data)
+    assert skin.metres_per_unit == pytest.approx(0.05)
+    metres = skin.point(skin.electrodes) * skin.metres_per_unit
+    np.testing.assert_allclose(metres, [[-0.025, -0.05], [0.05, -0.025], [0.0, 0.025], [-0.05, 0.0]], atol=1e-9)
+
+
+def test_the_first_of_evenly_spaced_electrodes_may_be_elsewhere():
+    skin = geometry.from_dict(drawn(electrodes={"width": 5, "count": 12, "first": np.pi * 30 / 2}))
+    np.testing.assert_allclose(skin.point(skin.electrodes)[0], [0, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"unit": "miles"}, "unit: found 'miles', expected one of m, cm, mm, inch"),
+        ({"radius": 0}, "radius: found 0.0, expected a length above 0"),
+        ({"metres_per_unit": 0.03}, "unknown key 'metres_per_unit'"),
+        ({"electrodes": {"width": 20, "count": 12}}, r"overlap by .* \(4.3 mm\): expected a gap .* width smaller"),
+        (
+            {"electrodes": {"width": 5, "centre": [[20, 0]] * 4}},
+            r"away from the outline \(10 mm\): expected",
+        ),
+        ({"electrodes": {"width": 5, "count": 12.5}}, "count: found 12.5, expected a whole number"),
+        ({"electrodes": {"width": 5, "count": 12, "offset": 1}}, "unknown key 'offset'; expected width"),
+        ({"electrodes": 12}, r"electrodes: found 12, expected a table \[electrodes\]"),
+    ],
+)
+def test_impossible_skins_in_millimetres(change, message):
+    with pytest.raises(GeometryError, match=message):
+        geometry.from_dict(drawn(**change))
+
+
+@pytest.mark.parametrize(("unit", "found"), [("m", "found 60 m x 60 m"), ("mm", "found 6e-05 m x 6e-05 m")])
+def test_a_length_in_another_unit_than_is_said(tmp_path, unit, found):
+    path = tmp_path / "mine.toml"
+    radius = 30 if unit == "m" else 0.03
+    path.write_text(
+        f'name = "mine"\nunit = "{unit}"\nradius = {radius}\ncontact_impedance = 0.01\n'
+        f"[electrodes]\nwidth = {radius / 6}\ncount = 12\n"
+    )
+    with pytest.raises(
+        GeometryError, match=f"{found}, expected a longer side of 0.005 to 3 m: correct unit = '{unit}'"
+    ):
+        geometry.load(path)

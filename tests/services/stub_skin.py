@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_stub.analog import Analog, Noise
+from firmware_stub.analog import Analog, BoardNoise
 from firmware_stub.faults import Faults
 from firmware_stub.sheet import Sheet
 from models.bundle import Bundle
@@ -38,7 +38,7 @@ class StubSkin:
     def __init__(self, snr_db: float, tare: bool = True) -> None:
         bundle = Bundle.load("square16")
         self.pattern, self.faults, self.scan = np.asarray(bundle.pattern), Faults(), 0
-        self.analog = Analog(Noise.of_db(snr_db), self.faults, np.random.default_rng(3))
+        self.analog = Analog(BoardNoise.of_db(snr_db), self.faults, np.random.default_rng(3))
         self.pipeline = Pipeline("square16", name="palm")
         if tare:
             result = self.rest(72)

@@ -227,7 +227,7 @@ intact = st.one_of(
         firmware=texts,
     ),
     st.builds(
-        lambda seq, us, duration, config, n, value: link.Frame(
+        lambda seq, us, duration, config, n, value: link.ScanFrame(
             seq, us, duration, config, np.full(n, value, np.complex64), np.full(n, seq & 15, np.uint8)
         ),
         u32, u64, u32, u16 | st.just(SCANNING.config), measured, st.floats(width=32),

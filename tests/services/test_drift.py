@@ -12,6 +12,7 @@ from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame, RawFrame
+from services.estimation.drift import DriftRates
 from services.estimation.drift_filter import DriftFilter
 from services.estimation.tare import take
 from services.estimation.touch_detector import Noise, TouchDetector
@@ -30,8 +31,20 @@ def stage(skin: Skin, bundle: Bundle, board: Board) -> Preprocessing:
     made = Preprocessing("palm", skin, bundle)
     for _ in range(80):
         run(made, board.frame())
-    assert made.untouched.baseline is not None
+    assert made.baseline_estimator.baseline is not None
     return made
+
+
+def drift_filter(bundle: Bundle, skin: Skin) -> DriftFilter:
+    return DriftFilter(bundle.prereconstructor(), drift_rates(skin), skin.tare.tracking_s)
+
+
+def touch_detector(bundle: Bundle, skin: Skin) -> TouchDetector:
+    return TouchDetector(bundle.prereconstructor(), drift_rates(skin), skin.touch.false_alarms)
+
+
+def drift_rates(skin: Skin) -> DriftRates:
+    return DriftRates(skin.tare.scale_per_s, skin.tare.contact_per_s)
 
 
 def run(stage: Preprocessing, frame: RawFrame) -> DeltaFrame:
@@ -56,7 +69,7 @@ def test_no_false_alarm_in_three_hours_of_drift(skin: Skin, bundle: Bundle, seed
     rng, directed, k = np.random.default_rng(seed), directions(bundle), len(bundle.pattern)
     pre, truth, live = bundle.prereconstructor(), np.asarray(bundle.z0, float), np.ones(len(bundle.pattern), bool)
     rates = np.array([skin.tare.scale_per_s] + [skin.tare.contact_per_s] * 16)
-    judge, follower, noise_level = TouchDetector(pre, skin), DriftFilter(pre, skin.tare), 1e-4
+    judge, follower, noise_level = touch_detector(bundle, skin), drift_filter(bundle, skin), 1e-4
     frame_s, block, worst, frames = FRAME_NS * 1e-9, 12, 0.0, 0
     for _ in range(3):
         drift, rate, now = np.zeros(17), np.zeros(17), FRAME_NS
@@ -147,7 +160,7 @@ def time(skin: Skin, bundle: Bundle, solved: Callable[..., Array]) -> Time:
     """Tared on the solved sheet, 80 dB."""
     made = Time(Preprocessing("palm", skin, bundle))
     assert not any(out.touched for out in made.frames(solved(), 8.0))
-    assert made.stage.untouched.baseline is not None
+    assert made.stage.baseline_estimator.baseline is not None
     return made
 
 
@@ -172,7 +185,7 @@ def test_a_touch_held_for_ten_minutes_does_not_fade(time: Time, solved: Callable
     def strength(outs: list[DeltaFrame]) -> float:
         assert all(out.touched for out in outs)
         d = np.mean([out.difference for out in outs if not out.held], axis=0)
-        operator, _ = time.stage.judge.operator(np.ones(len(d), bool), time.stage._noise(), 1)
+        operator, _ = time.stage.touch_detector.operator(np.ones(len(d), bool), time.stage.touch_estimator.noise(), 1)
         return float(operator.one_step(d, 48, None)[operator_inside(operator)].sum())
 
     list(time.frames(begun, 4.0))
@@ -215,7 +228,7 @@ def test_a_slow_press_is_not_swallowed(time: Time, solved: Callable[..., Array])
     outs = list(time.frames(lambda t: free + (pressed - free) * t / 20, 20.0))
     assert all(out.touched for out in outs[len(outs) // 2 :])
     last = [out for out in time.frames(pressed, 4.0) if not out.held][-1].difference
-    whole = (pressed - free) / time.stage.untouched.normaliser
+    whole = (pressed - free) / time.stage.baseline_estimator.normaliser
     assert whole @ last / (whole @ whole) > 0.8
 
 
@@ -287,7 +300,7 @@ def test_a_restored_baseline_is_as_old_as_it_is(stage: Preprocessing, skin: Skin
 
 def test_how_far_drift_may_have_gone_does_not_depend_on_how_time_is_cut(skin: Skin, bundle: Bundle) -> None:
     """After a long gap as after the same time in pieces: 256 s at once gave 5.1 %, in half seconds 0.23 %."""
-    whole, pieces = (DriftFilter(bundle.prereconstructor(), skin.tare) for _ in range(2))
+    whole, pieces = (drift_filter(bundle, skin) for _ in range(2))
     expected, variance = whole.predicted(256.0)
     for _ in range(512):
         pieces.mean, pieces.covariance = pieces.predicted(0.5)
@@ -298,7 +311,7 @@ def test_how_far_drift_may_have_gone_does_not_depend_on_how_time_is_cut(skin: Sk
 
 def test_a_drift_that_was_seen_is_expected_to_go_on(skin: Skin, bundle: Bundle) -> None:
     """A minute of steady drift, then a minute without frames: what is expected is nearer than that nothing changed."""
-    filter_, k = DriftFilter(bundle.prereconstructor(), skin.tare), len(bundle.pattern)
+    filter_, k = drift_filter(bundle, skin), len(bundle.pattern)
     rng, truth, live = np.random.default_rng(0), np.asarray(bundle.z0, float), np.ones(k, bool)
     z0, sigma, per_s = truth.copy(), np.full(k, 1e-4), 1e-4
     filter_.begin(FRAME_NS)
@@ -310,7 +323,7 @@ def test_a_drift_that_was_seen_is_expected_to_go_on(skin: Skin, bundle: Bundle) 
 
 
 def test_the_filter_goes_on_from_its_state(skin: Skin, bundle: Bundle) -> None:
-    filters, k = [DriftFilter(bundle.prereconstructor(), skin.tare) for _ in range(2)], len(bundle.pattern)
+    filters, k = [drift_filter(bundle, skin) for _ in range(2)], len(bundle.pattern)
     rng, truth, live = np.random.default_rng(0), np.asarray(bundle.z0, float), np.ones(k, bool)
     z0s = [truth.copy(), truth.copy()]
     filters[0].begin(FRAME_NS)

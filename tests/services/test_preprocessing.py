@@ -15,7 +15,7 @@ from services.board.boardlink import Scanning
 from services.describe import EVERY_S, MOVED
 from services.estimation import checks
 from services.estimation.sentinel import sentinel_of
-from services.estimation.tare import Baseline, disagreement, take
+from services.estimation.tare import Baseline, NoBaseline, disagreement, take
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
 from services.runtime.stage import Refused
@@ -178,7 +178,7 @@ def test_frames_that_acquisition_does_not_believe_are_no_baseline(
 ) -> None:
     for _ in range(144):
         run(stage, not_believed(board.frame(), reason))
-    assert stage.untouched.baseline is None
+    assert stage.baseline_estimator.baseline is None
     with pytest.raises(Refused, match="0 of 64 frames"):
         stage.command("tare", {})
     tared(stage, board)
@@ -189,15 +189,15 @@ def test_the_baseline_follows_no_frame_that_acquisition_does_not_believe(
     stage: Preprocessing, board: Board, reason: str
 ) -> None:
     tared(stage, board)
-    assert stage.untouched.baseline is not None
-    z0 = stage.untouched.baseline.z0.copy()
+    assert stage.baseline_estimator.baseline is not None
+    z0 = stage.baseline_estimator.baseline.z0.copy()
     for k in range(400):
         out = run(stage, not_believed(board.frame(1e-5 * min(1.0, k / 200)), reason))
         assert not out.valid and reason in out.reasons
-    assert np.array_equal(stage.untouched.baseline.z0, z0)
+    assert np.array_equal(stage.baseline_estimator.baseline.z0, z0)
     for _ in range(200):  # those that it believes are followed
         run(stage, board.frame(1e-5))
-    assert not np.array_equal(stage.untouched.baseline.z0, z0)
+    assert not np.array_equal(stage.baseline_estimator.baseline.z0, z0)
 
 
 def test_a_held_touch_is_not_averaged_over_frozen_frames(stage: Preprocessing, board: Board) -> None:
@@ -209,9 +209,9 @@ def test_a_held_touch_is_not_averaged_over_frozen_frames(stage: Preprocessing, b
     for _ in range(40):
         frozen = dataclasses.replace(again, scan=again.scan)
         run(stage, not_believed(frozen, "frozen"))
-    assert stage.hold.averaged <= 1
+    assert stage.frame_averager.averaged <= 1
     out = run(stage, board.frame(touch))
-    assert out.valid and out.touched and stage.hold.averaged <= 2
+    assert out.valid and out.touched and stage.frame_averager.averaged <= 2
 
 
 def test_no_false_touch_and_the_lightest_touch_is_seen(stage: Preprocessing, board: Board) -> None:
@@ -239,7 +239,7 @@ def test_an_unchanged_touch_is_held_and_averaged(stage: Preprocessing, board: Bo
     assert all((o.stack.size > 0) == (not o.held) for o in outs)
     scans = [o.scan for o in outs]
     assert [o.reconstructed for o in outs[7:10]] == [scans[7]] * 3
-    expected = touch * np.asarray(board.m.z0) / stage.untouched.normaliser
+    expected = touch * np.asarray(board.m.z0) / stage.baseline_estimator.normaliser
     error = [np.sqrt(np.mean((outs[i - 1].difference - expected) ** 2)) for i in (1, 16)]
     assert error[1] < 0.6 * error[0]  # 16 frames averaged; the tare's own noise remains
 
@@ -451,10 +451,10 @@ def test_more_noise_than_networks_were_trained_with_is_never_valid(skin: Skin, b
 
 def test_take_refuses_noise_and_missing_measurements(bundle: Bundle) -> None:
     pre, rng = bundle.prereconstructor(), np.random.default_rng(0)
-    with pytest.raises(Refused, match="scatter"):
+    with pytest.raises(NoBaseline, match="scatter"):
         take(bundle.z0 * (1 + 0.2 * rng.standard_normal((64, 120))), pre, "", 0)
     half = np.where(np.arange(120) < 70, np.nan, bundle.z0 * np.ones((64, 120)))
-    with pytest.raises(Refused, match="measurements give values"):
+    with pytest.raises(NoBaseline, match="measurements give values"):
         take(half, pre, "", 0)
 
 
@@ -469,7 +469,7 @@ def test_info_says_what_frames_are_compared_with(stage: Preprocessing, board: Bo
         if (info := stage.info()) is not None:
             told.append(info)
             copies.append(info["baseline"].copy())
-        off = np.abs(stage.untouched.baseline.z0 / told[-1]["baseline"] - 1)  # type: ignore[union-attr]
+        off = np.abs(stage.baseline_estimator.baseline.z0 / told[-1]["baseline"] - 1)  # type: ignore[union-attr]
         assert np.median(off) < 1.5 * per_scan * EVERY_S * 1e9 / FRAME_NS + MOVED
     seconds = 600 * FRAME_NS * 1e-9
     assert seconds / EVERY_S / 2 <= len(told) <= 1 + seconds / EVERY_S

@@ -1,0 +1,87 @@
+"""Whether something touches, decided together with drift: the baseline estimator and the touch detector at work."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from services.estimation.baseline import STEADY_S, BaselineEstimator
+from services.estimation.drift import DriftRates
+from services.estimation.evidence import Explanation
+from services.estimation.touch_detector import Noise, TouchDetector, TouchVerdict
+
+Array = NDArray[np.float64]
+
+
+class TouchEstimator:
+    """`touched` is what the last frame said."""
+
+    def __init__(self, bundle: Bundle, rates: DriftRates, frames: int, tracking_s: float, false_alarms: float) -> None:
+        """frames, tracking_s: see BaselineEstimator; false_alarms: see TouchDetector."""
+        self.false_alarms = false_alarms
+        self.baseline_estimator = BaselineEstimator(bundle, rates, frames, tracking_s)
+        self.touch_detector = TouchDetector(self.baseline_estimator.pre, rates, false_alarms)
+        self.touched = False
+
+    def reset(self) -> None:
+        self.touched = False
+        self.touch_detector.reset()
+        self.baseline_estimator.reset()
+
+    def begin_anew(self) -> None:
+        """There is another baseline."""
+        self.touched = False
+        self.touch_detector.reset()
+
+    def __call__(self, amplitude: Array, live: NDArray[np.bool_], now_ns: int) -> tuple[Array, TouchVerdict]:
+        """The difference (K,) of a frame's |Z| (K,) and what it says. A touch that begins is compared with an older
+        baseline. live (K,): measurements that count.
+        """
+        estimator, detector, noise = self.baseline_estimator, self.touch_detector, self.noise()
+        d = estimator.difference(amplitude, live)
+        since_s = estimator.since_s(now_ns)
+        if not self.touched and detector.uncertain(since_s):
+            explained = estimator.explain(d, live, since_s, detector.creep.direction(now_ns))
+            if explained.fits:
+                return self._alone(d, amplitude, live, explained, now_ns)
+        found = detector(d, live, noise, since_s, now_ns, self.touched)
+        if found.touched and not self.touched:
+            estimator.begin_touch()
+            d = estimator.difference(amplitude, live)
+            found = detector.begin(d, live, noise, estimator.since_s(now_ns), now_ns)
+        self.touched = found.touched
+        return d, found
+
+    def _alone(
+        self, d: Array, amplitude: Array, live: NDArray[np.bool_], explained: Explanation, now_ns: int
+    ) -> tuple[Array, TouchVerdict]:
+        """The same for a frame that no untouched one precedes for long: drift is estimated in the frame itself."""
+        estimator, detector = self.baseline_estimator, self.touch_detector
+        noise, limit = self.noise(), -float(np.log(self.false_alarms))
+        self.touched = explained.odds > limit
+        if self.touched:
+            creep = detector.creep.direction(now_ns)
+            if estimator.explain(d, live, STEADY_S, creep).as_good(explained):
+                estimator.steady(now_ns)  # no drift is read into noise
+            else:
+                estimator.drifted(explained.drift, now_ns, creep)
+                d = estimator.difference(amplitude, live)
+        found = detector.begin(d, live, noise, estimator.since_s(now_ns), now_ns, alone=self.touched)
+        return d, found._replace(touched=self.touched, score=explained.odds, threshold=limit)
+
+    def learn(self, amplitude: Array, live: NDArray[np.bool_], now_ns: int) -> None:
+        """The baseline follows the frame that was decided last."""
+        if self.touched:
+            self.baseline_estimator.touched(amplitude, live, now_ns)
+        else:
+            self.baseline_estimator.untouched(amplitude, live, now_ns, self.touch_detector.creep)
+
+    def noise(self) -> Noise:
+        baseline = self.baseline_estimator.baseline
+        assert baseline is not None
+        return Noise(self.baseline_estimator.sigma, baseline.frames, baseline.noise_frames)
+
+    def prepare(self) -> bool:
+        """Do one piece of what will be needed next; False where nothing is left."""
+        return self.baseline_estimator.baseline is not None and self.touch_detector.prepare(self.noise())
