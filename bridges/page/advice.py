@@ -19,6 +19,7 @@ ADVICE = {
     "extrapolated": "Press less hard, or calibrate for larger forces.",
     "late": "Look at the line to the board and the load of this computer.",
     "clock": "Wait: the board's clock is being learned. If it goes on, look at the cable.",
+    "gain": "Take everything off the skin; if it goes on, press Tare, and look at the board's supply.",
     "frozen": "Power-cycle the board.",
     "uncalibrated_force": "Calibrate the force: `skin calibrate force`.",
     "replay": "Nothing: this is a recording.",
