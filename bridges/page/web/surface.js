@@ -15,21 +15,23 @@ const TINTS = Array.from({ length: 65 }, (_, k) => // of drops from 0 to 1; the 
 export class Surface {
   /** null where it cannot be drawn here. */
   static async on(root) {
+    const probe = document.createElement("canvas").getContext("webgl2");
+    if (!probe) return null;
     try {
       const three = await import("/three/three.module.min.js");
-      return new Surface(root, three);
+      return new Surface(root, three, probe);
     } catch (why) {
       console.info(`no surface: ${why.message}`);
       return null;
     }
   }
 
-  constructor(root, three) {
+  constructor(root, three, probe) {
     this.root = root;
     this.three = three;
-    const probe = document.createElement("canvas").getContext("webgl2");
-    const named = probe?.getExtension("WEBGL_debug_renderer_info");
+    const named = probe.getExtension("WEBGL_debug_renderer_info");
     this.slow = SLOW.test(named ? probe.getParameter(named.UNMASKED_RENDERER_WEBGL) : "");
+    probe.getExtension("WEBGL_lose_context")?.loseContext();
     this.renderer = new three.WebGLRenderer({ antialias: !this.slow, alpha: true });
     this.renderer.debug.checkShaderErrors = false; // asking would wait for the compiler
     this.drawn = 0;
