@@ -52,12 +52,15 @@ def domain_id(given: int | None) -> int:
 
 
 def configure(interface: str) -> None:
-    """Tell Cyclone DDS what ROS 2 needs; what $CYCLONEDDS_URI says counts more. `interface`: the only network interface
-    to use, or "" for all as Cyclone chooses them; "lo" too where ROS's own variables ask for this host alone.
+    """Tell Cyclone DDS what ROS 2 needs. `interface`: the only network interface to use, or "" for those that Cyclone
+    chooses; "lo" too where ROS's own variables ask for this host alone. With $CYCLONEDDS_URI the interfaces are its
+    own business.
     """
+    theirs = os.environ.get("CYCLONEDDS_URI", "")
     here = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
     if here or os.environ.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"):
         interface = interface or "lo"
+    interface = "" if theirs else interface
     text = "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
     if interface:
         alone = ' multicast="false"' if interface == "lo" else ""  # the loopback has none
@@ -67,7 +70,6 @@ def configure(interface: str) -> None:
         text += "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
         text += "</Discovery>"
     ours = f"<CycloneDDS><Domain>{text}</Domain></CycloneDDS>"
-    theirs = os.environ.get("CYCLONEDDS_URI", "")
     os.environ["CYCLONEDDS_URI"] = f"{ours},{theirs}" if theirs else ours
 
 
