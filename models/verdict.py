@@ -32,7 +32,7 @@ MEAN_OF_RMS = float(np.sqrt(np.pi) / 2)  # mean distance of a two-dimensional no
 
 
 @dataclass(frozen=True)
-class Verdict:
+class TrainingVerdict:
     """grade: "good", "usable" or "too little"; text: a few sentences, for whoever started the training."""
 
     grade: str
@@ -72,7 +72,7 @@ def position_floor(skin: str, held_out: Samples, decibel: float = 70.0) -> float
 
 def judge(
     held_out: Mapping[str, Mapping[str, float]], batches: int, minutes: float, single_step: float, floor: float
-) -> Verdict:
+) -> TrainingVerdict:
     """held_out: level -> figures of models.evaluation; single_step: see `one_step`; floor: see `position_floor`."""
     clean, noisy = held_out["noise-free"], held_out["70 dB"]
     iou, place = clean["contact IoU"], noisy["position % of side"]
@@ -104,7 +104,7 @@ def judge(
         )
     figures = {"contact_iou": iou, "one_step_contact_iou": single_step, "position_percent": place}
     figures |= {"position_floor_percent": floor, "expected_contact_iou": iou + gain, "batches": float(batches)}
-    return Verdict(grade, text, figures)
+    return TrainingVerdict(grade, text, figures)
 
 
 def _round(minutes: float) -> int:

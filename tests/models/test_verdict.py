@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from models import build, geometry, samples, verdict  # noqa: E402
 from models.bundle import Bundle  # noqa: E402
-from models.network import Config  # noqa: E402
+from models.network import NetworkConfig  # noqa: E402
 from models.pace import Pace, TrainingBar  # noqa: E402
 from models.scenes import random_scene  # noqa: E402
 from models.shapes import to_rows  # noqa: E402
@@ -124,7 +124,7 @@ def test_a_training_shows_how_it_gets_on(scenes, tmp_path, capsys):
     torch.set_num_threads(1)
     pre = Bundle.load("square16").prereconstructor()
     batches = samples.Batches(scenes, pre, geometry.load("square16"), seed=0, size=16, groups=2, bank=4)
-    trainer = Trainer(Config(channels=(8, 8, 8), blocks=(1, 1, 1)), batches, scenes)
+    trainer = Trainer(NetworkConfig(channels=(8, 8, 8), blocks=(1, 1, 1)), batches, scenes)
     trainer.run(0.02, tmp_path / "tiny.pt", name="tiny")
     assert "tiny: minute 0.0" in capsys.readouterr().out
     assert set(trainer.pace.parts) == {"batches", "network", "held-out"} and len(trainer.curve) == 1
