@@ -179,7 +179,9 @@ def main(argv: list[str] | None = None) -> None:
         print(f"verdict: {said['full']['verdict']['text']}")
 
 
-def _verdict(skin: str, pre: PreReconstructor, held_out: samples.Samples, said: dict[str, Any]) -> verdict.TrainingVerdict:
+def _verdict(
+    skin: str, pre: PreReconstructor, held_out: samples.Samples, said: dict[str, Any]
+) -> verdict.TrainingVerdict:
     training = said["training"]
     without, floor = verdict.one_step(held_out, pre), verdict.position_floor(skin, held_out)
     return verdict.judge(said["held_out"], training["batches"], training["minutes"], without, floor)

@@ -13,7 +13,7 @@ import msgpack
 
 from . import fields as _fields
 from .errors import EitskinError
-from .fields import FieldMismatch, brief
+from .fields import FieldError, brief
 from .frame_types import (
     ELECTRODE_STATES,
     INFO_KEYS,
@@ -78,7 +78,7 @@ def pack(frame: Frame) -> bytes:
     try:
         body = _RECORDS[topic].encode(frame)
         packed: bytes = msgpack.packb(body)
-    except FieldMismatch as bad:
+    except FieldError as bad:
         raise FrameError(topic, bad.path.lstrip("."), bad.found, bad.expected) from None
     except (TypeError, ValueError, OverflowError) as bad:
         raise FrameError(topic, "", f"what msgpack refuses ({bad})", "the fields' own types") from None
@@ -100,7 +100,7 @@ def unpack(message: bytes) -> Frame:
     try:
         frame: Frame = record.decode(fields_read)
         finite = record.finite(frame)
-    except FieldMismatch as bad:
+    except FieldError as bad:
         raise FrameError(name, bad.path.lstrip("."), bad.found, bad.expected) from None
     except Exception as bad:  # a reader drops one message rather than die of it, whatever a checker has overlooked
         raise FrameError(

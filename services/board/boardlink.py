@@ -6,18 +6,14 @@ raises.
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from protocol import link
 from protocol.frames import STATUS_OPEN, STATUS_RTIA
 from services.board.clock import GOOD_NS, DeviceClock
 from services.board.line_pace import LinePace
 from services.board.scan_check import ScanCheck
+from services.board.scanning import Scanning, unfit
 from services.board.time_questions import TimeQuestions
 
 HELLO_EVERY_S = 0.2
@@ -30,23 +26,6 @@ DEAD_SCANS = 10  # in a row with all measurements out of range: the board may ha
 DEAD_AGAIN_S = 5.0  # then it is configured again, at most this often
 REFUSED_AGAIN_S = 1.0  # a refused board is tried again, for it may be power-cycled or flashed
 NO_CURRENT = STATUS_OPEN | STATUS_RTIA
-
-
-@dataclass(frozen=True)
-class Scanning:
-    """What the board is to do: scan list (K, 4) of 0-based electrodes, DFT points, gain resistor."""
-
-    pattern: NDArray[np.integer]
-    dft_points: int
-    rtia_ohm: float
-
-    @property
-    def config(self) -> int:
-        """Id of this configuration on the board: from its content, so that one of an earlier session is never taken
-        for it.
-        """
-        text = self.pattern.astype("u1").tobytes() + f"{self.dft_points} {self.rtia_ohm:g}".encode()
-        return zlib.crc32(text) & 0xFFFF
 
 
 class BoardLink:
@@ -218,23 +197,8 @@ class BoardLink:
     def _introduced(self, ident: link.Ident, now_s: float) -> None:
         self.ident = ident
         self.clock.timed = bool(ident.capabilities & link.Capability.TIME)
-        needed = int(self.scanning.pattern.max()) + 1
-        if ident.schema_hash != link.SCHEMA_HASH or ident.link_version != link.LINK_VERSION:
-            found, ours = f"{ident.schema_hash:08x}", f"{link.SCHEMA_HASH:08x}"
-            self._refuse(
-                f"firmware {ident.firmware!r} speaks schema {found}, this program {ours}: flash a matching one", now_s
-            )
-        elif ident.chip_id != link.CHIP_ID:
-            found = f"0x{ident.chip_id:04x}"
-            self._refuse(
-                f"the converter says chip id {found}, expected 0x{link.CHIP_ID:04x}: power-cycle the board", now_s
-            )
-        elif ident.electrodes < needed or ident.max_scan < len(self.scanning.pattern):
-            self._refuse(
-                f"the board has {ident.electrodes} electrodes and takes {ident.max_scan} measurements; "
-                f"the bundle needs {needed} and {len(self.scanning.pattern)}",
-                now_s,
-            )
+        if wrong := unfit(ident, self.scanning):
+            self._refuse(wrong, now_s)
         elif self.state in ("hello", "refused"):
             self._pending = [self.scanning, *([self._idle] if self._idle and self.switches else [])]
             self._to(now_s, "config")

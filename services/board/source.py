@@ -18,10 +18,11 @@ from protocol.frames import DeltaFrame, RawFrame
 from protocol.sockets import NewestReader
 from services.board import port as ports
 from services.board.adaptive import AdaptiveScan, Passed
-from services.board.boardlink import BoardLink, Scanning
+from services.board.boardlink import BoardLink
 from services.board.clock import UNSETTLED_NS
 from services.board.host_time import STOOD_STILL_S, HostTime, Suspensions
 from services.board.remarks import Remarks
+from services.board.scanning import Scanning
 from services.estimation.sentinel import sentinel_of
 from services.runtime.config import Skin
 from services.runtime.stage import Health, add_reason, valid_for_s

@@ -16,7 +16,8 @@ from protocol import transport
 from protocol.link import SCHEMA_HASH
 from protocol.runtime import RuntimeDirError, runtime_dir
 from services.board import port as ports
-from services.board.boardlink import BoardLink, Scanning
+from services.board.boardlink import BoardLink
+from services.board.scanning import Scanning
 from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
 from services.contacts.force import ForceLaw

@@ -28,12 +28,11 @@ from services.runtime.config import (
     ConfigFile,
     Indenter,
     Pose,
-    Section,
     Skin,
-    Skip,
     TareConfig,
     TouchConfig,
 )
+from services.runtime.config_sections import Section, Skip
 
 KEY = "settings"
 """The key of a recording's metadata."""

@@ -11,7 +11,8 @@ from bench.speed.sentinel_host import CHAIN_S, AdaptiveHost
 from protocol import link
 from protocol.frames import DeltaFrame
 from services.board.adaptive import DEAF_S, FULL_EVERY_S, AdaptiveScan
-from services.board.boardlink import SWITCH_S, BoardLink, Scanning
+from services.board.boardlink import SWITCH_S, BoardLink
+from services.board.scanning import Scanning
 from tests.services.fake_board import FakeBoard
 
 REST_S = 6.6  # from power-up to an idling board
