@@ -17,9 +17,11 @@ from protocol.topics import TOPIC_OF
 NEWEST = ("contact", "image", "delta", "truth", "shape")
 """Topics that a viewer may ask for. Status and info come with any of them."""
 LOOK_S = 0.1
-"""How often sockets are looked at that did not speak up."""
-GATHER_S = 0.03
-"""How long what comes before a scan's contacts waits for them, so that a scan is one message."""
+"""How often all sockets are looked at. In between a scan's contacts have them looked at: what they were made of has
+come before them, and being woken for each of it costs more than all the rest.
+"""
+GATHER_S = 0.003
+"""How long contacts wait for the outlines that follow them, so that a scan is one message."""
 ASK_AGAIN_S = 0.5
 
 Reconstruction = tuple[str, int]
@@ -49,13 +51,12 @@ class SkinFeed:
         """Of the newest contact frame: board, stub, replay; "" while nobody looks, or nothing has come."""
         self._watched: Counter[str] = Counter()
         self._readers: dict[str, NewestReader | AllReader] = {}
-        self._files: dict[str, int] = {}
         self._ages: Ages | None = None
         self._version = 0
-        self._empty_ns = 0
+        self._empty_ns = 0  # all sockets were empty then
         self._asked = 0.0
         self._look: asyncio.TimerHandle | None = None
-        self._gathering: asyncio.TimerHandle | None = None
+        self._listening = False  # for contacts
 
     def watch(self, topics: Iterable[str]) -> None:
         """Somebody looks at these."""
@@ -83,12 +84,16 @@ class SkinFeed:
     def _open(self, topic: str) -> None:
         every = topic == "status"
         reader = AllReader(["status", "info"], self.skin) if every else NewestReader(topic, self.skin)
-        self._readers[topic], self._files[topic] = reader, int(reader.socket.fileno())
-        asyncio.get_running_loop().add_reader(self._files[topic], self._drain)
+        self._readers[topic] = reader
+        if topic == "contact":
+            self._listen()
 
     def _close(self, topic: str) -> None:
-        asyncio.get_running_loop().remove_reader(self._files.pop(topic))
-        self._readers.pop(topic).close()
+        reader = self._readers.pop(topic)
+        if topic == "contact":
+            asyncio.get_running_loop().remove_reader(int(reader.socket.fileno()))
+            self._listening = False
+        reader.close()
         for known in (self.latest, self.pictures):
             for key in list(known):
                 if key.partition("/")[0] == topic or (topic == "status" and key == "info"):
@@ -96,43 +101,50 @@ class SkinFeed:
 
     def _forget(self) -> None:
         """Nobody looks: no socket, no timer, no thread."""
-        for timer in (self._look, self._gathering):
-            if timer is not None:
-                timer.cancel()
-        self._look = self._gathering = None
+        if self._look is not None:
+            self._look.cancel()
+        self._look = None
         if self._ages is not None:
             self._ages.close()
             self._ages = None
         self.source = ""
 
     def _looked(self) -> None:
-        self._drain()
-        self._look = asyncio.get_running_loop().call_later(LOOK_S, self._looked)
-
-    def _drain(self) -> None:
-        """Take in what has arrived. ZeroMQ tells of it at the edge only, so all of it, from all sockets."""
-        now, heard = time.monotonic_ns(), set()
-        for reader in list(self._readers.values()):
+        """Take in what has come, all of it: ZeroMQ tells of it at the edge only."""
+        looked_ns, heard = time.monotonic_ns(), set()
+        for reader in tuple(self._readers.values()):
             while (got := reader.recv_message()) is not None:
-                heard.add(self._take(*got, now))
-        self._empty_ns = now
-        if "contact" in heard:
-            self._news(True)
-        elif heard and self._gathering is None:
-            self._gathering = asyncio.get_running_loop().call_later(GATHER_S, self._news, False)
+                heard.add(self._take(*got, looked_ns))
+        self._empty_ns = looked_ns
+        if heard:
+            self._tell("contact" in heard)
+        self._listen()
+        self._look_in(LOOK_S)
 
-    def _news(self, contacts: bool) -> None:
-        if self._gathering is not None:
-            self._gathering.cancel()
-            self._gathering = None
-        self._tell(contacts)
+    def _look_in(self, seconds: float) -> None:
+        if self._look is not None:
+            self._look.cancel()
+        self._look = asyncio.get_running_loop().call_later(seconds, self._looked)
+
+    def _listen(self) -> None:
+        """Be woken by the next contacts."""
+        reader = self._readers.get("contact")
+        if reader is not None and not self._listening:
+            self._listening = True
+            asyncio.get_running_loop().add_reader(int(reader.socket.fileno()), self._spoken)
+
+    def _spoken(self) -> None:
+        """Something is to be read of the contacts; its file goes on to say so until it was."""
+        asyncio.get_running_loop().remove_reader(int(self._readers["contact"].socket.fileno()))
+        self._listening = False
+        self._look_in(GATHER_S)
 
     def _take(self, frame: Frame, message: bytes, now: int) -> str:
         topic = key = TOPIC_OF[type(frame)].name
         if self._ages is None:
             self._ages = Ages()
         # Another host's frame may have lain in the socket since that was last seen empty; our own say when.
-        measured = self._ages.measured_ns(frame, now if frame.host == host_id() else self._empty_ns)
+        measured = self._ages.measured_ns(frame, now if frame.host in ("", host_id()) else self._empty_ns)
         if isinstance(frame, StatusFrame):
             key = f"status/{frame.process}"
         elif topic == "contact":

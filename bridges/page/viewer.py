@@ -37,6 +37,7 @@ class Viewer:
         self._sent: dict[str, int] = {}  # version by key
         self._pictures: dict[str, Reconstruction | None] = {}  # that the browser has, by topic
         self._unread = 0
+        self._news = False  # since the last message
         self._go = asyncio.Event()
         self._under_way: set[asyncio.Task[None]] = set()
 
@@ -47,6 +48,7 @@ class Viewer:
 
     def tell(self) -> None:
         """There is news."""
+        self._news = True
         self._go.set()
 
     async def run(self, hello: dict[str, Any]) -> None:
@@ -68,6 +70,7 @@ class Viewer:
             self._go.clear()
             if self._unread >= MOST_UNREAD or self._feed is None:
                 continue
+            self._news = False
             batch = self._batch(self._feed)
             if not batch:
                 continue
@@ -103,7 +106,8 @@ class Viewer:
             log.warning("a browser sent what is no map: %s", foreign(text, 80))
         elif "ack" in said:
             self._unread = max(0, self._unread - 1)
-            self._go.set()
+            if self._news:  # that had to wait
+                self._go.set()
         elif "ping" in said:
             await self._answer({"kind": "pong", "ping": said["ping"], "now": time.monotonic_ns()})
         elif "want" in said:

@@ -221,3 +221,5 @@ paint(by("ramp"), Float32Array.from({ length: 256 }, (_, k) => k / 255), 1, 256,
 paint(by("heat"), new Float32Array(4), 2, 2, 1);
 setInterval(look, 100); // also where nothing is drawn, as in a tab at the back
 requestAnimationFrame(draw);
+
+export { link, map, state }; // for tests, and for who looks with the browser's tools
