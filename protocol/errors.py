@@ -24,6 +24,9 @@ class EitskinError(Exception):
         ├── GeometryError (ValueError)        a skin that cannot exist
         ├── PatternError (ValueError)         a drive pattern that cannot be measured or inverted
         ├── MeshError (RuntimeError)          an outline that cannot be meshed
+        ├── MismatchError (ValueError)        a sheet that differs from its model in a way that cannot be
+        ├── TooFewMeasured                    an untouched frame in which too little was measured to calibrate on
+        ├── OtherScenes (ValueError)          training scenes of another skin, or of this one as it was
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── ConfigError                       services: skin.toml cannot be used

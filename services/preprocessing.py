@@ -153,7 +153,7 @@ class Preprocessing(Stage):
         teaches = learns  # whether the baseline is to learn from this frame
         # Measured bundles have no sign model, so this check is skipped.
         if self.bundle.matrices.normalisation == "model" and impossible(
-            d, self.baseline_estimator.sigma, live & self.electrodes.self_sensing, self.touch_estimator.touched
+            d, self.baseline_estimator.sigma, live & self.electrodes.check.self_sensing, self.touch_estimator.touched
         ):
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")

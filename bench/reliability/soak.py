@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
+from bench.reliability.counts import Counts
 from bench.reliability.random_scene import SCAN_S, TARE_S, RandomScene, random_scene
 from bench.reliability.scenes import SolvedSheet
 from bench.reliability.session import Moment, Session
@@ -26,7 +27,7 @@ KEPT = 40  # notes of a report
 
 
 @dataclass
-class SoakTally:
+class SoakTally(Counts):
     frames: int = 0
     counted: int = 0  # valid, and not `changing`
     invalid: int = 0
@@ -38,9 +39,8 @@ class SoakTally:
     blamed: Counter[str] = field(default_factory=Counter)  # what failed last before a frame that was wrong
     notes: list[str] = field(default_factory=list)
 
-    def add(self, other: SoakTally) -> None:
-        for name, value in vars(other).items():
-            setattr(self, name, getattr(self, name) + value)
+    def add(self, other: Self) -> None:
+        super().add(other)
         self.notes = self.notes[:KEPT]
 
     def row(self) -> dict[str, Any]:

@@ -36,7 +36,6 @@ MODEL_ERROR = 1.5e-3  # of |d|: what a contact's change may be off the formula
 SHORT_WAY = 4.7  # times the nominal contact impedance: what the current's short way through an electrode comes to
 OTHER_BEFORE = 1.25  # b may be so many times what follows of a, and its inverse
 TELLING = 800.0  # |d| over the noise of one measurement from which a touch on an electrode would show
-LIKELY = 300.0  # from which 1 % of touches within 1 mm of an electrode would not show
 SUSPECT = 60.0  # from which one elsewhere would
 UNTOUCHED = 0.03  # of |d|, what a changed contact leaves of it where nothing else changed
 LEAST_RISE = 0.03  # of the nominal contact impedance
@@ -53,7 +52,6 @@ FEW_OF = 0.05  # share of the other pairs that may have
 class Changed(NamedTuple):
     electrode: int
     sure: bool  # whether it is no touch on this electrode
-    likely: bool = True  # whether few touches on this electrode look so: sure where it lasts
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class ContactDrift:
         expected = _most_noise(sigma[live]) + (MODEL_ERROR * size) ** 2
         sure = size >= TELLING * noise
         if self._left_by_rise(k, d, live, aside) <= expected:
-            return Changed(k, sure, size >= LIKELY * noise)
+            return Changed(k, sure)
         within = sure and aside is None and self._rises_within(k, d, live, expected)
         return Changed(k, True) if within else None
 
@@ -184,6 +182,11 @@ class ChangedContacts:
     def __init__(self, bundle: Bundle, members: NDArray[np.bool_]) -> None:
         self._drift, self._k = ContactDrift(bundle, members), members.shape[1]
         self.reset()
+
+    @property
+    def knows(self) -> bool:
+        """Whether the bundle predicts what a contact does."""
+        return self._drift.knows
 
     def reset(self) -> None:
         self.felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes

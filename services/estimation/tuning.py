@@ -62,6 +62,16 @@ class Tuning:
     gain_sigmas: float = _number(6.0, "sd", "of the common factor's noise, from which it is one", "1e-8 a frame")
     gain_left: float = _number(4.0, "sd of chi-square", "what a common factor may leave", "a touch leaves hundreds")
     lifted_sd: float = _number(2.0, "relative", "sd of a contact that lifts", "sheet: to 3 times and more")
+    contact_nats: float = _number(
+        10.0, "nats", "by which a changed contact must be likelier", "bench/reliability/shadow.py"
+    )
+    contact_apart: float = _number(
+        0.3,
+        "model units",
+        "from an electrode, within which a touch looks like its contact",
+        "bench/reliability/shadow.py",
+    )
+    contact_drift_s: float = _number(10.0, "s", "for which contacts drift, within which one is well", "prior")
     fault_misfit: float = _number(
         0.05, "of the fault's |d|", "what its prediction gets wrong", "prior: touches meanwhile"
     )

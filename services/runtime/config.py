@@ -58,6 +58,14 @@ class Pose(Section):
         return q
 
 
+class Surface(Section):
+    """What the sheet is wrapped round; without it the skin lies flat. See services/contacts/surface.py."""
+
+    kind: Literal["cylinder"]
+    radius_m: Annotated[float, Field(gt=0, le=10)]  # of the sheet on it, not of the limb below its foam
+    axis_degrees: Annotated[float, Field(ge=-360, le=360)] = 90.0  # of the cylinder's axis to the sheet's x
+
+
 class TareConfig(Section):
     """How the untouched baseline is taken and kept."""
 
@@ -96,6 +104,8 @@ class Skin(Section):
     bundle: str  # the name of a folder of models/bundles, else a path
     frame_id: str = ""  # default: the skin's name
     pose: Pose = Pose()
+    surface: Surface | None = None  # what the sheet is wrapped round
+    contacts_in: Literal["skin", "parent"] = "skin"  # "parent": contacts come in the frame that `pose` names
     mismatch: str = "none"  # of the stub's sheet: by what it differs from the bundle, a name of models/mismatch.py
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
     indenter: Indenter | None = None
