@@ -9,8 +9,9 @@ import secrets
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +19,18 @@ from protocol.control import ControlClient, ControlError
 from protocol.runtime import runtime_dir
 
 from .feed import SkinFeed
+from .replays import REPLAY, Replay, ReplayRefused, listed
 
 TOKEN_FILE = "page.token"
-TIMEOUT_S = {"preprocessing": 10.0, "stub": 2.0, "recorder": 2.0}
+TIMEOUT_S = {"preprocessing": 10.0, "stub": 2.0}
+AT_ONCE_S, STOP_S = 1.5, 5.0
 
 
 @dataclass(frozen=True)
 class Button:
-    """The process that a command goes to, and the arguments it may have. `stub`: only where the skin is the stub's."""
+    """The process that a command goes to ("": the page itself), and the arguments it may have. `stub`: only where the
+    skin is the stub's.
+    """
 
     process: str
     args: tuple[str, ...] = ()
@@ -38,7 +43,9 @@ BUTTONS = {
     "release": Button("stub", ("finger",)),
     "scene": Button("stub", ("name",)),
     "fault": Button("stub", ("name", "args", "seconds", "clear")),
-    "record": Button("recorder", ("on",), stub=False),
+    "record": Button("", ("on",), stub=False),
+    "recordings": Button("", stub=False),
+    "replay": Button("", ("file", "skin", "speed", "from"), stub=False),
 }
 
 
@@ -62,9 +69,11 @@ def token() -> str:
 class Buttons:
     """Carries out what browsers ask for."""
 
-    def __init__(self, secret: str, feeds: Mapping[str, SkinFeed], recordings: str) -> None:
-        self._secret, self._feeds = secret, feeds
+    def __init__(self, secret: str, feeds: dict[str, SkinFeed], recordings: str, tell: Callable[[bool], None]) -> None:
+        """tell: called when there is news of a replay."""
+        self._secret, self._feeds, self._tell = secret, feeds, tell
         self.recording = RecorderProcess(Path(recordings)) if recordings else None
+        self._replay: Replay | None = None
 
     def knows(self, given: str) -> bool:
         """Whether somebody has the token."""
@@ -81,46 +90,77 @@ class Buttons:
             return _no(f"{command} is for the stub's skin: {skin} is measured by {feed.source or 'nobody just now'}")
         if unknown := sorted(set(args) - set(button.args)):
             return _no(f"{command} has no argument {', '.join(unknown)[:80]}")
+        if button.process and skin == REPLAY:
+            return _no(f"{command} is for a skin, not for a recording")
         try:
-            return {"ok": True, "result": await asyncio.to_thread(self._call, button.process, skin, command, args)}
-        except (ControlError, OSError) as why:
+            return {"ok": True, "result": await self._carry_out(button.process, skin, command, args)}
+        except (ControlError, OSError, ReplayRefused) as why:
             return _no(str(why))
 
-    def _call(self, process: str, skin: str, command: str, args: dict[str, Any]) -> dict[str, Any]:
+    async def _carry_out(self, process: str, skin: str, command: str, args: dict[str, Any]) -> dict[str, Any]:
+        if process:
+            client = ControlClient(process, TIMEOUT_S[process])
+            return await asyncio.to_thread(partial(client.call, command, skin=skin, **args))
+        if self.recording is None:
+            raise ReplayRefused("the page has no folder for recordings")
         if command == "record":
-            if self.recording is None:
-                raise ControlError("bad_request", "the page has no folder for recordings")
-            return self.recording.start() if args.get("on") else self.recording.stop()
-        return ControlClient(process, TIMEOUT_S[process]).call(command, skin=skin, **args)
+            return await asyncio.to_thread(self.recording.start if args.get("on") else self.recording.stop)
+        if command == "recordings":
+            return {"files": await asyncio.to_thread(listed, self.recording.folder)}
+        return await self._replayed(skin, self.recording.folder, args)
 
-    def close(self) -> None:
+    async def _replayed(self, skin: str, folder: Path, args: dict[str, Any]) -> dict[str, Any]:
+        """One replay at a time: a new one, or another place of it, ends the one before."""
+        if self._replay is not None:
+            await asyncio.to_thread(self._replay.close)
+            self._replay = None
+        if (feed := self._feeds.pop(REPLAY, None)) is not None:
+            feed.close()
+        if not args.get("file"):
+            return {"playing": False}
+        shown = args.get("skin") or skin
+        if shown not in self._feeds:
+            raise ReplayRefused(f"there is no skin {shown!r:.64}")
+        self._replay = Replay(folder, str(args["file"]), args.get("speed", 1.0), args.get("from", 0.0))
+        self._feeds[REPLAY] = SkinFeed(str(shown), self._tell, self._replay.runtime)
+        return {"playing": True}
+
+    async def close(self) -> None:
+        if self._replay is not None:
+            await asyncio.to_thread(self._replay.close)
         if self.recording is not None:
-            self.recording.stop()
+            await asyncio.to_thread(self.recording.stop)
 
 
 class RecorderProcess:
     """A recorder that the page starts and ends."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder.absolute()
+        self.folder = folder.absolute()
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> dict[str, Any]:
+        """Raises ReplayRefused where it ends at once: another one records, or the folder cannot be written to."""
         if self._process is None or self._process.poll() is not None:
-            command = [sys.executable, "-m", "services.recorder", "--folder", str(self._folder)]
+            command = [sys.executable, "-m", "services.recorder", "--folder", str(self.folder)]
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-        return {"recording": True, "folder": str(self._folder)}
+            try:
+                self._process.wait(AT_ONCE_S)
+            except subprocess.TimeoutExpired:
+                return {"recording": True, "folder": str(self.folder)}
+            raise ReplayRefused("the recorder ended at once; the service's output says why")
+        return {"recording": True, "folder": str(self.folder)}
 
     def stop(self) -> dict[str, Any]:
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
             try:
-                self._process.wait(5)
+                self._process.wait(STOP_S)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
         self._process = None
-        return {"recording": False, "folder": str(self._folder)}
+        return {"recording": False, "folder": str(self.folder)}
 
 
 def _no(why: str) -> dict[str, Any]:

@@ -7,12 +7,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 from protocol.ages import Ages
 from protocol.frames import DeltaFrame, Frame, ImageFrame, InfoFrame, StatusFrame
 from protocol.runtime import host_id
 from protocol.sockets import AllReader, NewestReader
-from protocol.topics import TOPIC_OF
+from protocol.topics import TOPIC_OF, TOPICS
 
 NEWEST = ("contact", "image", "delta", "truth", "shape")
 """Topics that a viewer may ask for. Status and info come with any of them."""
@@ -41,8 +42,9 @@ class Latest:
 class SkinFeed:
     """Belongs to one event loop. `tell` is called when there is news for viewers, and whether contacts are among it."""
 
-    def __init__(self, skin: str, tell: Callable[[bool], None]) -> None:
-        self.skin, self._tell = skin, tell
+    def __init__(self, skin: str, tell: Callable[[bool], None], folder: Path | None = None) -> None:
+        """folder: the runtime folder of a replay, whose sockets are not those of the service."""
+        self.skin, self._tell, self._folder = skin, tell, folder
         self.latest: dict[str, Latest] = {}
         """By topic; of status by "status/PROCESS"."""
         self.pictures: dict[str, Latest] = {}
@@ -82,8 +84,10 @@ class SkinFeed:
             self._looked()
 
     def _open(self, topic: str) -> None:
+        producer = "preprocessing" if topic == "status" else TOPICS[topic].producers[0]
+        address = None if self._folder is None else f"ipc://{self._folder}/{producer}.ipc"
         every = topic == "status"
-        reader = AllReader(["status", "info"], self.skin) if every else NewestReader(topic, self.skin)
+        reader = AllReader(["status", "info"], self.skin, address) if every else NewestReader(topic, self.skin, address)
         self._readers[topic] = reader
         if topic == "contact":
             self._listen()

@@ -25,6 +25,7 @@ from .advice import ADVICE
 from .commands import BUTTONS, Buttons
 from .feed import SkinFeed
 from .fetch_three import three_folder, verified
+from .replays import REPLAY
 from .settings import LOOPBACK, PageSettings
 from .viewer import Viewer
 
@@ -46,7 +47,7 @@ class PageServer:
         """handed_on: called with the skin, and when it was measured, of each scan that goes to the browsers."""
         self.settings, self.port, self._handed_on = settings, 0, handed_on
         self.feeds = {skin: SkinFeed(skin, partial(self._tell, skin)) for skin in settings.skins}
-        self.buttons = Buttons(secret, self.feeds, settings.recordings)
+        self.buttons = Buttons(secret, self.feeds, settings.recordings, partial(self._tell, REPLAY))
         self._viewers: set[Viewer] = set()
         self._three = verified(three_folder())
         self._files = {f"/{path.name}": path.read_bytes() for path in WEB.iterdir() if path.suffix in TYPES}
@@ -143,24 +144,24 @@ class PageServer:
             "advice": ADVICE,
             "electrode_states": list(ELECTRODE_STATES),
             "three": bool(self._three),
-            "buttons": [name for name in BUTTONS if name != "record" or self.buttons.recording is not None],
+            "buttons": [name for name, button in BUTTONS.items() if button.process or self.buttons.recording],
         }
 
     @property
     def looking(self) -> Counter[str]:
-        """How many browsers look at each skin."""
-        return Counter(viewer.skin for viewer in list(self._viewers))
+        """How many browsers look at each skin, or at the replay."""
+        return Counter(viewer.name for viewer in list(self._viewers))
 
-    def _tell(self, skin: str, contacts: bool) -> None:
-        if contacts:
-            self._handed_on(skin, self.feeds[skin].latest["contact"].measured_ns)
+    def _tell(self, name: str, contacts: bool) -> None:
+        if contacts and name in self.settings.skins:
+            self._handed_on(name, self.feeds[name].latest["contact"].measured_ns)
         for viewer in self._viewers:
-            if viewer.skin == skin:
+            if viewer.name == name:
                 viewer.tell()
 
     async def close(self) -> None:
         """Send the browsers away."""
         await asyncio.gather(*(viewer.close() for viewer in list(self._viewers)), return_exceptions=True)
+        await self.buttons.close()
         for feed in self.feeds.values():
             feed.close()
-        await asyncio.to_thread(self.buttons.close)

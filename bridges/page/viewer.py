@@ -20,6 +20,7 @@ MOST_UNREAD = 2
 """Messages on their way that the browser has not yet said to have read; further frames replace each other here."""
 PAUSE_S = 0.03
 """At least so long between two messages: 30 pictures a second are what a person sees."""
+MOST_NAME = 64
 AT_ONCE = 8
 """Commands under way for one browser; a further one is refused."""
 
@@ -33,6 +34,8 @@ class Viewer:
     def __init__(self, socket: web.WebSocketResponse, feeds: Mapping[str, SkinFeed], command: Command) -> None:
         self._socket, self._feeds, self._command = socket, feeds, command
         self._feed: SkinFeed | None = None
+        self.name = ""
+        """What it looks at: a skin's name, or that of the replay; "" for nothing yet."""
         self._topics: frozenset[str] = frozenset()
         self._sent: dict[str, int] = {}  # version by key
         self._pictures: dict[str, Reconstruction | None] = {}  # that the browser has, by topic
@@ -40,11 +43,6 @@ class Viewer:
         self._news = False  # since the last message
         self._go = asyncio.Event()
         self._under_way: set[asyncio.Task[None]] = set()
-
-    @property
-    def skin(self) -> str:
-        """Which one it looks at; "" for none yet."""
-        return "" if self._feed is None else self._feed.skin
 
     def tell(self) -> None:
         """There is news."""
@@ -75,7 +73,7 @@ class Viewer:
             if not batch:
                 continue
             self._unread += 1
-            answer = {"kind": "frames", "skin": self._feed.skin, "now": time.monotonic_ns(), "frames": batch}
+            answer = {"kind": "frames", "skin": self.name, "now": time.monotonic_ns(), "frames": batch}
             await self._socket.send_bytes(msgpack.packb(answer))
             await asyncio.sleep(PAUSE_S)
 
@@ -112,9 +110,8 @@ class Viewer:
             await self._answer({"kind": "pong", "ping": said["ping"], "now": time.monotonic_ns()})
         elif "want" in said:
             topics = said["want"] if isinstance(said["want"], list) else []
-            self._look_at(
-                self._feeds.get(str(said.get("skin"))), frozenset(t for t in NEWEST if t in topics), anew=True
-            )
+            self.name = str(said.get("skin"))[:MOST_NAME]
+            self._look_at(self._feeds.get(self.name), frozenset(t for t in NEWEST if t in topics), anew=True)
         elif "command" in said:
             if len(self._under_way) >= AT_ONCE:
                 await self._answer({"kind": "answer", "id": said.get("id"), "ok": False, "error": "too many at once"})

@@ -21,7 +21,7 @@ ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftsh
 SECONDS = 10.0
 TWO_S, FAULT_S = 3.5, 6.5  # when the second finger comes, when the electrode dies
 TRIES = 40
-WIDE, NARROW, FILM = (1360, 1000), (390, 844), (1000, 640)
+WIDE, NARROW, FILM = (1360, 1060), (390, 844), (1000, 640)
 PLACE = "([x, y]) => { const p = new DOMPoint(x, -y).matrixTransform(overlay.getScreenCTM()); return [p.x, p.y]; }"
 
 
@@ -63,7 +63,7 @@ def picture(page: Any, file: str, *fingers: tuple[float, float]) -> None:
             break
         page.wait_for_timeout(300)
     hand.at()
-    image.quantize(256).save(DOCS / file, optimize=True)
+    image.save(DOCS / file, optimize=True)
 
 
 def film(page: Any, file: str) -> int:

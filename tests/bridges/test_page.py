@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import re
 import time
+import tomllib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -19,6 +21,7 @@ from aiohttp import web
 
 from bridges.page import fetch_three
 from bridges.page.advice import ADVICE
+from bridges.page.replays import Replay, ReplayRefused, listed
 from bridges.page.server import PageServer
 from bridges.page.settings import PageSettings
 from bridges.process import BridgeError, Handed
@@ -304,6 +307,20 @@ def test_the_token_is_kept_for_a_runtime_folder_and_for_its_owner_alone(runtime:
     assert token() not in ("short", first)
 
 
+def test_only_recordings_of_the_folder_are_replayed(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "out.mcap").write_bytes(b"")
+    (tmp_path / "in" / "cut.mcap").write_bytes(b"cut short")
+    (tmp_path / "in" / "notes.txt").write_bytes(b"")
+    assert [(f["name"], f["bytes"], f["seconds"]) for f in listed(tmp_path / "in")] == [("cut.mcap", 9, None)]
+    for name in ("../out.mcap", "notes.txt", "", "--help", str(tmp_path / "out.mcap")):
+        with pytest.raises(ReplayRefused, match="there is no recording"):
+            Replay(tmp_path / "in", name, 1.0, 0.0)
+    for speed, start in ((0, 0.0), (1e9, 0.0), (1.0, -1.0), (float("nan"), 0.0), ("fast", 0.0), (1.0, None)):
+        with pytest.raises(ReplayRefused, match="expected 0.05 to 50"):
+            Replay(tmp_path / "in", "cut.mcap", speed, start)
+
+
 def test_three_js_is_taken_by_its_hash_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     contents = {name: f"// {name}".encode() for name in fetch_three.SHA256}
     for name, content in contents.items():
@@ -324,3 +341,11 @@ def test_the_settings_in_skin_toml_reach_it() -> None:
     found = PageSettings.of(Handed.read(handed("page", load(ROOT / "skin.toml"))))
     assert found.skins == ("palm",) and found.port == 8080 and found.local
     assert json.loads(handed("page", load(ROOT / "skin.toml")))["options"]["host"] == "127.0.0.1"
+
+
+def test_what_the_page_of_the_page_configures_is_understood() -> None:
+    from services.runtime.config import ROOT, parse
+
+    (block,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "page.md").read_text(), re.DOTALL)
+    found = parse(tomllib.loads(block) | {"skins": {"palm": {"port": "stub", "bundle": "square16"}}})
+    assert found.bridges == ("page",) and found.page.host == "0.0.0.0" and found.page.names == ("robot.lan",)

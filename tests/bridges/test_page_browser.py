@@ -332,3 +332,29 @@ def test_the_surface_dents(launch: Callable[..., Any], address: str) -> None:
         }"""
         x, y, z = page.evaluate(deepest)
         assert z < -0.05 and abs(x + 0.5) < 0.06 and abs(y) < 0.06
+
+
+def test_a_recording_is_made_and_replayed(page: Open) -> None:
+    found = page()
+    found.click("#record")
+    found.wait_for_selector("#record[aria-pressed=true]")
+    found.mouse.move(*place(found, 15, 15))
+    found.mouse.down()
+    until(lambda: true_at(found, 15, 15))
+    time.sleep(2)
+    found.mouse.up()
+    found.click("#record")
+    found.wait_for_selector("#record[aria-pressed=false]")
+    until(lambda: nothing_touches(found))
+    found.click("#recordings summary")
+    made = until(lambda: found.input_value("#file"))
+    try:
+        found.click("#play")
+        until(lambda: found.inner_text("#trust-title").startswith("Replay"))
+        until(lambda: len(seen := marks(found, "#overlay .contact")) == 1 and abs(seen[0]["x"] - 15) < 3)
+        assert not marks(found, "#overlay .truth g")  # nobody knows it now
+        until(lambda: float(found.input_value("#scrub")) > 0.5)
+        found.click("#play")
+        until(lambda: found.inner_text("#trust-title").startswith("Live"))
+    finally:
+        (ROOT / "recordings" / str(made)).unlink()

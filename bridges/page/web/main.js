@@ -6,6 +6,7 @@ import { Link } from "./link.js";
 import { SkinMap } from "./map.js";
 import * as panels from "./panels.js";
 import { Press } from "./press.js";
+import { Replays } from "./replays.js";
 import { Surface } from "./surface.js";
 import { Timeline } from "./timeline.js";
 import { judge } from "./trust.js";
@@ -42,7 +43,7 @@ const link = new Link({
     const select = by("skin");
     select.replaceChildren(...message.skins.map((name) => new Option(name, name)));
     select.value = message.skins.includes(state.skin) ? state.skin : message.skins[0];
-    by("record").hidden = !message.buttons.includes("record");
+    by("record").hidden = by("recordings").hidden = !message.buttons.includes("record");
     by("surface-panel").hidden = !message.three;
     if (message.three && !surface) Surface.on(by("surface")).then(hasSurface);
     watch();
@@ -61,8 +62,8 @@ function hasSurface(found) {
   if (found && state.info) found.geometry(map.points, state.info.geometry.electrodes);
 }
 
-function watch() {
-  Object.assign(state, { skin: by("skin").value, newest: {}, pictures: {}, statuses: new Map(), info: null });
+function watch(name = by("skin").value) {
+  Object.assign(state, { skin: name, newest: {}, pictures: {}, statuses: new Map(), info: null });
   link.watch(state.skin, TOPICS);
 }
 
@@ -93,6 +94,7 @@ function contact(frame, now) {
     state.session = frame.session;
   }
   recent.scans.add(now, frame.scan);
+  if (state.skin === "replay") replays.at(frame.stamps.sample / 1e9, now);
   const { sample, publish } = frame.stamps;
   if (frame.source !== "replay" && publish >= sample) recent.latency.add(now, (publish - sample) / 1e6);
   timeline.add(now, present(frame));
@@ -111,14 +113,14 @@ function image(frame) {
 }
 
 function delta(frame) {
-  if (!frame.held) state.noise = panels.noiseOf(frame.sigma); // of one scan: a held touch's is that of a mean
+  if (!frame.touched || !state.noise) state.noise = panels.noiseOf(frame.sigma); // of one scan: a touch's may be of a mean
   if (frame.stack.length) state.pictures.delta = frame;
 }
 
 /** Judge what is there, and say so. Called often, whether anything comes or not: silence is news too. */
 function look() {
   const before = verdict.ok;
-  verdict = judge({ connected: link.connected, clock: link.clock, contact: state.newest.contact, statuses: state.statuses, hello: state.hello });
+  verdict = judge({ connected: link.connected, clock: link.clock, contact: state.newest.contact, statuses: state.statuses, hello: state.hello, replay: state.skin === "replay" });
   panels.banner(verdict);
   const now = performance.now();
   timeline.trust(now, verdict.ok);
@@ -129,12 +131,12 @@ function look() {
   if (chip.textContent !== source) chip.textContent = source;
   press.on = source === "stub" && token !== "" && link.connected;
   const why = token === "" ? "To press, open the address that the service printed: it ends with a token."
-    : source === "stub" ? "" : source ? `This skin is measured by a ${source}: press the real one.` : "";
+    : source === "stub" ? "" : source === "replay" ? "This is a recording." : source ? `This skin is measured by a ${source}: press the real one.` : "";
   by("press-why").hidden = !why;
   by("press-why").textContent = why;
   by("tools").disabled = !press.enabled;
   for (const button of by("faults").children) button.disabled = !(token && link.connected && state.statuses.has("stub"));
-  for (const id of ["tare", "record"]) by(id).disabled = !(token && link.connected);
+  for (const id of ["tare", "record", "play"]) by(id).disabled = !(token && link.connected);
 }
 
 function draw(now) {
@@ -153,6 +155,7 @@ function draw(now) {
     news(now);
   }
   surface?.draw(now);
+  replays.look(now);
   timeline.draw(now, still.matches ? 500 : 66);
   if (now - drawn.words > WORDS_MS) words(now);
 }
@@ -197,7 +200,8 @@ faults((name, args) => link.command(state.skin, name, args), said);
 for (const [id, unit] of [["force", "N"], ["radius", "mm"]]) {
   tools[id].addEventListener("input", () => { by(`${id}-out`).textContent = `${tools[id].value} ${unit}`; });
 }
-by("skin").addEventListener("change", watch);
+by("skin").addEventListener("change", () => replays.stop());
+const replays = new Replays((name, args) => link.command(by("skin").value, name, args), watch, said);
 by("tare").addEventListener("click", async () => {
   const answer = await link.command(state.skin, "tare");
   said(answer.ok ? `New baseline from ${answer.result.frames} frames, ${answer.result.snr_db.toFixed(0)} dB.` : answer.error);

@@ -25,7 +25,7 @@ export function banner(verdict) {
   const { body } = document;
   if (body.dataset.trust !== (verdict.ok ? "yes" : "no")) body.dataset.trust = verdict.ok ? "yes" : "no";
   const said = verdict.ok ? verdict.notes : verdict.reasons;
-  text("trust-title", verdict.ok ? (said.length ? "Live, with a remark" : "Live") : verdict.title);
+  text("trust-title", verdict.title + (verdict.ok && said.length ? ", with a remark" : ""));
   text("trust-reasons", said.map((r) => `${r.name.replaceAll("_", " ")}: ${r.text}`).join("; "));
   text("trust-advice", [...said.map((r) => r.advice), verdict.ok ? "" : verdict.advice].filter(Boolean).join(" "));
 }

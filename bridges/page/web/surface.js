@@ -173,7 +173,7 @@ export class Surface {
     this.dirty = false;
     if (this.late) this.bend(...this.late);
     this.late = null;
-    const far = 4.9 / Math.min(1, this.camera.aspect), flat = Math.cos(this.tilt) * far;
+    const far = 5.2 / Math.min(1, this.camera.aspect), flat = Math.cos(this.tilt) * far;
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(flat * Math.sin(this.turn), -flat * Math.cos(this.turn), Math.sin(this.tilt) * far);
     this.camera.lookAt(0, 0, 0);

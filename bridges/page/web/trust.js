@@ -2,13 +2,14 @@
 
 const QUIET = {
   nobody: ["Nothing has come yet", "Wait, or start the service: make up."],
+  replay: ["The replay begins", "Wait some seconds: it brings up stages of its own."],
   gone: ["The page's server does not answer", "The page looks for it again by itself. Is the service running?"],
 };
 
 /** {ok, title, reasons: [{name, text, advice}], notes: [...], ageMs} of the newest contact frame. */
-export function judge({ connected, clock, contact, statuses, hello }) {
+export function judge({ connected, clock, contact, statuses, hello, replay }) {
   if (!connected) return untrusted(...QUIET.gone);
-  if (!contact || !clock.known) return untrusted(...QUIET.nobody);
+  if (!contact || !clock.known) return untrusted(...(replay ? QUIET.replay : QUIET.nobody));
   const { frame, measured } = contact;
   const ageMs = measured === null ? Infinity : clock.now() - measured / 1e6;
   const explained = frame.reasons.map((name) => explain(name, hello));
@@ -20,7 +21,7 @@ export function judge({ connected, clock, contact, statuses, hello }) {
   if (!frame.valid) {
     return untrusted("Not to be acted on", complaints(statuses, clock, hello?.host), explained, ageMs);
   }
-  return { ok: true, title: "Live", advice: "", reasons: [], notes: explained, ageMs };
+  return { ok: true, title: replay ? "Replay" : "Live", advice: "", reasons: [], notes: explained, ageMs };
 }
 
 function untrusted(title, advice, reasons = [], ageMs = null) {
