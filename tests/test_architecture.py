@@ -29,6 +29,7 @@ BRIDGES_NEED = {"ros2": {"cyclonedds"}, "foxglove": {"foxglove"}, "export": {"mc
 OFFLINE_DOORS = {"services/cli"}
 SERVICES_USE_OF_MODELS = {
     "models.bundle",
+    "models.calibration_file",
     "models.files",
     "models.npz",
     "models.prereconstruction",
