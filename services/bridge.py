@@ -17,8 +17,8 @@ from protocol.errors import EitskinError
 from protocol.topics import BRIDGES
 from services.runtime.config import ROOT, ConfigError, ConfigFile, load
 
-NEEDS = {"ros2": "cyclonedds", "foxglove": "foxglove"}
-"""What each needs beside the service's own packages: an extra of its own in pyproject.toml."""
+NEEDS = {"page": "aiohttp", "ros2": "cyclonedds", "foxglove": "foxglove"}
+"""What each needs: an extra of its own in pyproject.toml, the page's among the service's own packages."""
 
 
 class MissingExtra(EitskinError):
@@ -28,8 +28,9 @@ class MissingExtra(EitskinError):
 def check(name: str) -> None:
     """Raises MissingExtra where the bridge cannot run here."""
     if importlib.util.find_spec(NEEDS[name]) is None:
+        extra = "" if name == "page" else f" EXTRAS={name}"
         raise MissingExtra(
-            f"the bridge {name} needs the package {NEEDS[name]}, which is not installed: run `make venv EXTRAS={name}`"
+            f"the bridge {name} needs the package {NEEDS[name]}, which is not installed: run `make venv{extra}`"
         )
 
 

@@ -1,4 +1,4 @@
-"""`skin bridge NAME`: hand contacts on to ROS 2 or Foxglove."""
+"""`skin bridge NAME`: show contacts on the live page, hand them on to ROS 2 or Foxglove."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def register(app: typer.Typer) -> None:
 
 
 def bridge(
-    name: Annotated[str, typer.Argument(help="ros2 or foxglove; its section in skin.toml has its settings.")],
+    name: Annotated[str, typer.Argument(help="page, ros2 or foxglove; its section in skin.toml has its settings.")],
 ) -> None:
-    """Hand contacts on to another world, in the foreground, beside a running service; Ctrl-C ends it."""
+    """Show contacts, or hand them on to another world, in the foreground, beside a running service; Ctrl-C ends it."""
     from protocol.topics import BRIDGES
     from services.bridge import MissingExtra, become
     from services.runtime.config import load

@@ -36,6 +36,13 @@ COMMANDS = (
     Row("make test", "ci", says="make test"),
     Row("make lint", "ci", says="make test"),  # which begins with it
     Row("make venv-dev", "ci", says="make test"),  # its first prerequisite
+    Row("make venv", "ci", says="make up"),  # whose first prerequisite it is
+    Row(
+        "(./)?skin bridge page",
+        "runs",
+        says="look at the skin, and press it, at http://127.0.0.1:",
+        instead="EITSKIN_RUNTIME={folder}/page ./skin bridge page",  # beside the one of the service of these tests
+    ),
     Row("make train SKIN=square16 QUICK=1", "ci", says="models.build --skin square16 --minutes 3"),
     Row("(./)?skin up", "service"),
     Row(
@@ -217,6 +224,7 @@ NOT_RUN = (("protocol/WIRE.md", "01 Hello: "),)
 
 TRIED_ELSEWHERE = {
     "docs/security.md": "tests/cli/test_security.py",
+    "docs/page.md": "tests/bridges/test_page.py",
     "docs/extending.md": "tests/docs/test_extending.py",
     "docs/ros.md": "tests/bridges/test_ros_page.py",
     "docs/foxglove.md": "tests/bridges/test_ros_page.py",
