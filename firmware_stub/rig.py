@@ -1,4 +1,4 @@
-"""Sheet, board and line in one: what a host has at the other end of its cable. Driven by time, at any speed.
+"""Sheet, board and line in one: what is at the other end of a host's cable. Its caller sets the time, at any speed.
 
 rig = Rig("square16", scene="slide", seed=1)
 rig.feed(link.encode(link.Hello()), 0.0)
@@ -26,7 +26,7 @@ from .timeline import Timeline, press_track
 from .world import World
 
 UNTOUCHED = "demo"  # the scene in which nothing touches
-SLEPT_S = 1.0  # a longer pause between two calls was the machine's sleep, not the board's
+SLEPT_S = 1.0  # after a longer pause between two calls the machine slept, not the board
 
 
 class Rig:

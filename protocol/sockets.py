@@ -1,8 +1,8 @@
 """Publishing and subscribing: one part per message, counted subscribers, readers that are never behind or never miss
 one.
 
-A reader survives anything that arrives: what is no frame is counted, logged once per source, and dropped. Sockets are
-not thread-safe: each belongs to the thread that uses it.
+A reader survives anything that arrives: messages that are not frames are counted, logged once per source, and dropped.
+Sockets are not thread-safe: each belongs to the thread that uses it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 class _Reader:
-    """What both readers share: receiving until a frame comes, and what to do with what is none."""
+    """What both readers share: receiving until a frame comes, and handling messages that are not frames."""
 
     def __init__(self, where: str, socket: Socket, addresses: Mapping[str, str]) -> None:
         self.socket = socket

@@ -58,7 +58,9 @@ class _Told(NamedTuple):
 
 
 class BaselineNews:
-    """Whether info/<skin> is to be sent again: at once for another baseline, by its size for drift of the same one."""
+    """Whether info/<skin> is to be sent again: at once for another baseline, and when the same one has drifted far
+    enough.
+    """
 
     def __init__(self) -> None:
         self._told: _Told | None = None

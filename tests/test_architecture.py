@@ -34,6 +34,7 @@ BRIDGES_NEED = {
 OFFLINE_DOORS = {"services/cli"}
 SERVICES_USE_OF_MODELS = {
     "models.bundle",
+    "models.calibration_file",
     "models.files",
     "models.npz",
     "models.prereconstruction",
