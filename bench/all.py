@@ -75,6 +75,12 @@ BENCHMARKS = (
         ("--frames", "30", "--rounds", "2"),
         limits="Our relay keeps the newest frame, so one that is overtaken is skipped by design.",
     ),
+    Benchmark(
+        "bridges",
+        "Bridges to ROS 2 and Foxglove",
+        ("--seconds", "8", "--rounds", "2"),
+        limits="p99 is waiting for a processor that the stub's physics, the pipeline or the listeners have.",
+    ),
     Benchmark("tracking", "Ten minutes of contacts", ("--seconds", "60")),
     Benchmark(
         "faults",
