@@ -58,6 +58,9 @@ class Tuning:
     mismatch_most: float = _number(4.0, "times", "mismatch beyond which it may hide a touch", START_ROWS)
     start_nats: float = _number(30.0, "nats", "by which a touch must explain Z0 better", START_ROWS)
 
+    # touches that change within a scan (within_scan.py)
+    changing_left: float = _number(0.03, "of |d|^2", "what such a touch leaves of its frame", "skin bench faults")
+
     # faults (gain.py, contact_evidence.py)
     gain_least: float = _number(3e-4, "relative", "least step of the board's gain", "sheet: less is drift's")
     gain_sigmas: float = _number(6.0, "sd", "of the common factor's noise, from which it is one", "1e-8 a frame")
