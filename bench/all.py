@@ -124,7 +124,7 @@ def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
                 print(line, end="", flush=True)
                 kept.write(line)
         status = process.wait()
-    finally:  # where we are told to end, it ends too
+    finally:  # it ends when we are told to end
         late.cancel()
         process.terminate()
         process.wait()

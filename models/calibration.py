@@ -42,7 +42,7 @@ class TooFewMeasured(EitskinError):
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class CalibrationFit:
     """mounting, its standard deviations (a Mounting too), and the relative rms misfit of |Z0| before and after."""
 
     mounting: Mounting
@@ -52,7 +52,7 @@ class Fit:
     held_out: tuple[float, ...]  # of the held-out parts after each step that counted
 
 
-def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: str = STEPS_MESH) -> Fit:
+def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: str = STEPS_MESH) -> CalibrationFit:
     """z0 (K,): |Z| of the untouched skin in the order of its pattern, 0 where not measured; any unit. sigma (K,): its
     standard deviation, same unit, infinite where not measured. matrices: the bundle's. Raises TooFewMeasured.
     """
@@ -94,7 +94,7 @@ def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: s
             if misses == PATIENCE:
                 break
     sd = now.mounting.with_vector(_spread(derivative, variance, live, now.mounting))
-    return Fit(now.mounting, sd, before, _rms(seen - now.log, live), tuple(held_out))
+    return CalibrationFit(now.mounting, sd, before, _rms(seen - now.log, live), tuple(held_out))
 
 
 def calibrated(matrices: Matrices, skin: SkinGeometry, mounting: Mounting, mesh: str = MESH) -> Matrices:

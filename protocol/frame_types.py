@@ -161,6 +161,9 @@ class DeltaFrame(Frame):
         "state of each electrode: " + ", ".join(f"{k} {state}" for k, state in enumerate(ELECTRODE_STATES)),
         lambda: np.zeros(16, "u1"),
     )
+    calibration: str = wire(
+        Text(64, form="(?:[0-9a-f]{64})?"), "hash of the bundle as it was calibrated to this skin; empty: as it is", ""
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -292,12 +295,16 @@ INFO_KEYS = {
     "bundle_hash": "sha256 over the whole of it, as its file SHA256 says",
     "geometry": "map: outline (n, 2) [m], electrodes (E, 2) [m], metres_per_unit, name",
     "pattern": "name of the drive pattern",
+    "stack": "map: lambda_squared of each plane of delta's `stack`; one_step: the plane whose lambda is nearest that "
+    "of the published one-step image",
     "frame_id": "name of the skin's coordinate frame",
     "parent_frame_id": "name of the frame that `pose` is given in",
     "pose": "x, y, z [m], qx, qy, qz, qw: the skin's frame in its parent",
     "surface": "map: kind (cylinder), radius_m, axis_degrees: what the sheet is wrapped round; or nil: it lies flat",
     "units": "map: name of a field -> its unit",
     "force_law": "map: kind and parameters of the force law, or nil",
+    "mounting": "map: what the calibration to this very skin found (contacts, shifts, field, anisotropy, remarks); "
+    "missing where the bundle is used as it is. `bundle_hash` covers it",
     "calibration_hash": "sha256 of the calibration file, or nil",
     "baseline": "array (K,): |Z0| as frames are compared with it; sent again when drift moved it by 2e-4, at most "
     "every 5 s",

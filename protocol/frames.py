@@ -118,7 +118,7 @@ def unpack(message: bytes) -> Frame:
 
 @lru_cache(maxsize=1024)
 def _place(head: bytes) -> tuple[str, str]:
-    """(topic, skin) of "topic/skin"; empty where it is none."""
+    """(topic, skin) of "topic/skin"; two empty texts for any other text."""
     known = _TOPIC.fullmatch(head)
     return (known[1].decode(), known[2].decode()) if known else ("", "")
 

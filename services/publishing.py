@@ -21,12 +21,12 @@ from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.surface import Placed
 from services.contacts.tracking import Tracker
 from services.describe import geometry
+from services.estimation.quality import SURE
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
 UNKNOWN_BELOW = 0.4  # probability of the best class, of five, below which a shape is "unknown"
-SURE = 0.05  # residual above which the touch changed during the scan; of steady touches hardly one has it
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 
@@ -81,7 +81,7 @@ class Publishing(Stage):
         elif self.lacks:
             add_reason(out.reasons, "gap")
             self._miss(out, "gap")
-        elif frame.held and self._knows(frame):
+        elif frame.held and (self._knows(frame) or self._changes(frame)):
             self._keep(frame)
             out.held = True
         elif not frame.image.size and (frame.touched or not frame.valid):
@@ -95,9 +95,9 @@ class Publishing(Stage):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)
-        # What stands by itself was still while it was scanned, as its source says.
-        moves = not self._alone(frame) and (not self._touched or not _explained(frame))
-        if frame.touched and not frame.held and moves:
+        # It began during the scan, or nothing of it is to be believed yet.
+        began = not self._touched or not (self._segments or _explained(frame))
+        if frame.touched and began and not frame.held and not self._alone(frame):
             add_reason(out.reasons, "changing")
         self._touched = frame.touched
         explained = out.quality is not None and out.quality >= EXPLAINED
@@ -112,7 +112,7 @@ class Publishing(Stage):
         return frames
 
     def _see(self, frame: ImageFrame) -> None:
-        """Contacts of a new image."""
+        """Find the contacts of a new image."""
         m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
         segments: list[Segment] = []
         if frame.touched and frame.image.size:
@@ -142,13 +142,18 @@ class Publishing(Stage):
         return self.each_alone or SEPARATE in frame.reasons
 
     def _knows(self, frame: ImageFrame) -> bool:
-        """Whether our contacts are those of this held image: frames in between may have passed us by, and what waits
-        to be seen twice is seen again in it.
+        """Whether our contacts are those of this held image. They are not if frames in between were missed, or if a
+        touch waits for its second frame.
         """
         recent = not self.tracker.forgotten(frame.stamps.get("sample", 0))
         session, scan = self._seen_in
         theirs = session in (ANY, frame.session) and scan == frame.reconstructed > 0  # 0: nobody says
         return self._known and recent and not self.tracker.waits and theirs
+
+    def _changes(self, frame: ImageFrame) -> bool:
+        """Whether this frame shows nothing new because its touch changed meanwhile: our contacts are all there is."""
+        forgotten = self.tracker.forgotten(frame.stamps.get("sample", 0))
+        return self._known and not forgotten and "changing" in frame.reasons
 
     def _keep(self, frame: ImageFrame) -> None:
         """The same contacts a frame later."""
@@ -157,7 +162,7 @@ class Publishing(Stage):
         self._contacts = [replace(c, state="hold", velocity=[0.0, 0.0, 0.0]) for c in present] + self._ends(ended)
 
     def _miss(self, out: ContactFrame, reason: str) -> None:
-        """A frame that says nothing of what touches: not even that a contact ended."""
+        """Make a frame that says nothing about touches, not even that a contact ended."""
         out.valid = False
         if not out.reasons:
             add_reason(out.reasons, reason)
@@ -191,7 +196,7 @@ class Publishing(Stage):
         return [(s.peak, c.force_n) for s, c in zip(self._segments, self._contacts, strict=False)]
 
     def _ends(self, tracks: list[Track]) -> list[Contact]:
-        """The last word on touches that ended: where they were; they do not press any more."""
+        """The last contacts of touches that ended: their last places, without force."""
         force = None if not self.law.exists else 0.0
         ends = []
         for t in tracks:
@@ -203,7 +208,7 @@ class Publishing(Stage):
         return ends
 
     def _force(self, frame: ContactFrame) -> ForceFrame:
-        """As valid as the contacts are."""
+        """The total force; valid if the contacts are."""
         present = [c for c in self._contacts if c.state != "end"]
         total = None if not self.law.exists else sum(c.force_n or 0.0 for c in present)
         wrench = np.sum([c.wrench for c in present], axis=0).tolist() if present else [0.0] * 6
@@ -293,5 +298,5 @@ def _wrench(at: Placed, force: float) -> list[float]:
 
 
 def _confidence(s: Segment) -> float:
-    """Probability that the peak is no noise, from its own standard deviation."""
+    """Probability that the peak is not noise, from its own standard deviation."""
     return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))

@@ -66,7 +66,7 @@ class FoxgloveChannels:
     """The channels of one skin."""
 
     def __init__(self, skin: str, frame_id: str, context: Context) -> None:
-        self.skin, self._frame_id = skin, frame_id
+        self.skin, self.frame_id = skin, frame_id
         self.image = RawImageChannel(f"/{skin}/image", context=context)
         self.scene = SceneUpdateChannel(f"/{skin}/scene", context=context)
         self.forces = Channel(f"/{skin}/forces", schema=FORCES, context=context)
@@ -92,7 +92,7 @@ class FoxgloveChannels:
         self.image.log(
             RawImage(
                 timestamp=_time(ns),
-                frame_id=self._frame_id,
+                frame_id=self.frame_id,
                 width=columns,
                 height=rows,
                 encoding="32FC1",
@@ -117,7 +117,7 @@ class FoxgloveChannels:
             moved = FrameTransform(
                 timestamp=_time(ns),
                 parent_frame_id=parent,
-                child_frame_id=self._frame_id,
+                child_frame_id=self.frame_id,
                 translation=Vector3(x=x, y=y, z=z),
                 rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
             )
@@ -126,7 +126,7 @@ class FoxgloveChannels:
         outline = np.asarray(geometry["outline"]) if isinstance(geometry, dict) and "outline" in geometry else None
         if outline is not None and outline.ndim == 2 and outline.shape[1] == 2 and np.isfinite(outline).all():
             entity = SceneEntity(
-                timestamp=_time(ns), frame_id=self._frame_id, id="skin", lines=[_loop(outline.tolist(), GREY)]
+                timestamp=_time(ns), frame_id=self.frame_id, id="skin", lines=[_loop(outline.tolist(), GREY)]
             )
             self.scene.log(SceneUpdate(entities=[entity]), log_time=ns)
 
@@ -136,7 +136,7 @@ class FoxgloveChannels:
         until = frame.valid_for_s
         return SceneEntity(
             timestamp=_time(ns),
-            frame_id=self._frame_id,
+            frame_id=self.frame_id,
             id="contacts",
             lifetime=Duration(sec=int(until), nsec=int(until % 1 * 1e9)),
             arrows=[_arrow(contact) for contact in contacts],

@@ -151,6 +151,8 @@ class Ros2Bridge(Bridge):
             raise BridgeError(
                 f"no DDS participant: {why}; see [ros2] in skin.toml, ROS_DOMAIN_ID, CYCLONEDDS_URI"
             ) from None
+        bases = ", ".join(topic_base(name) for name in handed.skins)
+        print(f"ros2: publishing {bases} in ROS domain {domain}", flush=True)
         self._clock = WallClock()
         replay = bool(options.get("replay"))
         self._skins = {

@@ -1,4 +1,4 @@
-"""`skin register`: from a file of presses at known places to a bundle of that skin and its pose."""
+"""`skin register`: turns a file of presses at known places into a bundle of that skin and its pose."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Where a real skin's frame lies in that of the machine that presses it: a similarity fitted to known presses.
 
-No reconstruction is needed for it: the bundle's sensitivities say how each measurement should change with the place of
-a press, up to a gain per measurement, and the similarity is the one that explains most of how they did change.
+This needs no reconstruction. The bundle's sensitivities say how each measurement should change with the place of a
+press, up to a gain per measurement. The similarity found is the one that explains most of the measured change.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Similarity:
 
 
 def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
-    """From touched, untouched (n, k), xy (n, 2), optionally depth (n,), pattern (k, 4). Raises RegistrationError."""
+    """Read touched, untouched (n, k), xy (n, 2), optionally depth (n,), pattern (k, 4). Raises RegistrationError."""
     missing = [name for name in ("touched", "untouched", "xy") if name not in arrays]
     if missing:
         raise RegistrationError(
@@ -103,7 +103,7 @@ def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
 
 
 def part(arrays: Mapping[str, NDArray[Any]], rows: slice) -> dict[str, NDArray[Any]]:
-    """The same arrays with some of their presses."""
+    """Some of the presses."""
     return {name: a[rows] if name in ("touched", "untouched", "xy", "depth") else a for name, a in arrays.items()}
 
 

@@ -1,8 +1,8 @@
 """A bundle fitted to one real skin: its sensitivities corrected by what presses at known places did.
 
 The response of measurement k to a press at x is modelled as gain_k times the bundle's sensitivity, plus a smooth field
-with a Gaussian-process prior; its posterior mean replaces the bundle's J. What it still gets wrong, found by leaving
-one press out at a time, goes into the reconstruction as model error beside the noise.
+with a Gaussian-process prior; its posterior mean replaces the bundle's J. Leaving out one press at a time shows what
+the posterior still gets wrong. The reconstruction treats that as model error beside the noise.
 """
 
 from __future__ import annotations

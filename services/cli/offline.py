@@ -31,6 +31,10 @@ def reconstruct(
         float | None,
         typer.Option(metavar="SECONDS", min=0, help="From `untouched` to the measurements; not given: minutes."),
     ] = None,
+    calibrate: Annotated[
+        bool,
+        typer.Option(help="First fit how the skin is mounted from `untouched`, where the bundle is off (seconds)."),
+    ] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Run the runtime stages over the rows of a file, without sockets.
@@ -62,6 +66,7 @@ def reconstruct(
         warn=lambda text: print(f"skin: {text}", file=sys.stderr),
         progress=_bar,
         age_s=UNKNOWN_AGE_S if age is None else age,
+        calibrate=calibrate,
     )
     try:
         np.savez(target, **out)  # type: ignore[arg-type]

@@ -47,7 +47,7 @@ def up(
 
 
 def _check_mismatches(config: ConfigFile) -> None:
-    """Said before anything starts: the stub would end at once, again and again."""
+    """Refuse an unknown mismatch before anything starts: the stub would end at once, again and again."""
     for name, skin in config.skins.items():
         if skin.mismatch != "none":
             from models.mismatch import NAMED
@@ -59,9 +59,7 @@ def _check_mismatches(config: ConfigFile) -> None:
 
 
 def _addresses(transport: Transport, processes: list[str]) -> str:
-    """Where contacts are to be had, once all processes are found able to listen where they are told to. Raises
-    TransportError.
-    """
+    """The addresses of the contacts, after a check that all processes can listen at theirs. Raises TransportError."""
     from protocol.transport import check, try_out
 
     check(transport)

@@ -1,5 +1,5 @@
-"""One touch in motion: seen now and then, in between where its velocity takes it (a Kalman filter, the same for x and
-y: constant velocity, random acceleration).
+"""The motion of one touch: a Kalman filter of place and velocity, the same for x and y (constant velocity, random
+acceleration). Between images the touch is where its velocity takes it.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-ACCELERATION = 0.3  # m/s^2, standard deviation: how a finger changes its mind
+ACCELERATION = 0.3  # m/s^2, standard deviation of a finger's acceleration
 PLACE_SIGMA_M = 0.0012  # of a centroid from one image
-FIRST_SPEED = 0.1  # m/s, standard deviation of a velocity of which nothing is known
+FIRST_SPEED = 0.1  # m/s, standard deviation of an unknown velocity
 LONGEST_PREDICTION_S = 0.2  # a velocity says nothing about longer gaps
 SIZE_SIGMA = 0.4  # of the logarithm of an integrated drop, from frame to frame
 SIZE_SHARE = 0.3  # of what is seen, in the running mean of the size
@@ -57,7 +57,7 @@ class Track:
         return self.x + self.vx * seconds, self.y + self.vy * seconds
 
     def move(self, seen: Patch, sample_ns: int) -> None:
-        """It was seen there."""
+        """Update with where an image shows it."""
         real = max(0.0, (sample_ns - self.seen_ns) * 1e-9)
         if real > 1e-6:
             self._filter(seen, real)
@@ -82,7 +82,7 @@ class Track:
         self.pp, self.pv, self.vv = (1 - place) * pp, (1 - place) * pv, vv - speed * pv
 
     def ghost(self) -> Track:
-        """Itself as one of its own `inside`: what it was before others came."""
+        """A copy of it as one of its own `inside`: what it was before others came."""
         return replace(self, inside=[])
 
 

@@ -1,9 +1,9 @@
 """Touches in an image of the conductivity drop: each thresholded at half its own peak.
 
-Where touches merge they are told apart by the valley between their peaks (splitting.py says which part of the
-image is whose). What a tracker expects counts as evidence: two touches that are known to be there are kept apart at a
-shallower valley than two that would be new. Every pixel of the smoothed image above the floor belongs to exactly one
-touch, so that the integrated drop is the same however a patch is split.
+Where touches merge they are told apart by the valley between their peaks (splitting.py says which part of the image is
+whose). The tracker's expectation counts as evidence: a shallower valley is enough to separate two known touches than
+two new ones. Every pixel of the smoothed image above the floor belongs to exactly one touch, so that the integrated
+drop is the same however a patch is split.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def _labels(smooth: Image, floor: float, expected: Sequence[Place]) -> tuple[Lab
 
 
 def _half(own: Image) -> NDArray[np.bool_]:
-    """The pixels above half the peak that hang together with it."""
+    """The pixels above half the peak that are connected to it."""
     top = int(own.argmax())
     mask = own > 0.5 * own.flat[top]
     labels, count = ndimage.label(mask, FOUR)

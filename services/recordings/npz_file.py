@@ -1,5 +1,5 @@
-"""Files of measurements (npz): the one place that reads and checks them, and says in which order their rows are
-frames, and whether those follow each other in time.
+"""Files of measurements (npz). Only this module reads and checks them. It says in which order their rows are frames,
+and whether these follow each other in time.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def read_scans(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Input:
-    """The same as `read_input`, in the order of the bundle's measurements; a file of presses (`touched` and
-    `untouched`, a row of each for a press) too. Raises InputError.
+    """The same as `read_input`, with columns in the order of the bundle's measurements. It also reads files of presses
+    (`touched` and `untouched`, a row of each for a press). Raises InputError.
     """
     order = measurement_order(arrays, bundle)
     if "touched" in arrays and "measurements" not in arrays:
@@ -100,7 +100,7 @@ def frames_of(data: Input) -> Iterator[tuple[NDArray[Any], str]]:
 
 
 def measurement_order(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> NDArray[np.intp]:
-    """Where in the file each measurement of the bundle stands. Raises InputError where one is not there."""
+    """The file's column of each measurement of the bundle. Raises InputError where one is not there."""
     if "pattern" not in arrays:
         return np.arange(len(bundle.pattern))
     theirs = arrays["pattern"]
@@ -129,7 +129,7 @@ def _key(row: list[int]) -> tuple[int, int, frozenset[int]]:
 def _amplitudes(arrays: Mapping[str, NDArray[Any]], name: str, k: int) -> Array:
     """|Z| (n, K), of which enough can be compared with: a baseline of fewer than half the measurements is none."""
     a: Array = np.abs(_matrix(arrays, name, k)).astype(float)
-    a[a < LEAST] = 0.0  # squares of what is that small are nothing
+    a[a < LEAST] = 0.0  # the squares of so small numbers underflow
     usable = int((np.isfinite(a) & (a > 0)).any(axis=0).sum())
     if usable < k / 2:
         raise InputError(

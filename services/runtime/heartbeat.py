@@ -44,7 +44,7 @@ class Heartbeat:
         self._heard, self._heard_any = now_ns * 1e-9, True
 
     def done(self, frame: Frame, began_ns: int, now_ns: int, late: bool = False) -> None:
-        """It was processed and its successors sent, too old to be acted on where `late`."""
+        """A frame was processed and its successors were sent; `late`: too old to be acted on."""
         since = frame.stamps.get("sample")
         ours = since is not None and frame.source != "replay" and frame.host in ("", host_id())
         ago_ns = now_ns - since if since is not None and ours else None
@@ -54,7 +54,7 @@ class Heartbeat:
             self._late_at, self._late_by_s = now_ns * 1e-9, ago_ns * 1e-9
 
     def silence(self, limit_s: float, upstream: str) -> str:
-        """What to say of an input that gives nothing; "" while it does."""
+        """The text for an input that gives nothing; "" while it gives frames."""
         quiet = time.monotonic() - self._heard
         if quiet < limit_s:
             return ""
