@@ -108,8 +108,8 @@ def _rbf(a: Array, b: Array) -> Array:
 
 
 def live_path(bundle: Bundle, arrays: dict[str, NDArray[Any]]) -> dict[str, int]:
-    """Of the presses that took no part in the registration: how many the live path finds, and how many of those where
-    the offline path does.
+    """Count, among presses that took no part in the registration, those that the live path finds, and those of them
+    that it finds where the offline path does.
     """
     skin, data = Skin(port="stub", bundle=str(bundle.path), frame_id="skin"), read_scans(arrays, bundle)
     offline = reconstruct(data, skin, bundle)

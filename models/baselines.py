@@ -1,4 +1,4 @@
-"""What others do with these measurements: NOSER in one step, total variation, several Gauss-Newton steps, GREIT.
+"""Known reconstruction methods for comparison: NOSER in one step, total variation, several Gauss-Newton steps, GREIT.
 
 Every method maps a relative difference d = |Z|/|Z0| - 1, (K,), to an image of the conductivity drop [S/m], (n, n), row
 0 at the lowest y. None of them knows a touch's sign, size or shape; all share one linearisation, on the "inverse" mesh.

@@ -8,10 +8,10 @@
                             network_int8.onnx  "int8"
                             locator.npz        of a registered skin: see locator.LocatorArrays
 
-The manifest holds the hash of every other file, so that the one over the manifest is over the whole. Networks may be
-missing. A bundle without any is a working bundle: the services then show the one-step image.
+The manifest holds the hash of every other file, so the manifest's own hash covers the whole. Networks may be missing. A
+bundle without any is a working bundle: the services then show the one-step image.
 
-    python -m models.bundle FOLDER             writes SHA256 anew: for who has changed a manifest by hand, and means it
+    python -m models.bundle FOLDER             writes SHA256 anew, after a change of the manifest by hand
 """
 
 from __future__ import annotations

@@ -109,7 +109,9 @@ def part(seen: ImageFeatures, rows: Array) -> ImageFeatures:
 def see(
     presses: SolvedPresses, pre: PreReconstructor, network: Predict, seed: int = 4, conditions: int = CONDITIONS
 ) -> Sightings:
-    """The presses under noise from 57 dB to none, each condition with its own tare; what nobody would see left out."""
+    """What the network shows of the presses under noise from 57 dB to none, each condition with its own tare.
+    Undetected presses are left out.
+    """
     rng = np.random.default_rng([seed, 32])
     index, decibels, found = [], [], []
     differences = presses.normalised(pre)

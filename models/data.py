@@ -67,7 +67,7 @@ class ChunkSpec:
 
 @lru_cache(maxsize=1)
 def _nominal(skin: str, mesh: str) -> ForwardModel:
-    """Kept for the process: meshing takes as long as dozens of solves."""
+    """The nominal skin's model, kept for the process: meshing takes as long as dozens of solves."""
     nominal = geometry.load(skin)
     return ForwardModel(nominal, nominal.pattern, mesh=mesh)
 

@@ -17,7 +17,7 @@ Inside = Callable[[Array], NDArray[np.bool_]]  # points (m, 2) in model units ->
 class Prior:
     """How contacts are distributed. Each range is (low, high), drawn from uniformly.
 
-    With probability `tail` a size or drop comes from the wide range: rare cases have to be seen, not dwelt on.
+    With probability `tail` a size or drop comes from the wide range: the network must see rare cases, but seldom.
     `touches` are the probabilities of one, two, three contacts; `gap` is the least distance between two outlines.
     """
 

@@ -45,6 +45,7 @@ class EitskinError(Exception):
         ├── MissingExtra                      the packages that a bridge needs are not installed
         ├── NotOurs                           a folder that must not be handed over
         ├── BridgeError                       bridges: a bridge cannot start
+        ├── ReplayRefused                     the page does not record or replay now
         ├── CliError                          ends a command with one line and an exit code
         └── Broken                            bench: a promise was broken under changed bytes
     """

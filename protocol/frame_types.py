@@ -320,6 +320,8 @@ INFO_KEYS = {
     "bundle_hash": "sha256 over the whole of it, as its file SHA256 says",
     "geometry": "map: outline (n, 2) [m], electrodes (E, 2) [m], metres_per_unit, name",
     "pattern": "name of the drive pattern",
+    "stack": "map: lambda_squared of each plane of delta's `stack`; one_step: the plane whose lambda is nearest that "
+    "of the published one-step image",
     "frame_id": "name of the skin's coordinate frame",
     "parent_frame_id": "name of the frame that `pose` is given in",
     "pose": "x, y, z [m], qx, qy, qz, qw: the skin's frame in its parent",

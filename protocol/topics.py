@@ -11,8 +11,8 @@ from typing import Literal
 
 from . import frame_types as f
 
-BRIDGES = ("ros2", "foxglove")
-"""Processes that hand contacts on to other worlds. On our side they publish their status alone."""
+BRIDGES = ("page", "ros2", "foxglove")
+"""Processes that show contacts, or hand them on to other worlds. On our side they publish their status alone."""
 PRODUCERS = ("acquisition", "preprocessing", "inference", "publisher", "stub", *BRIDGES)
 """Processes that own a data socket `<producer>.ipc`. A replay stands in for acquisition and binds its socket."""
 

@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.locator import Located, Locator
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
-from services.estimation.quality import Residual
+from services.estimation.quality import SURE, Residual
 from services.estimation.sentinel import CoarseImage
+from services.estimation.within_scan import ChangingTouch
 from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
-from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
+from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
 
+CHANGING_FRAMES = 3  # in a row that may be explained by a touch that changes: a press within 0.1 s is over by then
 SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
 
@@ -43,6 +45,8 @@ class Inference(Stage):
         self._refuses = isinstance(self._network, Network)
         self.linearisation = Linearisation(name, bundle)
         self._residual = Residual(bundle, to_scale=self._refuses)
+        self._changing_touch = ChangingTouch(bundle)  # the bundle's: how a skin is mounted changes 3 % of d by little
+        self.each_alone = False  # offline: frames that do not follow each other
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
@@ -59,8 +63,10 @@ class Inference(Stage):
         self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
         self._quiet: NDArray[np.float32] | None = None  # standard deviation that untouched frames state
         self._stated = 0  # how many have stated it, one after the other
-        self._counters = {"networks_run": 0, "held": 0, "untouched": 0, "unwanted": 0, "missed": 0, "refused": 0}
-        self._counters["uncalibrated"] = 0  # frames whose calibration could not be found
+        self._changing = 0  # frames in a row whose touch changed during the scan
+        self._changing_scan = 0  # of the last of them whose image shows nothing
+        names = ("networks_run", "held", "untouched", "unwanted", "missed", "refused", "changing", "uncalibrated")
+        self._counters = dict.fromkeys(names, 0)  # uncalibrated: frames whose calibration could not be found
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, DeltaFrame)
@@ -84,7 +90,7 @@ class Inference(Stage):
             self._roughly(frame, out)
         else:
             self._counters["untouched"] += 1
-            self._last = None
+            self._last, self._changing, self._changing_scan = None, 0, 0
             self._rest(frame.sigma)
         return [out]
 
@@ -139,9 +145,41 @@ class Inference(Stage):
             quantity = self._locator.quantity
             out.touches = [_touch(each, quantity) for each in self._locator.locate(frame.difference, frame.sigma)]
         self._refused = self._refuses and frame.touched and out.residual is not None and self._residual.refused
-        self._judge(out)
         self._counters["networks_run"] += 1
+        doubted = frame.touched and out.residual is not None and out.residual > SURE
+        if not doubted or self.each_alone or SEPARATE in frame.reasons:  # what stands by itself was still
+            self._changing = 0
+        elif self._refused and self._changes(frame, out):
+            return
+        elif not self._changing_touch.steady(frame.difference, frame.sigma):
+            self._changing += 1
+            add_reason(out.reasons, "changing")
+        self._judge(out)
         self._shows(frame, out)
+
+    def _changes(self, frame: DeltaFrame, out: ImageFrame) -> bool:
+        """Whether a touch that changed during the scan explains a frame that its image does not. Then the frame is
+        valid and says `changing`. Its image shows nothing new: that of before is held; where there was none, or where
+        the touch is seen to have ended, it is empty.
+        """
+        found = self._changing_touch(frame.difference, frame.sigma) if self._changing < CHANGING_FRAMES else None
+        if found is None:
+            return False
+        ended = found.ended and self._changing > 0
+        if not ended:
+            add_reason(out.reasons, "changing")
+        out.residual, self._refused = found.left, False
+        self._changing = CHANGING_FRAMES if ended else self._changing + 1  # what ended does not end again
+        self._changing_scan = frame.scan
+        self._counters["changing"] += 1
+        if (last := self._last) is None or ended:
+            out.image, out.sigma = np.zeros_like(out.image), np.zeros_like(out.sigma)
+            out.reconstructed = frame.scan
+        else:
+            blank = ImageFrame(skin=self.skin)
+            out.image, out.sigma, out.classes = blank.image, blank.sigma, blank.classes
+            self._shows_again(last, out)
+        return True
 
     def _roughly(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """The image of a few measurements, which no network was trained on."""
@@ -168,32 +206,39 @@ class Inference(Stage):
         """
         last = self._last
         if last is not None and self._last_scan == frame.reconstructed:
-            out.held = True
-            out.reconstructed, out.noise, out.residual = self._last_scan, last.noise, last.residual
-            if self._again:
-                out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
-                out.touches = last.touches
-                self._again = False
+            out.noise, out.residual = last.noise, last.residual
+            self._shows_again(last, out)
             self._judge(out)
             self._counters["held"] += 1
+        elif 0 < self._changing_scan == frame.reconstructed:
+            self._refused = True  # what stays as it is did not change during the scan
+            self._judge(out)
         else:  # skipped, or before we started: not valid until the next reconstruction, at most 16 frames on
             out.valid = False
             out.reasons.append("gap")
             self._counters["missed"] += 1
 
+    def _shows_again(self, last: ImageFrame, out: ImageFrame) -> None:
+        out.held, out.reconstructed = True, self._last_scan
+        if self._again:
+            out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
+            out.touches = last.touches
+            self._again = False
+
     def state(self) -> dict[str, Any]:
-        last, calibration = self._last, self.linearisation.state()
+        last, rest = self._last, {"changing": [self._changing, self._changing_scan], **self.linearisation.state()}
         if last is None:
-            return {"last": None, **calibration}
+            return {"last": None, **rest}
         kept: dict[str, Any] = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
         kept |= {"residual": last.residual, "refused": self._refused, "touches": [asdict(t) for t in last.touches]}
-        return {"last": {"scan": self._last_scan, **kept}, **calibration}
+        return {"last": {"scan": self._last_scan, **kept}, **rest}
 
     def load(self, state: dict[str, Any]) -> None:
         self.reset()
         if self.linearisation.load(state):
             self._build()
         last = state.get("last")
+        self._changing, self._changing_scan = (int(n) for n in state.get("changing", (0, 0)))
         if last is None:
             return
         try:

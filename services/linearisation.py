@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 
 UNKNOWN = 3  # frames of a calibration that cannot be found after which it is no longer looked for
 
+REMEMBERED = 16  # calibrations, a megabyte each
+
 _adopted: dict[str, MountedSkin] = {}  # by hash, in this process: the stages of a pipeline share it without a file
 
 
@@ -68,7 +70,7 @@ class Linearisation:
             if self.mounted is not None and not needs_fit(baseline, self.bundle):
                 return False  # it is mounted as it was
             self._fit.start(baseline)
-            return True
+            return self._fit.busy
         self._back = self.mounted is not None
         return False
 
@@ -130,3 +132,5 @@ class Linearisation:
         self.mounted = found
         if found is not None:
             _adopted[found.bundle.hash] = found
+            while len(_adopted) > REMEMBERED:
+                _adopted.pop(next(iter(_adopted)))

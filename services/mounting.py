@@ -77,11 +77,19 @@ class MountingFit:
         """Begin with the mean of an untouched skin's frames; a fit that is under way is dropped."""
         self.stop()
         self.problem = ""
+        try:
+            self._begin(baseline)
+        except OSError as why:  # no room, no process: the bundle is used as it is
+            self._clear()
+            self.problem = f"the skin could not be calibrated: {why}"
+
+    def _begin(self, baseline: Baseline) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="eitskin-fit-")
         request, out = (str(Path(self._folder.name, name)) for name in ("request.npz", "out"))
         sigma = baseline.sigma / np.sqrt(max(baseline.frames, 1))
         np.savez(request, z0=baseline.z0, sigma=sigma, baseline_hash=np.str_(baseline.hash))
-        words = [sys.executable, "-m", "models.fit_calibration", str(self.bundle.path), request, out]
+        bundle = str(self.bundle.path.resolve())
+        words = [sys.executable, "-m", "models.fit_calibration", bundle, request, out]
         with Path(self._folder.name, "said").open("wb") as said:
             self._process = subprocess.Popen(words, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
 

@@ -22,12 +22,12 @@ from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.surface import Placed
 from services.contacts.tracking import Tracker
 from services.describe import geometry
+from services.estimation.quality import SURE
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
 UNKNOWN_BELOW = 0.4  # probability of the best class, of five, below which a shape is "unknown"
-SURE = 0.05  # residual above which the touch changed during the scan; of steady touches hardly one has it
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 
@@ -85,7 +85,7 @@ class Publishing(Stage):
         elif self.lacks:
             add_reason(out.reasons, "gap")
             self._miss(out, "gap")
-        elif frame.held and self._knows(frame):
+        elif frame.held and (self._knows(frame) or self._changes(frame)):
             self._keep(frame)
             out.held = True
         elif not frame.image.size and (frame.touched or not frame.valid):
@@ -99,9 +99,9 @@ class Publishing(Stage):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)
-        # What stands by itself was still while it was scanned, as its source says.
-        moves = not self._alone(frame) and (not self._touched or not _explained(frame))
-        if frame.touched and not frame.held and moves:
+        # It began during the scan, or nothing of it is to be believed yet.
+        began = not self._touched or not (self._segments or _explained(frame))
+        if frame.touched and began and not frame.held and not self._alone(frame):
             add_reason(out.reasons, "changing")
         self._touched = frame.touched
         explained = out.quality is not None and out.quality >= EXPLAINED
@@ -159,6 +159,11 @@ class Publishing(Stage):
         session, scan = self._seen_in
         theirs = session in (ANY, frame.session) and scan == frame.reconstructed > 0  # 0: nobody says
         return self._known and recent and not self.tracker.waits and theirs
+
+    def _changes(self, frame: ImageFrame) -> bool:
+        """Whether this frame shows nothing new because its touch changed meanwhile: our contacts are all there is."""
+        forgotten = self.tracker.forgotten(frame.stamps.get("sample", 0))
+        return self._known and not forgotten and "changing" in frame.reasons
 
     def _keep(self, frame: ImageFrame) -> None:
         """The same contacts a frame later."""

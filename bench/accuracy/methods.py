@@ -1,4 +1,4 @@
-"""The rows of the accuracy benchmark: every method as a function of one frame, with what it may be tuned by."""
+"""The rows of the accuracy benchmark: every method as a function of one frame, with its tuning parameters."""
 
 from __future__ import annotations
 

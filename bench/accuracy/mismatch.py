@@ -63,7 +63,7 @@ WANTED: dict[str, tuple[float | None, float | None]] = {
 
 @dataclass(frozen=True, eq=False)
 class SkinFrames:
-    """Of one mismatched skin, noise-free: z0 (K,), z (N, K) ohm of `touches`."""
+    """Noise-free frames of one mismatched skin: z0 (K,), z (N, K) ohm of `touches`."""
 
     mismatch: Mismatch
     metres_per_unit: float

@@ -1,4 +1,4 @@
-"""How much of the time the service says something: without a fault, and with one electrode that failed for good."""
+"""Availability: the share of valid frames without a fault, and with one electrode that failed for good."""
 
 from __future__ import annotations
 

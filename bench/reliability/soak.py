@@ -1,5 +1,5 @@
-"""Many frames of random faults and presses: what no frame may say. Counted are frames that are valid and do not say
-`changing`; touches press with 1 N or more, radius 0.1 or more.
+"""Many frames of random faults and presses; counts the errors that no frame may have. Counted are frames that are valid
+and do not say `changing`; touches press with 1 N or more, radius 0.1 or more.
 
 A phantom: a contact further than FAR_M from every touch, while every touch has one near it or nothing touches. Off: the
 same while a touch has none near it. Unseen: a touch without a contact near it in more than UNSEEN such frames in a row.
@@ -59,7 +59,7 @@ class SoakTally(Counts):
 
 
 def chunk(sheet: SolvedSheet, pipeline: Pipeline, frames: int, seed: int) -> SoakTally:
-    """So many frames after a fresh start, tare included."""
+    """Score this many frames after a fresh start, tare included."""
     seconds = frames * SCAN_S
     scene = random_scene(seconds, seed)
     session = Session(sheet, scene.script, seed, pipeline)

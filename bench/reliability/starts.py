@@ -30,7 +30,7 @@ FREE = FREE_WITHIN + 2 * FREE_FOR
 
 @dataclass
 class StartScore(Counts):
-    """Of one start, or of several (`add`)."""
+    """The score of one start, or of several (`add`)."""
 
     starts: int = 0
     touched: int = 0  # frames while the touch stays

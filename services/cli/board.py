@@ -136,12 +136,17 @@ def _stub(command: str, skin: str, **args: Any) -> dict[str, Any]:
 
 def tare(
     force: Annotated[bool, typer.Option("--force", help="Also where it looks touched: nothing touches it.")] = False,
+    calibrate: Annotated[
+        bool, typer.Option(help="Also fit how the skin is mounted, and use matrices that fit it; takes some seconds.")
+    ] = True,
     skin: SkinOption = "",
     as_json: JsonOption = False,
 ) -> None:
     """Take a new baseline from the last seconds, in which nothing touched the skin."""
-    answer = control("preprocessing", "tare", skin=skin_name(skin), force=force, timeout_s=10.0)
+    answer = control("preprocessing", "tare", skin=skin_name(skin), force=force, calibrate=calibrate, timeout_s=10.0)
     if as_json:
         emit(answer)
     else:
         print(f"new baseline from {answer['frames']} frames, {answer['snr_db']:.1f} dB")
+        if answer.get("calibrating"):
+            print("fitting how the skin is mounted: used once it is found and nothing touches; `skin doctor` says what")

@@ -20,6 +20,7 @@ from services.board.boardlink import BoardLink
 from services.board.scanning import Scanning
 from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
+from services.cli.doctor_mounting import mounting_found
 from services.contacts.force import ForceLaw
 from services.estimation import checks
 from services.estimation.tare import implausibility
@@ -98,7 +99,11 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
         yield from live.processes(name)
         info = live.info(name)
         yield from live.compared(name, skin, bundle, info)
-        yield electrode_order(name, live.baseline(info), bundle)
+        said = info.get("mounting")
+        if isinstance(said, dict):
+            yield mounting_found(name, said, info)
+        if not isinstance(said, dict) or not float(said.get("misfit", 1.0)) <= GOOD_FIT:
+            yield electrode_order(name, live.baseline(info), bundle)
     else:
         yield Finding("SKIP", f"{name}: electrodes", "their order is looked at while the service runs: `skin up`")
 

@@ -189,14 +189,14 @@ class ElectrodeHealth:
         """An electrode that is at fault, and whose fault this frame does not show by itself."""
         if self._is_well(k, seen.amplitude, seen.failed, untouched):
             self._well[k] += 1
-        elif self._states[k] != DRIFTING or untouched is None:
+        elif self._states[k] not in (DRIFTING, SWAPPED) or untouched is None:
             self._well[k] = 0
         elif self._asked[k] > 0:
             self._asked[k] -= 1
         elif (opinion := self._ask(k, seen, untouched)) is not None:
             self._asked[k] = ASK_EVERY - 1
             self._well[k] = self._well[k] + 1 if opinion.well else 0
-            if opinion.changed():
+            if opinion.changed() and self._states[k] == DRIFTING:
                 self._unsure[k], self._suspected[k] = False, 0
                 self._contacts.felt[k] = opinion.felt
         if self._well[k] >= WELL_FRAMES:

@@ -21,6 +21,7 @@ from protocol.transport import Transport
 from services.runtime.config_sections import (
     FoxgloveSection,
     Logging,
+    PageSection,
     RealTime,
     Ros2Section,
     Section,
@@ -151,7 +152,8 @@ class ConfigFile(Section):
     security: Security = Security()
     realtime: RealTime = RealTime()
     skip: Skip = Skip()
-    bridges: tuple[Literal["ros2", "foxglove"], ...] = ()  # that `skin up` starts too
+    bridges: tuple[Literal["page", "ros2", "foxglove"], ...] = ()  # that `skin up` starts too
+    page: PageSection = PageSection()
     ros2: Ros2Section = Ros2Section()
     foxglove: FoxgloveSection = FoxgloveSection()
     logging: Logging = Logging()

@@ -106,7 +106,7 @@ def test_a_contact_that_rises_a_little_is_named_and_makes_no_contact(skin: StubS
     assert all(states(r) == {"drifting": [12]} for r in lifted[NAMED_WITHIN:])
     assert not lifted[1].contact.valid and "electrode_drift" in lifted[1].contact.reasons
     assert all(not r.contact.valid or present(r) == len(touch) for r in lifted)
-    assert all(r.contact.valid for r in lifted[10:])
+    assert lifted[-1].contact.valid == (times > 1.3)  # the less it rose, the more a light touch is like it
     back = [skin.feel(touch) for _ in range(BACK_WITHIN + 3)]
     assert states(back[-1]) == {}
     assert states(skin.rest(BACK_WITHIN + 6)) == {}
@@ -122,7 +122,7 @@ def moving(step: int) -> tuple[Shape, ...]:
     return (Shape("circle", -0.4 + 0.01 * step, 0.2, 0.2, 0.4),)
 
 
-@pytest.mark.parametrize(("electrode", "times"), [(12, 1.75), (6, 8.0), (3, 1.3)])
+@pytest.mark.parametrize(("electrode", "times"), [(12, 1.75), (6, 8.0), (3, 1.5)])
 def test_a_contact_that_rises_and_falls_under_a_touch_that_moves(skin: StubSkin, electrode: int, times: float) -> None:
     """Named, left out, the touch reported all the while, and the electrode well again before the touch ends."""
     for step in range(30):
@@ -296,3 +296,14 @@ def _named(skin: StubSkin, z: Any, status: Any) -> dict[str, list[int]]:
     (out,) = skin.pipeline.pre.process(raw, frozenset({"delta"}))
     assert isinstance(out, DeltaFrame)
     return states_of(out)
+
+
+def test_wires_put_right_under_a_touch_are_no_longer_named(skin: StubSkin) -> None:
+    order = np.arange(16)
+    order[[3, 9]] = 9, 3
+    for _ in range(12):
+        swapped = skin.see(transfer(PRESS)[np.ix_(order, order)])
+    assert states(swapped) == {"swapped": [3, 9]} and swapped.contact.valid
+    right = [skin.feel(PRESS) for _ in range(25)]
+    assert states(right[-1]) == {} and all(r.contact.valid for r in right[1:])
+    skin.rest(BACK_WITHIN + 3)

@@ -209,3 +209,17 @@ def test_a_bundle_that_predicts_the_skin_needs_no_fit(bundle: Bundle) -> None:
 
     assert not mounting.needs_fit(baseline("none"), bundle)
     assert mounting.needs_fit(baseline("shift1"), bundle)
+
+
+def test_a_fit_that_fails_says_why_and_changes_nothing(
+    bundle: Bundle, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    z0 = np.abs(MismatchedSheet(BUNDLE, named("shift1"), "inverse").solve().impedances())
+    z0[:60] = 0.0  # half of the measurements failed
+    sigma = np.where(z0 > 0, 1e-4 * z0, np.inf)
+    search = mounting.MountingFit(bundle)
+    search.start(Baseline(z0, sigma, 64, "b", 0))
+    assert search.wait() is None and "60 of 120" in search.problem and not search.busy
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "full"))  # a disk that takes nothing
+    search.start(Baseline(z0, sigma, 64, "b", 0))
+    assert "could not be calibrated" in search.problem and not search.busy
