@@ -169,7 +169,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="bench.real_presses", description=__doc__.splitlines()[0])
     parser.add_argument("file", type=Path, nargs="?", help="hydrogel_disc16.npz; default: in $EITSKIN_REFERENCE")
     parser.add_argument("--skin", default="disc16", help="bundle of the uniform disc")
-    parser.add_argument("--splits", type=int, default=5, help="random splits of each row of the second table")
+    parser.add_argument("--splits", type=int, default=3, help="random splits of each row of the second table")
     parser.add_argument("--quick", action="store_true", help="one split, and at most 300 presses")
     parser.add_argument("--out", type=Path, help="write the rows as JSON")
     args = parser.parse_args(argv)
