@@ -133,8 +133,6 @@ def main(name: str, make: Callable[[Handed], Bridge]) -> int:
     except (AlreadyRunning, BridgeError, RuntimeDirError, TransportError) as why:
         print(f"{name}: {why}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:  # while it was still being made
-        pass
     return 0
 
 
