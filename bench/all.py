@@ -103,6 +103,12 @@ BENCHMARKS = (
         "At 70 dB an ideal classifier names 78 % of the shapes (`skin bench shape_limit`); the rest is a network small "
         "enough for a millisecond, after three and a half hours of training on one core.",
     ),
+    Benchmark(
+        "mismatch",
+        "Mismatched skins",
+        ("--quick", "--only", "anisotropy5", "mild"),
+        limits="A soft edge shows in no untouched frame: networks that are trained with soft edges are to see it.",
+    ),
     Benchmark("memory", "Memory over many frames", ("--frames", "20000")),
 )
 

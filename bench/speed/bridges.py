@@ -43,7 +43,7 @@ SKINS = '[skins.palm]\nport = "stub"\nbundle = "square16"\nframe_id = "palm"\n'
 
 
 @dataclass
-class Heard:
+class HandedOn:
     """What came out of one bridge, all rounds together."""
 
     added_ms: list[float] = field(default_factory=list)
@@ -54,7 +54,7 @@ class Heard:
 
 
 @dataclass
-class Seen:
+class SeenContact:
     """A contact frame as a plain controller saw it."""
 
     sample: int
@@ -130,18 +130,18 @@ def _said(pattern: str, log: Path, process: subprocess.Popen[bytes]) -> str:
     return found[1]
 
 
-def watch(contacts: Outside, seconds: float) -> list[Seen]:
+def watch(contacts: Outside, seconds: float) -> list[SeenContact]:
     """Contact frames as they come."""
     found, end = [], time.monotonic() + seconds
     while time.monotonic() < end:
         if got := contacts.recv(0.2):
             stamps, at = got[0]["stamps"], got[1]
             since_ms = (at - stamps["read"]) * 1e-6
-            found.append(Seen(stamps["sample"], stamps["publish"], since_ms, got[0]["valid"]))
+            found.append(SeenContact(stamps["sample"], stamps["publish"], since_ms, got[0]["valid"]))
     return found
 
 
-def account(heard: Heard, seen: list[Seen], messages: list[tuple[int, int]]) -> None:
+def account(heard: HandedOn, seen: list[SeenContact], messages: list[tuple[int, int]]) -> None:
     """What the messages of a round say: the delay behind `publish`, and how many valid frames gave none."""
     ahead = time.time_ns() - time.monotonic_ns()
     times = np.array(sorted(ns - ahead for ns, _ in messages))
@@ -167,10 +167,10 @@ def listened(names: list[str], folder: Path, domain: int) -> Iterator[list[Liste
         yield made
 
 
-def run(seconds: float, rounds: int, names: list[str]) -> tuple[dict[str, list[float]], dict[str, Heard]]:
+def run(seconds: float, rounds: int, names: list[str]) -> tuple[dict[str, list[float]], dict[str, HandedOn]]:
     """(since acquisition read a frame, ms: without and with all bridges; what each bridge did)"""
     since: dict[str, list[float]] = {"without": [], "with all": []}
-    heard = {name: Heard() for name in names}
+    heard = {name: HandedOn() for name in names}
     with running() as service:
         BEGIN["moving"](service)
         contacts = Outside("contact", "palm", service.folder)
@@ -189,7 +189,7 @@ def _with_all(
     seconds: float,
     number: int,
     since: dict[str, list[float]],
-    heard: dict[str, Heard],
+    heard: dict[str, HandedOn],
 ) -> None:
     with listened(list(heard), service.folder, 130 + (os.getpid() + number) % 90) as bridges:
         watch(contacts, SETTLE_S)  # whoever has just come finds the others
@@ -210,7 +210,7 @@ def quantiles(values: list[float]) -> dict[str, float]:
     return {"p50": float(np.quantile(values, 0.5)), "p99": float(np.quantile(values, 0.99))}
 
 
-def goals(since: dict[str, list[float]], heard: dict[str, Heard]) -> list[Goal]:
+def goals(since: dict[str, list[float]], heard: dict[str, HandedOn]) -> list[Goal]:
     without, beside = quantiles(since["without"]), quantiles(since["with all"])
     found = [
         Goal("pipeline's p99 with all bridges, over without", beside["p99"] / without["p99"], at_most=RATIO, gate=None),
@@ -225,7 +225,7 @@ def goals(since: dict[str, list[float]], heard: dict[str, Heard]) -> list[Goal]:
     return found
 
 
-def table(since: dict[str, list[float]], heard: dict[str, Heard]) -> Table:
+def table(since: dict[str, list[float]], heard: dict[str, HandedOn]) -> Table:
     made = Table(title="bridges, a touch that slides", title_justify="left")
     for heading in ("", "frames", "p50 [ms]", "p99 [ms]", "lost", "cores"):
         made.add_column(heading, justify="left" if not heading else "right")

@@ -18,7 +18,7 @@ from dataclasses import asdict
 from typing import Any
 
 from services.contacts.merging import absorb, follow, give_up, host_of, is_part, others, part
-from services.contacts.motion import Patch, Track, cost
+from services.contacts.motion import Patch, Track, cost, is_left_over
 
 REACH_M = 0.015  # a touch that jumps further between two frames is another touch
 STAYS_M = 0.006  # what begins is near where it was seen first; what an image of a changing touch shows is not
@@ -77,7 +77,7 @@ class Tracker:
             if track is None:
                 track = Track(UNCONFIRMED, entry.x, entry.y, sample_ns, entry.size, entry.reach, begins=begins)
             else:
-                track.move(entry, sample_ns)
+                track.move(entry, sample_ns, sure)
                 if track.inside:
                     follow(track, entry, sample_ns)
             found.append(track)
@@ -141,7 +141,8 @@ class Tracker:
             row = []
             for track in self.tracks:
                 distance, chi2 = cost(track, entry, sample_ns)
-                row.append(chi2 if distance < (REACH_M if track.id != UNCONFIRMED else STAYS_M) else NEVER)
+                near = distance < (REACH_M if track.id != UNCONFIRMED else STAYS_M)
+                row.append(chi2 if near and not is_left_over(track, entry) else NEVER)
             costs.append(row)
         for k, column in zip(*(v.tolist() for v in linear_sum_assignment(costs)), strict=True):
             if costs[k][column] < NEVER:
