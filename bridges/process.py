@@ -120,11 +120,10 @@ def main(name: str, make: Callable[[Handed], Bridge]) -> int:
         handed = Handed.read()
         logging.getLogger().setLevel(handed.log_level.upper())
         transport.configure(handed.transport)
-        with lock(process=name):
+        with contextlib.suppress(KeyboardInterrupt), lock(process=name):  # Ctrl-C may come before the loop does
             bridge = make(handed)
             try:
-                with contextlib.suppress(KeyboardInterrupt):
-                    _Loop(bridge).run()
+                _Loop(bridge).run()
             finally:
                 bridge.close()
     except (AlreadyRunning, BridgeError, RuntimeDirError, TransportError) as why:

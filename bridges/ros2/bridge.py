@@ -16,6 +16,7 @@ from bridges import views
 from bridges.clock import WallClock
 from bridges.feeds import ContactFeed, ImageFeed, Measured, Picture, Refusal
 from bridges.process import Bridge, BridgeError, Handed
+from protocol.control import ControlClient, ControlError
 from protocol.frame_types import ELECTRODE_STATES
 from protocol.frames import DeltaFrame, InfoFrame, StatusFrame
 from protocol.sockets import AllReader, NewestReader
@@ -24,8 +25,10 @@ from protocol.transport import Socket
 from . import dds, messages
 from .dds import RosWriter
 from .names import topic_base
+from .tare_service import Act, TareService
 
 DIAGNOSTICS_S = 1.0
+TARE_S = 10.0
 VALID_S = 0.1
 """How often `valid` says false while nothing comes."""
 
@@ -162,6 +165,10 @@ class Ros2Bridge(Bridge):
         self._diagnostics = RosWriter(self._participant, "/diagnostics", "diagnostic_msgs/DiagnosticArray", "state")
         self._tf = RosWriter(self._participant, "/tf_static", "tf2_msgs/TFMessage", "latched")
         self._told = AllReader(["status", "info"])
+        self._tare: TareService | None = None
+        if options.get("commands"):
+            acts = {topic_base(name): tare(name) for name in handed.skins}
+            self._tare = TareService(domain, dds.interface(str(options.get("interface", ""))), acts)
         self._transforms: dict[str, messages.Message] = {}
         self._statuses: dict[tuple[str, str], tuple[StatusFrame, float]] = {}
         self._electrodes: dict[str, list[str]] = {}
@@ -273,6 +280,21 @@ class Ros2Bridge(Bridge):
         return messages.diagnostic(f"eitskin {name}: contacts", name, level, said, values)
 
     def close(self) -> None:
+        if self._tare is not None:
+            self._tare.close()
         self._told.close()
         for topics in self._skins.values():
             topics.close()
+
+
+def tare(skin: str) -> Act:
+    """What a call of the service does."""
+
+    def act() -> tuple[bool, str]:
+        try:
+            taken = ControlClient("preprocessing", TARE_S).call("tare", skin=skin)
+        except ControlError as why:
+            return False, str(why)
+        return True, f"new baseline from {taken.get('frames', 'some')} frames"
+
+    return act

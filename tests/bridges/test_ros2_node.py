@@ -197,6 +197,13 @@ def test_a_ros_node_hears_what_the_service_says_and_nothing_while_it_is_not_vali
     world.until("silent", "/valid", hung, lambda valid: valid is False)
     world.until("valid after the silence", "/valid", hung + 2.0, lambda valid: valid is True)
 
+    # tare by service
+    stub("release")
+    world.order("tare")
+    assert world.until("the service", "service", hung)["value"] is True
+    assert world.until("an answer", "tare", hung)["value"] == [True, "new baseline from 64 frames"]
+    world.until("valid after the tare", "/valid", time.time(), lambda valid: valid is True)
+
     # each valid frame became one wrench, and no other frame did
     time.sleep(0.5)
     offset = time.time() - time.monotonic()

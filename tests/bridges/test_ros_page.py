@@ -14,6 +14,7 @@ import yaml
 
 from bridges.foxglove.channels import FORCES
 from bridges.ros2.definitions import TABLE
+from bridges.ros2.tare_service import REQUEST_TYPE
 from services.runtime.config import parse
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,6 +29,7 @@ def test_the_table_names_every_topic_with_its_type() -> None:
     made = {(name.replace("{k}", "").lstrip("/"), kind) for name, kind in WRITERS}
     assert shown == made and len(made) >= 9
     assert {kind for _, kind in shown} <= TABLE.keys()
+    assert "| `/eitskin/SKIN/tare` | service std_srvs/Trigger" in PAGE and REQUEST_TYPE.startswith("std_srvs::srv::")
 
 
 def test_the_settings_are_such_that_the_service_takes_them() -> None:
@@ -35,7 +37,16 @@ def test_the_settings_are_such_that_the_service_takes_them() -> None:
     found: dict[str, Any] = tomllib.loads(block)
     skins = {"palm": {"port": "stub", "bundle": "square16"}}
     config = parse({**found, "skins": skins})
-    assert config.bridges == ("ros2",) and config.ros2.interface == "lo" and config.ros2.domain == 0
+    assert (
+        config.bridges == ("ros2",)
+        and config.ros2.interface == "lo"
+        and config.ros2.domain == 0
+        and config.ros2.commands
+    )
+
+
+def test_commands_are_off_unless_asked_for() -> None:
+    assert parse({"skins": {"palm": {"port": "stub", "bundle": "square16"}}}).ros2.commands is False
 
 
 @pytest.mark.parametrize("wrong", [{"domain": 233}, {"domain": "0"}, {"interface": "a b"}, {"comands": True}])

@@ -11,11 +11,11 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-How = Literal["ends", "runs", "help", "slow", "ci", "service"]
+How = Literal["ends", "runs", "help", "slow", "ci", "service", "walk"]
 """ends: run to its end, exit status 0. runs: run until it printed `says`, then Ctrl-C, no traceback. help: too long to
 be run at all; its program knows every option that is named (.ci/run runs benchmarks in short form). slow: as `ends`,
 but in .ci/run only. ci: .ci/run has this step, `says` is the line. service: it is how the service of these tests was
-started.
+started. walk: a test of the page's own types it, in the page's order (TRIED_ELSEWHERE).
 """
 
 
@@ -190,6 +190,14 @@ COMMANDS = (
     Row("python -m models.average", "help"),
     Row("python -m models.build .*", "help"),
     Row("python -m protocol.wire_doc", "ends", instead=".venv/bin/python -m protocol.wire_doc"),
+    # docs/your-skin.md, in its order
+    Row(r"(\./)?skin new( .*)?", "walk"),
+    Row(r"(\./)?skin collect", "ends", says="OUT.npz", instead="./skin collect --help"),
+    Row("make train SKIN=my-skin QUICK=1", "walk"),
+    Row(r"\./skin up --config mine.toml", "walk"),
+    Row(r"\./skin (tare|release|echo contact -n 5)", "walk"),
+    Row(r"\./skin press --x 0.012 .*", "walk"),
+    Row(r"\./skin (collect|calibrate force|register) .*presses.npz.*", "walk"),
 )
 
 
@@ -226,6 +234,7 @@ TRIED_ELSEWHERE = {
     "docs/security.md": "tests/cli/test_security.py",
     "docs/page.md": "tests/bridges/test_page.py",
     "docs/extending.md": "tests/docs/test_extending.py",
+    "docs/your-skin.md": "tests/docs/test_your_skin.py",
     "docs/ros.md": "tests/bridges/test_ros_page.py",
     "docs/foxglove.md": "tests/bridges/test_ros_page.py",
 }
