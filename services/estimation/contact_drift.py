@@ -5,16 +5,16 @@ other pairs too), so the difference of a frame is
 
     d = u a + n b + s        u: the series resistance, n: the rest of the contact's Jacobian, s: global scale
 
-with a the relative change of the contact impedance. The current between neighbours that takes the short way through
-the electrode, of which n comes, dies out as the contact does: b = a / (1 + a / SHORT_WAY), within 0.1 % of d from 1.05
-to 100 times; less or more by up to a quarter where the contact was not the nominal one before. While one rises, each
+with a the relative change of the contact impedance. The current between neighbours that takes the short way through the
+electrode, of which n comes, dies out as the contact does: b = a / (1 + a / SHORT_WAY), within 0.1 % of d from 1.05 to
+100 times; less or more by up to a quarter where the contact was not the nominal one before. While one rises, each
 measurement of a scan finds it a little higher: a and b are lines along the scan.
 
-Of 120 touches within 1 mm of an electrode (radii 0.05 to 0.5, drops to 0.85 S/m) the most alike is off this line by
-1.4 % of its d, of 120 anywhere within 40 mm of the centre by 37 %. So there are two answers: from SUSPECT on a change
-is a contact's unless somebody presses right on the electrode (`sure` is False: nothing is valid until contact_evidence.py
-tells), from TELLING on it is a contact's. Under a touch that stays as it is, the change since a few frames ago is the contact's alone. A fall is
-named at once: no touch lowers an impedance.
+Of 120 touches within 1 mm of an electrode (radii 0.05 to 0.5, drops to 0.85 S/m) the most alike is off this line by 1.4
+% of its d, of 120 anywhere within 40 mm of the centre by 37 %. So there are two answers: from SUSPECT on a change is a
+contact's unless somebody presses right on the electrode (`sure` is False: nothing is valid until contact_evidence.py
+tells), from TELLING on it is a contact's. Under a touch that stays as it is, the change since a few frames ago is the
+contact's alone. A fall is named at once: no touch lowers an impedance.
 """
 
 from __future__ import annotations
