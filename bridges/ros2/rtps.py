@@ -32,10 +32,12 @@ PARTICIPANT_GUID, BUILTIN_ENDPOINTS, ENDPOINT_GUID = 0x50, 0x58, 0x5A
 RELATED, RELATED_OF_FAST_DDS = 0x83, 0x800F
 UDP4 = 1
 
+from protocol.errors import EitskinError
+
 Address = tuple[str, int]
 
 
-class Malformed(ValueError):
+class Malformed(EitskinError, ValueError):
     """Bytes that are no RTPS message, or not one that we read."""
 
 
