@@ -11,6 +11,8 @@ import struct
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
+from protocol.errors import EitskinError
+
 MAGIC = b"RTPS\x02\x03"
 VENDOR = b"\x00\x00"  # nobody's
 UNKNOWN = b"\x00\x00\x00\x00"
@@ -31,8 +33,6 @@ ENDPOINT_LOCATOR, DEFAULT_LOCATOR, METATRAFFIC_LOCATOR = 0x2F, 0x31, 0x32
 PARTICIPANT_GUID, BUILTIN_ENDPOINTS, ENDPOINT_GUID = 0x50, 0x58, 0x5A
 RELATED, RELATED_OF_FAST_DDS = 0x83, 0x800F
 UDP4 = 1
-
-from protocol.errors import EitskinError
 
 Address = tuple[str, int]
 
