@@ -95,6 +95,7 @@ EXPECTED = {
     ("services.calibration.force_fit", "CalibrationError"): USAGE,
     ("protocol.transport", "TransportError"): FAILED,
     ("models.bundle", "BundleError"): USAGE,
+    ("services.bridge", "MissingExtra"): USAGE,
 }
 """Exceptions of other modules whose text is already meant for the person at the terminal, and the exit code of each."""
 
