@@ -1,6 +1,7 @@
 """docs/your-skin.md, word by word: every command in its order, in a copy of the checkout, as somebody who follows it.
 
-Quick: without training (the bundle has no network), with few presses and without registering. `-m slow` adds those.
+All of it is slow (-m slow): once without training (no network in the bundle), with few presses, without registering;
+once with those. Quick, and in one process: tests/services/test_other_skins.py.
 """
 
 from __future__ import annotations
@@ -144,6 +145,7 @@ def check(somebody: Reader, most_mm: float) -> None:
     assert json.loads(shown.read_text())
 
 
+@pytest.mark.slow
 def test_the_page_is_followed_without_training() -> None:
     with world() as place:
         check(follow(place, SHORTER), most_mm=2.0)
