@@ -44,9 +44,9 @@ class EitskinError(Exception):
         ├── CalibrationError                  presses of known force make no force law
         ├── MissingExtra                      the packages that a bridge needs are not installed
         ├── NotOurs                           a folder that must not be handed over
-        ├── MalformedRtps (ValueError)        bytes are no RTPS message (the wire of ROS 2)
         ├── BridgeError                       bridges: a bridge cannot start
         ├── ReplayRefused                     the page does not record or replay now
+        ├── Malformed (ValueError)            bytes that are no RTPS message, or not one that the bridge reads
         ├── CliError                          ends a command with one line and an exit code
         └── Broken                            bench: a promise was broken under changed bytes
     """

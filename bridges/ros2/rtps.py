@@ -37,7 +37,7 @@ UDP4 = 1
 Address = tuple[str, int]
 
 
-class MalformedRtps(EitskinError, ValueError):
+class Malformed(EitskinError, ValueError):
     """Bytes that are no RTPS message, or not one that we read."""
 
 
@@ -71,9 +71,9 @@ def sub(kind: int, body: bytes, flags: int = 0) -> bytes:
 
 
 def parse(data: bytes) -> tuple[bytes, Iterator[Sub]]:
-    """(prefix of the sender, submessages). Raises MalformedRtps."""
+    """(prefix of the sender, submessages). Raises Malformed."""
     if len(data) < 20 or data[:4] != MAGIC[:4] or data[4] != 2:
-        raise MalformedRtps("not RTPS 2")
+        raise Malformed("not RTPS 2")
     return data[8:20], _subs(data)
 
 
@@ -82,11 +82,11 @@ def _subs(data: bytes) -> Iterator[Sub]:
     while at + 4 <= len(data):
         kind, flags = data[at], data[at + 1]
         if not flags & 1:
-            raise MalformedRtps("big-endian")
+            raise Malformed("big-endian")
         (length,) = struct.unpack_from("<H", data, at + 2)
         end = at + 4 + length if length or kind in (0x01, 0x09) else len(data)  # 0: the last one, of any length
         if end > len(data):
-            raise MalformedRtps("a submessage that is cut short")
+            raise Malformed("a submessage that is cut short")
         body = data[at + 4 : end]
         if kind == INFO_DST and len(body) >= 12:
             to = body[:12]
@@ -110,7 +110,7 @@ def data(reader: bytes, writer: bytes, number: int, payload: bytes, inline: byte
 
 
 def read_data(found: Sub) -> Arrived:
-    """Raises MalformedRtps."""
+    """Raises Malformed."""
     try:
         _, to_inline = struct.unpack_from("<HH", found.body)
         reader, writer, number = found.body[4:8], found.body[8:12], number_at(found.body, 12)
@@ -118,7 +118,7 @@ def read_data(found: Sub) -> Arrived:
         if found.flags & 2:
             inline, at = parameters(found.body, at)
     except struct.error:
-        raise MalformedRtps("DATA that is cut short") from None
+        raise Malformed("DATA that is cut short") from None
     return Arrived(reader, writer, number, inline, found.body[at:] if found.flags & 4 else b"")
 
 
@@ -139,32 +139,32 @@ def acknack(reader: bytes, writer: bytes, base: int, missing: Iterable[int], cou
 
 
 def number_set(body: bytes, at: int) -> tuple[int, list[int]]:
-    """(base, the numbers in the set). Raises MalformedRtps."""
+    """(base, the numbers in the set). Raises Malformed."""
     try:
         base, (bits,) = number_at(body, at), struct.unpack_from("<I", body, at + 8)
         if bits > MOST_BITS:
-            raise MalformedRtps("too many bits")
+            raise Malformed("too many bits")
         words = struct.unpack_from(f"<{(bits + 31) // 32}I", body, at + 12)
     except struct.error:
-        raise MalformedRtps("numbers that are cut short") from None
+        raise Malformed("numbers that are cut short") from None
     return base, [base + k for k in range(bits) if words[k // 32] >> (31 - k % 32) & 1]
 
 
 def parameters(body: bytes, at: int = 0) -> tuple[dict[int, list[bytes]], int]:
-    """(parameters by number, where they end). Raises MalformedRtps."""
+    """(parameters by number, where they end). Raises Malformed."""
     found: dict[int, list[bytes]] = {}
     for _ in range(MOST_PARAMETERS):
         if at + 4 > len(body):
-            raise MalformedRtps("parameters without an end")
+            raise Malformed("parameters without an end")
         number, length = struct.unpack_from("<HH", body, at)
         at += 4
         if number == SENTINEL:
             return found, at
         if at + length > len(body):
-            raise MalformedRtps("a parameter that is cut short")
+            raise Malformed("a parameter that is cut short")
         found.setdefault(number, []).append(body[at : at + length])
         at += length
-    raise MalformedRtps("too many parameters")
+    raise Malformed("too many parameters")
 
 
 def parameter_list(pairs: Iterable[tuple[int, bytes]]) -> bytes:

@@ -177,7 +177,7 @@ class TareService:
             for each in subs:
                 if each.to in (bytes(12), self._prefix):
                     self._take(prefix, each)
-        except (OSError, rtps.MalformedRtps, struct.error) as why:
+        except (OSError, rtps.Malformed, struct.error) as why:
             log.debug("dropped a message: %s", why)
 
     def _take(self, prefix: bytes, each: rtps.Sub) -> None:

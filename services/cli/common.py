@@ -91,7 +91,7 @@ EXPECTED = {
     ("services.recordings.recording", "RecordingError"): USAGE,
     ("services.recordings.replay", "ReplayError"): FAILED,
     ("services.recordings.importing", "ImportRefused"): USAGE,
-    ("services.calibration.registration", "RegistrationError"): USAGE,
+    ("services.calibration.presses", "RegistrationError"): USAGE,
     ("services.calibration.force_fit", "CalibrationError"): USAGE,
     ("protocol.transport", "TransportError"): FAILED,
     ("models.bundle", "BundleError"): USAGE,

@@ -51,7 +51,7 @@ def test_bytes_that_are_none_are_refused_by_name_and_by_nothing_else() -> None:
                     arrived = rtps.read_data(each)
                     rtps.parameters(arrived.payload, 4)
                 rtps.number_set(each.body, 8)
-        except (rtps.MalformedRtps, struct.error):
+        except (rtps.Malformed, struct.error):
             pass
 
 
