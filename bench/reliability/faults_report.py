@@ -53,8 +53,8 @@ GATES: dict[str, float] = {
     # Late where these frames were wrong before: a contact that rises under a touch that moves is named, and its frames
     # are not valid, until the touch ends. A gross gain counts once it has lasted a second, and so does its end.
     "matrix late": 5,
-    "ok valid": 98,
-    "ok changing": 4,
+    "ok valid": 99.5,
+    "ok changing": 2,
     "electrode open valid": 95,
     "electrode open reported": 90,
     "electrode drifting reported": 90,

@@ -20,7 +20,7 @@ named at once: no touch lowers an impedance.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -247,11 +247,11 @@ class ChangedContacts:
         self.felt.pop(k, None)
         self._before.pop(k, None)
 
-    def keep(self, drifting: Sequence[int]) -> None:
-        """Forget the others."""
+    def keep(self, drifting: Sequence[int], like: Callable[[int, Array], bool] = lambda k, past: True) -> None:
+        """Forget the others. like: whether the measurements of electrode k are what they were in a past |Z| (K,)."""
         for k in drifting:  # what was wrong at once may have begun under a touch too
-            if k not in self._before and len(self._past) >= LOOK_BACK:
-                self._before[k] = self._past[-LOOK_BACK]
+            if k not in self._before and len(self._past) >= LOOK_BACK and not like(k, self._past[-LOOK_BACK]):
+                self._before[k] = self._past[-LOOK_BACK]  # a contact that drifts slowly was not well then either
         self.felt = {k: felt for k, felt in self.felt.items() if k in drifting}
         self._before = {k: before for k, before in self._before.items() if k in drifting}
 

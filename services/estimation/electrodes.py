@@ -218,23 +218,31 @@ class ElectrodeHealth:
         """An open wire or a short is seen directly; the others must measure what they did before, untouched."""
         if self._states[k] not in (DRIFTING, SWAPPED) or untouched is None:
             return True
+        return any(
+            since is not None and self._like(k, amplitude, since, failed, untouched)
+            for since in (untouched.z0, self._contacts.before(k))
+        )
+
+    def _like(self, k: int, amplitude: Array, since: Array, failed: Mask, untouched: Reference) -> bool:
+        """Whether the measurements of electrode k are what they were, or none of them tells."""
         rows = self.member[k] & ~failed & np.isfinite(untouched.sigma)
         if not rows.any():
             return True
-        within = WELL + 6 * untouched.sigma[rows]
-        for since in (untouched.z0, self._contacts.before(k)):
-            if since is not None:
-                off = np.abs(amplitude[rows] - since[rows]) / untouched.normaliser[rows]
-                if (off <= within).mean() >= MOSTLY:
-                    return True
-        return False
+        off = np.abs(amplitude[rows] - since[rows]) / untouched.normaliser[rows]
+        return bool((off <= WELL + 6 * untouched.sigma[rows]).mean() >= MOSTLY)
 
     def _shift(self, seen: FrameFindings, untouched: Reference | None) -> Array:
         """What the drifting electrodes do to the pairs of the others."""
         drifting = np.flatnonzero(np.isin(self._states, (DRIFTING, OPEN))).tolist()
-        self._contacts.keep(drifting)
         if untouched is None or not drifting:
+            self._contacts.keep(drifting)
             return np.zeros(len(seen.amplitude))
+
+        def like(k: int, past: Array) -> bool:
+            tells = bool((self.member[k] & ~seen.failed).any())
+            return tells and self._like(k, seen.amplitude, past, seen.failed, untouched)
+
+        self._contacts.keep(drifting, like)
         return self._contacts.shift(drifting, seen.amplitude, untouched, ~seen.failed & np.isfinite(untouched.sigma))
 
     # state

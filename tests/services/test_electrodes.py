@@ -201,6 +201,15 @@ def test_a_contact_that_rises_within_scans_is_named_before_it_is_up(skin: StubSk
     assert states(skin.rest(BACK_WITHIN + 3)) == {}
 
 
+def test_a_contact_that_drifts_slowly_stays_named() -> None:
+    """By 10 % a second. It was named in every other frame: what it measured three frames ago counted as well."""
+    own = StubSkin(80.0)
+    frames = [own.feel(contacts=((8, 1 + 0.0044 * n),)) for n in range(60)]
+    named = [int(frame.delta.electrodes[8]) == ELECTRODE_STATES.index("drifting") for frame in frames]
+    assert all(named[25:])
+    assert not any(frame.contact.valid and frame.contact.contacts for frame in frames)
+
+
 @pytest.mark.parametrize("pair", [(10, 11), (2, 13)])
 def test_exchanged_wires_are_read_as_each_others(skin: StubSkin, pair: tuple[int, int]) -> None:
     """A touch between them is where it is, and the frame says that it is degraded."""
