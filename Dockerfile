@@ -20,7 +20,7 @@ CMD ["python", "-m", "services.publisher"]
 
 # The same with what a bridge needs: `target` in docker-compose.yml.
 FROM service AS bridge
-ARG BRIDGE
+ARG BRIDGE=ros2
 USER 0:0
 COPY requirements/${BRIDGE}.lock /tmp/bridge.lock
 RUN pip install --no-cache-dir --disable-pip-version-check --require-hashes -r /tmp/bridge.lock && rm /tmp/bridge.lock

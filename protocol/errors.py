@@ -46,6 +46,7 @@ class EitskinError(Exception):
         ├── NotOurs                           a folder that must not be handed over
         ├── BridgeError                       bridges: a bridge cannot start
         ├── ReplayRefused                     the page does not record or replay now
+        ├── Malformed (ValueError)            bytes that are no RTPS message, or not one that the bridge reads
         ├── CliError                          ends a command with one line and an exit code
         └── Broken                            bench: a promise was broken under changed bytes
     """

@@ -11,6 +11,8 @@ import struct
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
+from protocol.errors import EitskinError
+
 MAGIC = b"RTPS\x02\x03"
 VENDOR = b"\x00\x00"  # nobody's
 UNKNOWN = b"\x00\x00\x00\x00"
@@ -35,7 +37,7 @@ UDP4 = 1
 Address = tuple[str, int]
 
 
-class Malformed(ValueError):
+class Malformed(EitskinError, ValueError):
     """Bytes that are no RTPS message, or not one that we read."""
 
 

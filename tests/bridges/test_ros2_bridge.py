@@ -15,7 +15,7 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
-from bridges.process import Bridge, BridgeError, Handed, main
+from bridges.process import INTERRUPTED, Bridge, BridgeError, Handed, main
 from bridges.ros2 import dds
 from tests.bridges.conftest import FakeService, RunningBridge
 
@@ -160,4 +160,4 @@ def test_ctrl_c_while_it_is_being_made_ends_it_without_a_word(
     reach = {"addresses": {}, "secret_key": None, "server_keys": {}, "clients": None, "operators": None}
     told = {"skins": {}, "transport": {**reach, "insecure": False}, "options": {}, "log_level": "info"}
     monkeypatch.setenv("EITSKIN_BRIDGE", json.dumps(told))
-    assert main("ros2", make) == 0 and capsys.readouterr().err == ""
+    assert main("ros2", make) == INTERRUPTED and capsys.readouterr().err == ""
