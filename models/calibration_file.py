@@ -16,6 +16,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.bundle_check import Wrong, check
@@ -35,6 +36,8 @@ class CalibrationFileError(EitskinError):
 def pack(matrices: Matrices, skin: Mapping[str, Any], said: Mapping[str, Any]) -> bytes:
     """skin: the geometry as mounted (`SkinGeometry.to_dict`); said: what the fit found, with `bundle_hash`."""
     arrays: dict[str, Any] = {f.name: np.asarray(getattr(matrices, f.name)) for f in fields(Matrices)}
+    lower = np.tril_indices(len(matrices.gram))  # it is symmetric: a state with the whole would be too large to send
+    arrays["gram"] = np.asarray(matrices.gram)[lower]
     text = json.dumps({"schema": SCHEMA, "skin": dict(skin), **said}, allow_nan=False)
     out = io.BytesIO()
     np.savez_compressed(out, said=np.frombuffer(text.encode(), np.uint8), **arrays)
@@ -49,6 +52,7 @@ def unpack(packed: bytes, bundle: Bundle) -> Bundle:
         schema, made_for, skin = said.pop("schema"), said["bundle_hash"], dict(said.pop("skin"))
         arrays["scale_index"], arrays["normalisation"] = int(arrays["scale_index"]), str(arrays["normalisation"])
         arrays["model_error"] = float(arrays["model_error"])
+        arrays["gram"] = _whole(arrays["gram"], len(arrays["z0"]))
         matrices = Matrices(**arrays)
     except (EitskinError, ValueError, KeyError, TypeError, OSError, AttributeError) as wrong:
         raise CalibrationFileError(f"no calibration ({str(wrong)[:120]}): run `skin tare` again") from None
@@ -65,6 +69,13 @@ def unpack(packed: bytes, bundle: Bundle) -> Bundle:
         raise CalibrationFileError(f"the calibration: {why}: run `skin tare` again") from None
     digest = hashlib.sha256(bundle.hash.encode() + packed).hexdigest()
     return replace(bundle, manifest=manifest, matrices=matrices, hash=digest)
+
+
+def _whole(lower: NDArray[np.float64], k: int) -> NDArray[np.float64]:
+    """(k, k) of its lower triangle. Raises ValueError where that has another size."""
+    made = np.zeros((k, k))
+    made[np.tril_indices(k)] = lower
+    return made + np.tril(made, -1).T
 
 
 def found_by(bundle: Bundle) -> dict[str, Any] | None:

@@ -167,6 +167,18 @@ class DeltaFrame(Frame):
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
+class LocatedTouch:
+    """One touch as a registered skin's response map finds it."""
+
+    position: list[float] = wire(Vector(2, "m"), "x, y in the skin's frame")
+    sigma: list[float] = wire(Vector(3), "as a contact's `position_sigma`")
+    amplitude: float = wire(Float(0), "beside the registration's mean press", 1.0)
+    indentation_m: float | None = wire(Maybe(Float(0, unit="m")), "as a contact's, or nil", None)
+    force_n: float | None = wire(Maybe(Float(0, unit="N")), "how hard, where the skin was registered with forces", None)
+    value_sigma: float | None = wire(Maybe(Float(0)), "standard uncertainty of depth or force, or nil", None)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
 class ImageFrame(Frame):
     """The conductivity drop over the skin's bounding box. A held frame's image was sent before: see the rules for
     readers.
@@ -196,6 +208,9 @@ class ImageFrame(Frame):
     noise: float | None = wire(
         Maybe(Float(0)), "rms `sigma` of the delta frame that the image was made of (relative), or nil", None
     )
+    touches: list[LocatedTouch] = wire(
+        ListOf(Record(LocatedTouch), 16), "of a registered skin: where its touches are, sent with the image", list
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -221,6 +236,16 @@ class Contact:
     shape: str = wire(Text(32), "most probable of " + ", ".join(SHAPES) + "; or unknown", "unknown")
     shape_probability: float | None = wire(Maybe(Float(0, 1)), "of `shape`, or nil", None)
     confidence: float = wire(Float(0, 1), "probability that this is a touch", 1.0)
+    position_sigma: list[float] | None = wire(
+        Maybe(Vector(3)),
+        "standard uncertainty of `position` along the longest and the shortest axis of its ellipse [m], angle of the "
+        "longest to x [rad]; nil where nobody measured it; 2.15 times the axes hold 90 %",
+        None,
+    )
+    indentation_m: float | None = wire(
+        Maybe(Float(0, unit="m")), "how deep the touch presses; nil where the skin was not registered with depths", None
+    )
+    indentation_sigma_m: float | None = wire(Maybe(Float(0, unit="m")), "its standard uncertainty, or nil", None)
     sheet: list[float] | None = wire(
         Maybe(Vector(2, "m")), "x, y on the unrolled sheet, as images have it; nil: those of `position`", None
     )

@@ -6,13 +6,15 @@ ONNX Runtime on one thread, warmed up before the stage is ready. A bundle withou
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import DeltaFrame, Frame, ImageFrame
+from models.locator import Located, Locator
+from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
 from services.estimation.quality import SURE, Residual
 from services.estimation.sentinel import CoarseImage
 from services.estimation.within_scan import ChangingTouch
@@ -47,6 +49,7 @@ class Inference(Stage):
         self.each_alone = False  # offline: frames that do not follow each other
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
+        self._locator = None if bundle.locator is None else Locator(bundle.locator)
         self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
@@ -138,6 +141,9 @@ class Inference(Stage):
         out.image, out.sigma, out.classes = ahead[1] if ahead and ahead[0] is frame else self._network.run(frame)
         out.noise = _rms(frame.sigma)
         out.residual = self._residual(frame.difference, frame.sigma, out.image)
+        if self._locator is not None and frame.touched:
+            quantity = self._locator.quantity
+            out.touches = [_touch(each, quantity) for each in self._locator.locate(frame.difference, frame.sigma)]
         self._refused = self._refuses and frame.touched and out.residual is not None and self._residual.refused
         self._counters["networks_run"] += 1
         doubted = frame.touched and out.residual is not None and out.residual > SURE
@@ -216,14 +222,15 @@ class Inference(Stage):
         out.held, out.reconstructed = True, self._last_scan
         if self._again:
             out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
+            out.touches = last.touches
             self._again = False
 
     def state(self) -> dict[str, Any]:
         last, rest = self._last, {"changing": [self._changing, self._changing_scan], **self.linearisation.state()}
         if last is None:
             return {"last": None, **rest}
-        kept = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
-        kept |= {"residual": last.residual, "refused": self._refused}
+        kept: dict[str, Any] = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
+        kept |= {"residual": last.residual, "refused": self._refused, "touches": [asdict(t) for t in last.touches]}
         return {"last": {"scan": self._last_scan, **kept}, **rest}
 
     def load(self, state: dict[str, Any]) -> None:
@@ -238,6 +245,7 @@ class Inference(Stage):
             image, sigma, classes = (np.asarray(last[name], np.float32) for name in ("image", "sigma", "classes"))
             self._last = ImageFrame(skin=self.skin, image=image, sigma=sigma, classes=classes)
             self._last.noise, self._last_scan = last.get("noise"), int(last["scan"])
+            self._last.touches = [LocatedTouch(**each) for each in last.get("touches", [])]
             self._last.residual, self._refused = last.get("residual"), bool(last.get("refused", False))
         except (KeyError, TypeError, ValueError) as wrong:
             raise Refused(f"no image in the saved state ({wrong})") from None
@@ -246,6 +254,14 @@ class Inference(Stage):
         if isinstance(self._network, OneStep):
             return Health("OK", [f"bundle {self.bundle.name} has no network: one-step images"], dict(self._counters))
         return Health("OK", [], dict(self._counters))
+
+
+def _touch(found: Located, quantity: str) -> LocatedTouch:
+    made = LocatedTouch(position=[found.x, found.y], sigma=found.sigma, amplitude=found.amplitude)
+    if found.value is not None:
+        setattr(made, quantity, found.value)
+        made.value_sigma = found.value_sigma
+    return made
 
 
 def _rms(sigma: NDArray[np.float32]) -> float | None:

@@ -47,8 +47,14 @@ class MountedSkin:
 
 
 def needs_fit(baseline: Baseline, bundle: Bundle) -> bool:
-    """Whether there is anything to find: a measured bundle predicts no |Z0|, and a good one predicts this one."""
-    return bundle.matrices.normalisation == "model" and implausibility(baseline.z0, bundle.prereconstructor()) > FITS
+    """Whether there is anything to find: a measured bundle predicts no |Z0|, a good one predicts this one, and one that
+    was registered was measured on this very skin.
+    """
+    return (
+        bundle.locator is None
+        and bundle.matrices.normalisation == "model"
+        and implausibility(baseline.z0, bundle.prereconstructor()) > FITS
+    )
 
 
 class MountingFit:

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame
+from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, LocatedTouch, ShapeFrame
 from protocol.held import ANY, HeldImage
 from services.contacts.force import ForceLaw, Look
 from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
 from services.contacts.placing import placement
+from services.contacts.registered import measures_force, patches, registered
 from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.surface import Placed
 from services.contacts.tracking import Tracker
@@ -43,6 +44,9 @@ class Publishing(Stage):
         self.config = skin
         self.law = ForceLaw.of(skin, bundle, name)
         self.place, self.frame_id = placement(skin, geometry(bundle)["outline"], name)
+        by_registration = measures_force(bundle)
+        self._tells_force = self.law.exists or by_registration
+        self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
         self.tracker = Tracker()
         self.each_alone = False  # offline: frames that do not follow each other
         self.reset()
@@ -72,8 +76,8 @@ class Publishing(Stage):
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, ImageFrame)
         self._counters["frames"] += 1
-        out = ContactFrame(**inherited(frame), frame_id=self.frame_id, force_calibrated=self.law.calibrated)
-        if not self.law.exists:
+        out = ContactFrame(**inherited(frame), frame_id=self.frame_id, force_calibrated=self._calibrated)
+        if not self._tells_force:
             add_reason(out.reasons, "uncalibrated_force")
         self.lacks = not self.held.complete(frame)
         if not frame.valid and "out_of_distribution" in frame.reasons:
@@ -115,10 +119,14 @@ class Publishing(Stage):
         """Find the contacts of a new image."""
         m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
         segments: list[Segment] = []
-        if frame.touched and frame.image.size:
+        located = frame.touches if frame.touched and frame.image.size else []
+        if located:
+            segments, seen = patches(frame)
+        elif frame.touched and frame.image.size:
             places = [] if self._alone(frame) else self.tracker.expected(now)
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
-        seen = [Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
+        if not located:
+            seen = [Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
         tracks: Sequence[Track | None]
         ended: list[Track] = []
         if self._alone(frame):
@@ -126,11 +134,13 @@ class Publishing(Stage):
         else:
             tracks, ended = self.tracker.update(seen, now, _explained(frame))
         present = []
-        for track, place, s in zip(tracks, seen, segments, strict=True):
+        said: Sequence[LocatedTouch | None] = located or [None] * len(segments)
+        for track, place, s, touch in zip(tracks, seen, segments, said, strict=True):
             if track is not None:
                 classes = _class_probabilities(s, frame.classes)
-                present.append((self._contact(track, place, s, classes, frame), s, classes))
-        present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
+                present.append((self._contact(track, place, s, classes, frame, touch), s, classes))
+        if not located:  # those come strongest first
+            present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
         self._segments, self._classes = [s for _, s, _ in present], [classes for _, _, classes in present]
         self._geometry, self._known = (m, [x0, y0]), True
         self._seen_in = frame.session, frame.reconstructed
@@ -169,8 +179,18 @@ class Publishing(Stage):
         self._forget()
         self._counters["unknown"] += 1
 
-    def _contact(self, track: Track, seen: Patch, s: Segment, classes: list[float], frame: ImageFrame) -> Contact:
+    def _contact(
+        self,
+        track: Track,
+        seen: Patch,
+        s: Segment,
+        classes: list[float],
+        frame: ImageFrame,
+        touch: LocatedTouch | None,
+    ) -> Contact:
         force, sigma = self.law.force(Look.of(s, frame))
+        if touch is not None and not self.law.exists:
+            force, sigma = touch.force_n, None if touch.force_n is None else touch.value_sigma
         best = int(np.argmax(classes)) if classes else -1
         known = bool(classes) and classes[best] >= UNKNOWN_BELOW
         at = self.place(seen.x, seen.y)
@@ -189,6 +209,7 @@ class Publishing(Stage):
             shape_probability=classes[best] if classes else None,
             confidence=_confidence(s),
             sheet=None if self.place.flat else [seen.x, seen.y],
+            **({} if touch is None else registered(touch)),
         )
 
     def _drops(self) -> list[tuple[float, float | None]]:
@@ -197,7 +218,7 @@ class Publishing(Stage):
 
     def _ends(self, tracks: list[Track]) -> list[Contact]:
         """The last contacts of touches that ended: their last places, without force."""
-        force = None if not self.law.exists else 0.0
+        force = 0.0 if self._tells_force else None
         ends = []
         for t in tracks:
             at, sheet = self.place(t.x, t.y), None if self.place.flat else [t.x, t.y]
@@ -210,7 +231,7 @@ class Publishing(Stage):
     def _force(self, frame: ContactFrame) -> ForceFrame:
         """The total force; valid if the contacts are."""
         present = [c for c in self._contacts if c.state != "end"]
-        total = None if not self.law.exists else sum(c.force_n or 0.0 for c in present)
+        total = None if not self._tells_force else sum(c.force_n or 0.0 for c in present)
         wrench = np.sum([c.wrench for c in present], axis=0).tolist() if present else [0.0] * 6
         return ForceFrame(**inherited(frame), wrench=wrench, force_n=total)
 
@@ -264,13 +285,17 @@ def _kept(frame: ImageFrame) -> dict[str, Any]:
     return {
         "scan": frame.reconstructed,
         **{name: np.array(getattr(frame, name), np.float32) for name in ("image", "sigma", "classes")},
+        "touches": [asdict(each) for each in frame.touches],
     }
 
 
 def _image_of(skin: str, kept: dict[str, Any]) -> ImageFrame:
     image, sigma, classes = (np.asarray(kept[name], np.float32) for name in ("image", "sigma", "classes"))
+    touches = [LocatedTouch(**each) for each in kept.get("touches", [])]
     scan = int(kept["scan"])
-    return ImageFrame(skin=skin, session=ANY, reconstructed=scan, image=image, sigma=sigma, classes=classes)
+    return ImageFrame(
+        skin=skin, session=ANY, reconstructed=scan, image=image, sigma=sigma, classes=classes, touches=touches
+    )
 
 
 def _explained(frame: ImageFrame) -> bool:

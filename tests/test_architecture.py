@@ -36,6 +36,8 @@ SERVICES_USE_OF_MODELS = {
     "models.bundle",
     "models.calibration_file",
     "models.files",
+    "models.locator",
+    "models.locator_arrays",
     "models.npz",
     "models.prereconstruction",
     "models.patterns",

@@ -173,7 +173,7 @@ class FoxgloveBridge(Bridge):
             pulse = self.pulses[name]
             pulse.idle = not skin.wanted
             pulse.sent.update({k: n - pulse.sent[k] for k, n in skin.channels.sent.items()})
-            pulse.drops["skipped"] = skin.contacts.skipped
+            pulse.drops["skipped"], pulse.drops["late"] = skin.contacts.skipped, skin.contacts.late
             if pulse.idle:
                 pulse.level, pulse.messages = "OK", ["idle: nobody looks"]
             elif isinstance(skin.state, Refusal):

@@ -235,7 +235,7 @@ class Ros2Bridge(Bridge):
         pulse = self.pulses[name]
         pulse.idle = not topics.wanted
         pulse.sent.update({writer.name: writer.sent - pulse.sent[writer.name] for writer in topics.writers()})
-        pulse.drops["skipped"] = topics.contacts.skipped
+        pulse.drops["skipped"], pulse.drops["late"] = topics.contacts.skipped, topics.contacts.late
         if pulse.idle:
             pulse.level, pulse.messages = "OK", ["idle: nobody subscribes"]
         elif isinstance(topics.state, Refusal):

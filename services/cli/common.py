@@ -91,10 +91,11 @@ EXPECTED = {
     ("services.recordings.recording", "RecordingError"): USAGE,
     ("services.recordings.replay", "ReplayError"): FAILED,
     ("services.recordings.importing", "ImportRefused"): USAGE,
-    ("services.calibration.registration", "RegistrationError"): USAGE,
+    ("services.calibration.presses", "RegistrationError"): USAGE,
     ("services.calibration.force_fit", "CalibrationError"): USAGE,
     ("protocol.transport", "TransportError"): FAILED,
     ("models.bundle", "BundleError"): USAGE,
+    ("services.bridge", "MissingExtra"): USAGE,
 }
 """Exceptions of other modules whose text is already meant for the person at the terminal, and the exit code of each."""
 

@@ -22,6 +22,8 @@ from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
 from services.cli.doctor_mounting import mounting_found
 from services.contacts.force import ForceLaw
+from services.contacts.placing import placement
+from services.describe import geometry
 from services.estimation import checks
 from services.estimation.tare import implausibility
 from services.runtime.config import RECORDINGS, ConfigError, ConfigFile, Skin, config_path, load
@@ -84,6 +86,8 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
     yield Finding("OK", f"{name}: checks", checks.sentence(bundle) or "all of them, on every frame")
     if skin.calibration is not None:
         yield _calibration(name, skin, bundle)
+    if skin.surface is not None:
+        yield _wrapped(name, skin, bundle)
     if Path(skin.port).suffix in RECORDINGS:
         found = Path(skin.port).is_file()
         yield Finding("OK" if found else "FAIL", f"{name}: port", f"{skin.port} {'is' if found else 'is not'} there")
@@ -106,6 +110,16 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
             yield electrode_order(name, live.baseline(info), bundle)
     else:
         yield Finding("SKIP", f"{name}: electrodes", "their order is looked at while the service runs: `skin up`")
+
+
+def _wrapped(name: str, skin: Skin, bundle: Bundle) -> Finding:
+    what = f"{name}: surface"
+    try:
+        _, frame_id = placement(skin, geometry(bundle)["outline"], name)
+    except ConfigError as why:
+        return Finding("FAIL", what, str(why))
+    assert skin.surface is not None
+    return Finding("OK", what, f"{skin.surface.kind} of radius {skin.surface.radius_m:g} m; contacts in {frame_id!r}")
 
 
 def _calibration(name: str, skin: Skin, bundle: Bundle) -> Finding:

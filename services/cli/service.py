@@ -28,12 +28,15 @@ def up(
 ) -> None:
     """Start all processes and keep them alive, in the foreground; Ctrl-C or SIGTERM stops them all."""
     from protocol.runtime import lock
+    from services.bridge import check
     from services.runtime.config import load
     from services.runtime.supervision import Program, programs
     from services.runtime.supervision import up as supervise
 
     found = load()
     _check_mismatches(found)
+    for name in found.bridges:
+        check(name)
     wanted = [p for p in programs(found) if not (no_board and p.name in ("acquisition", "stub"))]
     extra = [Program("recorder", "services.recorder", ("--folder", str(record.resolve())))] if record else []
     with lock():  # said before anything else where a service runs here already

@@ -75,6 +75,26 @@ def segment(image: Image, sigma: Image, expected: Sequence[Place] = ()) -> list[
     return sorted(found, key=lambda s: -s.peak)
 
 
+def divided(image: Image, sigma: Image, places: Sequence[Place]) -> list[Segment]:
+    """The same image as touches that are known to be at these (x, y) [pixels], one each, in their order: every pixel is
+    the nearest one's. Where the image shows nothing of a touch, its pixel and the four round it.
+    """
+    smooth = ndimage.correlate1d(ndimage.correlate1d(image.astype(np.float64), KERNEL, 0), KERNEL, 1)
+    floor = max(FLOOR, RELATIVE_FLOOR * float(image.max(initial=0.0)))
+    y, x = np.indices(image.shape)
+    nearest = np.argmin([(x - px) ** 2 + (y - py) ** 2 for px, py in places], axis=0)
+    found = []
+    for number, (px, py) in enumerate(places):
+        own = np.where((nearest == number) & (smooth > 0.5 * floor), smooth, 0.0)
+        volume = float(image[own > 0].sum())
+        if own.max() <= 0:
+            column, row = (int(min(max(round(p), 0), n - 1)) for p, n in ((px, image.shape[1]), (py, image.shape[0])))
+            own[row, column] = floor
+        mask = _half(own)
+        found.append(_measured(image, sigma, own, mask, mask, (0, 0), volume))
+    return found
+
+
 def _box(high: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Rows and columns round all high pixels, with a margin: empty pixels cost time too."""
     spans = []

@@ -17,7 +17,8 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+WEBGL = ["--use-angle=swiftshader-webgl", "--enable-unsafe-swiftshader"]  # drawn by software
+ARGUMENTS = ["--no-sandbox", "--disable-gpu-compositing", *WEBGL]
 SECONDS = 10.0
 TWO_S, FAULT_S = 3.5, 6.5  # when the second finger comes, when the electrode dies
 TRIES = 40

@@ -25,7 +25,7 @@ VECTORS = ROOT / "protocol" / "vectors"
 WAIT_MS = 30_000
 # No sandbox: CI is root in a container. Software drawing without WebGL, but where a test wants it.
 FLAT = ["--no-sandbox", "--disable-gpu", "--disable-3d-apis"]
-SOLID = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+SOLID = ["--no-sandbox", "--disable-gpu-compositing", "--use-angle=swiftshader-webgl", "--enable-unsafe-swiftshader"]
 TRUST_CHANGES = """() => {
   window.changes = [];
   const { body } = document;

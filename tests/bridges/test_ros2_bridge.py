@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
-from bridges.process import BridgeError, Handed
+from bridges.process import Bridge, BridgeError, Handed, main
 from bridges.ros2 import dds
 from tests.bridges.conftest import FakeService, RunningBridge
 
@@ -148,3 +149,15 @@ def test_what_the_user_says_of_cyclone_comes_after_ours(monkeypatch: pytest.Monk
     monkeypatch.setenv("CYCLONEDDS_URI", "")
     dds.configure("")
     assert 'NetworkInterface name="lo"' in os.environ["CYCLONEDDS_URI"]
+
+
+def test_ctrl_c_while_it_is_being_made_ends_it_without_a_word(
+    runtime: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make(handed: Handed) -> Bridge:
+        raise KeyboardInterrupt
+
+    reach = {"addresses": {}, "secret_key": None, "server_keys": {}, "clients": None, "operators": None}
+    told = {"skins": {}, "transport": {**reach, "insecure": False}, "options": {}, "log_level": "info"}
+    monkeypatch.setenv("EITSKIN_BRIDGE", json.dumps(told))
+    assert main("ros2", make) == 0 and capsys.readouterr().err == ""

@@ -6,6 +6,7 @@ import json
 import re
 import tomllib
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ import yaml
 from bridges.foxglove.channels import FORCES
 from bridges.ros2.definitions import TABLE
 from bridges.ros2.tare_service import REQUEST_TYPE
+from services.bridge import NEEDS
 from services.runtime.config import parse
+from tests.cli.conftest import Ran, skin  # noqa: F401
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs/ros.md").read_text(encoding="utf-8")
@@ -77,3 +80,16 @@ def test_the_layout_shows_topics_and_fields_that_there_are() -> None:
     assert set(re.findall(r"/palm/forces\.(\w+)", text)) <= set(FORCES["properties"])
     panels = set(re.findall(r'"(\w+!\w+)"', json.dumps(layout["layout"])))
     assert panels == set(layout["configById"])
+
+
+def test_a_bridge_whose_packages_are_missing_is_refused_before_anything_starts(
+    skin: Callable[..., Ran],  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = tmp_path / "skin.toml"
+    config.write_text('bridges = ["ros2"]\n[skins.palm]\nport = "stub"\nbundle = "square16"\n')
+    monkeypatch.setitem(NEEDS, "ros2", "no_such_package")
+    for command in (("up",), ("bridge", "ros2")):
+        ran = skin(*command, "--config", config)
+        assert ran.code == 2 and "make venv EXTRAS=ros2" in ran.err and "Traceback" not in ran.err, ran.err

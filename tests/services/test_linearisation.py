@@ -189,6 +189,8 @@ def test_a_calibration_of_another_bundle_or_a_damaged_one_is_refused(bundle: Bun
     own = unpack(packed, bundle)
     said = found_by(own)
     assert said is not None and found_by(bundle) is None and own.hash != bundle.hash
+    assert np.allclose(own.matrices.gram, own.matrices.gram.T) and own.matrices.gram.shape == bundle.matrices.gram.shape
+    assert np.allclose(own.matrices.gram, bundle.matrices.gram, rtol=0.5, atol=0.1 * np.abs(own.matrices.gram).max())
     geometry.from_dict(own.skin)  # electrodes where they are, on the outline
     with pytest.raises(CalibrationFileError, match="of the bundle"):
         unpack(packed, replaced(bundle, hash="0" * 64))

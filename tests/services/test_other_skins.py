@@ -57,7 +57,7 @@ class Made:
         return result
 
 
-@pytest.fixture(scope="module", params=SKINS)
+@pytest.fixture(scope="module", params=["disc12", "ell16", pytest.param("disc32", marks=pytest.mark.slow)])
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Made:
     return Made(request.param, tmp_path_factory.mktemp("skins"))
 

@@ -23,7 +23,7 @@ const token = keptToken();
 const map = new SkinMap(by("map"));
 const timeline = new Timeline(by("timeline"));
 const state = { skin: "", hello: null, newest: {}, pictures: {}, statuses: new Map(), info: null, session: "", noise: 0 };
-const recent = { scans: new panels.Recent(), latency: new panels.Recent(), shown: new panels.Recent() };
+const recent = { scans: new panels.Recent(), latency: new panels.Recent(), shown: new panels.Recent(), draw: new panels.Recent() };
 let surface = null, verdict = { ok: false }, undrawn = false;
 const drawn = { ms: 0, words: 0, summary: 0 };
 
@@ -120,7 +120,7 @@ function delta(frame) {
 /** Judge what is there, and say so. Called often, whether anything comes or not: silence is news too. */
 function look() {
   const before = verdict.ok;
-  verdict = judge({ connected: link.connected, clock: link.clock, contact: state.newest.contact, statuses: state.statuses, hello: state.hello, replay: state.skin === "replay" });
+  verdict = judge({ connected: link.connected, clock: link.clock, contact: state.newest.contact, statuses: state.statuses, hello: state.hello, replay: state.skin === "replay", drawMs: recent.draw.median });
   panels.banner(verdict);
   const now = performance.now();
   timeline.trust(now, verdict.ok);
@@ -143,6 +143,7 @@ function draw(now) {
   requestAnimationFrame(draw);
   const elapsed = now - drawn.ms;
   if (elapsed < PICTURE_MS) return;
+  if (drawn.ms) recent.draw.add(now, elapsed);
   drawn.ms = now;
   look();
   press.step();
@@ -223,7 +224,7 @@ by("picture").addEventListener("click", () => {
 });
 paint(by("ramp"), Float32Array.from({ length: 256 }, (_, k) => k / 255), 1, 256, 1);
 paint(by("heat"), new Float32Array(4), 2, 2, 1);
-setInterval(look, 100); // also where nothing is drawn, as in a tab at the back
+setInterval(() => { look(); press.step(); }, 100); // also where nothing is drawn, as in a tab at the back
 requestAnimationFrame(draw);
 
 export { link, map, state }; // for tests, and for who looks with the browser's tools

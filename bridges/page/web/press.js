@@ -1,7 +1,7 @@
 // Pressing the stub's skin: by mouse, by several fingers, by keys. A press is told again while it lasts, so that a page
 // that vanishes lets go within KEEP_S.
 
-const KEEP_S = 1.5;
+const KEEP_S = 2.5;
 const AGAIN_MS = 400;
 const FIRST_N = 1.5; // a press begins with so much, and grows while it is held
 const GROW_N_PER_S = 4;
