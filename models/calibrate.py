@@ -71,10 +71,10 @@ def solve(
 ) -> SolvedPresses:
     """Half circles, half other shapes, one touch each; read from `cache` where these very ones are there."""
     rng = np.random.default_rng([seed, 31])
-    shapes = []
+    prior, shapes = PRIOR.on(skin), []
     for k in range(n):
         kinds = ("circle",) if k % 2 else KINDS[1:]
-        shapes.append(random_shape(rng, Prior(**{**vars(PRIOR), "kinds": kinds}), skin.inside))
+        shapes.append(random_shape(rng, Prior(**{**vars(prior), "kinds": kinds}), skin.inside))
     rows = np.array([s.as_row() for s in shapes])
     if cache is not None and cache.is_file():
         with np.load(cache) as file:

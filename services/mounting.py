@@ -8,7 +8,6 @@ its own; what it finds is kept in the runtime folder and adopted between two fra
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import subprocess
 import sys
@@ -31,7 +30,7 @@ Array = NDArray[np.float64]
 
 KEPT_AS = "calibration"  # name of the kept state, beside preprocessing's
 MOST_BYTES = 16 * 1024 * 1024
-LONGEST_S = 300.0  # a fit that takes longer has failed
+LONGEST_S = 600.0  # a fit that somebody waits for, and that takes longer on however busy a machine, has failed
 FITS = 3e-4  # rms relative: a bundle that predicts |Z0| so well, up to gain and contacts, is that skin's already
 
 log = logging.getLogger(__name__)
@@ -96,8 +95,12 @@ class MountingFit:
     def wait(self) -> MountedSkin | None:
         """The same for who has the time: what was found, or None and `problem`."""
         if self._process is not None:
-            with contextlib.suppress(subprocess.TimeoutExpired):
+            try:
                 self._process.wait(LONGEST_S)
+            except subprocess.TimeoutExpired:
+                self.stop()
+                self.problem = f"the skin could not be calibrated: the fit took more than {LONGEST_S:.0f} s"
+                return None
             self.poll()
         if self._reader is not None:
             self._reader.join()

@@ -8,7 +8,7 @@ same while a touch has none near it. Unseen: a touch without a contact near it i
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -28,6 +28,7 @@ KEPT = 40  # notes of a report
 
 @dataclass
 class SoakTally(Counts):
+    chunks: int = 0  # starts
     frames: int = 0
     counted: int = 0  # valid, and not `changing`
     invalid: int = 0
@@ -45,8 +46,10 @@ class SoakTally(Counts):
 
     def row(self) -> dict[str, Any]:
         return {
+            "chunks": self.chunks,
             "frames": self.frames,
             "counted": self.counted,
+            "invalid": self.invalid,
             "touches": self.touches,
             "faults": self.faults,
             "phantoms": self.phantoms,
@@ -56,6 +59,12 @@ class SoakTally(Counts):
             "blamed": dict(self.blamed.most_common(12)),
             "notes": self.notes,
         }
+
+    @classmethod
+    def of(cls, row: Mapping[str, Any]) -> SoakTally:
+        """From the row of a report. Raises KeyError where it is of another version."""
+        counts = {name: row[name] for name in vars(cls())}
+        return cls(**{**counts, "blamed": Counter(row["blamed"]), "notes": list(row["notes"])})
 
 
 def chunk(sheet: SolvedSheet, pipeline: Pipeline, frames: int, seed: int) -> SoakTally:
@@ -69,7 +78,7 @@ def chunk(sheet: SolvedSheet, pipeline: Pipeline, frames: int, seed: int) -> Soa
 
 
 def tallied(moments: Iterable[Moment], scene: RandomScene, seed: int) -> SoakTally:
-    tally = SoakTally(touches=len(scene.presses), faults=len(scene.faults))
+    tally = SoakTally(chunks=1, touches=len(scene.presses), faults=len(scene.faults))
     run: list[int] = []  # frames in a row in which the n-th touch had no contact
     for m in moments:
         tally.frames += 1

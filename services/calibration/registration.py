@@ -214,7 +214,8 @@ def _better_than_chance(pose: _Pose, starts: list[tuple[float, bool]]) -> None:
         raise RegistrationError(
             f"no pose of the skin explains these presses: {100 * explained[0]:.0f} % of how the measurements changed, "
             f"where the same places in another order explain {100 * chance:.0f} %. Check that row n of xy is where row "
-            "n was measured, that xy is in metres, and that this is the skin that was pressed"
+            "n was measured, that xy is in metres, that this is the skin that was pressed, and what was told of it "
+            "(--diameter, --first-electrode, --numbering)"
         )
 
 

@@ -1,4 +1,4 @@
-"""Electrode health from the frames: which measurements count, which electrodes are at fault, and what to do about it.
+"""Electrode health over the frames: which electrodes are at fault, which measurements count, and what a person can do.
 
 A fault is named in the frame that shows it and taken back once the electrode has been well for some frames, so that
 neither a loose wire flaps nor the baseline follows a fault: what is at fault has weight zero throughout. Electrodes are
@@ -35,8 +35,8 @@ ASK_EVERY = 4  # frames from one question about a contact under a touch to the n
 
 @dataclass
 class Verdict:
-    """On one frame, its measurements in `order`. live (K,): counts; failed (K,): no value for a baseline either; states
-    (E,): ELECTRODE_STATES.
+    """The verdict on one frame, its measurements in `order`. live (K,): counts; failed (K,): no value for a baseline
+    either; states (E,): ELECTRODE_STATES.
     """
 
     live: Mask
@@ -49,7 +49,7 @@ class Verdict:
 
 
 class ElectrodeHealth:
-    """For one bundle: K measurements between E electrodes. Keeps which are at fault."""
+    """ElectrodeHealth keeps which of a bundle's E electrodes are at fault; K measurements."""
 
     def __init__(self, bundle: Bundle) -> None:
         self.check = FrameCheck(bundle)
@@ -74,7 +74,7 @@ class ElectrodeHealth:
         self._contacts.reset()
 
     def tared(self) -> None:
-        """There is a new baseline: what changed against the old one is forgotten."""
+        """Takes note of a new baseline: what changed against the old one is forgotten."""
         self._states[(self._states == DRIFTING) | (self._states == UNKNOWN)] = OK
         self._unsure[:], self._suspected[:] = False, 0
         self._contacts.keep(())
@@ -86,7 +86,7 @@ class ElectrodeHealth:
             self._contacts.forget_past()
 
     def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
-        """(K,) |Z| and status bits of a frame."""
+        """Judges a frame: (K,) |Z| and status bits."""
         found = self._judge(amplitude, status, untouched)
         self._contacts.follow(amplitude if found.order is None else amplitude[found.order])
         return found
@@ -125,8 +125,8 @@ class ElectrodeHealth:
         return Verdict(live, seen.failed | wrong, states, reasons, usable, seen.order, self._shift(seen, untouched))
 
     def _unchanged(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference) -> bool:
-        """Whether a frame without a mark differs from the untouched skin by its noise alone, and nothing was at fault:
-        most frames of a skin, and a tenth of the work.
+        """Returns whether a frame without a mark differs from the untouched skin by its noise alone, and nothing was at
+        fault: most frames of a skin, and a tenth of the work.
         """
         if status.any() or self._states.any() or self._contacts.felt:
             return False
@@ -137,13 +137,15 @@ class ElectrodeHealth:
         return bool(quiet.all() and np.isfinite(noise).all())
 
     def _nothing_wrong(self, seen: FrameFindings, status: NDArray[np.uint8], untouched: Reference) -> bool:
-        """Most touched frames: what follows would find that all is well too, at twice the work."""
+        """Returns whether nothing is wrong, as in most touched frames: what follows would find the same at twice the
+        work.
+        """
         wrong = seen.states.any() or status.any() or seen.failed.any() or self._states.any() or self._suspected.any()
         quiet = seen.suspect is None and not wrong
         return quiet and not self._contacts.felt and bool(np.isfinite(untouched.sigma).all())
 
     def problems(self) -> list[str]:
-        """For a person: which electrodes, and what to do."""
+        """Says to a person which electrodes are at fault, and what to do."""
         if self._fault:
             return [self._fault]
         found = []
@@ -168,11 +170,11 @@ class ElectrodeHealth:
                 seen.suspect = changed.electrode
 
     def _live(self, seen: FrameFindings, untouched: Reference, counts: Mask) -> Mask:
-        """(K,) measurements between electrodes that count."""
+        """Returns (K,) which measurements are between electrodes that count."""
         return ~seen.failed & np.isfinite(untouched.sigma) & ~self.member[~counts].any(axis=0)
 
     def _remember(self, seen: FrameFindings, untouched: Reference | None) -> None:
-        """Faults at once, recovery after WELL_FRAMES."""
+        """Takes faults over at once, recovery after WELL_FRAMES."""
         faulty = seen.states != OK
         self._states[faulty] = seen.states[faulty]
         self._well[faulty] = 0
@@ -186,7 +188,7 @@ class ElectrodeHealth:
             self._look_again(int(k), seen, untouched)
 
     def _look_again(self, k: int, seen: FrameFindings, untouched: Reference | None) -> None:
-        """An electrode that is at fault, and whose fault this frame does not show by itself."""
+        """Looks at an electrode at fault whose fault this frame does not show by itself."""
         if self._is_well(k, seen.amplitude, seen.failed, untouched):
             self._well[k] += 1
         elif self._states[k] not in (DRIFTING, SWAPPED) or untouched is None:
@@ -204,7 +206,7 @@ class ElectrodeHealth:
             self._contacts.forget(k)
 
     def _ask(self, k: int, seen: FrameFindings, untouched: Reference) -> ContactOpinion | None:
-        """Whether the contact of electrode k is changed, whatever touches; None where nothing tells."""
+        """Asks whether the contact of electrode k is changed, whatever touches; None where nothing tells."""
         counts = self._states == OK
         counts[k] = True
         live = self._live(seen, untouched, counts)
@@ -215,7 +217,9 @@ class ElectrodeHealth:
         return self._evidence(k, np.asarray(d, dtype=float), np.asarray(untouched.sigma, dtype=float), live)
 
     def _is_well(self, k: int, amplitude: Array, failed: Mask, untouched: Reference | None) -> bool:
-        """An open wire or a short is seen directly; the others must measure what they did before, untouched."""
+        """Returns whether electrode k is well. An open wire or a short is seen directly; the others must measure what
+        they did before.
+        """
         if self._states[k] not in (DRIFTING, SWAPPED) or untouched is None:
             return True
         return any(
@@ -232,7 +236,7 @@ class ElectrodeHealth:
         return bool((off <= WELL + 6 * untouched.sigma[rows]).mean() >= MOSTLY)
 
     def _shift(self, seen: FrameFindings, untouched: Reference | None) -> Array:
-        """What the drifting electrodes do to the pairs of the others."""
+        """Returns (K,) what the drifting electrodes do to the pairs of the others."""
         drifting = np.flatnonzero(np.isin(self._states, (DRIFTING, OPEN))).tolist()
         if untouched is None or not drifting:
             self._contacts.keep(drifting)

@@ -1,4 +1,4 @@
-"""What one frame shows of the electrodes by itself: open, shorted, exchanged, or not reached by a multiplexer."""
+"""One frame by itself shows electrodes that are open, shorted, exchanged, or not reached by a multiplexer."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class FrameFindings:
 
 
 class FrameCheck:
-    """For one bundle: K measurements between E electrodes."""
+    """FrameCheck looks at the frames of one bundle: K measurements between E electrodes."""
 
     def __init__(self, bundle: Bundle) -> None:
         pattern = np.asarray(bundle.pattern)
@@ -53,7 +53,7 @@ class FrameCheck:
         self._wiring = Wiring(pattern)
 
     def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> FrameFindings:
-        """(K,) |Z| and status bits of a frame."""
+        """Looks at a frame: (K,) |Z| and status bits."""
         failed = ~np.isfinite(amplitude) | (amplitude <= 0) | ((status & TROUBLE) != 0)
         reference = self._reference(amplitude, failed, untouched)
         states = np.zeros(self.electrodes, dtype=np.uint8)
@@ -90,7 +90,7 @@ class FrameCheck:
         return seen
 
     def _short(self, low: Mask) -> list[int]:
-        """Electrodes all joined to each other, by their pairs that measure next to nothing."""
+        """Returns electrodes all joined to each other, by their pairs that measure next to nothing."""
         if not low.any():
             return []
         joined = sorted(set(self._pattern[low, :2].ravel().tolist()))
@@ -101,7 +101,7 @@ class FrameCheck:
     def _miswired(
         self, amplitude: Array, failed: Mask, low: Mask, reference: Array, untouched: Reference | None
     ) -> Exchanged | StuckBit | None:
-        """Wires exchanged or a multiplexer stuck, where something fell as no touch lets it fall."""
+        """Looks for wires exchanged or a multiplexer stuck, where something fell as no touch lets it fall."""
         known = ~failed & (reference > 0)
         noise = 6 * untouched.sigma if untouched else np.zeros(len(amplitude))
         limit = FALLS if untouched else FALLS_UNTARED
@@ -127,7 +127,7 @@ class FrameCheck:
             left &= ~gone
 
     def _reference(self, amplitude: Array, failed: Mask, untouched: Reference | None) -> Array | None:
-        """|Z| that a well, untouched skin has: its baseline, else the bundle's prediction times the frame's gain."""
+        """Returns |Z| of a well, untouched skin: its baseline, else the bundle's prediction times the frame's gain."""
         if self._predicted is None:
             return None if untouched is None else untouched.z0
         if untouched is not None:

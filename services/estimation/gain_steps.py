@@ -1,5 +1,5 @@
-"""Steps of the board's gain over a skin's frames: taken over at once, or, where the gain is grossly off, once it has
-lasted.
+"""GainSteps finds steps of the board's gain over a skin's frames. The baseline takes a step over at once, or, where the
+gain is grossly off, once it has lasted.
 """
 
 from __future__ import annotations

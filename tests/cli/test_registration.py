@@ -10,6 +10,7 @@ import pytest
 
 from models.bundle import Bundle
 from models.locator import NINETY, Locator
+from models.locator_arrays import arrays_of
 from services.calibration.fields import half_width, sample, sensitivities
 from services.calibration.locating import build, true_places
 from services.calibration.presses import Presses, RegistrationError, part, read_presses
@@ -102,16 +103,16 @@ def test_real_presses_are_found_within_3_mm(bundle: Bundle, reference: Path) -> 
 
 
 def test_an_uneven_skin_is_learned_from_differences_of_any_scale(bundle: Bundle, reference: Path) -> None:
-    """Kernel ridge regression on 300 of these presses placed others to 3.9 mm median."""
+    """Kernel ridge regression on 100 of these presses placed others to 5.8 mm median."""
     arrays = load_npz(reference / "hydrogel_vse_concentric.npz")
     order = np.random.default_rng(1).permutation(len(arrays["xy"]))
     scaled = arrays | {"delta": arrays["delta"].astype(float) * 3e5}
     errors = []
     for file in (arrays, scaled):
-        train, test = (read_presses(part(file, order[rows]), bundle) for rows in (slice(0, 200), slice(300, 700)))
+        train, test = (read_presses(part(file, order[rows]), bundle) for rows in (slice(0, 100), slice(300, 700)))
         similarity = register(train, bundle).similarity
         errors.append(located(test, train, similarity, Locator(build(train, similarity, bundle)[0])))
-    assert np.median(errors[0]) < 0.0032
+    assert np.median(errors[0]) < 0.004
     assert np.allclose(errors[0], errors[1], atol=1e-5)
 
 
@@ -131,7 +132,13 @@ def test_ten_real_presses_are_enough_to_begin_with(bundle: Bundle, reference: Pa
     arrays = load_npz(reference / "hydrogel_disc16.npz")
     train, test = (read_presses(part(arrays, rows), bundle) for rows in (slice(0, 10), slice(100, 300)))
     similarity = register(train, bundle).similarity
-    assert np.median(located(test, train, similarity, Locator(build(train, similarity, bundle)[0]))) < 0.0095
+    made = build(train, similarity, bundle)[0]
+    assert np.median(located(test, train, similarity, Locator(made))) < 0.0095
+    arrays = {name: np.asarray(value) for name, value in vars(made).items()}
+    assert arrays_of(arrays, 192).map.shape == made.map.shape
+    for name, wrong in (("map", made.map[:-1]), ("error", made.error * np.nan), ("shape", np.array([0, 5]))):
+        with pytest.raises(ValueError, match=name):  # a bundle that holds it is refused
+            arrays_of(arrays | {name: wrong}, 192)
 
 
 def test_what_is_told_of_a_skin_is_kept(bundle: Bundle) -> None:
@@ -140,8 +147,8 @@ def test_what_is_told_of_a_skin_is_kept(bundle: Bundle) -> None:
     told = register(presses, bundle, Told(0.16 * 1.1, 0.4, True))
     found = told.similarity
     assert found.mirrored and abs(found.scale / 1.1 - 1) < 0.025 and abs(found.angle - 0.4) < np.radians(6)
-    wrong = register(presses, bundle, Told(clockwise=False)).similarity
-    assert not wrong.mirrored  # as told, though it explains less
+    with pytest.raises(RegistrationError, match="--numbering"):  # told wrongly: no pose explains these presses
+        register(presses, bundle, Told(clockwise=False))
     with pytest.raises(RegistrationError, match="presses lie inside the skin"):
         register(presses, bundle, Told(diameter_m=0.05))
 

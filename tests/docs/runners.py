@@ -187,6 +187,7 @@ COMMANDS = (
     Row("skin bench", "ends", says="accuracy"),
     Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB"),
     Row(r"(\./)?skin bench (?P<name>\w+)( .*)?", "help"),
+    Row(r"\.venv/bin/python -m bench\.speed\.page", "help"),
     Row("python -m models.average", "help"),
     Row("python -m models.build .*", "help"),
     Row("python -m protocol.wire_doc", "ends", instead=".venv/bin/python -m protocol.wire_doc"),
