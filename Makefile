@@ -45,12 +45,13 @@ $(VENV)/.three: bridges/page/fetch_three.py | $(BIN)/python
 	@touch $@
 
 # ROS 2 itself, as wheels, in an environment of its own: what tests/bridges/test_ros2_node.py listens with. 270 MB.
-ros-venv: .venv-ros/.done
-.venv-ros/.done:
-	$(PYTHON) -m venv .venv-ros
-	.venv-ros/bin/python -m pip install -q --disable-pip-version-check numpy ros-kilted-rclpy ros-kilted-rmw-fastrtps-cpp \
-	  ros-kilted-geometry-msgs ros-kilted-sensor-msgs ros-kilted-diagnostic-msgs ros-kilted-visualization-msgs \
-	  ros-kilted-std-msgs ros-kilted-std-srvs
+ROS ?= kilted
+ROS_VENV := .venv-ros$(if $(filter-out kilted,$(ROS)),-$(ROS))
+ROS_PACKAGES := rclpy rmw-fastrtps-cpp geometry-msgs sensor-msgs diagnostic-msgs visualization-msgs std-msgs std-srvs
+ros-venv: $(ROS_VENV)/.done
+$(ROS_VENV)/.done:
+	$(PYTHON) -m venv $(ROS_VENV)
+	$(ROS_VENV)/bin/python -m pip install -q --disable-pip-version-check numpy $(ROS_PACKAGES:%=ros-$(ROS)-%)
 	@touch $@
 
 test: venv-dev lint
