@@ -17,6 +17,8 @@ from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
 from protocol.frames import RawFrame
 from services import mounting
+from services.contacts import calibration_file
+from services.contacts.force_curve import Curve
 from services.estimation.tare import Baseline
 from services.linearisation import Linearisation
 from services.pipeline import Pipeline, Result
@@ -84,8 +86,22 @@ def iou(result: Result) -> float:
     return metrics.iou(image > 0.5 * image.max(), mask)[0]
 
 
-def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(sheet: MismatchedSheet, bundle: Bundle) -> None:
-    bench = Bench(sheet)
+@pytest.fixture
+def forces(tmp_path: Path, bundle: Bundle) -> Path:
+    """A calibration of forces, made with this bundle."""
+    file = tmp_path / "forces.json"
+    skin = Skin(port="stub", bundle=BUNDLE, frame_id="palm")
+    calibration_file.save(file, calibration_file.Calibration(Curve(12.0)), "palm", skin, bundle)
+    return file
+
+
+def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(
+    sheet: MismatchedSheet, bundle: Bundle, forces: Path
+) -> None:
+    bench = Bench(sheet, calibration=forces)
+    untared = bench.pipeline.pre.info()
+    assert untared is not None and untared["force_law"]["scale"] == 12.0
+    forces.unlink()  # while the service runs: it goes on with what it has read
     before = bench.feed(frames=80)
     assert not before.contact.valid and {"stale_baseline", "touched_at_start"} & set(before.contact.reasons)
     assert bench.pipeline.pre.linearisation.name == "" and not bench.pipeline.pre.linearisation.busy
@@ -97,14 +113,17 @@ def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(sheet: Misma
     info = bench.pipeline.pre.info()
     assert info is not None and info["bundle_hash"] == name != bundle.hash
     assert np.allclose(info["mounting"]["anisotropy"], 0.05, atol=0.03)
+    # Of the bundle as it was loaded, and still what the publisher uses.
+    assert info["calibration_hash"] == untared["calibration_hash"] and info["force_law"] == untared["force_law"]
     touched = bench.feed(TOUCH, frames=6)
     assert touched.contact.valid and iou(touched) > 0.9
     # another process, after a crash
     saved = bench.pipeline.pre.saved()
     assert saved is not None
+    calibration_file.save(forces, calibration_file.Calibration(Curve(12.0)), "palm", bench.skin, bundle)
     again = Preprocessing("palm", bench.skin, bundle)
     again.restore(saved, 1.0)
-    assert again.linearisation.name == name
+    assert again.linearisation.name == name and again.info() is not None
     assert again.baseline_estimator.baseline is not None
     off = Preprocessing("palm", bench.skin.model_copy(update={"tare": TareConfig(calibrate=False)}), bundle)
     with pytest.raises(Exception, match="another bundle"):
