@@ -250,7 +250,7 @@ class Preprocessing(Stage):
         wanted = self.config.tare.calibrate and bool(args.get("calibrate", True))
         calibrating = wanted and self.linearisation.tared(baseline)
         answer = {"frames": baseline.frames, "snr_db": -20 * np.log10(max(relative, 1e-12)), "hash": baseline.hash}
-        return answer | {"calibrating": calibrating}
+        return answer | {"calibrating": calibrating, "problem": self.linearisation.problem if wanted else ""}
 
     def state(self) -> dict[str, Any]:
         return {

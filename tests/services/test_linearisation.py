@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace as replaced
 from pathlib import Path
 from typing import Any
@@ -182,6 +183,27 @@ def test_the_switch_and_the_option_turn_it_off(sheet: MismatchedSheet) -> None:
     bench.feed(frames=80)
     assert not bench.pipeline.pre.command("tare", {"calibrate": False})["calibrating"]
     assert not bench.pipeline.pre.linearisation.busy
+
+
+def test_a_tare_without_scikit_fem_is_taken_and_says_that_nothing_was_calibrated(
+    sheet: MismatchedSheet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(sheet)
+    bench.feed(frames=80)
+    with monkeypatch.context() as lacking:
+        lacking.setitem(sys.modules, "skfem", None)
+        answer = bench.pipeline.pre.command("tare", {})
+    assert answer["frames"] == 64 and not answer["calibrating"]
+    assert "scikit-fem is not installed" in answer["problem"] and "service.lock" in answer["problem"]
+    assert answer["problem"] in bench.pipeline.pre.health().messages
+    assert bench.feed(frames=3).delta.calibration == "" and bench.pipeline.pre.baseline_estimator.baseline is not None
+    # what an earlier tare could not do is not said of one that was to calibrate nothing
+    bench.feed(frames=80)
+    assert bench.pipeline.pre.command("tare", {"calibrate": False, "force": True})["problem"] == ""
+    bench.sheet = MismatchedSheet(BUNDLE, named("none"), "stub")
+    bench.feed(frames=80)
+    assert bench.pipeline.pre.command("tare", {"force": True})["problem"] == ""
+    assert not bench.pipeline.pre.health().messages
 
 
 def test_a_calibration_that_inference_cannot_find_makes_frames_invalid(sheet: MismatchedSheet) -> None:
