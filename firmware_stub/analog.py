@@ -33,14 +33,14 @@ Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
-class Noise:
+class BoardNoise:
     """sigma^2 = (relative |Z|)^2 + floor^2 at 128 DFT points; both fall with the square root of the points."""
 
     relative: float = 1e-4
     floor: float = 0.0
 
     @classmethod
-    def of_db(cls, snr_db: float) -> Noise:
+    def of_db(cls, snr_db: float) -> BoardNoise:
         return cls(10 ** (-snr_db / 20))
 
     def sigma(self, z: NDArray[np.float64], points: int) -> NDArray[np.float64]:
@@ -70,7 +70,7 @@ def clip(amplitude: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
 class Analog:
     """Measures scan lists; keeps its random numbers and what the last result was."""
 
-    def __init__(self, noise: Noise, faults: Faults, rng: np.random.Generator) -> None:
+    def __init__(self, noise: BoardNoise, faults: Faults, rng: np.random.Generator) -> None:
         self.noise, self.faults, self.rng = noise, faults, rng
 
     def measure(

@@ -138,7 +138,7 @@ class Board:
                 now,
             )
         elif kind.sender != "host":
-            self._refuse(message, NakReason.UNKNOWN, f"{kind.__name__} is the board's to send", now)
+            self._refuse(message, NakReason.UNKNOWN, f"{kind.wire_name} is the board's to send", now)
         elif self.faults.active("wrong_schema", now) is not None:
             self._refuse(message, NakReason.SCHEMA, f"this firmware has schema {self._schema(now):08x}", now)
         elif isinstance(message, link.Config):
@@ -254,7 +254,7 @@ class Board:
         if gap is not None and self.analog.rng.random() < gap["fraction"]:
             return
         duration_us = round((end - start) * 1e6)
-        self._say(link.Frame(seq, self.device_us(start), duration_us, config.config, z, status), end)
+        self._say(link.ScanFrame(seq, self.device_us(start), duration_us, config.config, z, status), end)
 
     def device_us(self, t: float) -> int:
         """The microcontroller's clock at time t."""

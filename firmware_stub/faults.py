@@ -65,7 +65,7 @@ FAULTS: dict[str, Fault] = {
     ),
     # electrodes and multiplexers
     "electrode_open": Fault(
-        "the wire of `electrode` (0-based; and of `second`) is broken: no current, a floating voltage",
+        "the wire of `electrode` (and of `second`) is broken: no current, a floating voltage",
         {"electrode": 0, "second": -1},
     ),
     "electrodes_shorted": Fault("the wires of two `electrodes` touch each other", {"electrodes": [0, 1]}),

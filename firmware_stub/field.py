@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from .timeline import Segment, Timeline
+from .timeline import Timeline, WorldSegment
 from .world import World, blend, steps_between
 
 Matrix = NDArray[np.float64]
@@ -62,7 +62,7 @@ class Field:
         self._timeline = timeline
         self.prepare(at)
 
-    def segment(self, t: float) -> Segment:
+    def segment(self, t: float) -> WorldSegment:
         """The timeline's segment around t; the last one asked for is kept."""
         timeline, segment = self._recent
         if timeline is not self._timeline or not segment.start <= t < segment.end:
@@ -110,7 +110,7 @@ class Field:
 
     # --- poses ---
 
-    def _at(self, segment: Segment, t: float) -> Matrix:
+    def _at(self, segment: WorldSegment, t: float) -> Matrix:
         nodes = _nodes(segment)
         m = len(nodes) - 1
         if m == 0:
@@ -166,7 +166,7 @@ class Field:
 
 
 @lru_cache(maxsize=64)
-def _nodes(segment: Segment) -> list[World]:
+def _nodes(segment: WorldSegment) -> list[World]:
     """The key poses of a segment, evenly spaced in time."""
     if segment.first == segment.last:
         return [segment.first.rounded()]

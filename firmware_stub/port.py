@@ -72,7 +72,7 @@ class Line:
         self.backlog = 0
 
 
-class Port(Protocol):
+class BoardPort(Protocol):
     """One end of the line: raw bytes, never blocking, silent about a peer that is not there."""
 
     overrun: int
@@ -260,7 +260,7 @@ class TcpPort:
             self._client, self._deserted = client, None
 
 
-def open_port(listen: str | None, folder: Path, name: str = "board") -> Port:
+def open_port(listen: str | None, folder: Path, name: str = "board") -> BoardPort:
     """A pty in `folder`, or a TCP server at `listen`. Raises ValueError for another kind of URL, OSError if taken."""
     return TcpPort(listen, folder, name) if listen else PtyPort(folder, name)
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from . import scene as scenes
-from .analog import Analog, Noise
+from .analog import Analog, BoardNoise
 from .board import Board, Scan, measurement_s
 from .faults import FAULTS, Faults
 from .field import Field
@@ -60,7 +60,7 @@ class Rig:
         self.line = Line(baud)
         self._rng = np.random.default_rng(seed)
         self._realtime = threaded
-        noise = Noise(10 ** (-snr_db / 20), floor_ohm)
+        noise = BoardNoise(10 ** (-snr_db / 20), floor_ohm)
         full_s = len(self.sheet.skin.pattern) * measurement_s(128)
         self.board = Board(
             self.field,

@@ -10,7 +10,7 @@ from typing import Any
 
 from protocol.errors import EitskinError
 
-from .timeline import Cue, Curve, Script, Track
+from .timeline import Cue, PiecewiseLinear, Script, TouchPath
 from .world import NEWTON, Touch
 
 FOLDER = Path(__file__).with_name("scenes")
@@ -95,7 +95,7 @@ def touch(values: Mapping[str, Any]) -> Touch:
     return Touch(kind=kind, drop=drop, **pose)
 
 
-def _track(values: Mapping[str, Any]) -> Track:
+def _track(values: Mapping[str, Any]) -> TouchPath:
     """Keys inherit what the touch, or the key before them, says."""
     state = {key: value for key, value in values.items() if key != "keys"}
     times, poses = [], []
@@ -105,10 +105,10 @@ def _track(values: Mapping[str, Any]) -> Track:
         poses.append(touch(state))
     if len(times) < 2 or times[0] < 0 or sorted(times) != times or times[0] == times[-1]:
         raise ValueError(f"a touch's keys at {times}: expected at least two times, from 0 on, not decreasing")
-    return Track(tuple(times), tuple(poses))
+    return TouchPath(tuple(times), tuple(poses))
 
 
-def _press(*, t: float, seconds: float, force: float, ramp: float = 0.15, **pose: Any) -> Track:
+def _press(*, t: float, seconds: float, force: float, ramp: float = 0.15, **pose: Any) -> TouchPath:
     """The short form of a touch: there for `seconds` from `t` on, its two ramps included; may slide to to_x, to_y."""
     to = {key.removeprefix("to_"): pose.pop(key) for key in ("to_x", "to_y") if key in pose}
     end = round(t + seconds, 6)
@@ -116,16 +116,16 @@ def _press(*, t: float, seconds: float, force: float, ramp: float = 0.15, **pose
     return _track({**pose, "keys": keys})
 
 
-def _curve(keys: list[Mapping[str, float]]) -> Curve:
+def _curve(keys: list[Mapping[str, float]]) -> PiecewiseLinear:
     times = tuple(float(key["t"]) for key in keys)
     if not keys or list(times) != sorted(times):
         raise ValueError(f"drift keys at {times}: expected times that do not decrease")
-    return Curve(times, tuple(float(key["value"]) for key in keys))
+    return PiecewiseLinear(times, tuple(float(key["value"]) for key in keys))
 
 
 def _grid(
     *, count: int, spacing: float, forces: list[float], seconds: float, pause: float, ramp: float = 0.1, **pose: Any
-) -> Iterator[Track]:
+) -> Iterator[TouchPath]:
     """An indenter on count x count positions, from the top left row by row, every force at each before the next."""
     t = pause
     half = (count - 1) / 2

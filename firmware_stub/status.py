@@ -6,7 +6,7 @@ import time
 
 from protocol.frames import StatusFrame
 
-from .port import Port
+from .port import BoardPort
 from .rig import Rig
 
 EVERY_S = 1.0
@@ -24,7 +24,7 @@ class Status:
     def scanned(self) -> None:
         self._scans += 1
 
-    def due(self, rig: Rig, port: Port, now: float) -> StatusFrame | None:
+    def due(self, rig: Rig, port: BoardPort, now: float) -> StatusFrame | None:
         """The status frame that is due at `now` (the rig's seconds), or None."""
         messages = [f"fault on request: {name} {args or ''}".strip() for name, args in rig.faults.listing(now).items()]
         clock = time.monotonic()

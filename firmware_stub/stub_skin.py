@@ -8,7 +8,7 @@ import time
 
 from protocol.sockets import Publisher
 
-from .port import Port
+from .port import BoardPort
 from .rig import Rig
 from .status import Status
 from .truth import truth_frame
@@ -31,7 +31,7 @@ class StubSkin:
     `begin_ns`.
     """
 
-    def __init__(self, name: str, rig: Rig, port: Port, begin_ns: int) -> None:
+    def __init__(self, name: str, rig: Rig, port: BoardPort, begin_ns: int) -> None:
         self.name, self.rig, self.port = name, rig, port
         self._begin_ns = self._written_ns = begin_ns
         self._status = Status(name)

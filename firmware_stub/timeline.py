@@ -12,7 +12,7 @@ from .world import Touch, World, blend
 
 
 @dataclass(frozen=True)
-class Track:
+class TouchPath:
     """One touch from its first key to its last, linear in between."""
 
     times: tuple[float, ...]  # s, not decreasing
@@ -28,7 +28,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Curve:
+class PiecewiseLinear:
     """A number over time: linear between keys, constant outside."""
 
     times: tuple[float, ...]
@@ -43,7 +43,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Segment:
+class WorldSegment:
     """From `start` to `end` the world goes linearly from `first` to `last`; an endless one stays as it is."""
 
     start: float
@@ -73,9 +73,11 @@ class Script:
 
     name: str
     about: str = ""
-    tracks: tuple[Track, ...] = ()
-    background: Curve | None = None
-    contact: tuple[tuple[int | None, Curve], ...] = ()  # electrode (None: all) and the factor on its impedance
+    tracks: tuple[TouchPath, ...] = ()
+    background: PiecewiseLinear | None = None
+    contact: tuple[
+        tuple[int | None, PiecewiseLinear], ...
+    ] = ()  # electrode (None: all) and the factor on its impedance
     cues: tuple[Cue, ...] = ()
     sections: tuple[tuple[float, str], ...] = ()  # (from when on [s], name), for whoever keeps the score
     duration: float = 0.0
@@ -106,10 +108,10 @@ class Timeline:
 
     script: Script
     start: float = 0.0
-    presses: tuple[Track, ...] = ()
+    presses: tuple[TouchPath, ...] = ()
     electrodes: int = 16
 
-    def segment(self, t: float) -> Segment:
+    def segment(self, t: float) -> WorldSegment:
         """The stretch of time around t on which everything is linear: start <= t < end."""
         script, breaks = self.script, self.script.breaks
         base = self.start
@@ -126,8 +128,8 @@ class Timeline:
         start, end = max(starts), min(ends)
         if math.isinf(start) or math.isinf(end):
             still = self._world(t, t, base)
-            return Segment(start, end, still, still)
-        return Segment(start, end, self._world(start, t, base), self._world(end, t, base))
+            return WorldSegment(start, end, still, still)
+        return WorldSegment(start, end, self._world(start, t, base), self._world(end, t, base))
 
     def _world(self, t: float, inside: float, base: float) -> World:
         world = self.script.world(t - base, inside - base, self.electrodes)
@@ -138,7 +140,7 @@ class Timeline:
         return self.segment(t).at(t)
 
 
-def press_track(start: float, seconds: float, touch: Touch, to: Sequence[float] | None = None) -> Track:
+def press_track(start: float, seconds: float, touch: Touch, to: Sequence[float] | None = None) -> TouchPath:
     """A press from `start` on, sliding to the point `to` (metres) where one is given."""
     end = replace(touch, x=to[0], y=to[1]) if to else touch
-    return Track((start, start + seconds), (touch, end))
+    return TouchPath((start, start + seconds), (touch, end))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from protocol.frames import Touch as TrueTouch
-from protocol.frames import TruthFrame
+from protocol.frames import TrueTouch, TruthFrame
 
 from .board import Scan
 from .sheet import Sheet

@@ -13,13 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import spherical_jn
 
-from models.geometry import GeometryError, Skin
+from models.geometry import GeometryError, SkinGeometry
 
 Array = NDArray[np.float64]
 
 
 def disc_impedances(
-    skin: Skin, inclusion_radius: float = 0.0, inclusion_conductivity: float = 1.0, modes: int = 14, terms: int = 6000
+    skin: SkinGeometry,
+    inclusion_radius: float = 0.0,
+    inclusion_conductivity: float = 1.0,
+    modes: int = 14,
+    terms: int = 6000,
 ) -> Array:
     """(K,) ohm of the skin's pattern, on a disc of conductivity 1 S with a concentric inclusion [model units, S].
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from models.geometry import Skin
+from models.geometry import SkinGeometry
 from models.prereconstruction import Array, Drift, Operator, PreReconstructor
 
 # What two meshes or two solvers differ by, of |d|. It is no noise: it looks like the signal of a touch that is not
@@ -40,7 +40,7 @@ class Symmetry:
         return images[..., ::-1] if self.flip_x else images
 
 
-def symmetries(skin: Skin) -> list[Symmetry]:
+def symmetries(skin: SkinGeometry) -> list[Symmetry]:
     """Those of the square grid's eight that map the skin's electrodes (place, width) onto themselves and the
     pattern onto itself.
     """

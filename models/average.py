@@ -18,7 +18,7 @@ from torch import nn
 
 from models import data, geometry, samples
 from models.bundle import Bundle
-from models.network import MMCNN, Config
+from models.network import MMCNN, NetworkConfig
 
 BATCHES = 300  # that statistics are taken over
 
@@ -30,7 +30,7 @@ def average(checkpoints: list[dict[str, Any]], batches: samples.Batches) -> dict
         name: sum(k[name] for k in kept) / len(kept) if value.dtype.is_floating_point else value
         for name, value in kept[-1].items()
     }
-    model = MMCNN(Config.from_dict(checkpoints[-1]["config"]))
+    model = MMCNN(NetworkConfig.from_dict(checkpoints[-1]["config"]))
     model.load_state_dict(mean)
     for module in model.modules():
         if isinstance(module, nn.BatchNorm2d):

@@ -16,18 +16,19 @@ import shutil
 import sys
 import time
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from models import bundle, calibrate, data, export, geometry, manifest, samples, train
+from models import bundle, calibrate, data, export, geometry, manifest, samples, train, verdict
 from models.augmentation import random_condition
 from models.evaluation import LEVELS, evaluate, predict
 from models.forward import ForwardModel
 from models.linearise import linearise
-from models.network import MMCNN, Config, multiply_accumulates
+from models.network import MMCNN, NetworkConfig, multiply_accumulates
 from models.prereconstruction import Array, Matrices, PreReconstructor
 from protocol.errors import EitskinError
 
@@ -47,11 +48,20 @@ class Plan:
         """Shares of a budget on two idle cores: an eighth for scenes (40 a second), most of the rest to train."""
         return Plan(scenes=int(max(500, min(20000, minutes / 8 * 60 * 40))), full=0.58 * minutes, fast=0.14 * minutes)
 
+    def said(self, skin: str) -> str:
+        """What is to come, and until when on two idle cores."""
+        whole = self.scenes / 40 / 60 + self.full + self.fast + 2.0  # packaging takes two minutes
+        end = datetime.now() + timedelta(minutes=whole)
+        return (
+            f"{skin}: {self.scenes} scenes, {self.full:.0f} minutes for the network, {self.fast:.0f} for the fast one, "
+            f"then export and measuring: {whole:.0f} minutes on two idle cores, until {end:%H:%M}"
+        )
+
 
 FULL, QUICK = Plan(57000, 214.0, 13.0), Plan.of(12.5)  # packaging takes another two minutes
 
 
-def physics(skin: geometry.Skin, scenes: Path) -> tuple[Matrices, samples.Samples]:
+def physics(skin: geometry.SkinGeometry, scenes: Path) -> tuple[Matrices, samples.Samples]:
     """Matrices of a skin, and the held-out scenes in their normalisation."""
     # With z0 of the model as the divisor, contact impedances off by 30 % change d by 0.2 % instead of 0.5 %; but it
     # takes a converter that reads ohm. Skins recorded in counts of unknown gain a channel divide by their own baseline.
@@ -100,7 +110,7 @@ def networks(folder: Path, pre: PreReconstructor, held_out: samples.Samples) -> 
 def restore(checkpoint: Path) -> tuple[MMCNN, dict[str, Any]]:
     """The network a checkpoint ships (averaged weights, best on held-out scenes), and all of its state."""
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    model = MMCNN(Config.from_dict(state["config"]))
+    model = MMCNN(NetworkConfig.from_dict(state["config"]))
     model.load_state_dict(state["best"] or state["average"])
     return model.eval(), state
 
@@ -134,6 +144,8 @@ def main(argv: list[str] | None = None) -> None:
     skin = geometry.load(args.skin)
     out, work = args.out or bundle.BUNDLES / skin.name, args.work or data.WORK / skin.name
     plan = QUICK if args.quick else Plan.of(args.minutes) if args.minutes else FULL
+    if not (args.package or args.no_network):
+        print(plan.said(skin.name), flush=True)
     valid = VALID if plan.scenes >= 4 * VALID else max(100, plan.scenes // 5)
     if not args.package:
         if not args.no_network:
@@ -156,21 +168,31 @@ def main(argv: list[str] | None = None) -> None:
         presses = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4
         for variant, found in calibrate.uncertainty(skin, pre, made, presses, work / "presses.npz").items():
             said[variant]["uncertainty"] = found
+    if "full" in said:
+        said["full"]["verdict"] = _verdict(args.skin, pre, held_out, said["full"]).to_dict()
     written = bundle.write(out, manifest.describe(skin.name, skin, matrices, network=said or None), matrices, made)
     for curve in work.glob("*.png") if made else ():
         shutil.copy(curve, out / f"training_{curve.name}")
     size = sum(f.stat().st_size for f in written.path.iterdir()) / 2**20
     print(f"{written.path}: {size:.2f} MB, {written.hash[:12]}, after {(time.perf_counter() - began) / 60:.1f} minutes")
+    if "full" in said:
+        print(f"verdict: {said['full']['verdict']['text']}")
+
+
+def _verdict(
+    skin: str, pre: PreReconstructor, held_out: samples.Samples, said: dict[str, Any]
+) -> verdict.TrainingVerdict:
+    training = said["training"]
+    without, floor = verdict.one_step(held_out, pre), verdict.position_floor(skin, held_out)
+    return verdict.judge(said["held_out"], training["batches"], training["minutes"], without, floor)
 
 
 def make_scenes(skin: str, work: Path, scenes: int, valid: int, args: argparse.Namespace) -> None:
-    """Scenes that `work` lacks, in chunks that suit their number."""
-    if len(data.chunk_files(work, "train")) and len(data.chunk_files(work, "valid")):
-        print(f"using the scenes in {work}: remove it to make others")
-        return
-    chunk = 1000 if scenes >= 4000 else 125
+    """Scenes that `work` lacks, in chunks of the size that it has already, or that suits their number."""
+    chunk = data.chunk_size(work) or (1000 if scenes >= 4000 else 125)
     wanted = data.specs(skin, "valid", valid, args.seed, chunk) + data.specs(skin, "train", scenes, args.seed, chunk)
-    data.generate(work, wanted, args.jobs)
+    if not data.generate(work, wanted, args.jobs):
+        print(f"using the scenes in {work}: remove it to make others")
 
 
 if __name__ == "__main__":

@@ -32,8 +32,8 @@ from models.uncertainty import (
     LEAST_NOISE,
     PLATEAU,
     RELATIVE_FLOOR,
+    ImageFeatures,
     Map,
-    Seen,
     estimate,
     features,
     fit,
@@ -51,7 +51,7 @@ FOLDS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Presses:
+class SolvedPresses:
     """N solved presses: shapes (N, 7) rows, difference (N, K) = |Z| / |Z0| - 1 without noise, z0 (K,) ohm."""
 
     shapes: Array
@@ -66,7 +66,9 @@ class Presses:
         return [Shape.from_row(row) for row in self.shapes]
 
 
-def solve(skin: geometry.Skin, n: int = PRESSES, seed: int = 3, mesh: str = MESH, cache: Path | None = None) -> Presses:
+def solve(
+    skin: geometry.SkinGeometry, n: int = PRESSES, seed: int = 3, mesh: str = MESH, cache: Path | None = None
+) -> SolvedPresses:
     """Half circles, half other shapes, one touch each; read from `cache` where these very ones are there."""
     rng = np.random.default_rng([seed, 31])
     shapes = []
@@ -77,7 +79,7 @@ def solve(skin: geometry.Skin, n: int = PRESSES, seed: int = 3, mesh: str = MESH
     if cache is not None and cache.is_file():
         with np.load(cache) as file:
             if file["shapes"].shape == rows.shape and np.allclose(file["shapes"], rows) and str(file["mesh"]) == mesh:
-                return Presses(rows, file["difference"], file["z0"])
+                return SolvedPresses(rows, file["difference"], file["z0"])
     model = ForwardModel(skin, mesh=mesh)
     z0 = np.abs(model.solve(1.0).impedances())
     each = track(shapes, description=f"{n} presses on the {mesh} mesh")
@@ -85,7 +87,7 @@ def solve(skin: geometry.Skin, n: int = PRESSES, seed: int = 3, mesh: str = MESH
     if cache is not None:
         cache.parent.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(cache, shapes=rows, difference=difference, z0=z0, mesh=mesh)
-    return Presses(rows, difference, z0)
+    return SolvedPresses(rows, difference, z0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,18 +96,18 @@ class Sightings:
 
     index: Array
     decibel: Array
-    seen: Seen
+    seen: ImageFeatures
 
     def __getitem__(self, rows: Array) -> Sightings:
         return Sightings(self.index[rows], self.decibel[rows], part(self.seen, rows))
 
 
-def part(seen: Seen, rows: Array) -> Seen:
-    return Seen(**{f.name: getattr(seen, f.name)[rows] for f in fields(Seen)})
+def part(seen: ImageFeatures, rows: Array) -> ImageFeatures:
+    return ImageFeatures(**{f.name: getattr(seen, f.name)[rows] for f in fields(ImageFeatures)})
 
 
 def see(
-    presses: Presses, pre: PreReconstructor, network: Predict, seed: int = 4, conditions: int = CONDITIONS
+    presses: SolvedPresses, pre: PreReconstructor, network: Predict, seed: int = 4, conditions: int = CONDITIONS
 ) -> Sightings:
     """The presses under noise from 57 dB to none, each condition with its own tare; what nobody would see left out."""
     rng = np.random.default_rng([seed, 32])
@@ -141,11 +143,11 @@ def see(
                 decibels.append(decibel)
                 found.append(one)
     columns = np.array(found).T
-    return Sightings(np.array(index), np.array(decibels), Seen(*columns))
+    return Sightings(np.array(index), np.array(decibels), ImageFeatures(*columns))
 
 
 def look(image: Array, sigma: Array, noise: float) -> tuple[float, ...] | None:
-    """The numbers of a Seen, for the strongest touch of an image, as services/contacts/segmentation.py measures it."""
+    """The numbers of ImageFeatures for the strongest touch of an image, as the service's segmentation measures it."""
     n, smooth = len(image), ndimage.gaussian_filter(image, 1.0)
     top = float(smooth.max())
     if not top > FLOOR:
@@ -161,25 +163,25 @@ def look(image: Array, sigma: Array, noise: float) -> tuple[float, ...] | None:
     return peak, float(sigma[mask].mean()), integral, area, 1 - max(abs(x), abs(y)), noise
 
 
-def truths(presses: Presses) -> dict[str, Array]:
+def truths(presses: SolvedPresses) -> dict[str, Array]:
     shapes = presses.touches()
     drop = np.array([s.drop for s in shapes])
     return {"peak": drop, "integral": np.array([s.integral for s in shapes]), "known": drop}
 
 
-def rows_of(name: str, presses: Presses, index: Array) -> Array:
+def rows_of(name: str, presses: SolvedPresses, index: Array) -> Array:
     """Which sightings an estimate is fitted to: a known indenter is round and flat."""
     return presses.shapes[index, 0] == 1 if name == "known" else np.ones(len(index), dtype=bool)
 
 
-def problem(name: str, presses: Presses, s: Sightings) -> tuple[Array, Array, Array]:
+def problem(name: str, presses: SolvedPresses, s: Sightings) -> tuple[Array, Array, Array]:
     """(features, estimates, truths) of the sightings that an estimate is about."""
     s = s[rows_of(name, presses, s.index)]
     area = np.array([t.area for t in presses.touches()])[s.index] if name == "known" else None
     return features(name, s.seen, area), estimate(name, s.seen, area), truths(presses)[name][s.index]
 
 
-def fitted(presses: Presses, s: Sightings, network: str) -> dict[str, Any]:
+def fitted(presses: SolvedPresses, s: Sightings, network: str) -> dict[str, Any]:
     """For the manifest: a map of each estimate, and how it covers presses that it was not fitted to."""
     said: dict[str, Any] = {}
     for name in ESTIMATES:
@@ -211,7 +213,7 @@ def coverage(estimated: Array, sigma: Array, truth: Array, decibel: Array) -> di
 
 
 def uncertainty(
-    skin: geometry.Skin,
+    skin: geometry.SkinGeometry,
     pre: PreReconstructor,
     networks: dict[str, bytes],
     n: int = PRESSES,

@@ -162,6 +162,12 @@ def generate(
     return sum(s.size for s in todo)
 
 
+def chunk_size(folder: Path) -> int:
+    """Scenes of a chunk of the folder; 0 where it has none yet."""
+    path = folder / "data.json"
+    return int(json.loads(path.read_text())["chunk"]) if path.exists() else 0
+
+
 def _check_same_run(folder: Path, spec: ChunkSpec) -> None:
     """Chunks of another seed, skin or mesh must not be mixed in: samples could repeat, or not mean the same."""
     skin = json.dumps(geometry.load(spec.skin).to_dict(), sort_keys=True)

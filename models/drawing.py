@@ -282,11 +282,11 @@ def toml(name: str, drawing: Drawing, electrodes: dict[str, Any], contact_impeda
     else:
         shape = "outline = [                 # corners, counter-clockwise\n" + _rows(drawing.corners) + "]\n"
     if len(drawing.electrodes):
-        places = "centre = [                  # number 1 first, then counter-clockwise\n"
+        places = "centre = [                  # electrode 0 first, then counter-clockwise\n"
         places += _rows(drawing.electrodes) + "]\n"
     else:
         places = f"count = {electrodes['count']:<22}# evenly spaced, counter-clockwise\n"
-        places += f"first = {1e3 * electrodes['first']:<22.6g}# how far along the outline the first is\n"
+        places += f"first = {1e3 * electrodes['first']:<22.6g}# how far along the outline electrode 0 is\n"
     return (
         "# Written by `skin new`; every length is in `unit`. The skin's frame has its origin at the outline's middle.\n"
         f'name = "{name}"\n'

@@ -34,7 +34,7 @@ SIDE = 2.0  # model units; percentages of position refer to it
 
 
 @dataclass(frozen=True)
-class Noise:
+class MeasurementNoise:
     """Of an impedance: sigma^2 = (10^(-snr_db/20) |Z|)^2 + floor_ohm^2; tare_frames: averaged for the baseline."""
 
     snr_db: float = 70.0
@@ -147,7 +147,7 @@ def _untouched(skin: str, mesh: str) -> tuple[Array, Array]:
 def floors(
     skin: str,
     touch: Shape,
-    noise: Noise | float = 70.0,
+    noise: MeasurementNoise | float = 70.0,
     prior: SizePrior | None = None,
     pattern: str | ArrayLike | None = None,
     drift: Drift | None = None,
@@ -158,7 +158,7 @@ def floors(
     skin: a shipped skin's name or a .toml path. noise: a Noise or dB. pattern: None for the skin's own. drift: standard
     deviations since the tare, relative: none, some, or infinite (nothing known: the drift directions are lost).
     """
-    noise = noise if isinstance(noise, Noise) else Noise(float(noise))
+    noise = noise if isinstance(noise, MeasurementNoise) else MeasurementNoise(float(noise))
     drift = drift or Drift()
     seen = sensitivity(skin, touch, mesh)
     own = shared(skin, mesh).skin
@@ -173,7 +173,7 @@ def floors(
     }
 
 
-def information(seen: Sensitivity, rows: NDArray[np.int64], noise: Noise, drift: Drift) -> Array:
+def information(seen: Sensitivity, rows: NDArray[np.int64], noise: MeasurementNoise, drift: Drift) -> Array:
     """(4, 4) Fisher information of theta, the drift marginalised out."""
     z0, slope, nuisance = seen.relative(rows)
     sigma = noise.sigma(z0) / np.abs(z0)

@@ -22,7 +22,7 @@ from skfem import MeshTri
 
 from models import geometry, meshing, patterns
 from models.elements import LAMINATE, LAMINATE_REFERENCE, Array, Elements
-from models.geometry import Skin
+from models.geometry import SkinGeometry
 
 
 class ForwardModel(Elements):
@@ -41,7 +41,7 @@ class ForwardModel(Elements):
 
     def __init__(
         self,
-        skin: Skin | str = "square16",
+        skin: SkinGeometry | str = "square16",
         pattern: str | ArrayLike | None = None,
         mesh: str | meshing.Grading | MeshTri = "training",
     ) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from models import patterns
 from models.outline import Array, GeometryError, Outline
 
-__all__ = ["GeometryError", "Outline", "Skin", "from_dict", "load", "shipped"]
+__all__ = ["GeometryError", "Outline", "SkinGeometry", "from_dict", "load", "shipped"]
 
 SKINS = Path(__file__).parent / "skins"
 ON_OUTLINE = 1e-6  # how far from the outline an electrode's centre may be given, model units
@@ -27,7 +27,7 @@ SMALLEST_M, LARGEST_M = 5e-3, 3.0  # a skin's longer side; beyond it a length wa
 
 
 @dataclass(frozen=True, eq=False)
-class Skin:
+class SkinGeometry:
     """electrodes (n,): arc length of each centre along the outline; widths, contact_impedance (n,); pattern (K, 4).
 
     Lengths are model units along the outline, contact impedance is ohm m (2-D: with the sheet's conductivity in S).
@@ -107,7 +107,7 @@ class Skin:
 
     # --- variations and storage ---
 
-    def moved(self, shift: ArrayLike, contact_impedance: ArrayLike | None = None) -> Skin:
+    def moved(self, shift: ArrayLike, contact_impedance: ArrayLike | None = None) -> SkinGeometry:
         """A copy whose electrodes are shifted along the outline by `shift` (n,) model units: a mounting error."""
         contact = self.contact_impedance if contact_impedance is None else contact_impedance
         return replace(
@@ -116,7 +116,7 @@ class Skin:
             contact_impedance=np.broadcast_to(np.asarray(contact, dtype=float), self.electrodes.shape).copy(),
         )
 
-    def with_pattern(self, spec: str | ArrayLike) -> Skin:
+    def with_pattern(self, spec: str | ArrayLike) -> SkinGeometry:
         """A copy with another drive pattern: a name or a (K, 4) list."""
         name = spec if isinstance(spec, str) else "custom"
         return replace(self, pattern_name=name, pattern=patterns.pattern(spec, self.n_electrodes))
@@ -139,7 +139,7 @@ def shipped() -> list[str]:
     return sorted(path.stem for path in SKINS.glob("*.toml"))
 
 
-def load(name: str | Path) -> Skin:
+def load(name: str | Path) -> SkinGeometry:
     """A shipped skin by name ("square16", "disc16") or any TOML file by path. Raises GeometryError, PatternError."""
     path = Path(name) if str(name).endswith(".toml") else SKINS / f"{name}.toml"
     if not path.is_file():
@@ -156,7 +156,7 @@ def load(name: str | Path) -> Skin:
     return skin
 
 
-def check_size(skin: Skin, do: str) -> None:
+def check_size(skin: SkinGeometry, do: str) -> None:
     """Whether the skin is as large as one can be: else lengths were given in another unit. Raises GeometryError, which
     ends with what to `do`.
     """
@@ -168,7 +168,7 @@ def check_size(skin: Skin, do: str) -> None:
         )
 
 
-def from_dict(data: dict[str, Any]) -> Skin:
+def from_dict(data: dict[str, Any]) -> SkinGeometry:
     """The skin of a TOML's content (see skins/square16.toml). Raises GeometryError, PatternError."""
     where = f"skin '{data.get('name', 'unnamed')}': "
     needed = {"name", "unit" if "unit" in data else "metres_per_unit", "contact_impedance", "electrodes"}
@@ -209,7 +209,7 @@ def from_dict(data: dict[str, Any]) -> Skin:
         raise
     except (TypeError, ValueError) as error:
         raise GeometryError(f"{where}{error}") from None
-    return Skin(
+    return SkinGeometry(
         name=str(data["name"]),
         curve=curve,
         electrodes=centres,

@@ -20,12 +20,12 @@ import numpy as np
 
 from models import geometry, patterns
 from models.elements import Array
-from models.fisher import Floor, Noise, SizePrior, floors, mean_floor
+from models.fisher import Floor, MeasurementNoise, SizePrior, floors, mean_floor
 from models.forward import shared
 from models.prereconstruction import Drift
 from models.shapes import Shape
 
-__all__ = ["Floor", "Noise", "SizePrior", "floors", "map_floors", "mean_floor", "rank_patterns"]
+__all__ = ["Floor", "MeasurementNoise", "SizePrior", "floors", "map_floors", "mean_floor", "rank_patterns"]
 
 MAP_SIDE = 12  # positions along the side, at least, in a map
 DROPS = (0.1, 0.15, 0.3, 0.5)  # 1, 1.5, 3 and 5 N by the default force law
@@ -37,7 +37,7 @@ class Case:
 
     skin: str = "square16"
     pattern: str | None = None
-    noise: Noise = Noise()
+    noise: MeasurementNoise = MeasurementNoise()
     prior: SizePrior = SizePrior()
     drift: Drift = Drift()
 
@@ -126,7 +126,7 @@ def draw(case: Case, radius: float, drop: float, per_side: int, path: Path) -> N
     plt.close(figure)
 
 
-def _noise(noise: Noise) -> str:
+def _noise(noise: MeasurementNoise) -> str:
     parts = [] if np.isinf(noise.snr_db) else [f"{noise.snr_db:g} dB"]
     return " and ".join(parts + ([f"{noise.floor_ohm:g} ohm"] if noise.floor_ohm else []))
 
@@ -159,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     case = Case(
         options.skin,
         options.pattern,
-        Noise(options.snr, options.floor_ohm),
+        MeasurementNoise(options.snr, options.floor_ohm),
         SizePrior(radius=(radius, radius)) if options.known_radius else SizePrior(),
         Drift(options.drift, options.drift),
     )

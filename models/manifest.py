@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from models.geometry import Skin
+from models.geometry import SkinGeometry
 from models.linearise import NOSER_POWER
 from models.prereconstruction import ONE_STEP_LAMBDA, THRESHOLD_T, Matrices
 
@@ -17,7 +17,7 @@ IMAGE = 96
 ROOT = Path(__file__).parents[1]
 
 
-def describe(name: str, skin: Skin, matrices: Matrices, **more: Any) -> dict[str, Any]:
+def describe(name: str, skin: SkinGeometry, matrices: Matrices, **more: Any) -> dict[str, Any]:
     """A manifest of a bundle without a network; `more` (network, training, measured) is added as given."""
     h, w = matrices.inside.shape
     return {

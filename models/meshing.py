@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 from skfem import MeshTri
 
-from models.geometry import Skin
+from models.geometry import SkinGeometry
 from protocol.errors import EitskinError
 
 
@@ -40,7 +40,7 @@ USES = {
 }
 
 
-def build(skin: Skin, use: str | Grading = "training") -> MeshTri:
+def build(skin: SkinGeometry, use: str | Grading = "training") -> MeshTri:
     """The skin's mesh for a use in USES or a grading of one's own. Every electrode end and corner is a node.
 
     Raises ValueError for an unknown use, MeshError where the outline's features are finer than the spacing.
@@ -66,7 +66,7 @@ def build(skin: Skin, use: str | Grading = "training") -> MeshTri:
     return mesh
 
 
-def spacing(skin: Skin, use: Grading, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def spacing(skin: SkinGeometry, use: Grading, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N,) wanted spacing at points (N, 2)."""
     ends = skin.point(skin.edges.ravel())
     nearest = np.full(len(points), np.inf)
@@ -75,7 +75,7 @@ def spacing(skin: Skin, use: Grading, points: NDArray[np.float64]) -> NDArray[np
     return np.minimum(use.interior, use.edge + use.growth * nearest)
 
 
-def _boundary_arcs(skin: Skin, use: Grading) -> NDArray[np.float64]:
+def _boundary_arcs(skin: SkinGeometry, use: Grading) -> NDArray[np.float64]:
     """Arc lengths of the boundary nodes: fixed points, and between two of them equal steps of the integral of 1/h."""
     fixed = np.unique(
         np.round(np.mod(np.concatenate([skin.curve.corner_arcs, skin.edges.ravel()]), skin.perimeter), 12)
@@ -93,7 +93,7 @@ def _boundary_arcs(skin: Skin, use: Grading) -> NDArray[np.float64]:
     return np.asarray(np.mod(np.concatenate(arcs), skin.perimeter))
 
 
-def _seeds(skin: Skin, use: Grading) -> NDArray[np.float64]:
+def _seeds(skin: SkinGeometry, use: Grading) -> NDArray[np.float64]:
     """Interior points: centres of the leaves of a quadtree refined to the wanted spacing, not close to the outline."""
     size = use.interior * 0.93 * 2 ** np.floor(np.log2(0.4 / use.interior))  # halving ends at the interior spacing
     n = int(np.ceil(2.2 / size)) + 1
@@ -114,7 +114,7 @@ def _seeds(skin: Skin, use: Grading) -> NDArray[np.float64]:
     return np.vstack(leaves)
 
 
-def _triangles(skin: Skin, points: NDArray[np.float64]) -> NDArray[np.int64]:
+def _triangles(skin: SkinGeometry, points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Delaunay triangles inside the outline, counter-clockwise, without the slivers along straight sides."""
     cells = Delaunay(points).simplices.astype(np.int64)
     a, b, c = (points[cells[:, k]] for k in range(3))
@@ -128,7 +128,7 @@ def _triangles(skin: Skin, points: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _relax(
-    skin: Skin, use: Grading, points: NDArray[np.float64], cells: NDArray[np.int64], n_rim: int
+    skin: SkinGeometry, use: Grading, points: NDArray[np.float64], cells: NDArray[np.int64], n_rim: int
 ) -> NDArray[np.float64]:
     """Smoothing: interior points move to the mean of their triangles' centroids, weighted by area over h^2."""
     corners = points[cells]

@@ -85,7 +85,7 @@ def named(name: str) -> Mismatch:
 class MismatchedSheet:
     """A skin that differs from its file, on a mesh. `skin` is as mounted; `nominal` as its file says."""
 
-    def __init__(self, skin: geometry.Skin | str, mismatch: Mismatch, mesh: str = "stub") -> None:
+    def __init__(self, skin: geometry.SkinGeometry | str, mismatch: Mismatch, mesh: str = "stub") -> None:
         self.nominal = geometry.load(skin) if isinstance(skin, str) else skin
         self.mismatch = mismatch
         self.skin = mounted(self.nominal, mismatch)
@@ -128,7 +128,7 @@ def soft_drop(shapes: Sequence[Shape], blur: float, n: int) -> Array:
     return np.asarray(image.reshape(n, fine // n, n, fine // n).mean(axis=(1, 3)))
 
 
-def mounted(skin: geometry.Skin, mismatch: Mismatch) -> geometry.Skin:
+def mounted(skin: geometry.SkinGeometry, mismatch: Mismatch) -> geometry.SkinGeometry:
     """The skin with its electrodes where they really are, and the contact impedances that they really have.
 
     Electrodes that would overlap keep a hundredth of the skin's half extent between them.
@@ -165,7 +165,7 @@ class SmoothField:
         return np.asarray((plain - self._mean) * self._scale)
 
 
-def smooth_field(skin: geometry.Skin, sd: float, seed: int) -> SmoothField:
+def smooth_field(skin: geometry.SkinGeometry, sd: float, seed: int) -> SmoothField:
     axis = np.linspace(-1, 1, 61)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     return SmoothField(grid[skin.inside(grid)], sd, seed)

@@ -28,7 +28,7 @@ Model = TypeVar("Model", bound=nn.Module)
 
 
 @dataclass(frozen=True)
-class Config:
+class NetworkConfig:
     """Sizes of the network. channels: at 24, 12 and 6 pixels a side; blocks: residual blocks at 12 down, 6, 12 up."""
 
     stack: int = 9
@@ -41,12 +41,12 @@ class Config:
         return asdict(self)
 
     @staticmethod
-    def from_dict(values: dict[str, Any]) -> Config:
-        return Config(**{**values, "channels": tuple(values["channels"]), "blocks": tuple(values["blocks"])})
+    def from_dict(values: dict[str, Any]) -> NetworkConfig:
+        return NetworkConfig(**{**values, "channels": tuple(values["channels"]), "blocks": tuple(values["blocks"])})
 
 
-FULL = Config()
-FAST = Config(channels=(8, 24, 48), blocks=(1, 1, 1), lean=True)
+FULL = NetworkConfig()
+FAST = NetworkConfig(channels=(8, 24, 48), blocks=(1, 1, 1), lean=True)
 
 
 class CBAM(nn.Module):
@@ -89,7 +89,7 @@ def _convolution(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> n
     )
 
 
-class Stage(nn.Module):
+class ResidualStage(nn.Module):
     """Residual 3x3 convolutions at one resolution; context and place come in at the first."""
 
     def __init__(self, blocks: int, channels: int, side: int, lean: bool, attention: bool = False) -> None:
@@ -109,7 +109,7 @@ class Stage(nn.Module):
 class MMCNN(nn.Module):
     """See the module's docstring."""
 
-    def __init__(self, config: Config = FULL) -> None:
+    def __init__(self, config: NetworkConfig = FULL) -> None:
         super().__init__()
         self.config = config
         a, b, c = config.channels
@@ -117,11 +117,11 @@ class MMCNN(nn.Module):
         self.context = nn.Sequential(nn.Linear(CONTEXT, TOLD), nn.ReLU(), nn.Linear(TOLD, TOLD), nn.ReLU())
         self.stem, self.told = _convolution(config.stack, a), FiLM(a, n)
         self.down1 = _convolution(a, b, stride=2)
-        self.stage1 = Stage(config.blocks[0], b, n // 2, config.lean)
+        self.stage1 = ResidualStage(config.blocks[0], b, n // 2, config.lean)
         self.down2 = _convolution(b, c, stride=2)
-        self.stage2 = Stage(config.blocks[1], c, n // 4, config.lean, attention=not config.lean)
+        self.stage2 = ResidualStage(config.blocks[1], c, n // 4, config.lean, attention=not config.lean)
         self.up2 = _convolution(c, 4 * b, 1)
-        self.stage3 = Stage(config.blocks[2], b, n // 2, config.lean)
+        self.stage3 = ResidualStage(config.blocks[2], b, n // 2, config.lean)
         self.up1 = _convolution(b, 4 * a, 1)
         # per pixel of 24 x 24: 16 mask logits and the amplitude; 16 log sigmas. What shape it is shows in the wider
         # features.
@@ -173,7 +173,7 @@ def laid_out(model: Model, layout: torch.memory_format) -> Model:
     return model
 
 
-def multiply_accumulates(config: Config) -> int:
+def multiply_accumulates(config: NetworkConfig) -> int:
     """Multiply-accumulates of one frame, convolutions only."""
     model, total = MMCNN(config).eval(), 0
 

@@ -64,7 +64,12 @@ def inputs(operator: Operator, d: Array) -> Array:
 
 
 def train(
-    pre: PreReconstructor, skin: geometry.Skin, scenes: samples.Samples, minutes: float, attention: bool, seed: int = 0
+    pre: PreReconstructor,
+    skin: geometry.SkinGeometry,
+    scenes: samples.Samples,
+    minutes: float,
+    attention: bool,
+    seed: int = 0,
 ) -> PublishedMMCNN:
     """Trains for so many minutes; prints the loss now and then."""
     torch.manual_seed(seed)

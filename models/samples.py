@@ -96,7 +96,7 @@ class Batches:
         self,
         samples: Samples,
         pre: PreReconstructor,
-        skin: geometry.Skin,
+        skin: geometry.SkinGeometry,
         seed: int,
         size: int = 64,
         groups: int = 4,

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import json
 import math
 import time
 from pathlib import Path
@@ -27,8 +26,9 @@ from models import data, geometry, manifest, samples
 from models.bundle import Bundle
 from models.evaluation import LEVELS, evaluate, predict
 from models.losses import losses, total
-from models.network import FAST, FULL, MMCNN, Config, laid_out
+from models.network import FAST, FULL, MMCNN, NetworkConfig, laid_out
 from models.optim import Muon
+from models.pace import Pace, TrainingBar
 from models.prereconstruction import PreReconstructor
 
 CONFIGS = {"full": FULL, "fast": FAST}
@@ -39,7 +39,9 @@ AVERAGE = 0.999
 class Trainer:
     """One network's training state: everything that a checkpoint holds."""
 
-    def __init__(self, config: Config, batches: samples.Batches, held_out: samples.Samples, seed: int = 0) -> None:
+    def __init__(
+        self, config: NetworkConfig, batches: samples.Batches, held_out: samples.Samples, seed: int = 0
+    ) -> None:
         torch.manual_seed(seed)
         self.seed, self.commit = seed, manifest.commit()
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -62,10 +64,16 @@ class Trainer:
         self.curve: list[dict[str, Any]] = []
         self.best: dict[str, Any] | None = None
         self.best_score, self.best_at = -math.inf, 0.0
+        self.pace = Pace(torch.get_num_threads(), self.device.type)
 
     def step(self, done: float) -> dict[str, float]:
         """One batch at fraction `done` of the budget."""
-        batch = self.batches.draw().to(self.device)
+        with self.pace.of("batches"):
+            batch = self.batches.draw().to(self.device)
+        with self.pace.of("network"):
+            return self._learn(batch, done)
+
+    def _learn(self, batch: samples.Batch, done: float) -> dict[str, float]:
         warm, factor = min(1.0, done / 0.01 + 0.01), 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
         for optimizer, rate in zip(self.optimizers, self.rates, strict=True):
             for group in optimizer.param_groups:
@@ -88,48 +96,66 @@ class Trainer:
                 mine.lerp_(theirs, 1 - blend) if mine.dtype.is_floating_point else mine.copy_(theirs)
         return {name: float(value.detach()) for name, value in terms.items()}
 
-    def run(self, minutes: float, checkpoint: Path, quiet: bool = False, folder: Path | None = None) -> None:
+    def run(
+        self,
+        minutes: float,
+        checkpoint: Path,
+        quiet: bool = False,
+        folder: Path | None = None,
+        name: str = "training",
+    ) -> None:
         """Trains until the budget (all runs together) is spent; a checkpoint every two minutes.
 
-        folder: where samples are still being made; what has appeared there is taken in at every check.
+        folder: where samples are still being made; what has appeared there is taken in at every check. Held-out checks
+        take at most a tenth of the time, however slow the machine is.
         """
         chunks = len(data.chunk_files(folder)) if folder else 0
         budget, sums, count, saved = 60 * minutes, dict[str, float](), 0, self.elapsed
         began = time.perf_counter() - self.elapsed
-        checks = max(budget / 30, 15.0)
-        next_check = self.elapsed + checks
-        while self.elapsed < budget:
-            terms = self.step(self.elapsed / budget)
-            sums = {k: sums.get(k, 0.0) + v for k, v in terms.items()}
-            count += 1
-            self.elapsed = time.perf_counter() - began
-            if self.elapsed >= next_check or self.elapsed >= budget:
-                next_check = self.elapsed + checks
-                row = {"minutes": self.elapsed / 60, "steps": self.steps, **{k: v / count for k, v in sums.items()}}
-                for level, decibel in LEVELS.items():
-                    row |= {
-                        f"{k}, {level}": v
-                        for k, v in evaluate(predict(self.average), self.held_out, self.batches.pre, decibel).items()
-                    }
-                row["scenes"] = len(self.batches.samples)
-                self.curve.append(row)
-                if folder and (found := len(data.chunk_files(folder))) > chunks:
-                    self.batches.add(samples.load(folder, "train", self.batches.pre, skip=chunks))
-                    chunks = found
-                sums, count = {}, 0
-                if not quiet:
-                    print(json.dumps({k: round(v, 4) for k, v in row.items()}), flush=True)
-                score = sum(row[f"contact IoU, {level}"] for level in LEVELS)
-                if score > self.best_score:
-                    self.best_score, self.best_at = score, self.elapsed
-                    self.best = copy.deepcopy(self.average.state_dict())
-                elif self.elapsed - max(self.best_at, 0.5 * budget) > 0.25 * budget:
-                    print(f"no better on held-out scenes since minute {self.best_at / 60:.1f}: stopped")
-                    break
-            if self.elapsed - saved > 120:
-                saved = self.elapsed
-                self.save(checkpoint)
+        next_check = self.elapsed + max(budget / 30, 15.0)
+        with TrainingBar(name, budget, quiet) as bar:
+            while self.elapsed < budget:
+                terms = self.step(self.elapsed / budget)
+                sums = {k: sums.get(k, 0.0) + v for k, v in terms.items()}
+                count += 1
+                self.elapsed = time.perf_counter() - began
+                bar.at(self.elapsed, self.steps)
+                if self.elapsed >= next_check or self.elapsed >= budget:
+                    row = self._check({k: v / count for k, v in sums.items()})
+                    if folder and (found := len(data.chunk_files(folder))) > chunks:
+                        self.batches.add(samples.load(folder, "train", self.batches.pre, skip=chunks))
+                        chunks = found
+                    sums, count = {}, 0
+                    took = time.perf_counter() - began - self.elapsed
+                    next_check = self.elapsed + max(budget / 30, 15.0, 10 * took)
+                    bar.checked(row)
+                    if self._no_better(row, budget):
+                        print(f"no better on held-out scenes since minute {self.best_at / 60:.1f}: stopped")
+                        break
+                if self.elapsed - saved > 120:
+                    saved = self.elapsed
+                    self.save(checkpoint)
         self.save(checkpoint)
+
+    def _check(self, terms: dict[str, float]) -> dict[str, Any]:
+        """Held-out figures of the averaged network, as a row of the curve. terms: means since the last check."""
+        row: dict[str, Any] = {"minutes": self.elapsed / 60, "steps": self.steps, **terms}
+        with self.pace.of("held-out"):
+            for level, decibel in LEVELS.items():
+                figures = evaluate(predict(self.average), self.held_out, self.batches.pre, decibel)
+                row |= {f"{k}, {level}": v for k, v in figures.items()}
+        row["scenes"] = len(self.batches.samples)
+        self.curve.append(row)
+        return row
+
+    def _no_better(self, row: dict[str, Any], budget: float) -> bool:
+        """Keeps the network aside where it is the best so far; else, whether that has been so for too long."""
+        score = sum(row[f"contact IoU, {level}"] for level in LEVELS)
+        if score > self.best_score:
+            self.best_score, self.best_at = score, self.elapsed
+            self.best = copy.deepcopy(self.average.state_dict())
+            return False
+        return self.elapsed - max(self.best_at, 0.5 * budget) > 0.25 * budget
 
     def result(self) -> MMCNN:
         """The averaged network that was best on held-out scenes, on the CPU, for inference."""
@@ -194,7 +220,7 @@ def plot(curve: list[dict[str, Any]], path: Path) -> None:
 
 def train(
     variant: str,
-    skin: geometry.Skin,
+    skin: geometry.SkinGeometry,
     pre: PreReconstructor,
     scenes: samples.Samples,
     held_out: samples.Samples,
@@ -212,7 +238,9 @@ def train(
         trainer.resume(checkpoint)
     size = sum(p.numel() for p in trainer.model.parameters()) / 1e6
     print(f"{variant}: {size:.2f} M parameters, {len(scenes)} scenes, {trainer.device}", flush=True)
-    trainer.run(minutes, checkpoint, folder=folder)
+    before = trainer.steps
+    trainer.run(minutes, checkpoint, folder=folder, name=variant)
+    print(f"{variant}: {trainer.pace.said(trainer.steps - before, trainer.batches.size)}", flush=True)
     plot(trainer.curve, checkpoint.with_suffix(".png"))
     return trainer
 

@@ -30,7 +30,7 @@ LEAST_NOISE = 2e-6  # relative; less looks the same
 
 
 @dataclass(frozen=True)
-class Seen:
+class ImageFeatures:
     """What an image shows of N touches; each an array (N,) or a number. Lengths in model units."""
 
     peak: Array  # S/m: mean of the pixels near the highest
@@ -41,7 +41,7 @@ class Seen:
     noise: Array  # rms relative standard uncertainty of the measurements that the image was made of
 
 
-def known_drop(seen: Seen, area: Array | float) -> Array:
+def known_drop(seen: ImageFeatures, area: Array | float) -> Array:
     """Peak drop [S/m] of a flat round contact of known area that looks like `seen`.
 
     A small disc of conductivity 1 - h acts on the measurements in proportion to area * h / (1 - h/2) (a cylinder's
@@ -52,7 +52,7 @@ def known_drop(seen: Seen, area: Array | float) -> Array:
     return np.asarray(strength / (1 + strength / 2))
 
 
-def estimate(name: str, seen: Seen, area: Array | float | None = None) -> Array:
+def estimate(name: str, seen: ImageFeatures, area: Array | float | None = None) -> Array:
     """The quantity that a map is about; `area` of the indenter for "known"."""
     if name == "known":
         assert area is not None
@@ -60,7 +60,7 @@ def estimate(name: str, seen: Seen, area: Array | float | None = None) -> Array:
     return np.asarray(seen.peak if name == "peak" else seen.integral)
 
 
-def features(name: str, seen: Seen, area: Array | float | None = None) -> Array:
+def features(name: str, seen: ImageFeatures, area: Array | float | None = None) -> Array:
     """(N, F) of N touches."""
     peak, size = np.maximum(seen.peak, 1e-6), np.maximum(seen.area, 1e-6)
     noise = np.log10(np.maximum(seen.noise, LEAST_NOISE))

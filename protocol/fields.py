@@ -1,7 +1,7 @@
 """What a field of a frame may hold: one small checker per kind of value (lists, maps and records are in records.py).
 
 A checker turns what msgpack read into what Python code uses (`decode`), the other way round (`encode`), says whether
-a decoded value is finite (`finite`), and describes itself for WIRE.md (`describe`). `decode` raises `Mismatch`;
+a decoded value is finite (`finite`), and describes itself for WIRE.md (`describe`). `decode` raises `FieldError`;
 `frames.unpack` adds the topic and the field's name to it. Nothing here knows a topic, a frame or a socket.
 """
 
@@ -31,16 +31,16 @@ MAX_EXTENT = 2**31
 REMEMBERED = 64  # texts that a checker has accepted and need not look at again
 
 
-class Mismatch(EitskinError):
+class FieldError(EitskinError):
     """A value is not what its field allows: `path` inside the field ("" for the field itself), `found`, `expected`."""
 
     def __init__(self, found: str, expected: str, path: str = "") -> None:
         super().__init__(found, expected, path)
         self.found, self.expected, self.path = found, expected, path
 
-    def below(self, step: str) -> Mismatch:
+    def below(self, step: str) -> FieldError:
         """The same mismatch seen from one level further out."""
-        return Mismatch(self.found, self.expected, step + self.path)
+        return FieldError(self.found, self.expected, step + self.path)
 
 
 _SHORT = reprlib.Repr()
@@ -72,8 +72,8 @@ class Check:
     def describe(self) -> str:
         raise NotImplementedError
 
-    def refuse(self, value: object) -> Mismatch:
-        return Mismatch(brief(value), self.describe())
+    def refuse(self, value: object) -> FieldError:
+        return FieldError(brief(value), self.describe())
 
 
 @dataclass(frozen=True)
@@ -119,10 +119,10 @@ class Int(Check):
 class Version(Int):
     """The layout that a message was written in: all up to ours can be read, a newer one cannot."""
 
-    def refuse(self, value: object) -> Mismatch:
+    def refuse(self, value: object) -> FieldError:
         if type(value) is not int or value <= self.high:
             return super().refuse(value)
-        return Mismatch(f"schema {value}", f"schema {self.high} at most: who sent it is newer, update this reader")
+        return FieldError(f"schema {value}", f"schema {self.high} at most: who sent it is newer, update this reader")
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class Array(Check):
     def decode(self, value: Any) -> NDArray[Any]:
         array = decode_array(value)
         if value["dtype"] != self.dtype:
-            raise Mismatch(f"dtype {array.dtype.str}", self.describe())
+            raise FieldError(f"dtype {array.dtype.str}", self.describe())
         if array.size or not self.or_empty:
             self._check_shape(array)
         return array
@@ -252,7 +252,7 @@ class Array(Check):
                 return
         if self.or_empty and array.size == 0:
             return
-        raise Mismatch(f"shape {list(shape)}", self.describe())
+        raise FieldError(f"shape {list(shape)}", self.describe())
 
     def finite(self, value: Any) -> bool:
         return self.gaps or not value.size or value.dtype.kind not in "fc" or bool(np.isfinite(value).all())
@@ -263,34 +263,34 @@ class Array(Check):
 
 
 def decode_array(value: Any) -> NDArray[Any]:
-    """Read {dtype, shape, data} without copying `data`. Raises Mismatch."""
+    """Read {dtype, shape, data} without copying `data`. Raises FieldError."""
     expected = "array: map {dtype, shape, data}"
     try:
         name, shape, data = value["dtype"], value["shape"], value["data"]
         dtype = _DTYPES[name]
     except (TypeError, KeyError):
-        raise Mismatch(brief(value), f"{expected}, dtype one of {' '.join(_DTYPES)}") from None
+        raise FieldError(brief(value), f"{expected}, dtype one of {' '.join(_DTYPES)}") from None
     if type(shape) is not list or type(data) is not bytes or len(shape) > 8:
-        raise Mismatch(f"shape {brief(shape)}, data {brief(data)}", expected)
+        raise FieldError(f"shape {brief(shape)}, data {brief(data)}", expected)
     size = extent = dtype.itemsize
     for n in shape:
         if type(n) is not int or n < 0:
-            raise Mismatch(f"shape {brief(shape)}", expected)
+            raise FieldError(f"shape {brief(shape)}", expected)
         size *= n
         extent *= n or 1
     if size != len(data):
-        raise Mismatch(f"{len(data)} bytes of data", f"{size} bytes for shape {shape} of {name}")
+        raise FieldError(f"{len(data)} bytes of data", f"{size} bytes for shape {shape} of {name}")
     if extent > MAX_EXTENT:
-        raise Mismatch(f"shape {shape}", f"dimensions that multiply to at most {MAX_EXTENT} bytes")
+        raise FieldError(f"shape {shape}", f"dimensions that multiply to at most {MAX_EXTENT} bytes")
     array = np.frombuffer(data, dtype)
     return array if len(shape) == 1 else array.reshape(shape)
 
 
 def encode_array(array: NDArray[Any]) -> dict[str, Any]:
-    """The map that stands for a contiguous array of one of the allowed dtypes. Raises Mismatch for another dtype."""
+    """The map that stands for a contiguous array of one of the allowed dtypes. Raises FieldError for another dtype."""
     name = array.dtype.newbyteorder("<").str
     if name not in _DTYPES:
-        raise Mismatch(f"dtype {array.dtype}", f"one of {' '.join(_DTYPES)}")
+        raise FieldError(f"dtype {array.dtype}", f"one of {' '.join(_DTYPES)}")
     return {"dtype": name, "shape": list(array.shape), "data": array.astype(name, copy=False).tobytes()}
 
 

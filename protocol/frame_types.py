@@ -44,6 +44,7 @@ REASONS = {
     "extrapolated": "a force beyond the calibrated range",
     "late": "measured longer ago than it may be acted on: what brought it was held up",
     "clock": "the sample time is uncertain: the board's clock is not known well enough, or it jumped",
+    "gain": "all measurements changed by one common factor: the board's gain stepped, and the baseline with it",
     "frozen": "the board sends the same scan again and again, with new numbers and times",
     "uncalibrated_force": "the skin has no force law: forces are nil",
     "replay": "from a recording",
@@ -204,7 +205,7 @@ class Contact:
         "first frame of the touch; in between, or not known to be the first; last one",
         "hold",
     )
-    position: list[float] = wire(Vector(3, "m"), "centroid of the contact patch, in the skin's frame")
+    position: list[float] = wire(Vector(3, "m"), "centroid of the contact patch, in the frame `frame_id`")
     velocity: list[float] = wire(Vector(3, "m/s"), "of `position`", lambda: [0.0] * 3)
     normal: list[float] = wire(Vector(3), "unit vector out of the skin", lambda: [0.0, 0.0, 1.0])
     orientation: float = wire(Float(unit="rad"), "angle of the patch's longest axis to x, -pi/2 to pi/2", 0.0)
@@ -217,6 +218,15 @@ class Contact:
     shape: str = wire(Text(32), "most probable of " + ", ".join(SHAPES) + "; or unknown", "unknown")
     shape_probability: float | None = wire(Maybe(Float(0, 1)), "of `shape`, or nil", None)
     confidence: float = wire(Float(0, 1), "probability that this is a touch", 1.0)
+    sheet: list[float] | None = wire(
+        Maybe(Vector(2, "m")), "x, y on the unrolled sheet, as images have it; nil: those of `position`", None
+    )
+
+    @property
+    def on_sheet(self) -> tuple[float, float]:
+        """x, y [m] on the sheet, as images and the stub's truth have it, whatever the skin is wrapped round."""
+        x, y = self.position[:2] if self.sheet is None else self.sheet
+        return x, y
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -285,6 +295,7 @@ INFO_KEYS = {
     "frame_id": "name of the skin's coordinate frame",
     "parent_frame_id": "name of the frame that `pose` is given in",
     "pose": "x, y, z [m], qx, qy, qz, qw: the skin's frame in its parent",
+    "surface": "map: kind (cylinder), radius_m, axis_degrees: what the sheet is wrapped round; or nil: it lies flat",
     "units": "map: name of a field -> its unit",
     "force_law": "map: kind and parameters of the force law, or nil",
     "calibration_hash": "sha256 of the calibration file, or nil",
@@ -310,7 +321,7 @@ class InfoFrame(Frame):
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class Touch:
+class TrueTouch:
     """What the stub's skin is really touched by."""
 
     shape: str = wire(Text(32), "kind: circle, triangle, rectangle, square, L, hertz")
@@ -330,4 +341,4 @@ class Touch:
 class TruthFrame(Frame):
     """What really touches at the middle of the scan; only a stub knows. `publish`: the scan's last byte had left."""
 
-    touches: list[Touch] = wire(ListOf(Record(Touch), 256), "the touches", list, always=True)
+    touches: list[TrueTouch] = wire(ListOf(Record(TrueTouch), 256), "the touches", list, always=True)

@@ -13,7 +13,7 @@ import msgpack
 
 from . import fields as _fields
 from .errors import EitskinError
-from .fields import Mismatch, brief
+from .fields import FieldError, brief
 from .frame_types import (
     ELECTRODE_STATES,
     INFO_KEYS,
@@ -37,7 +37,7 @@ from .frame_types import (
     RawFrame,
     ShapeFrame,
     StatusFrame,
-    Touch,
+    TrueTouch,
     TruthFrame,
 )
 from .records import Record
@@ -47,7 +47,7 @@ __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
     "Contact", "ContactFrame", "DeltaFrame", "ForceFrame", "Frame", "FrameError", "ImageFrame", "InfoFrame",
-    "RawFrame", "ShapeFrame", "StatusFrame", "Touch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
+    "RawFrame", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
 ]  # fmt: skip
 
 MAX_MESSAGE = 4 * 1024 * 1024
@@ -78,7 +78,7 @@ def pack(frame: Frame) -> bytes:
     try:
         body = _RECORDS[topic].encode(frame)
         packed: bytes = msgpack.packb(body)
-    except Mismatch as bad:
+    except FieldError as bad:
         raise FrameError(topic, bad.path.lstrip("."), bad.found, bad.expected) from None
     except (TypeError, ValueError, OverflowError) as bad:
         raise FrameError(topic, "", f"what msgpack refuses ({bad})", "the fields' own types") from None
@@ -100,7 +100,7 @@ def unpack(message: bytes) -> Frame:
     try:
         frame: Frame = record.decode(fields_read)
         finite = record.finite(frame)
-    except Mismatch as bad:
+    except FieldError as bad:
         raise FrameError(name, bad.path.lstrip("."), bad.found, bad.expected) from None
     except Exception as bad:  # a reader drops one message rather than die of it, whatever a checker has overlooked
         raise FrameError(

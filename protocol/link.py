@@ -27,13 +27,13 @@ from .link_messages import (
     Config,
     Event,
     EventCode,
-    Frame,
     Hello,
     Ident,
     LinkError,
     Message,
     Nak,
     NakReason,
+    ScanFrame,
     SelfTest,
     SelfTestFault,
     Start,
@@ -44,8 +44,8 @@ from .link_messages import (
 
 __all__ = [
     "CHIP_ID", "LINK_VERSION", "MAX_BODY", "MAX_SCAN", "MAX_TEXT", "MESSAGES", "SCHEMA_HASH", "SCHEMA_TEXT",
-    "Ack", "Capability", "Config", "Decoder", "Event", "EventCode", "Frame", "Hello", "Ident", "LinkError", "Message",
-    "Nak", "NakReason", "SelfTest", "SelfTestFault", "Start", "Stop", "Time", "TimeAsk", "encode",
+    "Ack", "Capability", "Config", "Decoder", "Event", "EventCode", "Hello", "Ident", "LinkError", "Message",
+    "Nak", "NakReason", "ScanFrame", "SelfTest", "SelfTestFault", "Start", "Stop", "Time", "TimeAsk", "encode",
 ]  # fmt: skip
 
 MAX_PIECE = MAX_BODY + MAX_BODY // 254 + 1

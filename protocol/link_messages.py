@@ -94,6 +94,11 @@ class Message:
     number: ClassVar[int]
     sender: ClassVar[str]
     plain_crc: ClassVar[bool] = False
+    wire_name: ClassVar[str]
+    """What the schema and WIRE.md call it: the class's name where the class does not say otherwise."""
+
+    def __init_subclass__(cls) -> None:
+        cls.wire_name = vars(cls).get("wire_name", cls.__name__)
 
     @classmethod
     def layout(cls) -> list[tuple[str, str, str]]:
@@ -120,18 +125,18 @@ class Message:
         try:
             return bytes([self.number]) + head.pack(*(getattr(self, n) for n in names)) + self._tail()
         except (struct.error, TypeError, ValueError, OverflowError) as bad:
-            raise LinkError(f"{type(self).__name__} cannot be sent: {bad}") from None
+            raise LinkError(f"{self.wire_name} cannot be sent: {bad}") from None
 
     @classmethod
     def read(cls, body: bytes) -> Message:
         """The message in `body`. Raises LinkError."""
         names, head = HEADS[cls]
         if len(body) < 1 + head.size:
-            raise LinkError(f"{cls.__name__}: found {len(body)} bytes, expected at least {1 + head.size}")
+            raise LinkError(f"{cls.wire_name}: found {len(body)} bytes, expected at least {1 + head.size}")
         try:
             tail = cls._read_tail(body[1 + head.size :])
         except LinkError as bad:
-            raise LinkError(f"{cls.__name__}: {bad}") from None
+            raise LinkError(f"{cls.wire_name}: {bad}") from None
         return cls(**dict(zip(names, head.unpack_from(body, 1), strict=True)), **tail)
 
 
@@ -253,10 +258,10 @@ class Nak(_WithText):
 
 
 @dataclass(frozen=True, eq=False)
-class Frame(Message):
+class ScanFrame(Message):
     """One scan."""
 
-    number, sender = 0x84, "board"
+    number, sender, wire_name = 0x84, "board", "Frame"
     seq: int = _wired("u32", "counts scans since START, also those that could not be sent; wraps to 0")
     device_us: int = _wired("u64", "the microcontroller's clock at the start of the scan [us]")
     duration_us: int = _wired("u32", "how long the scan took [us]")
@@ -306,12 +311,12 @@ class Time(Message):
 
 
 MESSAGES: tuple[type[Message], ...] = (
-    Hello, Config, Start, Stop, SelfTest, TimeAsk, Ident, Ack, Nak, Frame, Event, Time,
+    Hello, Config, Start, Stop, SelfTest, TimeAsk, Ident, Ack, Nak, ScanFrame, Event, Time,
 )  # fmt: skip
 BY_NUMBER = {m.number: m for m in MESSAGES}
 HEADS = {m: m._head() for m in MESSAGES}
 SCHEMA_TEXT = "".join(
-    f"{m.number:02x} {m.__name__}: {'; '.join(f'{name} {kind}' for name, kind, _ in m.layout())}\n" for m in MESSAGES
+    f"{m.number:02x} {m.wire_name}: {'; '.join(f'{name} {kind}' for name, kind, _ in m.layout())}\n" for m in MESSAGES
 )
 """One line a message: what both ends must agree on."""
 SCHEMA_HASH = zlib.crc32(SCHEMA_TEXT.encode())

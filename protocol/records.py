@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .fields import MAX_DEPTH, MAX_LIST, Bool, Check, Float, Int, Mismatch, brief, decode_array, encode_array
+from .fields import MAX_DEPTH, MAX_LIST, Bool, Check, FieldError, Float, Int, brief, decode_array, encode_array
 
 MAX_FLOAT = sys.float_info.max
 
@@ -30,7 +30,7 @@ class ListOf(Check):
         for i, x in enumerate(value):
             try:
                 out.append(decode(x))
-            except Mismatch as bad:
+            except FieldError as bad:
                 raise bad.below(f"[{i}]") from None
         return out
 
@@ -58,10 +58,10 @@ class MapOf(Check):
         out, decode = {}, self.item.decode
         for key, x in value.items():
             if type(key) is not str or len(key) > 128:
-                raise Mismatch(f"key {brief(key)}", self.describe())
+                raise FieldError(f"key {brief(key)}", self.describe())
             try:
                 out[key] = decode(x)
-            except Mismatch as bad:
+            except FieldError as bad:
                 raise bad.below(f".{key}") from None
         return out
 
@@ -111,17 +111,17 @@ class Tree(Check):
 
     def _walk(self, value: Any, depth: int, array: Callable[[Any], NDArray[Any]] | None) -> Any:
         if depth > MAX_DEPTH:
-            raise Mismatch("deeper nesting", f"at most {MAX_DEPTH} levels")
+            raise FieldError("deeper nesting", f"at most {MAX_DEPTH} levels")
         if isinstance(value, dict):
             if array and len(value) == 3 and value.keys() == {"dtype", "shape", "data"}:
                 return array(value)
             out = {}
             for key, x in value.items():
                 if type(key) is not str:
-                    raise Mismatch(f"key {brief(key)}", "text keys")
+                    raise FieldError(f"key {brief(key)}", "text keys")
                 try:
                     out[key] = self._walk(x, depth + 1, array)
-                except Mismatch as bad:
+                except FieldError as bad:
                     raise bad.below(f".{key}") from None
             return out
         if isinstance(value, (list, tuple)):
@@ -175,7 +175,7 @@ class Record(Check):
                 read[name] = found if type(found) is kind and low <= found <= high else decode(found)
         except KeyError:  # tried first as if all were there: looking for each key costs every frame
             read = self._decode_partial(value)
-        except Mismatch as bad:
+        except FieldError as bad:
             raise bad.below(f".{name}") from None
         made = self.kind(**read)
         if self._same_length:
@@ -189,10 +189,10 @@ class Record(Check):
             if name in value:
                 try:
                     read[name] = check.decode(value[name])
-                except Mismatch as bad:
+                except FieldError as bad:
                     raise bad.below(f".{name}") from None
             elif name not in self._may_be_missing:
-                raise Mismatch("nothing", check.describe(), f".{name}")
+                raise FieldError("nothing", check.describe(), f".{name}")
         return read
 
     def encode(self, value: Any) -> dict[str, Any]:
@@ -202,11 +202,11 @@ class Record(Check):
             for name, encode, kind in self._encoders:
                 found = getattr(value, name)
                 out[name] = found if type(found) is kind else encode(found)
-        except Mismatch as bad:
+        except FieldError as bad:
             raise bad.below(f".{name}") from None
         except (TypeError, ValueError, AttributeError) as bad:
             expected = dict(self.checks)[name].describe()
-            raise Mismatch(f"{brief(getattr(value, name))} ({bad})", expected, f".{name}") from None
+            raise FieldError(f"{brief(getattr(value, name))} ({bad})", expected, f".{name}") from None
         if self._same_length:
             self._check_lengths(value)
         return out
@@ -216,7 +216,7 @@ class Record(Check):
         expected = len(getattr(made, first))
         for name in others:
             if (found := len(getattr(made, name))) != expected:
-                raise Mismatch(f"length {found}", f"length {expected}, as {first} has", f".{name}")
+                raise FieldError(f"length {found}", f"length {expected}, as {first} has", f".{name}")
 
     def finite(self, value: Any) -> bool:
         for name, finite in self._can_be_infinite:

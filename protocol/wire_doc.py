@@ -130,7 +130,7 @@ def link_tables() -> str:
     out = []
     for message in link.MESSAGES:
         crc = "plain CRC" if message.plain_crc else "seeded CRC"
-        out.append(f"### {message.number:#04x} {message.__name__} ({message.sender}, {crc})\n\n{message.__doc__}\n\n")
+        out.append(f"### {message.number:#04x} {message.wire_name} ({message.sender}, {crc})\n\n{message.__doc__}\n\n")
         rows: list[tuple[object, ...]] = [(0, "number", "u8", f"{message.number:#04x}")]
         offset: int | None = 1
         for name, kind, doc in message.layout():

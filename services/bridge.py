@@ -14,7 +14,7 @@ from typing import Any
 from protocol import logs
 from protocol.errors import EitskinError
 from protocol.topics import BRIDGES
-from services.runtime.config import ROOT, Config, ConfigError, load
+from services.runtime.config import ROOT, ConfigError, ConfigFile, load
 
 NEEDS = {"ros2": "cyclonedds", "foxglove": "foxglove"}
 """What each needs beside the service's own packages: an extra of its own in pyproject.toml."""
@@ -32,7 +32,7 @@ def check(name: str) -> None:
         )
 
 
-def settings(name: str, config: Config) -> str:
+def settings(name: str, config: ConfigFile) -> str:
     """What the bridge is told, as JSON."""
     reach = config.transport()
     told: dict[str, Any] = {
@@ -57,7 +57,7 @@ def _absolute(path: Any) -> str | None:
     return None if path is None else os.path.abspath(path)
 
 
-def become(name: str, config: Config) -> None:
+def become(name: str, config: ConfigFile) -> None:
     """Go on as the bridge, in this very process. Raises MissingExtra."""
     check(name)
     environment = {**os.environ, "EITSKIN_BRIDGE": settings(name, config)}

@@ -29,6 +29,7 @@ def describe(skin: Skin, bundle: Bundle, baseline: Baseline | None, revision: in
         "frame_id": skin.frame_id,
         "parent_frame_id": skin.pose.parent,
         "pose": [*skin.pose.position_m, *skin.pose.quaternion_xyzw],
+        "surface": None if skin.surface is None else skin.surface.model_dump(),
         "units": UNITS,
         "force_law": ForceLaw.of(skin, bundle).describe(),
         "calibration_hash": None

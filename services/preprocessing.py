@@ -98,12 +98,16 @@ class Preprocessing(Stage):
         separate = SEPARATE in frame.reasons
         if known is None or separate:
             self.gain.reset()
-        elif not frame.status.any() and (factor := self.gain(amplitude, known, out.stamps.get("sample", 0))):
+        elif not frame.status.any():
             # Frames with marks are passed over: their end would be taken for a step back from a gain never taken over.
-            self._counters["gain_steps"] += 1
-            self.baseline_estimator.rescale(factor)
-            self.electrodes.rescale(factor)
-            known = self.baseline_estimator.baseline
+            step = self.gain(amplitude, known, out.stamps.get("sample", 0))
+            if step is not None:
+                self._counters["gain_steps"] += 1
+                self.baseline_estimator.rescale(step.factor)
+                self.electrodes.rescale(step)
+                known = self.baseline_estimator.baseline
+            if step is not None or self.gain.gross:
+                add_reason(out.reasons, "gain")
         if separate:
             self.electrodes.reset()
             self._begin_anew()

@@ -14,10 +14,13 @@ from models.bundle import Bundle
 from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame
 from protocol.held import ANY, HeldImage
 from services.contacts.force import ForceLaw, Look
-from services.contacts.motion import Seen, Track
+from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
+from services.contacts.placing import placement
 from services.contacts.segmentation import Segment, readable, segment
+from services.contacts.surface import Placed
 from services.contacts.tracking import Tracker
+from services.describe import geometry
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
 
@@ -39,6 +42,7 @@ class Publishing(Stage):
         super().__init__(name)
         self.config = skin
         self.law = ForceLaw.of(skin, bundle, name)
+        self.place, self.frame_id = placement(skin, geometry(bundle)["outline"], name)
         self.tracker = Tracker()
         self.each_alone = False  # offline: frames that do not follow each other
         self.reset()
@@ -68,7 +72,7 @@ class Publishing(Stage):
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, ImageFrame)
         self._counters["frames"] += 1
-        out = ContactFrame(**inherited(frame), frame_id=self.config.frame_id, force_calibrated=self.law.calibrated)
+        out = ContactFrame(**inherited(frame), frame_id=self.frame_id, force_calibrated=self.law.calibrated)
         if not self.law.exists:
             add_reason(out.reasons, "uncalibrated_force")
         self.lacks = not self.held.complete(frame)
@@ -114,7 +118,7 @@ class Publishing(Stage):
         if frame.touched and frame.image.size:
             places = [] if self._alone(frame) else self.tracker.expected(now)
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
-        seen = [Seen(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
+        seen = [Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
         tracks: Sequence[Track | None]
         ended: list[Track] = []
         if self._alone(frame):
@@ -160,23 +164,26 @@ class Publishing(Stage):
         self._forget()
         self._counters["unknown"] += 1
 
-    def _contact(self, track: Track, seen: Seen, s: Segment, classes: list[float], frame: ImageFrame) -> Contact:
+    def _contact(self, track: Track, seen: Patch, s: Segment, classes: list[float], frame: ImageFrame) -> Contact:
         force, sigma = self.law.force(Look.of(s, frame))
         best = int(np.argmax(classes)) if classes else -1
         known = bool(classes) and classes[best] >= UNKNOWN_BELOW
+        at = self.place(seen.x, seen.y)
         return Contact(
             id=track.id,
             state="begin" if track.age == 1 and track.begins else "hold",
-            position=[seen.x, seen.y, 0.0],
-            velocity=[track.vx, track.vy, 0.0],
+            position=at.point.tolist(),
+            velocity=(track.vx * at.along_x + track.vy * at.along_y).tolist(),
+            normal=at.normal.tolist(),
             orientation=s.orientation,
             area_m2=s.area * frame.metres_per_pixel**2,
             force_n=force,
             force_sigma_n=sigma,
-            wrench=_wrench(seen.x, seen.y, force or 0.0),
+            wrench=_wrench(at, force or 0.0),
             shape=SHAPES[best] if known else "unknown",
             shape_probability=classes[best] if classes else None,
             confidence=_confidence(s),
+            sheet=None if self.place.flat else [seen.x, seen.y],
         )
 
     def _drops(self) -> list[tuple[float, float | None]]:
@@ -186,7 +193,14 @@ class Publishing(Stage):
     def _ends(self, tracks: list[Track]) -> list[Contact]:
         """The last word on touches that ended: where they were; they do not press any more."""
         force = None if not self.law.exists else 0.0
-        return [Contact(id=t.id, state="end", position=[t.x, t.y, 0.0], force_n=force, confidence=0.0) for t in tracks]
+        ends = []
+        for t in tracks:
+            at, sheet = self.place(t.x, t.y), None if self.place.flat else [t.x, t.y]
+            where, normal = at.point.tolist(), at.normal.tolist()
+            ends.append(
+                Contact(id=t.id, state="end", position=where, normal=normal, force_n=force, confidence=0.0, sheet=sheet)
+            )
+        return ends
 
     def _force(self, frame: ContactFrame) -> ForceFrame:
         """As valid as the contacts are."""
@@ -272,9 +286,10 @@ def _class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float
     return [min(1.0, float(p)) for p in total / max(float(total.sum()), 1e-9)]
 
 
-def _wrench(x: float, y: float, force: float) -> list[float]:
-    """On the skin, at its frame's origin: the touch presses along -z at (x, y)."""
-    return [0.0, 0.0, -force, -y * force, x * force, 0.0]
+def _wrench(at: Placed, force: float) -> list[float]:
+    """On the skin, at its frame's origin: the touch presses against the normal."""
+    pressed = -force * at.normal
+    return [*pressed.tolist(), *np.cross(at.point, pressed).tolist()]
 
 
 def _confidence(s: Segment) -> float:

@@ -21,11 +21,12 @@ from protocol import transport
 from protocol.frames import Frame, FrameError, InfoFrame
 from protocol.publishing import covers
 from protocol.runtime import host_id
-from protocol.sockets import ControlError, ControlServer, Publisher
+from protocol.sockets import ControlServer, Publisher
 from protocol.topics import TOPIC_OF
 from services.runtime import persistence
 from services.runtime.channel import Channel, Feed, Newest
-from services.runtime.config import Config
+from services.runtime.commands import Commands
+from services.runtime.config import ConfigFile
 from services.runtime.lateness import Lateness
 from services.runtime.stage import Refused, Stage, add_reason
 from services.runtime.waiting import Waiter
@@ -42,16 +43,16 @@ log = logging.getLogger(__name__)
 class Runner:
     """A process: its sockets and its channels. `run` returns when SIGINT or SIGTERM came."""
 
-    def __init__(self, process: str, config: Config, problems: Sequence[str] = ()) -> None:
+    def __init__(self, process: str, config: ConfigFile, problems: Sequence[str] = ()) -> None:
         """problems: what the process as a whole goes without, for its status."""
         self.process, self.config, self.problems = process, config, list(problems)
         for problem in problems:
             log.warning("%s", problem)
         transport.configure(config.transport())
         self.publisher = Publisher(process)
-        commands = {"status": self._status, "state": self._state, "load": self._load, "reset": self._reset}
-        self.control = ControlServer(process, commands)
         self.channels: dict[str, Channel] = {}
+        self._commands = Commands(self.channels, self.publisher, SILENT_S)
+        self.control = ControlServer(process, self._commands.handlers())
         self._bundles: dict[str, Bundle] = {}
         self._waiter = Waiter()
         self._lateness = Lateness()
@@ -76,7 +77,7 @@ class Runner:
         self.channels[stage.skin] = channel
         self._by_socket[channel.feed.socket] = channel
         for command in stage.commands:
-            self.control.handlers[command] = self._commander(command)
+            self.control.handlers[command] = self._commands.of_the_stage(command)
         if stage.persists:
             self._restore(channel)
         stage.warm_up()
@@ -275,56 +276,6 @@ class Runner:
 
     def _on_signal(self) -> None:
         self._stop = True
-
-    # commands
-
-    def _channel(self, args: dict[str, Any]) -> Channel:
-        name = args.get("skin") or next(iter(self.channels))
-        if not isinstance(name, str) or name not in self.channels:
-            raise ControlError("bad_request", f"no skin called {name!r}; configured: {', '.join(self.channels)}")
-        return self.channels[name]
-
-    def _commander(self, command: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
-        def carry_out(args: dict[str, Any]) -> dict[str, Any]:
-            channel = self._channel(args)
-            try:
-                result: dict[str, Any] = persistence.plain(channel.stage.command(command, args))
-                return result
-            except Refused as why:
-                raise ControlError("refused", str(why)) from None
-
-        return carry_out
-
-    def _status(self, args: dict[str, Any]) -> dict[str, Any]:
-        """`flowing`: whether a frame came within SILENT_S (or nobody wants one); what status/<skin> said last."""
-        channel = self._channel(args)
-        return channel.heartbeat.summary(asleep=channel.asleep, silent_s=SILENT_S)
-
-    def _state(self, args: dict[str, Any]) -> dict[str, Any]:
-        """The stage's temporal state, for a recording."""
-        return {"state": persistence.plain(self._channel(args).stage.state())}
-
-    def _load(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Take over a state that `state` gave."""
-        if not isinstance(args.get("state"), dict):
-            raise ControlError("bad_request", "load needs `state`, a map as the command state gives it")
-        stage = self._channel(args).stage
-        try:
-            stage.load(persistence.arrays(args["state"]))
-        except Exception as why:  # whatever was in the state, the stage goes on, with none
-            stage.reset()
-            what = str(why) if isinstance(why, Refused) else f"{type(why).__name__}: {why}"
-            raise ControlError("refused", f"the state does not fit: {what}") from None
-        return {}
-
-    def _reset(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Forget all temporal state; with `new_session` also begin a session, whose frames count from 0."""
-        stage = self._channel(args).stage
-        stage.reset()
-        if args.get("new_session"):
-            stage.new_session()
-            self.publisher.renew()
-        return {"session": self.publisher.session}
 
 
 def _settle() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame, RawFrame
-from services.board.boardlink import Scanning
+from services.board.scanning import Scanning
 from services.estimation.baseline import BaselineEstimator
 from services.estimation.sentinel import Coarse, sentinel_of
 from services.runtime.config import Skin

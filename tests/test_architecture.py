@@ -124,6 +124,18 @@ def test_services_take_only_bundle_and_numerics_from_models() -> None:
             assert not heavy, f"{path.relative_to(ROOT)} reaches {sorted(heavy)} through {module}"
 
 
+def test_a_class_name_is_defined_once() -> None:
+    places: dict[str, list[str]] = {}
+    for folder in ("protocol", "models", "services", "firmware_stub", "bench", "examples", "bridges"):
+        for path in sources(folder):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef):
+                    places.setdefault(node.name, []).append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert len(places) > 300
+    twice = {name: found for name, found in places.items() if len(found) > 1}
+    assert not twice, f"a class of this name is there already, choose another: {twice}"
+
+
 Graph = dict[str, set[str]]
 
 

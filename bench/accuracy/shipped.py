@@ -173,9 +173,9 @@ def floors(frames: Frames, levels: Iterable[str]) -> dict[str, Row]:
             continue
         relative, floor_ohm = _frames.Level(level).parts(frames.pairs0[0])
         decibel = -20 * np.log10(relative) if relative else np.inf
-        noise = fisher.Noise(decibel, floor_ohm)
+        noise = fisher.MeasurementNoise(decibel, floor_ohm)
 
-        def mean(index: Iterable[int], noise: fisher.Noise = noise) -> fisher.Floor:
+        def mean(index: Iterable[int], noise: fisher.MeasurementNoise = noise) -> fisher.Floor:
             return fisher.mean_floor(
                 fisher.floors("square16", frames.scene(k)[0], noise, fisher.SizePrior())["bayes"] for k in index
             )

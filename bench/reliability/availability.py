@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from bench.reliability.random_scene import SCAN_S, TARE_S, Press, RandomScene, random_scene
+from bench.reliability.random_scene import SCAN_S, TARE_S, RandomScene, TimedPress, random_scene
 from bench.reliability.scenes import RAMP_S, SolvedSheet
 from bench.reliability.session import Moment, Session
-from firmware_stub.timeline import Cue, Curve
+from firmware_stub.timeline import Cue, PiecewiseLinear
 from services.pipeline import Pipeline
 
 FAILS_S = TARE_S + 0.5
@@ -24,7 +24,7 @@ STATES = ("ok", "electrode open", "electrode dead", "electrode drifting")
 
 
 @dataclass
-class Score:
+class AvailabilityScore:
     frames: int = 0
     valid: int = 0
     named: int = 0  # frames that name the electrode
@@ -33,7 +33,7 @@ class Score:
     reported: int = 0  # touches that most of their frames show, as valid
     changing: list[int] = field(default_factory=list)  # frames that say so, for each begin and each end
 
-    def add(self, other: Score) -> None:
+    def add(self, other: AvailabilityScore) -> None:
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
 
@@ -51,7 +51,7 @@ class Score:
         }
 
 
-def session(sheet: SolvedSheet, pipeline: Pipeline, state: str, frames: int, seed: int) -> Score:
+def session(sheet: SolvedSheet, pipeline: Pipeline, state: str, frames: int, seed: int) -> AvailabilityScore:
     electrode = int(np.random.default_rng([seed, 32]).integers(16))
     seconds = frames * SCAN_S
     scene = SCENES[state](seconds, seed, electrode)
@@ -61,11 +61,11 @@ def session(sheet: SolvedSheet, pipeline: Pipeline, state: str, frames: int, see
     return scored(moments, scene, None if state == "ok" else electrode)
 
 
-def scored(moments: Sequence[Moment], scene: RandomScene, electrode: int | None) -> Score:
+def scored(moments: Sequence[Moment], scene: RandomScene, electrode: int | None) -> AvailabilityScore:
     since = FAILS_S + NAMED_S if electrode is not None else TARE_S
     counted = [m for m in moments if m.middle_s >= since]
     held = [p for p in scene.presses if p.begin > since]
-    score = Score(
+    score = AvailabilityScore(
         frames=len(counted),
         valid=sum(m.valid for m in counted),
         named=sum(electrode is not None and m.electrodes[electrode] != 0 for m in counted),
@@ -79,7 +79,7 @@ def scored(moments: Sequence[Moment], scene: RandomScene, electrode: int | None)
     return score
 
 
-def _reported(press: Press, moments: Sequence[Moment]) -> bool:
+def _reported(press: TimedPress, moments: Sequence[Moment]) -> bool:
     """Whether most frames of the time in which it presses fully are valid and have all that touches."""
     there = [m for m in moments if press.begin + RAMP_S <= m.middle_s <= press.end - RAMP_S]
     return sum(m.valid and not m.unseen() for m in there) > len(there) / 2
@@ -95,14 +95,14 @@ def _open(seconds: float, seed: int, electrode: int) -> RandomScene:
 
 
 def _dead(seconds: float, seed: int, electrode: int) -> RandomScene:
-    curve = Curve((0.0, FAILS_S - 1e-3, FAILS_S), (1.0, 1.0, DEAD))
+    curve = PiecewiseLinear((0.0, FAILS_S - 1e-3, FAILS_S), (1.0, 1.0, DEAD))
     return random_scene(seconds, seed, faults=False, contact=((electrode, curve),))
 
 
 def _drifting(seconds: float, seed: int, electrode: int) -> RandomScene:
     turns = np.arange(FAILS_S, seconds + DRIFT_S, DRIFT_S / 2)
     values = [DRIFTS if k % 2 else 1.0 for k in range(len(turns))]
-    curve = Curve((0.0, *map(float, turns)), (1.0, *values))
+    curve = PiecewiseLinear((0.0, *map(float, turns)), (1.0, *values))
     return random_scene(seconds, seed, faults=False, contact=((electrode, curve),))
 
 

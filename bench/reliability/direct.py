@@ -9,7 +9,7 @@ import numpy as np
 from bench.reliability.scenes import Matrix, SolvedSheet
 from bench.reliability.session import Moment, moment
 from bench.tracking.host import Felt
-from firmware_stub.analog import Analog, Noise
+from firmware_stub.analog import Analog, BoardNoise
 from firmware_stub.faults import Faults
 from firmware_stub.world import World
 from protocol.frames import RawFrame
@@ -25,7 +25,7 @@ class DirectSkin:
     def __init__(self, sheet: SolvedSheet, pipeline: Pipeline, seed: int, snr_db: float = SNR_DB) -> None:
         self.sheet, self.pipeline, self.faults = sheet, pipeline, Faults()
         self.pattern = np.asarray(pipeline.pre.bundle.pattern, np.int64)
-        self.analog = Analog(Noise.of_db(snr_db), self.faults, np.random.default_rng([seed, 11]))
+        self.analog = Analog(BoardNoise.of_db(snr_db), self.faults, np.random.default_rng([seed, 11]))
         self.scan = 0
         pipeline.reset()
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from bench import REPORTS
 from bench.reliability import drift_report, drifted, gain_steps, report, starts, workers
-from bench.reliability.drifted import CHANGES, Answer, Change
+from bench.reliability.drifted import CHANGES, Change, TouchEstimate
 from bench.reliability.scenes import grid, touches_at_random
 from bench.speed.service import end_on_sigterm
 from firmware_stub.world import Touch
@@ -31,7 +31,7 @@ PARTS = ("starts", "gains", "rows", "history")
 
 
 @dataclass(frozen=True)
-class Setting:
+class DriftSetting:
     """How much of everything."""
 
     bundle: str
@@ -44,21 +44,21 @@ class Setting:
     floor_places: int  # along the side
 
 
-def setting_of(args: argparse.Namespace) -> Setting:
+def setting_of(args: argparse.Namespace) -> DriftSetting:
     counts = (2, 2, 2, 2, 3) if args.quick else (7, 20, 7, 20, 6)
-    return Setting(args.bundle, args.seed, args.cores, *counts)
+    return DriftSetting(args.bundle, args.seed, args.cores, *counts)
 
 
 StartTask = tuple[str, str, tuple[float, float], float, float, int]
 
 
-def _start(task: StartTask) -> tuple[str, tuple[float, float], starts.Score]:
+def _start(task: StartTask) -> tuple[str, tuple[float, float], starts.StartScore]:
     bundle, state, place, newtons, radius, seed = task
     score = starts.start(workers.sheet(), workers.pipeline(bundle), state, place, newtons, radius, seed)
     return state, (newtons, radius), score
 
 
-def run_starts(setting: Setting) -> dict[str, starts.Score]:
+def run_starts(setting: DriftSetting) -> dict[str, starts.StartScore]:
     """By state, and by state and press."""
     tasks: list[StartTask] = [
         (setting.bundle, state, place, *press, setting.seed + k)
@@ -66,22 +66,22 @@ def run_starts(setting: Setting) -> dict[str, starts.Score]:
         for press in starts.PRESSES
         for state in starts.STATES
     ]
-    found: dict[str, starts.Score] = {}
+    found: dict[str, starts.StartScore] = {}
     for state, (newtons, radius), score in workers.spread(_start, tasks, setting.cores, "starts"):
         for key in (state, f"{state}, {newtons:g} N, radius {radius:g}"):
-            found.setdefault(key, starts.Score()).add(score)
+            found.setdefault(key, starts.StartScore()).add(score)
     return found
 
 
 GainTask = tuple[str, float, str, Touch, int]
 
 
-def _gain(task: GainTask) -> tuple[str, float, gain_steps.Score]:
+def _gain(task: GainTask) -> tuple[str, float, gain_steps.GainStepScore]:
     bundle, gain, situation, touch, seed = task
     return situation, gain, gain_steps.step(workers.sheet(), workers.pipeline(bundle), gain, situation, touch, seed)
 
 
-def run_gains(setting: Setting) -> dict[str, gain_steps.Score]:
+def run_gains(setting: DriftSetting) -> dict[str, gain_steps.GainStepScore]:
     """By situation, and by situation and gain."""
     tasks: list[GainTask] = [
         (setting.bundle, gain, situation, touch, setting.seed + k)
@@ -89,17 +89,17 @@ def run_gains(setting: Setting) -> dict[str, gain_steps.Score]:
         for gain in gain_steps.GAINS
         for situation in gain_steps.SITUATIONS
     ]
-    found: dict[str, gain_steps.Score] = {}
+    found: dict[str, gain_steps.GainStepScore] = {}
     for situation, gain, score in workers.spread(_gain, tasks, setting.cores, "gain steps"):
         for key in (situation, f"{situation}, {100 * gain:+.1f} %"):
-            found.setdefault(key, gain_steps.Score()).add(score)
+            found.setdefault(key, gain_steps.GainStepScore()).add(score)
     return found
 
 
 RowTask = tuple[str, Change, float, bool, int, int]
 
 
-def _rows(task: RowTask) -> tuple[Change, bool, list[Answer], int]:
+def _rows(task: RowTask) -> tuple[Change, bool, list[TouchEstimate], int]:
     bundle, change, radius, indenter, per_side, seed = task
     answers, alarms = drifted.rows_alone(
         workers.sheet(), Bundle.load(bundle), change, grid(per_side), seed, radius, indenter
@@ -107,7 +107,7 @@ def _rows(task: RowTask) -> tuple[Change, bool, list[Answer], int]:
     return change, indenter, answers, alarms
 
 
-def run_rows(setting: Setting) -> dict[str, dict[str, Any]]:
+def run_rows(setting: DriftSetting) -> dict[str, dict[str, Any]]:
     """By change: rows alone, and the same with the indenter declared."""
     tasks: list[RowTask] = [
         (setting.bundle, change, radius, indenter, setting.row_places, setting.seed)
@@ -115,7 +115,7 @@ def run_rows(setting: Setting) -> dict[str, dict[str, Any]]:
         for radius in drifted.RADII
         for indenter in (False, True)
     ]
-    answers: dict[tuple[str, bool], list[Answer]] = {}
+    answers: dict[tuple[str, bool], list[TouchEstimate]] = {}
     alarms: dict[tuple[str, bool], int] = {}
     for change, indenter, some, false in workers.spread(_rows, tasks, setting.cores, "rows alone"):
         key = change.name, indenter
@@ -133,18 +133,18 @@ def run_rows(setting: Setting) -> dict[str, dict[str, Any]]:
 HistoryTask = tuple[str, Change, Touch, int]
 
 
-def _history(task: HistoryTask) -> tuple[Change, Answer, int]:
+def _history(task: HistoryTask) -> tuple[Change, TouchEstimate, int]:
     bundle, change, touch, seed = task
     answer, alarms = drifted.with_history(workers.sheet(), workers.pipeline(bundle), change, touch, seed)
     return change, answer, alarms
 
 
-def run_history(setting: Setting) -> dict[str, dict[str, Any]]:
+def run_history(setting: DriftSetting) -> dict[str, dict[str, Any]]:
     touches = touches_at_random(setting.history_touches, setting.seed + 1)
     tasks: list[HistoryTask] = [
         (setting.bundle, change, touch, setting.seed + k) for k, touch in enumerate(touches) for change in CHANGES
     ]
-    answers: dict[str, list[Answer]] = {}
+    answers: dict[str, list[TouchEstimate]] = {}
     alarms: dict[str, int] = {}
     for change, answer, false in workers.spread(_history, tasks, setting.cores, "drift with history"):
         answers.setdefault(change.name, []).append(answer)
@@ -152,7 +152,7 @@ def run_history(setting: Setting) -> dict[str, dict[str, Any]]:
     return {change.name: drifted.row(answers[change.name], alarms[change.name]) for change in CHANGES}
 
 
-def run(setting: Setting, parts: Sequence[str] = PARTS) -> dict[str, dict[str, dict[str, Any]]]:
+def run(setting: DriftSetting, parts: Sequence[str] = PARTS) -> dict[str, dict[str, dict[str, Any]]]:
     found: dict[str, dict[str, dict[str, Any]]] = {}
     if "starts" in parts:
         found["starts"] = {key: score.row() for key, score in run_starts(setting).items()}

@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.reliability.direct import SNR_DB, DirectSkin
 from bench.reliability.scenes import METRES, SolvedSheet, circle
-from firmware_stub.analog import Analog, Noise
+from firmware_stub.analog import Analog, BoardNoise
 from firmware_stub.faults import Faults
 from firmware_stub.world import NEWTON, Touch, World
 from models import limits
@@ -68,7 +68,7 @@ CHANGES = (
 
 
 @dataclass(frozen=True)
-class Answer:
+class TouchEstimate:
     """What was said of one touch; of a valid frame or row. error: relative, of the force; -1 where it has none."""
 
     newtons: float
@@ -79,13 +79,13 @@ class Answer:
     extra: int  # contacts further than FAR_M
 
 
-def answer_of(touch: Touch, valid: bool, contacts: Sequence[tuple[float, float, float]]) -> Answer:
+def answer_of(touch: Touch, valid: bool, contacts: Sequence[tuple[float, float, float]]) -> TouchEstimate:
     """contacts: x, y [m], force [N] of each; none of them counts where the row is not valid."""
     off = [math.hypot(x - touch.x, y - touch.y) for x, y, _ in contacts] if valid else []
     nearest = int(np.argmin(off)) if off else -1
     newtons, near = touch.drop / NEWTON, nearest >= 0 and off[nearest] <= FAR_M
     error = contacts[nearest][2] / newtons - 1 if near and math.isfinite(contacts[nearest][2]) else -1.0
-    return Answer(
+    return TouchEstimate(
         newtons,
         touch.radius / METRES,
         valid,
@@ -103,14 +103,14 @@ def rows_alone(
     seed: int,
     radius: float,
     indenter: bool,
-) -> tuple[list[Answer], int]:
+) -> tuple[list[TouchEstimate], int]:
     """Answers to touches of this radius, and how many untouched rows had a valid contact."""
     rng = np.random.default_rng([seed, 21])
     touches = [circle(*place, newtons, radius) for place in places for newtons in FORCES]
     worlds = [change.world([touch], rng.permutation(16).tolist()) for touch in touches]
     worlds += [change.world([], rng.permutation(16).tolist()) for _ in range(0 if indenter else UNTOUCHED_ROWS)]
     pattern = np.asarray(bundle.pattern, np.int64)
-    analog = Analog(Noise.of_db(SNR_DB), Faults(), rng)
+    analog = Analog(BoardNoise.of_db(SNR_DB), Faults(), rng)
     settings: dict[str, Any] = {"indenter": {"radius_m": radius * METRES}} if indenter else {}
     skin = Skin.model_validate({"port": "stub", "bundle": str(bundle.path), "frame_id": "palm", **settings})
 
@@ -130,7 +130,9 @@ def rows_alone(
     return found, int(alarms[len(touches) :].sum())
 
 
-def with_history(sheet: SolvedSheet, pipeline: Pipeline, change: Change, touch: Touch, seed: int) -> tuple[Answer, int]:
+def with_history(
+    sheet: SolvedSheet, pipeline: Pipeline, change: Change, touch: Touch, seed: int
+) -> tuple[TouchEstimate, int]:
     """The answer of the touch's last frame, and how many valid frames before it had a contact."""
     electrodes = np.random.default_rng([seed, 22]).permutation(16).tolist()
     skin = DirectSkin(sheet, pipeline, seed)
@@ -147,7 +149,7 @@ def with_history(sheet: SolvedSheet, pipeline: Pipeline, change: Change, touch: 
     return answer_of(touch, last.valid, seen), sum(m.valid and bool(m.contacts) for m in moments)
 
 
-def row(answers: Sequence[Answer], alarms: int, floor_percent: float | None = None) -> dict[str, Any]:
+def row(answers: Sequence[TouchEstimate], alarms: int, floor_percent: float | None = None) -> dict[str, Any]:
     """Figures of a change. floor_percent: of the peak drop, root mean square over the same touches."""
     error = 100 * np.abs([a.error for a in answers])
     middle = [e for e, a in zip(error, answers, strict=True) if a.radius > 0.15]
@@ -172,7 +174,7 @@ def floor_percent(change: Change, per_side: int, radii: Sequence[float] = RADII)
     over the touches of the table.
     """
     size = change.size
-    case = limits.Case("square16", None, limits.Noise(SNR_DB), drift=Drift(size, size))
+    case = limits.Case("square16", None, limits.MeasurementNoise(SNR_DB), drift=Drift(size, size))
     floors = [
         mean_floor(limits.map_floors(case, radius, newtons * NEWTON, per_side)[1]["bayes"]).drop
         for radius in radii

@@ -20,14 +20,14 @@ from typing import Any
 
 from bench import REPORTS
 from bench.reliability import availability, faults_report, matrix, report, soak, workers
-from bench.reliability.matrix import ROWS, SITUATIONS, Score
+from bench.reliability.matrix import ROWS, SITUATIONS, FaultScore
 from bench.speed.service import end_on_sigterm
 from firmware_stub.world import Touch
 
 PLACES, QUICK_PLACES = 20, 2
 SESSIONS, QUICK_SESSIONS = 8, 1  # of each state of availability, soak.CHUNK frames each
 QUICK_FRAMES = 20_000  # of random faults and presses
-Cells = dict[tuple[str, str], Score]  # (row's title, situation)
+Cells = dict[tuple[str, str], FaultScore]  # (row's title, situation)
 
 
 def run_place(task: tuple[Touch, int, tuple[str, ...], str]) -> Cells:
@@ -47,34 +47,34 @@ def run_matrix(places: int, seed: int, titles: tuple[str, ...], bundle: str, cor
     tasks = [(touch, seed + k, titles, bundle) for k, touch in enumerate(matrix.places(places, seed))]
     for cells in workers.spread(run_place, tasks, cores, "places of the matrix"):
         for key, score in cells.items():
-            found.setdefault(key, Score()).add(score)
+            found.setdefault(key, FaultScore()).add(score)
     return found
 
 
-def run_chunk(task: tuple[int, int, str]) -> soak.Tally:
+def run_chunk(task: tuple[int, int, str]) -> soak.SoakTally:
     """One start and the frames after it: (frames, seed, bundle)."""
     frames, seed, bundle = task
     return soak.chunk(workers.sheet(), workers.pipeline(bundle), frames, seed)
 
 
-def run_soak(frames: int, seed: int, bundle: str, cores: int) -> soak.Tally:
+def run_soak(frames: int, seed: int, bundle: str, cores: int) -> soak.SoakTally:
     counts = [soak.CHUNK] * (frames // soak.CHUNK) + [frames % soak.CHUNK] * (frames % soak.CHUNK > 0)
     tasks = [(count, 1000 * seed + k, bundle) for k, count in enumerate(counts)]
-    whole = soak.Tally()
+    whole = soak.SoakTally()
     for tally in workers.spread(run_chunk, tasks, cores, "random faults and presses"):
         whole.add(tally)
     return whole
 
 
-def run_session(task: tuple[str, int, str]) -> tuple[str, availability.Score]:
+def run_session(task: tuple[str, int, str]) -> tuple[str, availability.AvailabilityScore]:
     """One session: (state, seed, bundle)."""
     state, seed, bundle = task
     sheet, pipeline = workers.sheet(), workers.pipeline(bundle)
     return state, availability.session(sheet, pipeline, state, availability.FRAMES, seed)
 
 
-def run_availability(sessions: int, seed: int, bundle: str, cores: int) -> dict[str, availability.Score]:
-    found = {state: availability.Score() for state in availability.STATES}
+def run_availability(sessions: int, seed: int, bundle: str, cores: int) -> dict[str, availability.AvailabilityScore]:
+    found = {state: availability.AvailabilityScore() for state in availability.STATES}
     tasks = [(state, 1000 * seed + k, bundle) for k in range(sessions) for state in availability.STATES]
     for state, score in workers.spread(run_session, tasks, cores, "availability"):
         found[state].add(score)

@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from bench.goals import Goal
-from bench.reliability.matrix import ROWS, SITUATIONS, Score
+from bench.reliability.matrix import ROWS, SITUATIONS, FaultScore
 from bench.reliability.report import cell, console, table_of
 
 COLUMNS = (  # heading, key, format
@@ -64,7 +64,7 @@ GATES: dict[str, float] = {
 }
 
 
-def matrix_rows(cells: Mapping[tuple[str, str], Score]) -> dict[str, dict[str, Any]]:
+def matrix_rows(cells: Mapping[tuple[str, str], FaultScore]) -> dict[str, dict[str, Any]]:
     """ "fault, situation" -> figures; the fault alone: all its situations."""
     found: dict[str, dict[str, Any]] = {}
     for row in ROWS:
@@ -122,8 +122,8 @@ def _of_soak(row: Mapping[str, Any] | None) -> Iterator[Keyed]:
     yield "soak invalid", Goal("frames that are not valid, %", row["invalid_%"])
 
 
-def _sum(scores: Any) -> Score:
-    whole = Score()
+def _sum(scores: Any) -> FaultScore:
+    whole = FaultScore()
     for score in scores:
         whole.add(score)
     return whole

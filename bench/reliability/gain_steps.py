@@ -29,7 +29,7 @@ def places(count: int, seed: int) -> list[Touch]:
 
 
 @dataclass
-class Score:
+class GainStepScore:
     steps: int = 0
     frames: int = 0  # while the gain lasts
     valid: int = 0
@@ -40,7 +40,7 @@ class Score:
     ended_false: int = 0  # false ones after its end
     ended_s: list[float] = field(default_factory=list)
 
-    def add(self, other: Score) -> None:
+    def add(self, other: GainStepScore) -> None:
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
 
@@ -58,7 +58,7 @@ class Score:
         }
 
 
-def step(sheet: SolvedSheet, pipeline: Pipeline, gain: float, situation: str, touch: Touch, seed: int) -> Score:
+def step(sheet: SolvedSheet, pipeline: Pipeline, gain: float, situation: str, touch: Touch, seed: int) -> GainStepScore:
     """gain: relative change."""
     free = World()
     world = World((touch,)) if situation == "held" else free
@@ -72,7 +72,7 @@ def step(sheet: SolvedSheet, pipeline: Pipeline, gain: float, situation: str, to
     ended_s = skin.now_s
     after = skin.rest(world, AFTER)
     again, ended = right_again(during, began_s), right_again(after, ended_s)
-    return Score(
+    return GainStepScore(
         steps=1,
         frames=len(during),
         valid=sum(m.valid for m in during),

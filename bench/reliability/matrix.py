@@ -21,7 +21,7 @@ import numpy as np
 from bench.reliability.scenes import SolvedSheet, press, script, touches_at_random
 from bench.reliability.session import Moment, Session
 from firmware_stub.faults import FAULTS, MUXES
-from firmware_stub.timeline import Cue, Curve, Track
+from firmware_stub.timeline import Cue, PiecewiseLinear, TouchPath
 from firmware_stub.world import Touch
 from protocol.frames import ELECTRODE_STATES
 from services.pipeline import Pipeline
@@ -96,8 +96,8 @@ ROWS = (
     Row("wrong_chip_id", BOARD, board=True),
     Row("brown_out", BOARD, ("multiplexer",), board=True),
     Row("brown_out", BOARD, ("multiplexer",), board=True, draw=_silent, label="brown_out, silent"),
-    Row("stale_rtia", GAIN, ("out_of_distribution",), draw=_large_gain),
-    Row("gain", GAIN, draw=_small_gain),
+    Row("stale_rtia", GAIN, ("gain",), draw=_large_gain),
+    Row("gain", GAIN, ("gain",), draw=_small_gain),
     Row("clipped", MEASUREMENT, ("saturated",)),
     Row("clipped", MEASUREMENT, draw=_silent, label="clipped, silent"),
     Row("rtia_overrange", MEASUREMENT, ("saturated",), draw=_overrange),
@@ -134,7 +134,7 @@ ROWS = (
 
 
 @dataclass
-class Score:
+class FaultScore:
     """What was counted of one case, or of several (`add`)."""
 
     cases: int = 0
@@ -152,7 +152,7 @@ class Score:
     reasons: Counter[str] = field(default_factory=Counter)  # in frames while the fault was in force
     worst: list[str] = field(default_factory=list)  # cases that were wrong, for a person
 
-    def add(self, other: Score) -> None:
+    def add(self, other: FaultScore) -> None:
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
 
@@ -177,7 +177,7 @@ class Score:
         }
 
 
-def tracks_of(situation: str, touch: Touch) -> tuple[Track, ...]:
+def tracks_of(situation: str, touch: Touch) -> tuple[TouchPath, ...]:
     """What touches: not, all the time, on its way, or from the middle of the fault on."""
     if situation == "untouched":
         return ()
@@ -187,12 +187,12 @@ def tracks_of(situation: str, touch: Touch) -> tuple[Track, ...]:
     return (press(touch, PRESS_S, RELEASE_S, (touch.x + away, touch.y) if situation == "sliding" else None),)
 
 
-def contact_of(row: Row, args: dict[str, Any]) -> tuple[tuple[int | None, Curve], ...]:
+def contact_of(row: Row, args: dict[str, Any]) -> tuple[tuple[int | None, PiecewiseLinear], ...]:
     if row.fault != CONTACT_RISES:
         return ()
     jump = 1e-3
     times = (0.0, FAULT_S - jump, FAULT_S, FAULT_END_S - jump, FAULT_END_S)
-    return ((args["electrode"], Curve(times, (1.0, 1.0, args["times"], args["times"], 1.0))),)
+    return ((args["electrode"], PiecewiseLinear(times, (1.0, 1.0, args["times"], args["times"], 1.0))),)
 
 
 def cues_of(row: Row, args: dict[str, Any]) -> tuple[Cue, ...]:
@@ -203,7 +203,7 @@ def cues_of(row: Row, args: dict[str, Any]) -> tuple[Cue, ...]:
     return (cue, *ends)
 
 
-def run_case(sheet: SolvedSheet, pipeline: Pipeline, row: Row, situation: str, touch: Touch, seed: int) -> Score:
+def run_case(sheet: SolvedSheet, pipeline: Pipeline, row: Row, situation: str, touch: Touch, seed: int) -> FaultScore:
     """One fault at one place."""
     rng = np.random.default_rng([seed, *row.title.encode()])
     args = row.draw(rng)
@@ -220,14 +220,14 @@ def run_case(sheet: SolvedSheet, pipeline: Pipeline, row: Row, situation: str, t
     return score
 
 
-def judged(row: Row, moments: Sequence[Moment], said: bool) -> Score:
+def judged(row: Row, moments: Sequence[Moment], said: bool) -> FaultScore:
     """said: whether acquisition said in words that something is wrong with the board."""
     # A fault takes hold of the scan under way; one that ends by itself leaves the scan that begins after it alone.
     end_s = FAULT_END_S if row.fault != "power_cycle" else FAULT_S
     after = [m for m in moments if m.read_s >= FAULT_S]
     during = [m for m in after if m.middle_s < end_s]
     wrong = [m for m in after if m.phantoms()]
-    score = Score(
+    score = FaultScore(
         cases=1,
         frames=len(after),
         valid=sum(m.valid for m in after),

@@ -10,7 +10,7 @@ import numpy as np
 from bench.reliability.matrix import CONTACT_RISES, ROWS, Row
 from bench.reliability.scenes import PLACE_M, RAMP_S, circle, press, script
 from firmware_stub.faults import FAULTS
-from firmware_stub.timeline import Cue, Curve, Script, Track
+from firmware_stub.timeline import Cue, PiecewiseLinear, Script, TouchPath
 from firmware_stub.world import Touch
 
 SCAN_S = 0.0436  # a full scan of the board
@@ -26,7 +26,7 @@ JUMP_S = 1e-3
 
 
 @dataclass(frozen=True)
-class Press:
+class TimedPress:
     """One touch, from begin to end [s], ramps included."""
 
     begin: float
@@ -37,7 +37,7 @@ class Press:
 @dataclass(frozen=True)
 class RandomScene:
     script: Script
-    presses: tuple[Press, ...]
+    presses: tuple[TimedPress, ...]
     faults: tuple[tuple[float, str], ...]  # when, what
 
 
@@ -45,7 +45,7 @@ def random_scene(
     seconds: float,
     seed: int,
     faults: bool = True,
-    contact: tuple[tuple[int | None, Curve], ...] = (),
+    contact: tuple[tuple[int | None, PiecewiseLinear], ...] = (),
     cues: tuple[Cue, ...] = (),
 ) -> RandomScene:
     """contact, cues: what else happens to the skin and the board."""
@@ -78,9 +78,9 @@ def slide(n: int) -> tuple[Touch, tuple[float, float], float]:
     return still(n), (x, y), float(rng.uniform(1.0, PRESS_S[1]))
 
 
-def _presses(rng: np.random.Generator, seconds: float) -> tuple[list[Track], list[Press]]:
-    tracks: list[Track] = []
-    presses: list[Press] = []
+def _presses(rng: np.random.Generator, seconds: float) -> tuple[list[TouchPath], list[TimedPress]]:
+    tracks: list[TouchPath] = []
+    presses: list[TimedPress] = []
     t = TARE_S + 0.5
     while True:
         t += float(rng.exponential(PAUSE_S)) + 2 * RAMP_S
@@ -96,7 +96,7 @@ def _presses(rng: np.random.Generator, seconds: float) -> tuple[list[Track], lis
         if t + lasts > seconds - 1:
             return tracks, presses
         tracks += made
-        presses += [Press(t, t + lasts, slides) for _ in made]
+        presses += [TimedPress(t, t + lasts, slides) for _ in made]
         t += lasts
 
 
@@ -107,8 +107,8 @@ def _cues(row: Row, args: dict[str, Any], at: float, seconds: float) -> list[Cue
     return [Cue(at, row.fault, args, seconds), *ends]
 
 
-def _jumps(row: Row, args: dict[str, Any], at: float, seconds: float) -> list[tuple[int | None, Curve]]:
+def _jumps(row: Row, args: dict[str, Any], at: float, seconds: float) -> list[tuple[int | None, PiecewiseLinear]]:
     if row.fault != CONTACT_RISES:
         return []
     times = (0.0, at - JUMP_S, at, at + seconds - JUMP_S, at + seconds)
-    return [(args["electrode"], Curve(times, (1.0, 1.0, args["times"], args["times"], 1.0)))]
+    return [(args["electrode"], PiecewiseLinear(times, (1.0, 1.0, args["times"], args["times"], 1.0)))]

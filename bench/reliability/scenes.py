@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bench import ROOT
 from firmware_stub.sheet import Sheet
-from firmware_stub.timeline import Cue, Curve, Script, Track
+from firmware_stub.timeline import Cue, PiecewiseLinear, Script, TouchPath
 from firmware_stub.world import NEWTON, Touch, World
 
 WORK = ROOT / "bench" / "work" / "reliability"
@@ -88,7 +88,9 @@ def circle(x: float, y: float, newtons: float, radius: float) -> Touch:
     return Touch("circle", x, y, radius * METRES, newtons * NEWTON)
 
 
-def press(touch: Touch, begin: float, end: float, to: tuple[float, float] | None = None, ramp: float = RAMP_S) -> Track:
+def press(
+    touch: Touch, begin: float, end: float, to: tuple[float, float] | None = None, ramp: float = RAMP_S
+) -> TouchPath:
     """From begin to end, its ramps included; slides to the point `to` in between."""
     x, y = to or (touch.x, touch.y)
     poses = (
@@ -97,14 +99,14 @@ def press(touch: Touch, begin: float, end: float, to: tuple[float, float] | None
         Touch(touch.kind, x, y, touch.radius, touch.drop),
         Touch(touch.kind, x, y, touch.radius, 0.0),
     )
-    return Track((begin, begin + ramp, end - ramp, end), poses)
+    return TouchPath((begin, begin + ramp, end - ramp, end), poses)
 
 
 def script(
-    tracks: tuple[Track, ...] = (),
+    tracks: tuple[TouchPath, ...] = (),
     cues: tuple[Cue, ...] = (),
-    contact: tuple[tuple[int | None, Curve], ...] = (),
-    background: Curve | None = None,
+    contact: tuple[tuple[int | None, PiecewiseLinear], ...] = (),
+    background: PiecewiseLinear | None = None,
 ) -> Script:
     return Script("reliability", tracks=tracks, cues=cues, contact=contact, background=background)
 

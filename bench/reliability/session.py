@@ -23,7 +23,7 @@ FAR_M = 0.015  # from every true touch: a contact is wrong
 
 
 @dataclass(frozen=True)
-class Contact:
+class PointForce:
     x: float  # m
     y: float
     newtons: float | None
@@ -38,24 +38,24 @@ class Moment:
     valid: bool
     reasons: tuple[str, ...]
     electrodes: tuple[int, ...]  # ELECTRODE_STATES
-    contacts: tuple[Contact, ...]  # those that did not end
-    truth: tuple[Contact, ...]
-    pressed: tuple[Contact, ...]  # those of the truth that were there all the time until the middle
+    contacts: tuple[PointForce, ...]  # those that did not end
+    truth: tuple[PointForce, ...]
+    pressed: tuple[PointForce, ...]  # those of the truth that were there all the time until the middle
 
     @property
     def changing(self) -> bool:
         return "changing" in self.reasons
 
-    def phantoms(self, far_m: float = FAR_M) -> tuple[Contact, ...]:
+    def phantoms(self, far_m: float = FAR_M) -> tuple[PointForce, ...]:
         """Contacts of a valid frame that no true touch is near."""
         return tuple(c for c in self.contacts if _nearest(c, self.truth) > far_m) if self.valid else ()
 
-    def unseen(self, far_m: float = FAR_M) -> tuple[Contact, ...]:
+    def unseen(self, far_m: float = FAR_M) -> tuple[PointForce, ...]:
         """Touches that press and have no contact near them."""
         return tuple(t for t in self.pressed if _nearest(t, self.contacts) > far_m)
 
 
-def _nearest(one: Contact, others: tuple[Contact, ...]) -> float:
+def _nearest(one: PointForce, others: tuple[PointForce, ...]) -> float:
     return min((float(np.hypot(one.x - o.x, one.y - o.y)) for o in others), default=np.inf)
 
 
@@ -69,14 +69,14 @@ def moment(read_s: float, middle_s: float, felt: Felt | None, delta: DeltaFrame,
         contact.valid,
         tuple(contact.reasons),
         tuple(delta.electrodes.tolist()),
-        tuple(Contact(c.position[0], c.position[1], c.force_n) for c in contact.contacts if c.state != "end"),
+        tuple(PointForce(c.position[0], c.position[1], c.force_n) for c in contact.contacts if c.state != "end"),
         (*middle, *first),
         middle if first else (),
     )
 
 
-def _touches(world: World) -> tuple[Contact, ...]:
-    return tuple(Contact(t.x, t.y, t.drop / NEWTON) for t in world.touches if t.drop > 0)
+def _touches(world: World) -> tuple[PointForce, ...]:
+    return tuple(PointForce(t.x, t.y, t.drop / NEWTON) for t in world.touches if t.drop > 0)
 
 
 class Session:

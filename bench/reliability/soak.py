@@ -26,7 +26,7 @@ KEPT = 40  # notes of a report
 
 
 @dataclass
-class Tally:
+class SoakTally:
     frames: int = 0
     counted: int = 0  # valid, and not `changing`
     invalid: int = 0
@@ -38,7 +38,7 @@ class Tally:
     blamed: Counter[str] = field(default_factory=Counter)  # what failed last before a frame that was wrong
     notes: list[str] = field(default_factory=list)
 
-    def add(self, other: Tally) -> None:
+    def add(self, other: SoakTally) -> None:
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
         self.notes = self.notes[:KEPT]
@@ -58,7 +58,7 @@ class Tally:
         }
 
 
-def chunk(sheet: SolvedSheet, pipeline: Pipeline, frames: int, seed: int) -> Tally:
+def chunk(sheet: SolvedSheet, pipeline: Pipeline, frames: int, seed: int) -> SoakTally:
     """So many frames after a fresh start, tare included."""
     seconds = frames * SCAN_S
     scene = random_scene(seconds, seed)
@@ -68,8 +68,8 @@ def chunk(sheet: SolvedSheet, pipeline: Pipeline, frames: int, seed: int) -> Tal
     return tally
 
 
-def tallied(moments: Iterable[Moment], scene: RandomScene, seed: int) -> Tally:
-    tally = Tally(touches=len(scene.presses), faults=len(scene.faults))
+def tallied(moments: Iterable[Moment], scene: RandomScene, seed: int) -> SoakTally:
+    tally = SoakTally(touches=len(scene.presses), faults=len(scene.faults))
     run: list[int] = []  # frames in a row in which the n-th touch had no contact
     for m in moments:
         tally.frames += 1

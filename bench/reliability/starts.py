@@ -28,7 +28,7 @@ FREE = FREE_WITHIN + 2 * FREE_FOR
 
 
 @dataclass
-class Score:
+class StartScore:
     """Of one start, or of several (`add`)."""
 
     starts: int = 0
@@ -42,7 +42,7 @@ class Score:
     free_phantoms: int = 0  # valid frames with a contact after the touch was lifted
     reasons: Counter[str] = field(default_factory=Counter)
 
-    def add(self, other: Score) -> None:
+    def add(self, other: StartScore) -> None:
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
 
@@ -68,7 +68,7 @@ def start(
     newtons: float,
     radius: float,
     seed: int,
-) -> Score:
+) -> StartScore:
     rng = np.random.default_rng([seed, 3])
     contact = contacts_at_random(rng, IMPEDANCES)
     touch = circle(*place, newtons, radius)
@@ -91,7 +91,7 @@ def start(
     scans = _free_after([m.valid and not m.contacts for m in after])
     without = sum(m.valid and bool(m.unseen()) for m in touched)
     phantoms = sum(bool(m.phantoms()) for m in touched)
-    return Score(
+    return StartScore(
         starts=1,
         touched=len(touched),
         touched_valid=sum(m.valid for m in touched),

@@ -23,7 +23,7 @@ STEP_S = 2e-4  # of the host's loop
 
 
 @dataclass
-class Host:
+class AdaptiveHost:
     """A skin that nothing touches until `press` says so; `contacts` (when, frame) as a controller would get them."""
 
     scan: ScanMode = "adaptive"

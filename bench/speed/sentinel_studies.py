@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from firmware_stub.board import measurement_s
 from models import patterns, sentinel
 from models.bundle import Bundle
-from models.fisher import Noise, SizePrior, information, sensitivity
+from models.fisher import MeasurementNoise, SizePrior, information, sensitivity
 from models.forward import shared
 from models.limits import positions
 from models.prereconstruction import Drift
 from models.shapes import Shape
 from protocol.frames import DeltaFrame
 from services.contacts.segmentation import segment
-from services.estimation.sentinel import Verdict, Watch
+from services.estimation.sentinel import SentinelDetector, SentinelVerdict
 from services.networks import Network
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ def lengths(bundle: Bundle) -> list[dict[str, Any]]:
 
 def _place(bundle: Bundle, rows: NDArray[np.integer]) -> float:
     """Bayesian floor of the position, % of the side, 1 N of radius 0.2, root mean square over the skin."""
-    drift, noise, prior = Drift(), Noise(70.0), SizePrior().information()
+    drift, noise, prior = Drift(), MeasurementNoise(70.0), SizePrior().information()
     each = []
     for x, y in positions("square16", 0.2, 5):
         seen = sensitivity("square16", Shape("circle", x, y, 0.2, 0.1))
@@ -65,12 +65,12 @@ def _place(bundle: Bundle, rows: NDArray[np.integer]) -> float:
 
 
 def power(bundle: Bundle, touches: int, draws: int, seed: int = 0) -> dict[str, Any]:
-    """Presses solved on a mesh that the design has not seen, judged by `Watch` as it is, one scan each."""
+    """Presses solved on a mesh that the design has not seen, judged by `SentinelDetector` as it is, one scan each."""
     model, rng = shared("square16", "stub"), np.random.default_rng(seed)
     found = sentinel.design(bundle.matrices)
     z0 = np.abs(model.solve().impedances())[found.rows]
     relative = 10 ** (-sentinel.SNR_DB / 20)
-    watch, hits, scores = Watch(found), [], []
+    watch, hits, scores = SentinelDetector(found), [], []
     for _ in range(touches):
         x, y = rng.uniform(-0.8, 0.8, 2)
         touched = model.solve(model.touched([Shape("circle", x, y, sentinel.RADIUS, sentinel.NEWTON)])).impedances()
@@ -79,7 +79,7 @@ def power(bundle: Bundle, touches: int, draws: int, seed: int = 0) -> dict[str, 
         verdicts = []
         for _ in range(draws):
             watch.begin_again()
-            verdicts.append(watch(z * (1 + relative * rng.standard_normal(len(z)))) is Verdict.HIT)
+            verdicts.append(watch(z * (1 + relative * rng.standard_normal(len(z)))) is SentinelVerdict.HIT)
             scores.append(watch.score)
         hits.append(np.mean(verdicts))
     return {"touches": touches, "draws": draws, "seen": float(np.mean(hits)), "worst": float(np.min(hits)),
@@ -90,7 +90,7 @@ def false_alarms(bundle: Bundle, minutes: float, seed: int = 0) -> dict[str, flo
     """Hits and suspicions a minute on an untouched skin that dries and whose contacts age as the stub's do."""
     found, rng = sentinel.design(bundle.matrices), np.random.default_rng(seed)
     z0, contact = bundle.z0[found.rows], bundle.matrices.contact[found.rows]
-    relative, watch = 10 ** (-sentinel.SNR_DB / 20), Watch(found)
+    relative, watch = 10 ** (-sentinel.SNR_DB / 20), SentinelDetector(found)
     rates = np.zeros(contact.shape[1])
     rates[[3, 13]] = 1e-4
     count = int(minutes * 60 / found.seconds)
@@ -100,8 +100,8 @@ def false_alarms(bundle: Bundle, minutes: float, seed: int = 0) -> dict[str, flo
         seconds = k * found.seconds
         now = z0 * (1 + 1e-5 * seconds + contact @ (rates * seconds))
         verdict = watch(now * (1 + relative * rng.standard_normal(len(z0))))
-        suspicions += verdict is Verdict.SUSPECT
-        if verdict is Verdict.HIT:
+        suspicions += verdict is SentinelVerdict.SUSPECT
+        if verdict is SentinelVerdict.HIT:
             hits += 1
             watch.begin(now * (1 + relative * rng.standard_normal((64, len(z0)))))
     return {"minutes": minutes, "hits_per_minute": hits / minutes, "suspicions_per_minute": suspicions / minutes}
@@ -120,7 +120,7 @@ def hold(seconds: tuple[float, ...] = (0.2, 0.5, 1.0, 2.0, 5.0)) -> list[dict[st
             row[f"frames_{points}"] = frames
             if frames:
                 snr = 70.0 + 10 * np.log10(frames * points / 128)
-                row[f"position_{points}"] = _floor(None, Noise(snr, tare_frames=10**9))
+                row[f"position_{points}"] = _floor(None, MeasurementNoise(snr, tare_frames=10**9))
         rows.append(row)
     return rows
 
@@ -159,12 +159,14 @@ def averaged(bundle: Bundle, touches: int, seed: int = 0) -> list[dict[str, Any]
         for told, name in ((False, "told of one frame"), (True, "told of the mean")):
             position, force, integral = np.sqrt((np.array(errors[n, told]) ** 2).mean(axis=0))
             row |= {f"{name}: position": position, "force " + name: force, "integral " + name: integral}
-        row["floor: position"] = _floor(None, Noise(70.0 - 10 * np.log10(1 / n + 1 / 64), tare_frames=10**9), 0.3)
+        row["floor: position"] = _floor(
+            None, MeasurementNoise(70.0 - 10 * np.log10(1 / n + 1 / 64), tare_frames=10**9), 0.3
+        )
         rows.append(row)
     return rows
 
 
-def _floor(rows: NDArray[np.int64] | None, noise: Noise, drop: float = 0.15) -> float:
+def _floor(rows: NDArray[np.int64] | None, noise: MeasurementNoise, drop: float = 0.15) -> float:
     """Bayesian floor of the position [% of the side], radius 0.2, root mean square over the skin."""
     own = shared("square16", "inverse").skin.pattern if rows is None else rows
     prior, each = SizePrior().information(), []
@@ -177,7 +179,7 @@ def _floor(rows: NDArray[np.int64] | None, noise: Noise, drop: float = 0.15) -> 
 
 def partial(counts: tuple[int, ...] = (15, 30, 60, 120)) -> list[dict[str, float]]:
     """The best n of the 120 pairs for a touch that is known but for its last movement, beside all of them."""
-    own, noise, prior = shared("square16", "inverse").skin.pattern, Noise(70.0), SizePrior().information()
+    own, noise, prior = shared("square16", "inverse").skin.pattern, MeasurementNoise(70.0), SizePrior().information()
     variances: dict[int, list[float]] = {n: [] for n in counts}
     for x, y in positions("square16", 0.2, 5):
         z0, slope, _ = sensitivity("square16", Shape("circle", x, y, 0.2, 0.15)).relative(own)
@@ -205,9 +207,9 @@ def d_optimal(count: int = 120) -> list[dict[str, Any]]:
     floor = 10**-3.5 * typical
     prior, rows = SizePrior().information(), []
     for name, noise in {
-        "relative 70 dB": Noise(70.0),
-        "converter alone": Noise(np.inf, floor),
-        "70 dB and a tenth of it": Noise(70.0, 0.1 * floor),
+        "relative 70 dB": MeasurementNoise(70.0),
+        "converter alone": MeasurementNoise(np.inf, floor),
+        "70 dB and a tenth of it": MeasurementNoise(70.0, 0.1 * floor),
     }.items():
         slopes = []
         for one in seen:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.speed.sentinel_host import Host
+from bench.speed.sentinel_host import AdaptiveHost
 from protocol.frames import ContactFrame
 from services.runtime.config import ScanMode
 
@@ -30,7 +30,7 @@ def presses(count: int, seed: int, light: bool) -> list[dict[str, float]]:
 
 def latencies(scan: ScanMode, count: int, seed: int, light: bool = False) -> dict[str, Any]:
     """Seconds (n,) from each press to its contacts of each of KINDS, NaN where none came; position errors [m]."""
-    host, rng = Host(scan, seed=seed), np.random.default_rng([seed, 5])
+    host, rng = AdaptiveHost(scan, seed=seed), np.random.default_rng([seed, 5])
     host.until(3.0 + SETTLE_S)
     times: dict[str, list[float]] = {kind: [] for kind in KINDS}
     errors: dict[str, list[float]] = {"coarse": [], "full": []}

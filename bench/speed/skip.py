@@ -37,7 +37,7 @@ from bench.tracking.scene import Recorded, record
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, Frame, RawFrame, pack, unpack
 from services.pipeline import build_stages
-from services.runtime.config import Skin, Touch
+from services.runtime.config import Skin, TouchConfig
 from services.runtime.stage import PROCESSES, Stage
 
 QUIET_S = 5.0  # of each scene, before it begins: the tare
@@ -54,7 +54,7 @@ PLAIN = frozenset({"delta", "image", "contact"})
 class Variant:
     """A configuration of the switches, and the topics somebody subscribes to."""
 
-    touch: Touch = Touch()
+    touch: TouchConfig = TouchConfig()
     wanted: frozenset[str] = PLAIN
 
     def skin(self) -> Skin:
@@ -63,10 +63,10 @@ class Variant:
 
 VARIANTS = {
     "all rules": Variant(),
-    "untouched frames reconstructed too": Variant(Touch(skip_untouched=False)),
-    "no hold": Variant(Touch(hold=False)),
+    "untouched frames reconstructed too": Variant(TouchConfig(skip_untouched=False)),
+    "no hold": Variant(TouchConfig(hold=False)),
     "force and shape subscribed": Variant(wanted=EVERYTHING),
-    "no rule": Variant(Touch(skip_untouched=False, hold=False), EVERYTHING),
+    "no rule": Variant(TouchConfig(skip_untouched=False, hold=False), EVERYTHING),
 }
 
 

@@ -18,8 +18,7 @@ from models.shapes import Shape
 from services.estimation.touch_decision import MEANS
 from services.pipeline import Pipeline
 from services.recordings.file_source import FILE_RATE_HZ, file_frame
-from services.runtime.config import Skin, Touch
-from services.runtime.config import Tare as TareConfig
+from services.runtime.config import Skin, TareConfig, TouchConfig
 
 SNR_DB = 70.0
 TIMES = 16  # that the touch is met
@@ -52,7 +51,7 @@ def averaging(recorded: Recorded, bundle: Bundle, seed: int = 1) -> dict[str, di
 
 def _floor(shape: Shape, averaged: int) -> float:
     """Of the position, model units."""
-    noise = fisher.Noise(SNR_DB + 10 * np.log10(averaged), tare_frames=TareConfig().frames / averaged)
+    noise = fisher.MeasurementNoise(SNR_DB + 10 * np.log10(averaged), tare_frames=TareConfig().frames / averaged)
     return float(fisher.floors("square16", shape, noise, fisher.SizePrior())["bayes"].position)
 
 
@@ -65,7 +64,7 @@ def _errors(
     bundle: Bundle,
 ) -> NDArray[np.float64]:
     """(HELD,) distances [m] of what is found from `place`; NaN where nothing is."""
-    pipeline = Pipeline(Skin(port="stub", bundle="square16", touch=Touch(hold=hold)), bundle=bundle)
+    pipeline = Pipeline(Skin(port="stub", bundle="square16", touch=TouchConfig(hold=hold)), bundle=bundle)
     errors = np.full(HELD, np.nan)
     for k in range(QUIET + HELD):
         noise = 10 ** (-SNR_DB / 20) * rng.standard_normal(len(free))

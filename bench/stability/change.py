@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from bench.stability.run import METRES, SKIN, Answer, Row, Runner, Scene, Setting, noisy, share, solved
+from bench.stability.run import METRES, SKIN, Answer, InProcessStages, Row, Scene, Setting, noisy, share, solved
 from models import fisher
 from models.shapes import Array, Shape
 
@@ -20,7 +20,7 @@ SLIDE_MM = 0.5
 
 def pairs(setting: Setting) -> Iterator[Row]:
     """Two frames of one touch that differ by noise alone; Lipschitz constants of position and force."""
-    runner = Runner(setting.bundle)
+    runner = InProcessStages(setting.bundle)
     draws = 4 if setting.quick else 30
     for decibel in LEVELS if not setting.quick else LEVELS[1:]:
         rng, relative = setting.rng("pairs"), share(decibel)
@@ -35,7 +35,7 @@ def pairs(setting: Setting) -> Iterator[Row]:
 
 def ways(setting: Setting) -> Iterator[Row]:
     """The straight way from one noisy frame to another in small steps: where the answer is not continuous it jumps."""
-    runner = Runner(setting.bundle)
+    runner = InProcessStages(setting.bundle)
     for decibel in (70.0, 80.0):
         rng, relative = setting.rng("ways"), share(decibel)
         worst: list[tuple[float, float]] = []
@@ -62,7 +62,7 @@ def ways(setting: Setting) -> Iterator[Row]:
 
 def derivative(setting: Setting) -> Iterator[Row]:
     """The Lipschitz constant at a touch: spectral norm of d(position)/d(d) and of d(force)/d(d), by differences."""
-    runner, decibel = Runner(setting.bundle), 70.0
+    runner, decibel = InProcessStages(setting.bundle), 70.0
     relative, rng = share(decibel), setting.rng("derivative")
     for k, scene in enumerate(setting.scenes()[:: 4 if setting.quick else 1]):
         baseline = runner.tare(scene.z0, relative, rng)
@@ -96,7 +96,7 @@ def slide(setting: Setting) -> Iterator[Row]:
     touches = [Shape("circle", 0.8 * s + 0.1, 0.6 * s - 0.2, 0.25, 0.3) for s in along]
     scenes = solved(setting.model(), touches)
     for decibel in (np.inf, 80.0, 70.0):
-        runner, rng, relative = Runner(setting.bundle), setting.rng("slide"), share(decibel)
+        runner, rng, relative = InProcessStages(setting.bundle), setting.rng("slide"), share(decibel)
         runner.begin(runner.tare(scenes[0].z0, relative, rng))
         seen = [(runner.see(noisy(s.z, relative, rng)), s) for s in scenes]
         errors = [a.place() - METRES * s.touch.centroid for a, s in seen if a.place() is not None]  # type: ignore[operator]
@@ -116,7 +116,7 @@ def slide(setting: Setting) -> Iterator[Row]:
 
 def allowed(touch: Shape, decibel: float) -> float:
     """Millimetres that a contact may move between two frames which differ by noise."""
-    floor = fisher.floors(SKIN, touch, fisher.Noise(decibel), fisher.SizePrior())["bayes"]
+    floor = fisher.floors(SKIN, touch, fisher.MeasurementNoise(decibel), fisher.SizePrior())["bayes"]
     return max(JUMP_MM, FLOORS * 1e3 * METRES * floor.position)
 
 

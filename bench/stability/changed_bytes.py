@@ -23,7 +23,7 @@ from models.files import FileError
 from models.npz import npz
 from protocol.errors import EitskinError
 from protocol.frames import FrameError, RawFrame, pack, unpack
-from protocol.link import Decoder, Frame, encode
+from protocol.link import Decoder, ScanFrame, encode
 from services.recordings.recording import RecordingError, RecordingReader, RecordingWriter
 from services.runtime import persistence
 
@@ -99,11 +99,11 @@ def link(setting: Setting) -> Iterator[Row]:
     """The serial line has a checksum: nothing that was changed comes out."""
     rng, n = setting.rng("link"), SIZES["quick" if setting.quick else "full"]
     z = setting.bundle.z0.astype("c8")
-    line = encode(Frame(seq=7, device_us=1, duration_us=1, config=1, z=z, status=np.zeros(len(z), "u1")))
+    line = encode(ScanFrame(seq=7, device_us=1, duration_us=1, config=1, z=z, status=np.zeros(len(z), "u1")))
 
     def feed(data: bytes) -> object:
         found = Decoder().feed(data + b"\0")
-        if found and not (isinstance(found[0], Frame) and np.array_equal(found[0].z, z) and found[0].seq == 7):
+        if found and not (isinstance(found[0], ScanFrame) and np.array_equal(found[0].z, z) and found[0].seq == 7):
             raise Broken("a changed frame was believed")
         return found
 

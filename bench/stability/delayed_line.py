@@ -30,7 +30,7 @@ Happening = Callable[["DelayedLine"], object]
 
 
 @dataclass(frozen=True)
-class Seen:
+class ReceivedFrame:
     """A frame as acquisition gave it out."""
 
     at_s: float  # true time
@@ -148,7 +148,7 @@ class DelayedLine(HostTime):
             scan, _, middle = self.rig.scans.popleft()
             self._middles[scan.seq] = middle
         for message in self._decoder.feed(data):
-            if isinstance(message, link.Frame):
+            if isinstance(message, link.ScanFrame):
                 self._measured.setdefault(message.z.tobytes(), self._middles[message.seq])
                 self.captured.append(link.encode(message))
         if data:
@@ -158,8 +158,8 @@ class DelayedLine(HostTime):
         arrives = self.true_s + (delay(self.true_s) if delay else 0.0)
         queue.append((max(arrives, queue[-1][0]) if queue else arrives, data))
 
-    def seen(self, frame: RawFrame) -> Seen:
-        return Seen(
+    def seen(self, frame: RawFrame) -> ReceivedFrame:
+        return ReceivedFrame(
             self.true_s,
             frame,
             self.true_s - self._measured[frame.z.tobytes()],
@@ -178,13 +178,13 @@ class _Source(BoardSource):
         return self.line
 
 
-def listen(line: DelayedLine, seconds: float) -> tuple[list[Seen], BoardSource]:
+def listen(line: DelayedLine, seconds: float) -> tuple[list[ReceivedFrame], BoardSource]:
     """What acquisition gives out of this line in so many seconds, and the source in the end."""
     source = _Source(line)
     return list(_frames(source, seconds)), source
 
 
-def _frames(source: _Source, seconds: float) -> Iterator[Seen]:
+def _frames(source: _Source, seconds: float) -> Iterator[ReceivedFrame]:
     for frame in source.frames():
         if source.line.true_s >= seconds:
             return

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.stability.run import Answer, Row, Runner, Setting, judged, noisy, share, summary
+from bench.stability.run import Answer, InProcessStages, Row, Setting, judged, noisy, share, summary
 from models.shapes import Array, Shape
 from protocol.frames import STATUS_CLIPPED, STATUS_OPEN
 from services.estimation.tare import Baseline, NoBaseline, take
@@ -39,7 +39,7 @@ def replaced(values: dict[str, complex]) -> Callable[[Setting], Iterator[Row]]:
     """A part: some channels of a touched frame hold such a value."""
 
     def part(setting: Setting) -> Iterator[Row]:
-        runner, rng, scenes = Runner(setting.bundle), setting.rng("channels"), setting.scenes()
+        runner, rng, scenes = InProcessStages(setting.bundle), setting.rng("channels"), setting.scenes()
         baseline = runner.tare(scenes[0].z0, share(USUAL_DB), rng)
         for name, value in values.items():
             for count in COUNTS if not setting.quick else FEW:
@@ -55,7 +55,7 @@ def replaced(values: dict[str, complex]) -> Callable[[Setting], Iterator[Row]]:
 
 def dead(setting: Setting) -> Iterator[Row]:
     """Electrodes without contact: the board flags them, sends NaN, or measures next to no current unflagged."""
-    runner, rng, scenes = Runner(setting.bundle), setting.rng("dead"), setting.scenes()
+    runner, rng, scenes = InProcessStages(setting.bundle), setting.rng("dead"), setting.scenes()
     baseline = runner.tare(scenes[0].z0, share(USUAL_DB), rng)
     pattern = np.asarray(setting.bundle.pattern)
     for kind in ("flagged", "NaN", "unflagged"):
@@ -73,7 +73,7 @@ def dead(setting: Setting) -> Iterator[Row]:
 
 def saturated(setting: Setting) -> Iterator[Row]:
     """Clipped channels: a plausible |Z|, too low, with the converter's flag and without."""
-    runner, rng, scenes = Runner(setting.bundle), setting.rng("saturated"), setting.scenes()
+    runner, rng, scenes = InProcessStages(setting.bundle), setting.rng("saturated"), setting.scenes()
     baseline = runner.tare(scenes[0].z0, share(USUAL_DB), rng)
     for kind in ("flagged", "unflagged"):
         for count in COUNTS if not setting.quick else FEW:
@@ -90,7 +90,7 @@ def saturated(setting: Setting) -> Iterator[Row]:
 
 def constant(setting: Setting) -> Iterator[Row]:
     """Frames that are all alike, no difference at all, and references of zero."""
-    runner, rng, scenes = Runner(setting.bundle), setting.rng("constant"), setting.scenes()
+    runner, rng, scenes = InProcessStages(setting.bundle), setting.rng("constant"), setting.scenes()
     z0, touched = scenes[0].z0, scenes[1]
     baseline = runner.tare(z0, share(USUAL_DB), rng)
     nothing = [(runner.once(baseline, baseline.z0), None) for _ in range(1)]
@@ -116,7 +116,7 @@ def constant(setting: Setting) -> Iterator[Row]:
 
 def random_frames(setting: Setting) -> Iterator[Row]:
     """Frames that no skin made, each on its own against a good tare; as a stream; as a tare; and what comes after."""
-    runner, rng, scenes = Runner(setting.bundle), setting.rng("random"), setting.scenes()
+    runner, rng, scenes = InProcessStages(setting.bundle), setting.rng("random"), setting.scenes()
     z0 = scenes[0].z0
     baseline = runner.tare(z0, share(USUAL_DB), rng)
     n = RANDOM["quick" if setting.quick else "full"]
@@ -141,7 +141,7 @@ def random_frames(setting: Setting) -> Iterator[Row]:
     yield {"case": "random tares", **_random_tares(runner, z0, rng, max(2 * len(FAMILIES), n // 400))}
 
 
-def _random_tares(runner: Runner, z0: Array, rng: np.random.Generator, n: int) -> Row:
+def _random_tares(runner: InProcessStages, z0: Array, rng: np.random.Generator, n: int) -> Row:
     """Tares of frames that no skin made: refused, or in doubt, or at least nothing valid against them."""
     answers: list[tuple[Answer, Shape | None]] = []
     families = [draw for name, draw in FAMILIES.items() if name != GAIN]  # another gain is another skin, and a good one
@@ -161,7 +161,7 @@ def _random_tares(runner: Runner, z0: Array, rng: np.random.Generator, n: int) -
     return summary(answers)
 
 
-def _stream(runner: Runner, frames: Array, touch: Shape | None, last: int = 0) -> Row:
+def _stream(runner: InProcessStages, frames: Array, touch: Shape | None, last: int = 0) -> Row:
     """A cold start on these frames; errors of the last ones, crashes of all."""
     runner.begin(None)
     answers = [runner.see(z) for z in frames]

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from bench.stability.delayed_line import Delay, DelayedLine, Happening, Seen, listen
+from bench.stability.delayed_line import Delay, DelayedLine, Happening, ReceivedFrame, listen
 from bench.stability.run import Row, Setting
 
 SLACK_S = 0.1
@@ -22,7 +22,7 @@ WELL_SHARE = 0.9  # of those frames
 
 
 @dataclass(frozen=True)
-class Case:
+class TimingCase:
     """seconds: how long it takes. well: whether all is well in its last WELL_S. quick: part of the short form."""
 
     name: str
@@ -82,46 +82,46 @@ def again(first: int, last: int) -> Happening:
 
 
 DELAYS = [
-    Case("no delay", 8.0),
-    Case("0.4 s from the start", 10.0, constant(0.4), well=False),
-    Case("0.9 s from the start", 10.0, constant(0.9), well=False),
-    Case("0.4 s from now on", 10.0, step(0.4), well=False),
-    Case("0.9 s from now on", 10.0, step(0.9), well=False),
-    Case("0.9 s for a while", 12.0, step(0.9, until=8.0)),
-    Case("0.9 s towards the board", 12.0, to_board=step(0.9)),
-    Case("growing by 0.5 ms/s", 180.0, ramp(0.5e-3), well=False, quick=False),
-    Case("growing by 3 ms/s", 60.0, ramp(3e-3), well=False),
-    Case("growing by 20 ms/s to 2 s", 110.0, ramp(20e-3, 2.0), well=False, quick=False),
-    Case("growing by 20 ms/s", 30.0, ramp(20e-3), well=False),
-    Case("nothing for 0.8 s, then all at once", 10.0, burst(0.8)),
-    Case("nothing for 3 s, then all at once", 12.0, burst(3.0)),
+    TimingCase("no delay", 8.0),
+    TimingCase("0.4 s from the start", 10.0, constant(0.4), well=False),
+    TimingCase("0.9 s from the start", 10.0, constant(0.9), well=False),
+    TimingCase("0.4 s from now on", 10.0, step(0.4), well=False),
+    TimingCase("0.9 s from now on", 10.0, step(0.9), well=False),
+    TimingCase("0.9 s for a while", 12.0, step(0.9, until=8.0)),
+    TimingCase("0.9 s towards the board", 12.0, to_board=step(0.9)),
+    TimingCase("growing by 0.5 ms/s", 180.0, ramp(0.5e-3), well=False, quick=False),
+    TimingCase("growing by 3 ms/s", 60.0, ramp(3e-3), well=False),
+    TimingCase("growing by 20 ms/s to 2 s", 110.0, ramp(20e-3, 2.0), well=False, quick=False),
+    TimingCase("growing by 20 ms/s", 30.0, ramp(20e-3), well=False),
+    TimingCase("nothing for 0.8 s, then all at once", 10.0, burst(0.8)),
+    TimingCase("nothing for 3 s, then all at once", 12.0, burst(3.0)),
 ]
 CLOCKS = [
-    Case(f"{how} by {abs(by):g} s", 12.0, at=[(7.0, fault("clock_jump", by=by))])
+    TimingCase(f"{how} by {abs(by):g} s", 12.0, at=[(7.0, fault("clock_jump", by=by))])
     for by in (-5.0, -0.2, -0.03, 0.03, 0.2, 5.0)
     for how in ["back" if by < 0 else "on"]
 ]
 AGAIN = [
-    Case("the same scan for 3 s", 10.0, at=[(BEGIN_S, fault("frozen", 3.0))]),
-    Case("scans of this session", 9.0, at=[(5.0, again(20, 60))]),
-    Case("scans from before a restart, at once", 11.0, at=[(5.0, fault("power_cycle")), (5.3, again(20, 60))]),
-    Case("scans from before a restart, later", 13.0, at=[(5.0, fault("power_cycle")), (8.0, again(0, 200))]),
-    Case("scans from long before a restart", 20.0, at=[(9.0, fault("power_cycle")), (11.0, again(150, 190))]),
+    TimingCase("the same scan for 3 s", 10.0, at=[(BEGIN_S, fault("frozen", 3.0))]),
+    TimingCase("scans of this session", 9.0, at=[(5.0, again(20, 60))]),
+    TimingCase("scans from before a restart, at once", 11.0, at=[(5.0, fault("power_cycle")), (5.3, again(20, 60))]),
+    TimingCase("scans from before a restart, later", 13.0, at=[(5.0, fault("power_cycle")), (8.0, again(0, 200))]),
+    TimingCase("scans from long before a restart", 20.0, at=[(9.0, fault("power_cycle")), (11.0, again(150, 190))]),
 ]
 STANDS_STILL = [
-    *(Case(f"stopped for {s:g} s", 12.0, at=[(BEGIN_S, stopped(s))]) for s in (0.3, 2.0, 5.0)),
-    *(Case(f"suspended for {s:g} s", 10.0 + s, at=[(BEGIN_S, suspended(s))]) for s in (0.5, 20.0)),
+    *(TimingCase(f"stopped for {s:g} s", 12.0, at=[(BEGIN_S, stopped(s))]) for s in (0.3, 2.0, 5.0)),
+    *(TimingCase(f"suspended for {s:g} s", 10.0 + s, at=[(BEGIN_S, suspended(s))]) for s in (0.5, 20.0)),
 ]
 UNTIMED = [  # what a board that does not tell its time is seen by all the same
-    Case("0.9 s from now on", 10.0, step(0.9), answers_time=False, well=False),
-    Case("growing by 5 ms/s", 90.0, ramp(5e-3), answers_time=False, well=False),
-    Case("growing by 20 ms/s", 30.0, ramp(20e-3), answers_time=False, well=False),
-    Case("clock back by 5 s", 12.0, at=[(7.0, fault("clock_jump", by=-5.0))], answers_time=False),
-    Case("clock on by 5 s", 12.0, at=[(7.0, fault("clock_jump", by=5.0))], answers_time=False),
+    TimingCase("0.9 s from now on", 10.0, step(0.9), answers_time=False, well=False),
+    TimingCase("growing by 5 ms/s", 90.0, ramp(5e-3), answers_time=False, well=False),
+    TimingCase("growing by 20 ms/s", 30.0, ramp(20e-3), answers_time=False, well=False),
+    TimingCase("clock back by 5 s", 12.0, at=[(7.0, fault("clock_jump", by=-5.0))], answers_time=False),
+    TimingCase("clock on by 5 s", 12.0, at=[(7.0, fault("clock_jump", by=5.0))], answers_time=False),
 ]
 
 
-def played(cases: list[Case]) -> Callable[[Setting], Iterator[Row]]:
+def played(cases: list[TimingCase]) -> Callable[[Setting], Iterator[Row]]:
     """A part: these cases."""
 
     def part(setting: Setting) -> Iterator[Row]:
@@ -132,7 +132,7 @@ def played(cases: list[Case]) -> Callable[[Setting], Iterator[Row]]:
     return part
 
 
-def judged(case: Case, seed: int) -> Row:
+def judged(case: TimingCase, seed: int) -> Row:
     log = logging.getLogger("services.board")
     level, log.level = log.level, logging.CRITICAL  # what acquisition says of the board is no news here
     try:
@@ -157,7 +157,7 @@ def judged(case: Case, seed: int) -> Row:
     }
 
 
-def _too_old(seen: Seen) -> bool:
+def _too_old(seen: ReceivedFrame) -> bool:
     return seen.true_age_s > seen.frame.valid_for_s + SLACK_S
 
 

@@ -12,8 +12,8 @@ from bench.stability.run import (
     SKIN,
     TOUCHES,
     Answer,
+    InProcessStages,
     Row,
-    Runner,
     Scene,
     Setting,
     mean_iou,
@@ -45,7 +45,7 @@ LAMBDAS = 10.0 ** np.arange(-8, 1.01, 0.5)
 
 
 def answers(
-    runner: Runner,
+    runner: InProcessStages,
     scenes: Sequence[Scene],
     relative: float | Array,
     rng: np.random.Generator,
@@ -67,7 +67,7 @@ def answers(
 
 def snr(setting: Setting) -> Iterator[Row]:
     """Noise on each measurement and on the tare."""
-    runner, rng = Runner(setting.bundle), setting.rng("snr")
+    runner, rng = InProcessStages(setting.bundle), setting.rng("snr")
     draws = 2 if setting.quick else 12
     for decibel in (30, 40, 50, 60, 70, 80, 90, 100) if not setting.quick else (30, 50, 70, 100):
         found = answers(runner, setting.scenes(), share(decibel), rng, draws)
@@ -76,7 +76,7 @@ def snr(setting: Setting) -> Iterator[Row]:
 
 def few(setting: Setting) -> Iterator[Row]:
     """A few measurements far noisier than the others, in the tare too: they should cost little."""
-    runner, rng = Runner(setting.bundle), setting.rng("few")
+    runner, rng = InProcessStages(setting.bundle), setting.rng("few")
     for count in (0, 1, 5, 20) if not setting.quick else (1, 5):
         for factor in (10.0, 100.0, 1000.0) if count and not setting.quick else (100.0,):
             found = []
@@ -89,7 +89,7 @@ def few(setting: Setting) -> Iterator[Row]:
 
 def scale(setting: Setting) -> Iterator[Row]:
     """The unit of the measurements: what divides out must make no difference."""
-    runner = Runner(setting.bundle)
+    runner = InProcessStages(setting.bundle)
     for exponent in (-9, -6, -3, 0, 3, 6, 9) if not setting.quick else (-9, 0, 9):
         rng = setting.rng("scale")  # the same noise for every unit
         found = answers(runner, setting.scenes(), share(USUAL_DB), rng, 1 if setting.quick else 4, 10.0**exponent)
@@ -98,7 +98,7 @@ def scale(setting: Setting) -> Iterator[Row]:
 
 def background(setting: Setting) -> Iterator[Row]:
     """The untouched sheet's conductivity, tared there; a touch takes the same share of it."""
-    model, runner, rng = setting.model(), Runner(setting.bundle), setting.rng("background")
+    model, runner, rng = setting.model(), InProcessStages(setting.bundle), setting.rng("background")
     values = (0.2, 0.35, 0.6, 1.0, 1.7, 3.0, 5.0) if not setting.quick else (0.2, 5.0)
     touches = TOUCHES if not setting.quick else TOUCHES[1:5]
     for value in values:
@@ -109,7 +109,7 @@ def background(setting: Setting) -> Iterator[Row]:
 
 def contact(setting: Setting) -> Iterator[Row]:
     """Contact impedance of all electrodes, and of each by chance, tared there."""
-    model, runner, rng = setting.model(), Runner(setting.bundle), setting.rng("contact")
+    model, runner, rng = setting.model(), InProcessStages(setting.bundle), setting.rng("contact")
     nominal = model.contact_impedance
     touches = TOUCHES if not setting.quick else TOUCHES[1:5]
     cases = [(f"x {f:g}", f, f * nominal) for f in ((0.1, 0.3, 1.0, 3.0, 10.0) if not setting.quick else (0.1, 10.0))]
@@ -123,7 +123,7 @@ def contact(setting: Setting) -> Iterator[Row]:
 
 def electrodes(setting: Setting) -> Iterator[Row]:
     """Electrodes mounted off by a share of their spacing (standard deviation), unknown to the bundle."""
-    runner, rng = Runner(setting.bundle), setting.rng("electrodes")
+    runner, rng = InProcessStages(setting.bundle), setting.rng("electrodes")
     skin = geometry.load(SKIN)
     for percent in (1, 2, 3, 5) if not setting.quick else (5,):
         found = []
@@ -136,7 +136,7 @@ def electrodes(setting: Setting) -> Iterator[Row]:
 
 def meshes(setting: Setting) -> Iterator[Row]:
     """The data's mesh from coarse to fine, noise-free: differences and answers against those of the finest."""
-    runner = Runner(setting.bundle)
+    runner = InProcessStages(setting.bundle)
     names = list(GRADINGS) if not setting.quick else ["coarsest", "coarse", "stub"]
     found, told = {}, {}
     for name in names:
@@ -172,7 +172,7 @@ def two_meshes(setting: Setting) -> Iterator[Row]:
         for network in ("full", "none"):
             if network == "full" and bundle.network_path() is None:
                 continue
-            runner = Runner(bundle, network)
+            runner = InProcessStages(bundle, network)
             for name in names:
                 pairs = answers(runner, data[name], share(np.inf), setting.rng("two"), 1)
                 kind = "network" if network == "full" else "one-step"

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from bench.accuracy.methods import session
-from bench.stability.run import METRES, NOISE_FREE, Row, Runner, Setting, mean_iou, noisy, share, summary
+from bench.stability.run import METRES, NOISE_FREE, InProcessStages, Row, Setting, mean_iou, noisy, share, summary
 from models import metrics
 from models.prereconstruction import Array, Drift, PreReconstructor
 from models.shapes import Shape
@@ -122,7 +122,7 @@ def _compared(ours: list[list[Array]], theirs: list[list[Array]], feeds: list[Fe
 
 
 def _truth(setting: Setting, variant: str) -> Row:
-    runner, rng, relative = Runner(setting.bundle, variant), setting.rng("variants"), share(USUAL_DB)
+    runner, rng, relative = InProcessStages(setting.bundle, variant), setting.rng("variants"), share(USUAL_DB)
     answers = []
     for scene in setting.scenes():
         baseline = runner.tare(scene.z0, relative, rng)

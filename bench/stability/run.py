@@ -122,7 +122,7 @@ class Answer:
         return self.contacts[0].force_n if self.contacts else None
 
 
-class Runner:
+class InProcessStages:
     """The stages of one skin, in this process."""
 
     def __init__(self, bundle: Bundle, network: str = "full") -> None:

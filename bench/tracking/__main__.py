@@ -20,7 +20,7 @@ import numpy as np
 from bench import REPORTS
 from bench.tracking import faults, report
 from bench.tracking.scene import Recorded, record
-from bench.tracking.scores import Scorer, Seen, all_of
+from bench.tracking.scores import Scorer, StageOutput, all_of
 from models.bundle import Bundle
 from services.pipeline import Pipeline
 from services.runtime.config import Skin
@@ -29,19 +29,19 @@ HOLD = "hold"  # the section whose touch must not fade
 FADE_S = 5.0  # mean of the force over so long, at both ends
 
 
-def follow(recorded: Recorded, skin: Skin, bundle: Bundle | None = None) -> list[Seen]:
+def follow(recorded: Recorded, skin: Skin, bundle: Bundle | None = None) -> list[StageOutput]:
     """What the stages say of every frame."""
     pipeline = Pipeline(skin, name="palm", bundle=bundle)
     seen = []
     for k in range(len(recorded)):
         result = pipeline.run(recorded.frame(k))
-        seen.append(Seen.of(result.delta, result.contact))
+        seen.append(StageOutput.of(result.delta, result.contact))
         if k % 1000 == 999:
             print(f"followed {recorded.seconds[k]:.0f} of {recorded.seconds[-1]:.0f} s", file=sys.stderr)
     return seen
 
 
-def score(recorded: Recorded, seen: list[Seen]) -> dict[str, Any]:
+def score(recorded: Recorded, seen: list[StageOutput]) -> dict[str, Any]:
     """Figures by section and in all, faults, notes."""
     scorer = Scorer(recorded)
     for k, said in enumerate(seen):
@@ -60,7 +60,7 @@ def score(recorded: Recorded, seen: list[Seen]) -> dict[str, Any]:
     }
 
 
-def fade(recorded: Recorded, seen: list[Seen]) -> float | None:
+def fade(recorded: Recorded, seen: list[StageOutput]) -> float | None:
     """How much less the held touch's force is at its end than at its beginning, %."""
     rows = [
         (recorded.seconds[k], seen[k].contacts[0][3])

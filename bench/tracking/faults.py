@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.tracking.scene import Recorded
-from bench.tracking.scores import Seen
+from bench.tracking.scores import StageOutput
 from protocol.frames import ELECTRODE_STATES
 
 OK = ELECTRODE_STATES.index("ok")
@@ -24,7 +24,7 @@ RECOVERY = 22  # frames after a fault in which its electrodes may still be named
 
 
 @dataclass(frozen=True)
-class Event:
+class FaultEvent:
     """One fault, in the frames first to last (inclusive). electrodes: those concerned; empty: any that a stuck
     address bit reaches.
     """
@@ -42,35 +42,35 @@ class Event:
         found = [self.args[key] for key in ("electrode", "second") if self.args.get(key, -1) >= 0]
         return found if self.name != "mux_disabled" else list(range(16))
 
-    def named(self, seen: Seen) -> bool:
+    def named(self, seen: StageOutput) -> bool:
         """Each concerned electrode in its state; a multiplexer: some electrode, or the frame's reason."""
         state = ELECTRODE_STATES.index(STATES[self.name])
         if self.name.startswith("mux"):
             return "multiplexer" in seen.reasons or state in seen.electrodes
         return all(seen.electrodes[e] == state for e in self.electrodes)
 
-    def marked(self, seen: Seen) -> bool:
+    def marked(self, seen: StageOutput) -> bool:
         """Something is said to be wrong, if not what."""
         concerned = self.electrodes or range(len(seen.electrodes))
         return any(seen.electrodes[e] != OK for e in concerned) or not seen.valid
 
 
-def events(recorded: Recorded) -> list[Event]:
-    found: list[Event] = []
+def events(recorded: Recorded) -> list[FaultEvent]:
+    found: list[FaultEvent] = []
     open_: dict[str, tuple[int, str]] = {}  # first frame, arguments
     for k in range(len(recorded) + 1):
         now = json.loads(str(recorded.faults[k])) if k < len(recorded) else {}
         texts = {name: json.dumps(args, sort_keys=True) for name, args in now.items()}
         for name, (first, text) in list(open_.items()):
             if texts.get(name) != text:
-                found.append(Event(name, json.loads(text), first, k - 1, str(recorded.sections[first])))
+                found.append(FaultEvent(name, json.loads(text), first, k - 1, str(recorded.sections[first])))
                 del open_[name]
         for name, text in texts.items():
             open_.setdefault(name, (k, text))
     return sorted(found, key=lambda e: e.first)
 
 
-def rows(recorded: Recorded, seen: Sequence[Seen]) -> list[dict[str, Any]]:
+def rows(recorded: Recorded, seen: Sequence[StageOutput]) -> list[dict[str, Any]]:
     """One row an event: frames until named and marked (1: the first frame measured with it), and until all is well
     again.
     """
@@ -98,7 +98,7 @@ def rows(recorded: Recorded, seen: Sequence[Seen]) -> list[dict[str, Any]]:
     return found
 
 
-def false_alarms(recorded: Recorded, seen: Sequence[Seen]) -> int:
+def false_alarms(recorded: Recorded, seen: Sequence[StageOutput]) -> int:
     """Frames that name an electrode while no fault is in force, nor was lately."""
     quiet, count = RECOVERY + 1, 0
     for k, s in enumerate(seen):
@@ -111,7 +111,7 @@ def _first(flags: Any) -> int | None:
     return next((n for n, flag in enumerate(flags, 1) if flag), None)
 
 
-def _said(during: Sequence[Seen]) -> dict[str, int]:
+def _said(during: Sequence[StageOutput]) -> dict[str, int]:
     """What was said of which electrode, in how many frames."""
     said: dict[str, int] = {}
     for s in during:

@@ -31,7 +31,7 @@ from protocol.frames import RawFrame
 MADE_BY = (
     *(f"firmware_stub/{n}.py" for n in ("analog", "board", "faults", "field", "rig", "scene", "sheet", "timeline")),
     *(f"models/{n}.py" for n in ("elements", "forward", "geometry", "meshing", "patterns", "shapes")),
-    *(f"services/board/{n}.py" for n in ("boardlink", "clock", "scan_check", "scan_order", "source")),
+    *(f"services/board/{n}.py" for n in ("boardlink", "clock", "scan_check", "scan_order", "scanning", "source")),
 )
 LAYOUT = 1  # of what is kept: raised when Recorded or what fills it changes
 KEPT = 6  # recorded scenes

@@ -27,7 +27,7 @@ METRES_PER_UNIT = 0.05  # of the skin, for models.metrics
 
 
 @dataclass(frozen=True)
-class Seen:
+class StageOutput:
     """What the stages said of one frame. contacts: those that last, each id, x, y [m], force, sigma [N]."""
 
     valid: bool
@@ -36,7 +36,7 @@ class Seen:
     contacts: tuple[tuple[int, float, float, float | None, float | None], ...] = ()
 
     @classmethod
-    def of(cls, delta: DeltaFrame, contact: ContactFrame) -> Seen:
+    def of(cls, delta: DeltaFrame, contact: ContactFrame) -> StageOutput:
         lasting = [c for c in contact.contacts if c.state != "end"]
         rows = tuple((c.id, c.position[0], c.position[1], c.force_n, c.force_sigma_n) for c in lasting)
         return cls(contact.valid, tuple(contact.reasons), tuple(delta.electrodes.tolist()), rows)
@@ -132,7 +132,7 @@ class Scorer:
         self._alone: dict[int, int] = {}  # contact id -> frames in a row without a touch
         self._real: dict[int, int] = {}  # contact id -> track it last belonged to
 
-    def add(self, k: int, seen: Seen) -> None:
+    def add(self, k: int, seen: StageOutput) -> None:
         section = str(self.recorded.sections[k])
         tally = self.tallies[section]
         truth = {int(t["track"]): t for t in self.recorded.truth(k)}
@@ -228,7 +228,7 @@ class Scorer:
         return count >= limit
 
 
-def match(truth: dict[int, dict[str, float]], seen: Seen, before: dict[int, int]) -> dict[int, int]:
+def match(truth: dict[int, dict[str, float]], seen: StageOutput, before: dict[int, int]) -> dict[int, int]:
     """track -> index of its contact. before: track -> contact id of the last frame."""
     index = {c[0]: i for i, c in enumerate(seen.contacts)}
 

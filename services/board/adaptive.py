@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from models.sentinel import Sentinel
 from protocol import link
 from protocol.frames import DeltaFrame
-from services.estimation.sentinel import Verdict, Watch
+from services.estimation.sentinel import SentinelDetector, SentinelVerdict
 
 QUIET_FRAMES = 64  # 3 s: a tare's worth, so that one can be taken while the board idles
 FULL_EVERY_S = 0.5  # as often as preprocessing follows drift: longer gaps would widen what it allows for
@@ -24,7 +24,7 @@ DEAF_S = 0.4  # without a verdict: preprocessing is down, or far behind
 LOST_S = 0.5  # a full scan asked for that does not come is asked for again
 BEGUN_S = 0.005  # after the scan under way, by when the next one has begun
 
-Passed = tuple[link.Frame, str]  # a scan and its kind
+Passed = tuple[link.ScanFrame, str]  # a scan and its kind
 
 
 class AdaptiveScan:
@@ -32,7 +32,7 @@ class AdaptiveScan:
 
     def __init__(self, sentinel: Sentinel, idle_config: int, quiet_frames: int = QUIET_FRAMES) -> None:
         self.rows, self.idle_config = sentinel.rows, idle_config
-        self.watch = Watch(sentinel)
+        self.watch = SentinelDetector(sentinel)
         self.counts: Counter[str] = Counter()
         self.idle = False
         self._quiet_frames = quiet_frames
@@ -43,7 +43,7 @@ class AdaptiveScan:
         self._asked_s: float | None = None  # when a full scan was asked for that has not come
         self._promised_s: float | None = None  # when the board said that it would make it
         self._long_s = self._short_s = 0.05  # seconds of a full and of a sentinel scan
-        self._block: list[link.Frame] = []  # sentinel scans not passed on yet
+        self._block: list[link.ScanFrame] = []  # sentinel scans not passed on yet
 
     def wants(self, now_s: float, confirmed: str = "") -> str:
         """What the board should scan now. confirmed: what it has said that it scans, after the scan under way."""
@@ -77,7 +77,7 @@ class AdaptiveScan:
         self._quiet = 0
         self._untouched.clear()
 
-    def scanned(self, scan: link.Frame, now_s: float) -> list[Passed]:
+    def scanned(self, scan: link.ScanFrame, now_s: float) -> list[Passed]:
         """A scan of the board -> what goes on to preprocessing."""
         if scan.config == self.idle_config:
             self._short_s = scan.duration_us * 1e-6
@@ -88,7 +88,7 @@ class AdaptiveScan:
         self._untouched.append(np.abs(scan.z[self.rows]).astype(float))
         return [(scan, "full")]
 
-    def _sentinel(self, scan: link.Frame, now_s: float) -> list[Passed]:
+    def _sentinel(self, scan: link.ScanFrame, now_s: float) -> list[Passed]:
         self.counts["sentinels"] += 1
         if not self.idle:  # on the way to full scans: a touch is under way
             return [(scan, "sentinel")]
@@ -97,10 +97,10 @@ class AdaptiveScan:
             return []
         self._block.append(scan)
         verdict = self.watch(np.abs(scan.z).astype(float))
-        if verdict is Verdict.HIT:
+        if verdict is SentinelVerdict.HIT:
             self._wake("hit")
             return [(_mean(self._block[-self.watch.window :]), "sentinel")]
-        if verdict is Verdict.SUSPECT and self._asked_s is None:
+        if verdict is SentinelVerdict.SUSPECT and self._asked_s is None:
             self.counts["suspicions"] += 1
             self._ask(now_s)
         soon = self._asked_s is not None and now_s - self._asked_s < 3 * self._short_s
@@ -141,12 +141,12 @@ class AdaptiveScan:
         self._asked_s, self._promised_s = now_s, None
 
 
-def _mean(scans: list[link.Frame]) -> link.Frame:
+def _mean(scans: list[link.ScanFrame]) -> link.ScanFrame:
     """One scan that is the mean of several in a row."""
     if len(scans) == 1:
         return scans[0]
     first, last = scans[0], scans[-1]
-    return link.Frame(
+    return link.ScanFrame(
         seq=last.seq,
         device_us=first.device_us,
         duration_us=last.device_us + last.duration_us - first.device_us,

@@ -6,18 +6,14 @@ raises.
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from protocol import link
 from protocol.frames import STATUS_OPEN, STATUS_RTIA
 from services.board.clock import GOOD_NS, DeviceClock
 from services.board.line_pace import LinePace
 from services.board.scan_check import ScanCheck
+from services.board.scanning import Scanning, unfit
 from services.board.time_questions import TimeQuestions
 
 HELLO_EVERY_S = 0.2
@@ -30,23 +26,6 @@ DEAD_SCANS = 10  # in a row with all measurements out of range: the board may ha
 DEAD_AGAIN_S = 5.0  # then it is configured again, at most this often
 REFUSED_AGAIN_S = 1.0  # a refused board is tried again, for it may be power-cycled or flashed
 NO_CURRENT = STATUS_OPEN | STATUS_RTIA
-
-
-@dataclass(frozen=True)
-class Scanning:
-    """What the board is to do: scan list (K, 4) of 0-based electrodes, DFT points, gain resistor."""
-
-    pattern: NDArray[np.integer]
-    dft_points: int
-    rtia_ohm: float
-
-    @property
-    def config(self) -> int:
-        """Id of this configuration on the board: from its content, so that one of an earlier session is never taken
-        for it.
-        """
-        text = self.pattern.astype("u1").tobytes() + f"{self.dft_points} {self.rtia_ohm:g}".encode()
-        return zlib.crc32(text) & 0xFFFF
 
 
 class BoardLink:
@@ -105,7 +84,7 @@ class BoardLink:
         """Have the running board scan this one of the configurations; `to_send` tells it."""
         self._wanted = to
 
-    def received(self, data: bytes, now_s: float) -> list[link.Frame]:
+    def received(self, data: bytes, now_s: float) -> list[link.ScanFrame]:
         """Scans that `data` completes, in order; everything else is dealt with here."""
         scans = []
         waited, bad = self.decoder.waiting, self.decoder.bad
@@ -114,7 +93,7 @@ class BoardLink:
         began_s = self._pace.first_byte_s(now_s, waited=waited, dropped=dropped, complete=bool(messages), waits=waits)
         self.reasons.clear()
         for n, message in enumerate(messages):
-            if isinstance(message, link.Frame):
+            if isinstance(message, link.ScanFrame):
                 first_byte_s = began_s if n == 0 else now_s
                 self._pace.took(now_s - first_byte_s)
                 if self._is_ours(message, first_byte_s, now_s):
@@ -218,23 +197,8 @@ class BoardLink:
     def _introduced(self, ident: link.Ident, now_s: float) -> None:
         self.ident = ident
         self.clock.timed = bool(ident.capabilities & link.Capability.TIME)
-        needed = int(self.scanning.pattern.max()) + 1
-        if ident.schema_hash != link.SCHEMA_HASH or ident.link_version != link.LINK_VERSION:
-            found, ours = f"{ident.schema_hash:08x}", f"{link.SCHEMA_HASH:08x}"
-            self._refuse(
-                f"firmware {ident.firmware!r} speaks schema {found}, this program {ours}: flash a matching one", now_s
-            )
-        elif ident.chip_id != link.CHIP_ID:
-            found = f"0x{ident.chip_id:04x}"
-            self._refuse(
-                f"the converter says chip id {found}, expected 0x{link.CHIP_ID:04x}: power-cycle the board", now_s
-            )
-        elif ident.electrodes < needed or ident.max_scan < len(self.scanning.pattern):
-            self._refuse(
-                f"the board has {ident.electrodes} electrodes and takes {ident.max_scan} measurements; "
-                f"the bundle needs {needed} and {len(self.scanning.pattern)}",
-                now_s,
-            )
+        if wrong := unfit(ident, self.scanning):
+            self._refuse(wrong, now_s)
         elif self.state in ("hello", "refused"):
             self._pending = [self.scanning, *([self._idle] if self._idle and self.switches else [])]
             self._to(now_s, "config")
@@ -286,7 +250,7 @@ class BoardLink:
         if event.code in (link.EventCode.BOOT, link.EventCode.BROWN_OUT):
             self._restart(now_s, f"the board lost its configuration ({event.text or link.EventCode(event.code).name})")
 
-    def _watch(self, scan: link.Frame, now_s: float) -> None:
+    def _watch(self, scan: link.ScanFrame, now_s: float) -> None:
         """A brown-out may lose the registers without a word: then there is no current through anything."""
         self._dead_scans = self._dead_scans + 1 if (scan.status & NO_CURRENT).all() else 0
         if self._dead_scans >= DEAD_SCANS and now_s - self._dead_s >= DEAD_AGAIN_S:
@@ -295,7 +259,7 @@ class BoardLink:
                 now_s, "no current through any electrode: configuring the board again; is the skin connected?"
             )
 
-    def _is_ours(self, scan: link.Frame, first_byte_s: float, now_s: float) -> bool:
+    def _is_ours(self, scan: link.ScanFrame, first_byte_s: float, now_s: float) -> bool:
         """Whether to believe that this is the board's next scan; counts what it is otherwise."""
         known = (self.scanning, self._idle) if self.switches else (self.scanning,)
         ours = any(s is not None and scan.config == s.config and len(scan.z) == len(s.pattern) for s in known)

@@ -29,7 +29,7 @@ class FrozenScans:
         self._same: dict[int, int] = {}
         self._by_turns = 0
 
-    def __call__(self, scan: link.Frame) -> bool:
+    def __call__(self, scan: link.ScanFrame) -> bool:
         """Whether this scan of a live board is one of FROZEN or more."""
         last = self._last.get(scan.config)
         self._last[scan.config] = scan.z
@@ -44,7 +44,7 @@ class FrozenScans:
         self.frozen = self.noisy and self._same[scan.config] >= FROZEN
         return self.frozen
 
-    def _learn(self, scan: link.Frame, last: NDArray[np.complex64]) -> None:
+    def _learn(self, scan: link.ScanFrame, last: NDArray[np.complex64]) -> None:
         with np.errstate(all="ignore"):
             step = scan.z.real - last.real
             before = self._steps.get(scan.config)

@@ -41,7 +41,7 @@ class ScanCheck:
         """The board's clock was wrong: it has to go on well for DOUBTED_SCANS."""
         self._doubted = DOUBTED_SCANS
 
-    def __call__(self, scan: link.Frame, arrived_ns: int, fit: bool) -> str:
+    def __call__(self, scan: link.ScanFrame, arrived_ns: int, fit: bool) -> str:
         """What it counts as: scans, repeated, foreign. fit: the clock may be set by it."""
         missing = self._order.missing(scan)
         if missing < 0:  # repeated or older. If the board began anew without a word, it counts as silent

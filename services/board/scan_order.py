@@ -22,17 +22,17 @@ class ScanOrder:
     def started(self, device_us: int) -> None:
         """A START was carried out when the board's clock showed this (0: it does not say)."""
         self._started_us = device_us
-        self._last: link.Frame | None = None
+        self._last: link.ScanFrame | None = None
         self._durations: dict[int, int] = {}  # us, by configuration
 
-    def missing(self, scan: link.Frame) -> int:
+    def missing(self, scan: link.ScanFrame) -> int:
         """How many scans lie between the last one and this; negative: it is that one again, or older."""
         if self._last is None:
             return 0
         ahead = (scan.seq - self._last.seq) % WRAP
         return (ahead if ahead < WRAP // 2 else ahead - WRAP) - 1
 
-    def consistent(self, scan: link.Frame) -> bool:
+    def consistent(self, scan: link.ScanFrame) -> bool:
         """Whether the board's clock has gone on as the scan's number says."""
         last = self._last
         if last is None:
@@ -43,7 +43,7 @@ class ScanOrder:
         most = LONGER * (last.duration_us + missing * max(others)) + PAUSE_US
         return least <= scan.device_us - last.device_us <= most
 
-    def take(self, scan: link.Frame) -> None:
+    def take(self, scan: link.ScanFrame) -> None:
         """This scan is the last one now."""
         self._last = scan
         self._durations[scan.config] = scan.duration_us

@@ -18,10 +18,11 @@ from protocol.frames import DeltaFrame, RawFrame
 from protocol.sockets import NewestReader
 from services.board import port as ports
 from services.board.adaptive import AdaptiveScan, Passed
-from services.board.boardlink import BoardLink, Scanning
+from services.board.boardlink import BoardLink
 from services.board.clock import UNSETTLED_NS
 from services.board.host_time import STOOD_STILL_S, HostTime, Suspensions
 from services.board.remarks import Remarks
+from services.board.scanning import Scanning
 from services.estimation.sentinel import sentinel_of
 from services.runtime.config import Skin
 from services.runtime.stage import Health, add_reason, valid_for_s
@@ -214,7 +215,7 @@ class BoardSource(Source):
             if isinstance(delta, DeltaFrame):
                 adaptive.heard(delta, now_s)
 
-    def raw_frame(self, scan: link.Frame, board: BoardLink, read_ns: int, kind: str = "full") -> RawFrame:
+    def raw_frame(self, scan: link.ScanFrame, board: BoardLink, read_ns: int, kind: str = "full") -> RawFrame:
         """A scan of the board with this host's stamps; `read_ns`: when its last byte was read."""
         if kind == "full":
             self._full_s = scan.duration_us * 1e-6

@@ -16,13 +16,14 @@ from protocol import transport
 from protocol.link import SCHEMA_HASH
 from protocol.runtime import RuntimeDirError, runtime_dir
 from services.board import port as ports
-from services.board.boardlink import BoardLink, Scanning
+from services.board.boardlink import BoardLink
+from services.board.scanning import Scanning
 from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
 from services.contacts.force import ForceLaw
 from services.estimation import checks
 from services.estimation.tare import implausibility
-from services.runtime.config import RECORDINGS, Config, ConfigError, Skin, config_path, load
+from services.runtime.config import RECORDINGS, ConfigError, ConfigFile, Skin, config_path, load
 
 BOARD_S = 2.5  # for a board to say who it is
 LATENCY_TIMER_MS = 1
@@ -69,7 +70,7 @@ def _clock() -> Finding:
     return Finding("WARN", "clock", f"the kernel's clock source is {source}, slow to read; expected {GOOD_CLOCKS[0]}")
 
 
-def _skin(name: str, skin: Skin, config: Config, running: bool) -> Iterator[Finding]:
+def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[Finding]:
     try:
         bundle = Bundle.load(skin.bundle)
     except BundleError as why:

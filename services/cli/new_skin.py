@@ -13,7 +13,7 @@ from services.cli.common import ROOT, USAGE, JsonOption, emit, fail
 
 if TYPE_CHECKING:
     from models.drawing import Drawing
-    from models.geometry import Skin
+    from models.geometry import SkinGeometry
 
 SHARE = 0.3  # of the electrodes' spacing that each covers, unless told
 CONTACT_IMPEDANCE = 0.01  # as that of the shipped skins
@@ -86,7 +86,7 @@ def _text(name: str, found: Drawing, count: int, width: float, first: float, pat
     return drawing.toml(name, found, chosen, CONTACT_IMPEDANCE, pattern)
 
 
-def _said(skin: Skin, found: Drawing, path: Path) -> dict[str, Any]:
+def _said(skin: SkinGeometry, found: Drawing, path: Path) -> dict[str, Any]:
     scale = 1e3 * skin.metres_per_unit
     low, high = skin.polygon().min(axis=0) * scale, skin.polygon().max(axis=0) * scale
     width, height = (round(float(v), 2) for v in high - low)

@@ -135,7 +135,7 @@ def _skin(monitor: Monitor, coloured: bool) -> RenderableType:
     half = max((abs(v) for point in outline for v in point), default=0.05) if outline else 0.05
     if image is not None:
         half = max(half, -min(image.origin))
-    marks = [(c.position[0], c.position[1]) for c in contact.contacts if c.state != "end"] if contact else []
+    marks = [c.on_sheet for c in contact.contacts if c.state != "end"] if contact else []
     skin = framed(draw(drop, half, marks, outline, coloured=coloured), half, top_of_scale(drop), coloured)
     if monitor.image_held:
         skin.append("\nimage held: unchanged" if drop is not None else "\nimage held: shown when it changes", "dim")

@@ -11,7 +11,7 @@ from services.cli.common import FAILED, USAGE, JsonOption, config_file, emit, fa
 
 if TYPE_CHECKING:
     from protocol.transport import Transport
-    from services.runtime.config import Config
+    from services.runtime.config import ConfigFile
 
 
 def register(app: typer.Typer) -> None:
@@ -46,7 +46,7 @@ def up(
     raise typer.Exit(supervise(found, extra, wanted))
 
 
-def _check_mismatches(config: Config) -> None:
+def _check_mismatches(config: ConfigFile) -> None:
     """Said before anything starts: the stub would end at once, again and again."""
     for name, skin in config.skins.items():
         if skin.mismatch != "none":

@@ -18,7 +18,7 @@ def pairs(truth: TruthFrame, contact: ContactFrame) -> list[dict[str, Any]]:
     """Each true touch and the contact that is its; `found` is None where none is left. Nearest pairs go first."""
     found = [c for c in contact.contacts if c.state != "end"]
     near = sorted(
-        (math.dist(c.position[:2], (t.x, t.y)), i, j) for i, t in enumerate(truth.touches) for j, c in enumerate(found)
+        (math.dist(c.on_sheet, (t.x, t.y)), i, j) for i, t in enumerate(truth.touches) for j, c in enumerate(found)
     )
     partner: dict[int, int] = {}
     for _, i, j in near:
@@ -32,11 +32,11 @@ def pairs(truth: TruthFrame, contact: ContactFrame) -> list[dict[str, Any]]:
             best = found[partner[i]]
             row["found"] = {
                 "id": best.id,
-                "x": best.position[0],
-                "y": best.position[1],
+                "x": best.on_sheet[0],
+                "y": best.on_sheet[1],
                 "force_n": best.force_n,
                 "shape": best.shape,
-                "error_mm": math.dist(best.position[:2], (touch.x, touch.y)) * 1e3,
+                "error_mm": math.dist(best.on_sheet, (touch.x, touch.y)) * 1e3,
             }
         rows.append(row)
     return rows

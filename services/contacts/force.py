@@ -137,7 +137,7 @@ class ForceLaw:
         """(what the curve is of, its relative standard uncertainty or None)."""
         unit = self.metres_per_unit
         edge = self.half_width - max(abs(look.x), abs(look.y)) / unit
-        seen = uncertainty.Seen(
+        seen = uncertainty.ImageFeatures(
             np.array([look.peak]),
             np.array([look.peak_sigma]),
             np.array([look.integral / unit**2]),

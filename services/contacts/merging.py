@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from services.contacts.motion import Seen, Track, size_cost
+from services.contacts.motion import Patch, Track, size_cost
 
 MERGED_S = 5.0  # a touch inside another's patch is waited for so long
 DROWNED_S = 1.0  # one that drowns beside it, or was lifted there
@@ -21,7 +21,7 @@ INSIDE_SIGMA_M = 0.003  # of where a touch inside a patch should be, at first
 INSIDE_SIGMA_M_S = 0.010  # by how much it grows: fingers stop and turn back
 
 
-def host_of(track: Track, hosts: Sequence[tuple[Track, Seen]], sample_ns: int) -> tuple[Track, float] | None:
+def host_of(track: Track, hosts: Sequence[tuple[Track, Patch]], sample_ns: int) -> tuple[Track, float] | None:
     """Whose patch covers the place where a lost touch should be, or drowns it; and for how long to wait for it [s]."""
     x, y = track.ahead(sample_ns)
     distance = [math.hypot(x - s.x, y - s.y) - s.reach for _, s in hosts]
@@ -60,7 +60,7 @@ def others(host: Track) -> list[Track]:
     return [t for t in host.inside if t.id != host.id]
 
 
-def follow(host: Track, patch: Seen, sample_ns: int) -> None:
+def follow(host: Track, patch: Patch, sample_ns: int) -> None:
     """The touches inside go on, and with the patch, and not out of it."""
     _advance(host.inside, (patch.x, patch.y), sample_ns)
     for t in host.inside:
@@ -70,13 +70,13 @@ def follow(host: Track, patch: Seen, sample_ns: int) -> None:
             t.y = patch.y + (t.y - patch.y) * patch.reach / away
 
 
-def is_part(host: Track, seen: Seen, sample_ns: int) -> bool:
+def is_part(host: Track, seen: Patch, sample_ns: int) -> bool:
     """Whether this can be a part of the host's patch, as it was."""
     x, y = host.ahead(sample_ns)
     return math.hypot(seen.x - x, seen.y - y) < host.reach + MARGIN_M
 
 
-def part(host: Track, parts: Sequence[Seen], sample_ns: int) -> list[Track | None]:
+def part(host: Track, parts: Sequence[Patch], sample_ns: int) -> list[Track | None]:
     """The touch that each of at least two parts is, or None for more parts than there are touches.
 
     Where there are more touches than parts, some parts have several inside.
@@ -116,5 +116,5 @@ def _advance(inside: Sequence[Track], centre: tuple[float, float], sample_ns: in
         t.x, t.y = t.x + dx, t.y + dy
 
 
-def _cost(track: Track, seen: Seen, sigma: float) -> float:
+def _cost(track: Track, seen: Patch, sigma: float) -> float:
     return (math.hypot(track.x - seen.x, track.y - seen.y) / sigma) ** 2 + size_cost(track, seen)

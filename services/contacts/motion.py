@@ -17,7 +17,7 @@ SIZE_SHARE = 0.3  # of what is seen, in the running mean of the size
 MOST_FOR_SIZE = 9.0  # a touch may grow quickly: its size alone makes it no other touch
 
 
-class Seen(NamedTuple):
+class Patch(NamedTuple):
     """One patch in one image."""
 
     x: float  # m, area centroid
@@ -56,7 +56,7 @@ class Track:
         seconds = self.seconds_to(sample_ns)
         return self.x + self.vx * seconds, self.y + self.vy * seconds
 
-    def move(self, seen: Seen, sample_ns: int) -> None:
+    def move(self, seen: Patch, sample_ns: int) -> None:
         """It was seen there."""
         real = max(0.0, (sample_ns - self.seen_ns) * 1e-9)
         if real > 1e-6:
@@ -69,7 +69,7 @@ class Track:
         self.reach, self.missing = seen.reach, 0
         self.age += 1
 
-    def _filter(self, seen: Seen, seconds: float) -> None:
+    def _filter(self, seen: Patch, seconds: float) -> None:
         noise = ACCELERATION**2 * seconds**2
         pp = self.pp + 2 * seconds * self.pv + seconds**2 * self.vv + noise * seconds**2 / 4
         pv = self.pv + seconds * self.vv + noise * seconds / 2
@@ -86,7 +86,7 @@ class Track:
         return replace(self, inside=[])
 
 
-def cost(track: Track, seen: Seen, sample_ns: int) -> tuple[float, float]:
+def cost(track: Track, seen: Patch, sample_ns: int) -> tuple[float, float]:
     """(distance [m] from where the track should be, how unlikely it is that this is the track: chi-squared)."""
     x, y = track.ahead(sample_ns)
     distance = math.hypot(seen.x - x, seen.y - y)
@@ -95,7 +95,7 @@ def cost(track: Track, seen: Seen, sample_ns: int) -> tuple[float, float]:
     return distance, distance**2 / variance + size_cost(track, seen)
 
 
-def size_cost(track: Track, seen: Seen) -> float:
+def size_cost(track: Track, seen: Patch) -> float:
     if track.size <= 0 or seen.size <= 0:
         return 0.0
     return min((math.log(seen.size / track.size) / SIZE_SIGMA) ** 2, MOST_FOR_SIZE)

@@ -18,7 +18,7 @@ from dataclasses import asdict
 from typing import Any
 
 from services.contacts.merging import absorb, follow, give_up, host_of, is_part, others, part
-from services.contacts.motion import Seen, Track, cost
+from services.contacts.motion import Patch, Track, cost
 
 REACH_M = 0.015  # a touch that jumps further between two frames is another touch
 STAYS_M = 0.006  # what begins is near where it was seen first; what an image of a changing touch shows is not
@@ -52,7 +52,7 @@ class Tracker:
         sure = [track for track in self.tracks if track.id != UNCONFIRMED]
         return [one.ahead(sample_ns) for track in sure for one in (track.inside or [track])]
 
-    def alone(self, seen: Sequence[Seen], sample_ns: int) -> tuple[list[Track], list[Track]]:
+    def alone(self, seen: Sequence[Patch], sample_ns: int) -> tuple[list[Track], list[Track]]:
         """The same as `update` for a frame that is no other's successor: what was there ended, each entry begins."""
         self.reset()
         ended = self._begin_frame(sample_ns)
@@ -61,7 +61,9 @@ class Tracker:
             self._next_id += 1
         return list(self.tracks), ended
 
-    def update(self, seen: Sequence[Seen], sample_ns: int, sure: bool = True) -> tuple[list[Track | None], list[Track]]:
+    def update(
+        self, seen: Sequence[Patch], sample_ns: int, sure: bool = True
+    ) -> tuple[list[Track | None], list[Track]]:
         """What one frame shows -> (the track of each entry, in their order, None for one to be confirmed; tracks that
         ended). sure: whether what this frame shows can be believed at once.
         """
@@ -125,7 +127,7 @@ class Tracker:
         ended, self._untold = self._untold, []
         return ended
 
-    def _assign(self, seen: Sequence[Seen], sample_ns: int) -> list[Track | None]:
+    def _assign(self, seen: Sequence[Patch], sample_ns: int) -> list[Track | None]:
         """The track of each entry: least total cost, within reach; or None."""
         owners: list[Track | None] = [None] * len(seen)
         if not seen or not self.tracks:
@@ -144,7 +146,7 @@ class Tracker:
                 owners[k] = self.tracks[column]
         return owners
 
-    def _merge(self, owners: list[Track | None], seen: Sequence[Seen], sample_ns: int) -> None:
+    def _merge(self, owners: list[Track | None], seen: Sequence[Patch], sample_ns: int) -> None:
         """Where a lost touch should be there is another one's patch: it is inside."""
         matched = [(track, entry) for track, entry in zip(owners, seen, strict=True) if track is not None]
         hosts = [(track, entry) for track, entry in matched if track.id != UNCONFIRMED]
@@ -155,7 +157,7 @@ class Tracker:
                 absorb(host, track.inside or [track], sample_ns, wait_s)
                 self.tracks = [t for t in self.tracks if t is not track]
 
-    def _part(self, owners: list[Track | None], seen: Sequence[Seen], sample_ns: int) -> None:
+    def _part(self, owners: list[Track | None], seen: Sequence[Patch], sample_ns: int) -> None:
         """A patch with several touches inside has fallen apart: they come out where they should be."""
         for host in [t for t in self.tracks if t.inside]:
             parts = [

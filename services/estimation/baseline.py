@@ -16,7 +16,7 @@ from services.estimation.drift_filter import DriftFilter
 from services.estimation.drift_in_touch import drifted, explain
 from services.estimation.evidence import Explanation, TouchEvidence, evidence_of
 from services.estimation.references import References
-from services.estimation.start import Verdict, judge_start
+from services.estimation.start import StartVerdict, judge_start
 from services.estimation.tare import Baseline, NoBaseline, noisy, plausible_noise
 from services.estimation.tare_window import TareWindow
 
@@ -116,8 +116,8 @@ class BaselineEstimator:
         start = judge_start(
             found.z0, found.sigma / np.sqrt(found.frames), self.evidence, None if trusted is None else trusted.z0
         )
-        self.touched_at_start = start.verdict is Verdict.TOUCHED
-        if start.verdict is Verdict.UNKNOWN and not found.doubt:
+        self.touched_at_start = start.verdict is StartVerdict.TOUCHED
+        if start.verdict is StartVerdict.UNKNOWN and not found.doubt:
             found = dataclasses.replace(found, doubt=UNSURE)
         if not self.touched_at_start:
             self.set_baseline(found, self.last_sample_ns)

@@ -199,6 +199,10 @@ class ChangedContacts:
         self._before = {k: row * factor for k, row in self._before.items()}
         self._past = deque((row * factor for row in self._past), maxlen=LOOK_FAR_BACK)
 
+    def forget_past(self) -> None:
+        """The frames so far say nothing of those to come: some had another gain."""
+        self._past.clear()
+
     def changed(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
         """The electrode whose contact this frame shows to have changed."""
         found = self._drift(_difference(amplitude, untouched.z0, untouched, live), untouched.sigma, live)

@@ -30,6 +30,7 @@ from services.estimation.advice import (
     stuck_bit,
 )
 from services.estimation.contact_drift import ChangedContacts, Reference
+from services.estimation.gain_steps import GainStep
 from services.estimation.saved import shaped
 from services.estimation.wiring import Exchanged, StuckBit, Wiring
 
@@ -114,9 +115,11 @@ class ElectrodeHealth:
         self._unsure[:], self._suspected[:] = False, 0
         self._contacts.keep(())
 
-    def rescale(self, factor: float) -> None:
-        """The board's gain stepped by this factor."""
-        self._contacts.rescale(factor)
+    def rescale(self, step: GainStep) -> None:
+        """The baseline took this step of the board's gain over."""
+        self._contacts.rescale(step.factor)
+        if step.lasted:
+            self._contacts.forget_past()
 
     def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
         """(K,) |Z| and status bits of a frame."""

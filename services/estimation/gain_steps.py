@@ -4,7 +4,7 @@ lasted.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,15 @@ Array = NDArray[np.float64]
 
 GROSS = 0.15  # relative: no gain of a sound board steps by more (RTIA and its calibration, a tenth)
 LASTING_S = 1.0
+PAST = 5  # frames that are kept: of a touch that moves slowly one alone is mostly noise
+BACK = 0.01  # relative: a gross gain that ends leaves the gain that was there before it, within drift
+
+
+class GainStep(NamedTuple):
+    """A factor that the baseline is to take over. lasted: whether it has been there for LASTING_S already."""
+
+    factor: float
+    lasted: bool = False
 
 
 class GainSteps:
@@ -26,31 +35,57 @@ class GainSteps:
         self.reset()
 
     def reset(self) -> None:
-        self._before: Array | None = None  # (K,) |Z| of the last frame
-        self._total = 0.0  # its sum
+        self._past: list[Array] = []  # (K,) |Z| of the last frames, the newest last
         self._gross_ns = 0  # since when all measurements have another gain by far
+        self._taken = 0.0  # gross factor that the baseline took over; 0: none that did not end
 
-    def __call__(self, amplitude: Array, baseline: Baseline, now_ns: int) -> float | None:
+    @property
+    def gross(self) -> bool:
+        """Whether all measurements of the last frame have another gain by far."""
+        return self._gross_ns > 0
+
+    def __call__(self, amplitude: Array, baseline: Baseline, now_ns: int) -> GainStep | None:
         """The factor that a sound frame's |Z| (K,) has in common against the sound one before, to be taken over by the
         baseline.
         """
-        before, total = self._before, self._total
-        self._before, self._total = amplitude.copy(), float(amplitude.sum())
-        if before is None or len(before) != len(amplitude):
+        past, self._past = self._past, [*self._past[1 - PAST :], amplitude.copy()]
+        if not past or len(past[-1]) != len(amplitude):
             return None
         gross = self._gross(amplitude, baseline)
+        if gross is not None and self._undoes(gross):
+            return self._back(gross)
         if gross is not None:
             self._gross_ns = self._gross_ns or now_ns
             if (now_ns - self._gross_ns) * 1e-9 < LASTING_S:
-                self._before, self._total = before, total  # a fault, which may end
+                self._past = past  # a fault, which may end
                 return None
+            self._gross_ns, self._taken, self._past = 0, gross, self._past[-1:]
+            return GainStep(gross, lasted=True)
         self._gross_ns = 0
-        if gross is not None:
-            return gross
-        if abs(self._total - total) < TUNING.gain_least * total:
+        total = float(past[-1].sum())
+        if abs(float(amplitude.sum()) - total) < TUNING.gain_least * total:
             return None
-        factor = _common(before, amplitude, baseline)
-        return factor if factor is not None and abs(factor - 1) <= GROSS else None
+        factor = _common(past[-1], amplitude, baseline)
+        for earlier in past[-2::-1] if factor is None else ():  # the steadier a touch moves, the further back tells
+            factor = factor or _common(past[-1], amplitude, baseline, earlier)
+        if factor is None:
+            return None
+        if self._undoes(factor):
+            return self._back(factor)
+        return self._step(factor) if abs(factor - 1) <= GROSS else None
+
+    def _undoes(self, factor: float) -> bool:
+        """Whether a gross gain that the baseline took over ends: nothing needs to last for that."""
+        return bool(self._taken) and abs(factor * self._taken - 1) < BACK
+
+    def _back(self, factor: float) -> GainStep:
+        self._gross_ns, self._taken = 0, 0.0
+        return self._step(factor)
+
+    def _step(self, factor: float) -> GainStep:
+        """What the frames before the step would have been with the new gain is what the next ones are compared with."""
+        self._past = [*(row * factor for row in self._past[:-1]), self._past[-1]]
+        return GainStep(factor)
 
     @staticmethod
     def _gross(amplitude: Array, baseline: Baseline) -> float | None:
@@ -64,19 +99,21 @@ class GainSteps:
         return _common(baseline.z0, amplitude, baseline)
 
     def state(self) -> dict[str, Any]:
-        return {"before": None if self._before is None else self._before.copy(), "gross_ns": self._gross_ns}
+        return {"past": [row.copy() for row in self._past], "gross_ns": self._gross_ns, "taken": self._taken}
 
     def load(self, state: dict[str, Any]) -> None:
         """Raises KeyError, TypeError or ValueError where it does not fit."""
         self.reset()
-        if state["before"] is not None:
-            self._before = shaped(state["before"], (self._k,), finite=False)
-            self._total = float(self._before.sum())
-        self._gross_ns = int(state["gross_ns"])
+        if "past" not in state:  # older recordings have the last frame alone
+            state = {**state, "past": [] if state["before"] is None else [state["before"]]}
+        self._past = [shaped(row, (self._k,), finite=False) for row in state["past"]]
+        self._gross_ns, self._taken = int(state["gross_ns"]), float(state.get("taken", 0.0))
 
 
-def _common(before: Array, now: Array, baseline: Baseline) -> float | None:
-    """now / before of two frames' |Z| (K,), where it is common to the measurements that count in both."""
+def _common(before: Array, now: Array, baseline: Baseline, earlier: Array | None = None) -> float | None:
+    """now / before of two frames' |Z| (K,), where it is common to the measurements that count in all."""
     live = (baseline.z0 > 0) & (before > 0) & np.isfinite(now) & np.isfinite(baseline.sigma)
+    if earlier is not None:
+        live &= earlier > 0
     sigma = np.where(live, baseline.sigma / np.where(live, baseline.z0, 1.0), np.inf)
-    return common_factor(before, now, sigma, live)
+    return common_factor(before, now, sigma, live, earlier=earlier)

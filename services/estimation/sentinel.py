@@ -52,13 +52,13 @@ def sentinel_of(bundle: Bundle) -> Sentinel:
     return _designs[bundle.hash]
 
 
-class Verdict(Enum):
+class SentinelVerdict(Enum):
     QUIET = 0
     SUSPECT = 1
     HIT = 2
 
 
-class Watch:
+class SentinelDetector:
     """Judges the amplitudes |z| (n,) of sentinel scans."""
 
     def __init__(self, sentinel: Sentinel) -> None:
@@ -87,7 +87,7 @@ class Watch:
         """The scan to come follows none: only the reference stays."""
         self._judged = 0
 
-    def __call__(self, amplitude: Array) -> Verdict:
+    def __call__(self, amplitude: Array) -> SentinelVerdict:
         size = len(self._recent)
         self._recent[self._judged % size] = amplitude / self._reference - 1
         self._judged += 1
@@ -99,9 +99,9 @@ class Watch:
                 if score > self.score:
                     self.score, self.window = score, window
         if self.score > self.hit:
-            return Verdict.HIT
+            return SentinelVerdict.HIT
         self._follow(amplitude)
-        return Verdict.SUSPECT if self.score > self.suspect else Verdict.QUIET
+        return SentinelVerdict.SUSPECT if self.score > self.suspect else SentinelVerdict.QUIET
 
     def _follow(self, amplitude: Array) -> None:
         self._sum += amplitude

@@ -25,14 +25,14 @@ Array = NDArray[np.float64]
 LADDER = 2.0 ** np.arange(9)  # of the mismatch: up to 256 times the least
 
 
-class Verdict(Enum):
+class StartVerdict(Enum):
     UNTOUCHED = "untouched"
     TOUCHED = "touched"
     UNKNOWN = "unknown"  # the mismatch of bundle and skin may hide a touch
 
 
-class Start(NamedTuple):
-    verdict: Verdict
+class StartJudgement(NamedTuple):
+    verdict: StartVerdict
     odds: float  # nats: log evidence of touched against untouched
     mismatch: float  # times the least one: the likeliest, of an untouched skin
     explanation: Explanation | None  # under the likeliest mismatch of a touched skin; drift is relative to `expected`
@@ -47,19 +47,19 @@ def judge_start(
     trusted: Array | None = None,
     drift_prior: Array | None = None,
     tuning: Tuning = TUNING,
-) -> Start:
+) -> StartJudgement:
     """z0, sigma (K,): mean |Z| of the first frames and the standard deviation of that mean, same unit; 0 and infinite
     where not measured. trusted (K,): |Z0| of this skin untouched, in the same unit, known earlier; drift_prior
     (1 + E, 1 + E): covariance of the drift since.
     """
     physics = evidence.physics
     if trusted is None and not physics.signed:
-        return Start(Verdict.UNKNOWN, 0.0, float("inf"), None, None, None)
+        return StartJudgement(StartVerdict.UNKNOWN, 0.0, float("inf"), None, None, None)
     live = np.isfinite(z0) & (z0 > 0) & np.isfinite(sigma)
     if trusted is not None:
         live &= np.isfinite(trusted) & (trusted > 0)
     if live.sum() < len(z0) / 2:
-        return Start(Verdict.UNKNOWN, 0.0, float("inf"), None, None, None)
+        return StartJudgement(StartVerdict.UNKNOWN, 0.0, float("inf"), None, None, None)
     expected = physics.z0 if trusted is None else trusted
     gain = float(np.median(z0[live] / expected[live]))
     # Scale and contacts are what a gain of 1 leaves; a trusted skin's own gain is part of its drift.
@@ -82,12 +82,12 @@ def judge_start(
     untouched, touched = (np.array([getattr(e, name) for e in found]) + log_prior for name in ("untouched", "touched"))
     odds = float(np.logaddexp.reduce(touched) - np.logaddexp.reduce(untouched))
     mismatch = float(rungs[int(untouched.argmax())])
-    verdict = Verdict.UNKNOWN
+    verdict = StartVerdict.UNKNOWN
     if odds > tuning.start_nats:
-        verdict = Verdict.TOUCHED
+        verdict = StartVerdict.TOUCHED
     elif odds < 0 and mismatch <= tuning.mismatch_most:
-        verdict = Verdict.UNTOUCHED
-    return Start(verdict, odds, mismatch, found[int(touched.argmax())], expected, prior)
+        verdict = StartVerdict.UNTOUCHED
+    return StartJudgement(verdict, odds, mismatch, found[int(touched.argmax())], expected, prior)
 
 
 def _rungs(

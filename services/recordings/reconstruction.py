@@ -181,7 +181,7 @@ def _store(out: dict[str, NDArray[Any]], row: int, result: Result) -> None:
     out["valid"][row] = result.contact.valid
     out["count"][row] = len(contacts)
     for place, contact in enumerate(contacts[:MOST_CONTACTS]):
-        out["position"][row, place] = contact.position[:2]
+        out["position"][row, place] = contact.on_sheet
         out["force"][row, place] = np.nan if contact.force_n is None else contact.force_n
         out["force_sigma"][row, place] = np.nan if contact.force_sigma_n is None else contact.force_sigma_n
         out["shape"][row, place] = contact.shape

@@ -45,7 +45,7 @@ class RecordingError(EitskinError, ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class RecordedMessage:
     """One message: `topic` as on the wire without its NUL (``raw/palm``), Unix `log_time_ns`, msgpack map `data`."""
 
     topic: str
@@ -185,7 +185,7 @@ class RecordingReader:
             elif opcode == Opcode.CHUNK:
                 return
 
-    def messages(self, topics: set[str] | None = None, start_s: float = 0.0) -> Iterator[Recorded]:
+    def messages(self, topics: set[str] | None = None, start_s: float = 0.0) -> Iterator[RecordedMessage]:
         """Messages in file order; of those topics only (names without the skin), from `start_s` after the first one.
 
         Raises RecordingError where the file unpacks to more than any recording does.
@@ -221,7 +221,7 @@ class RecordingReader:
                     if topic is None or log_time_ns - first_ns < start_s * 1e9:
                         continue
                     if topics is None or topic.partition("/")[0] in topics:
-                        yield Recorded(topic, log_time_ns, data)
+                        yield RecordedMessage(topic, log_time_ns, data)
 
     def _unpacked(self, chunk: Chunk | None) -> bytes:
         """The records of a chunk; none where it is damaged."""

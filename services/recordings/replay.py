@@ -16,7 +16,7 @@ from typing import Any
 from protocol.errors import EitskinError
 from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, read_map, unpack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
-from services.recordings.recording import STATE_TOPIC, Recorded, RecordingError, RecordingReader, RecordingWriter
+from services.recordings.recording import STATE_TOPIC, RecordedMessage, RecordingError, RecordingReader, RecordingWriter
 from services.runtime.config import SKIN_NAME
 from services.runtime.stage import STAGES, add_reason
 
@@ -82,7 +82,7 @@ def _first_states(reader: RecordingReader) -> dict[str, Step]:
     return found
 
 
-def _step(message: Recorded) -> Step | None:
+def _step(message: RecordedMessage) -> Step | None:
     topic, _, skin = message.topic.partition("/")
     try:
         if topic == STATE_TOPIC:

@@ -22,7 +22,17 @@ from models.bundle import BUNDLES, Bundle, BundleError
 from models.files import read_text
 from services.contacts import calibration_file as calibration
 from services.recordings.recording import RecordingError
-from services.runtime.config import SKIN_NAME, Config, ConfigError, Indenter, Pose, Section, Skin, Skip, Tare, Touch
+from services.runtime.config import (
+    SKIN_NAME,
+    ConfigError,
+    ConfigFile,
+    Indenter,
+    Pose,
+    Skin,
+    TareConfig,
+    TouchConfig,
+)
+from services.runtime.config_sections import Section, Skip
 
 KEY = "settings"
 """The key of a recording's metadata."""
@@ -48,8 +58,8 @@ class RecordedSkin(Section):
     dft_points: Literal[128, 256, 512] = 128
     scan: Literal["full", "adaptive"] = "full"
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0
-    tare: Tare = Tare()
-    touch: Touch = Touch()
+    tare: TareConfig = TareConfig()
+    touch: TouchConfig = TouchConfig()
     calibration: dict[str, Any] | None = None  # the content of its file, which calibration.load checks
 
 
@@ -111,7 +121,7 @@ class Known:
     given: Bundle | None = None
 
     @staticmethod
-    def here(config: Config | None, given: Path | None = None) -> Known:
+    def here(config: ConfigFile | None, given: Path | None = None) -> Known:
         """Raises BundleError where `given` cannot be used."""
         named: Iterable[str] = [skin.bundle for skin in config.skins.values()] if config is not None else ()
         paths: dict[str, Path] = {}

@@ -12,29 +12,34 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from models.files import FileError, read_text
 from protocol.errors import EitskinError
-from protocol.topics import BRIDGES, PRODUCERS
-from protocol.transport import Transport, half
-from services.runtime.stage import PROCESSES
+from protocol.topics import BRIDGES
+from protocol.transport import Transport
+from services.runtime.config_sections import (
+    FoxgloveSection,
+    Logging,
+    RealTime,
+    Ros2Section,
+    Section,
+    Security,
+    Skip,
+    Sockets,
+    Switch,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 BUNDLES, MANIFEST = ROOT / "models" / "bundles", "manifest.json"
 SKIN_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 
-Switch = Annotated[bool, Field(strict=True)]  # true or false; no word, which would be taken for true
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
 class ConfigError(EitskinError):
     """The configuration cannot be used. The text is for the person who must mend the file."""
-
-
-class Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Pose(Section):
@@ -52,7 +57,15 @@ class Pose(Section):
         return q
 
 
-class Tare(Section):
+class Surface(Section):
+    """What the sheet is wrapped round; without it the skin lies flat. See services/contacts/surface.py."""
+
+    kind: Literal["cylinder"]
+    radius_m: Annotated[float, Field(gt=0, le=10)]  # of the sheet on it, not of the limb below its foam
+    axis_degrees: Annotated[float, Field(ge=-360, le=360)] = 90.0  # of the cylinder's axis to the sheet's x
+
+
+class TareConfig(Section):
     """How the untouched baseline is taken and kept."""
 
     frames: Annotated[int, Field(ge=8, le=4096)] = 64
@@ -64,7 +77,7 @@ class Tare(Section):
     contact_per_s: Annotated[float, Field(gt=0, le=1e-1)] = 8e-4  # each electrode's contact impedance
 
 
-class Touch(Section):
+class TouchConfig(Section):
     """The touch decision: see services/estimation/touch_decision.py."""
 
     false_alarms: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
@@ -90,6 +103,8 @@ class Skin(Section):
     bundle: str  # the name of a folder of models/bundles, else a path
     frame_id: str = ""  # default: the skin's name
     pose: Pose = Pose()
+    surface: Surface | None = None  # what the sheet is wrapped round
+    contacts_in: Literal["skin", "parent"] = "skin"  # "parent": contacts come in the frame that `pose` names
     mismatch: str = "none"  # of the stub's sheet: by what it differs from the bundle, a name of models/mismatch.py
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
     indenter: Indenter | None = None
@@ -97,8 +112,8 @@ class Skin(Section):
     dft_points: Literal[128, 256, 512] = 128
     scan: ScanMode = "full"  # a short list while nothing touches: board/adaptive.py
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
-    tare: Tare = Tare()
-    touch: Touch = Touch()
+    tare: TareConfig = TareConfig()
+    touch: TouchConfig = TouchConfig()
 
     @field_validator("port")
     @classmethod
@@ -127,123 +142,7 @@ def _one_board(port: str, other: str) -> bool:
     return port == other or (port.startswith("/") and os.path.realpath(port) == os.path.realpath(other))
 
 
-class Sockets(Section):
-    """Where processes publish and take commands: ipc sockets in the runtime folder, or the addresses given here."""
-
-    addresses: dict[str, str] = {}  # producer, or "<process>.ctl" for its control socket -> tcp://host:port
-
-    @field_validator("addresses")
-    @classmethod
-    def known(cls, addresses: dict[str, str]) -> dict[str, str]:
-        for name, address in addresses.items():
-            if name.removesuffix(".ctl") not in (*PRODUCERS, "recorder"):
-                raise ValueError(f"producers {', '.join(PRODUCERS)}, or one of these with .ctl (found {name!r})")
-            port = address.rpartition(":")[2] if address.startswith("tcp://") else "1"
-            if not re.fullmatch(r"(tcp://\S+:\d{1,5}|ipc://\S+)", address) or not 1 <= int(port) <= 65535:
-                raise ValueError(f"tcp://HOST:PORT or ipc://PATH (found {address!r} for {name})")
-        for (name, address), (other, same) in itertools.combinations(addresses.items(), 2):
-            if _overlap(address, same):
-                raise ValueError(
-                    f"an address of its own for each socket ({name} has {address!r}, {other} has {same!r}: "
-                    "only one of them could listen there)"
-                )
-        return addresses
-
-
-def _overlap(one: str, other: str) -> bool:
-    """Whether two addresses cannot both be listened at."""
-    if not (one.startswith("tcp://") and other.startswith("tcp://")):
-        return one == other
-    (host, _, port), (other_host, _, other_port) = (a.removeprefix("tcp://").rpartition(":") for a in (one, other))
-    host, other_host = (name.replace("localhost", "127.0.0.1") for name in (host, other_host))
-    every = {"*", "0.0.0.0", "[::]"}
-    return int(port) == int(other_port) and (host == other_host or bool(every & {host, other_host}))
-
-
-class Security(Section):
-    """CURVE keys for tcp addresses (`skin keys new`). Unencrypted connections beyond this host are refused unless
-    `insecure` says so.
-    """
-
-    secret_key: Path | None = None  # our own key pair
-    server_keys: dict[str, Path] = {}  # producer -> its public key
-    clients: Path | None = None  # folder with the public keys that may connect
-    operators: Path | None = None  # folder with those that may also give commands that change something
-    insecure: Annotated[bool, Field(strict=True)] = False
-
-    @field_validator("server_keys")
-    @classmethod
-    def known(cls, keys: dict[str, Path]) -> dict[str, Path]:
-        for name in keys:
-            if name not in (*PRODUCERS, "recorder"):
-                raise ValueError(f"producers {', '.join(PRODUCERS)} or recorder (found {name!r})")
-        return keys
-
-    @model_validator(mode="after")
-    def whole(self) -> Security:
-        if missing := half(self.transport({}, Path())):
-            raise ValueError(missing)
-        return self
-
-    def transport(self, addresses: dict[str, str], folder: Path) -> Transport:
-        """For `protocol.transport.configure`; relative paths are relative to `folder`."""
-        return Transport(
-            addresses=addresses,
-            secret_key=folder / self.secret_key if self.secret_key else None,
-            server_keys={name: folder / key for name, key in self.server_keys.items()},
-            clients=folder / self.clients if self.clients else None,
-            operators=folder / self.operators if self.operators else None,
-            insecure=self.insecure,
-        )
-
-
-class Logging(Section):
-    level: Literal["debug", "info", "warning", "error"] = "info"
-
-
-class RealTime(Section):
-    """What each process asks of the kernel: services/runtime/realtime.py. What is refused is said in `status`."""
-
-    priority: Annotated[int, Field(ge=0, le=99, strict=True)] = 0  # of SCHED_FIFO; 0: the ordinary scheduler
-    lock_memory: Switch = False  # mlockall: no page of it is ever swapped out
-    cpus: dict[str, list[Annotated[int, Field(ge=0)]]] = {}  # process -> processors it may run on
-
-    @field_validator("cpus")
-    @classmethod
-    def known(cls, cpus: dict[str, list[int]]) -> dict[str, list[int]]:
-        for name, numbers in cpus.items():
-            if name not in PROCESSES:
-                raise ValueError(f"processes {', '.join(PROCESSES)} (found {name!r})")
-            if not numbers:
-                raise ValueError(f"at least one processor, counted from 0 (found none for {name})")
-        return cpus
-
-
-class Skip(Section):
-    """Switches of the skip rules that are not one skin's own (those are `touch` and `scan`). All on, but to measure."""
-
-    batch: Switch = True  # skins whose frames wait at once share a run of the network
-    unwanted: Switch = True  # what nobody subscribes to (force, shape) is not made
-
-
-class Ros2Section(Section):
-    """Topics for ROS 2: bridges/ros2, docs/ros.md."""
-
-    domain: Annotated[int, Field(ge=0, le=232, strict=True)] | None = None  # default: $ROS_DOMAIN_ID, else 0
-    interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:@-]{0,64}$")] = ""  # the only one; "lo": this host
-    commands: Switch = False  # the service `tare`: anybody in the ROS domain may call it
-    replay: Switch = False  # replayed frames are published too
-
-
-class FoxgloveSection(Section):
-    """The live server for Foxglove: bridges/foxglove."""
-
-    host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65535, strict=True)] = 8765
-    replay: Switch = False  # replayed frames are shown too
-
-
-class Config(Section):
+class ConfigFile(Section):
     """The whole file. `path` is where it was read from; relative paths in it are relative to its folder."""
 
     skins: Annotated[dict[str, Skin], Field(min_length=1)]
@@ -309,7 +208,7 @@ def config_path(path: str | Path | None = None) -> Path:
     return Path(path or os.environ.get("EITSKIN_CONFIG") or ROOT / "skin.toml")
 
 
-def load(path: str | Path | None = None) -> Config:
+def load(path: str | Path | None = None) -> ConfigFile:
     """Read and check the configuration. Raises ConfigError, one line for each thing that is wrong."""
     file = config_path(path)
     try:
@@ -321,10 +220,10 @@ def load(path: str | Path | None = None) -> Config:
     return parse(raw, file)
 
 
-def parse(raw: dict[str, Any], file: Path = Path("skin.toml")) -> Config:
+def parse(raw: dict[str, Any], file: Path = Path("skin.toml")) -> ConfigFile:
     """Check a configuration that is already a dict; `file` is named in errors."""
     try:
-        config = Config.model_validate(raw | {"path": file})
+        config = ConfigFile.model_validate(raw | {"path": file})
         return config.model_copy(update={"skins": {n: config._resolved(s) for n, s in config.skins.items()}})
     except ValidationError as wrong:
         raise ConfigError("\n".join(_explain(file, e) for e in wrong.errors())) from None
@@ -351,11 +250,11 @@ def _shown(value: Any) -> str:
 
 def _allowed(location: tuple[int | str, ...]) -> list[str]:
     """Keys that the section at `location` knows."""
-    model: Any = Config
+    model: Any = ConfigFile
     for part in location:
-        if model is Config and part == "skins":
+        if model is ConfigFile and part == "skins":
             continue
-        if location[0] == "skins" and part == location[1] and model is Config:
+        if location[0] == "skins" and part == location[1] and model is ConfigFile:
             model = Skin
             continue
         model = _section(model.model_fields[str(part)].annotation)

@@ -18,7 +18,7 @@ import msgpack
 import numpy as np
 
 from models.files import check
-from protocol.fields import Mismatch, decode_array, encode_array
+from protocol.fields import FieldError, decode_array, encode_array
 from protocol.frames import MAX_MESSAGE, read_map
 from protocol.runtime import runtime_dir
 
@@ -120,7 +120,7 @@ def arrays(value: Any) -> Any:
         if value.keys() == {"dtype", "shape", "data"}:
             try:
                 return decode_array(value)
-            except Mismatch as wrong:
+            except FieldError as wrong:
                 raise ValueError(f"found {wrong.found}, expected {wrong.expected}") from None
         return {key: arrays(inner) for key, inner in value.items()}
     return [arrays(inner) for inner in value] if isinstance(value, list) else value

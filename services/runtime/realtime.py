@@ -10,7 +10,7 @@ import ctypes
 import os
 import resource
 
-from services.runtime.config import RealTime
+from services.runtime.config_sections import RealTime
 
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4  # linux/mman.h
 CAP_IPC_LOCK = 14  # linux/capability.h

@@ -26,7 +26,7 @@ from supervisor.states import ProcessStates
 from supervisor.supervisord import Supervisor
 
 from protocol.runtime import CONFIG_LINK, lock, runtime_dir
-from services.runtime.config import BUNDLES, MANIFEST, ROOT, Config
+from services.runtime.config import BUNDLES, MANIFEST, ROOT, ConfigFile
 from services.runtime.stage import PROCESSES
 
 POLL_S = 0.05
@@ -46,7 +46,7 @@ class Program:
     environment: dict[str, str] = field(default_factory=dict)
 
 
-def programs(config: Config) -> list[Program]:
+def programs(config: ConfigFile) -> list[Program]:
     """What a configuration needs: the stages, its bridges, and the stub where a skin's port is "stub"."""
     found = [Program(name, f"services.{name}") for name in PROCESSES]
     found += [Program(name, "services.bridge", (name,)) for name in config.bridges]
@@ -55,7 +55,7 @@ def programs(config: Config) -> list[Program]:
     return found
 
 
-def stub_arguments(config: Config) -> tuple[str, ...]:
+def stub_arguments(config: ConfigFile) -> tuple[str, ...]:
     """What `python -m firmware_stub` is told: a board for each skin whose port is "stub", with that skin's bundle and
     by what its sheet differs from it.
     """
@@ -71,7 +71,7 @@ def _folder(bundle: str) -> Path:
     return Path(bundle).resolve() if (Path(bundle) / MANIFEST).is_file() else BUNDLES / bundle
 
 
-def up(config: Config, extra: Sequence[Program] = (), wanted: Sequence[Program] | None = None) -> int:
+def up(config: ConfigFile, extra: Sequence[Program] = (), wanted: Sequence[Program] | None = None) -> int:
     """Run the service in the foreground until SIGINT or SIGTERM; returns the exit status.
 
     Raises protocol.runtime.AlreadyRunning where another `skin up` holds the runtime folder.
@@ -153,7 +153,7 @@ class _Stage(Subprocess):  # type: ignore[misc]
         super()._spawn_as_child(filename, argv)
 
 
-def _settings(runtime: Path, config: Config, running: Sequence[Program]) -> str:
+def _settings(runtime: Path, config: ConfigFile, running: Sequence[Program]) -> str:
     """supervisord's configuration file."""
     environment = {
         "EITSKIN_RUNTIME": str(runtime),

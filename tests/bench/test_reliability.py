@@ -26,21 +26,23 @@ from bench.reliability import (
     starts,
     workers,
 )
-from bench.reliability.drifted import CHANGES, Answer
-from bench.reliability.matrix import CONTACT_RISES, ROWS, SITUATIONS, Score
-from bench.reliability.random_scene import Press, RandomScene, random_scene
-from bench.reliability.session import Contact, Moment
+from bench.reliability.drifted import CHANGES, TouchEstimate
+from bench.reliability.matrix import CONTACT_RISES, ROWS, SITUATIONS, FaultScore
+from bench.reliability.random_scene import RandomScene, TimedPress, random_scene
+from bench.reliability.session import Moment, PointForce
 from firmware_stub.faults import FAULTS, Faults
 from firmware_stub.timeline import Timeline
 from firmware_stub.world import World
 from models.bundle import Bundle
 
 PLACE = scenes.circle(0.012, -0.02, 3.0, 0.2)
-HERE, NEAR, AWAY = Contact(0.0, 0.0, 3.0), Contact(0.004, 0.0, 2.9), Contact(0.0, 0.03, 1.0)
+HERE, NEAR, AWAY = PointForce(0.0, 0.0, 3.0), PointForce(0.004, 0.0, 2.9), PointForce(0.0, 0.03, 1.0)
 DT = 0.0436
 
 
-def said(k: int, contacts: Sequence[Contact] = (), truth: Sequence[Contact] = (), valid: bool = True, *reasons: str):
+def said(
+    k: int, contacts: Sequence[PointForce] = (), truth: Sequence[PointForce] = (), valid: bool = True, *reasons: str
+):
     return Moment(k * DT, k * DT - 0.03, valid, reasons, (0,) * 16, tuple(contacts), tuple(truth), tuple(truth))
 
 
@@ -106,7 +108,7 @@ def test_a_case_counts_what_is_wrong_unseen_named_and_how_soon_it_is_well():
     assert matrix.judged(row_of("gain"), during(), said=False).nameable == 0
 
 
-def scene_of(*presses: Press) -> RandomScene:
+def scene_of(*presses: TimedPress) -> RandomScene:
     return RandomScene(scenes.script(), presses, ((5.2, "hang"),))
 
 
@@ -129,7 +131,7 @@ def test_random_frames_count_phantoms_places_and_touches_that_are_not_seen():
 
 
 def test_availability_counts_valid_frames_touches_and_changing():
-    press = Press(10.0, 12.0, False)
+    press = TimedPress(10.0, 12.0, False)
     frames = []
     for k in range(150, 350):
         touched = press.begin <= k * DT - 0.03 < press.end
@@ -160,7 +162,7 @@ def test_an_answer_counts_only_where_it_is_valid_and_near():
     touch = scenes.circle(0.0, 0.0, 2.0, 0.2)
     found = drifted.answer_of(touch, True, [(0.001, 0.0, 2.2), (0.03, 0.0, 1.0)])
     assert found.found and found.extra == 1 and found.error == pytest.approx(0.1)
-    assert drifted.answer_of(touch, False, [(0.001, 0.0, 2.2)]) == Answer(
+    assert drifted.answer_of(touch, False, [(0.001, 0.0, 2.2)]) == TouchEstimate(
         2.0, pytest.approx(0.2), False, False, -1.0, 0
     )
     roughly = drifted.answer_of(touch, True, [(0.01, 0.0, 2.0)])
@@ -174,7 +176,9 @@ def test_an_answer_counts_only_where_it_is_valid_and_near():
 
 
 def test_gates_are_of_the_quick_form_and_break_it():
-    rows = {"untouched": gain_steps.Score(steps=2, frames=10, valid=10, false=1, again_s=[0.1], ended_s=[0.1]).row()}
+    rows = {
+        "untouched": gain_steps.GainStepScore(steps=2, frames=10, valid=10, false=1, again_s=[0.1], ended_s=[0.1]).row()
+    }
     full, quick = (drift_report.goals({"gains": rows}, quick=q) for q in (False, True))
     assert all(goal.gate is None for goal in full) and [g.met for g in full][:2] == [False, True]
     assert drift_report.GATES["gains untouched false"] == 0
@@ -184,21 +188,23 @@ def test_gates_are_of_the_quick_form_and_break_it():
 
 
 def test_every_gate_is_a_goals():
-    score = Score(cases=1, frames=1, again_s=[0.1])
+    score = FaultScore(cases=1, frames=1, again_s=[0.1])
     cells = {(row.title, situation): score for row in ROWS for situation in SITUATIONS}
     found = {
         "matrix": faults_report.matrix_rows(cells),
-        "availability": {state: availability.Score(frames=1, touches=1).row() for state in availability.STATES},
-        "soak": soak.Tally(frames=1).row(),
+        "availability": {
+            state: availability.AvailabilityScore(frames=1, touches=1).row() for state in availability.STATES
+        },
+        "soak": soak.SoakTally(frames=1).row(),
     }
     keyed = [*faults_report._of_matrix(found), *faults_report._of_availability(found["availability"])]
     assert set(faults_report.GATES) <= {key for key, _ in [*keyed, *faults_report._of_soak(found["soak"])]}
     assert len(faults_report.goals(found, True)) == 4 + 2 + 2 * 3 + 4
     faults_report.show(found)
-    answer = drifted.row([Answer(1.0, 0.2, True, True, 0.1, 0)], 0, 5.0) | {"known_force_%": 1.0}
+    answer = drifted.row([TouchEstimate(1.0, 0.2, True, True, 0.1, 0)], 0, 5.0) | {"known_force_%": 1.0}
     of_drift = {
-        "starts": {state: starts.Score(starts=1).row() for state in starts.STATES},
-        "gains": {situation: gain_steps.Score(steps=1).row() for situation in gain_steps.SITUATIONS},
+        "starts": {state: starts.StartScore(starts=1).row() for state in starts.STATES},
+        "gains": {situation: gain_steps.GainStepScore(steps=1).row() for situation in gain_steps.SITUATIONS},
         "rows": {change.name: answer for change in CHANGES},
         "history": {change.name: answer for change in CHANGES},
     }
@@ -209,7 +215,7 @@ def test_every_gate_is_a_goals():
 
 
 def test_what_was_not_found_at_all_misses_its_target():
-    answers = [Answer(1.0, 0.2, False, False, -1.0, 0)]
+    answers = [TouchEstimate(1.0, 0.2, False, False, -1.0, 0)]
     rows = {change.name: drifted.row(answers, 0, 5.0) | {"known_force_%": 100.0} for change in CHANGES}
     goals = {goal.figure: goal for goal in drift_report.goals({"rows": rows}, quick=False)}
     assert goals["force error, rms, all radii, times the floor"].met is False

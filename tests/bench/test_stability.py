@@ -17,7 +17,7 @@ from bench.stability.run import (
     NEWTONS_PER_DROP,
     TOUCHES,
     Answer,
-    Runner,
+    InProcessStages,
     Scene,
     Setting,
     judged,
@@ -47,12 +47,12 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def runner(setting: Setting) -> Runner:
-    return Runner(setting.bundle)
+def runner(setting: Setting) -> InProcessStages:
+    return InProcessStages(setting.bundle)
 
 
 @pytest.fixture
-def baseline(runner: Runner, scene: Scene) -> Baseline:
+def baseline(runner: InProcessStages, scene: Scene) -> Baseline:
     return runner.tare(scene.z0, RELATIVE, np.random.default_rng(0))
 
 
@@ -63,7 +63,7 @@ def distance_mm(answer: Answer, other: Array) -> float:
 
 
 @pytest.mark.parametrize("exponent", [-9, 9])
-def test_the_unit_of_the_measurements_divides_out(runner: Runner, scene: Scene, exponent: int) -> None:
+def test_the_unit_of_the_measurements_divides_out(runner: InProcessStages, scene: Scene, exponent: int) -> None:
     factor, noise = 10.0**exponent, np.random.default_rng(1)
     z = noisy(scene.z, RELATIVE, noise)
     answers = []
@@ -77,7 +77,9 @@ def test_the_unit_of_the_measurements_divides_out(runner: Runner, scene: Scene, 
 
 
 @pytest.mark.parametrize("name", [*garbage.NOT_NUMBERS, *garbage.ODD_NUMBERS])
-def test_what_is_no_measurement_is_left_out(runner: Runner, scene: Scene, baseline: Baseline, name: str) -> None:
+def test_what_is_no_measurement_is_left_out(
+    runner: InProcessStages, scene: Scene, baseline: Baseline, name: str
+) -> None:
     """In 1, 10 or 40 of 120 channels the touch is still where it is; in all of them nothing is valid."""
     value = (garbage.NOT_NUMBERS | garbage.ODD_NUMBERS)[name]
     rng = np.random.default_rng(2)
@@ -95,7 +97,7 @@ def test_what_is_no_measurement_is_left_out(runner: Runner, scene: Scene, baseli
 
 @pytest.mark.parametrize("family", garbage.FAMILIES)
 def test_frames_that_no_skin_made_are_never_valid(
-    runner: Runner, scene: Scene, baseline: Baseline, family: str
+    runner: InProcessStages, scene: Scene, baseline: Baseline, family: str
 ) -> None:
     rng = np.random.default_rng(4)
     for _ in range(20):
@@ -103,7 +105,7 @@ def test_frames_that_no_skin_made_are_never_valid(
         assert not answer.broken and not answer.valid, answer
 
 
-def test_a_stream_of_garbage_leaves_nothing_behind(runner: Runner, scene: Scene, baseline: Baseline) -> None:
+def test_a_stream_of_garbage_leaves_nothing_behind(runner: InProcessStages, scene: Scene, baseline: Baseline) -> None:
     rng = np.random.default_rng(5)
     runner.begin(baseline)
     for _ in range(6):
@@ -119,7 +121,7 @@ def test_a_stream_of_garbage_leaves_nothing_behind(runner: Runner, scene: Scene,
 
 @pytest.mark.parametrize("lost", [1, 59, 61, 119, 120])
 def test_a_saved_baseline_of_too_few_measurements_is_refused(
-    runner: Runner, scene: Scene, baseline: Baseline, lost: int
+    runner: InProcessStages, scene: Scene, baseline: Baseline, lost: int
 ) -> None:
     saved = baseline.to_dict()
     saved["z0"] = np.where(np.arange(120) < lost, 0.0, baseline.z0)
@@ -133,7 +135,7 @@ def test_a_saved_baseline_of_too_few_measurements_is_refused(
 
 @pytest.mark.parametrize("dead", [1, 2, 3, 8, 15])
 def test_dead_electrodes_cost_accuracy_or_validity_never_truth(
-    setting: Setting, runner: Runner, scene: Scene, baseline: Baseline, dead: int
+    setting: Setting, runner: InProcessStages, scene: Scene, baseline: Baseline, dead: int
 ) -> None:
     pattern, rng = np.asarray(setting.bundle.pattern), np.random.default_rng(dead)
     for _ in range(4):
@@ -145,7 +147,7 @@ def test_dead_electrodes_cost_accuracy_or_validity_never_truth(
         assert answer.valid == (dead <= 2)
 
 
-def test_no_jump_within_noise(runner: Runner, scene: Scene, baseline: Baseline) -> None:
+def test_no_jump_within_noise(runner: InProcessStages, scene: Scene, baseline: Baseline) -> None:
     """At the board's noise, and on the whole way from one noisy frame to the next."""
     rng = np.random.default_rng(6)
     a, b = noisy(scene.z, RELATIVE, rng, 2)
@@ -218,7 +220,9 @@ def test_errors_are_those_of_valid_frames_with_a_contact() -> None:
     assert row["position_%"] == pytest.approx(1) and row["force_%"] == pytest.approx(20) and row["missed"] == 1
 
 
-def test_a_stage_that_lets_infinity_out_is_found(runner: Runner, scene: Scene, baseline: Baseline, monkeypatch) -> None:
+def test_a_stage_that_lets_infinity_out_is_found(
+    runner: InProcessStages, scene: Scene, baseline: Baseline, monkeypatch
+) -> None:
     network = runner.pipeline.inference._network
     real = network.run
 

@@ -9,8 +9,8 @@ import pytest
 from bench.tracking import __main__ as tracking
 from bench.tracking import faults, report
 from bench.tracking.scene import TOUCHES, Recorded, _drifting, simulate
-from bench.tracking.scores import GRACE, LIGHT_N, Scorer, Seen, all_of
-from firmware_stub.timeline import Curve, Script
+from bench.tracking.scores import GRACE, LIGHT_N, Scorer, StageOutput, all_of
+from firmware_stub.timeline import PiecewiseLinear, Script
 from protocol.frames import ELECTRODE_STATES
 from services.runtime.config import Skin
 
@@ -48,7 +48,7 @@ def crossing():
 def perfect(recorded):
     """Contacts as they truly are; ids are 100 + track."""
     return [
-        Seen(True, (), (0,) * 16, tuple((100 + int(t["track"]), t["x"], t["y"], t["force"], 0.1) for t in truth))
+        StageOutput(True, (), (0,) * 16, tuple((100 + int(t["track"]), t["x"], t["y"], t["force"], 0.1) for t in truth))
         for truth in (recorded.truth(k) for k in range(len(recorded)))
     ]
 
@@ -145,7 +145,7 @@ def states(**electrodes):
 def test_faults_are_named_when_state_and_electrodes_are_right():
     on = {"electrodes_swapped": {"electrodes": [2, 13]}}
     recorded = recorded_of([], faults=[on if 20 <= k < 40 else {} for k in range(N)])
-    well = Seen(True, (), states())
+    well = StageOutput(True, (), states())
     wrong = replace(well, electrodes=states(open=[2]), valid=False)
     right = replace(well, electrodes=states(swapped=[2, 13]))
     seen = [well] * 20 + [well] + [wrong] + [right] * 18 + [right] * 3 + [well] * 17
@@ -162,7 +162,7 @@ def test_a_fault_that_nobody_names_misses_the_target():
     on = {"electrode_open": {"electrode": 5, "second": -1}}
     recorded = recorded_of([], faults=[on if 20 <= k < 40 else {} for k in range(N)])
     for named, met in ((23, False), (22, True)):
-        seen = [Seen(True, (), states(open=[5]) if named <= k < 40 else states()) for k in range(N)]
+        seen = [StageOutput(True, (), states(open=[5]) if named <= k < 40 else states()) for k in range(N)]
         found = tracking.score(recorded, seen)
         assert report.goals(found)[4].met == met
 
@@ -220,7 +220,10 @@ def test_the_command_prints_tables_and_writes_strict_json(short, monkeypatch, tm
 
 
 def test_a_contact_drifts_from_its_fast_change_until_it_is_what_it_was():
-    ageing, loose = Curve((0.0, 60.0), (1.0, 1.2)), Curve((10.0, 12.0, 20.0, 21.0), (1.0, 1.5, 1.5, 1.0))
+    ageing, loose = (
+        PiecewiseLinear((0.0, 60.0), (1.0, 1.2)),
+        PiecewiseLinear((10.0, 12.0, 20.0, 21.0), (1.0, 1.5, 1.5, 1.0)),
+    )
     script = Script("drift", contact=((3, ageing), (9, loose)))
     times = [k / 20 for k in range(20 * 30)]
     on = [t for t, fault in zip(times, _drifting(script, times), strict=True) if fault]

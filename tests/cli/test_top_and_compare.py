@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from protocol.frames import Contact, ContactFrame, InfoFrame, RawFrame, StatusFrame, Touch, TruthFrame
+from protocol.frames import Contact, ContactFrame, InfoFrame, RawFrame, StatusFrame, TrueTouch, TruthFrame
 from protocol.runtime import host_id
 from services.cli.heatmap import LETTERS, coarse, draw, inside
 from services.cli.monitor import Monitor, percentile
@@ -110,7 +110,7 @@ def test_inside_an_l() -> None:
 
 
 def test_each_true_touch_meets_the_nearest_contact() -> None:
-    touches = [Touch(shape="circle", x=x, y=0.0, radius_m=0.01, drop=0.3, force_n=3.0) for x in (0.03, -0.03)]
+    touches = [TrueTouch(shape="circle", x=x, y=0.0, radius_m=0.01, drop=0.3, force_n=3.0) for x in (0.03, -0.03)]
     found = [Contact(id=1, position=[-0.029, 0.0, 0.0], force_n=2.9), Contact(id=2, state="end", position=[0.03, 0, 0])]
     rows = pairs(TruthFrame(skin="palm", touches=touches), ContactFrame(skin="palm", contacts=found))
     assert rows[0]["found"] is None and rows[1]["found"]["id"] == 1  # the contact that ended is none

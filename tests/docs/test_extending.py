@@ -21,7 +21,7 @@ COPIED = ("protocol", "models", "services", "firmware_stub", "bench", "pyproject
 ADDED = """
 import numpy as np
 from bench.reliability.matrix import ROWS
-from firmware_stub.analog import Noise
+from firmware_stub.analog import BoardNoise
 from firmware_stub.faults import FAULTS
 from firmware_stub.rig import Rig
 from models import patterns

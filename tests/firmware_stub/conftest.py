@@ -51,8 +51,8 @@ class Host:
         assert isinstance(self.ask(link.Config(config, points, 80e3, scan)), link.Ack)
         assert isinstance(self.ask(link.Start(config)), link.Ack)
 
-    def frames(self, seconds: float) -> list[link.Frame]:
-        return [m for m in self.wait(seconds) if isinstance(m, link.Frame)]
+    def frames(self, seconds: float) -> list[link.ScanFrame]:
+        return [m for m in self.wait(seconds) if isinstance(m, link.ScanFrame)]
 
     def z(self, seconds: float = 0.2) -> np.ndarray:
         """(n, K) |Z| of the frames of the next seconds."""

@@ -213,7 +213,7 @@ def test_interpolation_between_key_poses_stays_below_the_noise(host):
 def test_simulated_time_runs_ahead_in_any_steps_and_a_still_scene_is_solved_once(host):
     board = host()
     board.start()
-    frames = [m for m in board.wait(30.0, step=0.5) if isinstance(m, link.Frame)]
+    frames = [m for m in board.wait(30.0, step=0.5) if isinstance(m, link.ScanFrame)]
     assert len(frames) / 30.0 == pytest.approx(22.9, rel=0.02)
     assert frames[-1].seq - frames[0].seq == len(frames) - 1
     assert board.rig.field.solves == 1

@@ -272,7 +272,7 @@ def test_unplug_forgets_the_configuration_and_starts_the_clock_anew(running):
     board, _ = running
     board.wait(2.0)
     board.rig.fault("unplug", {}, board.now, 0.5)
-    assert [m for m in board.wait(0.45) if isinstance(m, link.Frame)] == []
+    assert [m for m in board.wait(0.45) if isinstance(m, link.ScanFrame)] == []
     assert board.rig.unplugged is not None
     board.wait(0.2)
     assert board.rig.unplugged is None

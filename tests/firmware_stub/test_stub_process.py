@@ -87,10 +87,10 @@ def test_frames_and_truth_over_the_pty(stub, folder):
     stub.open(folder / "board-palm").start()
     truth = NewestReader("truth", "palm")
     client = ControlClient("stub", 20.0)
-    healthy = np.abs(stub.until(link.Frame).z)
+    healthy = np.abs(stub.until(link.ScanFrame).z)
     assert client.call("press", x=0.02, y=-0.01, force=3, seconds=5)["drop"] == pytest.approx(0.3)
     # what is on the line or under way does not feel it; all later scans do
-    frames = [stub.until(link.Frame) for _ in range(5)]
+    frames = [stub.until(link.ScanFrame) for _ in range(5)]
     assert np.abs(np.abs(frames[-1].z) / healthy - 1).max() > 3e-3
     true = truth.recv(10.0)
     assert [(t.shape, t.x, t.y, t.force_n) for t in true.touches] == [("circle", 0.02, -0.01, pytest.approx(3.0))]
@@ -138,7 +138,7 @@ def test_unplugged_and_back_under_another_name(stub, folder):
     stub.serial.write(link.encode(link.Start(1)))
     assert stub.until(link.Nak).reason == link.NakReason.NOT_CONFIGURED
     stub.start()
-    assert len(stub.until(link.Frame).z) == 120
+    assert len(stub.until(link.ScanFrame).z) == 120
     ControlClient("stub", 20.0).call(
         "faults", name="unplug", seconds=0.1
     )  # and back to its own name, for the other tests
@@ -152,11 +152,11 @@ def test_unplugged_and_back_under_another_name(stub, folder):
 def test_a_late_reader_finds_fresh_frames(stub, folder):
     """Nobody read for a second: the kernel must not hand that second to the next reader."""
     stub.open(folder / "board-palm").start()
-    first = stub.until(link.Frame)
+    first = stub.until(link.ScanFrame)
     time.sleep(1.2)
     stub.serial.close()
     stub.open(folder / "board-palm")
-    frame = stub.until(link.Frame)
+    frame = stub.until(link.ScanFrame)
     assert (frame.device_us - first.device_us) * 1e-6 > 0.7
 
 
@@ -164,10 +164,10 @@ def test_over_tcp_with_scripted_scene_and_interrupt(other_folder):
     stub = Process(other_folder, "--listen", "socket://127.0.0.1:0", "--scene", "two")
     assert stub.url.startswith("socket://127.0.0.1:")
     stub.open().start()
-    assert len(stub.until(link.Frame).z) == 120
+    assert len(stub.until(link.ScanFrame).z) == 120
     stub.serial.close()
     stub.open()  # a second client takes over
-    assert len(stub.until(link.Frame).z) == 120
+    assert len(stub.until(link.ScanFrame).z) == 120
     assert stub.stop(signal.SIGINT) == 0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models import limits
-from models.fisher import STEPS, Noise, SizePrior, floors, information, mean_floor, sensitivity
+from models.fisher import STEPS, MeasurementNoise, SizePrior, floors, information, mean_floor, sensitivity
 from models.forward import shared
 from models.patterns import pattern
 from models.prereconstruction import Drift
@@ -35,7 +35,7 @@ def test_slopes_predict_signals_of_another_mesh():
 
 def test_estimates_from_noisy_frames_reach_the_floor():
     """Gauss-Newton on noisy frames, weighted by the noise, errs by what Cramer-Rao says."""
-    noise, rng = Noise(60.0), np.random.default_rng(4)
+    noise, rng = MeasurementNoise(60.0), np.random.default_rng(4)
     model = shared("square16", "inverse")
     rows = pattern("adjacent")
     z0, slope, _ = sensitivity("square16", TOUCH).relative(rows)
@@ -56,7 +56,7 @@ def test_estimates_from_noisy_frames_reach_the_floor():
 
 def test_drift_is_marginalised_not_projected():
     """Against the whole information matrix of touch and drift, inverted."""
-    seen, noise, drift = sensitivity("square16", TOUCH), Noise(70.0), Drift(0.01, 0.05)
+    seen, noise, drift = sensitivity("square16", TOUCH), MeasurementNoise(70.0), Drift(0.01, 0.05)
     rows = pattern("pairs")
     z0, slope, nuisance = seen.relative(rows)
     j = np.hstack([slope, nuisance]) / (noise.sigma(z0) / np.abs(z0))[:, None]
@@ -77,11 +77,11 @@ def test_facts_known_of_this_skin():
 
 
 def test_patterns_rank_by_the_noise():
-    fixed = dict(limits.rank_patterns(limits.Case(noise=Noise(np.inf, 1e-4)), per_side=4))
+    fixed = dict(limits.rank_patterns(limits.Case(noise=MeasurementNoise(np.inf, 1e-4)), per_side=4))
     assert list(fixed) == ["pairs", "opposite", "adjacent"]
     assert 1.4 < fixed["opposite"].position / fixed["pairs"].position < 3
     assert 4 < fixed["adjacent"].position / fixed["pairs"].position < 12
-    relative = [name for name, _ in limits.rank_patterns(limits.Case(noise=Noise(70.0)), per_side=4)]
+    relative = [name for name, _ in limits.rank_patterns(limits.Case(noise=MeasurementNoise(70.0)), per_side=4)]
     assert relative == ["adjacent", "opposite", "pairs"]
 
 

@@ -15,14 +15,14 @@ from models.augmentation import random_condition, symmetries  # noqa: E402
 from models.bundle import Bundle  # noqa: E402
 from models.forward import ForwardModel  # noqa: E402
 from models.losses import losses, total  # noqa: E402
-from models.network import Config, compose  # noqa: E402
+from models.network import NetworkConfig, compose  # noqa: E402
 from models.published import PublishedMMCNN  # noqa: E402
 from models.scenes import random_scene  # noqa: E402
 from models.shapes import Shape, to_rows  # noqa: E402
 from models.train import Trainer  # noqa: E402
 
 REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "eidors_reference.npz"
-TINY = Config(channels=(8, 8, 8), blocks=(1, 1, 1))
+TINY = NetworkConfig(channels=(8, 8, 8), blocks=(1, 1, 1))
 
 
 @pytest.fixture(scope="module")

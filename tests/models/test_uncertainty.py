@@ -6,7 +6,7 @@ import pytest
 from models import uncertainty
 from models.forward import shared
 from models.shapes import Shape
-from models.uncertainty import Map, Seen, features, fit, known_drop, maps
+from models.uncertainty import ImageFeatures, Map, features, fit, known_drop, maps
 
 
 def presses(n, seed):
@@ -15,7 +15,7 @@ def presses(n, seed):
     drop, area, noise = rng.uniform(0.1, 0.5, n), np.exp(rng.uniform(-4, -0.5, n)), 10 ** rng.uniform(-5, -3, n)
     spread = 0.05 * (noise / 1e-4) ** 0.4 * (area / 0.1) ** -0.5
     peak = drop * np.exp(spread * rng.standard_normal(n) + 0.1)
-    seen = Seen(peak, 0.2 * peak, drop * area, area, rng.uniform(0.1, 1, n), noise)
+    seen = ImageFeatures(peak, 0.2 * peak, drop * area, area, rng.uniform(0.1, 1, n), noise)
     return features("peak", seen), peak, drop, area, noise
 
 
@@ -46,7 +46,7 @@ def test_discs_of_the_same_strength_look_the_same_to_the_electrodes():
 
     small, strong = 0.10, 0.6
     known = np.pi * 0.15**2
-    flat = Seen(*(np.array([v]) for v in (strong, 0.0, strong * np.pi * small**2, np.pi * small**2, 0.5, 0.0)))
+    flat = ImageFeatures(*(np.array([v]) for v in (strong, 0.0, strong * np.pi * small**2, np.pi * small**2, 0.5, 0.0)))
     drop = float(known_drop(flat, known)[0])
     reference = seen(small, strong)
     same = np.linalg.norm(seen(0.15, drop) - reference) / np.linalg.norm(reference)

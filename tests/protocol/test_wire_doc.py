@@ -32,7 +32,7 @@ def test_wire_md_names_every_topic_key_and_message():
         for field in dataclasses.fields(topic.frame):
             assert f"| `{field.name}` |" in text
     for message in link.MESSAGES:
-        assert f"{message.number:#04x} {message.__name__}" in text
+        assert f"{message.number:#04x} {message.wire_name}" in text
     for reason in frames.REASONS:
         assert f"`{reason}`" in text
 

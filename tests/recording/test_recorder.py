@@ -21,7 +21,7 @@ from protocol.sockets import ControlClient, ControlServer, Publisher
 from services.recorder import Recorder
 from services.recordings import patient_file
 from services.recordings.patient_file import PatientFile
-from services.recordings.recording import Recorded, RecordingError, RecordingReader, RecordingWriter
+from services.recordings.recording import RecordedMessage, RecordingError, RecordingReader, RecordingWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -115,7 +115,7 @@ def start(tmp_path: Path, publisher: Publisher) -> subprocess.Popen[bytes]:
     return process
 
 
-def recorded(tmp_path: Path) -> list[Recorded]:
+def recorded(tmp_path: Path) -> list[RecordedMessage]:
     (file,) = tmp_path.glob("*.mcap")
     return list(RecordingReader(file).messages({"contact"}))
 

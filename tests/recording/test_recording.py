@@ -18,7 +18,7 @@ from mcap.stream_reader import lz4, zstandard
 from services.recordings.recording import (
     FLUSH_S,
     MAX_RECORD,
-    Recorded,
+    RecordedMessage,
     RecordingError,
     RecordingReader,
     RecordingWriter,
@@ -27,16 +27,18 @@ from services.recordings.recording import (
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def messages(n: int) -> list[Recorded]:
+def messages(n: int) -> list[RecordedMessage]:
     """Two topics, incompressible bodies of uneven length."""
     rng = random.Random(7)
     return [
-        Recorded(("raw/palm", "contact/palm")[k % 2], 10**18 + k * 20_000_000, rng.randbytes(rng.randint(1, 900)))
+        RecordedMessage(
+            ("raw/palm", "contact/palm")[k % 2], 10**18 + k * 20_000_000, rng.randbytes(rng.randint(1, 900))
+        )
         for k in range(n)
     ]
 
 
-def write(path: Path, sent: list[Recorded], per_chunk: int = 5) -> None:
+def write(path: Path, sent: list[RecordedMessage], per_chunk: int = 5) -> None:
     with RecordingWriter(path, {"version": "1"}) as writer:
         for k, message in enumerate(sent):
             writer.write(message.topic, message.data, message.log_time_ns)

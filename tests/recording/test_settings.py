@@ -23,13 +23,13 @@ from services.recordings import settings
 from services.recordings.recording import RecordingError, RecordingReader, RecordingWriter
 from services.recordings.replay import ReplayError
 from services.recordings.replay_session import _configuration, replay_file
-from services.runtime.config import ROOT, Config, load, parse
+from services.runtime.config import ROOT, ConfigFile, load, parse
 
 HERE = Path("recording.mcap")
 
 
 @pytest.fixture
-def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
+def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ConfigFile:
     """A configuration with everything that a recording must not carry, and everything that it must."""
     bundle = Bundle.load("square16")
     raw = {
@@ -72,7 +72,7 @@ def carried(tmp_path: Path, text: str) -> RecordingReader:
     return RecordingReader(path)
 
 
-def test_the_stages_get_what_they_had_and_no_more(config: Config, tmp_path: Path) -> None:
+def test_the_stages_get_what_they_had_and_no_more(config: ConfigFile, tmp_path: Path) -> None:
     text = _metadata(["raw"], None)[settings.KEY]
     assert not [word for word in ("SECRET", "tcp://", "47999", "insecure", str(ROOT), "/dev") if word in text]
     reader = carried(tmp_path, text)

@@ -63,7 +63,7 @@ class FakeBoard:
             device_us = max(0, self._scanned[1] + ahead * DURATION_US)
         self._scanned = (self.seq, device_us)
         n = len(self.config.scan)
-        frame = link.Frame(
+        frame = link.ScanFrame(
             seq=self.seq,
             device_us=device_us,
             duration_us=DURATION_US,

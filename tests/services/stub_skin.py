@@ -7,13 +7,14 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_stub.analog import Analog, Noise
+from firmware_stub.analog import Analog, BoardNoise
 from firmware_stub.faults import Faults
 from firmware_stub.sheet import Sheet
 from models.bundle import Bundle
 from models.shapes import Shape
 from protocol.frames import RawFrame
 from services.pipeline import Pipeline, Result
+from services.runtime.config import Skin
 
 TRANSFER = NDArray[np.float64]
 
@@ -35,11 +36,11 @@ def transfer(shapes: tuple[Shape, ...] = (), contacts: tuple[tuple[int, float], 
 class StubSkin:
     """Multiplexers, converter and firmware's arithmetic of the stub, then the stages of square16."""
 
-    def __init__(self, snr_db: float, tare: bool = True) -> None:
+    def __init__(self, snr_db: float, tare: bool = True, skin: Skin | str = "square16") -> None:
         bundle = Bundle.load("square16")
         self.pattern, self.faults, self.scan = np.asarray(bundle.pattern), Faults(), 0
-        self.analog = Analog(Noise.of_db(snr_db), self.faults, np.random.default_rng(3))
-        self.pipeline = Pipeline("square16", name="palm")
+        self.analog = Analog(BoardNoise.of_db(snr_db), self.faults, np.random.default_rng(3))
+        self.pipeline = Pipeline(skin, name="palm")
         if tare:
             result = self.rest(72)
             assert result.contact.valid and not result.delta.touched

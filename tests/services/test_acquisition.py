@@ -19,9 +19,10 @@ from models.patterns import pattern
 from protocol import link
 from protocol.frames import STATUS_OPEN, RawFrame, pack
 from services.acquisition import SourceFeed, open_source
-from services.board.boardlink import ANSWER_S, DEAD_SCANS, REFUSED_AGAIN_S, SILENT_S, BoardLink, Scanning
+from services.board.boardlink import ANSWER_S, DEAD_SCANS, REFUSED_AGAIN_S, SILENT_S, BoardLink
 from services.board.clock import DeviceClock
 from services.board.port import PortError, explain
+from services.board.scanning import Scanning
 from services.board.source import Source
 from services.recordings.file_source import FileSource, RecordingSource
 from services.recordings.recording import RecordingWriter
@@ -227,7 +228,7 @@ intact = st.one_of(
         firmware=texts,
     ),
     st.builds(
-        lambda seq, us, duration, config, n, value: link.Frame(
+        lambda seq, us, duration, config, n, value: link.ScanFrame(
             seq, us, duration, config, np.full(n, value, np.complex64), np.full(n, seq & 15, np.uint8)
         ),
         u32, u64, u32, u16 | st.just(SCANNING.config), measured, st.floats(width=32),

@@ -7,17 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.speed.sentinel_host import CHAIN_S, Host
+from bench.speed.sentinel_host import CHAIN_S, AdaptiveHost
 from protocol import link
 from protocol.frames import DeltaFrame
 from services.board.adaptive import DEAF_S, FULL_EVERY_S, AdaptiveScan
-from services.board.boardlink import SWITCH_S, BoardLink, Scanning
+from services.board.boardlink import SWITCH_S, BoardLink
+from services.board.scanning import Scanning
 from tests.services.fake_board import FakeBoard
 
 REST_S = 6.6  # from power-up to an idling board
 
 
-def touching(host: Host, since: float) -> list[tuple[float, bool]]:
+def touching(host: AdaptiveHost, since: float) -> list[tuple[float, bool]]:
     """(seconds since, coarse?) of each valid frame with a contact that goes on."""
     return [
         (t - since, "coarse" in frame.reasons)
@@ -27,11 +28,11 @@ def touching(host: Host, since: float) -> list[tuple[float, bool]]:
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[Host, Host]:
-    return Host("adaptive", seed=2), Host("full", seed=2)
+def pair() -> tuple[AdaptiveHost, AdaptiveHost]:
+    return AdaptiveHost("adaptive", seed=2), AdaptiveHost("full", seed=2)
 
 
-def test_a_touch_is_told_three_times_sooner_and_in_full_no_later(pair: tuple[Host, Host]) -> None:
+def test_a_touch_is_told_three_times_sooner_and_in_full_no_later(pair: tuple[AdaptiveHost, AdaptiveHost]) -> None:
     first: dict[str, list[float]] = {"adaptive": [], "full": []}
     whole: dict[str, list[float]] = {"adaptive": [], "full": []}
     for host in pair:
@@ -60,7 +61,7 @@ def test_a_touch_is_told_three_times_sooner_and_in_full_no_later(pair: tuple[Hos
     assert np.mean(whole["adaptive"]) < np.mean(whole["full"])
 
 
-def test_contacts_keep_their_rate_while_the_board_idles(pair: tuple[Host, Host]) -> None:
+def test_contacts_keep_their_rate_while_the_board_idles(pair: tuple[AdaptiveHost, AdaptiveHost]) -> None:
     host, _ = pair
     host.until(max(host.now, REST_S) + 0.5)
     assert host.adaptive is not None and host.adaptive.idle
@@ -75,7 +76,7 @@ def test_contacts_keep_their_rate_while_the_board_idles(pair: tuple[Host, Host])
 
 
 def test_without_verdicts_every_scan_is_full() -> None:
-    host = Host("adaptive", seed=3)
+    host = AdaptiveHost("adaptive", seed=3)
     host.until(REST_S)
     assert host.adaptive is not None and host.adaptive.idle
     host.deaf = True
@@ -87,7 +88,7 @@ def test_without_verdicts_every_scan_is_full() -> None:
 
 
 def test_an_electrode_in_doubt_ends_the_idling_and_makes_no_contact() -> None:
-    host = Host("adaptive", seed=4)
+    host = AdaptiveHost("adaptive", seed=4)
     host.until(REST_S)
     since = host.now
     host.rig.fault("electrode_open", {"electrode": 5}, host.now, seconds=100)
@@ -97,7 +98,7 @@ def test_an_electrode_in_doubt_ends_the_idling_and_makes_no_contact() -> None:
 
 
 def test_gross_changes_make_no_coarse_contact() -> None:
-    host = Host("adaptive", seed=5)
+    host = AdaptiveHost("adaptive", seed=5)
     host.until(REST_S)
     since = host.now
     host.rig.fault("electrodes_swapped", {"electrodes": [2, 9]}, host.now, seconds=100)
@@ -105,15 +106,15 @@ def test_gross_changes_make_no_coarse_contact() -> None:
     assert not [t for t, coarse in touching(host, since) if coarse]
 
 
-def scan(config: int, n: int, seq: int) -> link.Frame:
-    return link.Frame(seq, seq * 4000, 4000, config, np.full(n, 2 + 0j, np.complex64), np.zeros(n, np.uint8))
+def scan(config: int, n: int, seq: int) -> link.ScanFrame:
+    return link.ScanFrame(seq, seq * 4000, 4000, config, np.full(n, 2 + 0j, np.complex64), np.zeros(n, np.uint8))
 
 
 def verdict(**values: object) -> DeltaFrame:
     return DeltaFrame(skin="palm", valid=True, **values)  # type: ignore[arg-type]
 
 
-def test_only_sound_quiet_full_frames_let_the_board_rest(pair: tuple[Host, Host]) -> None:
+def test_only_sound_quiet_full_frames_let_the_board_rest(pair: tuple[AdaptiveHost, AdaptiveHost]) -> None:
     sentinel = pair[0].pipeline.pre.sentinel_scans._coarse.sentinel  # type: ignore[union-attr]
     rng = np.random.default_rng(0)
     for spoiler in (verdict(touched=True), DeltaFrame(skin="palm"), verdict(electrodes=np.eye(1, 16, dtype="u1")[0])):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from bench.stability.delayed_line import DelayedLine, Seen, listen
+from bench.stability.delayed_line import DelayedLine, ReceivedFrame, listen
 from models.bundle import Bundle
 from protocol import link
 from protocol.frames import RawFrame
@@ -110,8 +110,8 @@ def test_answers_count_once_and_only_for_questions_that_were_asked() -> None:
     assert questions.asked_s(link.Time(ask.nonce, 5)) is None
 
 
-def scan(seq: int, device_us: int, duration_us: int = 44_000, config: int = 1) -> link.Frame:
-    return link.Frame(seq % 2**32, device_us, duration_us, config, np.ones(2, np.complex64), np.zeros(2, np.uint8))
+def scan(seq: int, device_us: int, duration_us: int = 44_000, config: int = 1) -> link.ScanFrame:
+    return link.ScanFrame(seq % 2**32, device_us, duration_us, config, np.ones(2, np.complex64), np.zeros(2, np.uint8))
 
 
 def test_number_and_time_of_a_scan_go_together() -> None:
@@ -137,9 +137,9 @@ def test_number_and_time_of_a_scan_go_together() -> None:
     assert order.consistent(scan(102, 10_300_000, 2_000, 2)) and order.consistent(scan(102, 14_400_000, 2_000, 2))
 
 
-def scans_of(values: np.ndarray) -> list[link.Frame]:
+def scans_of(values: np.ndarray) -> list[link.ScanFrame]:
     zeros = np.zeros(values.shape[1], np.uint8)
-    return [link.Frame(n, n * 44_000, 44_000, 1, z.astype(np.complex64), zeros) for n, z in enumerate(values)]
+    return [link.ScanFrame(n, n * 44_000, 44_000, 1, z.astype(np.complex64), zeros) for n, z in enumerate(values)]
 
 
 def test_frozen_scans_are_found_where_noise_is_known() -> None:
@@ -170,12 +170,12 @@ def test_a_board_without_noise_repeats_itself_by_right(kind: str) -> None:
     assert len(values) > PROOF + FROZEN
 
 
-def run(line: DelayedLine, seconds: float) -> tuple[list[Seen], list[str], dict[str, int]]:
+def run(line: DelayedLine, seconds: float) -> tuple[list[ReceivedFrame], list[str], dict[str, int]]:
     seen, source = listen(line, seconds)
     return seen, source.health().messages, dict(source.counts)
 
 
-def after(seen: list[Seen], seconds: float) -> list[Seen]:
+def after(seen: list[ReceivedFrame], seconds: float) -> list[ReceivedFrame]:
     return [s for s in seen if s.at_s > seconds]
 
 

@@ -14,7 +14,7 @@ from models.prereconstruction import Drift
 from models.shapes import Shape
 from services.estimation.evidence import TouchEvidence
 from services.estimation.physics import SkinPhysics
-from services.estimation.start import Verdict, judge_start
+from services.estimation.start import StartVerdict, judge_start
 from services.estimation.tuning import TUNING
 
 Array = NDArray[np.float64]
@@ -133,7 +133,7 @@ def test_a_dead_electrode_leaves_the_rest(evidence: TouchEvidence, solved: Calla
 # the start
 
 
-def start(evidence: TouchEvidence, z: Array, rng: np.random.Generator, trusted: Array | None = None) -> Verdict:
+def start(evidence: TouchEvidence, z: Array, rng: np.random.Generator, trusted: Array | None = None) -> StartVerdict:
     return judge_start(noisy(z, rng, FRAMES), z * NOISE / np.sqrt(FRAMES), evidence, trusted).verdict
 
 
@@ -149,14 +149,14 @@ def test_a_press_at_the_start_is_told(
     for x, y in ((0.0, 0.0), (-0.6, 0.6), (0.4, -0.2)):
         contact, background = 1 + 0.3 * rng.uniform(-1, 1, 16), 1 + 0.05 * rng.uniform(-1, 1)
         z = solved(Shape("circle", x, y, radius, drop), background=background, contact=contact)
-        assert start(evidence, 1.7 * z, rng) is Verdict.TOUCHED
+        assert start(evidence, 1.7 * z, rng) is StartVerdict.TOUCHED
 
 
 def test_an_untouched_skin_of_any_contacts_is_untouched(evidence: TouchEvidence, solved: Callable[..., Array]) -> None:
     rng = np.random.default_rng(3)
     for _ in range(12):
         contact, background = 1 + 0.3 * rng.uniform(-1, 1, 16), 1 + 0.05 * rng.uniform(-1, 1)
-        assert start(evidence, solved(background=background, contact=contact), rng) is Verdict.UNTOUCHED
+        assert start(evidence, solved(background=background, contact=contact), rng) is StartVerdict.UNTOUCHED
 
 
 def test_a_skin_far_from_its_bundle_is_not_said_to_be_untouched(
@@ -165,8 +165,8 @@ def test_a_skin_far_from_its_bundle_is_not_said_to_be_untouched(
     """Every |Z| off by 1 % in its own way: a touch could hide there."""
     rng = np.random.default_rng(4)
     odd = 1 + 0.01 * rng.standard_normal(120)
-    assert start(evidence, solved() * odd, rng) is not Verdict.UNTOUCHED
-    assert start(evidence, solved(Shape("circle", 0, 0, 0.1, 0.1)) * odd, rng) is not Verdict.UNTOUCHED
+    assert start(evidence, solved() * odd, rng) is not StartVerdict.UNTOUCHED
+    assert start(evidence, solved(Shape("circle", 0, 0, 0.1, 0.1)) * odd, rng) is not StartVerdict.UNTOUCHED
 
 
 def test_a_trusted_baseline_tells_where_the_bundle_cannot(
@@ -176,13 +176,13 @@ def test_a_trusted_baseline_tells_where_the_bundle_cannot(
     odd = 1 + 0.01 * rng.standard_normal(120)
     trusted = noisy(solved() * odd, rng, FRAMES)
     free = solved(background=1.02, contact=1.05) * odd
-    assert start(evidence, free, rng, trusted=trusted) is Verdict.UNTOUCHED
+    assert start(evidence, free, rng, trusted=trusted) is StartVerdict.UNTOUCHED
     pressed = solved(Shape("circle", 0.2, 0.1, 0.1, 0.1), background=1.02, contact=1.05) * odd
-    assert start(evidence, pressed, rng, trusted=trusted) is Verdict.TOUCHED
+    assert start(evidence, pressed, rng, trusted=trusted) is StartVerdict.TOUCHED
 
 
 def test_a_measured_bundle_has_no_prediction_to_start_from() -> None:
     bundle = Bundle.load("disc16")
     evidence = TouchEvidence(SkinPhysics.of(bundle.matrices))
     z = np.asarray(bundle.z0, dtype=float)
-    assert judge_start(z, 1e-4 * z, evidence).verdict is Verdict.UNKNOWN
+    assert judge_start(z, 1e-4 * z, evidence).verdict is StartVerdict.UNKNOWN

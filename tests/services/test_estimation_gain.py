@@ -70,3 +70,42 @@ def test_a_gross_gain_that_lasts_is_valid_again_within_two_seconds() -> None:
     assert not seen[0].valid
     assert not any(c.valid and c.contacts for c in seen)
     assert all(c.valid and not c.contacts for c in seen[44:])
+
+
+def sliding(skin: StubSkin, step: int) -> tuple[Shape, ...]:
+    """About 0.3 mm from frame to frame."""
+    return (Shape("circle", 0.1 + 0.0055 * step, -0.26, 0.28, 0.45),)
+
+
+@pytest.mark.parametrize("gain", [-0.04, -0.002, 0.002, 0.014, 0.05])
+def test_a_gain_step_under_a_touch_that_moves_is_taken_over_and_said(gain: float) -> None:
+    skin = StubSkin(80.0)
+    for step in range(80):
+        if step == 20:
+            skin.faults.inject("gain", {"factor": 1 + gain}, 0.0, 1e9)
+        if step == 55:
+            skin.faults.clear("gain")
+        contact = skin.feel(sliding(skin, step)).contact
+        assert ("gain" in contact.reasons) == (step in (20, 55)), (step, contact.reasons)
+        if step > 4:
+            assert contact.valid and len(contact.contacts) == 1, (step, contact.reasons)
+
+
+def test_a_touch_that_moves_changes_no_gain() -> None:
+    skin = StubSkin(80.0)
+    for speed in (0.002, 0.01, 0.04):
+        for step in range(30):
+            skin.feel((Shape("circle", -0.5 + speed * step, 0.3, 0.2, 0.3),))
+        skin.rest(20)
+    assert skin.pipeline.pre.health().counters["gain_steps"] == 0
+
+
+def test_a_gross_gain_that_was_taken_over_ends_at_once_and_names_no_electrode() -> None:
+    skin = StubSkin(80.0)
+    skin.faults.inject("gain", {"factor": 2.4}, 0.0, 1e9)
+    seen = [skin.rest(1) for _ in range(40)]
+    assert "gain" in seen[0].contact.reasons and not seen[0].contact.valid and seen[-1].contact.valid
+    skin.faults.clear("gain")
+    seen += [skin.rest(1) for _ in range(40)]
+    assert all(r.contact.valid and not r.contact.contacts for r in seen[40:])
+    assert not any(r.delta.electrodes.any() for r in seen)

@@ -12,7 +12,7 @@ pytest.importorskip("skfem")
 
 from models import geometry  # noqa: E402
 from models.bundle import Bundle  # noqa: E402
-from models.calibrate import Presses, solve  # noqa: E402
+from models.calibrate import SolvedPresses, solve  # noqa: E402
 from models.forward import shared  # noqa: E402
 from models.shapes import Shape  # noqa: E402
 from protocol.frames import Contact, RawFrame  # noqa: E402
@@ -26,7 +26,7 @@ FRAME_NS = 45_000_000
 
 
 @pytest.fixture(scope="module")
-def presses() -> Presses:
+def presses() -> SolvedPresses:
     return solve(geometry.load("square16"), 150, seed=99)
 
 
@@ -66,7 +66,7 @@ def configured(**more: object) -> Skin:
     return Skin.model_validate({"port": "stub", "bundle": "square16", "frame_id": "palm", **more})
 
 
-def scored(skinny: Skinny, presses: Presses, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def scored(skinny: Skinny, presses: SolvedPresses, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """(error / sigma, relative error) of the presses that are seen."""
     z, errors = [], []
     for shape, d in zip(presses.touches(), presses.difference, strict=True):
@@ -80,14 +80,14 @@ def scored(skinny: Skinny, presses: Presses, frames: int = 1) -> tuple[np.ndarra
     return np.array(z), np.array(errors)
 
 
-def test_two_thirds_of_presses_fall_within_one_sigma(presses: Presses, bundle: Bundle) -> None:
+def test_two_thirds_of_presses_fall_within_one_sigma(presses: SolvedPresses, bundle: Bundle) -> None:
     z = np.concatenate([scored(Skinny(configured(), bundle, presses.z0, db), presses)[0] for db in (62.0, 75.0, 120.0)])
     assert len(z) > 400 and 0.61 < (np.abs(z) < 1).mean() < 0.76
     assert (np.abs(z) < 3).mean() > 0.9  # heavier tails than a normal distribution: soft presses among hard ones
 
 
-def test_held_presses_are_no_worse_than_they_say(presses: Presses, bundle: Bundle) -> None:
-    some = Presses(presses.shapes[:60], presses.difference[:60], presses.z0)
+def test_held_presses_are_no_worse_than_they_say(presses: SolvedPresses, bundle: Bundle) -> None:
+    some = SolvedPresses(presses.shapes[:60], presses.difference[:60], presses.z0)
     z, _ = scored(Skinny(configured(), bundle, presses.z0, 66.0, hold=True), some, frames=8)
     assert 0.5 < (np.abs(z) < 1).mean() < 0.9
 
@@ -98,7 +98,7 @@ def test_a_known_indenter_takes_the_trade_off_away(bundle: Bundle) -> None:
     rng = np.random.default_rng(3)
     shapes = [Shape("circle", *rng.uniform(-0.75, 0.75, 2), 0.2, rng.uniform(0.1, 0.5)) for _ in range(30)]
     d = np.array([np.abs(model.solve(model.touched([s])).impedances()) / z0 - 1 for s in shapes])
-    presses = Presses(np.array([s.as_row() for s in shapes]), d, z0)
+    presses = SolvedPresses(np.array([s.as_row() for s in shapes]), d, z0)
     prior = configured(indenter={"radius_m": 0.01})
     z, known = scored(Skinny(prior, bundle, z0, 70.0), presses)
     _, unknown = scored(Skinny(configured(), bundle, z0, 70.0), presses)

@@ -11,7 +11,7 @@ import pytest
 
 from models.bundle import Bundle
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA, DeltaFrame, RawFrame, pack, unpack
-from services.board.boardlink import Scanning
+from services.board.scanning import Scanning
 from services.describe import EVERY_S, MOVED
 from services.estimation import checks
 from services.estimation.sentinel import sentinel_of

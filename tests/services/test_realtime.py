@@ -13,7 +13,7 @@ from services.runtime.stage import Health
 SKINS = {"palm": {"port": "stub", "bundle": "square16"}}
 ASK = """
 import json, os, resource, sys
-from services.runtime.config import RealTime
+from services.runtime.config_sections import RealTime
 from services.runtime.realtime import apply
 drop, wanted = json.loads(sys.argv[1])
 if drop:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from services.contacts.merging import MERGED_S
-from services.contacts.motion import Seen, Track
+from services.contacts.motion import Patch, Track
 from services.contacts.tracking import FORGOTTEN_S, LOST_FRAMES, Tracker
 
 FRAME_NS = 45_000_000
@@ -17,11 +17,11 @@ RADIUS = 0.009  # m, of the touches in here
 SIZE = 1e-4  # integrated drop of one
 
 
-def touch(x: float, y: float = 0.0, size: float = SIZE) -> Seen:
-    return Seen(x, y, size, RADIUS)
+def touch(x: float, y: float = 0.0, size: float = SIZE) -> Patch:
+    return Patch(x, y, size, RADIUS)
 
 
-def image_of(places: list[tuple[float, float]], sizes: list[float]) -> list[Seen]:
+def image_of(places: list[tuple[float, float]], sizes: list[float]) -> list[Patch]:
     """What a segmentation sees of two discs: one patch while they overlap by more than half."""
     (ax, ay), (bx, by) = places
     apart = math.hypot(ax - bx, ay - by)
@@ -29,10 +29,10 @@ def image_of(places: list[tuple[float, float]], sizes: list[float]) -> list[Seen
         return [touch(*place, size) for place, size in zip(places, sizes, strict=True)]
     total = sum(sizes)
     x, y = ((sizes[0] * a + sizes[1] * b) / total for a, b in zip(*places, strict=True))
-    return [Seen(x, y, total, RADIUS + apart / 2)]
+    return [Patch(x, y, total, RADIUS + apart / 2)]
 
 
-def play(tracker: Tracker, frames: list[list[Seen]], start: int = 1) -> tuple[list[list[int]], list[int]]:
+def play(tracker: Tracker, frames: list[list[Patch]], start: int = 1) -> tuple[list[list[int]], list[int]]:
     """Ids of each frame's confirmed entries, and of what ended, in order."""
     ids, ended = [], []
     for n, seen in enumerate(frames, start):
@@ -82,14 +82,14 @@ def test_sizes_tell_two_touches_apart_that_turn_back() -> None:
 
 
 def test_three_touches_in_one_patch_come_out_with_their_ids() -> None:
-    def at(spread: float) -> list[Seen]:
+    def at(spread: float) -> list[Patch]:
         places = [(spread * math.cos(a), spread * math.sin(a)) for a in (0.0, 2.1, 4.2)]
         if spread > 0.012:
             return [touch(x, y) for x, y in places]
         if spread > 0.008:  # the last two are one patch
             x, y = (places[1][0] + places[2][0]) / 2, (places[1][1] + places[2][1]) / 2
-            return [touch(*places[0]), Seen(x, y, 2 * SIZE, RADIUS + spread)]
-        return [Seen(0, 0, 3 * SIZE, RADIUS + spread)]
+            return [touch(*places[0]), Patch(x, y, 2 * SIZE, RADIUS + spread)]
+        return [Patch(0, 0, 3 * SIZE, RADIUS + spread)]
 
     way_in = np.linspace(0.024, 0.004, 20)
     frames = [at(float(s)) for s in way_in]
@@ -105,7 +105,7 @@ def test_three_touches_in_one_patch_come_out_with_their_ids() -> None:
 
 def test_a_touch_inside_another_ones_patch_is_waited_for_only_so_long() -> None:
     tracker = Tracker()
-    together = [Seen(0.0, 0.0, 2 * SIZE, 1.5 * RADIUS)]
+    together = [Patch(0.0, 0.0, 2 * SIZE, 1.5 * RADIUS)]
     play(tracker, [[touch(-0.008), touch(0.008)], [touch(-0.007), touch(0.007)], together])
     ended = []
     for n in range(4, 4 + math.ceil(2 * MERGED_S / 0.045)):
@@ -118,7 +118,7 @@ def test_a_touch_inside_another_ones_patch_is_waited_for_only_so_long() -> None:
 def test_what_is_inside_ends_with_its_patch() -> None:
     tracker = Tracker()
     _, ended = play(
-        tracker, [[touch(-0.007), touch(0.007)]] * 2 + [[Seen(0, 0, 2 * SIZE, 0.015)], *[[]] * (LOST_FRAMES + 1)]
+        tracker, [[touch(-0.007), touch(0.007)]] * 2 + [[Patch(0, 0, 2 * SIZE, 0.015)], *[[]] * (LOST_FRAMES + 1)]
     )
     assert sorted(ended) == [1, 2] and not tracker.tracks
 
@@ -186,7 +186,7 @@ def test_velocity_starts_at_zero_and_finds_that_of_the_slide() -> None:
 def test_a_reset_ends_every_touch_once_and_no_id_comes_back() -> None:
     tracker = Tracker()
     three = [touch(-0.007), touch(0.007), touch(0.03)]
-    play(tracker, [three, three, [Seen(0, 0, 2 * SIZE, 0.015), touch(0.03)]])
+    play(tracker, [three, three, [Patch(0, 0, 2 * SIZE, 0.015), touch(0.03)]])
     tracker.reset()
     tracker.reset()
     tracks, ended = tracker.update([touch(0.03)], 4 * FRAME_NS)
@@ -228,6 +228,6 @@ def test_a_weak_touch_that_drowns_beside_a_strong_one_is_the_same_when_it_comes_
 
 def test_a_patch_that_falls_into_more_parts_than_touches_has_new_ones() -> None:
     tracker = Tracker()
-    play(tracker, [[touch(-0.007), touch(0.007)]] * 2 + [[Seen(0, 0, 2 * SIZE, 0.015)]])
+    play(tracker, [[touch(-0.007), touch(0.007)]] * 2 + [[Patch(0, 0, 2 * SIZE, 0.015)]])
     ids, ended = play(tracker, [[touch(-0.01), touch(0.01), touch(0.0, 0.012)]] * 2, 4)
     assert len(ids[0]) == 2 and set(ids[0]) < {1, 2, 3} == set(ids[1]) and not ended

@@ -19,7 +19,7 @@ from models.bundle import Bundle
 from models.shapes import KINDS, Shape, drop_image
 from models.uncertainty import FLOOR, RELATIVE_FLOOR
 from protocol.frames import SHAPES, ContactFrame, ImageFrame, pack, unpack
-from services.contacts.motion import Seen
+from services.contacts.motion import Patch
 from services.contacts.segmentation import KERNEL, segment
 from services.contacts.tracking import Tracker
 from services.publishing import Publishing
@@ -33,7 +33,7 @@ NOTHING = np.zeros((0, 0), np.float32)
 ALL = frozenset({"contact", "force", "shape"})
 
 places = st.floats(-0.05, 0.05)
-patches = st.builds(Seen, places, places, st.floats(1e-6, 1e-3), st.floats(0.002, 0.02))
+patches = st.builds(Patch, places, places, st.floats(1e-6, 1e-3), st.floats(0.002, 0.02))
 lists = st.lists(patches, max_size=4)
 happenings = st.one_of(lists, lists, st.sampled_from(["still", "reset", "reload", "pause", "same time"]))
 shapes = st.builds(
@@ -112,14 +112,14 @@ def test_every_id_begins_and_ends_once_over_resets_and_states(what: list[Any], d
     assert session.gone == session.begun
 
 
-def generic(one: Seen, k: int) -> Seen:
+def generic(one: Patch, k: int) -> Patch:
     """Moved and grown by next to nothing, so that no two are equal: between equals the order may decide."""
     return one._replace(x=one.x + 1e-5 * math.sin(7 * k), size=one.size * (1 + 0.01 * math.sin(3 * k)))
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(lists, max_size=10), st.randoms(use_true_random=False))
-def test_the_order_of_what_is_seen_does_not_matter(frames: list[list[Seen]], random: Any) -> None:
+def test_the_order_of_what_is_seen_does_not_matter(frames: list[list[Patch]], random: Any) -> None:
     one, other = Tracker(), Tracker()
     names: dict[int, int] = {}
     for n, alike in enumerate(frames, 1):
@@ -137,7 +137,7 @@ def test_the_order_of_what_is_seen_does_not_matter(frames: list[list[Seen]], ran
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(lists, max_size=12), st.lists(lists, max_size=8))
-def test_a_tracker_goes_on_from_its_state_as_itself(before: list[list[Seen]], after: list[list[Seen]]) -> None:
+def test_a_tracker_goes_on_from_its_state_as_itself(before: list[list[Patch]], after: list[list[Patch]]) -> None:
     tracker, other = Tracker(), Tracker()
     for n, seen in enumerate(before, 1):
         tracker.update(seen, n * FRAME_NS)

@@ -1,0 +1,158 @@
+"""Presses at known places, measured on a running service: what `skin register` and `skin calibrate force` read."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import ImageFrame, RawFrame
+from services.calibration.force_fit import CalibrationError
+from services.calibration.force_presses import PATIENCE_S, Reader, Steady
+from services.contacts.force import Look
+
+Array = NDArray[np.float64]
+
+UNTOUCHED = 32  # scans before a press whose mean is its reference
+FEWEST_UNTOUCHED = 8
+PRESSED_S = 1.0  # the last of a steady press: its scans are averaged
+
+
+@dataclass(frozen=True)
+class Collected:
+    """One press: where and how hard it was, as who pressed says, and what was measured."""
+
+    x: float  # m
+    y: float
+    force_n: float | None
+    touched: Array  # (K,) mean |Z|
+    untouched: Array  # (K,) the same just before
+    look: Look  # what its image showed
+
+
+class Collector:
+    """Follows raw and image frames of one skin. Use: `untouched`, then press, then `pressed`, then release."""
+
+    def __init__(self, reader: Reader, clock: Callable[[], float], patience_s: float = PATIENCE_S) -> None:
+        self._reader, self._clock, self._patience_s = reader, clock, patience_s
+        self._raw: dict[int, Array] = {}  # scan -> |Z|, of the scans that no image has been seen of yet
+        self._images: dict[int, ImageFrame] = {}  # the other way round: they come over two sockets
+        self._quiet: deque[Array] = deque(maxlen=UNTOUCHED)
+
+    def untouched(self) -> Array:
+        """(K,) mean |Z| of scans in which nothing touched, all measured from now on. Raises CalibrationError."""
+        self._quiet.clear()
+        while self._reader.recv(0.0) is not None:  # what was measured before
+            pass
+        why = "no frame came: start the service with `skin up`"
+        end = self._clock() + self._patience_s
+        while self._clock() < end:
+            pair = self._pair()
+            if pair is None:
+                continue
+            image, z = pair
+            if image.touched or not image.valid:
+                self._quiet.clear()
+                reasons = f" ({', '.join(image.reasons)})" if image.reasons else ""
+                why = "something touches" if image.touched else f"the frames are not valid{reasons}"
+                continue
+            self._quiet.append(z)
+            if len(self._quiet) >= FEWEST_UNTOUCHED:
+                return np.asarray(np.mean(self._quiet, axis=0))
+            why = "the skin has not been untouched for long enough"
+        raise CalibrationError(f"no untouched scans within {self._patience_s:g} s: {why}")
+
+    def pressed(self) -> tuple[Array, Look]:
+        """(K,) mean |Z| of the next steady press, and what its image shows. Raises CalibrationError."""
+        steady, recent = Steady(), deque[tuple[int, Array]]()
+        end = self._clock() + self._patience_s
+        while self._clock() < end:
+            pair = self._pair()
+            if pair is None:
+                continue
+            image, z = pair
+            now = image.stamps.get("sample", 0)
+            if not image.touched:
+                recent.clear()
+            recent.append((now, z))
+            while now - recent[0][0] > 1e9 * PRESSED_S:
+                recent.popleft()
+            if (look := steady(image)) is not None:
+                return np.asarray(np.mean([row for _, row in recent], axis=0)), look
+        raise CalibrationError(f"no steady press within {self._patience_s:g} s: {steady.trouble}")
+
+    def _pair(self) -> tuple[ImageFrame, Array] | None:
+        """The next image frame and the scan that it comes from."""
+        frame = self._reader.recv(0.5)
+        if isinstance(frame, RawFrame) and frame.kind == "full":
+            _keep(self._raw, frame.scan, np.abs(frame.z).astype(float))
+        elif isinstance(frame, ImageFrame):
+            _keep(self._images, frame.scan, frame)
+        if frame is None or not (frame.scan in self._raw and frame.scan in self._images):
+            return None
+        return self._images.pop(frame.scan), self._raw.pop(frame.scan)
+
+
+def _keep(of: dict[int, Any], scan: int, value: Any) -> None:
+    of[scan] = value
+    while len(of) > 2 * UNTOUCHED:  # the other one never came
+        del of[next(iter(of))]
+
+
+def places(outline: Array, n: int, margin: float, seed: int = 0) -> Array:
+    """(n, 2) places spread over a skin, no nearer to its outline (m, 2) than `margin` [m]: for a stub to be pressed at.
+
+    Of many random places, each next one is the farthest from those chosen before.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    tried = rng.uniform(low, high, (4000, 2))
+    tried = tried[_inside(outline, tried) & (_distance(outline, tried) >= margin)]
+    if not len(tried):
+        raise CalibrationError(f"no place of the skin is {1e3 * margin:g} mm from its outline: press with less radius")
+    chosen = [tried[0]]
+    far = np.hypot(*(tried - chosen[0]).T)
+    for _ in range(n - 1):
+        chosen.append(tried[int(far.argmax())])
+        far = np.minimum(far, np.hypot(*(tried - chosen[-1]).T))
+    return np.array(chosen)
+
+
+def _inside(outline: Array, points: Array) -> NDArray[np.bool_]:
+    x, y = points.T
+    odd = np.zeros(len(points), dtype=bool)
+    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        if y0 != y1:
+            odd ^= ((y0 > y) != (y1 > y)) & (x < (x1 - x0) * (y - y0) / (y1 - y0) + x0)
+    return odd
+
+
+def _distance(outline: Array, points: Array) -> Array:
+    steps = np.roll(outline, -1, axis=0) - outline
+    offset = points[:, None] - outline
+    along = np.clip((offset * steps).sum(axis=2) / np.maximum((steps**2).sum(axis=1), 1e-30), 0, 1)
+    return np.asarray(np.linalg.norm(offset - along[..., None] * steps, axis=2).min(axis=1))
+
+
+def write(path: Path, collected: Sequence[Collected], pattern: NDArray[Any]) -> Path | None:
+    """The npz that `skin register` reads, and beside it, where every press has a force, the CSV that
+    `skin calibrate force --csv FILE.csv --measurements FILE.npz` reads; returns that one. Raises OSError.
+    """
+    np.savez(
+        path,
+        touched=np.array([c.touched for c in collected]),
+        untouched=np.array([c.untouched for c in collected]),
+        xy=np.array([(c.x, c.y) for c in collected]),
+        pattern=np.asarray(pattern),
+    )
+    if any(c.force_n is None for c in collected):
+        return None
+    beside = path.with_suffix(".csv")
+    rows = [f"{c.force_n:g},{k}" for k, c in enumerate(collected)]
+    beside.write_text("force_n,row\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    return beside

@@ -1,0 +1,136 @@
+"""The sections of skin.toml that are not one skin's: sockets, keys, the kernel, skip rules, bridges, logging."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from protocol.topics import PRODUCERS
+from protocol.transport import Transport, half
+from services.runtime.stage import PROCESSES
+
+Switch = Annotated[bool, Field(strict=True)]  # true or false; no word, which would be taken for true
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Sockets(Section):
+    """Where processes publish and take commands: ipc sockets in the runtime folder, or the addresses given here."""
+
+    addresses: dict[str, str] = {}  # producer, or "<process>.ctl" for its control socket -> tcp://host:port
+
+    @field_validator("addresses")
+    @classmethod
+    def known(cls, addresses: dict[str, str]) -> dict[str, str]:
+        for name, address in addresses.items():
+            if name.removesuffix(".ctl") not in (*PRODUCERS, "recorder"):
+                raise ValueError(f"producers {', '.join(PRODUCERS)}, or one of these with .ctl (found {name!r})")
+            port = address.rpartition(":")[2] if address.startswith("tcp://") else "1"
+            if not re.fullmatch(r"(tcp://\S+:\d{1,5}|ipc://\S+)", address) or not 1 <= int(port) <= 65535:
+                raise ValueError(f"tcp://HOST:PORT or ipc://PATH (found {address!r} for {name})")
+        for (name, address), (other, same) in itertools.combinations(addresses.items(), 2):
+            if _overlap(address, same):
+                raise ValueError(
+                    f"an address of its own for each socket ({name} has {address!r}, {other} has {same!r}: "
+                    "only one of them could listen there)"
+                )
+        return addresses
+
+
+def _overlap(one: str, other: str) -> bool:
+    """Whether two addresses cannot both be listened at."""
+    if not (one.startswith("tcp://") and other.startswith("tcp://")):
+        return one == other
+    (host, _, port), (other_host, _, other_port) = (a.removeprefix("tcp://").rpartition(":") for a in (one, other))
+    host, other_host = (name.replace("localhost", "127.0.0.1") for name in (host, other_host))
+    every = {"*", "0.0.0.0", "[::]"}
+    return int(port) == int(other_port) and (host == other_host or bool(every & {host, other_host}))
+
+
+class Security(Section):
+    """CURVE keys for tcp addresses (`skin keys new`). Unencrypted connections beyond this host are refused unless
+    `insecure` says so.
+    """
+
+    secret_key: Path | None = None  # our own key pair
+    server_keys: dict[str, Path] = {}  # producer -> its public key
+    clients: Path | None = None  # folder with the public keys that may connect
+    operators: Path | None = None  # folder with those that may also give commands that change something
+    insecure: Annotated[bool, Field(strict=True)] = False
+
+    @field_validator("server_keys")
+    @classmethod
+    def known(cls, keys: dict[str, Path]) -> dict[str, Path]:
+        for name in keys:
+            if name not in (*PRODUCERS, "recorder"):
+                raise ValueError(f"producers {', '.join(PRODUCERS)} or recorder (found {name!r})")
+        return keys
+
+    @model_validator(mode="after")
+    def whole(self) -> Security:
+        if missing := half(self.transport({}, Path())):
+            raise ValueError(missing)
+        return self
+
+    def transport(self, addresses: dict[str, str], folder: Path) -> Transport:
+        """For `protocol.transport.configure`; relative paths are relative to `folder`."""
+        return Transport(
+            addresses=addresses,
+            secret_key=folder / self.secret_key if self.secret_key else None,
+            server_keys={name: folder / key for name, key in self.server_keys.items()},
+            clients=folder / self.clients if self.clients else None,
+            operators=folder / self.operators if self.operators else None,
+            insecure=self.insecure,
+        )
+
+
+class Logging(Section):
+    level: Literal["debug", "info", "warning", "error"] = "info"
+
+
+class RealTime(Section):
+    """What each process asks of the kernel: services/runtime/realtime.py. What is refused is said in `status`."""
+
+    priority: Annotated[int, Field(ge=0, le=99, strict=True)] = 0  # of SCHED_FIFO; 0: the ordinary scheduler
+    lock_memory: Switch = False  # mlockall: no page of it is ever swapped out
+    cpus: dict[str, list[Annotated[int, Field(ge=0)]]] = {}  # process -> processors it may run on
+
+    @field_validator("cpus")
+    @classmethod
+    def known(cls, cpus: dict[str, list[int]]) -> dict[str, list[int]]:
+        for name, numbers in cpus.items():
+            if name not in PROCESSES:
+                raise ValueError(f"processes {', '.join(PROCESSES)} (found {name!r})")
+            if not numbers:
+                raise ValueError(f"at least one processor, counted from 0 (found none for {name})")
+        return cpus
+
+
+class Skip(Section):
+    """Switches of the skip rules that are not one skin's own (those are `touch` and `scan`). All on, but to measure."""
+
+    batch: Switch = True  # skins whose frames wait at once share a run of the network
+    unwanted: Switch = True  # what nobody subscribes to (force, shape) is not made
+
+
+class Ros2Section(Section):
+    """Topics for ROS 2: bridges/ros2, docs/ros.md."""
+
+    domain: Annotated[int, Field(ge=0, le=232, strict=True)] | None = None  # default: $ROS_DOMAIN_ID, else 0
+    interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:@-]{0,64}$")] = ""  # the only one; "lo": this host
+    commands: Switch = False  # the service `tare`: anybody in the ROS domain may call it
+    replay: Switch = False  # replayed frames are published too
+
+
+class FoxgloveSection(Section):
+    """The live server for Foxglove: bridges/foxglove."""
+
+    host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535, strict=True)] = 8765
+    replay: Switch = False  # replayed frames are shown too
