@@ -18,8 +18,8 @@ export OPENBLAS_NUM_THREADS ?= 1
 up: venv
 	./skin up
 
-venv: $(VENV)/.service $(BRIDGES:%=$(VENV)/.%)
-venv-dev: $(VENV)/.dev
+venv: $(VENV)/.service $(VENV)/.three $(BRIDGES:%=$(VENV)/.%)
+venv-dev: $(VENV)/.dev $(VENV)/.three
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "found Python %s; eitskin needs 3.11 or newer: make PYTHON=python3.11 ..." % sys.version.split()[0])'
@@ -39,13 +39,19 @@ $(VENV)/.dev: requirements/dev.lock requirements/service.lock | $(BIN)/python
 	  "no wheel of $(TORCH) found: install PyTorch's CPU build 2.13.0 into $(VENV) as pytorch.org describes, then run make again"; exit 1; }
 	@touch $@ $(VENV)/.service
 
+# three.js, which draws the skin as a surface on the page; without it the page has the flat map alone.
+$(VENV)/.three: bridges/page/fetch_three.py | $(BIN)/python
+	@$(BIN)/python -m bridges.page.fetch_three
+	@touch $@
+
 # ROS 2 itself, as wheels, in an environment of its own: what tests/bridges/test_ros2_node.py listens with. 270 MB.
-ros-venv: .venv-ros/.done
-.venv-ros/.done:
-	$(PYTHON) -m venv .venv-ros
-	.venv-ros/bin/python -m pip install -q --disable-pip-version-check numpy ros-kilted-rclpy ros-kilted-rmw-fastrtps-cpp \
-	  ros-kilted-geometry-msgs ros-kilted-sensor-msgs ros-kilted-diagnostic-msgs ros-kilted-visualization-msgs \
-	  ros-kilted-std-msgs ros-kilted-std-srvs
+ROS ?= kilted
+ROS_VENV := .venv-ros$(if $(filter-out kilted,$(ROS)),-$(ROS))
+ROS_PACKAGES := rclpy rmw-fastrtps-cpp geometry-msgs sensor-msgs diagnostic-msgs visualization-msgs std-msgs std-srvs
+ros-venv: $(ROS_VENV)/.done
+$(ROS_VENV)/.done:
+	$(PYTHON) -m venv $(ROS_VENV)
+	$(ROS_VENV)/bin/python -m pip install -q --disable-pip-version-check numpy $(ROS_PACKAGES:%=ros-$(ROS)-%)
 	@touch $@
 
 test: venv-dev lint

@@ -1,4 +1,4 @@
-"""What a benchmark is to reach: figures beside their targets, in every report and on the page of all of them."""
+"""The targets of the benchmarks, beside the measured figures, in every report and on the page of all of them."""
 
 from __future__ import annotations
 

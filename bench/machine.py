@@ -1,4 +1,4 @@
-"""What a report says about where it was made."""
+"""The machine and versions that a report was made with."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def machine() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Of Python and of what the service runs on."""
+    """Versions of Python and of the packages that the service runs on."""
     return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
 
 

@@ -1,12 +1,15 @@
-"""Where 400 real presses on a hydrogel skin are found, after 100 others: `python -m bench.real_presses FILE`.
+"""Where real presses on hydrogel skins are found, by others of the same skin: `python -m bench.real_presses FILE`.
 
 FILE is hydrogel_disc16.npz: 500 presses of D. Hardman and colleagues (github.com/DSHardman/HydrogelEIT, superpose500).
-The first 100 fit the frame, the gains and the sensitivities; nothing is chosen by the other 400. Every row but the last
-goes through the runtime stages, each press against the untouched frame just before it.
+The first 100 register the skin; nothing is chosen by the other 400. Every row of the first table but the last goes
+through the runtime stages, each press against the untouched frame just before it.
 
 A line below the table says how many of the 400 the live path finds as one valid contact, and how many of those within
 0.5 mm of what `skin reconstruct` says: the whole file's frames as a replay or a port gives them, one after the other.
 Exit status 1 where those are fewer than 396.
+
+The second table has that file and hydrogel_vse_concentric.npz beside it (2500 presses of a skin that is uneven on
+purpose, differences only), registered on few and on many presses, over several random splits; --quick makes one split.
 """
 
 from __future__ import annotations
@@ -24,8 +27,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.press_splits import CASES, CONCENTRIC, print_splits, splits
 from models.bundle import Bundle, BundleError
-from services.calibration.registration import Presses, Similarity, part, read_presses, register
+from services.calibration.locating import build
+from services.calibration.presses import Presses, part, read_presses
+from services.calibration.registration import Similarity, register
+from services.calibration.response import fit
 from services.calibration.sensitivity import write_corrected
 from services.pipeline import Pipeline
 from services.recordings.file_source import FILE_RATE_HZ, file_frame
@@ -101,8 +108,8 @@ def _rbf(a: Array, b: Array) -> Array:
 
 
 def live_path(bundle: Bundle, arrays: dict[str, NDArray[Any]]) -> dict[str, int]:
-    """Of the presses that took no part in the registration: how many the live path finds, and how many of those where
-    the offline path does.
+    """Count, among presses that took no part in the registration, those that the live path finds, and those of them
+    that it finds where the offline path does.
     """
     skin, data = Skin(port="stub", bundle=str(bundle.path), frame_id="skin"), read_scans(arrays, bundle)
     offline = reconstruct(data, skin, bundle)
@@ -129,23 +136,28 @@ def run(file: Path, skin: str) -> tuple[list[dict[str, Any]], dict[str, int]]:
     bundle = Bundle.load(skin)
     first, others = slice(0, TRAINING), slice(TRAINING, None)
     train, test = (read_presses(part(arrays, rows), bundle) for rows in (first, others))
-    touched, untouched = arrays["touched"], arrays["untouched"]
+    touched, untouched, xy = arrays["touched"], arrays["untouched"], arrays["xy"]  # in the file's order, as frames are
     rows = []
     linear = dataclasses.replace(bundle, manifest={**bundle.manifest, "files": {"matrices.npz": ""}})
     found, seen, seconds = positions(linear, touched, untouched)
-    fit = similarity_of(found[first], train.xy)
+    fitted = similarity_of(found[first], xy[first])
     rows.append(
-        summary("uniform disc, one step; similarity", errors(found[others], fit, test.xy), seen[others], seconds)
+        summary("uniform disc, one step; similarity", errors(found[others], fitted, xy[others]), seen[others], seconds)
     )
-    similarity, _ = register(train, bundle)
+    similarity = register(train, bundle).similarity
     true_size = dataclasses.replace(similarity, scale=1.0)
-    for name, share in (("+ a gain per measurement", 0.0), ("+ smooth corrections (skin register)", None)):
+    locator, response, _ = build(train, similarity, bundle)
+    gains = fit(train, similarity, bundle, field=False)
+    for name, map_, shipped in (
+        ("+ a gain per measurement", gains, None),
+        ("+ the measured response map", response, None),
+        ("+ its likelihood (skin register)", response, locator),
+    ):
         with tempfile.TemporaryDirectory() as folder:
-            options = {} if share is None else {"field_share": share}
-            own = write_corrected(Path(folder) / "own", train, similarity, bundle, {}, **options)
+            own = write_corrected(Path(folder) / "own", train, map_, shipped, {})
             found, seen, seconds = positions(own, touched[others], untouched[others])
-            live = live_path(own, arrays) if share is None else {}
-        rows.append(summary(name, errors(found, true_size, test.xy), seen, seconds))
+            live = live_path(own, arrays) if shipped is not None else {}
+        rows.append(summary(name, errors(found, true_size, xy[others]), seen, seconds))
     began = time.perf_counter()
     guess = kernel_ridge(train, test)
     seconds = (time.perf_counter() - began) / len(test)
@@ -157,6 +169,8 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="bench.real_presses", description=__doc__.splitlines()[0])
     parser.add_argument("file", type=Path, nargs="?", help="hydrogel_disc16.npz; default: in $EITSKIN_REFERENCE")
     parser.add_argument("--skin", default="disc16", help="bundle of the uniform disc")
+    parser.add_argument("--splits", type=int, default=3, help="random splits of each row of the second table")
+    parser.add_argument("--quick", action="store_true", help="one split, and at most 300 presses")
     parser.add_argument("--out", type=Path, help="write the rows as JSON")
     args = parser.parse_args(argv)
     file = args.file or Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "hydrogel_disc16.npz"
@@ -179,9 +193,12 @@ def main(argv: list[str] | None = None) -> int:
         "live path: {found} of {presses} found as one valid contact (offline {offline} are touched and valid), "
         "{agree} within 0.5 mm of offline".format(**live)
     )
+    files = {name: file if name != CONCENTRIC else file.parent / f"{CONCENTRIC}.npz" for name, _, _ in CASES}
+    crossed = splits(files, args.skin, 1 if args.quick else args.splits, 300 if args.quick else None)
+    print_splits(crossed)
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        report = {"presses": 400, "registered_on": TRAINING, "rows": rows, "live_path": live}
+        report = {"presses": 400, "registered_on": TRAINING, "rows": rows, "live_path": live, "splits": crossed}
         args.out.write_text(json.dumps(report, indent=2) + "\n")
     return 0 if live["agree"] >= FEWEST_AGREE else 1
 

@@ -50,6 +50,8 @@ class ContactFeed:
         self._heard = 0.0
         self.skipped = 0
         """Frames overtaken by newer ones before we took them."""
+        self.late = 0
+        """Frames that could no longer be acted on when they came."""
 
     def want(self, wanted: bool) -> None:
         """Subscribe, or no longer."""
@@ -70,7 +72,8 @@ class ContactFeed:
         """The frame that has come since the last call, or why it is not handed on; None where none has come."""
         if self._newest is None:
             return None
-        if self._newest.reader.socket.poll(0):
+        came = bool(self._newest.reader.socket.poll(0))
+        if came:
             self._newest.woken(waited_ns)
         try:
             frame = self._newest.fresh(None, valid=True)
@@ -79,6 +82,7 @@ class ContactFeed:
             return Refusal(str(why))
         measured_ns = self._newest.measured_ns
         if frame is None or measured_ns is None:
+            self.late += came
             return None
         self._heard = time.monotonic()
         return Measured(frame, measured_ns)

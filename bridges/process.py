@@ -6,7 +6,6 @@ reads no configuration itself.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import os
@@ -113,6 +112,9 @@ class Bridge(ABC):
         """Close everything of one's own."""
 
 
+INTERRUPTED = 130  # exit code of a shell's program that Ctrl-C ended
+
+
 def main(name: str, make: Callable[[Handed], Bridge]) -> int:
     """A bridge's main. Returns the exit code; says on stderr what stands in the way."""
     logs.setup(f"{name}: %(message)s")
@@ -123,10 +125,11 @@ def main(name: str, make: Callable[[Handed], Bridge]) -> int:
         with lock(process=name):
             bridge = make(handed)
             try:
-                with contextlib.suppress(KeyboardInterrupt):
-                    _Loop(bridge).run()
+                _Loop(bridge).run()
             finally:
                 bridge.close()
+    except KeyboardInterrupt:
+        return INTERRUPTED
     except (AlreadyRunning, BridgeError, RuntimeDirError, TransportError) as why:
         print(f"{name}: {why}", file=sys.stderr)
         return 1
@@ -143,9 +146,8 @@ class _Loop:
         self._stop = False
 
     def run(self) -> None:
-        """Until SIGTERM or SIGINT."""
+        """Until SIGTERM; Ctrl-C raises KeyboardInterrupt, here as before the loop."""
         signal.signal(signal.SIGTERM, self._on_signal)
-        signal.signal(signal.SIGINT, self._on_signal)
         next_tick = 0.0
         try:
             while not self._stop:

@@ -1,4 +1,4 @@
-"""A robot small enough to run anywhere: a point that moves as it is told and says what it does."""
+"""A simulated robot: a point that moves at the commanded velocity and prints what it does."""
 
 from __future__ import annotations
 

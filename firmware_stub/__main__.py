@@ -135,7 +135,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _open(options: argparse.Namespace, skins: dict[str, StubSkin]) -> int:
-    """Fills in a skin for each that is asked for, each at a port of its own; returns when they began [ns]."""
+    """Open a stub skin, each at a port of its own, for each that is asked for; returns when they began [ns]."""
     host, first = tcp_address(options.listen) if options.listen else ("", 0)
     _alone()
     rigs = {

@@ -32,7 +32,7 @@ def measurement_s(points: int) -> float:
 
 @dataclass(frozen=True)
 class Scan:
-    """One that was measured, whether or not it reached the host. Times in seconds since the stub started."""
+    """A scan that was measured, whether or not it reached the host. Times in seconds since the stub started."""
 
     seq: int
     start: float
@@ -67,7 +67,7 @@ class Board:
     # --- life ---
 
     def power_cycle(self, now: float) -> None:
-        """As after power came back: nothing is configured, the clock is at zero."""
+        """Begin again as after power came back: nothing is configured, the clock is at zero."""
         self.faults.power_cycled()
         self._decoder = link.Decoder()
         self._booted = now
@@ -115,7 +115,7 @@ class Board:
         return out
 
     def skip_to(self, now: float) -> None:
-        """The host machine slept: count the scans that nobody measured."""
+        """Go on after the host machine slept, and count the scans that nobody measured."""
         if self._running is not None and (missed := int((now - self._scan_start) / self._duration(self._running))) > 0:
             self._seq += missed
             self._scan_start += missed * self._duration(self._running)

@@ -31,7 +31,7 @@ class Control:
     def _bind(self) -> ControlServer:
         handlers = {
             "press": lambda args: self._rig(args).press(_touch(args), self._clock()),
-            "release": lambda args: self._rig(args).release(self._clock()),
+            "release": lambda args: self._rig(args).release(self._clock(), str(args.get("finger", ""))),
             "scene": self._scene,
             "faults": self._fault,
             "fault": self._fault,

@@ -1,4 +1,4 @@
-"""What can go wrong with the board: one table, and which of it is going wrong now.
+"""What can go wrong with the board: the table of faults, and those in force.
 
 A fault lasts for its seconds; one marked `sticky` lasts until the board is power-cycled (`power_cycle`, `unplug`). The
 code that a fault disturbs asks `Faults.active(name)` at that point and nowhere else.

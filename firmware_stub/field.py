@@ -151,7 +151,7 @@ class Field:
         return matrix
 
     def _work(self) -> None:
-        # A real board's physics costs the host nothing: whoever is in a hurry goes before it.
+        # A real board's physics costs the host nothing, so this thread yields to all others.
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), SOLVER_NICE)
         while True:
             with self._lock:

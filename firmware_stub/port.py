@@ -139,7 +139,7 @@ class PtyPort:
             return b""
 
     def write(self, data: bytes) -> None:
-        """What nobody reads is lost once the kernel's buffer is full, as on a real line."""
+        """Write; unread bytes are lost once the kernel's buffer is full, as on a real line."""
         if self._master < 0:
             return
         self._discard_unread()
@@ -160,7 +160,7 @@ class PtyPort:
             self.overrun += unread
 
     def _forget(self) -> None:
-        """Remove the name, unless it is another board's by now."""
+        """Remove the link, unless it belongs to another board by now."""
         if self._link is not None:
             with contextlib.suppress(OSError):
                 if os.readlink(self._link) == self.url:

@@ -1,4 +1,4 @@
-"""Sheet, board and line in one: what a host has at the other end of its cable. Driven by time, at any speed.
+"""Sheet, board and line in one: what is at the other end of a host's cable. Its caller sets the time, at any speed.
 
 rig = Rig("square16", scene="slide", seed=1)
 rig.feed(link.encode(link.Hello()), 0.0)
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from .timeline import Timeline, press_track
 from .world import World
 
 UNTOUCHED = "demo"  # the scene in which nothing touches
-SLEPT_S = 1.0  # a longer pause between two calls was the machine's sleep, not the board's
+SLEPT_S = 1.0  # after a longer pause between two calls the machine slept, not the board
 
 
 class Rig:
@@ -117,7 +118,8 @@ class Rig:
     # --- what is done to the skin ---
 
     def press(self, values: Mapping[str, Any], now: float) -> dict[str, Any]:
-        """Press from now on; the next scan to start feels it. Keys as in `scene.touch`, and seconds, to_x, to_y.
+        """Press from now on; the next scan to start feels it. Keys as in `scene.touch`, and seconds, to_x, to_y;
+        `finger`, a name: the press takes the place of the one of that name.
 
         Raises ValueError for what no skin could feel.
         """
@@ -132,8 +134,9 @@ class Rig:
                     f"({point[0]:g}, {point[1]:g}) m is not on the skin, which is {self.sheet.size_text()}"
                 )
         old = self.field.timeline
-        presses = tuple(p for p in old.presses if p.times[-1] > now)
-        track = press_track(now, seconds, touch, to)
+        finger = str(values.get("finger", ""))
+        presses = tuple(p for p in old.presses if p.times[-1] > now and not (finger and p.finger == finger))
+        track = press_track(now, seconds, touch, to, finger)
         self.field.play(Timeline(old.script, old.start, (*presses, track), old.electrodes), now)
         return {
             "x": touch.x,
@@ -144,10 +147,16 @@ class Rig:
             "presses": len(presses) + 1,
         }
 
-    def release(self, now: float) -> dict[str, Any]:
-        """Take every press off and end the scene: nothing touches any more. Faults go on."""
+    def release(self, now: float, finger: str = "") -> dict[str, Any]:
+        """Take every press off and end the scene: nothing touches any more. With `finger`, take off the press of that
+        name alone, and go on with the scene. Faults go on.
+        """
         old = self.field.timeline
-        gone = sum(p.times[-1] > now for p in old.presses)
+        gone = sum(p.times[-1] > now for p in old.presses if finger in ("", p.finger))
+        if finger:
+            left = tuple(p for p in old.presses if p.times[-1] > now and p.finger != finger)
+            self.field.play(replace(old, presses=left), now)
+            return {"released": gone, "scene_ended": None, "faults": self.faults.listing(now)}
         self.play(UNTOUCHED, now)
         return {
             "released": gone,

@@ -20,14 +20,13 @@ MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through
 class Sheet:
     """Forward model on the mesh "stub", which nothing is trained or inverted on. Units: ohm, metres.
 
-    `of`: a skin of models/skins, a TOML file, or the folder of a bundle, whose manifest says its geometry.
-    `mismatch`: by what the sheet differs from that, one of models.mismatch.NAMED. `skin` is as the file says it,
-    `model` as it is.
+    `of`: a skin of models/skins, a TOML file, or the folder of a bundle, whose manifest says its geometry. `mismatch`:
+    how the sheet differs from that, one of models.mismatch.NAMED. `skin` is the file's, `model` the sheet's.
     """
 
     def __init__(self, of: str = "square16", mismatch: str = "none") -> None:
         self.mismatch = mismatch
-        differs = named(mismatch)  # first, since it fails fast
+        differs = named(mismatch)  # first, because it fails early
         in_bundle = (Path(of) / "manifest.json").is_file()
         self.skin = geometry.from_dict(Bundle.load(of).skin) if in_bundle else geometry.load(of)
         self._real = MismatchedSheet(self.skin, differs, mesh="stub")

@@ -49,7 +49,7 @@ class StubSkin:
 
     def step(self, publisher: Publisher) -> None:
         data = self.port.read()
-        now = self.now  # after: the board has not read what it is told before it came
+        now = self.now  # taken after the read: the board cannot have read it earlier
         if data:
             self.rig.feed(data, now)
         if sent := self.rig.pull(now):

@@ -17,6 +17,7 @@ class TouchPath:
 
     times: tuple[float, ...]  # s, not decreasing
     poses: tuple[Touch, ...]
+    finger: str = ""  # of a press that its maker goes on moving: the next one of this name takes its place
 
     def pose(self, t: float, inside: float) -> Touch | None:
         """The pose at t on the leg that holds the instant `inside`; None where the touch is not there then."""
@@ -140,7 +141,9 @@ class Timeline:
         return self.segment(t).at(t)
 
 
-def press_track(start: float, seconds: float, touch: Touch, to: Sequence[float] | None = None) -> TouchPath:
+def press_track(
+    start: float, seconds: float, touch: Touch, to: Sequence[float] | None = None, finger: str = ""
+) -> TouchPath:
     """A press from `start` on, sliding to the point `to` (metres) where one is given."""
     end = replace(touch, x=to[0], y=to[1]) if to else touch
-    return TouchPath((start, start + seconds), (touch, end))
+    return TouchPath((start, start + seconds), (touch, end), finger)

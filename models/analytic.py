@@ -1,4 +1,4 @@
-"""The complete electrode model on a disc, without a mesh: what the finite elements are held against.
+"""The complete electrode model on a disc, without a mesh; the finite elements are checked against it.
 
 On a disc of radius R the potential of a boundary current density is known mode by mode: current of angular frequency k
 gives a potential R/(s k) times it, or with a concentric inclusion that times (1 + m)/(1 - m) with m = c (a/R)^(2k), c =

@@ -1,5 +1,5 @@
-"""What training does to clean differences: symmetries of the skin, noise, drift, dead electrodes, model error.
-Afresh each batch.
+"""Random changes of clean differences in training, drawn anew for each batch: symmetries of the skin, noise, drift,
+dead electrodes, model error.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _key(measurement: npt.NDArray[np.integer]) -> tuple[tuple[int, ...], ...]:
 
 @dataclass(frozen=True)
 class Condition:
-    """What one tare found, and what really holds."""
+    """What one tare found, and the true noise and drift."""
 
     operator: Operator
     sigma: Array  # (K,) true noise of d

@@ -2,9 +2,9 @@
 
     python -m models.average --skin square16 --bundle BUNDLE --data FOLDER A.pt B.pt --out full.pt
 
-Weights that one run went through at different times lie in one valley of the loss: their mean is wrong by less than
-either (Izmailov et al. 2018, "Averaging weights leads to wider optima"). What batch normalisation has seen belongs to
-each of them alone, so it is measured on the scenes again.
+Weights from different times of one run lie in one valley of the loss, and their mean errs less than each of them
+(Izmailov et al. 2018, "Averaging weights leads to wider optima"). The statistics of batch normalisation belong to each
+of them alone, so they are measured on the scenes again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What others do with these measurements: NOSER in one step, total variation, several Gauss-Newton steps, GREIT.
+"""Known reconstruction methods for comparison: NOSER in one step, total variation, several Gauss-Newton steps, GREIT.
 
 Every method maps a relative difference d = |Z|/|Z0| - 1, (K,), to an image of the conductivity drop [S/m], (n, n), row
 0 at the lowest y. None of them knows a touch's sign, size or shape; all share one linearisation, on the "inverse" mesh.
@@ -23,7 +23,7 @@ NOSER_POWER = 0.5  # EIDORS's exponent of diag(J^T W J)
 
 
 @dataclass(frozen=True, eq=False)
-class Linearisation:
+class PeerPhysics:
     """The untouched skin on a mesh, seen from d: K measurements, m elements."""
 
     model: ForwardModel
@@ -59,7 +59,7 @@ class LinearMethod:
 
 
 def noser(
-    physics: Linearisation,
+    physics: PeerPhysics,
     lambda_: float = PUBLISHED_LAMBDA,
     n: int = 96,
     units: str = "ohm",
@@ -81,7 +81,7 @@ def noser(
 
 
 def greit(
-    physics: Linearisation, n: int = 48, noise_figure: float = 0.5, target: float = 0.1, wanted: float = 0.2
+    physics: PeerPhysics, n: int = 48, noise_figure: float = 0.5, target: float = 0.1, wanted: float = 0.2
 ) -> LinearMethod:
     """GREIT, Adler et al. 2009: the matrix that turns small targets into round blobs of one size and amplitude.
 
@@ -128,7 +128,7 @@ class TotalVariation:
     """
 
     def __init__(
-        self, physics: Linearisation, alpha: float = 1e-6, beta: float = 0.02, n: int = 32, steps: int = 8
+        self, physics: PeerPhysics, alpha: float = 1e-6, beta: float = 0.02, n: int = 32, steps: int = 8
     ) -> None:
         self.n, self.alpha, self.beta, self.steps = n, alpha, beta, steps
         self.live = np.flatnonzero(physics.inside(n))
@@ -175,7 +175,7 @@ class GaussNewton:
     y_{k+1} = R^-1 J_k^T (J_k R^-1 J_k^T + lambda^2)^-1 (d - d(y_k) + J_k y_k), J_k and d(y_k) from a new solution.
     """
 
-    def __init__(self, physics: Linearisation, lambda_: float = 0.03, n: int = 96, steps: int = 4) -> None:
+    def __init__(self, physics: PeerPhysics, lambda_: float = 0.03, n: int = 96, steps: int = 4) -> None:
         self.physics, self.lambda_, self.steps, self.n = physics, lambda_, steps, n
         self.pixels = physics.model.pixel_map(n)
         self.R = (physics.J**2).sum(0) ** NOSER_POWER

@@ -101,9 +101,11 @@ def networks(folder: Path, pre: PreReconstructor, held_out: samples.Samples) -> 
             for level, decibel in LEVELS.items()
         }
         milliseconds = said[variant]["run_time_ms"]["median"]
-        print(
-            f"{variant}: {len(content) / 1024:.0f} kB, {milliseconds:.2f} ms, {said[variant]['held_out']}", flush=True
+        found = "; ".join(
+            f"{level}: contact IoU {row['contact IoU']:.3f}, position {row['position % of side']:.2f} % of the side"
+            for level, row in said[variant]["held_out"].items()
         )
+        print(f"{variant}: {len(content) / 1024:.0f} kB, {milliseconds:.2f} ms a frame; held out, {found}", flush=True)
     return made, said
 
 

@@ -6,11 +6,12 @@
                             network.onnx       "full"
                             network_fast.onnx  "fast"
                             network_int8.onnx  "int8"
+                            locator.npz        of a registered skin: see locator.LocatorArrays
 
-The manifest holds the hash of every other file, so that the one over the manifest is over the whole. Networks may be
-missing. A bundle without any is a working bundle: the services then show the one-step image.
+The manifest holds the hash of every other file, so the manifest's own hash covers the whole. Networks may be missing. A
+bundle without any is a working bundle: the services then show the one-step image.
 
-    python -m models.bundle FOLDER             writes SHA256 anew: for who has changed a manifest by hand, and means it
+    python -m models.bundle FOLDER             writes SHA256 anew, after a change of the manifest by hand
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ import numpy.typing as npt
 
 from models.bundle_check import Wrong, check
 from models.files import FileError, read_bytes
+from models.locator_arrays import LocatorArrays, arrays_of
 from models.npz import read_npz
 from models.prereconstruction import Matrices, PreReconstructor
 from protocol.errors import EitskinError
@@ -41,6 +43,7 @@ MAX_BYTES = 8 * 1024 * 1024
 MAX_MANIFEST = 1024 * 1024
 MAX_MATRICES = 64 * 1024 * 1024  # unpacked
 SEAL = "SHA256"
+LOCATOR = "locator.npz"
 NETWORKS = {"full": "network.onnx", "fast": "network_fast.onnx", "int8": "network_int8.onnx"}
 CLASSES = ("circle", "triangle", "rectangle", "square", "L")
 
@@ -57,6 +60,7 @@ class Bundle:
     manifest: dict[str, Any]
     matrices: Matrices
     hash: str  # of the whole: sha256 of manifest.json, which holds the hashes of everything else; as SHA256 says
+    locator: LocatorArrays | None = None  # of a registered skin: what finds touches by the measured response map
 
     @property
     def name(self) -> str:
@@ -140,11 +144,16 @@ class Bundle:
             check(manifest, matrices)
         except Wrong as why:
             raise BundleError(f"{path}: {why}: build the bundle again") from None
-        return Bundle(path, manifest, matrices, digest)
+        locator = _read_locator(path / LOCATOR, len(matrices.pattern)) if LOCATOR in manifest["files"] else None
+        return Bundle(path, manifest, matrices, digest, locator)
 
 
 def write(
-    path: Path, manifest: Mapping[str, Any], matrices: Matrices, networks: Mapping[str, bytes] | None = None
+    path: Path,
+    manifest: Mapping[str, Any],
+    matrices: Matrices,
+    networks: Mapping[str, bytes] | None = None,
+    locator: LocatorArrays | None = None,
 ) -> Bundle:
     """Writes a bundle folder and loads it back. networks: variant -> ONNX bytes. `files` and `schema` are filled in
     here.
@@ -161,6 +170,11 @@ def write(
         if variant in networks:
             (path / name).write_bytes(networks[variant])
     names = ["matrices.npz", *(NETWORKS[v] for v in networks)]
+    (path / LOCATOR).unlink(missing_ok=True)
+    if locator is not None:
+        own: dict[str, Any] = {f.name: np.asarray(getattr(locator, f.name)) for f in fields(LocatorArrays)}
+        np.savez_compressed(path / LOCATOR, **own)
+        names.append(LOCATOR)
     size = sum((path / name).stat().st_size for name in names)
     if size > MAX_BYTES:
         raise BundleError(
@@ -216,7 +230,7 @@ def _manifest(path: Path, text: bytes) -> dict[str, Any]:
         raise BundleError(f"{place} is no bundle manifest ({str(error)[:80]}): build the bundle again") from None
     if schema != SCHEMA:
         raise BundleError(f"{path}: manifest schema {schema}, this program reads {SCHEMA}: build the bundle again")
-    known = ("matrices.npz", *NETWORKS.values())
+    known = ("matrices.npz", LOCATOR, *NETWORKS.values())
     for file, digest in files.items():
         if file not in known or not (isinstance(digest, str) and re.fullmatch("[0-9a-f]{64}", digest)):
             raise BundleError(
@@ -258,6 +272,13 @@ def _read_matrices(path: Path) -> Matrices:
     except (TypeError, ValueError) as why:
         raise BundleError(f"{path}: {why}: build the bundle again") from None
     return Matrices(**arrays)
+
+
+def _read_locator(path: Path, measurements: int) -> LocatorArrays:
+    try:
+        return arrays_of(read_npz(path, MAX_MATRICES), measurements)
+    except (FileError, ValueError, TypeError) as why:
+        raise BundleError(f"{path}: {why}: register the skin again") from None
 
 
 if __name__ == "__main__":

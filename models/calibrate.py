@@ -71,10 +71,10 @@ def solve(
 ) -> SolvedPresses:
     """Half circles, half other shapes, one touch each; read from `cache` where these very ones are there."""
     rng = np.random.default_rng([seed, 31])
-    shapes = []
+    prior, shapes = PRIOR.on(skin), []
     for k in range(n):
         kinds = ("circle",) if k % 2 else KINDS[1:]
-        shapes.append(random_shape(rng, Prior(**{**vars(PRIOR), "kinds": kinds}), skin.inside))
+        shapes.append(random_shape(rng, Prior(**{**vars(prior), "kinds": kinds}), skin.inside))
     rows = np.array([s.as_row() for s in shapes])
     if cache is not None and cache.is_file():
         with np.load(cache) as file:
@@ -109,7 +109,9 @@ def part(seen: ImageFeatures, rows: Array) -> ImageFeatures:
 def see(
     presses: SolvedPresses, pre: PreReconstructor, network: Predict, seed: int = 4, conditions: int = CONDITIONS
 ) -> Sightings:
-    """The presses under noise from 57 dB to none, each condition with its own tare; what nobody would see left out."""
+    """What the network shows of the presses under noise from 57 dB to none, each condition with its own tare.
+    Undetected presses are left out.
+    """
     rng = np.random.default_rng([seed, 32])
     index, decibels, found = [], [], []
     differences = presses.normalised(pre)
@@ -231,8 +233,17 @@ def uncertainty(
             "mesh": MESH,
             "prior": {k: list(v) for k, v in vars(PRIOR).items() if k in ("radius", "drop")},
         }
-        print(f"{variant}: { ({k: found[variant][k]['held_out'] for k in ESTIMATES}) }", flush=True)
+        print(f"{variant}: {_in_words(found[variant])}", flush=True)
     return found
+
+
+def _in_words(said: dict[str, Any]) -> str:
+    """How wrong each estimate is on presses that it was not fitted to, and whether it knows."""
+    parts = []
+    for name, of in (("peak", "peak drop"), ("integral", "integrated drop"), ("known", "peak drop, indenter known")):
+        held = said[name]["held_out"]
+        parts.append(f"{of} off by {100 * held['error, all']:.0f} % ({100 * held['within, all']:.0f} % within sigma)")
+    return ", ".join(parts)
 
 
 def check(shipped: bundle.Bundle, seed: int, n: int) -> None:

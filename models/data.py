@@ -67,7 +67,7 @@ class ChunkSpec:
 
 @lru_cache(maxsize=1)
 def _nominal(skin: str, mesh: str) -> ForwardModel:
-    """Kept for the process: meshing takes as long as dozens of solves."""
+    """The nominal skin's model, kept for the process: meshing takes as long as dozens of solves."""
     nominal = geometry.load(skin)
     return ForwardModel(nominal, nominal.pattern, mesh=mesh)
 
@@ -91,11 +91,12 @@ def make_chunk(spec: ChunkSpec) -> dict[str, NDArray[Any]]:
     contact = skin.contact_impedance * (1 + wide * CONTACT_SPREAD * rng.uniform(-1, 1, n))
     background = 1 + wide * BACKGROUND_SPREAD * rng.uniform(-1, 1)
     z0 = np.abs(model.solve(background, contact).impedances())
+    prior = TRAINING.on(skin)
     difference = np.empty((spec.size, len(z0)), np.float32)
     rows = np.empty((spec.size, 3, 7), np.float32)
     images = np.empty((spec.size, IMAGE, IMAGE), np.float16)
     for k in range(spec.size):
-        rows[k] = to_rows(random_scene(rng, TRAINING, skin.inside))
+        rows[k] = to_rows(random_scene(rng, prior, skin.inside))
         scene = from_rows(rows[k].astype(float))  # the float32 rows: what is stored is what was solved
         conductivity = model.touched(scene, background)
         difference[k] = np.abs(model.solve(conductivity, contact).impedances()) / z0 - 1

@@ -100,9 +100,7 @@ class Elements:
         Every pixel of the square [-1, 1]^2 is sampled at q x q points; those off the mesh do not count. Rows sum to 1,
         those of pixels wholly off the mesh to 0.
         """
-        fine = -1 + 2 * (np.arange(n * q) + 0.5) / (n * q)
-        x, y = np.meshgrid(fine, fine)
-        element = self._find(x.ravel(), y.ravel())
+        element = self._at_samples(n * q)
         sample = np.flatnonzero(element >= 0)
         iy, ix = np.divmod(sample, n * q)
         pixel = (iy // q) * n + ix // q
@@ -110,13 +108,22 @@ class Elements:
         entries = (weights, (pixel, element[sample]))
         return sparse.csr_array(sparse.coo_array(entries, shape=(n * n, self.n_elements)))
 
-    def _find(self, x: Array, y: Array) -> NDArray[np.int64]:
-        """(N,) element that holds each point, -1 where none does."""
-        from matplotlib.tri import Triangulation  # needed offline only: the stub runs without it
-
-        return np.asarray(
-            Triangulation(self.mesh.p[0], self.mesh.p[1], self.mesh.t.T).get_trifinder()(x, y), dtype=np.int64
-        )
+    def _at_samples(self, n: int) -> NDArray[np.int64]:
+        """(n*n,) element that holds each centre of an n x n grid of the square, raveled [iy, ix]; -1: none does."""
+        place = (self.corners + 1) * n / 2 - 0.5  # of corners, in samples
+        low = np.clip(np.ceil(place.min(axis=1) - 1e-9), 0, n).astype(int)
+        high = np.clip(np.floor(place.max(axis=1) + 1e-9), -1, n - 1).astype(int)
+        across, up = np.maximum(high - low + 1, 0).T
+        element = np.repeat(np.arange(self.n_elements), across * up)  # once for each sample in the box around it
+        count = np.arange(len(element)) - np.repeat(np.cumsum(across * up) - across * up, across * up)
+        ix, iy = low[element, 0] + count % across[element], low[element, 1] + count // across[element]
+        point = -1 + 2 * (np.stack([ix, iy], axis=1) + 0.5) / n
+        # a hat function is 1 at its corner and falls off with its gradient: none is negative inside
+        hats = 1 + np.einsum("mij,mij->mi", point[:, None] - self.corners[element], self.gradients[element])
+        inside = hats.min(axis=1) >= -1e-9
+        found = np.full(n * n, -1, dtype=np.int64)
+        found[(iy * n + ix)[inside]] = element[inside]
+        return found
 
 
 def barycentric(level: int) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import tempfile
 import time
 import warnings
@@ -80,19 +82,20 @@ def to_int8(content: bytes, stack: Array, context: Array) -> bytes:
         quantization.quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
         nodes = [n for n in onnx.load(str(prepared)).graph.node if n.op_type == "Conv"]
         keep = [n.name for n in nodes if n.name.startswith(FLOAT)]
-        quantization.quantize_static(
-            str(prepared),
-            str(target),
-            _Calibration(stack, context),
-            quant_format=quantization.QuantFormat.QDQ,
-            op_types_to_quantize=["Conv"],
-            nodes_to_exclude=keep,
-            per_channel=True,
-            reduce_range=True,  # AVX2 without VNNI saturates sums of full-range products
-            activation_type=quantization.QuantType.QUInt8,
-            weight_type=quantization.QuantType.QInt8,
-            calibrate_method=quantization.CalibrationMethod.Percentile,
-        )
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints how it counts
+            quantization.quantize_static(
+                str(prepared),
+                str(target),
+                _Calibration(stack, context),
+                quant_format=quantization.QuantFormat.QDQ,
+                op_types_to_quantize=["Conv"],
+                nodes_to_exclude=keep,
+                per_channel=True,
+                reduce_range=True,  # AVX2 without VNNI saturates sums of full-range products
+                activation_type=quantization.QuantType.QUInt8,
+                weight_type=quantization.QuantType.QInt8,
+                calibrate_method=quantization.CalibrationMethod.Percentile,
+            )
         return target.read_bytes()
 
 

@@ -35,7 +35,9 @@ SIDE = 2.0  # model units; percentages of position refer to it
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """Of an impedance: sigma^2 = (10^(-snr_db/20) |Z|)^2 + floor_ohm^2; tare_frames: averaged for the baseline."""
+    """Noise of an impedance: sigma^2 = (10^(-snr_db/20) |Z|)^2 + floor_ohm^2; tare_frames: averaged for the
+    baseline.
+    """
 
     snr_db: float = 70.0
     floor_ohm: float = 0.0
@@ -96,7 +98,7 @@ class Floor:
 
     @property
     def position_percent(self) -> float:
-        """Of the square's side."""
+        """Position in per cent of the square's side."""
         return 100 * self.position / SIDE
 
 

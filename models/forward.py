@@ -194,14 +194,20 @@ class Solution:
 
     def jacobian(self, pattern: str | ArrayLike | None = None) -> Array:
         """(K, n_elements) dZ/dconductivity [ohm/S] by the adjoint: -int_e grad u_drive . grad u_sense."""
+        xx, _, yy = self.products(pattern)
+        return np.asarray(-(xx + yy))
+
+    def products(self, pattern: str | ArrayLike | None = None) -> tuple[Array, Array, Array]:
+        """Each (K, n_elements): int_e grad u_drive . S grad u_sense for S of xx, of xy and of yy alone.
+
+        A change of the conductivity by (xx, xy, yy) changes Z by minus the sum of their products with these.
+        """
         drive, sense = self._incidence(pattern)
         model = self.model
         corner = self.potentials[model.mesh.t.T]  # (n_elements, 3, n)
-        result = np.zeros((len(drive), model.n_elements))
-        for axis in range(2):
-            field = np.einsum("ec,ecn->ne", model.gradients[..., axis], corner)
-            result -= (drive @ field) * (sense @ field)
-        return result * model.areas
+        field = [np.einsum("ec,ecn->ne", model.gradients[..., axis], corner) for axis in range(2)]
+        dx, dy, sx, sy = (pair @ part for pair in (drive, sense) for part in field)
+        return dx * sx * model.areas, (dx * sy + dy * sx) * model.areas, dy * sy * model.areas
 
     def jacobian_contact(self, pattern: str | ArrayLike | None = None) -> Array:
         """(K, n) dZ/d contact impedance [1/m]: 1/z_l^2 int_{E_l} (u_drive - U_drive)(u_sense - U_sense)."""

@@ -75,7 +75,7 @@ class SkinGeometry:
 
     @property
     def radius(self) -> float:
-        """Of a disc; 0 for a polygon."""
+        """Radius of a disc; 0 for a polygon."""
         return self.curve.radius
 
     @property

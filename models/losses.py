@@ -1,4 +1,4 @@
-"""What the network is trained for: image, outline, amplitude, integral, class, and an honest sigma."""
+"""The training losses: image, outline, amplitude, integral, class, and a calibrated sigma."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The shipped MM-CNN: a small U-Net with CBAM over the pre-reconstruction stack, told the noise it faces.
+"""The shipped MM-CNN: a small U-Net with CBAM over the pre-reconstruction stack; the noise level is one of its inputs.
 
 Inputs are what `prereconstruction.Operator.stack` gives: the stack (N, C, 24, 24), divided by the frame's scale, and
 its context (N, n). Outputs: drop (N, 1, 96, 96) in units of that scale, log_sigma (N, 1, 96, 96) of the same, classes

@@ -32,7 +32,7 @@ def read_npz(path: str | os.PathLike[str], most: int = MAX_NPZ) -> dict[str, NDA
 
 
 def npz(file: BinaryIO, name: str, most: int = MAX_NPZ) -> dict[str, NDArray[Any]]:
-    """The same of an open file; `name` is for errors."""
+    """All arrays of an open file; `name` is for errors."""
     try:
         if file.read(6) == b"\x93NUMPY":
             raise FileError(f"{name} holds one bare array, expected named ones: numpy.savez(path, name=array)")

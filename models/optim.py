@@ -26,7 +26,7 @@ def orthogonalise(g: Tensor, steps: int = 5) -> Tensor:
 
 
 class Muon(torch.optim.Optimizer):
-    """For weights of two or more dimensions; a convolution is the matrix (out, in * k * k)."""
+    """The optimizer for weights of two or more dimensions; a convolution counts as the matrix (out, in * k * k)."""
 
     def __init__(
         self, params: Iterable[nn.Parameter], lr: float = 0.02, momentum: float = 0.95, decay: float = 0.01

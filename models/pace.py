@@ -41,7 +41,7 @@ class Pace:
         return max(self._clock() - self._began, 1e-9)
 
     def processor_share(self) -> float:
-        """Of the time of `threads` cores."""
+        """The share of the time of `threads` cores that this process had."""
         return (self._processor() - self._used) / (self.wall_s() * self.threads)
 
     def said(self, batches: int, size: int) -> str:

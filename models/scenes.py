@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from models.geometry import SkinGeometry
 from models.shapes import KINDS, Array, Shape, gap
 
 Inside = Callable[[Array], NDArray[np.bool_]]  # points (m, 2) in model units -> which are on the skin
+
+
+FITS = 0.9  # of the largest circle that a skin has room for: the largest contact that is asked for
 
 
 @dataclass(frozen=True)
 class Prior:
     """How contacts are distributed. Each range is (low, high), drawn from uniformly.
 
-    With probability `tail` a size or drop comes from the wide range: rare cases have to be seen, not dwelt on.
+    With probability `tail` a size or drop comes from the wide range: the network must see rare cases, but seldom.
     `touches` are the probabilities of one, two, three contacts; `gap` is the least distance between two outlines.
     """
 
@@ -30,6 +34,17 @@ class Prior:
     touches: tuple[float, float, float] = (0.65, 0.20, 0.15)
     gap: float = 0.05
     kinds: tuple[str, ...] = KINDS
+
+    def on(self, skin: SkinGeometry) -> Prior:
+        """The same where the skin is wide enough; on a narrow one contacts no larger than it leaves room for."""
+        axis = np.linspace(-1, 1, 81)
+        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        room = FITS * float(skin.curve.distance(grid[skin.inside(grid)]).max())
+
+        def within(sizes: tuple[float, float]) -> tuple[float, float]:
+            return min(sizes[0], room / 2), min(sizes[1], room)
+
+        return replace(self, radius=within(self.radius), radius_wide=within(self.radius_wide))
 
 
 TRAINING = Prior()

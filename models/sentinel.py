@@ -7,9 +7,9 @@ Chosen by design of experiments from a bundle's linear physics, in two steps:
    generalised likelihood ratio); an untouched skin exceeds c with a probability that importance sampling gives
    (`exceedance`), and a touch is seen with probability at least Phi(lambda - c). The shortest list whose worst touch
    is seen well enough is found by exchange on min_m lambda_m.
-2. *Place.* Those few cannot say where; the list is continued, measurement by measurement, by whatever lowers the mean
-   variance of the position most, with size and drop unknown (A-optimal, Bayesian: Chaloner & Verdinelli, Statistical
-   Science 10, 1995).
+2. *Place.* These few measurements cannot tell the place. The list is continued, one measurement at a time, by the one
+   that lowers the mean variance of the position most, with size and drop unknown (A-optimal, Bayesian: Chaloner &
+   Verdinelli, Statistical Science 10, 1995).
 
 The reference is a mean of the untouched skin's own recent scans, so slow drift cancels and is not a nuisance here.
 """
@@ -92,7 +92,7 @@ class Sentinel:
 
     @property
     def seconds(self) -> float:
-        """Of one scan at 128 DFT points."""
+        """Seconds of one scan at 128 DFT points."""
         return len(self.rows) * MEASUREMENT_S
 
     def filters(self, sigma: Array) -> Array:

@@ -130,7 +130,7 @@ class Shape:
 
     @cached_property
     def centroid(self) -> Array:
-        """Of the patch's area, (2,): differs from (x, y) for the L only."""
+        """Centroid of the patch's area, (2,); it differs from (x, y) for the L only."""
         if self.corners is None:
             return np.array([self.x, self.y])
         p, q = self.corners, np.roll(self.corners, -1, axis=0)

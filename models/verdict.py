@@ -87,7 +87,7 @@ def judge(
     first = {
         "good": "good: what more time brings is hardly seen",
         "usable": "usable: positions are right, shapes and forces would gain from more time",
-        "too little": "too little: the network is not worth having yet",
+        "too little": "too little: far from what this skin can do",
     }[grade]
     text = (
         f"{first}. Held-out touches: contact IoU {iou:.2f} without noise (the one-step image, without any network: "
@@ -100,7 +100,7 @@ def judge(
         text += (
             f"It has seen {batches} batches in {minutes:.0f} minutes; {TIMES} times as many ({TIMES * minutes:.0f} "
             f"minutes at this pace) would bring a contact IoU of about {iou + gain:.2f}: make train with "
-            f"MINUTES={_round(TIMES * minutes / 0.58)}, which uses the scenes that are there."
+            f"MINUTES={_round(TIMES * minutes / 0.58)}, which adds to the scenes that are there."
         )
     figures = {"contact_iou": iou, "one_step_contact_iou": single_step, "position_percent": place}
     figures |= {"position_floor_percent": floor, "expected_contact_iou": iou + gain, "batches": float(batches)}

@@ -9,6 +9,7 @@ here; each is loaded when it is first used. Where to look:
     frames.py, fields.py, records.py   frames as messages and back, checked
     held.py                            the image that held frames stand for
     sockets.py, control.py             publishing, reading, commands
+    metering.py                        a process's rates, latencies and CPU, for its status
     runtime.py, transport.py           where the sockets are, whose they are, TCP and keys
     link.py, link_messages.py          the board's serial link (with cobs.py and ad5940.py)
     errors.py                          the base of all exceptions, and their tree

@@ -1,9 +1,8 @@
-"""How old a frame is, by this host's clock: while the host slept too, and where another host's clock has stamped it.
+"""How old a frame is by this host's clock, also after the host slept, and for stamps of another host's clock.
 
-A stamp of CLOCK_MONOTONIC stands still while the host is suspended; CLOCK_BOOTTIME does not, and tells. Another host's
-stamps say nothing about our clock until it has been asked for its own; that is done by a thread, so that nobody waits
-for it. Until then a frame is at least as old as its own stamps say that it took to be sent, and what it has waited
-here.
+CLOCK_MONOTONIC stands still while the host is suspended; CLOCK_BOOTTIME does not, so their difference shows the sleep.
+Another host's stamps cannot be compared with our clock until that host has told its own; a thread asks, so that nobody
+waits. Until then a frame's least age is what its own stamps say that it took to be sent, plus its waiting time here.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ log = logging.getLogger(__name__)
 
 
 class Ages:
-    """The ages of the frames that one thread reads. `processes`: whom to ask for the clock that the stamps are of."""
+    """The ages of the frames that one thread reads. `processes`: those to ask for their host's clock."""
 
     def __init__(self, processes: tuple[str, ...] = ("acquisition", "publisher")) -> None:
         self._processes = processes
@@ -94,8 +93,8 @@ class OtherClocks:
         self._thread.start()
 
     def ahead_ns(self, host: str) -> int | None:
-        """By how much that host's clock is ahead of ours at most: a frame's age comes out rather too large than too
-        small. None where none of the processes says that it is there.
+        """The most by which that host's clock may be ahead of ours, so that a frame's age is overestimated rather than
+        underestimated. None where no process says that it runs on that host.
         """
         now = time.monotonic_ns()
         for found, offset, uncertainty, asked_ns in list(self._found.values()):
@@ -104,7 +103,7 @@ class OtherClocks:
         return None
 
     def forget(self) -> None:
-        """Our own clock has stood still."""
+        """Forget all offsets: our own clock has stood still."""
         self._found.clear()
 
     def _ask(self) -> None:

@@ -98,8 +98,8 @@ class ControlServer:
         return self._listening.problems + flood
 
     def mind(self) -> bool:
-        """Look whether the socket is still reachable as configured, and mend it; whether `socket` is another one
-        now.
+        """Check that the socket is still reachable as configured and mend it where needed; returns whether `socket` is
+        another one now.
         """
         return self._listening.mind()
 
@@ -124,7 +124,7 @@ class ControlServer:
         return True
 
     def _count(self, peer: str) -> None:
-        """Notice who asks too often."""
+        """Count a peer's requests, and cut off one that asks too often."""
         now = time.monotonic()
         if int(now) != self._second:
             self._second, self._asked = int(now), 0

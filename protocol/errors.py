@@ -6,7 +6,7 @@ from __future__ import annotations
 class EitskinError(Exception):
     """What eitskin raises where something cannot be used or done. The text is for the person who must act.
 
-    Beside this base each keeps the built-in one that its name is followed by::
+    Each also derives from the built-in exception in parentheses::
 
         EitskinError
         ├── Stale (RuntimeError)              no contact frame is new enough: stop, or fall back
@@ -24,6 +24,12 @@ class EitskinError(Exception):
         ├── GeometryError (ValueError)        a skin that cannot exist
         ├── PatternError (ValueError)         a drive pattern that cannot be measured or inverted
         ├── MeshError (RuntimeError)          an outline that cannot be meshed
+        ├── MismatchError (ValueError)        a sheet that differs from its model in a way that cannot be
+        ├── TooFewMeasured                    an untouched frame in which too little was measured to calibrate on
+        ├── CalibrationFileError              what a calibration found cannot be read, kept or used
+        ├── OtherScenes (ValueError)          training scenes of another skin, or of this one as it was
+        ├── CalibrationFileError              what a calibration found cannot be read, kept or used
+        ├── OtherScenes (ValueError)          training scenes that must not be mixed with those of this run
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── ConfigError                       services: skin.toml cannot be used
@@ -39,6 +45,8 @@ class EitskinError(Exception):
         ├── MissingExtra                      the packages that a bridge needs are not installed
         ├── NotOurs                           a folder that must not be handed over
         ├── BridgeError                       bridges: a bridge cannot start
+        ├── ReplayRefused                     the page does not record or replay now
+        ├── Malformed (ValueError)            bytes that are no RTPS message, or not one that the bridge reads
         ├── CliError                          ends a command with one line and an exit code
         └── Broken                            bench: a promise was broken under changed bytes
     """

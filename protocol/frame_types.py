@@ -161,6 +161,21 @@ class DeltaFrame(Frame):
         "state of each electrode: " + ", ".join(f"{k} {state}" for k, state in enumerate(ELECTRODE_STATES)),
         lambda: np.zeros(16, "u1"),
     )
+    calibration: str = wire(
+        Text(64, form="(?:[0-9a-f]{64})?"), "hash of the bundle as it was calibrated to this skin; empty: as it is", ""
+    )
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class LocatedTouch:
+    """One touch as a registered skin's response map finds it."""
+
+    position: list[float] = wire(Vector(2, "m"), "x, y in the skin's frame")
+    sigma: list[float] = wire(Vector(3), "as a contact's `position_sigma`")
+    amplitude: float = wire(Float(0), "beside the registration's mean press", 1.0)
+    indentation_m: float | None = wire(Maybe(Float(0, unit="m")), "as a contact's, or nil", None)
+    force_n: float | None = wire(Maybe(Float(0, unit="N")), "how hard, where the skin was registered with forces", None)
+    value_sigma: float | None = wire(Maybe(Float(0)), "standard uncertainty of depth or force, or nil", None)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -193,6 +208,9 @@ class ImageFrame(Frame):
     noise: float | None = wire(
         Maybe(Float(0)), "rms `sigma` of the delta frame that the image was made of (relative), or nil", None
     )
+    touches: list[LocatedTouch] = wire(
+        ListOf(Record(LocatedTouch), 16), "of a registered skin: where its touches are, sent with the image", list
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -218,6 +236,16 @@ class Contact:
     shape: str = wire(Text(32), "most probable of " + ", ".join(SHAPES) + "; or unknown", "unknown")
     shape_probability: float | None = wire(Maybe(Float(0, 1)), "of `shape`, or nil", None)
     confidence: float = wire(Float(0, 1), "probability that this is a touch", 1.0)
+    position_sigma: list[float] | None = wire(
+        Maybe(Vector(3)),
+        "standard uncertainty of `position` along the longest and the shortest axis of its ellipse [m], angle of the "
+        "longest to x [rad]; nil where nobody measured it; 2.15 times the axes hold 90 %",
+        None,
+    )
+    indentation_m: float | None = wire(
+        Maybe(Float(0, unit="m")), "how deep the touch presses; nil where the skin was not registered with depths", None
+    )
+    indentation_sigma_m: float | None = wire(Maybe(Float(0, unit="m")), "its standard uncertainty, or nil", None)
     sheet: list[float] | None = wire(
         Maybe(Vector(2, "m")), "x, y on the unrolled sheet, as images have it; nil: those of `position`", None
     )
@@ -292,12 +320,16 @@ INFO_KEYS = {
     "bundle_hash": "sha256 over the whole of it, as its file SHA256 says",
     "geometry": "map: outline (n, 2) [m], electrodes (E, 2) [m], metres_per_unit, name",
     "pattern": "name of the drive pattern",
+    "stack": "map: lambda_squared of each plane of delta's `stack`; one_step: the plane whose lambda is nearest that "
+    "of the published one-step image",
     "frame_id": "name of the skin's coordinate frame",
     "parent_frame_id": "name of the frame that `pose` is given in",
     "pose": "x, y, z [m], qx, qy, qz, qw: the skin's frame in its parent",
     "surface": "map: kind (cylinder), radius_m, axis_degrees: what the sheet is wrapped round; or nil: it lies flat",
     "units": "map: name of a field -> its unit",
     "force_law": "map: kind and parameters of the force law, or nil",
+    "mounting": "map: what the calibration to this very skin found (contacts, shifts, field, anisotropy, remarks); "
+    "missing where the bundle is used as it is. `bundle_hash` covers it",
     "calibration_hash": "sha256 of the calibration file, or nil",
     "baseline": "array (K,): |Z0| as frames are compared with it; sent again when drift moved it by 2e-4, at most "
     "every 5 s",

@@ -34,6 +34,7 @@ from .frame_types import (
     Frame,
     ImageFrame,
     InfoFrame,
+    LocatedTouch,
     RawFrame,
     ShapeFrame,
     StatusFrame,
@@ -47,7 +48,8 @@ __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
     "Contact", "ContactFrame", "DeltaFrame", "ForceFrame", "Frame", "FrameError", "ImageFrame", "InfoFrame",
-    "RawFrame", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
+    "LocatedTouch", "RawFrame", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map",
+    "unpack",
 ]  # fmt: skip
 
 MAX_MESSAGE = 4 * 1024 * 1024
@@ -118,7 +120,7 @@ def unpack(message: bytes) -> Frame:
 
 @lru_cache(maxsize=1024)
 def _place(head: bytes) -> tuple[str, str]:
-    """(topic, skin) of "topic/skin"; empty where it is none."""
+    """(topic, skin) of "topic/skin"; two empty texts for any other text."""
     known = _TOPIC.fullmatch(head)
     return (known[1].decode(), known[2].decode()) if known else ("", "")
 

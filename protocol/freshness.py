@@ -50,8 +50,8 @@ class NotValid(Stale):
 class NewestContacts:
     """The newest contact frame of a skin and when it was measured, as far as this host can know (ages.py).
 
-    A frame of another host may have lain in the socket: it came after the socket was last seen empty, and more is not
-    known.
+    A frame of another host may have waited in the socket; it is only known to have come after the socket was last seen
+    empty.
     """
 
     def __init__(self, skin: str, endpoint: str | None = None, *, replay: bool = False) -> None:
@@ -88,7 +88,7 @@ class NewestContacts:
         return True
 
     def _leave_out_unseen_ends(self, frame: ContactFrame) -> None:
-        """A touch that we were never told of does not end for us."""
+        """Leave out the end of a touch that we were never told of."""
         if frame.session != self._session:
             self._session, self._seen = frame.session, {}
         if not frame.contacts:
@@ -105,15 +105,15 @@ class NewestContacts:
             self._empty_ns = now
 
     def first_by(self) -> float:
-        """Until when `latest` waits where nothing else is said: for the first frame, FIRST_S after it was first asked;
-        not at all once that has come.
+        """Until when `latest` waits by default: FIRST_S from its first call for the first frame, and not at all once
+        that has come.
         """
         if self._first_by is None:
             self._first_by = time.monotonic() + FIRST_S
         return self._first_by if self._frame is None else 0.0
 
     def silence_s(self, max_age: float | None) -> float:
-        """How long to wait for the next frame: as long as the newest one holds, where nothing else is said."""
+        """How long to wait for the next frame: by default as long as the newest one is valid."""
         if max_age is not None:
             return max_age
         return max(SILENCE_S, self._frame.valid_for_s) if self._frame is not None else FIRST_S

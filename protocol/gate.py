@@ -1,8 +1,8 @@
 """Who may connect to our sockets: the answer to ZeroMQ's question at each handshake (ZAP, ZeroMQ RFC 27).
 
-CURVE sockets let in the keys of their list. A peer that flooded us is refused for a while, on any socket. Refused is
-who gets no answer: its connection ends after HANDSHAKE_MS and its library tries again, so that a key that is added
-later works without a restart. (A peer that is told no never comes back: libzmq ends its session for good.)
+CURVE sockets let in the keys of their list. A peer that flooded us is refused for a while, on any socket. A refused
+peer gets no answer: its connection ends after HANDSHAKE_MS and its library tries again, so that a key that is added
+later works without a restart. (A peer that is told no never comes back, because libzmq ends its session for good.)
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ class Gate:
         self._thread.start()
 
     def guard(self, socket: zmq.Socket[bytes], domain: str, allowed: Allowed | None) -> None:
-        """Ask us at each handshake of `socket`, which is not yet bound. None: whoever has not flooded us."""
+        """Have the handshakes of `socket`, which is not yet bound, ask this gate. None: let in all that have not
+        flooded us.
+        """
         socket.zap_domain = domain.encode()
         socket.handshake_ivl = HANDSHAKE_MS
         if allowed is not None:
@@ -95,7 +97,7 @@ def peer_of(frame: zmq.Frame, secured: bool) -> str:
 
 
 def described(peer: str) -> str:
-    """The same for a person."""
+    """The peer as text for a person."""
     parts = peer.split(":")
     if len(parts) == 4:
         return f"process {parts[3]} of user {parts[1]}" if parts[3] != "0" else "a process of another container"

@@ -28,4 +28,5 @@ class HeldImage:
         if last is None or last.reconstructed != frame.reconstructed or last.session not in (ANY, frame.session):
             return False
         frame.image, frame.sigma, frame.classes = last.image, last.sigma, last.classes
+        frame.touches = last.touches
         return True

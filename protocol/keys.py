@@ -131,7 +131,7 @@ def _stats(files: list[Path]) -> list[tuple[Path, os.stat_result]]:
 
 @dataclass(frozen=True)
 class Admission:
-    """Whose keys a bound TCP socket lets in, and which of them may change something."""
+    """The keys that a bound TCP socket lets in, and those of them that may change something."""
 
     own: bytes
     secret: bytes = field(repr=False)
@@ -139,7 +139,7 @@ class Admission:
     operators: KeyFolder | None = None
 
     def keys(self) -> frozenset[bytes]:
-        """All that may connect: who holds our own secret key, clients, operators."""
+        """All keys that may connect: our own, the clients' and the operators'."""
         return frozenset({self.own, *self.clients.keys(), *(self.operators.keys() if self.operators else ())})
 
     let_in: set[bytes] = field(default_factory=set, compare=False)
@@ -150,7 +150,7 @@ class Admission:
         return key in self.keys()
 
     def admit(self, key: bytes) -> bool:
-        """The same at a handshake: noted in `let_in`, before it is decided, lest a key that is taken away just now be
+        """The same at a handshake. The key is noted in `let_in` first, so that one that is removed just now is not
         forgotten.
         """
         self.let_in.add(key)

@@ -60,7 +60,7 @@ def encode(message: Message, schema_hash: int = SCHEMA_HASH) -> bytes:
 
 
 class _Dropped(Exception):
-    """A piece of the line is no message: what it counts as, and why."""
+    """A piece of the line is not a message; says how it is counted, and why."""
 
 
 class Decoder:

@@ -1,8 +1,8 @@
 """A bound socket that notices when it is no longer reachable as configured, and opens itself anew.
 
-What can become of it: its ipc file is deleted or another process puts its own there; a key is taken from the list, and
-connections made with it must end (CURVE looks at keys only at the handshake); a peer floods it. In each case the socket
-is closed and bound again: readers come back by themselves, 30 ms later.
+Its ipc file may be deleted or replaced by another process. A key may be taken from the list; then connections made with
+it must end (CURVE looks at keys only at the handshake). A peer may flood it. In each case the socket is closed and
+bound again; readers come back by themselves, 30 ms later.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Listening:
         return found + (self.admission.problems if self.admission else [])
 
     def mind(self) -> bool:
-        """Look whether all is well, and mend it; whether `socket` is another one now."""
+        """Check the socket and mend it where needed; returns whether `socket` is another one now."""
         now = time.monotonic()
         if now - self._checked < (self._retry_s if self._unbound else CHECK_S):
             return False
@@ -81,7 +81,7 @@ class Listening:
         return True
 
     def _robbed(self) -> str:
-        """What has become of the socket's file; "" while it is there."""
+        """What happened to the socket's file; "" while it is there."""
         if self._file is None or (found := self._inode()) == self._file:
             return ""
         path = self.address.removeprefix("ipc://")
@@ -92,7 +92,7 @@ class Listening:
         return f"{who} put its own socket at {path}; we took it back: end that process, its readers still read it"
 
     def _unlisted(self) -> str:
-        """How many keys may no longer connect, though they have; "" where none."""
+        """A text on connected keys that may no longer connect; "" where there are none."""
         if self.admission is None:
             return ""
         gone = self.admission.let_in - self.admission.keys()

@@ -1,4 +1,4 @@
-"""Logs that stay readable and small, whatever arrives: the one place that bounds what is logged and how much.
+"""Logs that stay readable and small, whatever arrives. Only this module bounds what is logged and how much.
 
 Text of another program may hold anything: `foreign` makes one short line of it. `setup` gives a process its log, in
 which each place in the program writes at most BURST lines in EVERY_S seconds, none longer than LINE characters.

@@ -1,4 +1,4 @@
-"""A producer's data socket: what is sent, who subscribes, and what becomes of a subscriber that sends too much."""
+"""A producer's data socket: it sends frames, counts subscribers, and cuts off those that flood it."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ RETURN_S = 1.0
 class Publisher:
     """A producer's data socket.
 
-    XPUB that is told of every subscription and counts them itself: by default ZeroMQ hides the second one, so that a
-    late joiner would not get latched values and `wanted` could not be known. `session` is new with each Publisher
-    unless given.
+    It is an XPUB socket that is told of every subscription and counts them itself. By default ZeroMQ hides a second
+    subscription: a late joiner would not get latched values, and `wanted` could not be known. `session` is new with
+    each Publisher unless given.
     """
 
     def __init__(
@@ -88,9 +88,9 @@ class Publisher:
         return self._listening.problems
 
     def mind(self) -> bool:
-        """Look whether the socket is still reachable as configured and nobody floods it, and mend it; whether `socket`
-        is another one now. Call it at least once a second. Latched values are kept, and so are the subscriptions until
-        their owners have come back.
+        """Check that the socket is still reachable as configured and that nobody floods it, and mend it where needed;
+        returns whether `socket` is another one now. Call it at least once a second. Latched values are kept, and so are
+        the subscriptions until their owners have come back.
         """
         peer, self._flooded_by = self._flooded_by, None
         if peer is not None:

@@ -1,4 +1,4 @@
-"""Connections that ZeroMQ has given up, made anew.
+"""Makes connections anew that ZeroMQ has given up.
 
 libzmq connects again by itself to a peer that goes away, but never to one that broke its protocol (a message beyond
 MAXMSGSIZE, bytes that are none of ZMTP): that session ends for good, and the reader would hear nothing of the rightful
@@ -39,7 +39,7 @@ class Connections:
         self.renewed = 0
 
     def mind(self) -> None:
-        """Connect anew to whom we have been without for GRACE_S since the connection broke."""
+        """Connect anew to peers that have been missing for GRACE_S since their connection broke."""
         now = time.monotonic()
         if now - self._looked_s < CHECK_S:
             return

@@ -1,4 +1,4 @@
-"""The runtime folder: where the sockets of one running service lie, whose it is, and that there is only one.
+"""The runtime folder of one running service: its place, its owner, its sockets, and the lock against a second service.
 
 `$EITSKIN_RUNTIME`, else `$XDG_RUNTIME_DIR/eitskin`, else `/tmp/eitskin-<uid>`; mode 0700, so that reaching a socket
 needs the owner's rights.
@@ -123,7 +123,7 @@ def lock(folder: Path | None = None, process: str = "") -> Iterator[Path]:
 
 @cache
 def host_id() -> str:
-    """Which monotonic clock our stamps are of: the boot id, equal in all containers of a host and new after each
+    """The name of this host's monotonic clock: the boot id, equal in all containers of a host and new after each
     boot.
     """
     try:

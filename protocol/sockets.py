@@ -1,8 +1,8 @@
 """Publishing and subscribing: one part per message, counted subscribers, readers that are never behind or never miss
 one.
 
-A reader survives anything that arrives: what is no frame is counted, logged once per source, and dropped. Sockets are
-not thread-safe: each belongs to the thread that uses it.
+A reader survives anything that arrives: messages that are not frames are counted, logged once per source, and dropped.
+Sockets are not thread-safe: each belongs to the thread that uses it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 class _Reader:
-    """What both readers share: receiving until a frame comes, and what to do with what is none."""
+    """What both readers share: receiving until a frame comes, and handling messages that are not frames."""
 
     def __init__(self, where: str, socket: Socket, addresses: Mapping[str, str]) -> None:
         self.socket = socket
@@ -108,6 +108,11 @@ class NewestReader(_Reader):
         """The newest frame not yet read, waiting up to `timeout_s` for one; None when there is none. Never raises on
         bad input.
         """
+        got = self.recv_message(timeout_s)
+        return got[0] if got else None
+
+    def recv_message(self, timeout_s: float = 0.0) -> tuple[Frame, bytes] | None:
+        """The newest frame not yet read together with its message, for who forwards it."""
         got = self._receive(timeout_s)
         if got is None:
             return None
@@ -115,7 +120,7 @@ class NewestReader(_Reader):
         if self._last is not None and self._last[0] == frame.session and frame.seq > self._last[1]:
             self.skipped += frame.seq - self._last[1] - 1
         self._last = (frame.session, frame.seq)
-        return frame
+        return got
 
 
 class AllReader(_Reader):

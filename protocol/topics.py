@@ -1,4 +1,4 @@
-"""The table of topics: the only place that names them.
+"""The table of topics; only this module names them.
 
 Sockets, `skin top`, the recorder, WIRE.md's table and tests derive from it. A message's topic on the wire is
 `name/skin`.
@@ -11,15 +11,15 @@ from typing import Literal
 
 from . import frame_types as f
 
-BRIDGES = ("ros2", "foxglove")
-"""Processes that hand contacts on to other worlds. On our side they publish their status alone."""
+BRIDGES = ("page", "ros2", "foxglove")
+"""Processes that show contacts, or hand them on to other worlds. On our side they publish their status alone."""
 PRODUCERS = ("acquisition", "preprocessing", "inference", "publisher", "stub", *BRIDGES)
 """Processes that own a data socket `<producer>.ipc`. A replay stands in for acquisition and binds its socket."""
 
 
 @dataclass(frozen=True)
 class Topic:
-    """What is to be known of a topic.
+    """One topic's properties.
 
     `rate_hz`: nominal, of the demo; 0: on change only. `lazy`: its extra work is done only while somebody subscribes.
     `latched`: a late joiner is given the last value. `behind`: what a reader does that cannot keep up, skip to the

@@ -1,8 +1,7 @@
-"""How this process's sockets reach the others: which addresses, which keys. Every socket of the project is opened
-here.
+"""The addresses and keys with which this process's sockets reach others. Every socket of the project is opened here.
 
-By default all are ipc sockets in the runtime folder. A configuration may put producers at tcp:// addresses; then
-traffic is encrypted and both ends known to each other by CURVE, or, beyond the loopback, refused.
+By default all are ipc sockets in the runtime folder. A configuration may put producers at tcp:// addresses. Then CURVE
+encrypts the traffic and both ends check each other's keys; beyond the loopback, TCP without CURVE is refused.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ class Transport:
 
     @property
     def keyed(self) -> bool:
-        """Whether anything of keys is configured: then no TCP socket goes without."""
+        """Whether any key is configured: then no TCP socket works without keys."""
         return bool(self.secret_key or self.server_keys or self.clients or self.operators)
 
     def data_address(self, producer: str) -> str:
@@ -106,7 +105,9 @@ def check(transport: Transport) -> None:
 
 
 def half(transport: Transport) -> str:
-    """What is missing where keys are configured by half, so that something would go unencrypted or unasked; else ""."""
+    """What is missing where keys are only half configured, so that traffic would be unencrypted or unchecked; else
+    "".
+    """
     if not transport.keyed:
         return ""
     if transport.secret_key is None:
@@ -126,8 +127,9 @@ def half(transport: Transport) -> str:
 
 
 def admission(address: str, transport: Transport | None = None) -> Admission | None:
-    """Whom a socket bound at `address` lets in; None where no key is asked for (ipc: the folder's rights decide;
-    unencrypted TCP). Raises TransportError for an address that would be open to others against the configuration.
+    """The keys that a socket bound at `address` lets in; None where no key is asked for (ipc, where the folder's rights
+    decide, and unencrypted TCP). Raises TransportError for an address that would be open to others against the
+    configuration.
     """
     transport = transport or _current
     if not address.startswith("tcp://"):

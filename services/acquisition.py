@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 def open_source(name: str, skin: Skin, bundle: Bundle) -> Source:
-    """The source that a skin's `port` names."""
+    """Open the source that a skin's `port` names."""
     kind = {".mcap": RecordingSource, ".npz": FileSource}.get(Path(skin.port).suffix, BoardSource)
     return kind(name, skin, bundle)
 

@@ -5,6 +5,7 @@ A bridge is a client: it knows `protocol` alone, and is told by us what skin.tom
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import json
 import os
@@ -16,8 +17,8 @@ from protocol.errors import EitskinError
 from protocol.topics import BRIDGES
 from services.runtime.config import ROOT, ConfigError, ConfigFile, load
 
-NEEDS = {"ros2": "cyclonedds", "foxglove": "foxglove"}
-"""What each needs beside the service's own packages: an extra of its own in pyproject.toml."""
+NEEDS = {"page": "aiohttp", "ros2": "cyclonedds", "foxglove": "foxglove"}
+"""What each needs: an extra of its own in pyproject.toml, the page's among the service's own packages."""
 
 
 class MissingExtra(EitskinError):
@@ -27,13 +28,14 @@ class MissingExtra(EitskinError):
 def check(name: str) -> None:
     """Raises MissingExtra where the bridge cannot run here."""
     if importlib.util.find_spec(NEEDS[name]) is None:
+        extra = "" if name == "page" else f" EXTRAS={name}"
         raise MissingExtra(
-            f"the bridge {name} needs the package {NEEDS[name]}, which is not installed: run `make venv EXTRAS={name}`"
+            f"the bridge {name} needs the package {NEEDS[name]}, which is not installed: run `make venv{extra}`"
         )
 
 
-def settings(name: str, config: ConfigFile) -> str:
-    """What the bridge is told, as JSON."""
+def settings(name: str, config: ConfigFile, host: str = "") -> str:
+    """What the bridge is told, as JSON. `host`: where it listens, whatever the configuration says."""
     reach = config.transport()
     told: dict[str, Any] = {
         "skins": {
@@ -47,7 +49,7 @@ def settings(name: str, config: ConfigFile) -> str:
             "operators": _absolute(reach.operators),
             "insecure": reach.insecure,
         },
-        "options": getattr(config, name).model_dump(mode="json"),
+        "options": getattr(config, name).model_dump(mode="json") | ({"host": host} if host else {}),
         "log_level": config.logging.level,
     }
     return json.dumps(told)
@@ -57,23 +59,24 @@ def _absolute(path: Any) -> str | None:
     return None if path is None else os.path.abspath(path)
 
 
-def become(name: str, config: ConfigFile) -> None:
+def become(name: str, config: ConfigFile, host: str = "") -> None:
     """Go on as the bridge, in this very process. Raises MissingExtra."""
     check(name)
-    environment = {**os.environ, "EITSKIN_BRIDGE": settings(name, config)}
+    environment = {**os.environ, "EITSKIN_BRIDGE": settings(name, config, host)}
     os.chdir(ROOT)
     os.execve(sys.executable, [sys.executable, "-m", f"bridges.{name}"], environment)
 
 
 def main() -> int:
-    if len(sys.argv) != 2 or sys.argv[1] not in BRIDGES:
-        print(f"usage: python -m services.bridge {'|'.join(BRIDGES)}", file=sys.stderr)
-        return 2
-    logs.setup(f"{sys.argv[1]}: %(message)s")
+    parser = argparse.ArgumentParser(prog="services.bridge", description="Starts a bridge, beside a running service.")
+    parser.add_argument("name", choices=BRIDGES)
+    parser.add_argument("--host", default="", help="where it listens, whatever skin.toml says: in a container")
+    args = parser.parse_args()
+    logs.setup(f"{args.name}: %(message)s")
     try:
-        become(sys.argv[1], load())
+        become(args.name, load(), args.host)
     except (ConfigError, MissingExtra) as why:
-        print(f"{sys.argv[1]}: {why}", file=sys.stderr)
+        print(f"{args.name}: {why}", file=sys.stderr)
     return 1
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from models.bundle import Bundle
+from models.prereconstruction import ONE_STEP_LAMBDA
 from services.contacts.force import ForceLaw
 from services.estimation.tare import Baseline
 from services.runtime.config import Skin
@@ -26,6 +27,7 @@ def describe(skin: Skin, bundle: Bundle, baseline: Baseline | None, revision: in
         "bundle_hash": bundle.hash,
         "geometry": geometry(bundle),
         "pattern": bundle.skin.get("pattern", ""),
+        "stack": _stack(bundle),
         "frame_id": skin.frame_id,
         "parent_frame_id": skin.pose.parent,
         "pose": [*skin.pose.position_m, *skin.pose.quaternion_xyzw],
@@ -43,6 +45,12 @@ def describe(skin: Skin, bundle: Bundle, baseline: Baseline | None, revision: in
     return found
 
 
+def _stack(bundle: Bundle) -> dict[str, Any]:
+    ladder = np.asarray(bundle.matrices.ladder, dtype=float)
+    nearest = np.argmin(np.abs(np.log(ladder) - 2 * np.log(ONE_STEP_LAMBDA)))
+    return {"lambda_squared": ladder.tolist(), "one_step": int(nearest)}
+
+
 class _Told(NamedTuple):
     baseline: Baseline | None
     origin: tuple[Any, ...]
@@ -50,7 +58,9 @@ class _Told(NamedTuple):
 
 
 class BaselineNews:
-    """Whether info/<skin> is to be sent again: at once for another baseline, by its size for drift of the same one."""
+    """Whether info/<skin> is to be sent again: at once for another baseline, and when the same one has drifted far
+    enough.
+    """
 
     def __init__(self) -> None:
         self._told: _Told | None = None

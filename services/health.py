@@ -1,9 +1,9 @@
-"""Does a process answer, and do frames flow through it? What a container's healthcheck asks.
+"""Whether a process answers and frames flow through it, for a container's healthcheck.
 
 python -m services.health publisher      exit 0: yes. 1: no, and why.
 
-Stages are asked for each configured skin. The stub is well while a host has it scan and it is plugged in. A
-recorder, whose status counts the messages it has written, is well while those with frames grow in number.
+Stages are asked about each configured skin. The stub is healthy while it is plugged in and a host has it scan. A
+recorder is healthy while the number of frames it has written grows.
 """
 
 from __future__ import annotations

@@ -6,20 +6,25 @@ ONNX Runtime on one thread, warmed up before the stage is ready. A bundle withou
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import DeltaFrame, Frame, ImageFrame
-from services.estimation.quality import Residual
+from models.locator import Located, Locator
+from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
+from services.estimation.quality import SURE, Residual
 from services.estimation.sentinel import CoarseImage
+from services.estimation.within_scan import ChangingTouch
+from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
-from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
+from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
 
-SETTLED = 5  # untouched frames in a row that state the same noise, from which it is taken to be a touch's too
+CHANGING_FRAMES = 3  # in a row that may be explained by a touch that changes: a press within 0.1 s is over by then
+SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
 
 class Inference(Stage):
@@ -38,23 +43,30 @@ class Inference(Stage):
             self._network.check(bundle)
         # Only a network's image is meant to explain a frame: a one-step image shows where, not how much.
         self._refuses = isinstance(self._network, Network)
+        self.linearisation = Linearisation(name, bundle)
         self._residual = Residual(bundle, to_scale=self._refuses)
+        self._changing_touch = ChangingTouch(bundle)  # the bundle's: how a skin is mounted changes 3 % of d by little
+        self.each_alone = False  # offline: frames that do not follow each other
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
+        self._locator = None if bundle.locator is None else Locator(bundle.locator)
         self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
 
     def reset(self) -> None:
         self._last: ImageFrame | None = None  # of the touch that is being held
-        self._refused = False  # whether it explains its frame too badly to be of a touch
+        self._refused = False  # whether it explains its frame too badly to be that of a touch
         self._last_scan = 0  # of the frame that it was reconstructed from
-        self._again = True  # whether somebody may not have it: the next frame that holds it brings it
+        self._again = True  # whether a subscriber may not have it: the next held frame brings it
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
         self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
         self._quiet: NDArray[np.float32] | None = None  # standard deviation that untouched frames state
         self._stated = 0  # how many have stated it, one after the other
-        self._counters = {"networks_run": 0, "held": 0, "untouched": 0, "unwanted": 0, "missed": 0, "refused": 0}
+        self._changing = 0  # frames in a row whose touch changed during the scan
+        self._changing_scan = 0  # of the last of them whose image shows nothing
+        names = ("networks_run", "held", "untouched", "unwanted", "missed", "refused", "changing", "uncalibrated")
+        self._counters = dict.fromkeys(names, 0)  # uncalibrated: frames whose calibration could not be found
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, DeltaFrame)
@@ -63,6 +75,10 @@ class Inference(Stage):
             self._unseen = frame if frame.stack.size else self._unseen
             return []
         out = ImageFrame(**inherited(frame), touched=frame.touched)
+        if frame.calibration != self.linearisation.name and not self._follow(frame.calibration):
+            out.valid = False
+            add_reason(out.reasons, "stale_baseline")
+            self._counters["uncalibrated"] += 1
         out.metres_per_pixel, out.origin = self._metres_per_pixel, self._origin
         if frame.stack.size:
             self._run(frame, out)
@@ -74,9 +90,23 @@ class Inference(Stage):
             self._roughly(frame, out)
         else:
             self._counters["untouched"] += 1
-            self._last = None
+            self._last, self._changing, self._changing_scan = None, 0, 0
             self._rest(frame.sigma)
         return [out]
+
+    def _follow(self, calibration: str) -> bool:
+        """Use the matrices that frames are made with from now on; False where they cannot be found."""
+        followed = self.linearisation.follow(calibration)
+        if followed:
+            self._build()
+        return followed is not None
+
+    def _build(self) -> None:
+        """What stands on the matrices in use."""
+        self._residual = Residual(self.linearisation.bundle, to_scale=self._refuses)
+        if isinstance(self._network, OneStep):
+            self._network = OneStep(self.linearisation.bundle)
+        self._last, self._quiet, self._stated = None, None, 0
 
     def joined(self, topic: str) -> None:
         self._again = True
@@ -96,14 +126,14 @@ class Inference(Stage):
                     stage._ahead = frame, pictures
 
     def _rest(self, sigma: NDArray[np.float32]) -> None:
-        """An untouched frame stated this. One of a sentinel scan states nothing."""
+        """Learn the noise from an untouched frame. Sentinel scans do not state it."""
         if self._quiet is not None and np.array_equal(sigma, self._quiet):
             self._stated += 1
         elif np.isfinite(sigma).any():
             self._quiet, self._stated = sigma, 1
 
     def prepare(self) -> bool:
-        """What a touch would need that began now: not for a noise that changes from frame to frame."""
+        """Make the matrices that a touch would need now; not while the noise changes from frame to frame."""
         return self._quiet is not None and self._stated >= SETTLED and self._residual.prepare(self._quiet)
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
@@ -111,10 +141,45 @@ class Inference(Stage):
         out.image, out.sigma, out.classes = ahead[1] if ahead and ahead[0] is frame else self._network.run(frame)
         out.noise = _rms(frame.sigma)
         out.residual = self._residual(frame.difference, frame.sigma, out.image)
+        if self._locator is not None and frame.touched:
+            quantity = self._locator.quantity
+            out.touches = [_touch(each, quantity) for each in self._locator.locate(frame.difference, frame.sigma)]
         self._refused = self._refuses and frame.touched and out.residual is not None and self._residual.refused
-        self._judge(out)
         self._counters["networks_run"] += 1
+        doubted = frame.touched and out.residual is not None and out.residual > SURE
+        if not doubted or self.each_alone or SEPARATE in frame.reasons:  # what stands by itself was still
+            self._changing = 0
+        elif self._refused and self._changes(frame, out):
+            return
+        elif not self._changing_touch.steady(frame.difference, frame.sigma):
+            self._changing += 1
+            add_reason(out.reasons, "changing")
+        self._judge(out)
         self._shows(frame, out)
+
+    def _changes(self, frame: DeltaFrame, out: ImageFrame) -> bool:
+        """Whether a touch that changed during the scan explains a frame that its image does not. Then the frame is
+        valid and says `changing`. Its image shows nothing new: that of before is held; where there was none, or where
+        the touch is seen to have ended, it is empty.
+        """
+        found = self._changing_touch(frame.difference, frame.sigma) if self._changing < CHANGING_FRAMES else None
+        if found is None:
+            return False
+        ended = found.ended and self._changing > 0
+        if not ended:
+            add_reason(out.reasons, "changing")
+        out.residual, self._refused = found.left, False
+        self._changing = CHANGING_FRAMES if ended else self._changing + 1  # what ended does not end again
+        self._changing_scan = frame.scan
+        self._counters["changing"] += 1
+        if (last := self._last) is None or ended:
+            out.image, out.sigma = np.zeros_like(out.image), np.zeros_like(out.sigma)
+            out.reconstructed = frame.scan
+        else:
+            blank = ImageFrame(skin=self.skin)
+            out.image, out.sigma, out.classes = blank.image, blank.sigma, blank.classes
+            self._shows_again(last, out)
+        return True
 
     def _roughly(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """The image of a few measurements, which no network was trained on."""
@@ -129,47 +194,58 @@ class Inference(Stage):
         self._again = False
 
     def _judge(self, out: ImageFrame) -> None:
-        """An image that does not explain the measurements is of no touch."""
+        """Judge whether the image explains the measurements: else it is not that of a touch."""
         if self._refused:
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
             self._counters["refused"] += 1
 
     def _hold(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        """The image of the frame last reconstructed, if we have seen that one. It was sent then, and is sent again only
-        to who has come since.
+        """Hold the image of the frame last reconstructed, if this process has it. It is sent again only for new
+        subscribers.
         """
         last = self._last
         if last is not None and self._last_scan == frame.reconstructed:
-            out.held = True
-            out.reconstructed, out.noise, out.residual = self._last_scan, last.noise, last.residual
-            if self._again:
-                out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
-                self._again = False
+            out.noise, out.residual = last.noise, last.residual
+            self._shows_again(last, out)
             self._judge(out)
             self._counters["held"] += 1
+        elif 0 < self._changing_scan == frame.reconstructed:
+            self._refused = True  # what stays as it is did not change during the scan
+            self._judge(out)
         else:  # skipped, or before we started: not valid until the next reconstruction, at most 16 frames on
             out.valid = False
             out.reasons.append("gap")
             self._counters["missed"] += 1
 
+    def _shows_again(self, last: ImageFrame, out: ImageFrame) -> None:
+        out.held, out.reconstructed = True, self._last_scan
+        if self._again:
+            out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
+            out.touches = last.touches
+            self._again = False
+
     def state(self) -> dict[str, Any]:
-        last = self._last
+        last, rest = self._last, {"changing": [self._changing, self._changing_scan], **self.linearisation.state()}
         if last is None:
-            return {"last": None}
-        kept = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
-        kept |= {"residual": last.residual, "refused": self._refused}
-        return {"last": {"scan": self._last_scan, **kept}}
+            return {"last": None, **rest}
+        kept: dict[str, Any] = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
+        kept |= {"residual": last.residual, "refused": self._refused, "touches": [asdict(t) for t in last.touches]}
+        return {"last": {"scan": self._last_scan, **kept}, **rest}
 
     def load(self, state: dict[str, Any]) -> None:
         self.reset()
+        if self.linearisation.load(state):
+            self._build()
         last = state.get("last")
+        self._changing, self._changing_scan = (int(n) for n in state.get("changing", (0, 0)))
         if last is None:
             return
         try:
             image, sigma, classes = (np.asarray(last[name], np.float32) for name in ("image", "sigma", "classes"))
             self._last = ImageFrame(skin=self.skin, image=image, sigma=sigma, classes=classes)
             self._last.noise, self._last_scan = last.get("noise"), int(last["scan"])
+            self._last.touches = [LocatedTouch(**each) for each in last.get("touches", [])]
             self._last.residual, self._refused = last.get("residual"), bool(last.get("refused", False))
         except (KeyError, TypeError, ValueError) as wrong:
             raise Refused(f"no image in the saved state ({wrong})") from None
@@ -180,8 +256,16 @@ class Inference(Stage):
         return Health("OK", [], dict(self._counters))
 
 
+def _touch(found: Located, quantity: str) -> LocatedTouch:
+    made = LocatedTouch(position=[found.x, found.y], sigma=found.sigma, amplitude=found.amplitude)
+    if found.value is not None:
+        setattr(made, quantity, found.value)
+        made.value_sigma = found.value_sigma
+    return made
+
+
 def _rms(sigma: NDArray[np.float32]) -> float | None:
-    """Of what is finite; None where nothing is."""
+    """Root mean square of the finite values; None without any."""
     finite = sigma[np.isfinite(sigma)].astype(float)
     return float(np.sqrt((finite**2).mean())) if finite.size else None
 

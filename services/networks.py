@@ -67,7 +67,7 @@ class Network:
         return _scaled(frame, drop[0, 0], log_sigma[0, 0], logits[0])
 
     def run_many(self, frames: Sequence[DeltaFrame]) -> list[Pictures]:
-        """The same for several frames in one run: a third less time per frame; the last bits may differ."""
+        """Run several frames at once: a third less time per frame; the last bits may differ."""
         stacks, contexts = np.stack([f.stack for f in frames]), np.stack([f.context for f in frames])
         drop, log_sigma, logits = self.session.run(OUTPUTS, {"stack": stacks, "context": contexts})
         return [_scaled(f, drop[n, 0], log_sigma[n, 0], logits[n]) for n, f in enumerate(frames)]

@@ -40,7 +40,7 @@ class Pipeline:
             skin = Skin(port="stub", bundle=skin, frame_id=name)
         self.name = name
         self.pre, self.inference, self.publishing = build_stages(name, skin, bundle)
-        self.pre.always_reconstruct = self.publishing.each_alone = always_reconstruct
+        self.pre.always_reconstruct = self.inference.each_alone = self.publishing.each_alone = always_reconstruct
 
     def run(self, raw: RawFrame) -> Result:
         """What the processes would publish for one raw frame; stamps are filled in."""
@@ -54,8 +54,9 @@ class Pipeline:
         return Result(delta, image, contact)
 
     def prepare(self) -> None:
-        """What the processes do while no frame waits."""
+        """Do the work that the processes do while no frame waits."""
         for stage in (self.pre, self.inference, self.publishing):
+            stage.between_frames()
             stage.prepare()
 
     def reset(self) -> None:

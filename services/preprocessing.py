@@ -32,6 +32,7 @@ from services.estimation.tare import Baseline, NoBaseline
 from services.estimation.touch_decision import FrameAverager, TouchDecision, sigma_of_mean
 from services.estimation.touch_estimator import TouchEstimator
 from services.kept_baseline import kept, take_over
+from services.linearisation import Linearisation
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
 from services.sentinel_scans import SentinelScans
@@ -52,15 +53,9 @@ class Preprocessing(Stage):
 
     def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
         super().__init__(name)
-        self.config, self.bundle = skin, bundle
-        self.electrodes = ElectrodeHealth(bundle)
-        rates = DriftRates(skin.tare.scale_per_s, skin.tare.contact_per_s)
-        self.touch_estimator = TouchEstimator(
-            bundle, rates, skin.tare.frames, skin.tare.tracking_s, skin.touch.false_alarms
-        )
-        self.baseline_estimator = self.touch_estimator.baseline_estimator
-        self.touch_detector = self.touch_estimator.touch_detector
-        self.pre = self.baseline_estimator.pre
+        self.config = skin
+        self.linearisation = Linearisation(name, bundle)
+        self._build()
         self.gain = GainSteps(len(bundle.pattern))
         self.frame_averager = FrameAverager()
         self._news = BaselineNews()
@@ -68,6 +63,29 @@ class Preprocessing(Stage):
         self.sentinel_scans = SentinelScans(skin, bundle)
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
         self.reset()
+
+    def _build(self) -> None:
+        """What stands on the bundle in use."""
+        self.bundle, skin = self.linearisation.bundle, self.config
+        self.electrodes = ElectrodeHealth(self.bundle)
+        rates = DriftRates(skin.tare.scale_per_s, skin.tare.contact_per_s)
+        self.touch_estimator = TouchEstimator(
+            self.bundle, rates, skin.tare.frames, skin.tare.tracking_s, skin.touch.false_alarms
+        )
+        self.baseline_estimator = self.touch_estimator.baseline_estimator
+        self.touch_detector = self.touch_estimator.touch_detector
+        self.pre = self.baseline_estimator.pre
+
+    def between_frames(self) -> None:
+        """A calibration that is ready is adopted while nothing touches."""
+        if not self.linearisation.follows(self.touch_estimator.touched):
+            return
+        before, health = self.baseline_estimator, self.electrodes.state()
+        self._build()
+        self.baseline_estimator.succeed(before)
+        self.electrodes.load(health)
+        self._begin_anew()
+        self._news = BaselineNews()
 
     def reset(self) -> None:
         self.sentinel_scans.scan = 0
@@ -81,7 +99,7 @@ class Preprocessing(Stage):
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, RawFrame)
-        out = DeltaFrame(**inherited(frame))
+        out = DeltaFrame(**inherited(frame), calibration=self.linearisation.name)
         self._counters["frames"] += 1
         out.valid, out.reasons = as_sent(frame)  # measurements that failed are left out below
         for reason in reasons_of(frame.status):
@@ -153,7 +171,7 @@ class Preprocessing(Stage):
         teaches = learns  # whether the baseline is to learn from this frame
         # Measured bundles have no sign model, so this check is skipped.
         if self.bundle.matrices.normalisation == "model" and impossible(
-            d, self.baseline_estimator.sigma, live & self.electrodes.self_sensing, self.touch_estimator.touched
+            d, self.baseline_estimator.sigma, live & self.electrodes.check.self_sensing, self.touch_estimator.touched
         ):
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
@@ -228,7 +246,10 @@ class Preprocessing(Stage):
             raise Refused(str(why)) from None
         self._begin_anew()
         relative = float(np.median(baseline.sigma / np.maximum(baseline.z0, 1e-12)))
-        return {"frames": baseline.frames, "snr_db": -20 * np.log10(max(relative, 1e-12)), "hash": baseline.hash}
+        wanted = self.config.tare.calibrate and bool(args.get("calibrate", True))
+        calibrating = wanted and self.linearisation.tared(baseline)
+        answer = {"frames": baseline.frames, "snr_db": -20 * np.log10(max(relative, 1e-12)), "hash": baseline.hash}
+        return answer | {"calibrating": calibrating}
 
     def state(self) -> dict[str, Any]:
         return {
@@ -240,6 +261,7 @@ class Preprocessing(Stage):
             "electrodes": self.electrodes.state(),
             "judge": self.touch_detector.state(),
             **self.baseline_estimator.state(),
+            **self.linearisation.state(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -251,6 +273,9 @@ class Preprocessing(Stage):
             raise Refused(f"the saved state does not fit ({wrong}): reset") from None
 
     def _load(self, state: dict[str, Any]) -> None:
+        if self.linearisation.load(state):
+            self._build()
+            self._news = BaselineNews()
         self.baseline_estimator.load(state)
         self.touch_estimator.touched = bool(state["touched"])
         self.sentinel_scans.scan = int(state.get("coarse", 0))
@@ -269,6 +294,8 @@ class Preprocessing(Stage):
         return kept(self.baseline_estimator)
 
     def restore(self, saved: dict[str, Any], age_s: float) -> None:
+        if self.config.tare.calibrate and self.linearisation.restore(saved):
+            self._build()
         try:
             take_over(self.baseline_estimator, saved, age_s, self.config.tare.max_age_s)
         except NoBaseline as why:
@@ -288,13 +315,15 @@ class Preprocessing(Stage):
     def info(self) -> dict[str, Any] | None:
         if not self._news(self.baseline_estimator.baseline, self.baseline_estimator.last_sample_ns):
             return None
-        return describe(self.config, self.bundle, self.baseline_estimator.baseline, self.baseline_estimator.revision)
+        said = describe(self.config, self.bundle, self.baseline_estimator.baseline, self.baseline_estimator.revision)
+        return said | {"mounting": self.linearisation.found} if self.linearisation.found else said
 
     def health(self) -> Health:
         problem = self._foreign or self.baseline_estimator.problem
         if not problem and self.baseline_estimator.baseline is None:
             problem = self.baseline_estimator.progress()
         problems = [*([problem] if problem else []), *self.electrodes.problems()]
+        problems += [self.linearisation.problem] if self.linearisation.problem else []
         unchecked = [self._unchecked] if self._unchecked else []  # as the bundle is made: no warning
         return Health("WARN" if problems else "OK", [*problems, *unchecked], dict(self._counters))
 

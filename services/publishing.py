@@ -11,22 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame
+from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, LocatedTouch, ShapeFrame
 from protocol.held import ANY, HeldImage
 from services.contacts.force import ForceLaw, Look
 from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
 from services.contacts.placing import placement
+from services.contacts.registered import measures_force, patches, registered
 from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.surface import Placed
 from services.contacts.tracking import Tracker
 from services.describe import geometry
+from services.estimation.quality import SURE
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
 UNKNOWN_BELOW = 0.4  # probability of the best class, of five, below which a shape is "unknown"
-SURE = 0.05  # residual above which the touch changed during the scan; of steady touches hardly one has it
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 
@@ -43,6 +44,9 @@ class Publishing(Stage):
         self.config = skin
         self.law = ForceLaw.of(skin, bundle, name)
         self.place, self.frame_id = placement(skin, geometry(bundle)["outline"], name)
+        by_registration = measures_force(bundle)
+        self._tells_force = self.law.exists or by_registration
+        self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
         self.tracker = Tracker()
         self.each_alone = False  # offline: frames that do not follow each other
         self.reset()
@@ -72,8 +76,8 @@ class Publishing(Stage):
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, ImageFrame)
         self._counters["frames"] += 1
-        out = ContactFrame(**inherited(frame), frame_id=self.frame_id, force_calibrated=self.law.calibrated)
-        if not self.law.exists:
+        out = ContactFrame(**inherited(frame), frame_id=self.frame_id, force_calibrated=self._calibrated)
+        if not self._tells_force:
             add_reason(out.reasons, "uncalibrated_force")
         self.lacks = not self.held.complete(frame)
         if not frame.valid and "out_of_distribution" in frame.reasons:
@@ -81,7 +85,7 @@ class Publishing(Stage):
         elif self.lacks:
             add_reason(out.reasons, "gap")
             self._miss(out, "gap")
-        elif frame.held and self._knows(frame):
+        elif frame.held and (self._knows(frame) or self._changes(frame)):
             self._keep(frame)
             out.held = True
         elif not frame.image.size and (frame.touched or not frame.valid):
@@ -95,9 +99,9 @@ class Publishing(Stage):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)
-        # What stands by itself was still while it was scanned, as its source says.
-        moves = not self._alone(frame) and (not self._touched or not _explained(frame))
-        if frame.touched and not frame.held and moves:
+        # It began during the scan, or nothing of it is to be believed yet.
+        began = not self._touched or not (self._segments or _explained(frame))
+        if frame.touched and began and not frame.held and not self._alone(frame):
             add_reason(out.reasons, "changing")
         self._touched = frame.touched
         explained = out.quality is not None and out.quality >= EXPLAINED
@@ -112,13 +116,17 @@ class Publishing(Stage):
         return frames
 
     def _see(self, frame: ImageFrame) -> None:
-        """Contacts of a new image."""
+        """Find the contacts of a new image."""
         m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
         segments: list[Segment] = []
-        if frame.touched and frame.image.size:
+        located = frame.touches if frame.touched and frame.image.size else []
+        if located:
+            segments, seen = patches(frame)
+        elif frame.touched and frame.image.size:
             places = [] if self._alone(frame) else self.tracker.expected(now)
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
-        seen = [Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
+        if not located:
+            seen = [Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
         tracks: Sequence[Track | None]
         ended: list[Track] = []
         if self._alone(frame):
@@ -126,11 +134,13 @@ class Publishing(Stage):
         else:
             tracks, ended = self.tracker.update(seen, now, _explained(frame))
         present = []
-        for track, place, s in zip(tracks, seen, segments, strict=True):
+        said: Sequence[LocatedTouch | None] = located or [None] * len(segments)
+        for track, place, s, touch in zip(tracks, seen, segments, said, strict=True):
             if track is not None:
                 classes = _class_probabilities(s, frame.classes)
-                present.append((self._contact(track, place, s, classes, frame), s, classes))
-        present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
+                present.append((self._contact(track, place, s, classes, frame, touch), s, classes))
+        if not located:  # those come strongest first
+            present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
         self._segments, self._classes = [s for _, s, _ in present], [classes for _, _, classes in present]
         self._geometry, self._known = (m, [x0, y0]), True
         self._seen_in = frame.session, frame.reconstructed
@@ -142,13 +152,18 @@ class Publishing(Stage):
         return self.each_alone or SEPARATE in frame.reasons
 
     def _knows(self, frame: ImageFrame) -> bool:
-        """Whether our contacts are those of this held image: frames in between may have passed us by, and what waits
-        to be seen twice is seen again in it.
+        """Whether our contacts are those of this held image. They are not if frames in between were missed, or if a
+        touch waits for its second frame.
         """
         recent = not self.tracker.forgotten(frame.stamps.get("sample", 0))
         session, scan = self._seen_in
         theirs = session in (ANY, frame.session) and scan == frame.reconstructed > 0  # 0: nobody says
         return self._known and recent and not self.tracker.waits and theirs
+
+    def _changes(self, frame: ImageFrame) -> bool:
+        """Whether this frame shows nothing new because its touch changed meanwhile: our contacts are all there is."""
+        forgotten = self.tracker.forgotten(frame.stamps.get("sample", 0))
+        return self._known and not forgotten and "changing" in frame.reasons
 
     def _keep(self, frame: ImageFrame) -> None:
         """The same contacts a frame later."""
@@ -157,15 +172,25 @@ class Publishing(Stage):
         self._contacts = [replace(c, state="hold", velocity=[0.0, 0.0, 0.0]) for c in present] + self._ends(ended)
 
     def _miss(self, out: ContactFrame, reason: str) -> None:
-        """A frame that says nothing of what touches: not even that a contact ended."""
+        """Make a frame that says nothing about touches, not even that a contact ended."""
         out.valid = False
         if not out.reasons:
             add_reason(out.reasons, reason)
         self._forget()
         self._counters["unknown"] += 1
 
-    def _contact(self, track: Track, seen: Patch, s: Segment, classes: list[float], frame: ImageFrame) -> Contact:
+    def _contact(
+        self,
+        track: Track,
+        seen: Patch,
+        s: Segment,
+        classes: list[float],
+        frame: ImageFrame,
+        touch: LocatedTouch | None,
+    ) -> Contact:
         force, sigma = self.law.force(Look.of(s, frame))
+        if touch is not None and not self.law.exists:
+            force, sigma = touch.force_n, None if touch.force_n is None else touch.value_sigma
         best = int(np.argmax(classes)) if classes else -1
         known = bool(classes) and classes[best] >= UNKNOWN_BELOW
         at = self.place(seen.x, seen.y)
@@ -184,6 +209,7 @@ class Publishing(Stage):
             shape_probability=classes[best] if classes else None,
             confidence=_confidence(s),
             sheet=None if self.place.flat else [seen.x, seen.y],
+            **({} if touch is None else registered(touch)),
         )
 
     def _drops(self) -> list[tuple[float, float | None]]:
@@ -191,8 +217,8 @@ class Publishing(Stage):
         return [(s.peak, c.force_n) for s, c in zip(self._segments, self._contacts, strict=False)]
 
     def _ends(self, tracks: list[Track]) -> list[Contact]:
-        """The last word on touches that ended: where they were; they do not press any more."""
-        force = None if not self.law.exists else 0.0
+        """The last contacts of touches that ended: their last places, without force."""
+        force = 0.0 if self._tells_force else None
         ends = []
         for t in tracks:
             at, sheet = self.place(t.x, t.y), None if self.place.flat else [t.x, t.y]
@@ -203,9 +229,9 @@ class Publishing(Stage):
         return ends
 
     def _force(self, frame: ContactFrame) -> ForceFrame:
-        """As valid as the contacts are."""
+        """The total force; valid if the contacts are."""
         present = [c for c in self._contacts if c.state != "end"]
-        total = None if not self.law.exists else sum(c.force_n or 0.0 for c in present)
+        total = None if not self._tells_force else sum(c.force_n or 0.0 for c in present)
         wrench = np.sum([c.wrench for c in present], axis=0).tolist() if present else [0.0] * 6
         return ForceFrame(**inherited(frame), wrench=wrench, force_n=total)
 
@@ -259,13 +285,17 @@ def _kept(frame: ImageFrame) -> dict[str, Any]:
     return {
         "scan": frame.reconstructed,
         **{name: np.array(getattr(frame, name), np.float32) for name in ("image", "sigma", "classes")},
+        "touches": [asdict(each) for each in frame.touches],
     }
 
 
 def _image_of(skin: str, kept: dict[str, Any]) -> ImageFrame:
     image, sigma, classes = (np.asarray(kept[name], np.float32) for name in ("image", "sigma", "classes"))
+    touches = [LocatedTouch(**each) for each in kept.get("touches", [])]
     scan = int(kept["scan"])
-    return ImageFrame(skin=skin, session=ANY, reconstructed=scan, image=image, sigma=sigma, classes=classes)
+    return ImageFrame(
+        skin=skin, session=ANY, reconstructed=scan, image=image, sigma=sigma, classes=classes, touches=touches
+    )
 
 
 def _explained(frame: ImageFrame) -> bool:
@@ -293,5 +323,5 @@ def _wrench(at: Placed, force: float) -> list[float]:
 
 
 def _confidence(s: Segment) -> float:
-    """Probability that the peak is no noise, from its own standard deviation."""
+    """Probability that the peak is not noise, from its own standard deviation."""
     return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))

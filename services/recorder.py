@@ -1,7 +1,7 @@
 """The recorder: `python -m services.recorder FILE` or `--folder FOLDER`. Only subscribes; nothing waits for it.
 
-Recording does not wake lazy topics unless they are asked for. What the stages' state was is asked of them when the
-recording starts and after each new baseline, and stored as `state/<skin>`: a replay begins from there.
+Recording does not wake lazy topics unless they are asked for. The recorder asks the stages for their state when the
+recording starts and after each new baseline. It stores the answers as `state/<skin>`; a replay begins from there.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Recorder:
         return f"{lost}: the disk was full" if self.writer.lost else ""
 
     def _ask_states(self, frame: Frame) -> None:
-        """At the first frame of a skin, and when it was tared; the state holds what drift does from there."""
+        """Ask at the first frame of a skin, and after each tare: the state holds how drift is followed from there."""
         if frame.skin not in self._skins and len(self._skins) < MOST_SKINS:
             self._skins.add(frame.skin)
             self.states.ask(frame.skin)
@@ -190,7 +190,7 @@ def _metadata(topics: list[str], skin: str | None) -> dict[str, str]:
 
 
 def file_in(folder: Path) -> Path:
-    """A name not yet taken in a folder: the time, to the second, and a number where need be."""
+    """A file name that the folder does not have yet: the time, to the second, and a number where needed."""
     stem = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     names = (folder / f"{stem}{suffix}.mcap" for suffix in ("", *(f"-{n}" for n in range(1, 1000))))
     return next(path for path in names if not path.exists())

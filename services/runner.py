@@ -35,7 +35,7 @@ HEARTBEAT_S = 1.0
 TICK_S = 0.2  # how often at most silence, changes of health and new subscribers are looked for
 SILENT_S = 0.5  # without frames from upstream: status STALE
 AT_ONCE = 256  # frames taken from a feed before any is processed
-WARM_FRAMES = 50  # frames after which what lives is taken to live for ever (garbage collection)
+WARM_FRAMES = 50  # frames after which the living objects are taken to be permanent (garbage collection)
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class Runner:
     """A process: its sockets and its channels. `run` returns when SIGINT or SIGTERM came."""
 
     def __init__(self, process: str, config: ConfigFile, problems: Sequence[str] = ()) -> None:
-        """problems: what the process as a whole goes without, for its status."""
+        """problems: what the process as a whole lacks, for its status."""
         self.process, self.config, self.problems = process, config, list(problems)
         for problem in problems:
             log.warning("%s", problem)
@@ -62,7 +62,7 @@ class Runner:
         self._stop = False
         self._frames = 0
         self._turns: Iterator[Channel] = iter(())  # who may prepare next
-        self._settled = False  # what was made while warming up is out of the garbage collector's sight
+        self._settled = False  # the garbage collector no longer walks what was made while warming up
 
     def bundle(self, skin: str) -> Bundle:
         """The bundle of a skin, loaded once."""
@@ -111,7 +111,7 @@ class Runner:
         self.close()
 
     def _next_deadline(self) -> float:
-        """When there is something to do if nothing arrives: a heartbeat, or silence to be noticed."""
+        """When there is something to do even if nothing arrives: a heartbeat is due, or silence has to be reported."""
         return min((channel.heartbeat.deadline(SILENT_S) for channel in self.channels.values()), default=0.0)
 
     def close(self) -> None:
@@ -125,7 +125,7 @@ class Runner:
     # frames
 
     def _serve(self, channels: list[Channel], stood: bool = False) -> None:
-        """What waits at these channels, newest frames of several skins together."""
+        """Process what waits at these channels; the newest frames of several skins together."""
         work = [(channel, frame) for channel in channels for frame in self._waiting(channel, stood)]
         if len(work) > 1 and self.config.skip.batch:
             try:
@@ -136,7 +136,7 @@ class Runner:
             self._handle(channel, frame)
 
     def _waiting(self, channel: Channel, stood: bool) -> list[Frame]:
-        """Frames to process: the newest of a socket, all of a feed but what it is too late for."""
+        """The frames to process: the newest one of a socket, or all of a feed's that are not late."""
         frames: list[Frame] = []
         while len(frames) < AT_ONCE and (frame := channel.feed.recv()) is not None:
             frames.append(frame)
@@ -172,14 +172,16 @@ class Runner:
         self._frames += 1
 
     def _joined(self, prefix: bytes) -> None:
-        """Somebody subscribes to what begins so."""
+        """Somebody has subscribed to topics with this prefix."""
         for channel in self.channels.values():
             for topic, head in channel.heads.items():
                 if covers(prefix, head):
                     channel.stage.joined(topic)
 
     def _prepare(self) -> None:
-        """One piece of work for later, while nobody waits: channels take turns, for even asking all of them costs."""
+        """Do one piece of work for later, while no frame waits. Channels take turns, because asking all of them costs
+        time.
+        """
         if self._frames >= WARM_FRAMES and not self._settled:
             self._settled = True
             _settle()
@@ -187,7 +189,7 @@ class Runner:
             channel = next(self._turns)
             try:
                 channel.stage.prepare()
-            except Exception as why:  # what could not be made ahead is made when it is needed, or fails then
+            except Exception as why:  # the work is done when it is needed, or fails then
                 self._log_once(channel, why, "%s: could not prepare (further such failures are not logged)")
 
     def _send(self, channel: Channel, frame: Frame) -> None:
@@ -198,7 +200,7 @@ class Runner:
             self._failed(channel, why)
 
     def _wanted(self, stage: Stage) -> frozenset[str]:
-        """Topics that the stage is to make: those somebody subscribes to, unless skin.toml says all."""
+        """The topics that the stage is to make: those with subscribers, unless skin.toml asks for all."""
         if not self.config.skip.unwanted:
             return frozenset(stage.writes)
         return frozenset(topic for topic in stage.writes if self.publisher.wanted(topic, stage.skin))
@@ -217,7 +219,7 @@ class Runner:
     # housekeeping
 
     def _mind_sockets(self) -> list[str]:
-        """Mend what has become of our sockets; what to say of it in status."""
+        """Mend our sockets where needed; returns what status should say about them."""
         for place, (owner, socket) in enumerate(self._minded):
             if owner.mind():
                 self._waiter.exchange(socket, owner.socket)
@@ -236,6 +238,10 @@ class Runner:
             beat = channel.heartbeat
             beat.drops["malformed"], beat.drops["skipped"] = channel.feed.malformed, channel.feed.skipped
             silent = "" if channel.asleep else beat.silence(SILENT_S, channel.stage.reads)
+            try:
+                channel.stage.between_frames()
+            except Exception as why:  # what could not be adopted is not in use
+                self._log_once(channel, why, "%s: could not adopt (further such failures are not logged)")
             health = channel.stage.health().with_problems(problems)
             status = beat.status(health, silent, now, HEARTBEAT_S, asleep=channel.asleep)
             if status is not None:
@@ -279,8 +285,8 @@ class Runner:
 
 
 def _settle() -> None:
-    """What lives now is taken to live for ever: the garbage collector never walks it again, and seldom the rest. The
-    first call takes some ten milliseconds, a later one a fraction.
+    """Take all living objects to be permanent: the garbage collector never walks them again, and the others seldom. The
+    first call takes some ten milliseconds, later ones a fraction of that.
     """
     gc.collect()
     gc.freeze()

@@ -1,4 +1,4 @@
-"""Scans of the short list of an adaptive board: whether something begins to touch, between two full scans."""
+"""Scans of an adaptive board's short list: they say whether a touch begins between two full scans."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from services.runtime.config import Skin
 
 
 class SentinelScans:
-    """`scan`: that of the coarse touch that no full scan has answered yet; 0: there is none."""
+    """`scan`: the number of the sentinel scan with a touch that no full scan has confirmed or refuted yet; 0: none."""
 
     def __init__(self, skin: Skin, bundle: Bundle) -> None:
         self.config, self.bundle = skin, bundle

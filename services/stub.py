@@ -1,6 +1,6 @@
 """python -m services.stub [options of the stub]: the stub board of every configured skin whose port is "stub".
 
-For where no `skin up` starts it: a container of its own.
+For a stub in a container of its own, which no `skin up` starts.
 """
 
 from __future__ import annotations

@@ -23,13 +23,21 @@ ALLOWED = {
 }
 WIRE_NEEDS = {"numpy", "zmq", "msgpack"}
 RUNTIME_NEEDS = WIRE_NEEDS | {"serial", "onnxruntime", "scipy", "pydantic", "typer", "rich", "supervisor", "mcap"}
-BRIDGES_NEED = {"ros2": {"cyclonedds"}, "foxglove": {"foxglove"}}
+BRIDGES_NEED = {
+    "page": {"aiohttp", "mcap"},
+    "ros2": {"cyclonedds"},
+    "foxglove": {"foxglove"},
+    "export": {"mcap", "foxglove", "rerun"},
+}
 """What each bridge needs beside what protocol needs: an extra of its own."""
 # The command line hands these over to the offline tools on demand.
 OFFLINE_DOORS = {"services/cli"}
 SERVICES_USE_OF_MODELS = {
     "models.bundle",
+    "models.calibration_file",
     "models.files",
+    "models.locator",
+    "models.locator_arrays",
     "models.npz",
     "models.prereconstruction",
     "models.patterns",

@@ -1,4 +1,4 @@
-"""The rows of the accuracy benchmark: every method as a function of one frame, with what it may be tuned by."""
+"""The rows of the accuracy benchmark: every method as a function of one frame, with its tuning parameters."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _difference(method: Callable[[Array], Array], z0: Array) -> Image:
 
 def classical() -> list[Method]:
     """The baselines of models/baselines.py, each also with its hyperparameter tuned to the noise."""
-    physics = baselines.Linearisation(ForwardModel("square16", mesh="inverse"))
+    physics = baselines.PeerPhysics(ForwardModel("square16", mesh="inverse"))
     made: dict[tuple[str, float | None], Callable[[Array], Array]] = {}
 
     def row(

@@ -1,1 +1,1 @@
-"""What `skin bench faults` and `skin bench drift` are made of: scenes, a skin in simulated time, what is counted."""
+"""The parts of `skin bench faults` and `skin bench drift`: scenes, a skin in simulated time, the scores."""

@@ -1,4 +1,4 @@
-"""How much of the time the service says something: without a fault, and with one electrode that failed for good."""
+"""Availability: the share of valid frames without a fault, and with one electrode that failed for good."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.reliability.counts import Counts
 from bench.reliability.random_scene import SCAN_S, TARE_S, RandomScene, TimedPress, random_scene
 from bench.reliability.scenes import RAMP_S, SolvedSheet
 from bench.reliability.session import Moment, Session
@@ -24,7 +25,7 @@ STATES = ("ok", "electrode open", "electrode dead", "electrode drifting")
 
 
 @dataclass
-class AvailabilityScore:
+class AvailabilityScore(Counts):
     frames: int = 0
     valid: int = 0
     named: int = 0  # frames that name the electrode
@@ -32,10 +33,6 @@ class AvailabilityScore:
     touches: int = 0
     reported: int = 0  # touches that most of their frames show, as valid
     changing: list[int] = field(default_factory=list)  # frames that say so, for each begin and each end
-
-    def add(self, other: AvailabilityScore) -> None:
-        for name, value in vars(other).items():
-            setattr(self, name, getattr(self, name) + value)
 
     def row(self) -> dict[str, Any]:
         return {

@@ -1,4 +1,6 @@
-"""The stub's sheet and analogue part and the stages, without board, line and clock: for what no link can change."""
+"""The stub's sheet and analogue part and the stages, without board, line and clock: for tests that the link does not
+affect.
+"""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ PARTS = ("starts", "gains", "rows", "history")
 
 @dataclass(frozen=True)
 class DriftSetting:
-    """How much of everything."""
+    """The numbers of cases, and the bundle, seed and cores."""
 
     bundle: str
     seed: int
@@ -59,7 +59,7 @@ def _start(task: StartTask) -> tuple[str, tuple[float, float], starts.StartScore
 
 
 def run_starts(setting: DriftSetting) -> dict[str, starts.StartScore]:
-    """By state, and by state and press."""
+    """The starts' scores by state, and by state and press."""
     tasks: list[StartTask] = [
         (setting.bundle, state, place, *press, setting.seed + k)
         for k, place in enumerate(grid(setting.start_places))
@@ -82,7 +82,7 @@ def _gain(task: GainTask) -> tuple[str, float, gain_steps.GainStepScore]:
 
 
 def run_gains(setting: DriftSetting) -> dict[str, gain_steps.GainStepScore]:
-    """By situation, and by situation and gain."""
+    """The gain steps' scores by situation, and by situation and gain."""
     tasks: list[GainTask] = [
         (setting.bundle, gain, situation, touch, setting.seed + k)
         for k, touch in enumerate(gain_steps.places(setting.gain_places, setting.seed))
@@ -108,7 +108,7 @@ def _rows(task: RowTask) -> tuple[Change, bool, list[TouchEstimate], int]:
 
 
 def run_rows(setting: DriftSetting) -> dict[str, dict[str, Any]]:
-    """By change: rows alone, and the same with the indenter declared."""
+    """The scores by change: rows alone, and the same with the indenter declared."""
     tasks: list[RowTask] = [
         (setting.bundle, change, radius, indenter, setting.row_places, setting.seed)
         for change in CHANGES

@@ -48,7 +48,7 @@ class Change:
 
     @property
     def size(self) -> float:
-        """What `skin limits --drift` is told."""
+        """The argument of `skin limits --drift`."""
         return max(abs(self.scale), self.contact)
 
     def world(self, touches: Sequence[Touch], electrodes: Sequence[int], share: float = 1.0) -> World:

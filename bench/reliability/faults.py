@@ -4,6 +4,7 @@
     skin bench faults --quick             two places, and 20 000 frames of random faults and presses: for CI
     skin bench faults --only gain hang    some rows of the matrix, nothing else
     skin bench faults --frames 1000000    that many frames of random faults and presses, nothing else
+    skin bench faults --frames 100000 --more    so many more, added to those of the last report
 
 The stub board's bytes go through line, link, clock regression and the stages that the services run. Prints figures
 beside targets and writes faults.json (--frames: soak.json). Exit status 1 where what held when the gate was set, a
@@ -13,6 +14,7 @@ constant beside each target, does not hold any more.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from pathlib import Path
@@ -57,13 +59,29 @@ def run_chunk(task: tuple[int, int, str]) -> soak.SoakTally:
     return soak.chunk(workers.sheet(), workers.pipeline(bundle), frames, seed)
 
 
-def run_soak(frames: int, seed: int, bundle: str, cores: int) -> soak.SoakTally:
+def run_soak(frames: int, seed: int, bundle: str, cores: int, so_far: soak.SoakTally) -> soak.SoakTally:
+    """Adds so many frames, from starts that `so_far` does not have."""
     counts = [soak.CHUNK] * (frames // soak.CHUNK) + [frames % soak.CHUNK] * (frames % soak.CHUNK > 0)
-    tasks = [(count, 1000 * seed + k, bundle) for k, count in enumerate(counts)]
-    whole = soak.SoakTally()
+    tasks = [(count, 1000 * seed + so_far.chunks + k, bundle) for k, count in enumerate(counts)]
     for tally in workers.spread(run_chunk, tasks, cores, "random faults and presses"):
-        whole.add(tally)
-    return whole
+        so_far.add(tally)
+    return so_far
+
+
+def reported(path: Path, seed: int, bundle: str) -> tuple[soak.SoakTally, list[dict[str, Any]]]:
+    """What an earlier report counted, and the runs that it is of. Raises ValueError where it cannot be added to."""
+    try:
+        report = json.loads(path.read_text())
+        was, runs, tally = (
+            (report["seed"], report["bundle"]["name"]),
+            list(report["runs"]),
+            soak.SoakTally.of(report["soak"]),
+        )
+    except (OSError, ValueError, KeyError) as why:
+        raise ValueError(f"{path} is no report of random frames ({why!r}): run without --more first") from None
+    if was != (seed, bundle):
+        raise ValueError(f"{path} is of seed {was[0]} and bundle {was[1]}, this run is of {seed} and {bundle}")
+    return tally, runs
 
 
 def run_session(task: tuple[str, int, str]) -> tuple[str, availability.AvailabilityScore]:
@@ -87,6 +105,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--places", type=int, help=f"default: {PLACES}, with --quick {QUICK_PLACES}")
     parser.add_argument("--only", nargs="+", metavar="FAULT", help="rows of the matrix that begin so; writes no report")
     parser.add_argument("--frames", type=int, help="random faults and presses instead of the matrix")
+    parser.add_argument("--more", action="store_true", help="with --frames: add to what the last report counted")
     parser.add_argument("--bundle", default="square16")
     parser.add_argument("--seed", type=int, default=5, help="of places, arguments and noise")
     parser.add_argument("--cores", type=int, default=workers.cores())
@@ -97,6 +116,12 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f"--only {' '.join(args.only)}: expected the beginning of {', '.join(r.title for r in ROWS)}")
     if args.frames is not None and not soak.LEAST <= args.frames <= soak.MOST:
         parser.error(f"--frames {args.frames}: expected {soak.LEAST} to {soak.MOST}")
+    so_far, runs = soak.SoakTally(), list[dict[str, Any]]()
+    if args.more:
+        try:
+            so_far, runs = reported(args.out / "soak.json", args.seed, args.bundle)
+        except ValueError as why:
+            parser.error(str(why))
     end_on_sigterm()
     began = time.perf_counter()
     found: dict[str, Any] = {}
@@ -107,10 +132,13 @@ def main(argv: list[str] | None = None) -> int:
         sessions = QUICK_SESSIONS if args.quick else SESSIONS
         scores = run_availability(sessions, args.seed, args.bundle, args.cores)
         found["availability"] = {state: score.row() for state, score in scores.items()}
+    head = report.head("faults", argv, args, 0.0)
     if args.frames or (args.quick and args.only is None):
-        found["soak"] = run_soak(args.frames or QUICK_FRAMES, args.seed, args.bundle, args.cores).row()
+        tally = run_soak(args.frames or QUICK_FRAMES, args.seed, args.bundle, args.cores, so_far)
+        found["soak"] = tally.row()
+        found["runs"] = [*runs, {"commit": head["commit"], "frames": tally.frames - sum(r["frames"] for r in runs)}]
     goals = faults_report.goals(found, args.quick)
-    head = report.head("faults", argv, args, time.perf_counter() - began)
+    head["seconds"] = round(time.perf_counter() - began, 1)
     faults_report.show(found)
     report.show(head, goals)
     if args.only is None:

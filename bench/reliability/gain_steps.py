@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.reliability.counts import Counts
 from bench.reliability.direct import DirectSkin
 from bench.reliability.scenes import SolvedSheet, circle, touches_at_random
 from bench.reliability.session import Moment
@@ -29,7 +30,7 @@ def places(count: int, seed: int) -> list[Touch]:
 
 
 @dataclass
-class GainStepScore:
+class GainStepScore(Counts):
     steps: int = 0
     frames: int = 0  # while the gain lasts
     valid: int = 0
@@ -39,10 +40,6 @@ class GainStepScore:
     late: int = 0  # beginnings and ends of a step after which frames were not right within AGAIN_S
     ended_false: int = 0  # false ones after its end
     ended_s: list[float] = field(default_factory=list)
-
-    def add(self, other: GainStepScore) -> None:
-        for name, value in vars(other).items():
-            setattr(self, name, getattr(self, name) + value)
 
     def row(self) -> dict[str, Any]:
         return {

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.reliability.counts import Counts
 from bench.reliability.scenes import SolvedSheet, press, script, touches_at_random
 from bench.reliability.session import Moment, Session
 from firmware_stub.faults import FAULTS, MUXES
@@ -134,7 +135,7 @@ ROWS = (
 
 
 @dataclass
-class FaultScore:
+class FaultScore(Counts):
     """What was counted of one case, or of several (`add`)."""
 
     cases: int = 0
@@ -151,10 +152,6 @@ class FaultScore:
     again_s: list[float] = field(default_factory=list)
     reasons: Counter[str] = field(default_factory=Counter)  # in frames while the fault was in force
     worst: list[str] = field(default_factory=list)  # cases that were wrong, for a person
-
-    def add(self, other: FaultScore) -> None:
-        for name, value in vars(other).items():
-            setattr(self, name, getattr(self, name) + value)
 
     def row(self) -> dict[str, Any]:
         finite = [t for t in self.again_s if math.isfinite(t)]

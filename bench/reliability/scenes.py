@@ -91,7 +91,7 @@ def circle(x: float, y: float, newtons: float, radius: float) -> Touch:
 def press(
     touch: Touch, begin: float, end: float, to: tuple[float, float] | None = None, ramp: float = RAMP_S
 ) -> TouchPath:
-    """From begin to end, its ramps included; slides to the point `to` in between."""
+    """A press from begin to end, its ramps included; it slides to the point `to` in between."""
     x, y = to or (touch.x, touch.y)
     poses = (
         Touch(touch.kind, touch.x, touch.y, touch.radius, 0.0),

@@ -1,5 +1,5 @@
-"""A skin in simulated time: stub board, line, link, clock and the stages that the services run; and what each frame
-said beside what was true.
+"""A skin in simulated time: stub board, line, link, clock and the services' stages. Each frame's contacts stand beside
+the true touches.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Many frames of random faults and presses: what no frame may say. Counted are frames that are valid and do not say
-`changing`; touches press with 1 N or more, radius 0.1 or more.
+"""Many frames of random faults and presses; counts the errors that no frame may have. Counted are frames that are valid
+and do not say `changing`; touches press with 1 N or more, radius 0.1 or more.
 
 A phantom: a contact further than FAR_M from every touch, while every touch has one near it or nothing touches. Off: the
 same while a touch has none near it. Unseen: a touch without a contact near it in more than UNSEEN such frames in a row.
@@ -8,10 +8,11 @@ same while a touch has none near it. Unseen: a touch without a contact near it i
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
+from bench.reliability.counts import Counts
 from bench.reliability.random_scene import SCAN_S, TARE_S, RandomScene, random_scene
 from bench.reliability.scenes import SolvedSheet
 from bench.reliability.session import Moment, Session
@@ -26,7 +27,8 @@ KEPT = 40  # notes of a report
 
 
 @dataclass
-class SoakTally:
+class SoakTally(Counts):
+    chunks: int = 0  # starts
     frames: int = 0
     counted: int = 0  # valid, and not `changing`
     invalid: int = 0
@@ -38,15 +40,16 @@ class SoakTally:
     blamed: Counter[str] = field(default_factory=Counter)  # what failed last before a frame that was wrong
     notes: list[str] = field(default_factory=list)
 
-    def add(self, other: SoakTally) -> None:
-        for name, value in vars(other).items():
-            setattr(self, name, getattr(self, name) + value)
+    def add(self, other: Self) -> None:
+        super().add(other)
         self.notes = self.notes[:KEPT]
 
     def row(self) -> dict[str, Any]:
         return {
+            "chunks": self.chunks,
             "frames": self.frames,
             "counted": self.counted,
+            "invalid": self.invalid,
             "touches": self.touches,
             "faults": self.faults,
             "phantoms": self.phantoms,
@@ -57,9 +60,15 @@ class SoakTally:
             "notes": self.notes,
         }
 
+    @classmethod
+    def of(cls, row: Mapping[str, Any]) -> SoakTally:
+        """From the row of a report. Raises KeyError where it is of another version."""
+        counts = {name: row[name] for name in vars(cls())}
+        return cls(**{**counts, "blamed": Counter(row["blamed"]), "notes": list(row["notes"])})
+
 
 def chunk(sheet: SolvedSheet, pipeline: Pipeline, frames: int, seed: int) -> SoakTally:
-    """So many frames after a fresh start, tare included."""
+    """Score this many frames after a fresh start, tare included."""
     seconds = frames * SCAN_S
     scene = random_scene(seconds, seed)
     session = Session(sheet, scene.script, seed, pipeline)
@@ -69,7 +78,7 @@ def chunk(sheet: SolvedSheet, pipeline: Pipeline, frames: int, seed: int) -> Soa
 
 
 def tallied(moments: Iterable[Moment], scene: RandomScene, seed: int) -> SoakTally:
-    tally = SoakTally(touches=len(scene.presses), faults=len(scene.faults))
+    tally = SoakTally(chunks=1, touches=len(scene.presses), faults=len(scene.faults))
     run: list[int] = []  # frames in a row in which the n-th touch had no contact
     for m in moments:
         tally.frames += 1

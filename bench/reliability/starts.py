@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.reliability.counts import Counts
 from bench.reliability.direct import DirectSkin
 from bench.reliability.scenes import SolvedSheet, circle, contacts_at_random
 from firmware_stub.world import World
@@ -28,8 +29,8 @@ FREE = FREE_WITHIN + 2 * FREE_FOR
 
 
 @dataclass
-class StartScore:
-    """Of one start, or of several (`add`)."""
+class StartScore(Counts):
+    """The score of one start, or of several (`add`)."""
 
     starts: int = 0
     touched: int = 0  # frames while the touch stays
@@ -41,10 +42,6 @@ class StartScore:
     free_scans: list[float] = field(default_factory=list)
     free_phantoms: int = 0  # valid frames with a contact after the touch was lifted
     reasons: Counter[str] = field(default_factory=Counter)
-
-    def add(self, other: StartScore) -> None:
-        for name, value in vars(other).items():
-            setattr(self, name, getattr(self, name) + value)
 
     def row(self) -> dict[str, Any]:
         return {

@@ -128,7 +128,7 @@ def scaled(n: int, touched: float, seconds: float) -> dict[str, Any]:
 
 
 def _wait_for_touch(service: Service, touched: float) -> None:
-    """Until the recordings' quiet beginning is over: the first skin is a touched one, if any is."""
+    """Wait until the recordings' quiet beginning is over: the first skin is a touched one, if any is."""
     contacts = Outside("contact", "s00", service.folder)
     end = time.monotonic() + START_S + MARGIN_S
     while time.monotonic() < end and touched > 0:

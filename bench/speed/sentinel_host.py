@@ -56,7 +56,7 @@ class AdaptiveHost:
             self.step(end)
 
     def step(self, end: float = np.inf) -> None:
-        """To when something is to be done next."""
+        """Go on to the time of the next event."""
         wait = max(STEP_S, self.rig.wake_s(self.now))
         if self.adaptive is not None:
             wait = min(wait, self.adaptive.due_s(self.now), *(due - self.now for due, *_ in self._verdicts[:1]))

@@ -50,7 +50,7 @@ def averaging(recorded: Recorded, bundle: Bundle, seed: int = 1) -> dict[str, di
 
 
 def _floor(shape: Shape, averaged: int) -> float:
-    """Of the position, model units."""
+    """Floor of the position error, model units."""
     noise = fisher.MeasurementNoise(SNR_DB + 10 * np.log10(averaged), tare_frames=TareConfig().frames / averaged)
     return float(fisher.floors("square16", shape, noise, fisher.SizePrior())["bayes"].position)
 

@@ -1,4 +1,4 @@
-"""What one run of the network for several skins saves, whose frames wait at once."""
+"""How much time one run of the network saves for several skins whose frames wait at once."""
 
 from __future__ import annotations
 

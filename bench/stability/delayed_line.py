@@ -1,5 +1,5 @@
 """The stub board at the other end of a line that holds bytes up, and acquisition's own source at this end, in simulated
-time: what it gives out, and when that was really measured.
+time: gives its frames, and when they were really measured.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class DelayedLine(HostTime):
             self._step(until)
 
     def _step(self, until: float) -> None:
-        """To when something happens next, or until then."""
+        """Go on to the next event, or to that time."""
         due = [self.true_s + max(LEAST_STEP_S, self.rig.wake_s(self.true_s)), until]
         if self._to_host and self._to_host[0][0] > self.true_s:
             due.append(self._to_host[0][0])

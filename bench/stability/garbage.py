@@ -1,4 +1,4 @@
-"""What a broken board may send: numbers that are none, dead electrodes, clipped converters, noise without a skin."""
+"""What a broken board may send: NaN and infinity, dead electrodes, clipped converters, noise without a skin."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Keys that are missing, wrong, half configured, readable by others or taken away, over TCP on this host's loopback.
 
 The promise: nobody reads who is not listed, nobody is believed who is not the service, nobody changes anything who is
-no operator; and who is listed gets every frame meanwhile. `frames` counts what was sent to whom it is not for,
-`refused_%` how much of it did not arrive.
+no operator; and who is listed gets every frame meanwhile. `frames` counts messages sent to somebody who must not get
+them, `refused_%` the share that did not arrive.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ class Site:
             self.address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
 
     def use(self, name: str) -> None:
-        """From now on this process opens sockets as `robot` or as a client of it; "" as one without any key."""
+        """Have this process open sockets as `robot` or as a client of it from now on; "" is a client without any
+        key.
+        """
         addresses = {"publisher": self.address, "publisher.ctl": self.address}
         secret = self.folder / "keys" / f"{name}.key_secret"
         if not name:

@@ -1,4 +1,4 @@
-"""What may happen to time: bytes held up, clocks that jump, scans sent again, a process or a machine that stands still.
+"""Faults of timing: delayed bytes, clocks that jump, scans sent again, a process or a machine that stands still.
 
 The stub board behind a line that does these things, acquisition's own source at this end, in simulated time. The
 promise: no frame that a reader may act on is older than its `valid_for_s` and SLACK_S, counted from when its values

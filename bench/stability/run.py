@@ -1,4 +1,4 @@
-"""Frames through the runtime's own stages, and what each answer is held against: the truth, and the promise.
+"""Sends frames through the runtime's own stages and compares each answer with the truth and with the promise.
 
 The promise, whatever comes in: no exception, no NaN or infinity out, never `valid` on garbage. A `valid` frame is
 garbage where its strongest contact lies further than FAR_M from the touch, or where nothing real touches at all.
@@ -131,7 +131,7 @@ class InProcessStages:
         self.scan = 0
 
     def tare(self, z0: Array, relative: float | Array, rng: np.random.Generator) -> Baseline:
-        """Of TARE_FRAMES frames of the untouched skin. Raises services.estimation.tare.NoBaseline."""
+        """The baseline of TARE_FRAMES frames of the untouched skin. Raises services.estimation.tare.NoBaseline."""
         return take(noisy(z0, relative, rng, TARE_FRAMES), self.pipeline.pre.pre, "bench", 0)
 
     def begin(self, baseline: Baseline | None) -> None:
@@ -168,7 +168,7 @@ class InProcessStages:
         return Answer(contact.valid, result.delta.touched, present, result.image.image, tuple(contact.reasons), broken)
 
     def once(self, baseline: Baseline, z: NDArray[Any], status: NDArray[np.uint8] | None = None) -> Answer:
-        """A frame on its own: nothing is remembered from the one before."""
+        """Answer one frame by itself, without memory of the one before."""
         self.begin(baseline)
         return self.see(z, status)
 

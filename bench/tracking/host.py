@@ -53,7 +53,7 @@ class Host:
         return "the port is gone" if self._reopened_s is not None else self.link.problem
 
     def step(self) -> Iterator[tuple[RawFrame, Felt]]:
-        """To when the board has something to do next, and a little later; the frames that came by then."""
+        """Go on to the board's next event, and a little later; returns the frames that came by then."""
         self.now += max(1e-3, min(self.rig.wake_s(self.now), 0.02)) + READ_LATE_S * float(self._rng.random()) ** 2
         if self._reopened_s is None and (due := self.link.to_send(self.now)):
             self.rig.feed(due, self.now)

@@ -17,7 +17,7 @@ from bench.tracking.scene import Recorded
 from models.metrics import of_side
 from protocol.frames import ContactFrame, DeltaFrame
 
-GATE_M = 0.010  # a contact further away is of no true touch
+GATE_M = 0.010  # a contact further away matches no true touch
 LIGHT_N = 0.5  # a lighter touch may be seen or not
 GRACE = 2  # frames a contact may outlast its touch before it counts as false
 STEADY = 0.01  # relative change of the force from frame to frame

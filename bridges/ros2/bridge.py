@@ -12,19 +12,23 @@ from collections.abc import Iterable
 from cyclonedds.core import DDSException
 from cyclonedds.domain import DomainParticipant
 
+from bridges import views
+from bridges.clock import WallClock
 from bridges.feeds import ContactFeed, ImageFeed, Measured, Picture, Refusal
 from bridges.process import Bridge, BridgeError, Handed
+from protocol.control import ControlClient, ControlError
 from protocol.frame_types import ELECTRODE_STATES
 from protocol.frames import DeltaFrame, InfoFrame, StatusFrame
 from protocol.sockets import AllReader, NewestReader
 from protocol.transport import Socket
 
 from . import dds, messages
-from .clock import RosClock
 from .dds import RosWriter
 from .names import topic_base
+from .tare_service import Act, TareService
 
 DIAGNOSTICS_S = 1.0
+TARE_S = 10.0
 VALID_S = 0.1
 """How often `valid` says false while nothing comes."""
 
@@ -32,7 +36,9 @@ VALID_S = 0.1
 class SkinTopics:
     """The topics of one skin."""
 
-    def __init__(self, skin: str, frame_id: str, participant: DomainParticipant, clock: RosClock, replay: bool) -> None:
+    def __init__(
+        self, skin: str, frame_id: str, participant: DomainParticipant, clock: WallClock, replay: bool
+    ) -> None:
         base = topic_base(skin)
         self._frame_id, self._clock = frame_id, clock
         self.contacts = ContactFeed(skin, replay)
@@ -88,8 +94,8 @@ class SkinTopics:
             return
         frame = found.frame
         header = self._header(found.measured_ns)
-        contacts = messages.present(frame)
-        if messages.has_forces(frame):
+        contacts = views.present(frame)
+        if views.has_forces(frame):
             if self.wrench in self.wanted:
                 self.wrench.write(messages.wrench(header, contacts))
             for k, slot in enumerate(self.slots):
@@ -125,7 +131,7 @@ class SkinTopics:
             self.valid.write({"data": valid})
 
     def _header(self, measured_ns: int) -> messages.Message:
-        return {"stamp": self._clock.stamp(measured_ns), "frame_id": self._frame_id}
+        return {"stamp": messages.stamp(self._clock.time_ns(measured_ns)), "frame_id": self._frame_id}
 
     def close(self) -> None:
         self.contacts.close()
@@ -148,7 +154,9 @@ class Ros2Bridge(Bridge):
             raise BridgeError(
                 f"no DDS participant: {why}; see [ros2] in skin.toml, ROS_DOMAIN_ID, CYCLONEDDS_URI"
             ) from None
-        self._clock = RosClock()
+        bases = ", ".join(topic_base(name) for name in handed.skins)
+        print(f"ros2: publishing {bases} in ROS domain {domain}", flush=True)
+        self._clock = WallClock()
         replay = bool(options.get("replay"))
         self._skins = {
             name: SkinTopics(name, skin.frame_id, self._participant, self._clock, replay)
@@ -157,6 +165,10 @@ class Ros2Bridge(Bridge):
         self._diagnostics = RosWriter(self._participant, "/diagnostics", "diagnostic_msgs/DiagnosticArray", "state")
         self._tf = RosWriter(self._participant, "/tf_static", "tf2_msgs/TFMessage", "latched")
         self._told = AllReader(["status", "info"])
+        self._tare: TareService | None = None
+        if options.get("commands"):
+            acts = {topic_base(name): tare(name) for name in handed.skins}
+            self._tare = TareService(domain, dds.interface(str(options.get("interface", ""))), acts)
         self._transforms: dict[str, messages.Message] = {}
         self._statuses: dict[tuple[str, str], tuple[StatusFrame, float]] = {}
         self._electrodes: dict[str, list[str]] = {}
@@ -198,7 +210,7 @@ class Ros2Bridge(Bridge):
 
     def _place(self, frame: InfoFrame) -> None:
         """Where a skin is: sent again only when it changes."""
-        found = messages.transform(self._clock.stamp(time.monotonic_ns()), frame)
+        found = messages.transform(self._clock.time_ns(time.monotonic_ns()), frame)
         known = self._transforms.get(frame.skin)
         if found is None or frame.skin not in self._skins:
             return
@@ -223,7 +235,7 @@ class Ros2Bridge(Bridge):
         pulse = self.pulses[name]
         pulse.idle = not topics.wanted
         pulse.sent.update({writer.name: writer.sent - pulse.sent[writer.name] for writer in topics.writers()})
-        pulse.drops["skipped"] = topics.contacts.skipped
+        pulse.drops["skipped"], pulse.drops["late"] = topics.contacts.skipped, topics.contacts.late
         if pulse.idle:
             pulse.level, pulse.messages = "OK", ["idle: nobody subscribes"]
         elif isinstance(topics.state, Refusal):
@@ -232,7 +244,7 @@ class Ros2Bridge(Bridge):
             pulse.level, pulse.messages = "STALE", ["no frame yet"]
         else:
             pulse.level, pulse.messages = "OK", []
-            if not messages.has_forces(topics.state.frame):
+            if not views.has_forces(topics.state.frame):
                 pulse.level, pulse.messages = "WARN", ["no wrench is published: this skin has no force law"]
 
     def _diagnose(self) -> None:
@@ -249,7 +261,7 @@ class Ros2Bridge(Bridge):
             values: dict[str, object] = {f"electrode {k}": state for k, state in enumerate(states)}
             found.append(messages.diagnostic(f"eitskin {name}: electrodes", name, level, said, values))
             found.append(self._contacts_diagnostic(name, topics))
-        header = {"stamp": self._clock.stamp(time.monotonic_ns()), "frame_id": ""}
+        header = {"stamp": messages.stamp(self._clock.time_ns(time.monotonic_ns())), "frame_id": ""}
         self._diagnostics.write({"header": header, "status": found})
 
     def _contacts_diagnostic(self, name: str, topics: SkinTopics) -> messages.Message:
@@ -261,13 +273,28 @@ class Ros2Bridge(Bridge):
             level, said = "OK", "valid"
             if state.frame.reasons:
                 level, said = "WARN", "valid, but " + ", ".join(state.frame.reasons)
-            values["contacts"] = len(messages.present(state.frame))
+            values["contacts"] = len(views.present(state.frame))
         else:
             level, said = ("ERROR", f"not published: {state.why}") if state else ("STALE", "no frame yet")
         values |= {"stamp uncertainty [s]": uncertain_ns * 1e-9, "system time was set": self._clock.steps}
         return messages.diagnostic(f"eitskin {name}: contacts", name, level, said, values)
 
     def close(self) -> None:
+        if self._tare is not None:
+            self._tare.close()
         self._told.close()
         for topics in self._skins.values():
             topics.close()
+
+
+def tare(skin: str) -> Act:
+    """What a call of the service does."""
+
+    def act() -> tuple[bool, str]:
+        try:
+            taken = ControlClient("preprocessing", TARE_S).call("tare", skin=skin)
+        except ControlError as why:
+            return False, str(why)
+        return True, f"new baseline from {taken.get('frames', 'some')} frames"
+
+    return act

@@ -51,23 +51,31 @@ def domain_id(given: int | None) -> int:
     return int(said)
 
 
-def configure(interface: str) -> None:
-    """Tell Cyclone DDS what ROS 2 needs; what $CYCLONEDDS_URI says counts more. `interface`: the only network interface
-    to use, or "" for all as Cyclone chooses them; "lo" too where ROS's own variables ask for this host alone.
+def interface(given: str) -> str:
+    """The only network interface to use, "" for those that Cyclone chooses: "lo" too where ROS's own variables ask for
+    this host alone.
     """
     here = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
     if here or os.environ.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"):
-        interface = interface or "lo"
+        return given or "lo"
+    return given
+
+
+def configure(given: str) -> None:
+    """Tell Cyclone DDS what ROS 2 needs, `given` being the interface of skin.toml. With $CYCLONEDDS_URI the interfaces
+    are its own business.
+    """
+    theirs = os.environ.get("CYCLONEDDS_URI", "")
+    name = "" if theirs else interface(given)
     text = "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
-    if interface:
-        alone = ' multicast="false"' if interface == "lo" else ""  # the loopback has none
-        text += f'<General><Interfaces><NetworkInterface name="{interface}"{alone}/></Interfaces></General>'
-    if interface == "lo":
+    if name:
+        alone = ' multicast="false"' if name == "lo" else ""  # the loopback has none
+        text += f'<General><Interfaces><NetworkInterface name="{name}"{alone}/></Interfaces></General>'
+    if name == "lo":
         text += '<Discovery><Peers><Peer Address="localhost"/></Peers>'
         text += "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
         text += "</Discovery>"
     ours = f"<CycloneDDS><Domain>{text}</Domain></CycloneDDS>"
-    theirs = os.environ.get("CYCLONEDDS_URI", "")
     os.environ["CYCLONEDDS_URI"] = f"{ours},{theirs}" if theirs else ours
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from bridges import views
 from protocol.frames import Contact, ContactFrame, ImageFrame, InfoFrame, StatusFrame
 
 SLOTS = 4
@@ -26,30 +27,23 @@ LEVELS = {"OK": 0, "WARN": 1, "ERROR": 2, "STALE": 3}
 Message = dict[str, Any]
 
 
-def present(frame: ContactFrame) -> list[Contact]:
-    """The contacts that are there, strongest first."""
-    return [contact for contact in frame.contacts if contact.state != "end"]
-
-
-def has_forces(frame: ContactFrame) -> bool:
-    """Whether forces are known: a skin without a force law has none, which is not the same as none pressing."""
-    return "uncalibrated_force" not in frame.reasons and all(c.force_n is not None for c in present(frame))
-
-
 def wrench(header: Message, contacts: Iterable[Contact]) -> Message:
     """geometry_msgs/WrenchStamped: the sum of the contacts' wrenches, 0 where there is none."""
-    total = [math.fsum(values) for values in zip(*(c.wrench for c in contacts), strict=True)] or [0.0] * 6
-    return {"header": header, "wrench": {"force": xyz(total[:3]), "torque": xyz(total[3:])}}
+    found = views.total(contacts)
+    return {"header": header, "wrench": {"force": xyz(found[:3]), "torque": xyz(found[3:])}}
 
 
 def poses(header: Message, frame: ContactFrame) -> Message:
     """geometry_msgs/PoseArray: z out of the skin, x along the patch's longest axis; strongest first."""
-    return {"header": header, "poses": [pose(contact) for contact in present(frame)]}
+    return {"header": header, "poses": [pose(contact) for contact in views.present(frame)]}
 
 
 def pose(contact: Contact) -> Message:
     """geometry_msgs/Pose of a contact."""
-    return {"position": xyz(contact.position), "orientation": _orientation(contact.normal, contact.orientation)}
+    return {
+        "position": xyz(contact.position),
+        "orientation": quaternion(views.orientation(contact.normal, contact.orientation)),
+    }
 
 
 def markers(header: Message, frame: ContactFrame, gone: Iterable[int]) -> Message:
@@ -58,9 +52,8 @@ def markers(header: Message, frame: ContactFrame, gone: Iterable[int]) -> Messag
     """
     lifetime = {"sec": int(frame.valid_for_s), "nanosec": int(frame.valid_for_s % 1 * 1e9)}
     found: list[Message] = []
-    for contact in present(frame):
-        length = 0.02 if contact.force_n is None else max(0.004, METRES_PER_NEWTON * contact.force_n)
-        tail = [p + length * n for p, n in zip(contact.position, contact.normal, strict=True)]
+    for contact in views.present(frame):
+        tail = views.tail(contact, METRES_PER_NEWTON)
         across = 2 * math.sqrt(max(contact.area_m2, 1e-6) / math.pi)
         common = {"header": header, "id": _id32(contact.id), "action": ADD, "lifetime": lifetime}
         found += [
@@ -87,7 +80,7 @@ def markers(header: Message, frame: ContactFrame, gone: Iterable[int]) -> Messag
                 "pose": {"position": xyz(tail)},
                 "scale": {"z": 0.008},
                 "color": {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0},
-                "text": label(contact),
+                "text": views.label(contact),
             },
         ]
     for each in gone:
@@ -97,17 +90,9 @@ def markers(header: Message, frame: ContactFrame, gone: Iterable[int]) -> Messag
     return {"markers": found}
 
 
-def label(contact: Contact) -> str:
-    """A contact in a few words."""
-    if contact.force_n is None:
-        return f"{contact.id} {contact.shape}"
-    sigma = "" if contact.force_sigma_n is None else f" ± {contact.force_sigma_n:.1f}"
-    return f"{contact.id} {contact.force_n:.1f}{sigma} N {contact.shape}"
-
-
 def cloud(header: Message, frame: ImageFrame) -> Message:
     """sensor_msgs/PointCloud2: a point for each pixel, with the conductivity drop and its uncertainty in S/m."""
-    drop, sigma = _filled(frame)
+    drop, sigma = views.filled(frame)
     rows, columns = drop.shape
     points = np.zeros((rows, columns, len(POINT)), "<f4")
     m, (x0, y0) = frame.metres_per_pixel, frame.origin
@@ -131,7 +116,7 @@ def image(header: Message, frame: ImageFrame) -> Message:
     """sensor_msgs/Image, 32FC1: the conductivity drop in S/m, as seen from above: y up, so the first row is the
     highest y.
     """
-    drop, _ = _filled(frame)
+    drop, _ = views.filled(frame)
     rows, columns = drop.shape
     data = np.ascontiguousarray(drop[::-1], "<f4")
     return {
@@ -144,17 +129,7 @@ def image(header: Message, frame: ImageFrame) -> Message:
     }
 
 
-def _filled(frame: ImageFrame) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Drop and uncertainty, of one shape. Untouched there is no image: nothing has dropped, NaN is not known."""
-    drop = frame.image
-    if not drop.size:
-        across = [round(-2 * start / frame.metres_per_pixel) if frame.metres_per_pixel else 0 for start in frame.origin]
-        drop = np.zeros((max(across[1], 0), max(across[0], 0)), "<f4")
-    sigma = frame.sigma if frame.sigma.shape == drop.shape else np.full(drop.shape, np.nan, "<f4")
-    return drop, sigma
-
-
-def transform(stamp: Message, frame: InfoFrame) -> Message | None:
+def transform(ns: int, frame: InfoFrame) -> Message | None:
     """geometry_msgs/TransformStamped of the skin's pose; None where the service does not say."""
     found, parent, child = frame.info.get("pose"), frame.info.get("parent_frame_id"), frame.info.get("frame_id")
     if not isinstance(parent, str) or not isinstance(child, str) or not parent or not child:
@@ -164,9 +139,9 @@ def transform(stamp: Message, frame: InfoFrame) -> Message | None:
     except (TypeError, ValueError):
         return None
     return {
-        "header": {"stamp": stamp, "frame_id": parent},
+        "header": {"stamp": stamp(ns), "frame_id": parent},
         "child_frame_id": child,
-        "transform": {"translation": xyz((x, y, z)), "rotation": {"x": qx, "y": qy, "z": qz, "w": qw}},
+        "transform": {"translation": xyz((x, y, z)), "rotation": quaternion((qx, qy, qz, qw))},
     }
 
 
@@ -202,6 +177,16 @@ def _shown(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
+def stamp(ns: int) -> Message:
+    """A builtin_interfaces/Time."""
+    return {"sec": ns // 1_000_000_000, "nanosec": ns % 1_000_000_000}
+
+
+def quaternion(values: Sequence[float]) -> Message:
+    """A Quaternion of x, y, z, w."""
+    return dict(zip("xyzw", values, strict=True))
+
+
 def xyz(values: Sequence[float]) -> Message:
     """A Vector3 or Point."""
     return {"x": float(values[0]), "y": float(values[1]), "z": float(values[2])}
@@ -210,16 +195,3 @@ def xyz(values: Sequence[float]) -> Message:
 def _id32(number: int) -> int:
     """A contact's id as a marker's, which has 31 bits."""
     return number & 0x7FFFFFFF
-
-
-def _orientation(normal: Sequence[float], angle: float) -> Message:
-    """The turn that brings z to the normal, after one by `angle` about z."""
-    nx, ny, nz = normal
-    if nz < -0.999999:  # upside down: half a turn about x
-        tilt = (1.0, 0.0, 0.0, 0.0)
-    else:
-        w = math.sqrt(max(0.0, 0.5 * (1 + nz)))
-        tilt = (-0.5 * ny / w, 0.5 * nx / w, 0.0, w)
-    s, c = math.sin(0.5 * angle), math.cos(0.5 * angle)
-    x, y, _, w = tilt
-    return {"x": x * c + y * s, "y": y * c - x * s, "z": w * s, "w": w * c}

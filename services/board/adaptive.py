@@ -1,4 +1,5 @@
-"""Which list the board scans, and which of its scans go on: the whole pattern, or the sentinel's while nothing touches.
+"""The adaptive scan decides which list the board scans, the whole pattern or the sentinel list, and which of its scans
+go on to preprocessing.
 
 A state machine without I/O, told the time. *full*: the whole pattern, over and over. *idle*: the sentinel list, and a
 full scan every FULL_EVERY_S, at once on a suspicion. The judge of "nothing touches" is preprocessing, whose delta
@@ -28,7 +29,9 @@ Passed = tuple[link.ScanFrame, str]  # a scan and its kind
 
 
 class AdaptiveScan:
-    """One connection's. `wants` is "full" or "sentinel"; idle_config: the id of the sentinel list on the board."""
+    """The adaptive scan of one connection. `wants` is "full" or "sentinel"; idle_config: the id of the sentinel list on
+    the board.
+    """
 
     def __init__(self, sentinel: Sentinel, idle_config: int, quiet_frames: int = QUIET_FRAMES) -> None:
         self.rows, self.idle_config = sentinel.rows, idle_config
@@ -46,7 +49,7 @@ class AdaptiveScan:
         self._block: list[link.ScanFrame] = []  # sentinel scans not passed on yet
 
     def wants(self, now_s: float, confirmed: str = "") -> str:
-        """What the board should scan now. confirmed: what it has said that it scans, after the scan under way."""
+        """Returns what the board should scan now. confirmed: what it said that it scans after the scan under way."""
         if not self.idle:
             return "full"
         if now_s - self._heard_s > DEAF_S:
@@ -65,20 +68,20 @@ class AdaptiveScan:
         return "full" if now_s < self._promised_s + self._short_s + BEGUN_S else "sentinel"
 
     def due_s(self, now_s: float) -> float:
-        """Seconds until `wants` changes by itself."""
+        """Returns the seconds until `wants` changes by itself."""
         if not self.idle or self._asked_s is None or self._promised_s is None:
             return FULL_EVERY_S
         return max(0.001, self._promised_s + self._short_s + BEGUN_S - now_s)
 
     def interrupted(self) -> None:
-        """The board does not scan: it begins with full scans, and nothing is known of them."""
+        """The board does not scan any more: it will begin with full scans, and nothing is known of them."""
         if self.idle:
             self._wake("interrupted")
         self._quiet = 0
         self._untouched.clear()
 
     def scanned(self, scan: link.ScanFrame, now_s: float) -> list[Passed]:
-        """A scan of the board -> what goes on to preprocessing."""
+        """Takes a scan of the board; returns what goes on to preprocessing."""
         if scan.config == self.idle_config:
             self._short_s = scan.duration_us * 1e-6
             return self._sentinel(scan, now_s)
@@ -111,7 +114,7 @@ class AdaptiveScan:
         return [(mean, "sentinel")]
 
     def heard(self, delta: DeltaFrame, now_s: float) -> None:
-        """What preprocessing made of a scan."""
+        """Takes what preprocessing made of a scan."""
         self._heard_s = now_s
         if delta.touched or not delta.valid or delta.electrodes.any():
             if self.idle:
@@ -142,7 +145,7 @@ class AdaptiveScan:
 
 
 def _mean(scans: list[link.ScanFrame]) -> link.ScanFrame:
-    """One scan that is the mean of several in a row."""
+    """Returns one scan that is the mean of several in a row."""
     if len(scans) == 1:
         return scans[0]
     first, last = scans[0], scans[-1]

@@ -57,7 +57,7 @@ class BoardLink:
 
     @property
     def board(self) -> str:
-        """Unique id of the board, hexadecimal; "" until it has introduced itself."""
+        """The board's unique id, hexadecimal; "" until it has introduced itself."""
         return self.ident.unique_id.hex() if self.ident else ""
 
     @property
@@ -77,15 +77,15 @@ class BoardLink:
 
     @property
     def confirmed(self) -> Scanning | None:
-        """What the running board has said that it scans, after the scan under way; None while it has not."""
+        """The list that the running board has said that it scans, after the scan under way; None while it has not."""
         return self._started if self.state == "running" and not self._tries else None
 
     def switch(self, to: Scanning) -> None:
-        """Have the running board scan this one of the configurations; `to_send` tells it."""
+        """Makes the running board scan this one of the configurations; `to_send` tells it."""
         self._wanted = to
 
     def received(self, data: bytes, now_s: float) -> list[link.ScanFrame]:
-        """Scans that `data` completes, in order; everything else is dealt with here."""
+        """Returns the scans that `data` completes, in order; all other messages are dealt with here."""
         scans = []
         waited, bad = self.decoder.waiting, self.decoder.bad
         messages = self.decoder.feed(data)
@@ -113,11 +113,11 @@ class BoardLink:
         return scans
 
     def pause_s(self, now_s: float) -> float:
-        """How long the next byte is not worth waking up for."""
+        """Returns for how many seconds the next byte is not worth waking up for."""
         return self._pace.pause_s(now_s) if self.state == "running" and self.decoder.waiting else 0.0
 
     def to_send(self, now_s: float) -> bytes:
-        """What is due now."""
+        """Returns the bytes that are due now."""
         if self.state == "running":
             if now_s - self._heard_s <= SILENT_S:
                 return self._switching(now_s) + self._asking(now_s)
@@ -154,7 +154,7 @@ class BoardLink:
         self._restart(now_s, "this machine was suspended: asking the board again")
 
     def _asking(self, now_s: float) -> bytes:
-        """TIME_ASK where one is due."""
+        """Returns a TIME_ASK where one is due."""
         if not self.clock.timed:
             return b""
         width_ns = self.clock.width_ns(self._heard_us)
@@ -174,7 +174,7 @@ class BoardLink:
         self._restart(now_s, "the board's clock jumped, or runs wrong by more than 1 ms/s: asking it again")
 
     def _switching(self, now_s: float) -> bytes:
-        """START of another configuration, again until it is answered."""
+        """Returns a START of another configuration, again and again until it is answered."""
         answered = not self._tries
         if self._wanted is self._started and (answered or now_s < self._due_s):
             return b""
@@ -251,7 +251,7 @@ class BoardLink:
             self._restart(now_s, f"the board lost its configuration ({event.text or link.EventCode(event.code).name})")
 
     def _watch(self, scan: link.ScanFrame, now_s: float) -> None:
-        """A brown-out may lose the registers without a word: then there is no current through anything."""
+        """Looks for a brown-out that lost the registers without a word: then no measurement has a current."""
         self._dead_scans = self._dead_scans + 1 if (scan.status & NO_CURRENT).all() else 0
         if self._dead_scans >= DEAD_SCANS and now_s - self._dead_s >= DEAD_AGAIN_S:
             self._dead_scans, self._dead_s = 0, now_s
@@ -260,7 +260,7 @@ class BoardLink:
             )
 
     def _is_ours(self, scan: link.ScanFrame, first_byte_s: float, now_s: float) -> bool:
-        """Whether to believe that this is the board's next scan; counts what it is otherwise."""
+        """Returns whether this is to be believed as the board's next scan; counts what it is otherwise."""
         known = (self.scanning, self._idle) if self.switches else (self.scanning,)
         ours = any(s is not None and scan.config == s.config and len(scan.z) == len(s.pattern) for s in known)
         if self.state != "running" or not ours:
@@ -291,7 +291,7 @@ def _ns(seconds: float) -> int:
 
 
 def _reason(number: int) -> str:
-    """A NAK's reason by name; a newer firmware may have others."""
+    """Returns a NAK's reason by name; a newer firmware may have others."""
     try:
         return link.NakReason(number).name
     except ValueError:

@@ -1,6 +1,6 @@
-"""When was a scan measured, on the host's clock? From what the board's clock said, and what cannot have been otherwise.
+"""The device clock says when a scan was measured, on the host's clock: from the board's own times and from bounds.
 
-Sought is host time minus device time. Whatever the board sends arrives after it was sent: every arrival bounds the
+The unknown is host time minus device time. Whatever the board sends arrives after it was sent: every arrival bounds the
 difference from above. A timed question (START, TIME_ASK) is answered after it was asked: every answer bounds it from
 below too, within its round trip. A bound holds for ever, but for the crystals: they part by at most MAX_RATE_ERROR, so
 it widens by that. The earliest arrivals and the shortest round trips count; what comes late moves nothing.
@@ -30,7 +30,7 @@ Bound = tuple[int, int]  # device ns, difference ns
 
 
 class DeviceClock:
-    """Maps device time to host monotonic time. One object a connection.
+    """A DeviceClock maps device time to host monotonic time, for one connection.
 
     timed: the board answers timed questions, so that the bounds say how sure a stamp is.
     """
@@ -50,7 +50,7 @@ class DeviceClock:
         self._scatter_ns = UNSETTLED_NS
 
     def reset(self) -> None:
-        """Forget everything: the board's clock or the host's was set anew."""
+        """Forgets everything: the board's clock or the host's was set anew."""
         self._forget()
         self.resets += 1
 
@@ -102,8 +102,8 @@ class DeviceClock:
     # what is known of it
 
     def host_ns(self, device_us: int) -> int:
-        """Host monotonic time [ns] at which the board's clock showed device_us; where that is unknown, the earliest
-        that it can have been.
+        """Returns the host monotonic time [ns] at which the board's clock showed device_us; where that is unknown, the
+        earliest that it can have been.
         """
         device_ns = device_us * 1000
         lower, upper = self._bounds(device_ns)
@@ -115,7 +115,7 @@ class DeviceClock:
         return device_ns + min(upper, found)
 
     def width_ns(self, device_us: int) -> int | None:
-        """How far the bounds are apart at that time; None without a bound from below."""
+        """Returns how far the bounds are apart at that time [ns]; None without a bound from below."""
         lower, upper = self._bounds(device_us * 1000)
         return None if lower is None or upper is None else max(0, upper - lower)
 
@@ -125,7 +125,7 @@ class DeviceClock:
         return self.timed and (width is None or width > WIDE_NS)
 
     def sigma_ns(self, device_us: int) -> int:
-        """Standard uncertainty of `host_ns`: anywhere between the bounds, or the scatter about the line."""
+        """Returns the standard uncertainty of `host_ns`: anywhere between the bounds, or the scatter about the line."""
         width = self.width_ns(device_us)
         if not self.timed or width is None:
             return self._scatter_ns
@@ -139,7 +139,7 @@ class DeviceClock:
         return len(self._points) >= 4
 
     def _bounds(self, device_ns: int) -> tuple[int | None, int | None]:
-        """The least and the most that the difference can be at that time."""
+        """Returns the least and the most that the difference can be at that time."""
         lower, upper = self._lower, self._upper
         return (
             None if lower is None else lower[1] - round(MAX_RATE_ERROR * abs(device_ns - lower[0])),
@@ -182,7 +182,7 @@ class DeviceClock:
 
 
 def _later(bound: Bound, device_ns: int, difference: int, sign: int) -> bool:
-    """Whether a new bound is tighter than `bound` from the later of their times on. sign: +1 above, -1 below."""
+    """Returns whether a new bound is tighter than `bound`, from their later time on. sign: +1 above, -1 below."""
     newest = max(device_ns, bound[0])
     new = difference + sign * MAX_RATE_ERROR * (newest - device_ns)
     old = bound[1] + sign * MAX_RATE_ERROR * (newest - bound[0])

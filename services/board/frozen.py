@@ -1,4 +1,4 @@
-"""The same scan again and again, with new numbers and times: no news, whatever the clock says."""
+"""A board is frozen where it sends the same scan again and again, with new numbers and times."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ PROOF = 8  # scans in a row that show the noise
 
 
 class FrozenScans:
-    """Whether a board's scans are frozen: every value of FROZEN scans of one list in a row is the same bit by bit.
+    """FrozenScans tells a frozen board: FROZEN scans of one list in a row have the same values bit by bit.
 
-    That says something of a board whose noise exceeds a step of its registers: there it cannot happen. Whether it does
+    That tells something only of a board whose noise exceeds a step of its registers. Whether it does
     is learnt from the scans themselves. Noise goes up and down by turns: against the scan before, most measurements
     change in the other direction than last time. In PROOF scans in a row no touch, drift or contact does that; and a
     board with less noise than a step repeats values. Until then, and so for ever on a board without noise (a simulated

@@ -1,4 +1,4 @@
-"""This host's clocks as acquisition needs them, and whether it was suspended. Tests have clocks of their own."""
+"""HostTime and Suspensions are this host's clocks as acquisition needs them. Tests have clocks of their own."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class HostTime:
         return time.monotonic_ns()
 
     def suspended_ns(self) -> int:
-        """For how long this machine has been suspended since it started: the monotonic clock stands still then."""
+        """Returns for how long this machine has been suspended in all: the monotonic clock stands still then."""
         if not hasattr(time, "CLOCK_BOOTTIME"):  # not Linux
             return 0
         while True:
@@ -31,7 +31,7 @@ class HostTime:
 
 
 class Suspensions:
-    """Whether the machine was suspended since it was asked last."""
+    """Suspensions tells whether the machine was suspended since it was asked last."""
 
     def __init__(self, host: HostTime) -> None:
         self._host, self._known_ns = host, host.suspended_ns()

@@ -1,4 +1,4 @@
-"""How slowly a scan comes over the line: when its first byte came, and when the next one is worth waking up for."""
+"""The line's pace: when a scan's first byte came, and when the next byte is worth waking up for."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ LONGEST_LINE_S = 0.02  # that a scan is expected to take on the line: slower one
 
 
 class LinePace:
-    """Of one connection."""
+    """The pace of one connection's line."""
 
     def __init__(self, now_s: float) -> None:
         self._began_s = now_s  # when the first byte of what is not complete came
@@ -15,7 +15,7 @@ class LinePace:
         self._paused = False  # since the last look at the line
 
     def first_byte_s(self, now_s: float, *, waited: bool, dropped: bool, complete: bool, waits: bool) -> float:
-        """When the first byte of the first message came that bytes read now complete.
+        """Returns when the first byte came of the first message that the bytes read now complete.
 
         waited, waits: something incomplete was there before them, is there after them. dropped: some of it was no
         message, so that the first byte of what was one is not known. complete: there is a message.
@@ -26,12 +26,14 @@ class LinePace:
         return began_s
 
     def took(self, seconds: float) -> None:
-        """A scan took so long from its first byte to its last."""
+        """Takes how long a scan took from its first byte to its last."""
         # Complete at the first look after a pause: the pause was too long.
         self._line_s = self._line_s / 2 if self._paused else (seconds if seconds < LONGEST_LINE_S else 0.0)
 
     def pause_s(self, now_s: float) -> float:
-        """How long the next byte is not worth waking up for: the rest of a scan comes as slowly as that of the last."""
+        """Returns for how long the next byte is not worth waking up for: the rest of a scan comes as slowly as that of
+        the last.
+        """
         pause_s = self._line_s - EARLY_S - (now_s - self._began_s)
         self._paused = pause_s > 0
         return max(0.0, pause_s)

@@ -45,7 +45,7 @@ class Port:
             self._serial.timeout = 0.02
 
     def read(self, timeout_s: float) -> bytes:
-        """What has arrived, waiting up to timeout_s for the first byte; b"" when nothing came."""
+        """Returns what has arrived, waiting up to timeout_s for the first byte; b"" when nothing came."""
         try:
             if self._fd < 0:
                 data: bytes = self._serial.read(1)
@@ -73,8 +73,8 @@ class Port:
 
 
 def candidates(port: str, skin: str, usb_serial: str | None, known_board: bool) -> Iterator[str]:
-    """URLs at which the skin's board may be: first the configured one, then, once we know it, the names it may have
-    come back under.
+    """Returns the URLs at which the skin's board may be: first the configured one, then, once we know it, the names it
+    may have come back under.
     """
     if port == "stub":
         folder = runtime_dir()
@@ -99,13 +99,13 @@ def candidates(port: str, skin: str, usb_serial: str | None, known_board: bool) 
 
 
 def usb_serial_number(url: str) -> str | None:
-    """Serial number of the USB device behind a device path, if it has one."""
+    """Returns the serial number of the USB device behind a device path, if it has one."""
     real = os.path.realpath(url) if "://" not in url else url
     return next((p.serial_number for p in list_ports.comports() if p.device == real), None)
 
 
 def explain(url: str, why: Exception) -> str:
-    """What a failure to open means and what to do about it."""
+    """Returns what a failure to open means and what to do about it."""
     text, number = str(why), getattr(why, "errno", None)
     if "exclusively lock" in text or number in (11, 16):
         return f"{url} is held by another program: close that one (`fuser {url}` names it)"

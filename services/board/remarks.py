@@ -1,4 +1,4 @@
-"""What status says of a board that runs, beside what stands in the way: what cannot be seen of it, or believed."""
+"""Remarks on a board that runs, for `skin status`: what cannot be seen of it, or not be believed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ UNKNOWN = (
 
 
 class Remarks:
-    """Kept by the source's thread, read by the runner's."""
+    """The source's thread keeps the remarks, the runner's reads them."""
 
     def __init__(self) -> None:
         self._levels: dict[str, str] = {}  # by text
@@ -31,7 +31,7 @@ class Remarks:
         self._stood_still = now_s, f"acquisition stood still for {stood_s:.1f} s: {skipped} scans were skipped"
 
     def look(self, board: BoardLink, now_s: float) -> None:
-        """What is there to say now?"""
+        """Looks for what is to be said now."""
         levels = {}
         if board.state == "running":
             if not board.clock.timed:

@@ -1,4 +1,4 @@
-"""Which scans of a board to believe, and what to know of those."""
+"""The scan check decides which scans of a board are believed, and gives their reasons."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DOUBTED_SCANS = 3  # after that: the clock is to be believed again only once it 
 
 
 class ScanCheck:
-    """The scans of one connection.
+    """The scan check of one connection.
 
     `reasons`: of the scans received last, by number: gap, clock, frozen. `jumped`: the board's clock has, by the scans.
     """
@@ -42,7 +42,7 @@ class ScanCheck:
         self._doubted = DOUBTED_SCANS
 
     def __call__(self, scan: link.ScanFrame, arrived_ns: int, fit: bool) -> str:
-        """What it counts as: scans, repeated, foreign. fit: the clock may be set by it."""
+        """Returns what a scan counts as: scans, repeated, foreign. fit: the clock may be set by it."""
         missing = self._order.missing(scan)
         if missing < 0:  # repeated or older. If the board began anew without a word, it counts as silent
             return "repeated"

@@ -1,4 +1,4 @@
-"""Whether a scan follows those before it: by its number, and by the board's clock."""
+"""The scan order tells whether a scan follows those before it: by its number, and by the board's clock."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PAUSE_US = 1_000_000  # a board may also pause between scans
 
 
 class ScanOrder:
-    """Scans since START.
+    """The order of one board's scans since START.
 
     A number that went on by n says that n scans have begun since; their durations say how far the board's clock went on
     meanwhile. Captured scans that are sent again fail one or the other, or lie before START.
@@ -26,7 +26,7 @@ class ScanOrder:
         self._durations: dict[int, int] = {}  # us, by configuration
 
     def missing(self, scan: link.ScanFrame) -> int:
-        """How many scans lie between the last one and this; negative: it is that one again, or older."""
+        """Returns how many scans lie between the last one and this; negative: it is that one again, or older."""
         if self._last is None:
             return 0
         ahead = (scan.seq - self._last.seq) % WRAP
@@ -44,6 +44,6 @@ class ScanOrder:
         return least <= scan.device_us - last.device_us <= most
 
     def take(self, scan: link.ScanFrame) -> None:
-        """This scan is the last one now."""
+        """Takes this scan as the last one."""
         self._last = scan
         self._durations[scan.config] = scan.duration_us

@@ -1,4 +1,4 @@
-"""Where raw frames come from: a board, a recording, an imported file. One interface, so that acquisition does not care.
+"""Sources of raw frames: a board, a recording, an imported file, with one interface.
 
 A source blocks for at most POLL_S at a time, and never raises for what its device or file does.
 """
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 
 class Source(ABC):
-    """Raw frames of one skin."""
+    """A Source gives the raw frames of one skin."""
 
     def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
         self.name, self.skin, self.bundle = name, skin, bundle
@@ -50,7 +50,7 @@ class Source(ABC):
 
     @abstractmethod
     def frames(self) -> Iterator[RawFrame | None]:
-        """Frames as they come, for ever; None at least every POLL_S while none comes."""
+        """Yields frames as they come, for ever; None at least every POLL_S while none comes."""
 
     def health(self) -> Health:
         return Health("ERROR" if self.problem else "OK", [self.problem] if self.problem else [], dict(self.counts))
@@ -125,7 +125,9 @@ class BoardSource(Source):
             self._port = None
 
     def _connection(self, port: ports.Port, must_be: str) -> Generator[RawFrame | None, None, bool]:
-        """Until the port is gone (PortError), or turns out to be another board than `must_be` (returns True)."""
+        """Yields a connection's frames until the port is gone (PortError), or turns out to be another board than
+        `must_be` (returns True).
+        """
         opened = last = self._now()
         board, suspensions = BoardLink(self.scanning, opened, self.idling), Suspensions(self.host)
         adaptive = self.adaptive()
@@ -181,14 +183,14 @@ class BoardSource(Source):
         return self.host.now_ns() * 1e-9
 
     def _waiting(self, port: ports.Port) -> bytes:
-        """Everything that has come while this process stood still."""
+        """Returns everything that has come while this process stood still."""
         data = b""
         while len(data) < MOST_WAITING and (more := port.read(0.0)):
             data += more
         return data
 
     def _newest(self, passed: list[Passed], board: BoardLink, stood_s: float, now_s: float) -> list[Passed]:
-        """What goes on of the scans that waited while this process stood still: the newest one."""
+        """Returns the newest of the scans that waited while this process stood still: it alone goes on."""
         skipped = max(0, len(passed) - 1)
         if skipped:
             board.reasons[passed[-1][0].seq] = sorted({"gap", *board.reasons.get(passed[-1][0].seq, ())})
@@ -198,17 +200,17 @@ class BoardSource(Source):
         return passed[-1:]
 
     def adaptive(self) -> AdaptiveScan | None:
-        """What decides which list a new connection's board scans, where skin.toml wants that."""
+        """Returns what decides which list a new connection's board scans, where skin.toml wants that."""
         return AdaptiveScan(sentinel_of(self.bundle), self.idling.config) if self.idling else None
 
     def steer(self, board: BoardLink, adaptive: AdaptiveScan, now_s: float) -> None:
-        """Have the board scan what `adaptive` wants."""
+        """Makes the board scan what `adaptive` wants."""
         assert self.idling is not None
         confirmed = "full" if board.confirmed is self.scanning else "sentinel"
         board.switch(self.scanning if adaptive.wants(now_s, confirmed) == "full" else self.idling)
 
     def _listen(self, adaptive: AdaptiveScan, now_s: float) -> None:
-        """Preprocessing's newest verdict, in the thread that the socket belongs to."""
+        """Hears preprocessing's newest verdict, in the thread that the socket belongs to."""
         if self._verdicts is None:
             self._verdicts = NewestReader("delta", self.name)
         while (delta := self._verdicts.recv()) is not None:
@@ -216,7 +218,7 @@ class BoardSource(Source):
                 adaptive.heard(delta, now_s)
 
     def raw_frame(self, scan: link.ScanFrame, board: BoardLink, read_ns: int, kind: str = "full") -> RawFrame:
-        """A scan of the board with this host's stamps; `read_ns`: when its last byte was read."""
+        """Returns the raw frame of a board's scan, with this host's stamps; `read_ns`: when its last byte was read."""
         if kind == "full":
             self._full_s = scan.duration_us * 1e-6
         middle_us = scan.device_us + scan.duration_us // 2
@@ -245,7 +247,7 @@ class BoardSource(Source):
         )
 
     def _trouble(self, problem: str) -> None:
-        """Say what is the matter, once each time it changes."""
+        """Says what is the matter, once each time it changes."""
         if problem == self.problem or self.ending.is_set():
             return
         self.problem, now = problem, self._now()
@@ -258,7 +260,7 @@ class BoardSource(Source):
             log.info("%s: the board is running", self.name)
 
     def _count(self, board: BoardLink, seen: Counter[str], adaptive: AdaptiveScan | None) -> None:
-        """Add what is new in the connection's counts to ours."""
+        """Adds what is new in the connection's counts to ours."""
         now = board.counts + Counter({f"line_{what}": n for what, n in board.decoder.counts.items() if what != "good"})
         if adaptive is not None:
             now += adaptive.counts

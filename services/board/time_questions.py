@@ -1,4 +1,4 @@
-"""TIME_ASK to the board, and what its answers belong to. Without I/O, told the time."""
+"""Time questions: the TIME_ASKs that the board is sent, and which of them an answer belongs to. Without I/O."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ KEPT = 128  # unanswered questions
 
 
 class TimeQuestions:
-    """Those of one connection."""
+    """The time questions of one connection."""
 
     def __init__(self) -> None:
         self._asked_s: dict[int, float] = {}
@@ -25,7 +25,7 @@ class TimeQuestions:
         self._due_s = now_s
 
     def to_send(self, now_s: float, well_known: bool, line_busy: bool) -> bytes:
-        """The question that is due now, or b""."""
+        """Returns the question that is due now, or b""."""
         if now_s < self._due_s or (line_busy and now_s < self._due_s + PATIENCE_S):
             return b""
         self._due_s = now_s + (ASK_EVERY_S if well_known else ASK_OFTEN_S)
@@ -36,5 +36,5 @@ class TimeQuestions:
         return link.encode(link.TimeAsk(nonce=nonce))
 
     def asked_s(self, answer: link.Time) -> float | None:
-        """When the question was asked that this answers; None for no question of ours, or one answered before."""
+        """Returns when the question that this answers was asked; None for no question of ours."""
         return self._asked_s.pop(answer.nonce, None)

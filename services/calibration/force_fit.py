@@ -1,10 +1,10 @@
 """Fits a skin's force law to a handful of presses of known force.
 
-log force = log scale + exponent * log quantity + a few terms of the place: monotone as long as the exponent is above 0,
-and linear in what is sought, so leaving a press out costs nothing (the hat matrix says what it would have been). Which
-quantity, whether the exponent is free, and how many terms: what the presses themselves predict best when each is left
-out, of what their number allows; the simplest of those that are nearly as good. The error stated is that of presses
-that took no part in any of this, the choice included.
+log force = log scale + exponent * log quantity + a few terms of the place. The law is monotone as long as the exponent
+is above 0. It is linear in its coefficients, so leave-one-out errors cost nothing (the hat matrix gives them). The
+presses choose the quantity, whether the exponent is free, and the number of terms: the law that predicts each left-out
+press best wins, or a simpler one that is nearly as good. The number of presses limits the choice. The stated error is
+that of presses that took no part in the fit or in the choice.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def _table(presses: Sequence[Press], laws: dict[Of, ForceLaw]) -> Table:
 
 
 def _forms(n: int, laws: dict[Of, ForceLaw]) -> list[Form]:
-    """What n presses allow, simplest first."""
+    """The laws that n presses allow, simplest first."""
     every = [Form(*each) for each in itertools.product(laws, (False, True), TERMS)]
     return sorted((f for f in every if PRESSES_PER_PARAMETER * f.parameters <= n), key=lambda f: f.parameters)
 
@@ -167,7 +167,7 @@ def _residuals(table: Table, form: Form) -> Array:
 
 def _choose(table: Table, laws: dict[Of, ForceLaw]) -> Form:
     """The simplest form that is nearly as good as the best. Raises CalibrationError where force does not rise."""
-    # Asked of a quantity by itself: a law of slope 1 rises whatever the presses say.
+    # This looks at a quantity by itself: a law of slope 1 rises whatever the presses say.
     rising = {reads: law for reads, law in laws.items() if _rises(table, Form(reads, True, "none"))}
     if not rising:
         raise CalibrationError(

@@ -30,14 +30,14 @@ PATIENCE_S = 60.0
 
 
 def laws(skin: Skin, bundle: Bundle) -> dict[Of, ForceLaw]:
-    """What says each quantity of a look, without any calibration there may be already."""
+    """The force laws that give each quantity of a look, without a calibration that may be there already."""
     law = ForceLaw.of(skin.model_copy(update={"calibration": None}), bundle)
     kinds: tuple[Of, ...] = ("peak", "integral")
     return {reads: replace(law, reads=reads) for reads in kinds}
 
 
 def looks(frame: ImageFrame) -> list[Look]:
-    """What an image shows of each touch, strongest first."""
+    """What an image shows of its touches, strongest first."""
     if not (frame.touched and frame.image.size):
         return []
     return [Look.of(s, frame) for s in segment(frame.image, frame.sigma)]
@@ -51,7 +51,7 @@ def mean(several: list[Look]) -> Look:
 
 
 class Steady:
-    """Images of a press, until it has been steady long enough."""
+    """Collects images of a press until it has been steady long enough."""
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, Look]] = deque()
@@ -84,7 +84,7 @@ class Steady:
 
 
 class Reader(Protocol):
-    """protocol.sockets.AllReader, as far as it is needed here."""
+    """The part of protocol.sockets.AllReader that is needed here."""
 
     def recv(self, timeout_s: float = 0.0) -> Frame | None: ...
 
@@ -106,7 +106,7 @@ def wait_for_press(reader: Reader, clock: Callable[[], float], patience_s: float
 
 
 def wait_for_release(reader: Reader, clock: Callable[[], float], patience_s: float = PATIENCE_S) -> None:
-    """Until nothing touches. Raises CalibrationError where that does not happen."""
+    """Wait until nothing touches. Raises CalibrationError where that does not happen."""
     end = clock() + patience_s
     while clock() < end:
         frame = reader.recv(0.5)
@@ -130,7 +130,7 @@ def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None])
     assert data.untouched is not None  # read_input sees to it
     skin = skin.model_copy(update={"calibration": None})
     pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
-    baseline = baseline_of(data.untouched, pipeline, warn)
+    baseline = baseline_of(data.untouched, pipeline.pre.pre, warn)
 
     def look(row: int) -> Look:
         if not 0 <= row < len(data.measurements):

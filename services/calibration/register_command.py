@@ -1,4 +1,4 @@
-"""`skin register`: from a file of presses at known places to a bundle of that skin and its pose."""
+"""`skin register`: turns a file of presses at known places into a bundle of that skin and its pose."""
 
 from __future__ import annotations
 
@@ -10,35 +10,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from services.calibration.registration import FEWEST, RegistrationError, Similarity, part, read_presses, register
-from services.calibration.sensitivity import out_of_fold, write_corrected
+from services.calibration.locating import build
+from services.calibration.presses import Presses, RegistrationError, part, read_presses
+from services.calibration.registration import FEWEST, Registration, Similarity, Told, register
+from services.calibration.sensitivity import write_corrected
 from services.recordings.reconstruction import find_skin
 
 
-def register_presses(arrays: Mapping[str, NDArray[Any]], skin: str, count: int, out: Path) -> dict[str, Any]:
-    """Fits the first `count` presses, writes the bundle folder `out` and a skin.toml in it; returns the report.
+def register_presses(
+    arrays: Mapping[str, NDArray[Any]], skin: str, count: int | None, out: Path, told: Told | None = None
+) -> dict[str, Any]:
+    """Fits the first `count` presses (None: all), writes the bundle folder `out` and a skin.toml in it; returns the
+    report.
 
     Raises RegistrationError, BundleError.
     """
     bundle = find_skin(skin)[1]
+    if count is not None:
+        held = len(arrays["xy"]) if "xy" in arrays and arrays["xy"].ndim else 0
+        if not FEWEST <= count <= held:
+            raise RegistrationError(f"--presses {count}: the file holds {held}, at least {FEWEST} are needed")
+        arrays = part(arrays, slice(0, count))
     presses = read_presses(arrays, bundle)
-    if not FEWEST <= count <= len(presses):
-        raise RegistrationError(f"--presses {count}: the file holds {len(presses)}, at least {FEWEST} are needed")
-    presses = read_presses(part(arrays, slice(0, count)), bundle)
-    similarity, explained = register(presses, bundle)
-    residual = out_of_fold(presses, similarity, bundle)
-    report = {
-        "presses": count,
-        "angle_degrees": float(np.degrees(similarity.angle)),
-        "scale": similarity.scale,
-        "offset_m": similarity.offset.tolist(),
-        "mirrored": similarity.mirrored,
-        "explained_variance": explained,
-        "residual_m": {"median": float(np.median(residual)), "mean": float(residual.mean())},
-    }
-    made = write_corrected(out, presses, similarity, bundle, report)
-    (out / "skin.toml").write_text(configuration(made, similarity), encoding="utf-8")
+    found = register(presses, bundle, told)
+    locator, response, crossed = build(presses, found.similarity, bundle)
+    report = said(presses, found, len(bundle.pattern))
+    report |= {"left_out": crossed.report(presses.quantity)}
+    report |= {"correlation_length_m": response.assumed.length_m}
+    made = write_corrected(out, presses, response, locator, report)
+    (out / "skin.toml").write_text(configuration(made, found.similarity), encoding="utf-8")
     return {**report, "bundle": str(out)}
+
+
+def said(presses: Presses, found: Registration, measurements: int) -> dict[str, Any]:
+    """What is known of the presses and the pose."""
+    similarity = found.similarity
+    return {
+        "presses": len(presses),
+        "unusable_presses": presses.left_out,
+        "unusable_measurements": measurements - int(presses.measured.sum()),
+        "from_delta": presses.from_delta,
+        "delta_unit": presses.unit,
+        "typical_difference": float(np.sqrt(np.median((presses.difference**2).mean(axis=1)))),
+        "angle_degrees": float(np.degrees(similarity.angle)),
+        "angle_sigma_degrees": float(np.degrees(found.sigma["angle"])),
+        "scale": similarity.scale,
+        "scale_sigma": found.sigma["scale"] * similarity.scale,
+        "offset_m": similarity.offset.tolist(),
+        "offset_sigma_m": found.sigma["offset"],
+        "mirrored": similarity.mirrored,
+        "explained_variance": found.explained,
+        "doubts": found.doubts,
+    }
 
 
 def configuration(bundle: Bundle, similarity: Similarity) -> str:

@@ -1,50 +1,36 @@
 """Where a real skin's frame lies in that of the machine that presses it: a similarity fitted to known presses.
 
 No reconstruction is needed for it: the bundle's sensitivities say how each measurement should change with the place of
-a press, up to a gain per measurement, and the similarity is the one that explains most of how they did change.
+a press, up to a gain per measurement, and the similarity is the one that explains most of how they did change. Presses
+lie inside the skin, and seldom far from its edge: that bounds the skin's size where nobody tells it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, optimize
+from scipy import optimize
 
 from models.bundle import Bundle
-from protocol.errors import EitskinError
-from services.estimation.references import noise_of_references
-from services.recordings.npz_file import InputError, measurement_order
+from services.calibration.fields import electrodes, half_width, sample, sensitivities
+from services.calibration.presses import Presses, RegistrationError
 
 Array = NDArray[np.float64]
 
-FEWEST = 20
+FEWEST = 10
 PRESS_BLUR = 2.0
 """Pixels of the bundle's grid over which sensitivities are averaged: about the width of a press."""
-MOST_DEPTHS = 8
-
-
-class RegistrationError(EitskinError, ValueError):
-    """The presses cannot be registered; says what was found, what was expected and what to do."""
-
-
-@dataclass(frozen=True)
-class Presses:
-    """N presses at known places. K measurements, in the bundle's order."""
-
-    difference: Array  # (N, K) |Z| / |Z0| - 1
-    xy: Array  # (N, 2) m, in the machine's frame
-    strength: Array  # (N,) relative to the mean press
-    noise: Array  # (K,) standard deviation of a difference that nothing caused
-
-    def __getitem__(self, rows: Any) -> Presses:
-        return Presses(self.difference[rows], self.xy[rows], self.strength[rows], self.noise)
-
-    def __len__(self) -> int:
-        return len(self.xy)
+SIZE = (1.0, 1.6)  # radius of the electrodes' circle beside that of the presses, where nobody tells the size
+TOLD_SIZE = 0.02  # relative: how far a size that was told may be off
+TOLD_ANGLE = np.radians(5.0)
+MOST_FOR_POSE = 200  # presses from which the pose is found
+STARTS = 4  # the best of those on a grid, each followed to its optimum
+PARTS = 10  # of the jackknife that tells the width of the posterior
+SHUFFLES = 8
+WIDEST_ANGLE = np.radians(30.0)
+DECIDED = 2.0  # standard errors by which one numbering must explain more than the other
 
 
 @dataclass(frozen=True)
@@ -70,114 +56,188 @@ class Similarity:
         return np.asarray((machine - self.offset) @ self.matrix / self.scale)
 
 
-def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
-    """From touched, untouched (n, k), xy (n, 2), optionally depth (n,), pattern (k, 4). Raises RegistrationError."""
-    missing = [name for name in ("touched", "untouched", "xy") if name not in arrays]
-    if missing:
-        raise RegistrationError(
-            f"no array {', '.join(missing)}: expected touched and untouched (n, {len(bundle.pattern)}), "
-            "and xy (n, 2) in metres"
-        )
-    try:
-        order = measurement_order(arrays, bundle)
-    except InputError as why:
-        raise RegistrationError(str(why)) from None
-    touched, untouched, xy = (np.asarray(arrays[name]) for name in ("touched", "untouched", "xy"))
-    for name in ("touched", "untouched", "xy", "depth"):
-        if name in arrays and arrays[name].dtype.kind not in ("iufc" if "touched" in name else "iuf"):
-            raise RegistrationError(f"{name} is {arrays[name].dtype}, expected numbers")
-    if touched.shape != untouched.shape or touched.ndim != 2 or touched.shape[1] != len(order):
-        raise RegistrationError(
-            f"touched {touched.shape} and untouched {untouched.shape}: "
-            f"expected both (n, {len(order)}), one row per press"
-        )
-    if xy.shape != (len(touched), 2) or not np.isfinite(xy).all():
-        raise RegistrationError(f"xy {xy.shape}: expected ({len(touched)}, 2), metres, all finite")
-    before = np.abs(untouched[:, order]).astype(float)
-    if not (before > 0).all():
-        raise RegistrationError("untouched holds values that are not above 0: leave those presses out")
-    difference = np.abs(touched[:, order]) / before - 1
-    if not np.isfinite(difference).all():
-        raise RegistrationError("touched holds values that are not finite: leave those presses out")
-    return Presses(difference, xy.astype(float), _strength(arrays, difference), noise_of_references(before))
+@dataclass(frozen=True)
+class Told:
+    """What somebody knows of the skin; None: nobody does."""
+
+    diameter_m: float | None = None  # of the circle through the electrodes
+    first_electrode: float | None = None  # rad, seen from the skin's centre, in the machine's frame
+    clockwise: bool | None = None  # how the electrodes are numbered, in the machine's frame
 
 
-def part(arrays: Mapping[str, NDArray[Any]], rows: slice) -> dict[str, NDArray[Any]]:
-    """The same arrays with some of their presses."""
-    return {name: a[rows] if name in ("touched", "untouched", "xy", "depth") else a for name, a in arrays.items()}
+@dataclass(frozen=True)
+class Registration:
+    """A similarity, how much it explains, and how well it is known."""
+
+    similarity: Similarity
+    explained: float  # share of the measurements' variance, with one gain per measurement
+    sigma: dict[str, float]  # standard uncertainty of angle [rad], scale (relative), offset [m]
+    doubts: list[str] = field(default_factory=list)  # for a person: what is not sure, and what would settle it
 
 
-def _strength(arrays: Mapping[str, NDArray[Any]], difference: Array) -> Array:
-    """How strong each press is: the mean change by presses of its depth; 1 where depths are unknown or all differ."""
-    depth = np.asarray(arrays.get("depth", np.zeros(len(difference))))
-    if depth.shape != (len(difference),):
-        raise RegistrationError(f"depth {depth.shape}: expected ({len(difference)},), metres")
-    kinds, kind = np.unique(np.round(depth, 5), return_inverse=True)
-    if len(kinds) > MOST_DEPTHS:
-        return np.ones(len(difference))
-    change = np.abs(difference).mean(axis=1)
-    of_kind = np.array([change[kind == k].mean() for k in range(len(kinds))])
-    return np.asarray(of_kind[kind] / change.mean())
+class _Pose:
+    """What each press leaves unexplained, as a function of the pose."""
 
+    def __init__(self, presses: Presses, bundle: Bundle, told: Told) -> None:
+        some = np.unique(np.linspace(0, len(presses) - 1, min(len(presses), MOST_FOR_POSE)).astype(int))
+        self.presses = presses[some]
+        live = presses.measured
+        self.fields, self.width = sensitivities(bundle, PRESS_BLUR)[live], half_width(bundle)
+        y = self.presses.difference[:, live]
+        self.y = y / np.maximum(np.sqrt((y**2).mean(axis=0)), 1e-30)
+        xy = presses.xy
+        self.centre = 0.5 * (xy.min(axis=0) + xy.max(axis=0))
+        self.radius = float(np.linalg.norm(xy - self.centre, axis=1).max())
+        at = electrodes(bundle)
+        self.circle = float(np.linalg.norm(at, axis=1).max())
+        first = float(np.arctan2(at[0, 1], at[0, 0]))
+        turning = at[:, 0] * np.roll(at[:, 1], -1) - at[:, 1] * np.roll(at[:, 0], -1)
+        self.bundle_clockwise = bool(turning.sum() < 0)
+        self.first = first
+        if told.diameter_m is None:
+            self.sizes = (SIZE[0] * self.radius / self.circle, SIZE[1] * self.radius / self.circle)
+        else:
+            size = 0.5 * told.diameter_m / self.circle
+            self.sizes = (size * (1 - TOLD_SIZE), size * (1 + TOLD_SIZE))
+        both = (False, True)
+        self.ways = both if told.clockwise is None else (told.clockwise != self.bundle_clockwise,)
+        self.told_angle = told.first_electrode
 
-def sensitivities(bundle: Bundle, blur: float) -> Array:
-    """(K, h, w) the sensitivities averaged over a press `blur` pixels wide; no singular points at electrodes."""
-    m = bundle.matrices
-    inside = m.inside.astype(float)
-    weight = np.maximum(ndimage.gaussian_filter(inside, blur), 0.2)
-    found = []
-    for row in m.jacobian.astype(float).reshape(-1, *m.inside.shape):
-        limit = np.percentile(np.abs(row), 98)
-        found.append(ndimage.gaussian_filter(np.clip(row, -limit, limit) * inside, blur) / weight)
-    return np.array(found)
+    def angles(self, mirrored: bool) -> Array:
+        """Where to start."""
+        if self.told_angle is None:
+            return np.asarray(np.radians(np.arange(0, 360, 10)), float)
+        return np.array([self.told_angle + (self.first if mirrored else -self.first)])
 
+    def of(self, p: Array, mirrored: bool) -> Similarity:
+        return Similarity(float(p[0]), float(np.exp(p[1])), np.asarray(p[2:]), mirrored)
 
-def sample(fields: Array, points: Array, half_width_m: float) -> Array:
-    """Values (N, K) of fields (K, h, w) at (N, 2) points [m] of the skin's frame; the edge's value outside."""
-    h, w = fields.shape[1:]
-    x = np.clip((points[:, 0] / half_width_m + 1) * w / 2 - 0.5, 0, w - 1)
-    y = np.clip((points[:, 1] / half_width_m + 1) * h / 2 - 0.5, 0, h - 1)
-    left, low = np.minimum(x.astype(int), w - 2), np.minimum(y.astype(int), h - 2)
-    right, up = x - left, y - low
-    lower = (1 - right) * fields[:, low, left] + right * fields[:, low, left + 1]
-    upper = (1 - right) * fields[:, low + 1, left] + right * fields[:, low + 1, left + 1]
-    return np.asarray(((1 - up) * lower + up * upper).T)
-
-
-def half_width(bundle: Bundle) -> float:
-    """Half the side of the bundle's image, in its metres."""
-    return 0.5 * bundle.image_size * bundle.metres_per_pixel
-
-
-def register(presses: Presses, bundle: Bundle) -> tuple[Similarity, float]:
-    """The similarity, and the share of the measurements' variance that it explains with one gain per measurement.
-
-    Raises RegistrationError for too few presses.
-    """
-    if len(presses) < FEWEST:
-        raise RegistrationError(f"{len(presses)} presses: at least {FEWEST}, spread over the skin, are needed")
-    fields, width = sensitivities(bundle, PRESS_BLUR), half_width(bundle)
-    y = presses.difference / np.sqrt((presses.difference**2).mean(axis=0))
-
-    def unexplained(parameters: Array, mirrored: bool) -> float:
-        similarity = Similarity(parameters[0], float(np.exp(parameters[1])), parameters[2:], mirrored)
-        x = sample(fields, similarity.to_skin(presses.xy), width) * presses.strength[:, None]
+    def left(self, similarity: Similarity, rows: NDArray[np.intp] | slice = slice(None)) -> Array:
+        """(N,) mean square that each press leaves unexplained, with one gain per measurement."""
+        xy, y = self.presses.xy[rows], self.y[rows]
+        x = sample(self.fields, similarity.to_skin(xy), self.width) * self.presses.strength[rows][:, None]
         gain = (x * y).sum(axis=0) / np.maximum((x * x).sum(axis=0), 1e-30)
-        return float(((y - gain * x) ** 2).mean())
+        return np.asarray(((y - gain * x) ** 2).mean(axis=1))
 
-    centre = 0.5 * (presses.xy.min(axis=0) + presses.xy.max(axis=0))
+    def cost(self, p: Array, mirrored: bool, rows: NDArray[np.intp] | slice = slice(None)) -> float:
+        """With a wall where the size or the angle cannot be, or presses would lie outside the skin."""
+        similarity = self.of(p, mirrored)
+        low, high = np.log(self.sizes)
+        wall = max(0.0, low - p[1]) + max(0.0, p[1] - high)
+        out = np.linalg.norm(similarity.to_skin(self.presses.xy), axis=1) / self.circle - 1.0
+        wall += max(0.0, float(out.max()))
+        if self.told_angle is not None:
+            off = p[0] - self.angles(mirrored)[0]
+            wall += max(0.0, abs((off + np.pi) % (2 * np.pi) - np.pi) - TOLD_ANGLE)
+        return float(self.left(similarity, rows).mean() + 10.0 * wall)
+
+    def start(self, angle: float) -> Array:
+        return np.array([angle, np.log(np.sqrt(self.sizes[0] * self.sizes[1])), *self.centre])
+
+    def best(self, start: Array, mirrored: bool, steps: int, rows: NDArray[np.intp] | slice = slice(None)) -> Array:
+        reach = 0.06 * self.width * float(np.exp(start[1]))
+        simplex = np.vstack([start, start + np.diag([0.1, 0.05, reach, reach])])
+        found = optimize.minimize(
+            self.cost, start, (mirrored, rows), "Nelder-Mead", options={"initial_simplex": simplex, "maxiter": steps}
+        )
+        return np.asarray(found.x)
+
+
+def register(presses: Presses, bundle: Bundle, told: Told | None = None) -> Registration:
+    """The pose that explains most. Raises RegistrationError where the presses cannot tell it."""
+    if len(presses) < FEWEST:
+        without = f" ({presses.left_out} others of the file cannot be used)" if presses.left_out else ""
+        raise RegistrationError(f"{len(presses)} presses{without}: at least {FEWEST}, spread over the skin, are needed")
+    pose = _Pose(presses, bundle, told or Told())
+    _fits(pose, told or Told())
     starts = [
-        (unexplained(np.array([angle, 0.0, *centre]), mirrored), angle, mirrored)
-        for mirrored in (False, True)
-        for angle in np.radians(np.arange(0, 360, 10))
+        (pose.cost(pose.start(angle), way), angle, way) for way in pose.ways for angle in pose.angles(way).tolist()
     ]
-    _, angle, mirrored = min(starts)
-    start = np.array([angle, 0.0, *centre])
-    steps = np.diag([0.1, 0.1, 0.06 * width, 0.06 * width])
-    simplex = np.vstack([start, start + steps])
-    best = optimize.minimize(
-        unexplained, start, (mirrored,), "Nelder-Mead", options={"initial_simplex": simplex, "maxiter": 300}
-    )
-    found = best.x
-    turn = float((found[0] + np.pi) % (2 * np.pi) - np.pi)
-    return Similarity(turn, float(np.exp(found[1])), np.asarray(found[2:]), mirrored), 1 - float(best.fun)
+    _better_than_chance(pose, [(angle, way) for _, angle, way in starts])
+    starts.sort(key=lambda each: each[0])
+    found: dict[bool, tuple[float, Array]] = {}
+    for way in pose.ways:
+        for _, angle, _ in [each for each in starts if each[2] == way][:STARTS]:
+            p = pose.best(pose.start(angle), way, 250)
+            value = pose.cost(p, way)
+            if way not in found or value < found[way][0]:
+                found[way] = (value, p)
+    way = min(found, key=lambda each: found[each][0])
+    p = found[way][1]
+    similarity = pose.of(p, way)
+    explained = 1 - float(pose.left(similarity).mean())
+    sigma = _widths(pose, p, way)
+    doubts = _doubts(pose, p, sigma, told or Told())
+    if len(found) == 2:
+        other = pose.left(pose.of(found[not way][1], not way)) - pose.left(similarity)
+        error = float(other.std(ddof=1)) / np.sqrt(len(other))
+        if float(other.mean()) < DECIDED * error:
+            doubts.append(
+                "whether the electrodes are numbered clockwise is not decided by these presses: say --numbering"
+            )
+    if sigma["angle"] > WIDEST_ANGLE and (told is None or told.first_electrode is None):
+        raise RegistrationError(
+            f"these {len(presses)} presses leave the skin's angle open by {np.degrees(sigma['angle']):.0f} degrees: "
+            "say where the first electrode is (--first-electrode), or press at more places"
+        )
+    angle = float((p[0] + np.pi) % (2 * np.pi) - np.pi)
+    return Registration(Similarity(angle, similarity.scale, similarity.offset, way), explained, sigma, doubts)
+
+
+def _fits(pose: _Pose, told: Told) -> None:
+    """Presses of a size that a skin has, and inside the one that was told."""
+    if pose.radius < 1e-4:
+        raise RegistrationError(
+            f"all presses lie within {2e3 * pose.radius:.2g} mm: spread them over the skin (xy is in metres)"
+        )
+    if told.diameter_m is not None and told.diameter_m < 2 * pose.radius * (1 - TOLD_SIZE):
+        raise RegistrationError(
+            f"presses lie up to {2e3 * pose.radius:.0f} mm apart, the skin's diameter is said to be "
+            f"{1e3 * told.diameter_m:.0f} mm: presses lie inside the skin; check both (metres)"
+        )
+
+
+def _better_than_chance(pose: _Pose, starts: list[tuple[float, bool]]) -> None:
+    """The places must say more of the measurements than the same places in another order do, at the best of the poses
+    that are looked at first.
+    """
+    rng, n = np.random.default_rng(7), len(pose.y)
+    orders = [np.arange(n), *(rng.permutation(n) for _ in range(SHUFFLES))]
+    explained = np.zeros(len(orders))
+    for angle, way in starts:
+        x = sample(pose.fields, pose.of(pose.start(angle), way).to_skin(pose.presses.xy), pose.width)
+        power = np.maximum((x * x).sum(axis=0), 1e-30)
+        each = [float(((x * pose.y[order]).sum(axis=0) ** 2 / power).mean()) / n for order in orders]
+        explained = np.maximum(explained, each)
+    chance = float(explained[1:].max())
+    if explained[0] <= chance:
+        raise RegistrationError(
+            f"no pose of the skin explains these presses: {100 * explained[0]:.0f} % of how the measurements changed, "
+            f"where the same places in another order explain {100 * chance:.0f} %. Check that row n of xy is where row "
+            "n was measured, that xy is in metres, that this is the skin that was pressed, and what was told of it "
+            "(--diameter, --first-electrode, --numbering)"
+        )
+
+
+def _widths(pose: _Pose, p: Array, way: bool) -> dict[str, float]:
+    """Standard uncertainties, by a jackknife over the presses: what the model is wrong by is in it."""
+    n = len(pose.presses)
+    parts = np.random.default_rng(6).permutation(n) % min(PARTS, n)
+    count = int(parts.max()) + 1
+    found = np.array([pose.best(p, way, 60, np.flatnonzero(parts != one)) for one in range(count)])
+    spread = np.sqrt((count - 1) / count * ((found - found.mean(axis=0)) ** 2).sum(axis=0))
+    return {"angle": float(spread[0]), "scale": float(spread[1]), "offset": float(np.hypot(spread[2], spread[3]))}
+
+
+def _doubts(pose: _Pose, p: Array, sigma: dict[str, float], told: Told) -> list[str]:
+    found = []
+    low, high = np.log(pose.sizes)
+    if told.diameter_m is None and (p[1] < low + 0.01 or p[1] > high - 0.01):
+        end = SIZE[0] if p[1] < low + 0.01 else SIZE[1]
+        found.append(
+            f"the skin's size is at the end of what is looked at, {end:g} times the circle of the presses: "
+            "say --diameter"
+        )
+    if sigma["scale"] > 0.15 and told.diameter_m is None:
+        found.append(f"the skin's size is known to {100 * sigma['scale']:.0f} % only: say --diameter")
+    return found

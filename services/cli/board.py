@@ -29,7 +29,7 @@ def press(
     skin: SkinOption = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Press the stub's skin. Returns as soon as the board has taken it; the press goes on for its seconds."""
+    """Press the stub's skin. Returns as soon as the board has accepted it; the press lasts for its seconds."""
     args: dict[str, Any] = {"x": x, "y": y, "force": force, "radius": radius, "shape": shape, "seconds": seconds}
     if (to_x is None) != (to_y is None):
         fail("a slide needs both --to-x and --to-y: found only one of them", USAGE)
@@ -136,12 +136,17 @@ def _stub(command: str, skin: str, **args: Any) -> dict[str, Any]:
 
 def tare(
     force: Annotated[bool, typer.Option("--force", help="Also where it looks touched: nothing touches it.")] = False,
+    calibrate: Annotated[
+        bool, typer.Option(help="Also fit how the skin is mounted, and use matrices that fit it; takes some seconds.")
+    ] = True,
     skin: SkinOption = "",
     as_json: JsonOption = False,
 ) -> None:
     """Take a new baseline from the last seconds, in which nothing touched the skin."""
-    answer = control("preprocessing", "tare", skin=skin_name(skin), force=force, timeout_s=10.0)
+    answer = control("preprocessing", "tare", skin=skin_name(skin), force=force, calibrate=calibrate, timeout_s=10.0)
     if as_json:
         emit(answer)
     else:
         print(f"new baseline from {answer['frames']} frames, {answer['snr_db']:.1f} dB")
+        if answer.get("calibrating"):
+            print("fitting how the skin is mounted: used once it is found and nothing touches; `skin doctor` says what")

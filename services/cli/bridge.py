@@ -1,16 +1,12 @@
-"""`skin bridge NAME`: hand contacts on to ROS 2 or Foxglove."""
+"""`skin bridge NAME`: show contacts on the live page, hand them on to ROS 2 or Foxglove."""
 
 from __future__ import annotations
 
-from enum import Enum
 from typing import Annotated
 
 import typer
 
-from protocol.topics import BRIDGES
 from services.cli.common import USAGE, config_file, fail, of_service
-
-BridgeName = Enum("BridgeName", {name: name for name in BRIDGES})  # type: ignore[misc]
 
 
 def register(app: typer.Typer) -> None:
@@ -18,13 +14,16 @@ def register(app: typer.Typer) -> None:
 
 
 def bridge(
-    name: Annotated[BridgeName, typer.Argument(help="Which one; its section in skin.toml has its settings.")],
+    name: Annotated[str, typer.Argument(help="page, ros2 or foxglove; its section in skin.toml has its settings.")],
 ) -> None:
-    """Hand contacts on to another world, in the foreground, beside a running service; Ctrl-C ends it."""
+    """Show contacts, or hand them on to another world, in the foreground, beside a running service; Ctrl-C ends it."""
+    from protocol.topics import BRIDGES
     from services.bridge import MissingExtra, become
     from services.runtime.config import load
 
+    if name not in BRIDGES:
+        fail(f"no bridge {name!r}: expected {' or '.join(BRIDGES)}", USAGE)
     try:
-        become(name.value, load(config_file()))
+        become(name, load(config_file()))
     except MissingExtra as why:
         fail(str(why), USAGE)

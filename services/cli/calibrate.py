@@ -45,7 +45,7 @@ def force(
     most: Annotated[float, typer.Option(help="Newtons beyond which it is extrapolated; default: the firmest.")] = 0.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit the skin's force law to presses of known force and say how well it foretells each press from the others.
+    """Fit the skin's force law to presses of known force and say how well it predicts each press from the others.
 
     By prompts: type the force, press and hold still, release; an empty line ends. CSV: a line of names, then a press a
     line: force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2[,noise] as --save writes it; or, with --measurements:

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from models.bundle import Bundle
     from services.calibration.collecting import Collected, Collector
 
-FORCES = (3.0, 1.0, 5.0, 2.0, 4.0)  # newtons with which the stub is pressed, in turn
+FORCES = (3.0, 1.5, 5.0, 2.0, 4.0)  # newtons with which the stub is pressed, in turn
+STUB_PATIENCE_S = 20.0  # a press of the stub is there at once, or not seen at all
 
 
 def register(app: typer.Typer) -> None:
@@ -50,6 +51,7 @@ def collect(
     from models.bundle import Bundle
     from protocol.sockets import AllReader
     from services.calibration import collecting
+    from services.calibration.force_presses import PATIENCE_S
     from services.runtime.config import load
 
     if target.suffix != ".npz":
@@ -64,7 +66,8 @@ def collect(
     use_configured_sockets()
     reader = AllReader(["raw", "image"], name)
     try:
-        collector = collecting.Collector(reader, time.monotonic)
+        patience_s = STUB_PATIENCE_S if stub else PATIENCE_S
+        collector = collecting.Collector(reader, time.monotonic, patience_s)
         presses = _on_the_stub(collector, name, bundle, stub, radius) if stub else _by_prompts(collector)
         found = list(presses)
     finally:
@@ -79,13 +82,15 @@ def collect(
     if as_json:
         emit(report)
         return
-    print(f"wrote {target}: {len(found)} presses; next: skin register {target} --skin {name} --presses {len(found)}")
+    register = f"skin register {target} --skin {configured.bundle} --presses {len(found)}"
+    print(f"wrote {target}: {len(found)} presses; next: {register}")
     if forces is not None:
         print(f"wrote {forces}; next: skin calibrate force --csv {forces} --measurements {target} --skin {name}")
 
 
 def _on_the_stub(collector: Collector, name: str, bundle: Bundle, n: int, radius: float) -> Iterator[Collected]:
     from services.calibration.collecting import Collected, places
+    from services.calibration.force_fit import CalibrationError
     from services.describe import geometry
 
     for k, (x, y) in enumerate(places(geometry(bundle)["outline"], n, 1.2 * radius)):
@@ -95,6 +100,10 @@ def _on_the_stub(collector: Collector, name: str, bundle: Bundle, n: int, radius
         control("stub", "press", skin=name, **press)
         try:
             touched, look = collector.pressed()
+        except CalibrationError as why:
+            where = f"({x * 1e3:+.1f}, {y * 1e3:+.1f}) mm with {force:g} N"
+            print(f"  {k + 1}: {where}: {why}; this press does not count", file=sys.stderr)
+            continue
         finally:
             control("stub", "release", skin=name)
         _say(k, x, y, force, look.x, look.y)

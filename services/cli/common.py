@@ -70,7 +70,7 @@ def of_service(command: Callable[..., Any], starts: bool = False) -> Callable[..
 
 
 def nobody(skin: str, seconds: float, topic: str = "") -> str:
-    """What to say where a service was listened to and nothing came."""
+    """The text for a service that was listened to and sent nothing."""
     from protocol.runtime import runtime_dir
 
     folder = runtime_dir()
@@ -91,17 +91,18 @@ EXPECTED = {
     ("services.recordings.recording", "RecordingError"): USAGE,
     ("services.recordings.replay", "ReplayError"): FAILED,
     ("services.recordings.importing", "ImportRefused"): USAGE,
-    ("services.calibration.registration", "RegistrationError"): USAGE,
+    ("services.calibration.presses", "RegistrationError"): USAGE,
     ("services.calibration.force_fit", "CalibrationError"): USAGE,
     ("protocol.transport", "TransportError"): FAILED,
     ("models.bundle", "BundleError"): USAGE,
+    ("services.bridge", "MissingExtra"): USAGE,
 }
 """Exceptions of other modules whose text is already meant for the person at the terminal, and the exit code of each."""
 
 
 def interrupted(error: BaseException) -> bool:
-    """Whether Ctrl-C is what an error comes from: a compiled module that is interrupted while it loads says
-    `initialization failed`.
+    """Whether Ctrl-C caused an error: a compiled module that is interrupted while it loads says `initialization
+    failed`.
     """
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
@@ -110,7 +111,7 @@ def interrupted(error: BaseException) -> bool:
 
 
 def expected_code(error: BaseException) -> int | None:
-    """The exit code of an error whose text explains itself; None for any other. Imports nothing."""
+    """The exit code of an error whose text explains itself; None for other errors. This imports nothing."""
     if isinstance(error, CliError):
         return error.code
     for (module, name), code in EXPECTED.items():
@@ -163,7 +164,7 @@ def skin_name(given: str) -> str:
 
 
 def use_configured_sockets() -> None:
-    """Our sockets where the configuration puts them; without a word on them, in the runtime folder."""
+    """Use the addresses that the configuration gives; without any, the sockets in the runtime folder."""
     if _configuration().get("sockets"):
         from protocol import transport
         from services.runtime.config import load
@@ -191,7 +192,7 @@ def _plain(value: Any) -> Any:
 
 
 def control(process: str, command: str, *, timeout_s: float = 2.0, **args: Any) -> dict[str, Any]:
-    """One command over a process's control socket. CliError where nobody answers or the answer is a refusal."""
+    """Give one command over a process's control socket. CliError where nobody answers or the answer is a refusal."""
     from protocol import transport
     from protocol.sockets import ControlClient, ControlError
 

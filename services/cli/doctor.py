@@ -20,7 +20,10 @@ from services.board.boardlink import BoardLink
 from services.board.scanning import Scanning
 from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
+from services.cli.doctor_mounting import mounting_found
 from services.contacts.force import ForceLaw
+from services.contacts.placing import placement
+from services.describe import geometry
 from services.estimation import checks
 from services.estimation.tare import implausibility
 from services.runtime.config import RECORDINGS, ConfigError, ConfigFile, Skin, config_path, load
@@ -33,7 +36,7 @@ SWAP_GAIN = 3.0  # a swap of two electrodes is suspected where it makes the fit 
 
 
 def examine(path: Path | None = None) -> list[Finding]:
-    """Everything, in the order in which it must be right."""
+    """Examine everything, in the order in which it must be right."""
     return list(_examine(path))
 
 
@@ -83,6 +86,8 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
     yield Finding("OK", f"{name}: checks", checks.sentence(bundle) or "all of them, on every frame")
     if skin.calibration is not None:
         yield _calibration(name, skin, bundle)
+    if skin.surface is not None:
+        yield _wrapped(name, skin, bundle)
     if Path(skin.port).suffix in RECORDINGS:
         found = Path(skin.port).is_file()
         yield Finding("OK" if found else "FAIL", f"{name}: port", f"{skin.port} {'is' if found else 'is not'} there")
@@ -98,9 +103,23 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
         yield from live.processes(name)
         info = live.info(name)
         yield from live.compared(name, skin, bundle, info)
-        yield electrode_order(name, live.baseline(info), bundle)
+        said = info.get("mounting")
+        if isinstance(said, dict):
+            yield mounting_found(name, said, info)
+        if not isinstance(said, dict) or not float(said.get("misfit", 1.0)) <= GOOD_FIT:
+            yield electrode_order(name, live.baseline(info), bundle)
     else:
         yield Finding("SKIP", f"{name}: electrodes", "their order is looked at while the service runs: `skin up`")
+
+
+def _wrapped(name: str, skin: Skin, bundle: Bundle) -> Finding:
+    what = f"{name}: surface"
+    try:
+        _, frame_id = placement(skin, geometry(bundle)["outline"], name)
+    except ConfigError as why:
+        return Finding("FAIL", what, str(why))
+    assert skin.surface is not None
+    return Finding("OK", what, f"{skin.surface.kind} of radius {skin.surface.radius_m:g} m; contacts in {frame_id!r}")
 
 
 def _calibration(name: str, skin: Skin, bundle: Bundle) -> Finding:

@@ -127,8 +127,10 @@ def compared(name: str, skin: Skin, bundle: Bundle, info: dict[str, Any]) -> Ite
     if not info:
         yield Finding("FAIL", what, f"no info/{name} came within {FRAME_S:g} s: does preprocessing run?")
         return
-    if info.get("bundle_hash") != bundle.hash:
-        theirs = f"{info.get('bundle')} ({str(info.get('bundle_hash'))[:12]})"
+    # A bundle that was calibrated to the skin has a hash of its own, and says which it was made of.
+    loaded = info.get("mounting", info).get("bundle_hash")
+    if loaded != bundle.hash:
+        theirs = f"{info.get('bundle')} ({str(loaded)[:12]})"
         yield Finding("FAIL", what, f"bundle {theirs}, not {bundle.name} ({bundle.hash[:12]}): restart the service")
     file = skin.calibration
     ours = hashlib.sha256(file.read_bytes()).hexdigest() if file is not None and file.is_file() else None

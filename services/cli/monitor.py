@@ -20,7 +20,7 @@ SILENT_S = 3.5
 
 
 def percentile(values: list[float], share: float) -> float | None:
-    """The value that a share of them does not exceed; None of none."""
+    """The value that this share of the values does not exceed; None without values."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else None
 
@@ -79,7 +79,7 @@ class Monitor:
         self._held = HeldImage()
 
     def read(self, seconds: float) -> None:
-        """Takes in what arrives within `seconds`."""
+        """Read what arrives within `seconds`."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             frame = self.reader.recv(left)
@@ -151,7 +151,7 @@ def _process(status: StatusFrame, before: StatusFrame | None, silent_s: float) -
 
 
 def _skipped(status: StatusFrame, before: StatusFrame | None) -> dict[str, float]:
-    """Which share of the frames since the status before each skip rule spared work for."""
+    """For each skip rule, the share of frames since the last status for which it saved work."""
     new = {k: n - (before.counters.get(k, 0) if before else 0) for k, n in status.counters.items()}
     counted = [new.get(k, 0) for k in ("networks_run", *SKIPS)]
     if min(counted) < 0 or not sum(counted):  # it began anew, or nothing came

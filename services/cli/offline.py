@@ -31,11 +31,16 @@ def reconstruct(
         float | None,
         typer.Option(metavar="SECONDS", min=0, help="From `untouched` to the measurements; not given: minutes."),
     ] = None,
+    calibrate: Annotated[
+        bool,
+        typer.Option(help="First fit how the skin is mounted from `untouched`, where the bundle is off (seconds)."),
+    ] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Run the runtime stages over the rows of a file, without sockets.
 
-    IN: measurements (n, k), and untouched (m, k) or reference (n, k). OUT: image (n, 96, 96) float32 conductivity drop
+    IN: measurements (n, k), and untouched (m, k) or reference (n, k); or delta (n, k), touched less untouched in any
+    unit. OUT: image (n, 96, 96) float32 conductivity drop
     [S/m], row 0 at the lowest y; touched, valid, count (n,); position (n, 8, 2) [m], force and force_sigma (n, 8) [N],
     strongest first, padded with NaN; shape (n, 8).
     """
@@ -62,6 +67,7 @@ def reconstruct(
         warn=lambda text: print(f"skin: {text}", file=sys.stderr),
         progress=_bar,
         age_s=UNKNOWN_AGE_S if age is None else age,
+        calibrate=calibrate,
     )
     try:
         np.savez(target, **out)  # type: ignore[arg-type]
@@ -80,19 +86,49 @@ def _bar(rows):  # type: ignore[no-untyped-def]
 
 
 def register_frame(
-    source: Annotated[Path, typer.Argument(metavar="FILE.npz", help="touched, untouched (n, k), xy (n, 2) in metres.")],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE.npz",
+            help="touched and untouched, or delta (n, k) in any unit; xy (n, 2) in metres; depth (n,) or force (n,).",
+        ),
+    ],
     out: Annotated[
         Path | None, typer.Option(help="Folder for the skin's own bundle and a skin.toml; default: calibration/NAME.")
     ] = None,
     skin: Annotated[str, typer.Option("--skin", metavar="NAME", help="A configured skin, or a bundle.")] = "disc16",
-    presses: Annotated[int, typer.Option(help="How many presses to use, from the first.")] = 100,
+    presses: Annotated[int | None, typer.Option(help="How many presses to use, from the first; default: all.")] = None,
+    diameter: Annotated[
+        float | None, typer.Option(metavar="METRES", min=1e-3, max=10, help="Of the circle through the electrodes.")
+    ] = None,
+    first_electrode: Annotated[
+        float | None,
+        typer.Option(metavar="DEGREES", min=-360, max=360, help="Angle of electrode 1 in the machine's frame."),
+    ] = None,
+    numbering: Annotated[
+        str | None, typer.Option(help="clockwise or counter-clockwise, seen in the machine's frame.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit the skin's frame, and its sensitivities, to presses at places that a machine knows; say how well they fit."""
-    from services.calibration.register_command import register_presses
+    """Make the bundle of one real skin from presses at places that a machine knows; say how well others are found.
 
+    Ten presses are enough to begin with, a hundred are good, a thousand better. What is known of the skin (--diameter,
+    --first-electrode, --numbering) need not be found from them.
+    """
+    import math
+
+    from services.calibration.register_command import register_presses
+    from services.calibration.registration import Told
+
+    if numbering not in (None, "clockwise", "counter-clockwise"):
+        fail(f"found --numbering {numbering}, expected clockwise or counter-clockwise", USAGE)
+    told = Told(
+        diameter,
+        None if first_electrode is None else math.radians(first_electrode),
+        None if numbering is None else numbering == "clockwise",
+    )
     out = out or Path("calibration", Path(skin).name)
-    report = register_presses(load_npz(source), skin, presses, out)
+    report = register_presses(load_npz(source), skin, presses, out, told)
     if as_json:
         emit(report)
         return
@@ -102,11 +138,26 @@ def register_frame(
         f"the skin lies in the machine's frame at ({x * 1e3:+.1f}, {y * 1e3:+.1f}) mm, turned by "
         f"{report['angle_degrees']:+.1f} degrees, {report['scale']:.3f} times the bundle's size, electrodes {seen}"
     )
-    residual = report["residual_m"]
     print(
-        f"residual over {presses} presses, each found without itself: median {residual['median'] * 1e3:.1f} mm, "
-        f"mean {residual['mean'] * 1e3:.1f} mm"
+        f"known to {report['offset_sigma_m'] * 1e3:.1f} mm, {report['angle_sigma_degrees']:.1f} degrees, "
+        f"{100 * report['scale_sigma'] / report['scale']:.0f} % of its size"
     )
+    if report["unusable_presses"] or report["unusable_measurements"]:
+        print(
+            f"left out: {report['unusable_presses']} presses and {report['unusable_measurements']} measurements "
+            "that are not finite or never change"
+        )
+    for doubt in report["doubts"]:
+        print(f"in doubt: {doubt}")
+    left = report["left_out"]
+    print(
+        f"{report['presses']} presses, each found without itself: median {left['median_m'] * 1e3:.1f} mm, "
+        f"mean {left['mean_m'] * 1e3:.1f} mm, {100 * left['within_90_percent_ellipse']:.0f} % within their 90 % ellipse"
+    )
+    if "mean_error_of_indentation_m" in left:
+        print(f"depth: mean error {left['mean_error_of_indentation_m'] * 1e3:.2f} mm")
+    if "mean_error_of_force_n" in left:
+        print(f"force: mean error {left['mean_error_of_force_n']:.2f} N")
     print(f"wrote {out}: name it as `bundle` in skin.toml, or run with --config {out / 'skin.toml'}")
 
 

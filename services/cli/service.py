@@ -28,12 +28,15 @@ def up(
 ) -> None:
     """Start all processes and keep them alive, in the foreground; Ctrl-C or SIGTERM stops them all."""
     from protocol.runtime import lock
+    from services.bridge import check
     from services.runtime.config import load
     from services.runtime.supervision import Program, programs
     from services.runtime.supervision import up as supervise
 
     found = load()
     _check_mismatches(found)
+    for name in found.bridges:
+        check(name)
     wanted = [p for p in programs(found) if not (no_board and p.name in ("acquisition", "stub"))]
     extra = [Program("recorder", "services.recorder", ("--folder", str(record.resolve())))] if record else []
     with lock():  # said before anything else where a service runs here already
@@ -47,7 +50,7 @@ def up(
 
 
 def _check_mismatches(config: ConfigFile) -> None:
-    """Said before anything starts: the stub would end at once, again and again."""
+    """Refuse an unknown mismatch before anything starts: the stub would end at once, again and again."""
     for name, skin in config.skins.items():
         if skin.mismatch != "none":
             from models.mismatch import NAMED
@@ -59,9 +62,7 @@ def _check_mismatches(config: ConfigFile) -> None:
 
 
 def _addresses(transport: Transport, processes: list[str]) -> str:
-    """Where contacts are to be had, once all processes are found able to listen where they are told to. Raises
-    TransportError.
-    """
+    """The addresses of the contacts, after a check that all processes can listen at theirs. Raises TransportError."""
     from protocol.transport import check, try_out
 
     check(transport)

@@ -3,8 +3,8 @@
     {"schema": "eitskin.force/1", "skin", "frame_id", "bundle", "bundle_hash", "indenter_radius_m", "of", "curve",
      "most_n", "own_error", "error", "presses", "made", "sha256"}
 
-`skin calibrate force` writes it (calibration/force_fit.py fits). By hand a linear law of the peak drop will do:
-{"newtons_per_siemens": 10.0, "most_n": 5.0}.
+`skin calibrate force` writes it (calibration/force_fit.py fits). A file written by hand may hold a linear law of the
+peak drop: {"newtons_per_siemens": 10.0, "most_n": 5.0}.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@
 
 The quantity is the touch's peak conductivity drop [S/m] or its integral over the patch [S/m m^2]. The curve is the
 kind's default (0.1 to 0.5 S/m are 1 to 5 N), the bundle's own, or the one that a calibration of this very skin fitted
-(calibrating/calibration.py). Where the configuration knows the indenter, the peak is not read off the image, which
-confounds peak and area, but follows from the integral and the known area (models/uncertainty.py). How certain the
-quantity is was found on presses that the bundle's network never saw, and is kept in the bundle.
+(services/calibration/force_fit.py). An image confounds peak and area. Where the configuration knows the indenter, the
+peak follows from the integral and the known area instead (models/uncertainty.py). The quantity's uncertainty was found
+on presses that the bundle's network never saw; the bundle holds it.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ NOTHING = Force(None, None)
 
 @dataclass(frozen=True)
 class ForceLaw:
-    """The law of one skin. `curve` None: it has none, its forces are nil."""
+    """The law of one skin. Where `curve` is None the skin has no law, and its forces are nil."""
 
     curve: Curve | None
     reads: Of = "peak"
@@ -128,13 +128,15 @@ class ForceLaw:
         return f"{self.curve.scale:.4g} N per {unit}, to {self.most_n:g} N{located}"
 
     def impossible(self, peak: float, newton: float | None) -> bool:
-        """Whether no touch can have this peak drop [S/m] or force. Without a law drops have no scale: anything goes."""
+        """Whether no touch can have this peak drop [S/m] or force. Without a law drops have no scale, so nothing is
+        impossible.
+        """
         if self.curve is None:
             return False
         return peak >= BACKGROUND or (newton or 0.0) > FAR_BEYOND * self.most_n
 
     def quantity(self, look: Look) -> tuple[float, float | None]:
-        """(what the curve is of, its relative standard uncertainty or None)."""
+        """(value of the curve's quantity, its relative standard uncertainty or None)."""
         unit = self.metres_per_unit
         edge = self.half_width - max(abs(look.x), abs(look.y)) / unit
         seen = uncertainty.ImageFeatures(
@@ -169,7 +171,7 @@ class ForceLaw:
 
 
 def _surroundings(skin: Skin, bundle: Bundle) -> dict[str, Any]:
-    """What a law needs to know of the skin, whatever the law."""
+    """What every law needs to know of the skin."""
     unit = bundle.metres_per_unit
     area = None if skin.indenter is None else math.pi * (skin.indenter.radius_m / unit) ** 2
     variant = skin.network if bundle.network_path("full" if skin.network == "none" else skin.network) else "full"

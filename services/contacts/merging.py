@@ -1,8 +1,8 @@
 """Touches that grow into one patch and come out of it again.
 
-A merged patch is one contact; its track keeps its id. The touches in it (`Track.inside`) go on with the velocities they
-had, as far as the patch lets them: together they stay where the patch is. When it falls apart each part is the touch
-that should be there and has its size, so that two fingers that slide through each other keep their ids.
+A merged patch is one contact; its track keeps its id. The touches in it (`Track.inside`) move on with the velocities
+they had, but together they stay where the patch is. When the patch falls apart, each part becomes the touch whose
+predicted place and size fit it. So two fingers that slide through each other keep their ids.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from services.contacts.motion import Patch, Track, size_cost
 
-MERGED_S = 5.0  # a touch inside another's patch is waited for so long
+MERGED_S = 5.0  # how long a touch inside another's patch is kept
 DROWNED_S = 1.0  # one that drowns beside it, or was lifted there
 WEAK = 0.5  # of the size of a patch: a touch that drowns beside it
 BESIDE_M = 0.010  # from the patch's edge, where it does
@@ -22,7 +22,9 @@ INSIDE_SIGMA_M_S = 0.010  # by how much it grows: fingers stop and turn back
 
 
 def host_of(track: Track, hosts: Sequence[tuple[Track, Patch]], sample_ns: int) -> tuple[Track, float] | None:
-    """Whose patch covers the place where a lost touch should be, or drowns it; and for how long to wait for it [s]."""
+    """The track whose patch covers the place where a lost touch should be, or hides it; and how long to wait for that
+    touch [s].
+    """
     x, y = track.ahead(sample_ns)
     distance = [math.hypot(x - s.x, y - s.y) - s.reach for _, s in hosts]
     nearest = min(range(len(hosts)), key=lambda k: distance[k], default=None)
@@ -46,7 +48,7 @@ def absorb(host: Track, tracks: Sequence[Track], since_ns: int, wait_s: float) -
 
 
 def give_up(host: Track, sample_ns: int) -> list[Track]:
-    """Touches that were inside for too long: they leave."""
+    """Drop touches that were inside for too long."""
     late = [t for t in others(host) if sample_ns > t.until_ns]
     if late:
         host.inside = [t for t in host.inside if not any(t is one for one in late)]
@@ -56,12 +58,12 @@ def give_up(host: Track, sample_ns: int) -> list[Track]:
 
 
 def others(host: Track) -> list[Track]:
-    """The touches inside a patch that it does not have its id from."""
+    """The touches inside a patch other than the one that gave it its id."""
     return [t for t in host.inside if t.id != host.id]
 
 
 def follow(host: Track, patch: Patch, sample_ns: int) -> None:
-    """The touches inside go on, and with the patch, and not out of it."""
+    """Move the touches inside on: with the patch, and not out of it."""
     _advance(host.inside, (patch.x, patch.y), sample_ns)
     for t in host.inside:
         away = math.hypot(t.x - patch.x, t.y - patch.y)
@@ -105,7 +107,7 @@ def part(host: Track, parts: Sequence[Patch], sample_ns: int) -> list[Track | No
 
 
 def _advance(inside: Sequence[Track], centre: tuple[float, float], sample_ns: int) -> None:
-    """Each with its velocity, then all together to where their common centre is."""
+    """Move each with its velocity, then all of them so that their common centre is the patch's."""
     for t in inside:
         (t.x, t.y), t.seen_ns = t.ahead(sample_ns), sample_ns
     total = sum(t.size for t in inside)

@@ -1,5 +1,5 @@
-"""One touch in motion: seen now and then, in between where its velocity takes it (a Kalman filter, the same for x and
-y: constant velocity, random acceleration).
+"""The motion of one touch: a Kalman filter of place and velocity, the same for x and y (constant velocity, random
+acceleration). Between images the touch is where its velocity takes it.
 """
 
 from __future__ import annotations
@@ -8,12 +8,13 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-ACCELERATION = 0.3  # m/s^2, standard deviation: how a finger changes its mind
+ACCELERATION = 0.3  # m/s^2, standard deviation of a finger's acceleration
 PLACE_SIGMA_M = 0.0012  # of a centroid from one image
-FIRST_SPEED = 0.1  # m/s, standard deviation of a velocity of which nothing is known
+FIRST_SPEED = 0.1  # m/s, standard deviation of an unknown velocity
 LONGEST_PREDICTION_S = 0.2  # a velocity says nothing about longer gaps
 SIZE_SIGMA = 0.4  # of the logarithm of an integrated drop, from frame to frame
 SIZE_SHARE = 0.3  # of what is seen, in the running mean of the size
+LEFT_OVER, LEFT_OVER_M = 0.3, 0.008  # share of its size, and distance, that no touch changes by at once as it goes on
 MOST_FOR_SIZE = 9.0  # a touch may grow quickly: its size alone makes it no other touch
 
 
@@ -44,6 +45,7 @@ class Track:
     missing: int = 0  # frames since it was seen
     age: int = 1  # frames in which it was seen
     begins: bool = True  # whether it was looked for, and not there, just before
+    sure: list[float] = field(default_factory=list)  # m, where the last image that explained its frame showed it
     since_ns: int = 0  # when the last one of `inside` came
     until_ns: int = 0  # how long it is waited for while it is inside another one's patch
     inside: list[Track] = field(default_factory=list)
@@ -56,8 +58,10 @@ class Track:
         seconds = self.seconds_to(sample_ns)
         return self.x + self.vx * seconds, self.y + self.vy * seconds
 
-    def move(self, seen: Patch, sample_ns: int) -> None:
-        """It was seen there."""
+    def move(self, seen: Patch, sample_ns: int, sure: bool = True) -> None:
+        """Update with where an image shows it. sure: the image explains its frame; else it shows roughly where."""
+        if sure:
+            self.sure = [seen.x, seen.y]
         real = max(0.0, (sample_ns - self.seen_ns) * 1e-9)
         if real > 1e-6:
             self._filter(seen, real)
@@ -82,8 +86,17 @@ class Track:
         self.pp, self.pv, self.vv = (1 - place) * pp, (1 - place) * pv, vv - speed * pv
 
     def ghost(self) -> Track:
-        """Itself as one of its own `inside`: what it was before others came."""
+        """A copy of it as one of its own `inside`: what it was before others came."""
         return replace(self, inside=[])
+
+
+def is_left_over(track: Track, seen: Patch) -> bool:
+    """Whether a patch is what a touch that just ended leaves of itself in the image: far from where the touch was last
+    seen for sure, and much smaller.
+    """
+    if not track.sure or not 0 < seen.size < LEFT_OVER * track.size:
+        return False
+    return math.hypot(seen.x - track.sure[0], seen.y - track.sure[1]) > LEFT_OVER_M
 
 
 def cost(track: Track, seen: Patch, sample_ns: int) -> tuple[float, float]:

@@ -1,9 +1,9 @@
 """Touches in an image of the conductivity drop: each thresholded at half its own peak.
 
-Where touches merge they are told apart by the valley between their peaks (splitting.py says which part of the
-image is whose). What a tracker expects counts as evidence: two touches that are known to be there are kept apart at a
-shallower valley than two that would be new. Every pixel of the smoothed image above the floor belongs to exactly one
-touch, so that the integrated drop is the same however a patch is split.
+Where touches merge they are told apart by the valley between their peaks (splitting.py says which part of the image is
+whose). The tracker's expectation counts as evidence: a shallower valley is enough to separate two known touches than
+two new ones. Every pixel of the smoothed image above the floor belongs to exactly one touch, so that the integrated
+drop is the same however a patch is split.
 """
 
 from __future__ import annotations
@@ -75,6 +75,26 @@ def segment(image: Image, sigma: Image, expected: Sequence[Place] = ()) -> list[
     return sorted(found, key=lambda s: -s.peak)
 
 
+def divided(image: Image, sigma: Image, places: Sequence[Place]) -> list[Segment]:
+    """The same image as touches that are known to be at these (x, y) [pixels], one each, in their order: every pixel is
+    the nearest one's. Where the image shows nothing of a touch, its pixel and the four round it.
+    """
+    smooth = ndimage.correlate1d(ndimage.correlate1d(image.astype(np.float64), KERNEL, 0), KERNEL, 1)
+    floor = max(FLOOR, RELATIVE_FLOOR * float(image.max(initial=0.0)))
+    y, x = np.indices(image.shape)
+    nearest = np.argmin([(x - px) ** 2 + (y - py) ** 2 for px, py in places], axis=0)
+    found = []
+    for number, (px, py) in enumerate(places):
+        own = np.where((nearest == number) & (smooth > 0.5 * floor), smooth, 0.0)
+        volume = float(image[own > 0].sum())
+        if own.max() <= 0:
+            column, row = (int(min(max(round(p), 0), n - 1)) for p, n in ((px, image.shape[1]), (py, image.shape[0])))
+            own[row, column] = floor
+        mask = _half(own)
+        found.append(_measured(image, sigma, own, mask, mask, (0, 0), volume))
+    return found
+
+
 def _box(high: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Rows and columns round all high pixels, with a margin: empty pixels cost time too."""
     spans = []
@@ -107,7 +127,7 @@ def _labels(smooth: Image, floor: float, expected: Sequence[Place]) -> tuple[Lab
 
 
 def _half(own: Image) -> NDArray[np.bool_]:
-    """The pixels above half the peak that hang together with it."""
+    """The pixels above half the peak that are connected to it."""
     top = int(own.argmax())
     mask = own > 0.5 * own.flat[top]
     labels, count = ndimage.label(mask, FOUR)

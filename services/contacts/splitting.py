@@ -68,7 +68,9 @@ def _stands_alone(smooth: Image, peak: tuple[int, int], stronger: list[tuple[int
 
 
 def territories(smooth: Image, floor: float, peaks: list[tuple[int, int]]) -> Labels:
-    """Which peak each pixel above the floor belongs to, 1, 2, ...: where steepest ascent leads to; 0 below it."""
+    """The peak that each pixel above the floor belongs to, 1, 2, ...: where steepest ascent leads; 0 below the
+    floor.
+    """
     above = smooth > floor
     if len(peaks) < 2:
         return above.astype(np.intp) * len(peaks)

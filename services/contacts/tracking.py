@@ -1,14 +1,14 @@
 """Contacts over time: a touch keeps its id while it lasts; no id is used twice in a session.
 
-Each touch is where its velocity takes it until it is seen (motion.py); what is seen is given to the touches by
-the assignment of least total cost. Touches that grow into one patch, and come out of it, are merging.py's.
+Between images a touch moves with its velocity (motion.py). The patches of an image are assigned to the touches at least
+total cost. merging.py handles touches that grow into one patch and come out of it.
 
-A touch *begins* where the frame before was looked at and did not show it. What the first frame shows that anybody looks
-at, after a start or after a time of not looking, may have been there for long.
+A touch *begins* if the frame before was examined and did not show it. A touch in the first frame that is examined,
+after a start or after a pause, may have been there for long.
 
-The first touch begins at once, if its image is good. What appears beside others, or in an image that does not explain
-what was measured, begins when a second frame shows it too: while a touch comes or goes during a scan, the image of that
-scan may show more than there is, or something else.
+The first touch begins at once, if its image is good. A touch that appears beside others, or in an image that does not
+explain the measurements, begins when a second frame shows it too: if a touch comes or goes during a scan, that scan's
+image may show touches that are not there.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import asdict
 from typing import Any
 
 from services.contacts.merging import absorb, follow, give_up, host_of, is_part, others, part
-from services.contacts.motion import Patch, Track, cost
+from services.contacts.motion import Patch, Track, cost, is_left_over
 
 REACH_M = 0.015  # a touch that jumps further between two frames is another touch
 STAYS_M = 0.006  # what begins is near where it was seen first; what an image of a changing touch shows is not
@@ -39,12 +39,12 @@ class Tracker:
         self.tracks: list[Track] = []
 
     def reset(self) -> None:
-        """End everything; the next frame tells. Ids go on counting: none is used again in a session."""
+        """End all touches; the next frame reports it. Ids go on counting: none is used again in a session."""
         self._untold += [one for track in self.tracks for one in (track, *others(track)) if one.id != UNCONFIRMED]
         self.tracks = []
 
     def forget(self) -> None:
-        """Nobody is left who was told of anything: there is nothing to end."""
+        """Drop all touches without ending them: nobody is left who was told of them."""
         self.tracks, self._untold, self._looked_ns = [], [], None
 
     def expected(self, sample_ns: int) -> list[tuple[float, float]]:
@@ -53,7 +53,7 @@ class Tracker:
         return [one.ahead(sample_ns) for track in sure for one in (track.inside or [track])]
 
     def alone(self, seen: Sequence[Patch], sample_ns: int) -> tuple[list[Track], list[Track]]:
-        """The same as `update` for a frame that is no other's successor: what was there ended, each entry begins."""
+        """The same as `update` for a frame that follows no other in time: what was there ended, each entry begins."""
         self.reset()
         ended = self._begin_frame(sample_ns)
         for entry in seen:
@@ -64,8 +64,8 @@ class Tracker:
     def update(
         self, seen: Sequence[Patch], sample_ns: int, sure: bool = True
     ) -> tuple[list[Track | None], list[Track]]:
-        """What one frame shows -> (the track of each entry, in their order, None for one to be confirmed; tracks that
-        ended). sure: whether what this frame shows can be believed at once.
+        """Take in the patches of one frame. Returns the track of each patch, in their order (None for one that is to be
+        confirmed), and the tracks that ended. sure: whether new touches of this frame can be believed at once.
         """
         begins = not self.forgotten(sample_ns)
         ended = self._begin_frame(sample_ns)
@@ -77,7 +77,7 @@ class Tracker:
             if track is None:
                 track = Track(UNCONFIRMED, entry.x, entry.y, sample_ns, entry.size, entry.reach, begins=begins)
             else:
-                track.move(entry, sample_ns)
+                track.move(entry, sample_ns, sure)
                 if track.inside:
                     follow(track, entry, sample_ns)
             found.append(track)
@@ -89,8 +89,8 @@ class Tracker:
         return [t if t.id != UNCONFIRMED else None for t in found], ended + self._lose(coasting, sample_ns)
 
     def _confirm(self, found: list[Track], sure: bool) -> None:
-        """Give ids to what begins: what was seen before in an image to believe, or the largest of it where no other
-        touch is known; at once, where none was lately.
+        """Give ids to touches that begin: those that an earlier good image showed too, or the largest one where no
+        other touch is known; at once where nothing touched lately.
         """
         new = [t for t in found if t.id == UNCONFIRMED]
         begin = [t for t in new if t.age > 1]
@@ -103,7 +103,9 @@ class Tracker:
             self._next_id += 1
 
     def still(self, sample_ns: int) -> list[Track]:
-        """A frame that shows the same as the one before: nothing is lost for longer by it -> tracks that ended."""
+        """Take in a frame that shows the same as the one before; no touch counts as missing for longer. Returns tracks
+        that ended.
+        """
         ended = self._begin_frame(sample_ns)
         for track in self.tracks:
             for one in track.inside:
@@ -116,7 +118,7 @@ class Tracker:
         return any(track.id == UNCONFIRMED for track in self.tracks)
 
     def forgotten(self, sample_ns: int) -> bool:
-        """Whether nobody looked for so long that no touch can be known to be the same."""
+        """Whether so much time passed without a frame that no touch can be known to be the same."""
         return self._looked_ns is None or sample_ns - self._looked_ns > FORGOTTEN_S * 1e9
 
     def _begin_frame(self, sample_ns: int) -> list[Track]:
@@ -139,7 +141,8 @@ class Tracker:
             row = []
             for track in self.tracks:
                 distance, chi2 = cost(track, entry, sample_ns)
-                row.append(chi2 if distance < (REACH_M if track.id != UNCONFIRMED else STAYS_M) else NEVER)
+                near = distance < (REACH_M if track.id != UNCONFIRMED else STAYS_M)
+                row.append(chi2 if near and not is_left_over(track, entry) else NEVER)
             costs.append(row)
         for k, column in zip(*(v.tolist() for v in linear_sum_assignment(costs)), strict=True):
             if costs[k][column] < NEVER:
@@ -147,7 +150,7 @@ class Tracker:
         return owners
 
     def _merge(self, owners: list[Track | None], seen: Sequence[Patch], sample_ns: int) -> None:
-        """Where a lost touch should be there is another one's patch: it is inside."""
+        """Put lost touches into the patch of another touch that covers their place."""
         matched = [(track, entry) for track, entry in zip(owners, seen, strict=True) if track is not None]
         hosts = [(track, entry) for track, entry in matched if track.id != UNCONFIRMED]
         for track in [t for t in self.tracks if t.id != UNCONFIRMED and not any(t is one for one, _ in matched)]:
@@ -158,7 +161,7 @@ class Tracker:
                 self.tracks = [t for t in self.tracks if t is not track]
 
     def _part(self, owners: list[Track | None], seen: Sequence[Patch], sample_ns: int) -> None:
-        """A patch with several touches inside has fallen apart: they come out where they should be."""
+        """Take touches out of a patch that has fallen apart, each where it should be."""
         for host in [t for t in self.tracks if t.inside]:
             parts = [
                 k

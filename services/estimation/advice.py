@@ -1,4 +1,4 @@
-"""The states of an electrode (protocol.frames.ELECTRODE_STATES), the reason each gives, and what a person can do."""
+"""Each state of an electrode (protocol.frames.ELECTRODE_STATES) gives a reason, and advice for a person."""
 
 from __future__ import annotations
 

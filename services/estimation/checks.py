@@ -1,4 +1,4 @@
-"""What the measurements of a bundle cannot tell, by name: a check that is skipped must not look like one passed."""
+"""Some checks cannot be made with the measurements of a bundle: they are named, so that none looks passed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from services.estimation.wiring import Wiring
 
 
 def skipped(bundle: Bundle) -> dict[str, str]:
-    """Check -> why this bundle's frames cannot be checked so; follows from its pattern and its normalisation."""
+    """Returns the checks that cannot be made, each with the reason, from the bundle's pattern and normalisation."""
     pattern, found = np.asarray(bundle.pattern), {}
     measured = bundle.matrices.normalisation != "model"
     own = (pattern[:, 0] == pattern[:, 2]) & (pattern[:, 1] == pattern[:, 3])
@@ -27,7 +27,7 @@ def skipped(bundle: Bundle) -> dict[str, str]:
 
 
 def sentence(bundle: Bundle) -> str:
-    """The same for a person; "" where every check is made."""
+    """Says the same to a person; "" where every check is made."""
     by_reason: dict[str, list[str]] = {}
     for check, why in skipped(bundle).items():
         by_reason.setdefault(why, []).append(check)

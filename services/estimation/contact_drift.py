@@ -1,26 +1,26 @@
-"""One electrode's contact with the skin that changes, told from a touch.
+"""A contact that changes is told from a touch by the form of what it does to the pairs.
 
 A contact impedance adds to every pair of its electrode alike (a touch near it lets the current go round, and is felt by
 other pairs too), so the difference of a frame is
 
     d = u a + n b + s        u: the series resistance, n: the rest of the contact's Jacobian, s: global scale
 
-with a the relative change of the contact impedance. The current between neighbours that takes the short way through
-the electrode, of which n comes, dies out as the contact does: b = a / (1 + a / SHORT_WAY), within 0.1 % of d from 1.05
-to 100 times; less or more by up to a quarter where the contact was not the nominal one before. While one rises, each
+with a the relative change of the contact impedance. The current between neighbours that takes the short way through the
+electrode, of which n comes, dies out as the contact does: b = a / (1 + a / SHORT_WAY), within 0.1 % of d from 1.05 to
+100 times; less or more by up to a quarter where the contact was not the nominal one before. While one rises, each
 measurement of a scan finds it a little higher: a and b are lines along the scan.
 
-Of 120 touches within 1 mm of an electrode (radii 0.05 to 0.5, drops to 0.85 S/m) the most alike is off this line by
-1.4 % of its d, of 120 anywhere within 40 mm of the centre by 37 %. So there are two answers: from SUSPECT on a change
-is a contact's unless somebody presses right on the electrode (`sure` is False: nothing is valid), from TELLING on it is
-a contact's. Under a touch that stays as it is, the change since a few frames ago is the contact's alone. A fall is
-named at once: no touch lowers an impedance.
+Of 120 touches within 1 mm of an electrode (radii 0.05 to 0.5, drops to 0.85 S/m) the most alike is off this line by 1.4
+% of its d, of 120 anywhere within 40 mm of the centre by 37 %. So there are two answers: from SUSPECT on a change is a
+contact's unless somebody presses right on the electrode (`sure` is False: nothing is valid until contact_evidence.py
+tells), from TELLING on it is a contact's. Under a touch that stays as it is, the change since a few frames ago is the
+contact's alone. A fall is named at once: no touch lowers an impedance.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,7 +36,6 @@ MODEL_ERROR = 1.5e-3  # of |d|: what a contact's change may be off the formula
 SHORT_WAY = 4.7  # times the nominal contact impedance: what the current's short way through an electrode comes to
 OTHER_BEFORE = 1.25  # b may be so many times what follows of a, and its inverse
 TELLING = 800.0  # |d| over the noise of one measurement from which a touch on an electrode would show
-LIKELY = 300.0  # from which 1 % of touches within 1 mm of an electrode would not show
 SUSPECT = 60.0  # from which one elsewhere would
 UNTOUCHED = 0.03  # of |d|, what a changed contact leaves of it where nothing else changed
 LEAST_RISE = 0.03  # of the nominal contact impedance
@@ -53,7 +52,6 @@ FEW_OF = 0.05  # share of the other pairs that may have
 class Changed(NamedTuple):
     electrode: int
     sure: bool  # whether it is no touch on this electrode
-    likely: bool = True  # whether few touches on this electrode look so: sure where it lasts
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,9 @@ class Reference:
 
 
 class ContactDrift:
-    """For a bundle that predicts impedances (`knows`); members (E, K): measurement uses electrode."""
+    """ContactDrift compares frames with what a change of one contact does. It `knows` that for bundles that predict
+    impedances. members (E, K): measurement uses electrode.
+    """
 
     def __init__(self, bundle: Bundle, members: NDArray[np.bool_]) -> None:
         m = bundle.matrices
@@ -84,7 +84,7 @@ class ContactDrift:
         self._time = np.linspace(-1.0, 1.0, len(m.z0))  # the scan goes through the pattern in its order
 
     def __call__(self, d: Array, sigma: Array, live: NDArray[np.bool_]) -> Changed | None:
-        """The electrode, 0-based, whose contact changed, or None. d, sigma (K,); live: measurements that count."""
+        """Returns the electrode whose contact changed, or None. d, sigma (K,); live (K,): measurements that count."""
         if not self._tells(live):
             return None
         fell = live & (d < -np.maximum(FALL, SIGMAS * np.where(live, sigma, 0.0)))
@@ -105,8 +105,8 @@ class ContactDrift:
         return None
 
     def risen(self, d: Array, sigma: Array, live: NDArray[np.bool_], aside: Array | None = None) -> Changed | None:
-        """The electrode whose contact rose, where that is all that d (K,) shows beside directions `aside` (K, n),
-        which are orthonormal.
+        """Returns the electrode whose contact rose, where that is all that d (K,) shows beside directions `aside` (K,
+        n), which are orthonormal.
         """
         if not self._tells(live):
             return None
@@ -121,12 +121,12 @@ class ContactDrift:
         expected = _most_noise(sigma[live]) + (MODEL_ERROR * size) ** 2
         sure = size >= TELLING * noise
         if self._left_by_rise(k, d, live, aside) <= expected:
-            return Changed(k, sure, size >= LIKELY * noise)
+            return Changed(k, sure)
         within = sure and aside is None and self._rises_within(k, d, live, expected)
         return Changed(k, True) if within else None
 
     def _left_by_rise(self, k: int, d: Array, live: NDArray[np.bool_], aside: Array | None) -> float:
-        """The energy that a rise of electrode k's contact leaves of d; infinite where it is no rise."""
+        """Returns the energy that a rise of electrode k's contact leaves of d; infinite where it is no rise."""
         beside = [] if aside is None else list(aside.T)
         (a, b, *_), left = self._fit(k, d, live, beside)
         if a < LEAST_RISE:
@@ -142,20 +142,20 @@ class ContactDrift:
         return float(rest @ rest)
 
     def _rises_within(self, k: int, d: Array, live: NDArray[np.bool_], expected: float) -> bool:
-        """Whether electrode k's contact rose in the course of the scan."""
+        """Returns whether electrode k's contact rose in the course of the scan."""
         (a, b, _, slope, _), left = self._fit(k, d, live, [self._u[k] * self._time, self._n[k] * self._time])
         return bool(a >= RISES_WITHIN and -0.1 * a <= b <= 1.3 * a and abs(slope) <= STEEPEST * a and left <= expected)
 
     def _fit(self, k: int, d: Array, live: NDArray[np.bool_], more: Sequence[Array] = ()) -> tuple[Array, float]:
-        """a, b, s and what there is of `more` (K,) in d; the energy that is left."""
+        """Fits a, b, s and the amounts of `more` (K,) to d; returns them and the energy that is left."""
         columns = np.column_stack([self._u[k], self._n[k], np.ones(len(d)), *more])[live]
         found, *_ = np.linalg.lstsq(columns, d[live], rcond=None)
         left = d[live] - columns @ found
         return found, float(left @ left)
 
     def felt_by_others(self, k: int, d: Array, sigma: Array, live: NDArray[np.bool_]) -> Array | None:
-        """(K,) what the change at electrode k does to the pairs that do not use it; None while something else changes
-        too.
+        """Returns (K,) what the change at electrode k does to the pairs that do not use it; None while something else
+        changes too.
         """
         if not self.knows or not live.any():
             return None
@@ -174,16 +174,21 @@ def _without(aside: Array | None, d: Array) -> Array:
 
 
 def _most_noise(sigma: Array) -> float:
-    """Energy that noise alone may come to."""
+    """Returns the energy that noise alone may come to."""
     return float(sigma @ sigma) * (1 + 4 * float(np.sqrt(2 / len(sigma))))
 
 
 class ChangedContacts:
-    """Which contacts changed, and what they do to pairs of other electrodes; members (E, K)."""
+    """ChangedContacts keeps which contacts changed, and what they do to pairs of other electrodes; members (E, K)."""
 
     def __init__(self, bundle: Bundle, members: NDArray[np.bool_]) -> None:
         self._drift, self._k = ContactDrift(bundle, members), members.shape[1]
         self.reset()
+
+    @property
+    def knows(self) -> bool:
+        """Whether the bundle predicts what a contact does."""
+        return self._drift.knows
 
     def reset(self) -> None:
         self.felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
@@ -191,11 +196,11 @@ class ChangedContacts:
         self._past: deque[Array] = deque(maxlen=LOOK_FAR_BACK)  # |Z| (K,) of the frames before, the newest last
 
     def follow(self, amplitude: Array) -> None:
-        """A frame's |Z| (K,); to be called after each."""
+        """Takes a frame's |Z| (K,), after it was judged."""
         self._past.append(amplitude.copy())
 
     def rescale(self, factor: float) -> None:
-        """All |Z| so far, times this factor."""
+        """Multiplies all |Z| so far by this factor."""
         self._before = {k: row * factor for k, row in self._before.items()}
         self._past = deque((row * factor for row in self._past), maxlen=LOOK_FAR_BACK)
 
@@ -204,7 +209,7 @@ class ChangedContacts:
         self._past.clear()
 
     def changed(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
-        """The electrode whose contact this frame shows to have changed."""
+        """Returns the electrode whose contact this frame shows to have changed."""
         found = self._drift(_difference(amplitude, untouched.z0, untouched, live), untouched.sigma, live)
         if found is not None or len(self._past) < LOOK_BACK:
             return found
@@ -219,7 +224,7 @@ class ChangedContacts:
         return self._changed_under_motion(amplitude, untouched, live)
 
     def _changed_under_motion(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
-        """The same under a touch that moves: steadily, so the frames before say which change is its own."""
+        """Returns the same under a touch that moves steadily: the frames before say which change is its own."""
         back = 2 * LOOK_BACK
         if len(self._past) < 2 * back + LOOK_BACK:
             return None
@@ -236,24 +241,26 @@ class ChangedContacts:
         return found._replace(sure=False)
 
     def before(self, k: int) -> Array | None:
-        """|Z| (K,) of the touch under which the contact of electrode k rose."""
+        """Returns |Z| (K,) of the touch under which the contact of electrode k rose."""
         return self._before.get(k)
 
     def forget(self, k: int) -> None:
-        """The contact of electrode k is what it was."""
+        """Drops what is kept of electrode k: its contact is what it was."""
         self.felt.pop(k, None)
         self._before.pop(k, None)
 
-    def keep(self, drifting: Sequence[int]) -> None:
-        """Forget the others."""
+    def keep(self, drifting: Sequence[int], like: Callable[[int, Array], bool] = lambda k, past: True) -> None:
+        """Forgets all others. like: whether the measurements of electrode k are what they were in a past |Z| (K,)."""
         for k in drifting:  # what was wrong at once may have begun under a touch too
-            if k not in self._before and len(self._past) >= LOOK_BACK:
-                self._before[k] = self._past[-LOOK_BACK]
+            if k not in self._before and len(self._past) >= LOOK_BACK and not like(k, self._past[-LOOK_BACK]):
+                self._before[k] = self._past[-LOOK_BACK]  # a contact that drifts slowly was not well then either
         self.felt = {k: felt for k, felt in self.felt.items() if k in drifting}
         self._before = {k: before for k, before in self._before.items() if k in drifting}
 
     def shift(self, drifting: Sequence[int], amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Array:
-        """(K,) of |Z|; followed while nothing else changes: untouched, or under the touch it began under."""
+        """Returns (K,) the change of |Z|, followed while nothing else changes: untouched, or under the touch it began
+        under.
+        """
         for k in drifting:
             for since in (untouched.z0, self._before.get(k)):
                 if since is not None:

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from models.prereconstruction import Operator
 from services.estimation.saved import shaped
+from services.estimation.tuning import TUNING
 
 Array = NDArray[np.float64]
 
-SHARE = 0.05  # of the touch: a foam's set after seconds of load
+SHARE = TUNING.creep_sd  # of the touch
 LASTS_S = 120.0  # after the release; by then the baseline has followed
 
 

@@ -19,6 +19,7 @@ from scipy.optimize import nnls
 
 from models.prereconstruction import Drift, PreReconstructor
 from services.estimation.drift import DriftRates
+from services.estimation.tuning import TUNING
 
 Array = NDArray[np.float64]
 
@@ -27,9 +28,7 @@ STEPS = 6  # reach 1/4, 1, 4, 16, 64, 256 s: a sheet that dried by 5 %, contacts
 REST_S = 0.25
 LINEARISATION = 1e-3  # of what drift does that its Jacobian does not give: 4e-4 in EIDORS' frames at +-30 %
 MISFIT = 1e-2  # of |d| that the linear, coarse picture of a touch does not give
-MISFIT_POWER = 0.8  # of the Gram matrix's eigenvalues: that misfit looks almost as touches do
 TYPICAL = 0.3  # S/m: drop of a pixel that is touched
-ABSOLUTE = 3e-5  # of |Z|: no model of a skin is better
 COARSE = 2  # pixels of the reconstruction matrices to one of the non-negative fit, along each axis
 
 
@@ -65,7 +64,7 @@ class MarginalLikelihood:
         jacobian = self.m.jacobian.reshape(k, *blocks).sum(axis=(2, 4)).reshape(k, -1)
         self._jacobian = np.asarray(jacobian[:, self.m.inside.reshape(blocks).any(axis=(1, 3)).ravel()], dtype=float)
         values, vectors = np.linalg.eigh(self.m.gram)
-        misfit = vectors * np.maximum(values, 0.0) ** MISFIT_POWER @ vectors.T
+        misfit = vectors * np.maximum(values, 0.0) ** TUNING.misfit_power @ vectors.T
         self._misfit = misfit / np.trace(misfit)
         # Touches raise d only where the bundle's model says which way d goes.
         self.speaks = self.m.normalisation == "model"
@@ -74,7 +73,7 @@ class MarginalLikelihood:
         """-log p of (K,) d with noise sigma (K,), up to what all steps have in common. Some milliseconds."""
         drift = self.drift_prior.drift(step)
         contact, on = self.m.contact[live], np.ix_(live, live)
-        covariance = np.diag(self.drift_prior.sigma(sigma, self.m.contact, step)[live] ** 2 + ABSOLUTE**2)
+        covariance = np.diag(self.drift_prior.sigma(sigma, self.m.contact, step)[live] ** 2 + TUNING.absolute**2)
         covariance += drift.scale**2 + drift.contact**2 * contact @ contact.T
         covariance += MISFIT**2 * float(d[live] @ d[live]) * self._misfit[on]
         root = np.linalg.cholesky(covariance)

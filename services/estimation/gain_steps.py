@@ -1,5 +1,5 @@
-"""Steps of the board's gain over a skin's frames: taken over at once, or, where the gain is grossly off, once it has
-lasted.
+"""GainSteps finds steps of the board's gain over a skin's frames. The baseline takes a step over at once, or, where the
+gain is grossly off, once it has lasted.
 """
 
 from __future__ import annotations
@@ -112,8 +112,8 @@ class GainSteps:
 
 def _common(before: Array, now: Array, baseline: Baseline, earlier: Array | None = None) -> float | None:
     """now / before of two frames' |Z| (K,), where it is common to the measurements that count in all."""
-    live = (baseline.z0 > 0) & (before > 0) & np.isfinite(now) & np.isfinite(baseline.sigma)
-    if earlier is not None:
-        live &= earlier > 0
+    live = (baseline.z0 > 0) & np.isfinite(now) & np.isfinite(baseline.sigma)
+    for row in (before,) if earlier is None else (before, earlier):
+        live &= np.isfinite(row) & (row > 0)
     sigma = np.where(live, baseline.sigma / np.where(live, baseline.z0, 1.0), np.inf)
     return common_factor(before, now, sigma, live, earlier=earlier)

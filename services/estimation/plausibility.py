@@ -1,4 +1,4 @@
-"""Differences that no touch can make: gross faults of the board that nothing else tells from a touch.
+"""Some differences no touch can make: gross faults of the board that nothing else tells from a touch.
 
 Pressing lowers the sheet's conductivity, and the impedance between two electrodes can only rise with it (Rayleigh's
 monotonicity: it is the least dissipation of any current between them). It also leaves the pairs far from it nearly
@@ -25,8 +25,9 @@ FALLEN = 0.3  # share of a change's energy that is of falls, beyond which it is 
 
 
 def impossible(d: Array, sigma: Array, pairs: NDArray[np.bool_], touched: bool) -> bool:
-    """Whether (K,) differences d with standard deviations sigma are of no touch. pairs (K,): live measurements between
-    the very two electrodes that they drive; too few of them tell nothing. touched: they are taken for a touch's.
+    """Returns whether (K,) differences d with standard deviations sigma are of no touch. pairs (K,): live measurements
+    between the very two electrodes that they drive; too few of them tell nothing. touched: they are taken for a
+    touch's.
     """
     if pairs.sum() < len(d) / 2:
         return False
@@ -40,6 +41,6 @@ def impossible(d: Array, sigma: Array, pairs: NDArray[np.bool_], touched: bool) 
 
 
 def _even(change: Array, sigma: Array) -> bool:
-    """Whether all pairs rose alike, beyond noise."""
+    """Returns whether all pairs rose alike, beyond noise."""
     mean, noise = float(change.mean()), float(sigma @ sigma) / len(sigma)
     return mean > CLEAR * noise**0.5 and float(change.var()) - noise < EVEN * mean * mean

@@ -1,4 +1,4 @@
-"""What the board itself says of its measurements: a status of each, in bits."""
+"""The board itself gives each measurement a status, in bits; some of them give a frame its reasons."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ REASON_OF = {STATUS_CLIPPED | STATUS_RTIA: "saturated", STATUS_FIFO: "fifo"}
 
 
 def reasons_of(status: NDArray[np.uint8]) -> list[str]:
-    """The reasons that the bits of a scan (K,) give."""
+    """Returns the reasons that the bits of a scan (K,) give."""
     if not status.any():
         return []
     seen = int(np.bitwise_or.reduce(status))

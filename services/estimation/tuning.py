@@ -16,6 +16,7 @@ def _number(value: Any, unit: str, meaning: str, origin: str) -> Any:
 
 
 DRIFT_ROWS = "bench/reliability/estimation.py drift"
+CONTACT_SCENES = "tests/services/test_contact_evidence.py"
 START_ROWS = "bench/reliability/estimation.py start"
 
 
@@ -57,17 +58,22 @@ class Tuning:
     mismatch_most: float = _number(4.0, "times", "mismatch beyond which it may hide a touch", START_ROWS)
     start_nats: float = _number(30.0, "nats", "by which a touch must explain Z0 better", START_ROWS)
 
-    # faults and time (gain.py, hypotheses.py, posterior.py)
+    # touches that change within a scan (within_scan.py)
+    changing_left: float = _number(0.03, "of |d|^2", "what such a touch leaves of its frame", "skin bench faults")
+
+    # faults (gain.py, contact_evidence.py)
     gain_least: float = _number(3e-4, "relative", "least step of the board's gain", "sheet: less is drift's")
     gain_sigmas: float = _number(6.0, "sd", "of the common factor's noise, from which it is one", "1e-8 a frame")
     gain_left: float = _number(4.0, "sd of chi-square", "what a common factor may leave", "a touch leaves hundreds")
     lifted_sd: float = _number(2.0, "relative", "sd of a contact that lifts", "sheet: to 3 times and more")
-    fault_misfit: float = _number(
-        0.05, "of the fault's |d|", "what its prediction gets wrong", "prior: touches meanwhile"
+    contact_nats: float = _number(100.0, "nats", "by which a changed contact must be likelier", CONTACT_SCENES)
+    contact_apart: float = _number(
+        0.3,
+        "model units",
+        "from an electrode, within which a touch looks like its contact",
+        CONTACT_SCENES,
     )
-    touch_rate: float = _number(0.2, "1/s", "touches begin and end so often", "prior")
-    fault_rate: float = _number(1e-4, "1/s", "each kind of fault begins so often", "prior: once in three hours")
-    mend_rate: float = _number(0.1, "1/s", "and ends so often", "prior")
+    contact_drift_s: float = _number(10.0, "s", "for which contacts drift, within which one is well", "prior")
 
 
 TUNING = Tuning()

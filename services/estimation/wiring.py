@@ -47,7 +47,9 @@ class StuckBit:
 
 
 class Wiring:
-    """For a pattern (K, 4) of all pairs of its electrodes; `knows` is false for others, and nothing is recognised."""
+    """Wiring knows a pattern (K, 4) of all pairs of its electrodes; `knows` is false for others, and nothing is
+    recognised.
+    """
 
     def __init__(self, pattern: NDArray[np.integer]) -> None:
         self.electrodes = n = int(pattern.max()) + 1
@@ -68,7 +70,9 @@ class Wiring:
         self._routes = np.array([_routed(self._pattern, s) for s in self._stuck])  # (B, K, 4)
 
     def __call__(self, amplitude: Array, reference: Array) -> Exchanged | StuckBit | None:
-        """(K,) |Z|, NaN where it failed, and (K,) of the untouched skin -> the one fault that explains it, or None."""
+        """Returns the one fault that explains (K,) |Z|, NaN where it failed, against (K,) of the untouched skin; or
+        None.
+        """
         if not self.knows:
             return None
         known = np.isfinite(amplitude)
@@ -89,11 +93,11 @@ class Wiring:
         return None
 
     def order(self, fault: Exchanged) -> NDArray[np.intp]:
-        """(K,) which measurement of a frame holds the value that each would have with the wires put right."""
+        """Returns (K,) which measurement of a frame holds the value that each would have with the wires put right."""
         return np.asarray(self._orders[self._swaps.index(fault)])
 
     def _predicted(self, reference: Array) -> Array:
-        """(B, K) |Z| of the untouched skin through each stuck multiplexer."""
+        """Returns (B, K) |Z| of the untouched skin through each stuck multiplexer."""
         n = self.electrodes
         between = np.zeros((n, n))
         i, j = self._pattern[:, 0], self._pattern[:, 1]
@@ -105,13 +109,17 @@ class Wiring:
 
 
 def _pressed(change: Array, known: NDArray[np.bool_]) -> Array:
-    """Mean over the measurements of the relative change, a fall tenfold: pressing raises, and lowers nothing."""
+    """Returns the mean over the measurements of the relative change, a fall tenfold: pressing raises, and lowers
+    nothing.
+    """
     cost = np.minimum(np.where(change < 0, -10 * change, change), 1.0)
     return np.asarray(cost.sum(axis=-1) / np.maximum(1, known.sum(axis=-1)))
 
 
 def _off(change: Array, reference: Array, known: NDArray[np.bool_]) -> Array:
-    """Mean over the measurements of the relative misfit; one far off counts like one that is off by all of it."""
+    """Returns the mean over the measurements of the relative misfit; one far off counts like one that is off by all of
+    it.
+    """
     relative = np.minimum(np.abs(np.where(known, change, 0.0)) / reference, 1.0)
     return np.asarray(relative.sum(axis=-1) / np.maximum(1, known.sum(axis=-1)))
 

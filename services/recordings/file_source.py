@@ -79,7 +79,7 @@ class FileSource(Source):
 def file_frame(
     skin: str, pattern: str, scan: int, values: NDArray[np.generic], kind: str, now_ns: int, separate: bool = False
 ) -> RawFrame:
-    """A raw frame of one row (K,) of a file; separate: the one before it is not the one before it in time."""
+    """The raw frame of one row (K,) of a file. separate: whether the row does not follow the one before it in time."""
     return RawFrame(
         skin=skin,
         scan=scan,

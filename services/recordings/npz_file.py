@@ -1,9 +1,10 @@
-"""Files of measurements (npz): the one place that reads and checks them, and says in which order their rows are
-frames, and whether those follow each other in time.
+"""Files of measurements (npz). Only this module reads and checks them. It says in which order their rows are frames,
+and whether these follow each other in time.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 
 LEAST = 1e-60
 """|Z| below this is no measurement, in whatever unit."""
+DELTA_LEVEL = 0.02
+"""Root mean square of the relative changes that differences in unknown units are taken for."""
 TARE_ROWS = 64
 """Rows of `reference` that come first as frames, from which the noise is found: those most alike, in whatever order the
 rows stand.
@@ -55,10 +58,12 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def read_scans(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Input:
-    """The same as `read_input`, in the order of the bundle's measurements; a file of presses (`touched` and
-    `untouched`, a row of each for a press) too. Raises InputError.
+    """The same as `read_input`, with columns in the order of the bundle's measurements. It also reads files of presses
+    (`touched` and `untouched`, a row of each for a press). Raises InputError.
     """
     order = measurement_order(arrays, bundle)
+    if "delta" in arrays and "touched" not in arrays and "measurements" not in arrays:
+        arrays = {**arrays, **_beside_one(arrays, bundle)}
     if "touched" in arrays and "measurements" not in arrays:
         own = {"reference": arrays["untouched"]} if "untouched" in arrays else {}
         arrays = {"measurements": arrays["touched"], **own}
@@ -87,6 +92,41 @@ def read_input(arrays: Mapping[str, NDArray[Any]], k: int) -> Input:
     return Input(measurements, None, reference)
 
 
+def _beside_one(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> dict[str, NDArray[Any]]:
+    """Measurements and their references of a file that has differences alone: in the unit that the skin was registered
+    in, else so that they are as large as touches are. Every reference is the same, which says nothing of noise.
+    """
+    k = len(bundle.pattern)
+    delta = _matrix(arrays, "delta", k)
+    known = bundle.manifest.get("registration", {})
+    unit = known.get("delta_unit") if known.get("from_delta") else None
+    unit = delta_unit(delta, known.get("typical_difference", DELTA_LEVEL)) if unit is None else float(unit)
+    untouched = np.ones(k) if bundle.matrices.normalisation == "measured" else _in_file_order(bundle, arrays)
+    changed = np.maximum(untouched + delta * unit * untouched.mean(), 1e-3 * untouched)
+    return {"measurements": changed, "reference": np.broadcast_to(untouched, delta.shape).copy()}
+
+
+def _in_file_order(bundle: Bundle, arrays: Mapping[str, NDArray[Any]]) -> Array:
+    z0 = np.zeros(len(bundle.z0))
+    z0[measurement_order(arrays, bundle)] = bundle.z0
+    return z0
+
+
+def delta_unit(delta: NDArray[Any], level: float = DELTA_LEVEL) -> float:
+    """What differences in any unit (n, k) are multiplied by to be relative changes of `level`. Raises InputError.
+
+    Half of the rows are above it, so that a few wild ones say nothing.
+    """
+    finite = np.where(np.isfinite(delta), delta, np.nan).astype(float)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        largest = np.nanmax(np.abs(finite), initial=0.0)
+        typical = largest * np.sqrt(np.nanmedian(np.nanmean((finite / (largest or 1.0)) ** 2, axis=1)))
+    if not typical > 0:
+        raise InputError("`delta` holds no differences other than 0")
+    return float(level / typical)
+
+
 def frames_of(data: Input) -> Iterator[tuple[NDArray[Any], str]]:
     """(values (K,), kind) of the rows as frames: `untouched` first; each row of `reference` before its own."""
     if data.untouched is not None:
@@ -100,7 +140,7 @@ def frames_of(data: Input) -> Iterator[tuple[NDArray[Any], str]]:
 
 
 def measurement_order(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> NDArray[np.intp]:
-    """Where in the file each measurement of the bundle stands. Raises InputError where one is not there."""
+    """The file's column of each measurement of the bundle. Raises InputError where one is not there."""
     if "pattern" not in arrays:
         return np.arange(len(bundle.pattern))
     theirs = arrays["pattern"]
@@ -129,7 +169,7 @@ def _key(row: list[int]) -> tuple[int, int, frozenset[int]]:
 def _amplitudes(arrays: Mapping[str, NDArray[Any]], name: str, k: int) -> Array:
     """|Z| (n, K), of which enough can be compared with: a baseline of fewer than half the measurements is none."""
     a: Array = np.abs(_matrix(arrays, name, k)).astype(float)
-    a[a < LEAST] = 0.0  # squares of what is that small are nothing
+    a[a < LEAST] = 0.0  # the squares of so small numbers underflow
     usable = int((np.isfinite(a) & (a > 0)).any(axis=0).sum())
     if usable < k / 2:
         raise InputError(

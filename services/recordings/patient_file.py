@@ -1,5 +1,5 @@
-"""A file that waits for room: what does not fit on the disk stays in memory, bounded, and is written when there is room
-again. Nothing that was accepted is lost or written in part, so what writes to it need not know.
+"""A file that waits for a full disk: what does not fit stays in memory, up to a limit, and is written when there is
+room again. Nothing that was accepted is lost or written in part, so its writers need not know of it.
 """
 
 from __future__ import annotations

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle, BundleError
-from models.prereconstruction import noise_of_frames
+from models.calibration_file import found_by
+from models.prereconstruction import PreReconstructor, noise_of_frames
 from protocol.frames import RawFrame
 from services.estimation.tare import Baseline, NoBaseline, take
+from services.mounting import MountingFit, needs_fit
 from services.pipeline import ALL, Pipeline, Result
 from services.recordings.npz_file import Input, frames_of
 from services.runtime.config import ConfigError, Skin, load
@@ -48,7 +50,23 @@ def find_skin(name: str) -> tuple[Skin, Bundle]:
         raise BundleError(f"{why}\nnor a configured skin, for the configuration cannot be used: {unusable}") from None
 
 
-def baseline_of(frames: Array, pipeline: Pipeline, warn: Callable[[str], None]) -> Baseline:
+def mounted_bundle(frames: Array, bundle: Bundle, warn: Callable[[str], None]) -> Bundle:
+    """The bundle calibrated from untouched |Z| (M, K), or as it is where there is nothing to find or nothing found."""
+    baseline = baseline_of(frames, bundle.prereconstructor(), lambda text: None)
+    if not needs_fit(baseline, bundle):
+        return bundle
+    search = MountingFit(bundle)
+    search.start(baseline)
+    found = search.wait()
+    if found is None:
+        warn(search.problem)
+        return bundle
+    for remark in (found_by(found.bundle) or {}).get("remarks", []):
+        warn(f"`untouched`: {remark}")
+    return found.bundle
+
+
+def baseline_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None]) -> Baseline:
     """The tare of (M, K) untouched |Z|; where a board's tare would refuse, the mean all the same, in doubt."""
     doubt = ""
     if len(frames) > 1 and (frames == frames[0]).all():
@@ -56,7 +74,7 @@ def baseline_of(frames: Array, pipeline: Pipeline, warn: Callable[[str], None]) 
         frames = frames[:1]
     if len(frames) >= FEWEST_FOR_TARE:
         try:
-            return take(frames, pipeline.pre.pre, "file", 0)
+            return take(frames, pre, "file", 0)
         except NoBaseline as why:
             doubt = f"`untouched`: {why}"
             warn(doubt + "; using their mean")
@@ -82,16 +100,19 @@ def reconstruct(
     warn: Callable[[str], None] = lambda text: None,
     progress: Callable[[Iterable[int]], Iterable[int]] = lambda rows: rows,
     age_s: float = UNKNOWN_AGE_S,
+    calibrate: bool = False,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of OUT.npz: see `skin reconstruct --help`. Rows are independent unless `sequence`.
 
     age_s: of the untouched rows when the measurements, or the first of a sequence, were taken. A reference has none.
+    calibrate: fit first how the skin is mounted, from the untouched rows, where the bundle does not predict them as it
+    is (seconds).
 
     A row whose reference gives fewer than half the measurements stays empty: not valid, no image, no contacts.
     """
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of numpy, for measurements that are not finite
-        return _reconstruct(data, skin, bundle, sequence, warn, progress, age_s)
+        return _reconstruct(data, skin, bundle, sequence, warn, progress, age_s, calibrate)
 
 
 def _reconstruct(
@@ -102,15 +123,18 @@ def _reconstruct(
     warn: Callable[[str], None],
     progress: Callable[[Iterable[int]], Iterable[int]],
     age_s: float,
+    calibrate: bool,
 ) -> dict[str, NDArray[Any]]:
+    if calibrate and data.untouched is not None:
+        bundle = mounted_bundle(data.untouched, bundle, warn)
     pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
-    pipeline.publishing.each_alone = not sequence
+    pipeline.inference.each_alone = pipeline.publishing.each_alone = not sequence
     out = _empty(len(data.measurements))
     rows = progress(range(len(data.measurements)))
     if data.untouched is None:
         _beside_references(data, pipeline, sequence, rows, out, warn)
         return out
-    baseline = baseline_of(data.untouched, pipeline, warn)
+    baseline = baseline_of(data.untouched, pipeline.pre.pre, warn)
     for row in rows:
         if not sequence:
             pipeline.reset()

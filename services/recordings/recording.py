@@ -1,9 +1,9 @@
 """Recordings: MCAP files that hold frames exactly as they crossed the sockets.
 
 One channel a topic (``raw/palm``), message encoding ``msgpack``, the msgpack map of a frame as its data: any MCAP tool
-reads it. ``state/<skin>`` holds what the stages' state was, by process. Nothing stays in memory longer than `FLUSH_S`:
-what a killed recorder loses. A file that ends anywhere is read up to its last whole chunk: `RecordingReader` never
-needs the index at the end. A file may come from anybody: what a chunk unpacks to is bounded before it is unpacked.
+reads it. ``state/<skin>`` holds what the stages' state was, by process. Nothing stays in memory longer than `FLUSH_S`,
+so a killed recorder loses no more. A file that ends anywhere can be read up to its last whole chunk: `RecordingReader`
+never needs the index at the end. A file may come from anybody, so the size of a chunk is checked before it is unpacked.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ def _step(message: RecordedMessage) -> Step | None:
 
 
 def mark(raw: RawFrame) -> None:
-    """Says of a recorded frame that it is one, read now."""
+    """Mark a recorded frame as replayed, and read now."""
     raw.source, raw.host = "replay", ""
     raw.stamps = {"sample": raw.stamps.get("sample", 0), "read": time.monotonic_ns()}
     raw.valid, raw.reasons = as_sent(raw)  # whoever reads it will remark on failed measurements again

@@ -1,10 +1,10 @@
-"""What a recording carries of its configuration: what the stages need to give the same contacts again, and no more.
+"""The part of the configuration that a recording carries: what the stages need to give the same contacts again.
 
     {"skins": {"palm": {"bundle": "square16", "bundle_hash": ..., "frame_id": ..., "pose": ..., "network": ...,
      "indenter": ..., "dft_points": ..., "scan": ..., "rtia_ohm": ..., "tare": ..., "touch": ...,
      "calibration": {...}}}, "skip": {...}}
 
-No address, no key, no port and no path: a recording may come from anybody, and what it says is checked like a
+It holds no address, key, port or path. A recording may come from anybody, so its settings are checked like a
 configuration. Its bundle is looked for among the installed ones by its hash.
 """
 
@@ -129,7 +129,7 @@ class Known:
         for place in (*installed, *named):
             try:
                 bundle = Bundle.load(place)
-            except BundleError:  # it is another skin's, perhaps, and `skin doctor` speaks of it
+            except BundleError:  # it may be another skin's; `skin doctor` reports it
                 continue
             paths.setdefault(bundle.hash, bundle.path)
         return Known(paths, Bundle.load(given) if given is not None else None)
@@ -146,7 +146,7 @@ class Known:
         return self.paths[skin.bundle_hash]
 
     def differs(self, name: str, skin: RecordedSkin) -> str:
-        """ "" or what to say of a bundle that was given and is not the recorded one."""
+        """A warning where the given bundle is not the recorded one; else ""."""
         if self.given is None or self.given.hash == skin.bundle_hash:
             return ""
         return (
@@ -156,7 +156,7 @@ class Known:
 
 
 def configuration(settings: Settings, known: Known, folder: Path) -> dict[str, Any]:
-    """A configuration of these skins, as skin.toml would hold it: sockets and all else as they are without a word.
+    """A configuration of these skins, as skin.toml would hold it, with the defaults for sockets and all else.
 
     Calibrations are written to `folder`. Raises RecordingError, BundleError.
     """

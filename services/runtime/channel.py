@@ -60,11 +60,11 @@ class Newest:
         (self.socket.subscribe if on else self.socket.unsubscribe)(self._name)
 
     def mind(self) -> None:
-        """Connect anew where ZeroMQ has given up: no frame that comes would have us look."""
+        """Connect anew where ZeroMQ has given up; no arriving frame would make us notice."""
         self.reader.mind()
 
     def ask_again(self) -> None:
-        """Have upstream send again what it sends to who has just come: nothing else is heard of a subscription."""
+        """Subscribe anew, so that upstream sends its latched values and held image again."""
         self.listen(False)
         self.listen(True)
 

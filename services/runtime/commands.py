@@ -1,4 +1,4 @@
-"""What a process does at a command: those of every process here, a stage's own by the stage."""
+"""The commands of a process. This module carries out those of every process; a stage carries out its own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Handler = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 class Commands:
-    """Commands name their skin; without a name they are for the first one."""
+    """A command names its skin; without a name it is for the first one."""
 
     def __init__(self, channels: Mapping[str, Channel], publisher: Publisher, silent_s: float) -> None:
         """silent_s: without frames for so long, nothing flows."""

@@ -21,6 +21,7 @@ from protocol.transport import Transport
 from services.runtime.config_sections import (
     FoxgloveSection,
     Logging,
+    PageSection,
     RealTime,
     Ros2Section,
     Section,
@@ -70,6 +71,7 @@ class TareConfig(Section):
 
     frames: Annotated[int, Field(ge=8, le=4096)] = 64
     max_age_s: Annotated[float, Field(gt=0)] = 3600.0  # an older persisted baseline is not loaded
+    calibrate: Switch = True  # after `skin tare`: fit how the skin is mounted, and use matrices that fit it
     tracking_s: Annotated[float, Field(gt=0)] = 120.0  # time constant of what drift does not explain, while untouched
     # How fast an untouched skin may change, relative; see services/estimation/drift_prior.py. A foam that dries by 6 %,
     # electrodes whose contacts change by a quarter, within five minutes.
@@ -105,7 +107,7 @@ class Skin(Section):
     pose: Pose = Pose()
     surface: Surface | None = None  # what the sheet is wrapped round
     contacts_in: Literal["skin", "parent"] = "skin"  # "parent": contacts come in the frame that `pose` names
-    mismatch: str = "none"  # of the stub's sheet: by what it differs from the bundle, a name of models/mismatch.py
+    mismatch: str = "none"  # how the stub's sheet differs from the bundle: a name of models/mismatch.py
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
     indenter: Indenter | None = None
     network: NetworkFile = "int8"
@@ -150,7 +152,8 @@ class ConfigFile(Section):
     security: Security = Security()
     realtime: RealTime = RealTime()
     skip: Skip = Skip()
-    bridges: tuple[Literal["ros2", "foxglove"], ...] = ()  # that `skin up` starts too
+    bridges: tuple[Literal["page", "ros2", "foxglove"], ...] = ()  # that `skin up` starts too
+    page: PageSection = PageSection()
     ros2: Ros2Section = Ros2Section()
     foxglove: FoxgloveSection = FoxgloveSection()
     logging: Logging = Logging()

@@ -119,6 +119,15 @@ class Skip(Section):
     unwanted: Switch = True  # what nobody subscribes to (force, shape) is not made
 
 
+class PageSection(Section):
+    """The live page: bridges/page, docs/page.md."""
+
+    host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65515, strict=True)] = 8080  # or the first free one of the twenty from there
+    names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]{1,253}$")], ...] = ()  # further names it is asked for by
+    recordings: str = "recordings"  # folder of the button Record; "": no button
+
+
 class Ros2Section(Section):
     """Topics for ROS 2: bridges/ros2, docs/ros.md."""
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter, deque
+from collections import Counter
 from typing import Any
 
 from protocol.frames import Frame, StatusFrame
+from protocol.metering import Meter
 from protocol.runtime import host_id
 from services.runtime.stage import Health
 
-LATENCIES = 256  # frames over which p50 and p99 are taken
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 LATE_S = 2.0  # how long a late frame is spoken of
 FAILURE_S = 5.0  # how long a frame that could not be processed is spoken of
@@ -20,22 +20,16 @@ FAILURE_S = 5.0  # how long a frame that could not be processed is spoken of
 class Heartbeat:
     def __init__(self, process: str, skin: str) -> None:
         self.process, self.skin = process, skin
-        self.sent: Counter[str] = Counter()
+        self._meter = Meter()
+        self.sent = self._meter.sent
         self.drops: Counter[str] = Counter({"late": 0, "failed": 0})
         self.late = 0  # frames that were sent too old to be acted on
         self._late_at, self._late_by_s = -math.inf, 0.0
         self._failure, self._failed_at = "", 0.0
         self._since = self._heard = time.monotonic()
         self._heard_any = False
-        self._latency: deque[float] = deque(maxlen=LATENCIES)
-        self._work: deque[float] = deque(maxlen=LATENCIES)
         self._last: StatusFrame | None = None
         self._next = 0.0
-        self._rate_at = time.monotonic()
-        self._rate_sent: Counter[str] = Counter()
-        self._rates: dict[str, float] = {}
-        self._cpu_at = time.process_time()
-        self._cpu = 0.0
 
     @property
     def failure(self) -> str:
@@ -50,17 +44,17 @@ class Heartbeat:
         self._heard, self._heard_any = now_ns * 1e-9, True
 
     def done(self, frame: Frame, began_ns: int, now_ns: int, late: bool = False) -> None:
-        """It was processed and its successors sent, too old to be acted on where `late`."""
+        """A frame was processed and its successors were sent; `late`: too old to be acted on."""
         since = frame.stamps.get("sample")
-        if since is not None and frame.source != "replay" and frame.host in ("", host_id()):
-            self._latency.append((now_ns - since) * 1e-6)
-            if late:
-                self.late += 1
-                self._late_at, self._late_by_s = now_ns * 1e-9, (now_ns - since) * 1e-9
-        self._work.append((now_ns - began_ns) * 1e-6)
+        ours = since is not None and frame.source != "replay" and frame.host in ("", host_id())
+        ago_ns = now_ns - since if since is not None and ours else None
+        self._meter.handled(ago_ns, now_ns - began_ns)
+        if late and ago_ns is not None:
+            self.late += 1
+            self._late_at, self._late_by_s = now_ns * 1e-9, ago_ns * 1e-9
 
     def silence(self, limit_s: float, upstream: str) -> str:
-        """What to say of an input that gives nothing; "" while it does."""
+        """The text for an input that gives nothing; "" while it gives frames."""
         quiet = time.monotonic() - self._heard
         if quiet < limit_s:
             return ""
@@ -96,7 +90,7 @@ class Heartbeat:
         changed = last is None or level != last.level or _kinds(messages) != _kinds(last.messages)
         if not changed and now < self._next:
             return None
-        self._measure(now)
+        self._meter.measure(now)
         self._next = now + every_s
         self._last = StatusFrame(
             skin=self.skin,
@@ -105,11 +99,11 @@ class Heartbeat:
             valid_for_s=3 * every_s,
             level=level,
             messages=messages,
-            rates=dict(self._rates),
+            rates=dict(self._meter.rates),
             drops=dict(self.drops),
             counters={**health.counters, "late": self.late},
-            latency=self._quantiles(),
-            cpu=self._cpu,
+            latency=self._meter.quantiles(),
+            cpu=self._meter.cpu,
             stamps={"publish": time.monotonic_ns()},
         )
         return self._last
@@ -124,28 +118,10 @@ class Heartbeat:
             "quiet_s": quiet,
             "level": last.level if last else "STALE",
             "messages": list(last.messages) if last else [],
-            "rates": dict(self._rates),
+            "rates": dict(self._meter.rates),
             "drops": dict(self.drops),
-            "latency": self._quantiles(),
+            "latency": self._meter.quantiles(),
         }
-
-    def _measure(self, now: float) -> None:
-        seconds = now - self._rate_at
-        if seconds < 0.5:
-            return
-        self._rates = {topic: (n - self._rate_sent[topic]) / seconds for topic, n in self.sent.items()}
-        cpu = time.process_time()
-        self._cpu = max(0.0, cpu - self._cpu_at) / seconds
-        self._rate_at, self._rate_sent, self._cpu_at = now, self.sent.copy(), cpu
-
-    def _quantiles(self) -> dict[str, float]:
-        found = {}
-        for name, values in (("", self._latency), ("work_", self._work)):
-            if values:
-                ordered = sorted(values)
-                found[name + "p50"] = ordered[len(ordered) // 2]
-                found[name + "p99"] = ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]
-        return found
 
 
 def _kinds(messages: list[str]) -> list[str]:

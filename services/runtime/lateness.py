@@ -1,4 +1,4 @@
-"""Late is late: which frames are too old to be acted on, and what is skipped of those that have queued up."""
+"""Which frames are too old to be acted on, and which queued frames are skipped."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import time
 from protocol.ages import Ages
 from protocol.frames import Frame
 
-STOOD_S = 0.1  # beyond what it meant to wait: the process stood still, and what has come meanwhile is not news
-ARRIVING_S = 0.01  # for what has piled up in sockets and threads meanwhile to be there, all of it
+STOOD_S = 0.1  # a wait that is longer than meant by so much: the process stood still, and what came meanwhile is old
+ARRIVING_S = 0.01  # for all that has queued up in sockets and threads to arrive
 
 
 class Lateness:
@@ -21,8 +21,8 @@ class Lateness:
         self._looked_s = time.monotonic()
 
     def stood_still(self, timeout_s: float) -> bool:
-        """Whether this process (stopped, swapped out) or the whole host (suspended) stood still since the last call, of
-        which timeout_s were to be waited. If so, what has piled up is let come, so that the newest of it is found.
+        """Whether this process (stopped, swapped out) or the whole host (suspended) stood still since the last call,
+        apart from a wait of timeout_s. If so, this waits for the queued frames to arrive, so that the newest is found.
         """
         now = time.monotonic()
         stood = self._ages.look() or now - self._looked_s > max(0.0, timeout_s) + STOOD_S
@@ -40,8 +40,8 @@ class Lateness:
         return measured is not None and self._ages.age_s(measured) > frame.valid_for_s
 
     def news(self, frames: list[Frame], stood: bool) -> list[Frame]:
-        """Those of queued frames, oldest first, that are to be processed: not a live one that is late where a newer one
-        waits; after the process `stood` still only the newest.
+        """The queued frames that are to be processed, oldest first. A live frame that is late is skipped where a newer
+        one waits. After the process `stood` still only the newest is processed.
         """
         return [
             frame

@@ -1,5 +1,5 @@
-"""A stage's state in the runtime folder, so that a process that was killed goes on where it stopped; and states as
-plain maps.
+"""A stage's state, kept in the runtime folder, so that a killed process goes on where it stopped; states as plain
+maps.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from protocol.runtime import runtime_dir
 
 LARGEST = MAX_MESSAGE
 CHECKSUM = hashlib.sha256().digest_size
-AHEAD_S = 1.0  # what a clock that is being set right may have gone back by between two processes
+AHEAD_S = 1.0  # by how much a clock that is being set right may go back between two processes
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ def _place() -> Path:
 
 @contextlib.contextmanager
 def _folder(create: bool = False) -> Iterator[int]:
-    """The folder of kept states, by descriptor: ours, and no link to another. Raises OSError, ValueError."""
+    """A descriptor of the folder of kept states, which must be ours and no link. Raises OSError, ValueError."""
     if create:
         _place().mkdir(mode=0o700, exist_ok=True)
     fd = os.open(_place(), os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)

@@ -44,7 +44,9 @@ def apply(wanted: RealTime, process: str) -> list[str]:
 
 
 def _lock_memory() -> str:
-    """ "" or what stands in the way. Pages stay in RAM once they were used; what nobody uses is not brought there."""
+    """Lock memory; returns "" or what stands in the way. Pages stay in RAM once they were used; unused ones are not
+    loaded.
+    """
     if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY and not _may_lock():
         return "its amount is limited, and a process that reaches the limit gets no memory at all"
     libc = ctypes.CDLL(None, use_errno=True)

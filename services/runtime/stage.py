@@ -28,7 +28,7 @@ class Refused(EitskinError):
 
 @dataclass
 class Health:
-    """How a stage finds itself: `level` OK, WARN or ERROR, and why."""
+    """How a stage is: `level` OK, WARN or ERROR, and why."""
 
     level: str = "OK"
     messages: list[str] = field(default_factory=list)
@@ -51,7 +51,7 @@ class Stage(ABC):
     commands: ClassVar[tuple[str, ...]] = ()  # what `command` understands
     sleeps: ClassVar[bool] = False  # unsubscribes while nobody subscribes to what it writes
     persists: ClassVar[bool] = False  # `saved` is kept in the runtime folder and loaded at start
-    lacks = False  # what upstream sends only once is missing here: subscribing anew has it sent again
+    lacks = False  # this stage lacks something that upstream sends only once; subscribing anew has it sent again
 
     def __init__(self, skin: str) -> None:
         self.skin = skin
@@ -66,7 +66,7 @@ class Stage(ABC):
         """Forget all temporal state."""
 
     def new_session(self) -> None:  # noqa: B027
-        """What must be unique within a session may begin anew."""
+        """Begin a new session: ids that are unique within a session may begin anew."""
 
     def state(self) -> dict[str, Any]:
         """Temporal state: numbers, texts, lists, arrays. `load(state())` in another process continues bit by bit."""
@@ -83,10 +83,12 @@ class Stage(ABC):
         """Take over what an earlier process saved `age_s` ago. Raises Refused where it does not fit."""
 
     def joined(self, topic: str) -> None:  # noqa: B027
-        """Somebody has subscribed to `topic`, which it writes: what is sent only once is to be sent again."""
+        """Somebody has subscribed to `topic`, which this stage writes: send again what is sent only once."""
 
     def wake(self) -> None:  # noqa: B027
-        """Frames come again after a time without, in which nobody subscribed: who does now knows nothing of before."""
+        """Frames come again after a pause in which nobody subscribed: new subscribers know nothing of earlier
+        frames.
+        """
 
     def command(self, name: str, args: dict[str, Any]) -> dict[str, Any]:
         """Carry out one of `commands`. Raises Refused."""
@@ -110,6 +112,9 @@ class Stage(ABC):
         need, and say whether there was one. Changes nothing but how soon a result is there.
         """
         return False
+
+    def between_frames(self) -> None:  # noqa: B027
+        """Called a few times a second: adopt what other processes have made meanwhile. Never waits."""
 
     def warm_up(self) -> None:  # noqa: B027
         """Do once what is slow the first time."""

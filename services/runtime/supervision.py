@@ -57,7 +57,7 @@ def programs(config: ConfigFile) -> list[Program]:
 
 def stub_arguments(config: ConfigFile) -> tuple[str, ...]:
     """What `python -m firmware_stub` is told: a board for each skin whose port is "stub", with that skin's bundle and
-    by what its sheet differs from it.
+    the name of the mismatch between its sheet and the bundle.
     """
     skins = [(name, skin) for name, skin in config.skins.items() if skin.port == "stub"]
     said = [part for name, skin in skins for part in ("--skin", f"{name}={_folder(skin.bundle)}")]

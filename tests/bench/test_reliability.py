@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -311,3 +312,22 @@ def test_the_command_prints_a_table_and_writes_a_report(sheet, capsys, tmp_path,
     assert "fault matrix" in capsys.readouterr().out and not list(tmp_path.iterdir())
     assert faults.main(["--frames", "200", "--cores", "1", "--out", str(tmp_path)]) == 0
     assert (tmp_path / "soak.json").is_file() and "random faults and presses" in capsys.readouterr().out
+
+
+def test_more_random_frames_are_added_to_those_of_the_last_report(tmp_path, monkeypatch, capsys):
+    seeds = []
+
+    def spread(work, tasks, cores, what):
+        seeds.extend(seed for _, seed, _ in tasks)
+        yield from (soak.SoakTally(chunks=1, frames=frames, counted=frames - 1) for frames, _, _ in tasks)
+
+    monkeypatch.setattr(workers, "spread", spread)
+    words = ["--frames", str(2 * soak.CHUNK), "--cores", "1", "--out", str(tmp_path)]
+    assert faults.main(words) == 0 and faults.main([*words, "--more"]) == 0
+    report = json.loads((tmp_path / "soak.json").read_text())
+    assert report["soak"]["frames"] == 4 * soak.CHUNK and report["soak"]["chunks"] == 4
+    assert [run["frames"] for run in report["runs"]] == [2 * soak.CHUNK] * 2
+    assert len(set(seeds)) == 4
+    with pytest.raises(SystemExit):
+        faults.main([*words, "--more", "--seed", "9"])
+    assert "is of seed 5" in capsys.readouterr().err

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from bridges import views
+from bridges.clock import WallClock
 from bridges.ros2 import messages
 from bridges.ros2.cdr import encode
-from bridges.ros2.clock import RosClock
 from bridges.ros2.definitions import TABLE, definition, full_name, nested
 from bridges.ros2.names import topic_base
 from protocol.frames import Contact, ContactFrame, ImageFrame, InfoFrame, StatusFrame
@@ -68,7 +69,7 @@ def test_a_field_that_a_message_has_not_is_refused() -> None:
 
 def test_the_wrench_is_the_sum_of_those_that_are_there() -> None:
     frame = contacts(contact(1, 0.02, 0.0, 3.0), contact(2, -0.01, 0.03, 1.0), contact(3, 0, 0, 2.0, state="end"))
-    found = read("geometry_msgs/WrenchStamped", messages.wrench(HEADER, messages.present(frame)))
+    found = read("geometry_msgs/WrenchStamped", messages.wrench(HEADER, views.present(frame)))
     assert (found.header.stamp.sec, found.header.stamp.nanosec, found.header.frame_id) == (5, 7, "palm")
     force, torque = found.wrench.force, found.wrench.torque
     assert (force.x, force.y, force.z) == (0, 0, -4.0)
@@ -78,10 +79,10 @@ def test_the_wrench_is_the_sum_of_those_that_are_there() -> None:
 
 
 def test_a_skin_without_a_force_law_has_no_wrench() -> None:
-    assert messages.has_forces(contacts())
-    assert messages.has_forces(contacts(contact(1, 0, 0, 2.0)))
-    assert not messages.has_forces(contacts(reasons=("uncalibrated_force",)))
-    assert not messages.has_forces(contacts(contact(1, 0, 0, None)))
+    assert views.has_forces(contacts())
+    assert views.has_forces(contacts(contact(1, 0, 0, 2.0)))
+    assert not views.has_forces(contacts(reasons=("uncalibrated_force",)))
+    assert not views.has_forces(contacts(contact(1, 0, 0, None)))
 
 
 def test_poses_have_z_along_the_normal_and_x_along_the_patch() -> None:
@@ -137,13 +138,13 @@ def test_an_untouched_image_is_of_zeros_whose_uncertainty_is_not_known() -> None
 
 def test_the_pose_becomes_a_transform_or_nothing() -> None:
     told = {"pose": [0.1, 0.2, 0.3, 0.0, 0.0, 1.0, 0.0], "parent_frame_id": "wrist", "frame_id": "palm"}
-    found = messages.transform({"sec": 1}, InfoFrame(skin="palm", info=told))
+    found = messages.transform(1_000_000_000, InfoFrame(skin="palm", info=told))
     assert found is not None
     read_back = read("tf2_msgs/TFMessage", {"transforms": [found]}).transforms[0]
     assert (read_back.header.frame_id, read_back.child_frame_id) == ("wrist", "palm")
     assert read_back.transform.translation.z == 0.3 and read_back.transform.rotation.z == 1.0
     for wrong in ({**told, "pose": [1, 2]}, {**told, "pose": None}, {**told, "frame_id": ""}, {}):
-        assert messages.transform({"sec": 1}, InfoFrame(skin="palm", info=wrong)) is None
+        assert messages.transform(1_000_000_000, InfoFrame(skin="palm", info=wrong)) is None
 
 
 def test_a_process_that_says_nothing_more_is_stale() -> None:
@@ -156,11 +157,11 @@ def test_a_process_that_says_nothing_more_is_stale() -> None:
 def test_ros_time_follows_the_systems_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.monotonic_ns", lambda: 5_000)
     monkeypatch.setattr("time.time_ns", lambda: 1_700_000_000_000_000_000)
-    clock = RosClock()
-    assert clock.stamp(2_000_005_000) == {"sec": 1_700_000_002, "nanosec": 0}
+    clock = WallClock()
+    assert clock.time_ns(2_000_005_000) == 1_700_000_002_000_000_000
     monkeypatch.setattr("time.time_ns", lambda: 1_700_000_010_000_000_000)
     clock.measure()
-    assert clock.stamp(2_000_005_000)["sec"] == 1_700_000_012 and clock.steps == 1
+    assert clock.time_ns(2_000_005_000) == 1_700_000_012_000_000_000 and clock.steps == 1
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -146,6 +148,14 @@ def world(runtime: Path) -> Iterator[World]:
         made.close()
 
 
+def is_true(w: list[float]) -> bool:
+    """Whether a wrench is that of 3 N at (0.02, -0.01): by its force, and by its moments. A touch is measured roughly
+    while it comes.
+    """
+    fz, tx, ty = w[2:5]
+    return abs(fz + 3.0) < 0.6 and abs(ty / -fz - 0.02) < 0.003 and abs(tx / fz + 0.01) < 0.003
+
+
 def stub(command: str, **args: Any) -> dict[str, Any]:
     return ControlClient("stub", 5.0).call(command, skin="palm", **args)
 
@@ -168,14 +178,11 @@ def test_a_ros_node_hears_what_the_service_says_and_nothing_while_it_is_not_vali
     # a press, against the truth
     began = time.time()
     stub("press", x=0.02, y=-0.01, force=3.0, radius=0.01, shape="circle", seconds=seconds)
-    pressed = world.until("a pressed wrench", "/wrench", began, lambda w: abs(-w[2] - 3.0) < 0.6)
+    pressed = world.until("3 N at the right place", "/wrench", began, is_true)
     assert pressed["frame"] == "palm" and 0 < pressed["at"] - pressed["stamp"] < 1.0
-    fz, tx, ty = pressed["value"][2:5]
-    assert abs(ty / -fz - 0.02) < 0.003 and abs(tx / fz + 0.01) < 0.003  # where it presses, by its moments
-    slot = world.until("a slot", "/contacts/slot0", began, lambda w: w[2] < -2)
-    assert abs(slot["value"][2] + 3) < 0.6
-    x, y, _, _ = world.until("a pose", "/contacts/poses", began, bool)["value"][0]
-    assert abs(x - 0.02) < 0.003 and abs(y + 0.01) < 0.003
+    world.until("the same in the strongest slot", "/contacts/slot0", began, is_true)
+    assert not [m for m in world.of("/contacts/slot1", began) if m["value"][2] < -0.5]  # one contact alone
+    world.until("its pose", "/contacts/poses", began, lambda p: bool(p) and math.dist(p[0][:2], (0.02, -0.01)) < 0.003)
     marks = world.until("markers", "/contacts", began, lambda found: any("N" in m[4] for m in found))["value"]
     assert {mark[0] for mark in marks} == {"patch", "force", "label"}
     cloud = world.until("a cloud with the touch", "/pressure", began, lambda c: c["peak"][3] > 0)["value"]
@@ -197,6 +204,19 @@ def test_a_ros_node_hears_what_the_service_says_and_nothing_while_it_is_not_vali
     world.until("silent", "/valid", hung, lambda valid: valid is False)
     world.until("valid after the silence", "/valid", hung + 2.0, lambda valid: valid is True)
 
+    # tare by service
+    stub("release")
+    for _ in range(20):  # at first the answer is that too few untouched frames have come since
+        asked = time.time()
+        world.order("tare")
+        done, said = world.until("an answer", "tare", asked)["value"]
+        if done:
+            break
+        assert re.match("only [0-9]+ of 64 (untouched )?frames", said), said
+        time.sleep(1.0)
+    assert said == "new baseline from 64 frames" and world.of("service")[-1]["value"] is True
+    world.until("valid after the tare", "/valid", time.time(), lambda valid: valid is True)
+
     # each valid frame became one wrench, and no other frame did
     time.sleep(0.5)
     offset = time.time() - time.monotonic()
@@ -210,4 +230,7 @@ def test_a_ros_node_hears_what_the_service_says_and_nothing_while_it_is_not_vali
     published = [message["stamp"] for message in wrenches]
     assert not [at for at in refused if min(abs(at - stamp) for stamp in published) < 0.01]
     missing = [at for at in valid_at if min(abs(at - stamp) for stamp in published) > 0.01]
-    assert len(missing) <= 0.02 * len(valid_at), f"{len(missing)} of {len(valid_at)} valid frames gave no wrench"
+    drops = ControlClient("ros2", 5.0).call("status", skin="palm")["drops"]
+    counted = drops["skipped"] + drops["late"]  # a busy machine: the newest frame overtakes older ones, and is counted
+    lost = len(missing) - counted
+    assert lost <= 0.02 * len(valid_at), f"{lost} of {len(valid_at)} valid frames are lost, {counted} were counted"

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.cli.talkers import PRESS_AND_WATCH
+
 K = 120
 
 
@@ -81,20 +83,7 @@ def test_a_broken_configuration_is_named_where_the_skin_is_not_found(skin, tmp_p
     assert ran.code == 0  # a bundle needs no configuration
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ("press", "--x", 0, "--y", 0, "--force", 1),
-        ("release",),
-        ("scene", "slide"),
-        ("fault", "hang"),
-        ("tare",),
-        ("top", "--once", "--seconds", 0.1),
-        ("top", "--once", "--json", "--seconds", 0.1),
-        ("echo", "contact", "--timeout", 0.1),
-        ("compare", "--seconds", 0.1),
-    ],
-)
+@pytest.mark.parametrize("command", [*PRESS_AND_WATCH, ("top", "--once", "--json", "--seconds", 0.1)])
 def test_no_service_is_said_at_once(skin, command) -> None:  # type: ignore[no-untyped-def]
     ran = skin(*command)
     assert ran.code == 3 and "skin up" in ran.err and len(ran.err.splitlines()) == 1 and ran.out == ""

@@ -85,6 +85,20 @@ def test_the_calibration_is_looked_at(skin, tmp_path, content, code, expected) -
     assert ran.code == code and expected in ran.out
 
 
+@pytest.mark.parametrize(
+    ("radius", "code", "expected"),
+    [(0.04, 0, "OK palm: surface cylinder of radius 0.04 m; contacts in 'arm'"), (0.01, 1, "reaches 100 mm round")],
+)
+def test_what_the_sheet_is_wrapped_round_is_looked_at(skin, tmp_path, radius, code, expected) -> None:  # type: ignore[no-untyped-def]
+    file = tmp_path / "arm.toml"
+    file.write_text(
+        '[skins.palm]\nport = "stub"\nbundle = "square16"\npose = { parent = "arm" }\ncontacts_in = "parent"\n'
+        f'surface = {{ kind = "cylinder", radius_m = {radius} }}\n'
+    )
+    ran = skin("doctor", "--config", file)
+    assert ran.code == code and expected in " ".join(ran.out.split())
+
+
 def test_a_damaged_bundle_is_named(skin, tmp_path, bundle) -> None:  # type: ignore[no-untyped-def]
     import shutil
 

@@ -14,22 +14,9 @@ from firmware_stub.rig import Rig
 from protocol.runtime import CONFIG_LINK
 from services.cli.common import of_service
 from services.recordings.replay import ReplayError, steps
+from tests.cli.talkers import PRESS_AND_WATCH, TALKERS
 
 ROOT = Path(__file__).resolve().parents[2]
-TALKERS = (
-    ("press", "--x", 0, "--y", 0, "--force", 1),
-    ("release",),
-    ("scene", "slide"),
-    ("fault", "hang"),
-    ("tare",),
-    ("top", "--once", "--seconds", 0.1),
-    ("echo", "contact", "--timeout", 0.1),
-    ("compare", "--seconds", 0.1),
-    ("record", "file.mcap", "--seconds", 0.1),
-    ("doctor",),
-    ("calibrate", "force"),
-)
-"""Commands that talk to a service."""
 
 
 @pytest.mark.parametrize("command", TALKERS, ids=lambda c: c[0])
@@ -41,9 +28,7 @@ def test_each_says_alike_which_service_it_cannot_find(skin, tmp_path, command) -
     assert ran.code == 2 and "none.toml" in ran.err and "expected a configuration" in ran.err
 
 
-@pytest.mark.parametrize(
-    "command", [c for c in TALKERS if c[0] not in ("doctor", "record", "calibrate")], ids=lambda c: c[0]
-)
+@pytest.mark.parametrize("command", PRESS_AND_WATCH, ids=lambda c: c[0])
 def test_runtime_and_config_name_the_service(skin, tmp_path, monkeypatch, command) -> None:  # type: ignore[no-untyped-def]
     other = tmp_path / "other"
     other.mkdir(mode=0o700)

@@ -18,6 +18,8 @@ def services(name: str) -> dict[str, dict[str, Any]]:
 def test_no_process_has_a_network_and_the_stub_shares_acquisitions_loopback() -> None:
     modes = {name: service["network_mode"] for name, service in services("docker-compose.yml").items()}
     assert modes.pop("stub") == "service:acquisition"
+    bridges = {name: modes.pop(name) for name in ("ros2", "foxglove")}
+    assert bridges == {"ros2": "host", "foxglove": "bridge"}
     assert set(modes.values()) == {"none"}
 
 
@@ -35,3 +37,13 @@ def test_only_the_helper_is_root_and_it_only_hands_folders_over() -> None:
     assert helper["cap_add"] == ["CHOWN", "FOWNER"] and helper["command"][:3] == ["python", "-m", "services.folders"]
     mounted = {volume.rpartition(":")[2]: volume.rpartition(":")[0] for volume in helper["volumes"]}
     assert dict(argument.split("=", 1) for argument in helper["command"][4:]) == mounted
+
+
+def test_a_bridge_runs_only_where_its_profile_is_named_and_is_seen_by_its_host_alone() -> None:
+    found = services("docker-compose.yml")
+    for name in ("ros2", "foxglove"):
+        assert found[name]["profiles"] == [name]
+        assert found[name]["build"] == {"context": ".", "target": "bridge", "args": {"BRIDGE": name}}
+        assert (ROOT / "requirements" / f"{name}.lock").is_file()
+    assert found["foxglove"]["ports"] == ["127.0.0.1:8765:8765"]
+    assert {name for name, service in found.items() if "ports" in service} == {"foxglove"}

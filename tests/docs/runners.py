@@ -11,11 +11,11 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-How = Literal["ends", "runs", "help", "slow", "ci", "service"]
+How = Literal["ends", "runs", "help", "slow", "ci", "service", "walk"]
 """ends: run to its end, exit status 0. runs: run until it printed `says`, then Ctrl-C, no traceback. help: too long to
 be run at all; its program knows every option that is named (.ci/run runs benchmarks in short form). slow: as `ends`,
 but in .ci/run only. ci: .ci/run has this step, `says` is the line. service: it is how the service of these tests was
-started.
+started. walk: a test of the page's own types it, in the page's order (TRIED_ELSEWHERE).
 """
 
 
@@ -36,6 +36,13 @@ COMMANDS = (
     Row("make test", "ci", says="make test"),
     Row("make lint", "ci", says="make test"),  # which begins with it
     Row("make venv-dev", "ci", says="make test"),  # its first prerequisite
+    Row("make venv", "ci", says="make up"),  # whose first prerequisite it is
+    Row(
+        "(./)?skin bridge page",
+        "runs",
+        says="look at the skin, and press it, at http://127.0.0.1:",
+        instead="EITSKIN_RUNTIME={folder}/page ./skin bridge page",  # beside the one of the service of these tests
+    ),
     Row("make train SKIN=square16 QUICK=1", "ci", says="models.build --skin square16 --minutes 3"),
     Row("(./)?skin up", "service"),
     Row(
@@ -44,8 +51,10 @@ COMMANDS = (
         says="^[0-9]+ [0-9]+ /tmp/",
         instead="{line} && echo $EITSKIN_UID $EITSKIN_GID $EITSKIN_RUNTIME",
     ),
-    Row("docker compose --profile demo up", "ci", says=r"docker compose -f \$compose --profile demo up"),
-    Row("docker compose up", "ci", says=r"docker compose -f \$compose --profile demo up"),
+    Row(r"make venv EXTRAS=(ros2|foxglove)", "ci", says="make venv EXTRAS=ros2,foxglove"),
+    Row(r"docker compose --profile (ros2|foxglove) up", "ci", says=r"--profile ros2 --profile foxglove up"),
+    Row("docker compose --profile demo up", "ci", says=r"docker compose -f \$compose --profile demo"),
+    Row("docker compose up", "ci", says=r"docker compose -f \$compose --profile demo"),
     # pressing, watching
     Row(re.escape(TOUCHED), "ends", says="pressing at .* with 3 N for 20 s"),
     Row("(./)?skin press", "ends", says="pressing at", instead=TOUCHED),
@@ -84,6 +93,35 @@ COMMANDS = (
         instead=".venv/bin/python -m services.health publisher",
     ),
     Row("skin (up|down|press|top|release|replay|doctor)", "ends", instead="./skin --help"),
+    # bridges
+    Row(
+        r"(\./)?skin bridge ros2",
+        "runs",
+        says="ros2: publishing /eitskin/palm in ROS domain 97",
+        instead="ROS_DOMAIN_ID=97 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST ./skin bridge ros2",
+    ),
+    Row(r"(\./)?skin bridge foxglove", "runs", says="foxglove: open ws://127.0.0.1:", instead="./skin bridge foxglove"),
+    Row("skin bridge NAME", "ends", instead="./skin bridge --help"),
+    Row(
+        r"(\./)?skin export FILE.mcap --rerun",
+        "ends",
+        says="rerun-sdk|\\.rrd",
+        code=2,
+        instead="./skin export {folder}/demo.mcap --rerun",
+    ),
+    Row(
+        r"(\./)?skin export FILE.mcap --(?P<kind>foxglove|ros2|csv)",
+        "ends",
+        says="palm|rows [0-9]+",
+        instead="./skin record {folder}/export.mcap --seconds 1 --overwrite && "
+        "./skin export {folder}/export.mcap --csv --overwrite",
+    ),
+    Row(
+        "skin record FILE.mcap --topics .*",
+        "ends",
+        says="image/palm [0-9]+",
+        instead="./skin record {folder}/all.mcap --overwrite --seconds 1 --topics raw,contact,image,shape,status,info",
+    ),
     # recordings, files
     Row("skin record", "ends", says="contact/palm [0-9]+", instead="./skin record {folder}/demo.mcap --seconds 2"),
     Row(
@@ -149,9 +187,18 @@ COMMANDS = (
     Row("skin bench", "ends", says="accuracy"),
     Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB"),
     Row(r"(\./)?skin bench (?P<name>\w+)( .*)?", "help"),
+    Row(r"\.venv/bin/python -m bench\.speed\.page", "help"),
     Row("python -m models.average", "help"),
     Row("python -m models.build .*", "help"),
     Row("python -m protocol.wire_doc", "ends", instead=".venv/bin/python -m protocol.wire_doc"),
+    # docs/your-skin.md, in its order
+    Row(r"(\./)?skin new( .*)?", "walk"),
+    Row(r"(\./)?skin collect", "ends", says="OUT.npz", instead="./skin collect --help"),
+    Row("make train SKIN=my-skin QUICK=1", "walk"),
+    Row(r"\./skin up --config mine.toml", "walk"),
+    Row(r"\./skin (tare|release|echo contact -n 5)", "walk"),
+    Row(r"\./skin press --x 0.012 .*", "walk"),
+    Row(r"\./skin (collect|calibrate force|register) .*presses.npz.*", "walk"),
 )
 
 
@@ -186,6 +233,10 @@ NOT_RUN = (("protocol/WIRE.md", "01 Hello: "),)
 
 TRIED_ELSEWHERE = {
     "docs/security.md": "tests/cli/test_security.py",
+    "docs/page.md": "tests/bridges/test_page.py",
     "docs/extending.md": "tests/docs/test_extending.py",
+    "docs/your-skin.md": "tests/docs/test_your_skin.py",
+    "docs/ros.md": "tests/bridges/test_ros_page.py",
+    "docs/foxglove.md": "tests/bridges/test_ros_page.py",
 }
 """Documents whose blocks a test of their own runs, or applies where they are changes of the code."""

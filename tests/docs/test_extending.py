@@ -16,7 +16,7 @@ from tests.docs.snippets import ROOT, in_text
 BLOCKS = [
     s for s in in_text((ROOT / "docs" / "extending.md").read_text("utf-8"), "docs/extending.md") if s.kind == "text"
 ]
-COPIED = ("protocol", "models", "services", "firmware_stub", "bench", "pyproject.toml")
+COPIED = ("protocol", "models", "services", "bridges", "firmware_stub", "bench", "pyproject.toml")
 
 ADDED = """
 import numpy as np

@@ -170,6 +170,18 @@ def test_a_press_is_in_the_next_scan_and_gone_after_its_seconds(host):
     assert len(board.rig.scans[-1][1].touches) == 0
 
 
+def test_a_finger_moves_and_lifts_alone(host):
+    """What a page that is pressed by pointer sends: the next press of a finger takes the place of the one before."""
+    rig = host().rig
+    for x in (0.0, 0.01, 0.02):
+        rig.press({"x": x, "y": 0.0, "force": 2.0, "finger": "one"}, 0.1)
+    rig.press({"x": -0.02, "y": 0.0, "force": 1.0, "finger": "two"}, 0.1)
+    assert [touch.x for touch in rig.field.timeline.at(0.2).touches] == [0.02, -0.02]
+    assert rig.release(0.3, "one")["released"] == 1
+    assert [touch.x for touch in rig.field.timeline.at(0.4).touches] == [-0.02]
+    assert rig.release(0.5)["released"] == 1 and not rig.field.timeline.at(0.6).touches
+
+
 def test_a_mirrored_press_gives_the_mirrored_measurements(host):
     """The square is its own mirror image: electrode k of the bottom, right, top, left becomes 3 - k (mod 16)."""
     mirror = (3 - np.arange(16)) % 16

@@ -16,7 +16,7 @@ REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "eidor
 
 @pytest.fixture(scope="module")
 def physics():
-    return baselines.Linearisation(ForwardModel("square16", mesh="inverse"))
+    return baselines.PeerPhysics(ForwardModel("square16", mesh="inverse"))
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def mean_iou(method, scenes):
 
 def test_noser_is_equation_1():
     coarse = Grading(edge=0.05, growth=0.5, interior=0.25, offset=0.3)
-    physics = baselines.Linearisation(ForwardModel("square16", mesh=coarse))
+    physics = baselines.PeerPhysics(ForwardModel("square16", mesh=coarse))
     J = -physics.model.solve(1.0).jacobian()
     R = np.diag((J**2).sum(0) ** 0.5)
     RM = np.linalg.solve(J.T @ J + 0.15**2 * R, J.T)  # W = 1, ohm

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.scenes import TARGETS, Prior, random_scene, random_shape
+from models import geometry
+from models.scenes import TARGETS, TRAINING, Prior, random_scene, random_shape
 from models.shapes import (
     KINDS,
     Shape,
@@ -114,3 +115,23 @@ def test_scenes_obey_their_prior():
 def test_a_contact_too_large_for_the_skin_is_refused():
     with pytest.raises(ValueError, match="fits on this skin"):
         random_shape(np.random.default_rng(0), Prior(radius=(1.6, 1.7), tail=0.0, kinds=("circle",)))
+
+
+def test_contacts_fit_on_a_strip_and_are_as_ever_on_a_wide_skin():
+    """A strip of 100 x 14 mm leaves room for circles of 0.14 model units; the usual ones begin at 0.12."""
+    strip = geometry.from_dict(
+        {
+            "name": "strip",
+            "unit": "mm",
+            "outline": [[0, 0], [100, 0], [100, 14], [0, 14]],
+            "contact_impedance": 0.01,
+            "electrodes": {"width": 5, "count": 12, "first": 10},
+        }
+    )
+    prior = TRAINING.on(strip)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        scene = random_scene(rng, prior, strip.inside)
+        assert scene and all(strip.inside(shape.outline(32)).all() for shape in scene)
+    assert prior.radius[0] < prior.radius[1] <= 0.14
+    assert TRAINING.on(geometry.load("square16")) == TRAINING == TRAINING.on(geometry.load("disc16"))

@@ -53,9 +53,9 @@ class StubSkin:
     def feel(self, shapes: tuple[Shape, ...] = (), contacts: tuple[tuple[int, float], ...] = ()) -> Result:
         return self.see(transfer(shapes, contacts))
 
-    def see(self, t: TRANSFER) -> Result:
-        """One scan of a sheet with these transfer impedances."""
-        z, status = self.analog.measure((t, t), self.pattern, 128, 40_000.0, 0.0)
+    def see(self, t: TRANSFER, end: TRANSFER | None = None) -> Result:
+        """One scan of a sheet with these transfer impedances; end: with those when it ends, changing steadily."""
+        z, status = self.analog.measure((t, t if end is None else end), self.pattern, 128, 40_000.0, 0.0)
         return self.run(z, status)
 
     def run(self, z: NDArray[np.complex64], status: NDArray[np.uint8] | None = None) -> Result:

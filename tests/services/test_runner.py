@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
+from models.mismatch import MismatchedSheet, named
 from protocol.frames import DeltaFrame, Frame, ImageFrame, InfoFrame, RawFrame, StatusFrame, pack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
 from services.runner import Runner
@@ -205,6 +206,32 @@ class OneFrame:
 
     def close(self) -> None:
         pass
+
+
+def test_a_tare_by_command_is_followed_by_a_calibration_that_outlives_a_crash(
+    process: Process, board: Board, bundle: Bundle, runtime: Path
+) -> None:
+    """The fit runs in a process of its own: frames go on meanwhile, and name it once it is in use."""
+    off = np.abs(MismatchedSheet("square16", named("mild"), "stub").solve().impedances()) / bundle.z0 - 1
+    process.connect(board)
+    assert process.feed(board, 80, off)[-1].calibration == ""
+    assert process.control.call("tare", skin="palm", force=True)["calibrating"]
+    end, out = time.monotonic() + 240, None
+    while time.monotonic() < end and (out is None or not out.calibration):
+        out = process.feed(board, 1, off)[0]
+        time.sleep(0.05)
+    assert out is not None and out.calibration and out.valid, process.logged()
+    latched = AllReader(["info"], "palm", endpoint=f"ipc://{runtime}/preprocessing.ipc")
+    frame = latched.recv(15.0)
+    latched.close()
+    assert isinstance(frame, InfoFrame) and frame.info["bundle_hash"] == out.calibration
+    assert frame.info["mounting"]["bundle_hash"] == bundle.hash
+    time.sleep(2.0)  # ticks, in which it is kept
+    process.popen.kill()
+    process.popen.wait()
+    process.start()
+    process.connect(board)
+    assert process.feed(board, 3, off)[-1].calibration == out.calibration
 
 
 @pytest.mark.parametrize("skip", [True, False])

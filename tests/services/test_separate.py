@@ -10,8 +10,8 @@ import pytest
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, RawFrame
+from services.calibration.presses import part
 from services.calibration.register_command import register_presses
-from services.calibration.registration import part
 from services.estimation.references import alike, noise_of_references
 from services.pipeline import Pipeline
 from services.recordings import file_source

@@ -140,8 +140,8 @@ def test_a_stop_leaves_only_what_is_to_stay(up: Callable[..., subprocess.Popen[s
     assert {p.name for p in runtime.iterdir()} == {"a", "s", "lock", "state", *others}
 
 
-def test_the_demo_has_a_stub_and_every_stage_names_itself() -> None:
+def test_the_demo_has_a_stub_and_a_page_and_every_stage_names_itself() -> None:
     found = {p.name: p.module for p in programs(load(ROOT / "skin.toml"))}
-    assert found.pop("stub") == "firmware_stub"
+    assert found.pop("stub") == "firmware_stub" and found.pop("page") == "services.bridge"
     assert all(module == f"services.{name}" for name, module in found.items())
     assert list(found) == ["acquisition", "preprocessing", "inference", "publisher"]

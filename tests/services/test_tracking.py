@@ -231,3 +231,23 @@ def test_a_patch_that_falls_into_more_parts_than_touches_has_new_ones() -> None:
     play(tracker, [[touch(-0.007), touch(0.007)]] * 2 + [[Patch(0, 0, 2 * SIZE, 0.015)]])
     ids, ended = play(tracker, [[touch(-0.01), touch(0.01), touch(0.0, 0.012)]] * 2, 4)
     assert len(ids[0]) == 2 and set(ids[0]) < {1, 2, 3} == set(ids[1]) and not ended
+
+
+def test_what_a_touch_leaves_of_itself_in_the_image_as_it_ends_is_no_touch() -> None:
+    """An image of its release shows it roughly where it was, the next one a faint rest somewhere else."""
+    tracker = Tracker()
+    play(tracker, [[touch(-0.020, 0.013)]] * 3)
+    (changing,), _ = tracker.update([touch(-0.017, 0.009, 1.5 * SIZE)], 4 * FRAME_NS, sure=False)
+    (rest,), _ = tracker.update([touch(-0.015, -0.003, 0.1 * SIZE)], 6 * FRAME_NS)
+    assert changing is not None and rest is None
+
+
+def test_a_touch_that_moves_fast_or_lightens_in_its_place_goes_on() -> None:
+    tracker = Tracker()
+    (first,), _ = tracker.update([touch(0.0)], 0)
+    (light,), _ = tracker.update([touch(0.002, size=0.1 * SIZE)], FRAME_NS)
+    assert first is not None and light is not None and light.id == first.id
+    moved, sure = [], (True, False, False, True)
+    for n, believed in enumerate(sure, 2):
+        moved += tracker.update([touch(0.002 + 0.01 * (n - 1), size=SIZE)], n * FRAME_NS, sure=believed)[0]
+    assert [t and t.id for t in moved] == [first.id] * 4

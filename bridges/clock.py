@@ -1,4 +1,4 @@
-"""When a frame was measured, as ROS time: nanoseconds since 1970, as nodes that do not simulate have it."""
+"""When a frame was measured by the system's time: nanoseconds since 1970, as ROS and Foxglove have it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 TRIES = 5
 
 
-class RosClock:
+class WallClock:
     """How far the system's time is ahead of the monotonic clock that frames are stamped with. Measured again and
     again, since the system's time is set now and then (NTP).
     """
@@ -31,7 +31,6 @@ class RosClock:
         self.steps += abs(best[0] - self.offset_ns) > 1_000_000
         self.offset_ns, self.uncertainty_ns = best
 
-    def stamp(self, monotonic_ns: int) -> dict[str, int]:
-        """A builtin_interfaces/Time."""
-        ns = monotonic_ns + self.offset_ns
-        return {"sec": ns // 1_000_000_000, "nanosec": ns % 1_000_000_000}
+    def time_ns(self, monotonic_ns: int) -> int:
+        """The system's time at an instant of this host's monotonic clock."""
+        return monotonic_ns + self.offset_ns

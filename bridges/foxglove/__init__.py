@@ -1,0 +1,1 @@
+"""Foxglove: what it draws and plots, live or in a file."""

@@ -1,0 +1,167 @@
+"""What the page's buttons do: commands to the service's processes, by those who have the token."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import os
+import secrets
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from protocol.control import ControlClient, ControlError
+from protocol.runtime import runtime_dir
+
+from .feed import SkinFeed
+from .replays import REPLAY, Replay, ReplayRefused, listed
+
+TOKEN_FILE = "page.token"
+TIMEOUT_S = {"preprocessing": 10.0, "stub": 2.0}
+AT_ONCE_S, STOP_S = 1.5, 5.0
+
+
+@dataclass(frozen=True)
+class Button:
+    """The process that a command goes to ("": the page itself), and the arguments it may have. `stub`: only where the
+    skin is the stub's.
+    """
+
+    process: str
+    args: tuple[str, ...] = ()
+    stub: bool = True
+
+
+BUTTONS = {
+    "tare": Button("preprocessing", ("force",), stub=False),
+    "press": Button("stub", ("x", "y", "force", "radius", "shape", "rotation", "seconds", "finger")),
+    "release": Button("stub", ("finger",)),
+    "scene": Button("stub", ("name",)),
+    "fault": Button("stub", ("name", "args", "seconds", "clear")),
+    "record": Button("", ("on",), stub=False),
+    "recordings": Button("", stub=False),
+    "replay": Button("", ("file", "skin", "speed", "from"), stub=False),
+}
+
+
+def token() -> str:
+    """What commands must come with: made once for a runtime folder, which nobody else may enter, and kept there, so
+    that the printed address goes on to hold when the page's process is started anew.
+    """
+    path = runtime_dir() / TOKEN_FILE
+    try:
+        if len(known := path.read_text().strip()) >= 16:
+            return known
+    except OSError:
+        pass
+    new = secrets.token_urlsafe(16)
+    path.unlink(missing_ok=True)
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        file.write(new)
+    return new
+
+
+class Buttons:
+    """Carries out what browsers ask for."""
+
+    def __init__(self, secret: str, feeds: dict[str, SkinFeed], recordings: str, tell: Callable[[bool], None]) -> None:
+        """tell: called when there is news of a replay."""
+        self._secret, self._feeds, self._tell = secret, feeds, tell
+        self.recording = RecorderProcess(Path(recordings)) if recordings else None
+        self._replay: Replay | None = None
+
+    def knows(self, given: str) -> bool:
+        """Whether somebody has the token."""
+        return hmac.compare_digest(given.encode(), self._secret.encode())
+
+    async def press(self, skin: str, command: str, args: dict[str, Any], given: str) -> dict[str, Any]:
+        """{ok, result} or {ok, error}, for the person at the page."""
+        button, feed = BUTTONS.get(command), self._feeds.get(skin)
+        if not self.knows(given):
+            return _no("commands need the token of the address that the service printed: open that address")
+        if button is None or feed is None:
+            return _no(f"there is no command {command[:32]!r}" if button is None else f"there is no skin {skin[:64]!r}")
+        if button.stub and feed.source != "stub":
+            return _no(f"{command} is for the stub's skin: {skin} is measured by {feed.source or 'nobody just now'}")
+        if unknown := sorted(set(args) - set(button.args)):
+            return _no(f"{command} has no argument {', '.join(unknown)[:80]}")
+        if button.process and skin == REPLAY:
+            return _no(f"{command} is for a skin, not for a recording")
+        try:
+            return {"ok": True, "result": await self._carry_out(button.process, skin, command, args)}
+        except (ControlError, OSError, ReplayRefused) as why:
+            return _no(str(why))
+
+    async def _carry_out(self, process: str, skin: str, command: str, args: dict[str, Any]) -> dict[str, Any]:
+        if process:
+            client = ControlClient(process, TIMEOUT_S[process])
+            return await asyncio.to_thread(partial(client.call, command, skin=skin, **args))
+        if self.recording is None:
+            raise ReplayRefused("the page has no folder for recordings")
+        if command == "record":
+            return await asyncio.to_thread(self.recording.start if args.get("on") else self.recording.stop)
+        if command == "recordings":
+            return {"files": await asyncio.to_thread(listed, self.recording.folder)}
+        return await self._replayed(skin, self.recording.folder, args)
+
+    async def _replayed(self, skin: str, folder: Path, args: dict[str, Any]) -> dict[str, Any]:
+        """One replay at a time: a new one, or another place of it, ends the one before."""
+        if self._replay is not None:
+            await asyncio.to_thread(self._replay.close)
+            self._replay = None
+        if (feed := self._feeds.pop(REPLAY, None)) is not None:
+            feed.close()
+        if not args.get("file"):
+            return {"playing": False}
+        shown = args.get("skin") or skin
+        if shown not in self._feeds:
+            raise ReplayRefused(f"there is no skin {shown!r:.64}")
+        self._replay = Replay(folder, str(args["file"]), args.get("speed", 1.0), args.get("from", 0.0))
+        self._feeds[REPLAY] = SkinFeed(str(shown), self._tell, self._replay.runtime)
+        return {"playing": True}
+
+    async def close(self) -> None:
+        if self._replay is not None:
+            await asyncio.to_thread(self._replay.close)
+        if self.recording is not None:
+            await asyncio.to_thread(self.recording.stop)
+
+
+class RecorderProcess:
+    """A recorder that the page starts and ends."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.absolute()
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> dict[str, Any]:
+        """Raises ReplayRefused where it ends at once: another one records, or the folder cannot be written to."""
+        if self._process is None or self._process.poll() is not None:
+            command = [sys.executable, "-m", "services.recorder", "--folder", str(self.folder)]
+            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+            try:
+                self._process.wait(AT_ONCE_S)
+            except subprocess.TimeoutExpired:
+                return {"recording": True, "folder": str(self.folder)}
+            raise ReplayRefused("the recorder ended at once; the service's output says why")
+        return {"recording": True, "folder": str(self.folder)}
+
+    def stop(self) -> dict[str, Any]:
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+            try:
+                self._process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        self._process = None
+        return {"recording": False, "folder": str(self.folder)}
+
+
+def _no(why: str) -> dict[str, Any]:
+    return {"ok": False, "error": why}

@@ -1,0 +1,167 @@
+"""The page's server: its files, and one WebSocket for each browser. Asked by other names, or from other pages, it
+refuses.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import socket
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from aiohttp import web
+from aiohttp.typedefs import Handler, Middleware
+
+from protocol.frame_types import ELECTRODE_STATES, REASONS
+from protocol.logs import foreign
+from protocol.runtime import host_id
+
+from .advice import ADVICE
+from .commands import BUTTONS, Buttons
+from .feed import SkinFeed
+from .fetch_three import three_folder, verified
+from .replays import REPLAY
+from .settings import LOOPBACK, PageSettings
+from .viewer import Viewer
+
+WEB = Path(__file__).with_name("web")
+TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+TRIES = 20
+MOST_VIEWERS = 64
+HEARTBEAT_S = 10.0
+MOST_ASKED = 16 * 1024
+"""Longest message of a browser, in bytes."""
+
+log = logging.getLogger(__name__)
+
+
+class PageServer:
+    """`listen`, `application`, and `close`."""
+
+    def __init__(self, settings: PageSettings, secret: str, handed_on: Callable[[str, int | None], None]) -> None:
+        """handed_on: called with the skin, and when it was measured, of each scan that goes to the browsers."""
+        self.settings, self.port, self._handed_on = settings, 0, handed_on
+        self.feeds = {skin: SkinFeed(skin, partial(self._tell, skin)) for skin in settings.skins}
+        self.buttons = Buttons(secret, self.feeds, settings.recordings, partial(self._tell, REPLAY))
+        self._viewers: set[Viewer] = set()
+        self._three = verified(three_folder())
+        self._files = {f"/{path.name}": path.read_bytes() for path in WEB.iterdir() if path.suffix in TYPES}
+        self._files |= {f"/three/{name}": content for name, content in self._three.items()}
+        self._files["/"] = self._files["/index.html"]
+
+    def listen(self) -> socket.socket:
+        """A socket at the first free port from the settings' on. Raises OSError where none of them is."""
+        family = socket.AF_INET6 if ":" in self.settings.host else socket.AF_INET
+        for port in range(self.settings.port, self.settings.port + TRIES):
+            found = socket.socket(family, socket.SOCK_STREAM)
+            found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                found.bind((self.settings.host, port))
+                found.listen(64)
+            except OSError as why:
+                found.close()
+                if why.errno != errno.EADDRINUSE:
+                    raise
+                continue
+            self.port = port
+            return found
+        last = self.settings.port + TRIES - 1
+        raise OSError(errno.EADDRINUSE, f"no free port from {self.settings.port} to {last} at {self.settings.host}")
+
+    def application(self) -> web.Application:
+        found = web.Application(middlewares=[self._guarded()])
+        found.router.add_get("/live", self._live)
+        found.router.add_get("/{path:.*}", self._file)
+        return found
+
+    @property
+    def names(self) -> set[str]:
+        """What a browser may call us in its header Host."""
+        hosts = {*LOOPBACK, *self.settings.names, self.settings.host} - {"0.0.0.0", "::"}
+        return {f"[{host}]:{self.port}" if ":" in host else f"{host}:{self.port}" for host in hosts}
+
+    def _guarded(self) -> Middleware:
+        @web.middleware
+        async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
+            if request.host not in self.names:
+                raise web.HTTPMisdirectedRequest(text=f"asked for as {foreign(request.host, 80)!r}: that is not us\n")
+            return await handler(request)
+
+        return guard
+
+    async def _file(self, request: web.Request) -> web.Response:
+        content = self._files.get(request.path)
+        if content is None:
+            raise web.HTTPNotFound(text="no such file\n", headers=self._headers())
+        kind = TYPES[Path(request.path).suffix] if request.path != "/" else "text/html"
+        return web.Response(body=content, content_type=kind, charset="utf-8", headers=self._headers())
+
+    def _headers(self) -> dict[str, str]:
+        sockets = " ".join(sorted(f"ws://{name}" for name in self.names if "[" not in name))  # which CSP cannot name
+        return {
+            "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: "
+            f"blob:; connect-src 'self' {sockets}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Opener-Policy": "same-origin",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "Cache-Control": "no-cache",
+        }
+
+    async def _live(self, request: web.Request) -> web.StreamResponse:
+        origin = request.headers.get("Origin", "")
+        if origin.removeprefix("http://") not in self.names or not origin.startswith("http://"):
+            raise web.HTTPForbidden(text="a WebSocket of another page: refused\n")
+        if not self.settings.local and not self.buttons.knows(request.query.get("token", "")):
+            raise web.HTTPForbidden(text="open the address that the service printed, with its token\n")
+        if len(self._viewers) >= MOST_VIEWERS:
+            raise web.HTTPServiceUnavailable(text=f"{MOST_VIEWERS} browsers look already\n")
+        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=MOST_ASKED, compress=False)
+        await socket.prepare(request)
+        viewer = Viewer(socket, self.feeds, self.buttons.press)
+        self._viewers.add(viewer)
+        try:
+            await viewer.run(self._hello())
+        except ConnectionError:
+            pass
+        finally:
+            self._viewers.discard(viewer)
+        return socket
+
+    def _hello(self) -> dict[str, object]:
+        """What a browser is to know before the first frame."""
+        return {
+            "kind": "hello",
+            "skins": list(self.settings.skins),
+            "host": host_id(),
+            "now": time.monotonic_ns(),
+            "reasons": REASONS,
+            "advice": ADVICE,
+            "electrode_states": list(ELECTRODE_STATES),
+            "three": bool(self._three),
+            "buttons": [name for name, button in BUTTONS.items() if button.process or self.buttons.recording],
+        }
+
+    @property
+    def looking(self) -> Counter[str]:
+        """How many browsers look at each skin, or at the replay."""
+        return Counter(viewer.name for viewer in list(self._viewers))
+
+    def _tell(self, name: str, contacts: bool) -> None:
+        if contacts and name in self.settings.skins:
+            self._handed_on(name, self.feeds[name].latest["contact"].measured_ns)
+        for viewer in self._viewers:
+            if viewer.name == name:
+                viewer.tell()
+
+    async def close(self) -> None:
+        """Send the browsers away."""
+        await asyncio.gather(*(viewer.close() for viewer in list(self._viewers)), return_exceptions=True)
+        await self.buttons.close()
+        for feed in self.feeds.values():
+            feed.close()

@@ -1,0 +1,111 @@
+"""`skin export FILE.mcap`: a recording in the formats of others."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from services.cli.common import USAGE, JsonOption, emit, fail
+
+if TYPE_CHECKING:
+    from bridges.export.entries import Logged
+
+SUFFIXES = {"foxglove": ".foxglove.mcap", "ros2": ".ros2.mcap", "csv": ".csv", "rerun": ".rrd"}
+NEEDS = {"foxglove": ("foxglove", "make venv EXTRAS=foxglove"), "rerun": ("rerun", ".venv/bin/pip install rerun-sdk")}
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(export)
+
+
+def export(
+    file: Annotated[Path, typer.Argument(metavar="FILE.mcap")],
+    foxglove: Annotated[bool, typer.Option("--foxglove", help="MCAP with Foxglove's schemas.")] = False,
+    ros2: Annotated[bool, typer.Option("--ros2", help="MCAP as rosbag2 writes it.")] = False,
+    table: Annotated[bool, typer.Option("--csv", help="CSV, and an npz beside it: a row per contact.")] = False,
+    rerun: Annotated[bool, typer.Option("--rerun", help="An .rrd file, where rerun-sdk is installed.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Default: beside FILE, by its name.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
+    skin: Annotated[str, typer.Option("--skin", help="Only this skin.", metavar="NAME")] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Write a recording in another format. What a recording does not hold (images, say) is not in it either."""
+    chosen = {"foxglove": foxglove, "ros2": ros2, "csv": table, "rerun": rerun}
+    kinds = [kind for kind, wanted in chosen.items() if wanted]
+    if len(kinds) != 1:
+        fail(f"found {len(kinds)} formats, expected one of --{', --'.join(SUFFIXES)}", USAGE)
+    (kind,) = kinds
+    if kind in NEEDS and importlib.util.find_spec(NEEDS[kind][0]) is None:
+        fail(f"--{kind} needs the package {NEEDS[kind][0]}, which is not installed: {NEEDS[kind][1]}", USAGE)
+    target = out or file.with_suffix(SUFFIXES[kind])
+    made = [target, target.with_suffix(".npz")] if kind == "csv" else [target]
+    for path in made:
+        if path.exists() and not overwrite:
+            fail(f"{path} is there already: choose another name with --out, or say --overwrite", USAGE)
+        if path.resolve() == file.resolve():
+            fail(f"{path} is the recording itself: choose another name with --out", USAGE)
+    _written(kind, file, skin, made, as_json)
+
+
+def _written(kind: str, file: Path, skin: str, made: list[Path], as_json: bool) -> None:
+    """Write under other names first: what is there already stays until the new one is whole."""
+    parts = [path.with_name(f".{path.name}.part") for path in made]
+    for part in parts:
+        part.unlink(missing_ok=True)
+    try:
+        counts = _write(kind, file, skin, parts)
+        if not counts:
+            fail(f"{file}: found no frame{f' of {skin}' if skin else ''} that --{kind} could write", USAGE)
+        for part, path in zip(parts, made, strict=True):
+            part.replace(path)
+    except OSError as error:
+        fail(f"cannot write {made[0]}: {error.strerror}")
+    finally:
+        for part in parts:
+            part.unlink(missing_ok=True)
+    if as_json:
+        emit({"files": [str(path) for path in made], "messages": dict(counts)})
+    else:
+        said = ", ".join(f"{topic} {n}" for topic, n in counts.items())
+        print(f"{', '.join(map(str, made))}: {said}")
+
+
+def _write(kind: str, file: Path, skin: str, parts: list[Path]) -> Counter[str]:
+    from bridges.export.entries import timed
+
+    entries = timed(lambda: _frames(file, skin))
+    if kind == "csv":
+        from bridges.export.to_table import write_table
+
+        return +Counter({"rows": write_table(entries, *parts)})
+    if kind == "ros2":
+        from bridges.export.to_ros2 import write_ros2
+
+        with open(parts[0], "xb") as binary:
+            return write_ros2(entries, binary)
+    if kind == "foxglove":
+        from bridges.export.to_foxglove import write_foxglove
+
+        return write_foxglove(entries, parts[0])
+    from bridges.export.to_rerun import write_rerun
+
+    return write_rerun(entries, parts[0])
+
+
+def _frames(file: Path, skin: str) -> Iterator[Logged]:
+    """The frames of a recording, of one skin or all; what is none is left out."""
+    from protocol.frames import FrameError, unpack
+    from services.recordings.recording import RecordingReader
+
+    for message in RecordingReader(file).messages({"contact", "image", "shape", "status", "info"}):
+        try:
+            frame = unpack(message.wire)
+        except FrameError:
+            continue
+        if not skin or frame.skin == skin:
+            yield message.log_time_ns, frame

@@ -1,0 +1,94 @@
+"""Does a touch that came, went or changed while it was scanned explain a frame that no image explains?
+
+A scan takes its measurements one after the other, so a touch whose force changes meanwhile is in each with another
+size. One touch on the grid of the estimation, its size a line through KNOTS moments of the scan, leaves next to nothing
+of such a frame; two touches are tried, one after the other. Of what is no touch the same model leaves most.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from models.bundle import Bundle
+from models.sentinel import touches
+from services.estimation.tuning import TUNING
+
+Array = NDArray[np.float64]
+
+ENDED = 0.1  # of a touch's largest size, at most which is left of it where it ended
+AS_WELL = 2.0  # times what a changing touch leaves: a touch that did not change does as well
+KNOTS = 4  # moments of a scan between which a touch's size is a line: a force ramp begins or ends in one of three parts
+TINY = 1e-300  # keeps a touch out that no measurement counts of
+RIDGE = 1e-6  # of a touch's own energy: keeps the fit of its sizes solvable where few measurements count
+
+
+class ScanChange(NamedTuple):
+    left: float  # share of |d|^2 that a touch which changed during the scan leaves, noise apart
+    ended: bool  # whether nothing of it was left when the scan ended
+
+
+class ChangingTouch:
+    """For one bundle. `knows` is false where its differences have no sign: then nothing is explained."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        m = bundle.matrices
+        self.knows = m.normalisation == "model"
+        half_width = float(bundle.manifest["image"].get("half_width", 1.0))
+        self._response = np.asarray(touches(m, half_width, TUNING.radii).response, dtype=float)  # (M, K)
+        time = np.linspace(0.0, 1.0, self._response.shape[1])  # the scan goes through the pattern in its order
+        at = np.linspace(0.0, 1.0, KNOTS)
+        self._size = np.maximum(0.0, 1.0 - np.abs(time - at[:, None]) * (KNOTS - 1))  # (KNOTS, K)
+
+    def steady(self, difference: NDArray[np.floating], sigma: NDArray[np.floating]) -> bool:
+        """Whether a touch that did not change explains a difference (K,) about as well as one that did. sigma (K,):
+        standard deviation of d, infinite where a measurement does not count.
+        """
+        live, d, noise = _counted(difference, sigma)
+        changed = self(difference, sigma)
+        if changed is None:
+            return False
+        response = self._response * live
+        gain = float(((response @ d) ** 2 / ((response**2).sum(axis=1) + TINY)).max())
+        return float(d @ d) - gain - noise <= AS_WELL * changed.left * float(d @ d)
+
+    def __call__(self, difference: NDArray[np.floating], sigma: NDArray[np.floating]) -> ScanChange | None:
+        """The change that explains a difference (K,); None where it leaves too much."""
+        live, d, noise = _counted(difference, sigma)
+        energy = float(d @ d)
+        if not self.knows or live.sum() < len(d) / 2 or not energy > noise:
+            return None
+        response, size = self._response * live, self._size
+        products = response**2 @ np.array([size[i] * size[j] for i, j in self._pairs()]).T
+        gram = np.empty((len(response), KNOTS, KNOTS))
+        for n, (i, j) in enumerate(self._pairs()):
+            gram[:, i, j] = gram[:, j, i] = products[:, n]
+        gram += RIDGE * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(KNOTS) + TINY * np.eye(KNOTS)
+        columns, left = np.zeros((len(d), 0)), d
+        strength: list[float] = []
+        for _ in range(2):
+            seen = response @ (size * left).T
+            gain = (seen * np.linalg.solve(gram, seen[:, :, None])[:, :, 0]).sum(axis=1)
+            found = response[int(gain.argmax())]
+            columns, strength = np.hstack([columns, (size * found).T]), [*strength, float(np.linalg.norm(found))]
+            sizes, _ = nnls(columns, d)
+            left = d - columns @ sizes
+            share = max(0.0, float(left @ left) - noise) / energy
+            if share <= TUNING.changing_left:
+                course = np.array(strength) @ sizes.reshape(-1, KNOTS)
+                return ScanChange(share, bool(course[-1] <= ENDED * course.max()))
+        return None
+
+    @staticmethod
+    def _pairs() -> list[tuple[int, int]]:
+        return list(combinations_with_replacement(range(KNOTS), 2))
+
+
+def _counted(difference: NDArray[np.floating], sigma: NDArray[np.floating]) -> tuple[NDArray[np.bool_], Array, float]:
+    """Measurements that count, d (K,) with 0 elsewhere, and the energy of their noise."""
+    live = np.isfinite(sigma)
+    return live, np.where(live, difference, 0.0).astype(float), float((sigma[live].astype(float) ** 2).sum())

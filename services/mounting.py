@@ -1,0 +1,173 @@
+"""How this very skin is mounted, found from its untouched baseline. The fit runs beside the service, in a process of
+its own; what it finds is kept in the runtime folder and adopted between two frames.
+
+    person: skin tare --> preprocessing --> python -m models.fit_calibration   (niced, seconds)
+                               |<--------------------- packed calibration
+    delta frames name it  --> inference takes the same piece, so that image and data agree
+"""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from models.calibration_file import CalibrationFileError, unpack
+from models.files import FileError, read_bytes
+from services.estimation.evidence import evidence_of
+from services.estimation.tare import Baseline, implausibility
+from services.runtime import persistence
+from services.runtime.config import ROOT
+
+Array = NDArray[np.float64]
+
+KEPT_AS = "calibration"  # name of the kept state, beside preprocessing's
+MOST_BYTES = 16 * 1024 * 1024
+LONGEST_S = 600.0  # a fit that somebody waits for, and that takes longer on however busy a machine, has failed
+FITS = 3e-4  # rms relative: a bundle that predicts |Z0| so well, up to gain and contacts, is that skin's already
+
+log = logging.getLogger(__name__)
+
+
+class MountedSkin:
+    """A bundle calibrated to one skin, with the packed piece that it was read from."""
+
+    def __init__(self, packed: bytes, bundle: Bundle) -> None:
+        """Raises CalibrationFileError."""
+        self.packed = packed
+        self.bundle = unpack(packed, bundle)
+
+
+def needs_fit(baseline: Baseline, bundle: Bundle) -> bool:
+    """Whether there is anything to find: a measured bundle predicts no |Z0|, a good one predicts this one, and one that
+    was registered was measured on this very skin.
+    """
+    return (
+        bundle.locator is None
+        and bundle.matrices.normalisation == "model"
+        and implausibility(baseline.z0, bundle.prereconstructor()) > FITS
+    )
+
+
+class MountingFit:
+    """One fit at a time, in a process of its own. `poll` never waits."""
+
+    def __init__(self, bundle: Bundle, keep_as: str = "") -> None:
+        """bundle: as it was loaded, not calibrated. keep_as: the skin under whose name what is found is kept."""
+        self.bundle, self._keep_as = bundle, keep_as
+        self.problem = ""  # why the last fit gave nothing, for a person
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._reader: Thread | None = None
+        self._read: MountedSkin | None = None
+
+    @property
+    def busy(self) -> bool:
+        return self._process is not None or self._reader is not None
+
+    def start(self, baseline: Baseline) -> None:
+        """Begin with the mean of an untouched skin's frames; a fit that is under way is dropped."""
+        self.stop()
+        self.problem = ""
+        try:
+            self._begin(baseline)
+        except OSError as why:  # no room, no process: the bundle is used as it is
+            self._clear()
+            self.problem = f"the skin could not be calibrated: {why}"
+
+    def _begin(self, baseline: Baseline) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="eitskin-fit-")
+        request, out = (str(Path(self._folder.name, name)) for name in ("request.npz", "out"))
+        sigma = baseline.sigma / np.sqrt(max(baseline.frames, 1))
+        np.savez(request, z0=baseline.z0, sigma=sigma, baseline_hash=np.str_(baseline.hash))
+        bundle = str(self.bundle.path.resolve())
+        words = [sys.executable, "-m", "models.fit_calibration", bundle, request, out]
+        with Path(self._folder.name, "said").open("wb") as said:
+            self._process = subprocess.Popen(words, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+
+    def wait(self) -> MountedSkin | None:
+        """The same for who has the time: what was found, or None and `problem`."""
+        if self._process is not None:
+            try:
+                self._process.wait(LONGEST_S)
+            except subprocess.TimeoutExpired:
+                self.stop()
+                self.problem = f"the skin could not be calibrated: the fit took more than {LONGEST_S:.0f} s"
+                return None
+            self.poll()
+        if self._reader is not None:
+            self._reader.join()
+        return self.poll()
+
+    def poll(self) -> MountedSkin | None:
+        """What was found, once, when it is ready to be used."""
+        if self._process is not None and self._process.poll() is not None:
+            code, self._process = self._process.returncode, None
+            self._reader = Thread(target=self._finish, args=(code,), name="mounting", daemon=True)
+            self._reader.start()
+        if self._reader is None or self._reader.is_alive():
+            return None
+        self._reader, found, self._read = None, self._read, None
+        self._clear()
+        return found
+
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+        if self._reader is not None:
+            self._reader.join()
+            self._reader = None
+        self._read = None
+        self._clear()
+
+    def _finish(self, code: int) -> None:
+        """In a thread: what takes a frame's time and more, so that adopting it takes none."""
+        assert self._folder is not None
+        folder = Path(self._folder.name)
+        try:
+            if code:
+                said = (folder / "said").read_text(errors="replace").strip().splitlines()
+                raise CalibrationFileError(said[-1] if said else f"the fit ended with exit code {code}")
+            found = MountedSkin(read_bytes(folder / "out", MOST_BYTES), self.bundle)
+            if self._keep_as:
+                keep(self._keep_as, found)
+                read = kept(self._keep_as, self.bundle)
+                if read is None or read.bundle.hash != found.bundle.hash:  # inference could not follow
+                    raise CalibrationFileError("what was found could not be kept in the runtime folder: is it full?")
+            evidence_of(found.bundle)
+            self._read = found
+        except (CalibrationFileError, FileError, OSError) as why:
+            self.problem = f"the skin could not be calibrated: {why}"
+
+    def _clear(self) -> None:
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
+
+
+def keep(skin: str, found: MountedSkin | None) -> None:
+    """Keep a calibration for the next start; None: that there is none."""
+    packed = np.frombuffer(found.packed if found is not None else b"", np.uint8)
+    persistence.save(KEPT_AS, skin, {"packed": packed})
+
+
+def kept(skin: str, bundle: Bundle) -> MountedSkin | None:
+    """What `keep` kept, where it is this bundle's."""
+    found = persistence.restore(KEPT_AS, skin)
+    if found is None:
+        return None
+    try:
+        packed = np.asarray(found[0]["packed"], np.uint8).tobytes()
+        return MountedSkin(packed, bundle) if packed else None
+    except (CalibrationFileError, KeyError, TypeError, ValueError) as why:
+        log.warning("%s: the kept calibration is not used: %s", skin, why)
+        return None

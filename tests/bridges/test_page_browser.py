@@ -1,0 +1,360 @@
+"""The page in a real browser beside the whole service: Debian's chromium, without a screen, driven by playwright.
+
+`apt-get install chromium` has the browser, `make venv-dev` playwright; where one is missing these tests say so, and
+.ci/run installs both. EITSKIN_CHROMIUM names another one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridges.page.fetch_three import three_folder, verified
+
+ROOT = Path(__file__).resolve().parents[2]
+VECTORS = ROOT / "protocol" / "vectors"
+WAIT_MS = 30_000
+# No sandbox: CI is root in a container. Software drawing without WebGL, but where a test wants it.
+FLAT = ["--no-sandbox", "--disable-gpu", "--disable-3d-apis"]
+SOLID = ["--no-sandbox", "--disable-gpu-compositing", "--use-angle=swiftshader-webgl", "--enable-unsafe-swiftshader"]
+TRUST_CHANGES = """() => {
+  window.changes = [];
+  const { body } = document;
+  const seen = () => changes.push([body.dataset.trust, performance.now()]);
+  new MutationObserver(seen).observe(body, { attributeFilter: ["data-trust"] });
+}"""
+
+
+def missing(what: str) -> None:
+    if os.environ.get("EITSKIN_REQUIRE_BROWSER"):
+        pytest.fail(what)
+    pytest.skip(what)
+
+
+@pytest.fixture(scope="module")
+def chromium() -> str:
+    try:
+        import playwright.sync_api  # noqa: F401
+    except ImportError:
+        missing("BROWSER MISSING: no playwright here: run `make venv-dev`")
+    path = os.environ.get("EITSKIN_CHROMIUM") or shutil.which("chromium")
+    if not path:
+        missing("BROWSER MISSING: no chromium here: apt-get install chromium")
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def address(shared_service: Path) -> str:
+    """Of the page that `skin up` has started, as it printed it."""
+    end = time.monotonic() + 60
+    while not (found := re.search(r"http://\S+/#\S+", (shared_service / "log.txt").read_text())):
+        assert time.monotonic() < end, (shared_service / "log.txt").read_text()
+        time.sleep(0.1)
+    return found[0]
+
+
+Open = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def launch(chromium: str) -> Iterator[Callable[..., Any]]:
+    """Starts a browser with these arguments."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as found:
+        yield lambda args: found.chromium.launch(executable_path=chromium, args=args)
+
+
+@pytest.fixture(scope="module")
+def browser(launch: Callable[..., Any]) -> Iterator[Any]:
+    with launch(FLAT) as one:
+        yield one
+
+
+@pytest.fixture
+def page(browser: Any, address: str) -> Iterator[Open]:
+    """Opens the page; a test fails where the browser complains, or asks anybody else for anything."""
+    wrong: list[str] = []
+    contexts = []
+    own = address.split("/#")[0]
+
+    def opened(width: int = 1280, height: int = 900, to: str = address, **options: Any) -> Any:
+        context = browser.new_context(viewport={"width": width, "height": height}, **options)
+        contexts.append(context)
+        found = context.new_page()
+        found.set_default_timeout(WAIT_MS)
+        found.on("console", lambda said: said.type == "error" and wrong.append(said.text))
+        found.on("pageerror", lambda error: wrong.append(str(error)))
+        found.on("request", lambda request: request.url.startswith((own, "data:")) or wrong.append(request.url))
+        sockets = own.replace("http", "ws")
+        found.on("websocket", lambda socket: socket.url.startswith(sockets) or wrong.append(socket.url))
+        found.goto(to)
+        found.wait_for_selector("#overlay .outline", state="attached")
+        found.wait_for_selector("body[data-trust=yes]")
+        return found
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert not wrong, wrong
+
+
+def place(page: Any, x_mm: float, y_mm: float) -> tuple[float, float]:
+    """Where a place of the skin is on the screen."""
+    ask = "([x, y]) => { const p = new DOMPoint(x, -y).matrixTransform(overlay.getScreenCTM()); return [p.x, p.y]; }"
+    x, y = page.evaluate(ask, [x_mm, y_mm])
+    return x, y
+
+
+def marks(page: Any, selector: str) -> list[dict[str, float]]:
+    """x, y [mm] and force [N] of what is drawn on the map."""
+    ask = "found => found.map(g => ({x: +g.dataset.x, y: +g.dataset.y, force: +g.dataset.force}))"
+    return page.locator(selector).evaluate_all(ask)  # type: ignore[no-any-return]
+
+
+def until(true: Callable[[], Any], seconds: float = WAIT_MS / 1e3) -> Any:
+    end = time.monotonic() + seconds
+    while not (found := true()):
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.1)
+    return found
+
+
+def apart_mm(page: Any) -> float | None:
+    """From the one contact on the page to the one true touch on it; None while there is no such pair."""
+    found, true = marks(page, "#overlay .contact"), marks(page, "#overlay .truth g")
+    if len(found) != 1 or len(true) != 1:
+        return None
+    return float(((found[0]["x"] - true[0]["x"]) ** 2 + (found[0]["y"] - true[0]["y"]) ** 2) ** 0.5)
+
+
+def true_at(page: Any, x: float, y: float) -> bool:
+    """Whether the one true touch is there, within half a millimetre."""
+    true = marks(page, "#overlay .truth g")
+    return len(true) == 1 and abs(true[0]["x"] - x) < 0.5 and abs(true[0]["y"] - y) < 0.5
+
+
+def nothing_touches(page: Any) -> bool:
+    return not marks(page, "#overlay .contact") and not marks(page, "#overlay .truth g")
+
+
+@pytest.mark.parametrize(("x", "y"), [(20, -10), (-25, 25)])
+def test_a_press_is_seen_where_it_is(page: Open, x: float, y: float) -> None:
+    found = page()
+    found.mouse.move(*place(found, x, y))
+    found.mouse.down()
+    until(lambda: (apart := apart_mm(found)) is not None and apart < 3)
+    until(lambda: true_at(found, x, y))
+    until(
+        lambda: [true["force"] for true in marks(found, "#overlay .truth g")] == pytest.approx([3])
+    )  # it grew while it was held
+    until(lambda: re.search(r"[23]\.\d\d N ± 0\.\d\d", found.inner_text("#contacts")))
+    found.mouse.move(*place(found, x + 10, y))
+    until(lambda: true_at(found, x + 10, y))
+    found.mouse.up()
+    until(lambda: nothing_touches(found))
+
+
+def test_several_fingers_press_at_once_on_a_narrow_screen(page: Open) -> None:
+    found = page(390, 844, has_touch=True, is_mobile=True)
+    assert found.evaluate("document.documentElement.scrollWidth") <= 390
+    found.locator("#map").scroll_into_view_if_needed()
+    hand = found.context.new_cdp_session(found)
+    fingers = [dict(zip("xy", place(found, x, 0), strict=True), id=n) for n, x in enumerate((-25, 25))]
+    hand.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": fingers})
+    until(lambda: len(marks(found, "#overlay .contact")) == 2)
+    hand.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    until(lambda: nothing_touches(found))
+
+
+def test_by_keyboard_alone(page: Open) -> None:
+    found = page()
+    found.keyboard.press("Tab")
+    found.keyboard.press("Enter")  # to the skin
+    for _ in range(30):
+        if found.evaluate("document.activeElement.id") == "map":
+            break
+        found.keyboard.press("Tab")
+    else:
+        raise AssertionError("Tab does not reach the map")
+    for _ in range(5):
+        found.keyboard.press("ArrowLeft")
+    found.keyboard.press("+")
+    assert found.inner_text("#force-out") == "3.5 N"
+    found.keyboard.down(" ")
+    until(lambda: (apart := apart_mm(found)) is not None and apart < 3)
+    until(lambda: true_at(found, -10, 0))
+    until(lambda: "contact" in found.inner_text("#summary"))  # what a screen reader says
+    found.keyboard.up(" ")
+    until(lambda: nothing_touches(found))
+
+
+def test_a_fault_is_named_with_what_to_do(page: Open) -> None:
+    found = page()
+    found.click("text=Dead electrode")
+    found.wait_for_selector("#overlay .electrodes g[data-name=open]")
+    until(lambda: "electrode open" in found.inner_text("#banner"))
+    assert "Look at the wire" in found.inner_text("#banner")
+    assert found.text_content("#overlay .electrodes g[data-name=open] .sign") == "×"
+    found.click("text=All well again")
+    until(lambda: "electrode" not in found.inner_text("#banner"))
+    found.click("text=Unplug")
+    found.wait_for_selector("body[data-trust=no]")
+    until(lambda: found.evaluate("getComputedStyle(map).filter") == "grayscale(1)")
+    until(lambda: "unplugged" in (said := found.inner_text("#banner")) or "s old" in said)
+    found.wait_for_selector("body[data-trust=yes]")
+
+
+def test_it_greys_within_half_a_second_of_a_killed_publisher(page: Open, shared_service: Path) -> None:
+    found = page()
+    found.evaluate(TRUST_CHANGES)
+    took: list[float] = []
+    while not took or (min(took) > 0.5 and len(took) < 4):  # what the machine's other work adds is not the page's
+        publisher = int((shared_service / "publisher.lock").read_text())
+        began = found.evaluate("changes.length = 0, performance.now()")
+        os.kill(publisher, signal.SIGKILL)
+        grey = until(lambda: found.evaluate("changes.find(([trust]) => trust === 'no')"))
+        took.append((grey[1] - began) / 1e3)
+        found.wait_for_selector("body[data-trust=yes]")
+        until(lambda: found.evaluate("getComputedStyle(map).filter") == "none")
+    assert min(took) <= 0.5, took
+
+
+def test_without_the_token_it_only_looks(page: Open, address: str) -> None:
+    found = page(to=address.split("#")[0])
+    assert "token" in found.inner_text("#press-why")
+    assert found.is_disabled("#tare") and found.is_disabled("text=Unplug")
+    found.mouse.move(*place(found, 0, 0))
+    found.mouse.down()
+    time.sleep(0.5)
+    assert nothing_touches(found)
+
+
+def test_dark_and_light_and_without_motion(page: Open) -> None:
+    dark = page(color_scheme="dark", reduced_motion="reduce")
+    light = page(color_scheme="light")
+    paper = "getComputedStyle(document.body).backgroundColor"
+    assert dark.evaluate(paper) != light.evaluate(paper)
+    assert dark.evaluate("getComputedStyle(map).transitionDuration") == "0s"
+    assert light.evaluate("getComputedStyle(map).transitionDuration") != "0s"
+
+
+def test_it_reads_the_wire_as_the_vectors_say(page: Open) -> None:
+    """The page's own msgpack reader, on messages made by a program that shares no code with ours."""
+    found = page()
+    read = """async ([hex]) => {
+      const { frameOf } = await import("/msgpack.js");
+      const plain = v => {
+        if (ArrayBuffer.isView(v) && v.shape) return { shape: v.shape, values: Array.from(v, Number) };
+        if (Array.isArray(v)) return v.map(plain);
+        if (!v || typeof v !== "object") return v;
+        return Object.fromEntries(Object.entries(v).map(([k, x]) => [k, plain(x)]));
+      };
+      const { topic, skin, frame } = frameOf(Uint8Array.from(hex.match(/../g), h => parseInt(h, 16)));
+      const sayable = (k, v) => typeof v === "number" && !Number.isFinite(v) ? String(v) : v;
+      return JSON.stringify({ topic, skin, fields: plain(frame) }, sayable);
+    }"""
+    files = sorted((VECTORS / "frames").glob("*.bin"))
+    assert len(files) >= 9
+    for file in files:
+        expected = json.loads(file.with_suffix(".json").read_text())
+        got = json.loads(found.evaluate(read, [file.read_bytes().hex()]))
+        assert (got["topic"], got["skin"]) == (expected["topic"], expected["skin"]), file.name
+        for name, value in expected["fields"].items():
+            same(got["fields"][name], value, f"{file.name}: {name}")
+
+
+NUMBERS = {"nan": "NaN", "inf": "Infinity", "-inf": "-Infinity"}
+
+
+def same(got: Any, expected: Any, where: str) -> None:
+    if isinstance(expected, dict) and "dtype" in expected:
+        flat = []
+        stack = [expected["values"]]
+        while stack:
+            value = stack.pop(0)
+            stack = [*value, *stack] if isinstance(value, list) else stack
+            flat += [] if isinstance(value, list) else [value]
+        assert got["shape"] == expected["shape"], where
+        for a, b in zip(got["values"], flat, strict=True):
+            same(a, NUMBERS.get(b, b) if isinstance(b, str) else b, where)
+    elif isinstance(expected, float) or (isinstance(expected, int) and abs(expected) > 2**53):
+        assert got == pytest.approx(expected, rel=1e-6), where
+    elif isinstance(expected, dict):
+        for key, value in expected.items():
+            same(got[key], value, f"{where}.{key}")
+    elif isinstance(expected, list):
+        assert len(got) == len(expected), where
+        for a, b in zip(got, expected, strict=True):
+            same(a, b, where)
+    else:
+        assert got == expected, where
+
+
+def test_what_is_no_message_is_refused(page: Open) -> None:
+    found = page()
+    refuses = """async bytes => {
+      const { frameOf } = await import("/msgpack.js");
+      try { frameOf(Uint8Array.from(bytes)); return "took it"; } catch (why) { return why.name; }
+    }"""
+    head = b"contact/palm\0"
+    endless = [b"\xdf\xff\xff\xff\xff", b"\xdd\xff\xff\xff\xff", 100 * b"\x91"]
+    for bad in (b"", head, head + b"\xc1", head + b"\x81\xa1\xff\x01", *(head + more for more in endless)):
+        assert found.evaluate(refuses, list(bad)) != "took it", bad
+
+
+def test_the_surface_dents(launch: Callable[..., Any], address: str) -> None:
+    """With WebGL, which software draws here."""
+    if not verified(three_folder()):
+        missing("THREE.JS MISSING: `make venv` fetches it with npm")
+    with launch(SOLID) as one:
+        page = one.new_page(viewport={"width": 1280, "height": 900})
+        page.set_default_timeout(WAIT_MS)
+        page.goto(address)
+        page.wait_for_selector("#surface canvas")
+        deepest = """async () => {
+          const { Surface } = await import("/surface.js");
+          const s = await Surface.on(document.createElement("div"));
+          const drop = new Float32Array(96 * 96); drop[48 * 96 + 24] = drop[49 * 96 + 24] = 0.5;
+          s.dent(drop, 96, 96, 0.5); s.draw(1e9);
+          const p = s.plane.attributes.position; let k = 0;
+          for (let i = 1; i < p.count; i++) if (p.getZ(i) < p.getZ(k)) k = i;
+          return [p.getX(k), p.getY(k), p.getZ(k)];
+        }"""
+        x, y, z = page.evaluate(deepest)
+        assert z < -0.05 and abs(x + 0.5) < 0.06 and abs(y) < 0.06
+
+
+def test_a_recording_is_made_and_replayed(page: Open) -> None:
+    found = page()
+    found.click("#record")
+    found.wait_for_selector("#record[aria-pressed=true]")
+    found.mouse.move(*place(found, 15, 15))
+    found.mouse.down()
+    until(lambda: true_at(found, 15, 15))
+    time.sleep(2)
+    found.mouse.up()
+    found.click("#record")
+    found.wait_for_selector("#record[aria-pressed=false]")
+    until(lambda: nothing_touches(found))
+    found.click("#recordings summary")
+    made = until(lambda: found.input_value("#file"))
+    try:
+        found.click("#play")
+        until(lambda: found.inner_text("#trust-title").startswith("Replay"))
+        until(lambda: len(seen := marks(found, "#overlay .contact")) == 1 and abs(seen[0]["x"] - 15) < 3)
+        assert not marks(found, "#overlay .truth g")  # nobody knows it now
+        until(lambda: float(found.input_value("#scrub")) > 0.5)
+        found.click("#play")
+        until(lambda: found.inner_text("#trust-title").startswith("Live"))
+    finally:
+        (ROOT / "recordings" / str(made)).unlink()

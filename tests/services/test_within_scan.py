@@ -1,0 +1,113 @@
+"""Touches that come, go and change while they are scanned: valid, `changing`, and nothing else is taken for one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from models.shapes import Shape
+from services.estimation.within_scan import ChangingTouch
+from services.pipeline import Result
+from tests.services.stub_skin import TRANSFER, StubSkin, transfer
+
+TOUCHES = (
+    Shape("circle", 0.8, 0.4, 0.25, 0.22),
+    Shape("circle", -0.6, -0.5, 0.2, 0.4),
+    Shape("circle", 0.1, 0.25, 0.12, 0.3),
+)
+RAMP = (0.0, 0.35, 0.79, 1.0)  # share of the force at the ends of the scans that a ramp of 0.1 s is in
+METRES = 0.05
+
+
+def levels(touch: Shape, shares: tuple[float, ...]) -> list[TRANSFER]:
+    return [transfer((replace(touch, drop=share * touch.drop),) if share else ()) for share in shares]
+
+
+@pytest.fixture(scope="module")
+def skin() -> StubSkin:
+    return StubSkin(80.0)
+
+
+@pytest.mark.parametrize("touch", TOUCHES)
+def test_a_touch_that_comes_and_goes_is_valid_and_says_changing_while_it_does(skin: StubSkin, touch: Shape) -> None:
+    skin.rest(20)
+    up = levels(touch, RAMP)
+    begin = [skin.see(*scan) for scan in pairwise(up)]
+    held = [skin.see(up[-1]) for _ in range(8)]
+    end = [skin.see(*scan) for scan in pairwise(reversed(up))]
+    free = [skin.see(up[0]) for _ in range(6)]
+    every = [*begin, *held, *end, *free]
+    assert all(r.contact.valid for r in every), [r.contact.reasons for r in every]
+    assert not says_changing(held) and not says_changing(free)
+    assert says_changing(begin) and says_changing(end) <= 2
+    for n, result in enumerate(every):
+        for contact in result.contact.contacts:
+            off = np.hypot(*(np.array(contact.position[:2]) - METRES * np.array([touch.x, touch.y])))
+            assert off < (0.003 if len(begin) < n < len(begin) + len(held) else 0.015)
+    assert all(len(present(r)) == 1 for r in held) and not present(free[-1])
+    # Where it presses all through the scan, either its contact is there or the frame says why not.
+    assert all(present(r) or "changing" in r.contact.reasons for r in [*begin, *end[:-1]])
+
+
+def present(result: Result) -> list[object]:
+    return [c for c in result.contact.contacts if c.state != "end"]
+
+
+def says_changing(results: list[Result]) -> int:
+    return sum("changing" in r.contact.reasons for r in results)
+
+
+def test_what_stays_as_it_is_did_not_change(skin: StubSkin) -> None:
+    """The same odd frame again and again: a fault that only looks like a touch that went."""
+    touch = TOUCHES[1]
+    skin.rest(20)
+    up = levels(touch, RAMP)
+    for scan in pairwise(up):
+        skin.see(*scan)
+    skin.see(up[-1])
+    z, status = skin.analog.measure((up[1], up[0]), skin.pattern, 128, 40_000.0, 0.0)
+    seen = []
+    for _ in range(8):
+        noise = 1 + 1e-4 * np.random.default_rng(skin.scan).standard_normal(len(z))
+        seen.append(skin.run((z * noise).astype(np.complex64), status))
+    assert seen[0].contact.valid and "changing" in seen[0].contact.reasons
+    assert not present(seen[1])  # at most it has ended
+    assert not any(r.contact.valid for r in seen[2:])
+    assert all("out_of_distribution" in r.contact.reasons for r in seen[2:])
+
+
+@pytest.mark.parametrize("touch", TOUCHES)
+def test_a_changing_touch_explains_a_scan_in_which_it_went_and_nothing_else(bundle: Bundle, touch: Shape) -> None:
+    explain = ChangingTouch(bundle)
+    whole = difference(bundle, levels(touch, (1.0,))[0])
+    time = np.linspace(0.0, 1.0, len(whole))
+    sigma = np.full(len(whole), 1e-4)
+    went = explain(whole * np.clip(1.2 - 2 * time, 0, 1), sigma)
+    came = explain(whole * np.clip(2 * time - 0.7, 0, 1), sigma)
+    assert went is not None and went.ended and came is not None and not came.ended
+    assert explain.steady(whole, sigma) and not explain.steady(whole * np.clip(1.2 - 2 * time, 0, 1), sigma)
+    rng = np.random.default_rng(3)
+    size = float(np.linalg.norm(whole))
+    strange = {
+        "measurements mixed up": whole[rng.permutation(len(whole))],
+        "noise": size / len(whole) ** 0.5 * rng.standard_normal(len(whole)),
+        "another gain from the middle on": np.where(time > 0.5, 0.05, 0.0),
+        "a touch turned over": -whole,
+        "a scan that slipped by three": np.roll(whole, 3),
+        "one electrode off": np.where((np.asarray(bundle.pattern) == 3).any(axis=1), 0.3, 0.0),
+    }
+    assert [name for name, d in strange.items() if explain(d, sigma) is not None] == []
+    assert explain(np.zeros(len(whole)), sigma) is None
+    assert explain(whole, np.full(len(whole), np.inf)) is None
+
+
+def difference(bundle: Bundle, t: TRANSFER) -> NDArray[np.float64]:
+    """(K,) d of the stub's sheet."""
+    i, j = np.asarray(bundle.pattern)[:, :2].T
+    free = transfer()
+    return np.asarray((t[i, i] + t[j, j] - 2 * t[i, j]) / (free[i, i] + free[j, j] - 2 * free[i, j]) - 1)
