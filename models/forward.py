@@ -75,8 +75,8 @@ class ForwardModel(Elements):
 
     def electrode_of(self, edges: NDArray[np.int64]) -> NDArray[np.int64]:
         """(m,) electrode over each boundary edge (m, 2) of nodes, -1 where there is none."""
-        known = {tuple(sorted(pair)): int(e) for pair, e in zip(self._facets.tolist(), self._facet_electrode, strict=True)}
-        return np.array([known.get(tuple(sorted(pair)), -1) for pair in edges.tolist()])
+        known = {frozenset(pair): int(e) for pair, e in zip(self._facets.tolist(), self._facet_electrode, strict=True)}
+        return np.array([known.get(frozenset(pair), -1) for pair in edges.tolist()])
 
     def matrix(self, conductivity: ArrayLike = 1.0, contact_impedance: ArrayLike | None = None) -> sparse.csc_matrix:
         """The system's matrix, nodes and all electrodes but the last, in the fill-reducing order (`currents` too)."""

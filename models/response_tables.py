@@ -85,14 +85,14 @@ def _sources(model: ForwardModel, dipoles: Array) -> Array:
         offset = (start + at * step)[:, None] - dipoles[None]  # (facets, I, 2)
         r2 = (offset**2).sum(axis=2)
         for axis in range(2):
-            columns = slice(axis * len(dipoles), (axis + 1) * len(dipoles))
+            part = result[:, axis * len(dipoles) : (axis + 1) * len(dipoles)]
             potential = offset[..., axis] / r2 / (2 * np.pi)
             along = (offset * normal[:, None]).sum(axis=2)
             flux = (normal[:, axis, None] - 2 * offset[..., axis] * along / r2) / r2 / (2 * np.pi)
             through = -(weight * length)[:, None] * flux
             into = -(weight * length[under] * per_ohm)[:, None] * potential[under]
             for nodes, share in ((facets[0], 1 - at), (facets[1], at)):
-                np.add.at(result, (nodes, columns), share * through)
-                np.add.at(result, (nodes[under], columns), share * into)
-            np.add.at(result, (model.n_nodes + electrode[under], columns), -into)
+                np.add.at(part, nodes, share * through)
+                np.add.at(part, nodes[under], share * into)
+            np.add.at(part, model.n_nodes + electrode[under], -into)
     return result

@@ -4,8 +4,8 @@ A touch has parameters theta = (x, y, log radius, logit drop, rotation, log aspe
 The frame is d = f(theta) + e, with f of `touch_response` and e normal of a covariance that the caller knows: noise,
 drift, and what no model gets right. Gauss-Newton steps, damped (Levenberg-Marquardt) and kept only where they raise the
 posterior, lead from the network's answer to the likeliest theta. There the posterior is taken as normal (Laplace),
-which gives each kind's evidence, and so what shape it is (MacKay, "Information Theory, Inference, and Learning Algorithms",
-chapters 27 and 28).
+which gives each kind's evidence, and so what shape it is (MacKay, "Information Theory, Inference, and Learning
+Algorithms", chapters 27 and 28).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from models.touch_response import TouchGrid, TouchResponse, effective_drop
 FREE = {"circle": 4, "hertz": 4, "triangle": 5, "rectangle": 6, "square": 5, "L": 5}  # parameters of each kind
 PERIOD = {"triangle": 2 * np.pi / 3, "rectangle": np.pi, "square": np.pi / 2, "L": 2 * np.pi}
 STARTS = {"triangle": 4, "rectangle": 6, "square": 3, "L": 8}  # rotations tried in one period
-TRIED = 2  # of them, the likeliest, are fitted to the end
+TRIED = {"triangle": 2, "rectangle": 2, "square": 2, "L": 4}  # of them, the likeliest, are fitted to the end
 ROUNDER = {"circle": 1.0, "hertz": 1.1, "triangle": 1.55, "rectangle": 1.3, "square": 1.25, "L": 1.4}
 """Circumscribed radius of each kind over that of the circle of its area."""
 
@@ -36,6 +36,9 @@ MOST = np.array([0.2, 0.2, 0.4, 0.8, 0.5, 0.4])  # of one step
 STEP = np.array([0.02, 0.02, 0.03, 0.0, 0.05, 0.04])  # for derivatives of coverage; place: of the radius
 DONE = 0.05  # a step that raises the posterior by less, in nats times two, is the last
 STEPS = 12
+FLOOR = 1e-4  # of |Z|: no forward model is better
+MISFIT = 3e-3  # of |d|: what the response is wrong by, over the directions that touches make, and in each measurement
+MISFIT_POWER = 0.4  # of the Gram matrix's eigenvalues: that error looks almost as touches do
 UNLIKELY = 12.0  # nats behind the likeliest kind: not fitted further
 
 
@@ -78,7 +81,7 @@ class TouchPosterior:
     @property
     def fits_frame(self) -> bool:
         """Whether the likeliest touch explains the frame: else it is none of these kinds, or more than one."""
-        return self.fits[0].misfit < self.measurements + 4 * (2 * self.measurements) ** 0.5
+        return bool(self.fits[0].misfit < self.measurements + 4 * (2 * self.measurements) ** 0.5)
 
     @property
     def classes(self) -> Array:
@@ -138,7 +141,25 @@ class TouchFit:
             theta[4] = rotation
             theta[:2] += (x, y) - shape_of(kind, theta).centroid  # an L's centroid is not its circle's centre
             turned.append((frame.misfit(kind, theta), theta))
-        return [theta for _, theta in sorted(turned, key=lambda pair: pair[0])[:TRIED]]
+        return [theta for _, theta in sorted(turned, key=lambda pair: pair[0])[: TRIED[kind]]]
+
+
+def frame_covariance(gram: Array, sigma: Array, d: Array, tare_frames: int = 64, drift: Array | None = None) -> Array:
+    """(K, K) covariance of d (K,) about what a touch makes of it.
+
+    gram (K, K): the bundle's; sigma (K,): standard deviation of d of one frame; drift (K, K): covariance of what drift
+    since the tare does.
+    """
+    noise = sigma**2 * (1 + 1 / tare_frames) + FLOOR**2 + (MISFIT * d) ** 2
+    factor = MISFIT * float(np.linalg.norm(d)) * misfit_factor(gram)
+    return np.asarray(np.diag(noise) + factor @ factor.T + (0.0 if drift is None else drift))
+
+
+def misfit_factor(gram: Array, power: float = MISFIT_POWER) -> Array:
+    """(K, K) factor of a covariance of trace 1 that lies where touches do: powers of the Gram matrix's eigenvalues."""
+    values, vectors = np.linalg.eigh(gram)
+    profile = np.maximum(values, 0) ** power
+    return np.asarray(vectors * (profile / np.linalg.norm(profile)))
 
 
 class _Whitened:

@@ -92,7 +92,7 @@ class TouchResponse:
     def __init__(self, tables: ResponseTables, pattern: npt.NDArray[np.integer], z0: Array, cells: int = CELLS) -> None:
         electrodes = tables.fields.shape[2]
         self.tables, self.cells, self.z0 = tables, cells, np.asarray(z0, dtype=float)
-        self._drive, self._sense = (incidence(pattern[:, k : k + 2], electrodes).T for k in (0, 2))
+        self._drive, self._sense = (incidence(pattern[:, k : k + 2].astype(np.int64), electrodes).T for k in (0, 2))
         self._free = _infinite_sheet(cells)
 
     def grid(self, x: float, y: float, radius: float) -> TouchGrid:
