@@ -29,7 +29,7 @@ WAIT = ("frames came so far: wait", "did not answer tare within")
 SHORTER = {
     "make train SKIN=my-skin QUICK=1": ".venv/bin/python -m models.build --skin my-skin --no-network --jobs 1",
     "./skin collect presses.npz --stub 40": "./skin collect presses.npz --stub 6",
-    "./skin register presses.npz --skin my-skin --presses 30 --out my-registered": "",
+    "./skin register presses.npz --skin my-skin --out my-registered": "",
 }
 TRAINED = {
     "make train SKIN=my-skin QUICK=1": ".venv/bin/python -m models.build --skin my-skin --minutes 4",
@@ -157,4 +157,4 @@ def test_the_page_is_followed_with_a_training() -> None:
         somebody = follow(place, TRAINED)
         check(somebody, most_mm=2.0)
         assert "verdict: " in somebody.said["make train SKIN=my-skin QUICK=1"].out
-        assert "residual over" in somebody.said[commands()[-1]].out
+        assert "each found without itself: median" in somebody.said[commands()[-1]].out
