@@ -18,7 +18,9 @@ from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
 from protocol.frames import RawFrame
 from services import mounting
+from services.calibration.force_presses import of_file
 from services.contacts import calibration_file
+from services.contacts.force import ForceLaw
 from services.contacts.force_curve import Curve
 from services.estimation.tare import Baseline
 from services.linearisation import Linearisation
@@ -222,6 +224,23 @@ def _raw(bench: Bench) -> RawFrame:
         skin="palm", scan=999, z=z.astype(np.complex64), status=np.zeros(len(z), np.uint8),
         stamps={"sample": 999 * 45_000_000}, source="board", valid=True, board="b",
     )  # fmt: skip
+
+
+def test_forces_are_calibrated_on_the_images_that_a_tare_leads_to(
+    sheet: MismatchedSheet, bundle: Bundle, tmp_path: Path
+) -> None:
+    press = Shape("circle", -0.5, -0.5, 0.25, 0.3)
+    z0, z = (np.abs(sheet.solve(shapes).impedances()) for shapes in ((), (press,)))
+    noise = NOISE * np.random.default_rng(3).standard_normal((40, len(z)))
+    np.savez(tmp_path / "presses.npz", measurements=z[None], untouched=z0 * (1 + noise))
+
+    def newton(**config: Any) -> float:
+        skin = Skin(port="stub", bundle=BUNDLE, frame_id="palm", **config)
+        look = of_file(tmp_path / "presses.npz", skin, bundle, lambda text: None)(0)
+        return ForceLaw.of(skin, bundle).force(look).newton
+
+    assert newton() == pytest.approx(3.0, rel=0.06)
+    assert newton(tare=TareConfig(calibrate=False)) > 1.15 * 3.0
 
 
 def test_a_calibration_of_another_bundle_or_a_damaged_one_is_refused(bundle: Bundle, sheet: MismatchedSheet) -> None:
