@@ -17,13 +17,12 @@ from models.locator import Located, Locator
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
 from services.estimation.quality import SURE, Residual
 from services.estimation.sentinel import CoarseImage
-from services.estimation.within_scan import ChangingTouch
+from services.estimation.within_scan import CHANGING_FRAMES, ChangingTouch
 from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
 
-CHANGING_FRAMES = 3  # in a row that may be explained by a touch that changes: a press within 0.1 s is over by then
 SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
 
@@ -153,26 +152,25 @@ class Inference(Stage):
             return
         elif not self._changing_touch.steady(frame.difference, frame.sigma):
             self._changing += 1
-            add_reason(out.reasons, "changing")
+            if not self._refused:
+                add_reason(out.reasons, "changing")
         self._judge(out)
         self._shows(frame, out)
 
     def _changes(self, frame: DeltaFrame, out: ImageFrame) -> bool:
         """Whether a touch that changed during the scan explains a frame that its image does not. Then the frame is
-        valid and says `changing`. Its image shows nothing new: that of before is held; where there was none, or where
-        the touch is seen to have ended, it is empty.
+        valid and says `changing`, also where the touch ended: it pressed in a part of the scan. Its image shows nothing
+        new: that of before is held, and where there was none it is empty.
         """
         found = self._changing_touch(frame.difference, frame.sigma) if self._changing < CHANGING_FRAMES else None
         if found is None:
             return False
-        ended = found.ended and self._changing > 0
-        if not ended:
-            add_reason(out.reasons, "changing")
+        add_reason(out.reasons, "changing")
         out.residual, self._refused = found.left, False
-        self._changing = CHANGING_FRAMES if ended else self._changing + 1  # what ended does not end again
+        self._changing = CHANGING_FRAMES if found.ended else self._changing + 1  # what ended does not end again
         self._changing_scan = frame.scan
         self._counters["changing"] += 1
-        if (last := self._last) is None or ended:
+        if (last := self._last) is None:
             out.image, out.sigma = np.zeros_like(out.image), np.zeros_like(out.sigma)
             out.reconstructed = frame.scan
         else:

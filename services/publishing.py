@@ -23,6 +23,7 @@ from services.contacts.surface import Placed
 from services.contacts.tracking import Tracker
 from services.describe import geometry
 from services.estimation.quality import SURE
+from services.estimation.within_scan import CHANGING_FRAMES
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
 
@@ -67,6 +68,7 @@ class Publishing(Stage):
     def _forget(self) -> None:
         """Nothing is known of what touches."""
         self._known = self._touched = False
+        self._changing = 0  # frames in a row that said so
         self._seen_in = (ANY, -1)  # session and scan of the image that the contacts were seen in
         self._contacts: list[Contact] = []  # of the frame made last, strongest first; those that ended come last
         self._segments: list[Segment] = []  # of the contacts that did not end, in their order
@@ -80,6 +82,7 @@ class Publishing(Stage):
         if not self._tells_force:
             add_reason(out.reasons, "uncalibrated_force")
         self.lacks = not self.held.complete(frame)
+        had = bool(self._segments)
         if not frame.valid and "out_of_distribution" in frame.reasons:
             self._miss(out, "out_of_distribution")
         elif self.lacks:
@@ -99,10 +102,12 @@ class Publishing(Stage):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)
-        # It began during the scan, or nothing of it is to be believed yet.
-        began = not self._touched or not (self._segments or _explained(frame))
-        if frame.touched and began and not frame.held and not self._alone(frame):
+        # It began or went during the scan, or nothing of it is to be believed yet.
+        went = had and self._changing < CHANGING_FRAMES
+        changed = not self._touched or not (self._segments or (_explained(frame) and not went))
+        if out.valid and frame.touched and changed and not frame.held and not self._alone(frame):
             add_reason(out.reasons, "changing")
+        self._changing = self._changing + 1 if "changing" in out.reasons else 0
         self._touched = frame.touched
         explained = out.quality is not None and out.quality >= EXPLAINED
         if any(self.law.impossible(*each) for each in self._drops()) and not explained:
@@ -251,6 +256,7 @@ class Publishing(Stage):
             "tracker": self.tracker.state(),
             "known": self._known,
             "touched": self._touched,
+            "changing": self._changing,
             "reconstructed": self._seen_in[1],
             "held": None if self.held.last is None else _kept(self.held.last),
             "contacts": [asdict(c) for c in self._contacts],
@@ -262,6 +268,7 @@ class Publishing(Stage):
     def load(self, state: dict[str, Any]) -> None:
         self.tracker.load(state["tracker"])
         self._known, self._touched = bool(state["known"]), bool(state.get("touched", False))
+        self._changing = int(state.get("changing", 0))
         self._seen_in = (ANY, int(state.get("reconstructed", -1)))  # older recordings have none
         kept = state.get("held")
         self.held.last = None if kept is None else _image_of(self.skin, kept)

@@ -48,6 +48,8 @@ def common_factor(
         noise = np.sqrt(1.0 + (1.0 + motion) ** 2 + motion**2) * sigma[live]
     found, variance = _fit(change, columns, noise)
     gain = float(found[0])
+    if not variance > 0:  # rounding: what moved is one factor too, so the two cannot be told apart
+        return None
     if not abs(gain) > max(tuning.gain_least, tuning.gain_sigmas * variance**0.5):
         return None
     # Noise is relative: after a factor, the frame's own has it too.

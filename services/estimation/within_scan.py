@@ -20,6 +20,7 @@ from services.estimation.tuning import TUNING
 
 Array = NDArray[np.float64]
 
+CHANGING_FRAMES = 2  # in a row that may be explained by a touch that changes: a press within 0.1 s is over by then
 ENDED = 0.1  # of a touch's largest size, at most which is left of it where it ended
 AS_WELL = 2.0  # times what a changing touch leaves: a touch that did not change does as well
 KNOTS = 4  # moments of a scan between which a touch's size is a line: a force ramp begins or ends in one of three parts

@@ -106,7 +106,10 @@ def test_a_case_counts_what_is_wrong_unseen_named_and_how_soon_it_is_well():
     assert (
         matrix.judged(board, during(), said=True).named == 1 and matrix.judged(board, during(), said=False).named == 0
     )
-    assert matrix.judged(row_of("gain"), during(), said=False).nameable == 0
+    assert matrix.judged(row_of("clipped, silent"), during(), said=False).nameable == 0  # nobody can tell
+    gain = [replace(m, reasons=("gain",)) if 7.5 < m.read_s < 8 else m for m in during()]
+    assert matrix.judged(row_of("gain"), gain, said=False).named == 1
+    assert matrix.judged(row_of("gain"), during(), said=False).named == 0
 
 
 def scene_of(*presses: TimedPress) -> RandomScene:

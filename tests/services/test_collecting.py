@@ -15,7 +15,7 @@ from services.calibration import collecting, presses_csv
 from services.calibration.collecting import Collected, Collector
 from services.calibration.force_fit import CalibrationError
 from services.calibration.force_presses import of_file
-from services.calibration.registration import read_presses
+from services.calibration.presses import read_presses
 from services.contacts.force import Look
 from services.runtime.config import Skin
 from tests.services.stub_skin import StubSkin

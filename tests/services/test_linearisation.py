@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace as replaced
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
 from protocol.frames import RawFrame
 from services import mounting
+from services.contacts import calibration_file
+from services.contacts.force_curve import Curve
 from services.estimation.tare import Baseline
 from services.linearisation import Linearisation
 from services.pipeline import Pipeline, Result
@@ -84,8 +87,22 @@ def iou(result: Result) -> float:
     return metrics.iou(image > 0.5 * image.max(), mask)[0]
 
 
-def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(sheet: MismatchedSheet, bundle: Bundle) -> None:
-    bench = Bench(sheet)
+@pytest.fixture
+def forces(tmp_path: Path, bundle: Bundle) -> Path:
+    """A calibration of forces, made with this bundle."""
+    file = tmp_path / "forces.json"
+    skin = Skin(port="stub", bundle=BUNDLE, frame_id="palm")
+    calibration_file.save(file, calibration_file.Calibration(Curve(12.0)), "palm", skin, bundle)
+    return file
+
+
+def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(
+    sheet: MismatchedSheet, bundle: Bundle, forces: Path
+) -> None:
+    bench = Bench(sheet, calibration=forces)
+    untared = bench.pipeline.pre.info()
+    assert untared is not None and untared["force_law"]["scale"] == 12.0
+    forces.unlink()  # while the service runs: it goes on with what it has read
     before = bench.feed(frames=80)
     assert not before.contact.valid and {"stale_baseline", "touched_at_start"} & set(before.contact.reasons)
     assert bench.pipeline.pre.linearisation.name == "" and not bench.pipeline.pre.linearisation.busy
@@ -97,14 +114,17 @@ def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(sheet: Misma
     info = bench.pipeline.pre.info()
     assert info is not None and info["bundle_hash"] == name != bundle.hash
     assert np.allclose(info["mounting"]["anisotropy"], 0.05, atol=0.03)
+    # Of the bundle as it was loaded, and still what the publisher uses.
+    assert info["calibration_hash"] == untared["calibration_hash"] and info["force_law"] == untared["force_law"]
     touched = bench.feed(TOUCH, frames=6)
     assert touched.contact.valid and iou(touched) > 0.9
     # another process, after a crash
     saved = bench.pipeline.pre.saved()
     assert saved is not None
+    calibration_file.save(forces, calibration_file.Calibration(Curve(12.0)), "palm", bench.skin, bundle)
     again = Preprocessing("palm", bench.skin, bundle)
     again.restore(saved, 1.0)
-    assert again.linearisation.name == name
+    assert again.linearisation.name == name and again.info() is not None
     assert again.baseline_estimator.baseline is not None
     off = Preprocessing("palm", bench.skin.model_copy(update={"tare": TareConfig(calibrate=False)}), bundle)
     with pytest.raises(Exception, match="another bundle"):
@@ -163,6 +183,27 @@ def test_the_switch_and_the_option_turn_it_off(sheet: MismatchedSheet) -> None:
     bench.feed(frames=80)
     assert not bench.pipeline.pre.command("tare", {"calibrate": False})["calibrating"]
     assert not bench.pipeline.pre.linearisation.busy
+
+
+def test_a_tare_without_scikit_fem_is_taken_and_says_that_nothing_was_calibrated(
+    sheet: MismatchedSheet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(sheet)
+    bench.feed(frames=80)
+    with monkeypatch.context() as lacking:
+        lacking.setitem(sys.modules, "skfem", None)
+        answer = bench.pipeline.pre.command("tare", {})
+    assert answer["frames"] == 64 and not answer["calibrating"]
+    assert "scikit-fem is not installed" in answer["problem"] and "service.lock" in answer["problem"]
+    assert answer["problem"] in bench.pipeline.pre.health().messages
+    assert bench.feed(frames=3).delta.calibration == "" and bench.pipeline.pre.baseline_estimator.baseline is not None
+    # what an earlier tare could not do is not said of one that was to calibrate nothing
+    bench.feed(frames=80)
+    assert bench.pipeline.pre.command("tare", {"calibrate": False, "force": True})["problem"] == ""
+    bench.sheet = MismatchedSheet(BUNDLE, named("none"), "stub")
+    bench.feed(frames=80)
+    assert bench.pipeline.pre.command("tare", {"force": True})["problem"] == ""
+    assert not bench.pipeline.pre.health().messages
 
 
 def test_a_calibration_that_inference_cannot_find_makes_frames_invalid(sheet: MismatchedSheet) -> None:

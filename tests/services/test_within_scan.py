@@ -42,7 +42,8 @@ def test_a_touch_that_comes_and_goes_is_valid_and_says_changing_while_it_does(sk
     end = [skin.see(*scan) for scan in pairwise(reversed(up))]
     free = [skin.see(up[0]) for _ in range(6)]
     every = [*begin, *held, *end, *free]
-    assert all(r.contact.valid for r in every), [r.contact.reasons for r in every]
+    # Two frames in a row may be explained by a change: of an end in three scans the last may be refused.
+    assert all(r.contact.valid for r in [*begin, *held, *end[:-1], *free]), [r.contact.reasons for r in every]
     assert not says_changing(held) and not says_changing(free)
     assert says_changing(begin) and says_changing(end) <= 2
     for n, result in enumerate(every):
@@ -50,12 +51,33 @@ def test_a_touch_that_comes_and_goes_is_valid_and_says_changing_while_it_does(sk
             off = np.hypot(*(np.array(contact.position[:2]) - METRES * np.array([touch.x, touch.y])))
             assert off < (0.003 if len(begin) < n < len(begin) + len(held) else 0.015)
     assert all(len(present(r)) == 1 for r in held) and not present(free[-1])
-    # Where it presses all through the scan, either its contact is there or the frame says why not.
-    assert all(present(r) or "changing" in r.contact.reasons for r in [*begin, *end[:-1]])
+    # Where it presses in any part of the scan, its contact is there, or the frame says why not, or is not valid.
+    assert not any(hides(r) for r in [*begin, *end]), [r.contact.reasons for r in [*begin, *end]]
 
 
 def present(result: Result) -> list[object]:
     return [c for c in result.contact.contacts if c.state != "end"]
+
+
+def hides(result: Result) -> bool:
+    """Whether a person would take the frame for one in which nothing touches."""
+    return result.contact.valid and not present(result) and "changing" not in result.contact.reasons
+
+
+@pytest.mark.parametrize("touch", TOUCHES)
+@pytest.mark.parametrize("shares", [(1.0, 0.6, 0.15, 0.0), (1.0, 0.93, 0.5, 0.06), (1.0, 0.3, 0.0)])
+def test_no_frame_hides_a_touch_that_goes_while_it_is_scanned(
+    skin: StubSkin, touch: Shape, shares: tuple[float, ...]
+) -> None:
+    skin.rest(20)
+    down = levels(touch, shares)
+    for _ in range(6):
+        skin.see(down[0])
+    going = [skin.see(*scan) for scan in pairwise(down)]
+    free = [skin.see(levels(touch, (0.0,))[0]) for _ in range(6)]
+    assert [hides(r) for r in going[:-1]] == [False] * (len(going) - 1), [r.contact.reasons for r in going]
+    assert not hides(going[-1]) or shares[-2] < 0.2  # what is left of a faint touch may be too little to be seen
+    assert says_changing(going) <= 2 and all(r.contact.valid and not present(r) for r in free[2:])
 
 
 def says_changing(results: list[Result]) -> int:
