@@ -84,6 +84,12 @@ class Handed:
             ) from None
 
 
+def openable(host: str) -> str:
+    """A host that is listened at, as part of an address to be opened on this computer: "all of them" is none."""
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"[{host}]" if ":" in host else host
+
+
 def _path(text: str | None) -> Path | None:
     return Path(text) if text else None
 

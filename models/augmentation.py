@@ -12,11 +12,12 @@ import numpy.typing as npt
 
 from models.geometry import SkinGeometry
 from models.prereconstruction import Array, Drift, Operator, PreReconstructor
+from models.touch_fit import misfit_factor
 
 # What two meshes or two solvers differ by, of |d|. It is no noise: it looks like the signal of a touch that is not
 # there, a thousandth of what is, and falls off with the Gram matrix's eigenvalues almost as touches do (their power 0.4
 # in amplitude, against 0.5). Independent errors of that size on each channel would bury the corners of every shape.
-MODEL_ERROR, MODEL_ERROR_POWER = 1.2e-3, 0.4
+MODEL_ERROR = 1.2e-3
 SERVICE_DRIFT = Drift(scale=2e-5, contact=1e-4)  # a little less than services allow for at rest
 
 Pixel = TypeVar("Pixel", bound=np.generic)
@@ -117,10 +118,5 @@ def condition(
         live[np.isin(m.pattern, electrodes).any(axis=1)] = False
     estimate = sigma * np.clip(1 + 0.06 * rng.standard_normal(k), 0.7, 1.3)
     operator = pre.condition(estimate, drift=drift, weights=live.astype(float))
-    return Condition(operator, sigma, drift, m.contact, _error(m.gram) * (not exact), live, 64)
-
-
-def _error(gram: Array) -> Array:
-    values, vectors = np.linalg.eigh(gram)
-    profile = np.maximum(values, 0) ** MODEL_ERROR_POWER
-    return np.asarray(MODEL_ERROR * vectors * (profile / np.linalg.norm(profile)))
+    error = MODEL_ERROR * misfit_factor(m.gram.astype(float)) * (not exact)
+    return Condition(operator, sigma, drift, m.contact, error, live, 64)

@@ -34,8 +34,8 @@ def check(name: str) -> None:
         )
 
 
-def settings(name: str, config: ConfigFile, host: str = "") -> str:
-    """What the bridge is told, as JSON. `host`: where it listens, whatever the configuration says."""
+def settings(name: str, config: ConfigFile, host: str = "", port: int = 0) -> str:
+    """What the bridge is told, as JSON. `host`, `port`: where it listens, whatever the configuration says."""
     reach = config.transport()
     told: dict[str, Any] = {
         "skins": {
@@ -49,7 +49,9 @@ def settings(name: str, config: ConfigFile, host: str = "") -> str:
             "operators": _absolute(reach.operators),
             "insecure": reach.insecure,
         },
-        "options": getattr(config, name).model_dump(mode="json") | ({"host": host} if host else {}),
+        "options": getattr(config, name).model_dump(mode="json")
+        | ({"host": host} if host else {})
+        | ({"port": port} if port else {}),
         "log_level": config.logging.level,
     }
     return json.dumps(told)
@@ -59,10 +61,10 @@ def _absolute(path: Any) -> str | None:
     return None if path is None else os.path.abspath(path)
 
 
-def become(name: str, config: ConfigFile, host: str = "") -> None:
+def become(name: str, config: ConfigFile, host: str = "", port: int = 0) -> None:
     """Go on as the bridge, in this very process. Raises MissingExtra."""
     check(name)
-    environment = {**os.environ, "EITSKIN_BRIDGE": settings(name, config, host)}
+    environment = {**os.environ, "EITSKIN_BRIDGE": settings(name, config, host, port)}
     os.chdir(ROOT)
     os.execve(sys.executable, [sys.executable, "-m", f"bridges.{name}"], environment)
 
@@ -71,10 +73,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="services.bridge", description="Starts a bridge, beside a running service.")
     parser.add_argument("name", choices=BRIDGES)
     parser.add_argument("--host", default="", help="where it listens, whatever skin.toml says: in a container")
+    parser.add_argument("--port", type=int, default=0, help="likewise: the one that the container shows to its host")
     args = parser.parse_args()
     logs.setup(f"{args.name}: %(message)s")
     try:
-        become(args.name, load(), args.host)
+        become(args.name, load(), args.host, args.port)
     except (ConfigError, MissingExtra) as why:
         print(f"{args.name}: {why}", file=sys.stderr)
     return 1

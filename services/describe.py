@@ -20,8 +20,24 @@ EVERY_S = 5.0  # but that at most so often
 UNITS = {"z": "ohm", "image": "S/m", "position": "m", "velocity": "m/s", "area_m2": "m^2", "force_n": "N"}
 
 
-def describe(skin: Skin, bundle: Bundle, baseline: Baseline | None, revision: int = 0) -> dict[str, Any]:
-    """The map of an InfoFrame: bundle, geometry, pose, units and, once there is one, the baseline."""
+def force(skin: Skin, bundle: Bundle) -> dict[str, Any]:
+    """The part of the map that says how forces are found. bundle: as it was loaded, which a calibration of forces names
+    whatever a tare finds about the mounting. Read once, at the start, as the publisher does. Raises ConfigError.
+    """
+    law = ForceLaw.of(skin, bundle).describe()
+    file = skin.calibration
+    return {
+        "force_law": law,
+        "calibration_hash": None if file is None else hashlib.sha256(file.read_bytes()).hexdigest(),
+    }
+
+
+def describe(
+    skin: Skin, bundle: Bundle, force: dict[str, Any], baseline: Baseline | None, revision: int = 0
+) -> dict[str, Any]:
+    """The map of an InfoFrame: bundle (the one in use), geometry, pose, units, what `force` said and, once there is
+    one, the baseline.
+    """
     found: dict[str, Any] = {
         "bundle": bundle.name,
         "bundle_hash": bundle.hash,
@@ -33,10 +49,7 @@ def describe(skin: Skin, bundle: Bundle, baseline: Baseline | None, revision: in
         "pose": [*skin.pose.position_m, *skin.pose.quaternion_xyzw],
         "surface": None if skin.surface is None else skin.surface.model_dump(),
         "units": UNITS,
-        "force_law": ForceLaw.of(skin, bundle).describe(),
-        "calibration_hash": None
-        if skin.calibration is None
-        else hashlib.sha256(skin.calibration.read_bytes()).hexdigest(),
+        **force,
     }
     if baseline is not None:
         found |= {"baseline": baseline.z0, "baseline_sigma": baseline.sigma, "baseline_hash": baseline.hash}

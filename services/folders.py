@@ -10,6 +10,7 @@ is left as it is. Exit 1, and why, for anything else.
 from __future__ import annotations
 
 import os
+import stat
 import sys
 from pathlib import Path, PurePosixPath
 
@@ -27,7 +28,7 @@ def hand_over(folder: str, name: str, uid: int, gid: int, mounts: str) -> str:
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         owner = os.fstat(fd).st_uid
-        if owner == uid:
+        if owner == uid and (uid != 0 or stat.S_IMODE(os.fstat(fd).st_mode) == MODE or os.listdir(fd)):
             return f"{name} belongs to user {uid} already"
         if owner != 0:
             raise NotOurs(f"{name} belongs to user {owner}, expected {uid}: choose another folder")

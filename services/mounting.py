@@ -8,6 +8,7 @@ its own; what it finds is kept in the runtime folder and adopted between two fra
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import subprocess
 import sys
@@ -56,6 +57,18 @@ def needs_fit(baseline: Baseline, bundle: Bundle) -> bool:
     )
 
 
+def missing_package() -> str:
+    """ "" or why no fit can be made here: the meshes' package comes with the extra `stub`, which a service that only
+    measures may lack.
+    """
+    if importlib.util.find_spec("skfem") is not None:
+        return ""
+    return (
+        "the skin could not be calibrated: scikit-fem is not installed; install requirements/service.lock and run "
+        "`skin tare` again"
+    )
+
+
 class MountingFit:
     """One fit at a time, in a process of its own. `poll` never waits."""
 
@@ -75,7 +88,9 @@ class MountingFit:
     def start(self, baseline: Baseline) -> None:
         """Begin with the mean of an untouched skin's frames; a fit that is under way is dropped."""
         self.stop()
-        self.problem = ""
+        self.problem = missing_package()
+        if self.problem:
+            return
         try:
             self._begin(baseline)
         except OSError as why:  # no room, no process: the bundle is used as it is
@@ -119,6 +134,7 @@ class MountingFit:
         return found
 
     def stop(self) -> None:
+        self.problem = ""  # of an earlier tare
         if self._process is not None:
             self._process.kill()
             self._process.wait()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
-from services.describe import BaselineNews, describe
+from services.describe import BaselineNews, describe, force
 from services.estimation import checks
 from services.estimation.baseline import believed
 from services.estimation.contact_drift import Reference
@@ -60,6 +60,7 @@ class Preprocessing(Stage):
         self.frame_averager = FrameAverager()
         self._news = BaselineNews()
         self._unchecked = checks.sentence(bundle)
+        self._force = force(skin, bundle)
         self.sentinel_scans = SentinelScans(skin, bundle)
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
         self.reset()
@@ -249,7 +250,7 @@ class Preprocessing(Stage):
         wanted = self.config.tare.calibrate and bool(args.get("calibrate", True))
         calibrating = wanted and self.linearisation.tared(baseline)
         answer = {"frames": baseline.frames, "snr_db": -20 * np.log10(max(relative, 1e-12)), "hash": baseline.hash}
-        return answer | {"calibrating": calibrating}
+        return answer | {"calibrating": calibrating, "problem": self.linearisation.problem if wanted else ""}
 
     def state(self) -> dict[str, Any]:
         return {
@@ -315,7 +316,8 @@ class Preprocessing(Stage):
     def info(self) -> dict[str, Any] | None:
         if not self._news(self.baseline_estimator.baseline, self.baseline_estimator.last_sample_ns):
             return None
-        said = describe(self.config, self.bundle, self.baseline_estimator.baseline, self.baseline_estimator.revision)
+        estimator = self.baseline_estimator
+        said = describe(self.config, self.bundle, self._force, estimator.baseline, estimator.revision)
         return said | {"mounting": self.linearisation.found} if self.linearisation.found else said
 
     def health(self) -> Health:

@@ -13,7 +13,7 @@ from foxglove import Capability, Context
 
 from bridges.clock import WallClock
 from bridges.feeds import ContactFeed, ImageFeed, Measured, Refusal
-from bridges.process import Bridge, BridgedSkin, BridgeError, Handed
+from bridges.process import Bridge, BridgedSkin, BridgeError, Handed, openable
 from protocol.frames import InfoFrame, ShapeFrame
 from protocol.sockets import AllReader, NewestReader
 from protocol.transport import Socket
@@ -140,10 +140,9 @@ class FoxgloveBridge(Bridge):
             raise BridgeError(f"no Foxglove server at {host}:{port}: {why}; see [foxglove] in skin.toml") from None
         self._door = None if alone else Door(host, port, self._server.port, self.token)
         self.port = self._server.port if self._door is None else self._door.port
-        shown = f"[{host}]" if ":" in host else host
         suffix = "" if alone else f"/?token={self.token}"
         print(
-            f"foxglove: open ws://{shown}:{self.port}{suffix} in Foxglove (Open connection); "
+            f"foxglove: open ws://{openable(host)}:{self.port}{suffix} in Foxglove (Open connection); "
             f'services ask for "token": "{self.token}"',
             flush=True,
         )

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 from aiohttp import web
 
-from bridges.process import Bridge, BridgeError, Handed
+from bridges.process import Bridge, BridgeError, Handed, openable
 from protocol.transport import Socket
 
 from .commands import token
@@ -35,8 +35,7 @@ class PageBridge(Bridge):
         self._stop = asyncio.Event()
         self._thread = threading.Thread(target=self._serve, args=(listening,), name="server", daemon=True)
         self._thread.start()
-        name = f"[{settings.host}]" if ":" in settings.host else settings.host
-        self.address = f"http://{name}:{self._server.port}"
+        self.address = f"http://{openable(settings.host)}:{self._server.port}"
         print(f"look at the skin, and press it, at {self.address}/#{secret}", flush=True)
 
     def _serve(self, listening: socket.socket) -> None:

@@ -20,7 +20,7 @@ from services.contacts.force import ForceLaw, Look
 from services.contacts.segmentation import segment
 from services.pipeline import Pipeline
 from services.recordings.npz_file import InputError, load_npz, read_input
-from services.recordings.reconstruction import baseline_of, raw_frame
+from services.recordings.reconstruction import baseline_of, mounted_bundle, raw_frame
 from services.runtime.config import Skin
 
 STEADY_S = 1.5  # how long a press must have been steady
@@ -116,7 +116,8 @@ def wait_for_release(reader: Reader, clock: Callable[[], float], patience_s: flo
 
 
 def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None]) -> Callable[[int], Look]:
-    """What the image of each row of a file of measurements shows; that function raises ValueError.
+    """What the image of each row of a file of measurements shows; that function raises ValueError. Images are those
+    that the service makes after a tare: with the skin as it is mounted, found from the untouched rows.
 
     Raises CalibrationError.
     """
@@ -129,6 +130,8 @@ def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None])
         raise CalibrationError(str(why) if str(path) in str(why) else f"{path}: {why}") from None
     assert data.untouched is not None  # read_input sees to it
     skin = skin.model_copy(update={"calibration": None})
+    if skin.tare.calibrate:
+        bundle = mounted_bundle(data.untouched, bundle, warn)
     pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
     baseline = baseline_of(data.untouched, pipeline.pre.pre, warn)
 

@@ -150,3 +150,5 @@ def tare(
         print(f"new baseline from {answer['frames']} frames, {answer['snr_db']:.1f} dB")
         if answer.get("calibrating"):
             print("fitting how the skin is mounted: used once it is found and nothing touches; `skin doctor` says what")
+        elif answer.get("problem"):
+            print(answer["problem"])

@@ -35,6 +35,7 @@ def up(
 
     found = load()
     _check_mismatches(found)
+    _check_calibrations(found)
     for name in found.bridges:
         check(name)
     wanted = [p for p in programs(found) if not (no_board and p.name in ("acquisition", "stub"))]
@@ -59,6 +60,16 @@ def _check_mismatches(config: ConfigFile) -> None:
                 fail(
                     f"{config.path}: skins.{name}.mismatch: found {skin.mismatch!r}; allowed: {', '.join(NAMED)}", USAGE
                 )
+
+
+def _check_calibrations(config: ConfigFile) -> None:
+    """Refuse a calibration of forces that cannot be used, likewise. Raises BundleError, ConfigError."""
+    for name, skin in config.skins.items():
+        if skin.calibration is not None:
+            from models.bundle import Bundle
+            from services.contacts.force import ForceLaw
+
+            ForceLaw.of(skin, Bundle.load(skin.bundle), name)
 
 
 def _addresses(transport: Transport, processes: list[str]) -> str:

@@ -24,7 +24,7 @@ from bridges.page.advice import ADVICE
 from bridges.page.replays import Replay, ReplayRefused, listed
 from bridges.page.server import PageServer
 from bridges.page.settings import PageSettings
-from bridges.process import BridgeError, Handed
+from bridges.process import BridgeError, Handed, openable
 from protocol.frames import REASONS, ContactFrame, Frame, ImageFrame, unpack
 from protocol.sockets import ControlServer, Publisher
 from protocol.transport import Transport
@@ -341,6 +341,17 @@ def test_the_settings_in_skin_toml_reach_it() -> None:
     found = PageSettings.of(Handed.read(handed("page", load(ROOT / "skin.toml"))))
     assert found.skins == ("palm",) and found.port == 8080 and found.local
     assert json.loads(handed("page", load(ROOT / "skin.toml")))["options"]["host"] == "127.0.0.1"
+    inside = PageSettings.of(Handed.read(handed("page", load(ROOT / "skin.toml"), "0.0.0.0", 9000)))
+    assert (inside.host, inside.port) == ("0.0.0.0", 9000), "what a container's command says"
+
+
+@pytest.mark.parametrize(
+    ("host", "shown"),
+    [("127.0.0.1", "127.0.0.1"), ("0.0.0.0", "127.0.0.1"), ("::", "[::1]"), ("fe80::1", "[fe80::1]"), ("lan", "lan")],
+)
+def test_the_printed_address_is_one_that_the_page_answers_to(host: str, shown: str) -> None:
+    assert openable(host) == shown
+    assert f"{shown}:0" in PageServer(settings(host=host), SECRET, lambda skin, measured_ns: None).names
 
 
 def test_what_the_page_of_the_page_configures_is_understood() -> None:

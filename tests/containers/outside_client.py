@@ -2,19 +2,24 @@
 
 Run beside `docker compose --profile demo up` with $EITSKIN_RUNTIME pointing at the folder of the sockets:
 
-    python tests/containers/outside_client.py
+    python tests/containers/outside_client.py [page] [ros2] [foxglove]
 
-Plain pyzmq and msgpack, as a stranger would write it. Exit 0 when all was seen; needs the right to kill a
-container's process.
+which names the bridges whose profiles are up too: they are looked at and killed as well. Plain pyzmq, msgpack and
+aiohttp, as a stranger would write it. Exit 0 when all was seen; needs the right to kill a container's process.
 """
 
+import asyncio
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
+from pathlib import Path
 
+import aiohttp
 import msgpack
 import zmq
 
@@ -80,7 +85,66 @@ def kill(name: str) -> None:
     os.kill(int(pid), signal.SIGKILL)
 
 
+async def page_shows(base: str) -> bool:
+    """Whether the page shows frames to who has its token, and to nobody else."""
+    token = (Path(RUNTIME) / "page.token").read_text().strip()
+    async with aiohttp.ClientSession(headers={"Origin": base}) as session:
+        for query in ("", "?token=wrong"):
+            async with session.get(f"{base}/live{query}") as refused:
+                if refused.status != 403:
+                    sys.exit(f"the page without its token: found HTTP {refused.status}, expected 403")
+        async with session.ws_connect(f"{base}/live?token={token}") as socket:
+            await socket.send_json({"skin": "palm", "want": ["contact"]})
+            async with asyncio.timeout(5):
+                while msgpack.unpackb(await socket.receive_bytes())["kind"] != "frames":
+                    pass
+    return True
+
+
+def status_of(address: str) -> int:
+    try:
+        with urllib.request.urlopen(address, timeout=2) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as refused:
+        return refused.code
+
+
+def heartbeat(name: str) -> bool:
+    """Whether a process answers the command `status`."""
+    request = zmq.Context.instance().socket(zmq.REQ)
+    request.setsockopt(zmq.LINGER, 0)
+    request.connect(f"ipc://{RUNTIME}/{name}.ctl")
+    request.send(msgpack.packb({"command": "status", "args": {"skin": "palm"}}))
+    answered = bool(request.poll(1000)) and msgpack.unpackb(request.recv())["ok"]
+    request.close()
+    return answered
+
+
+def works(bridge: str) -> bool:
+    if bridge == "page":
+        base = f"http://127.0.0.1:{os.environ.get('EITSKIN_PAGE_PORT', '8080')}"
+        return status_of(base) == 200 and asyncio.run(page_shows(base))
+    if bridge == "foxglove":
+        return status_of("http://127.0.0.1:8765") == 403  # its door asks for a token
+    return heartbeat(bridge)
+
+
+def until_works(bridge: str) -> float:
+    """Seconds until a bridge does what it is for."""
+    start, why = time.monotonic(), ""
+    while time.monotonic() - start < 30:
+        try:
+            if works(bridge):
+                return time.monotonic() - start
+        except (OSError, TimeoutError, TypeError, aiohttp.ClientError) as found:  # TypeError: it closes
+            why = f": {type(found).__name__}: {found}"
+        time.sleep(0.1)
+    sys.exit(f"{bridge} does not work within 30 s{why}")
+
+
 def main() -> None:
+    if unknown := set(sys.argv[1:]) - {"page", "ros2", "foxglove"}:
+        sys.exit(f"no bridge {', '.join(sorted(unknown))}: expected page, ros2, foxglove")
     if not shutil.which(ENGINE):
         sys.exit("neither docker nor podman found: run this beside a running compose project")
     socket = contacts()
@@ -107,6 +171,11 @@ def main() -> None:
         print(f"{name} killed: valid frames again after {0.4 + back:.1f} s" + (", new session" if new else ""))
         if name == "publisher" and not new:
             sys.exit("the publisher came back with its old session")
+    for name in sys.argv[1:]:
+        until_works(name)
+        kill(name)
+        time.sleep(0.3)
+        print(f"{name} works; killed: works again after {0.3 + until_works(name):.1f} s")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,9 @@ from typing import Any
 
 import yaml
 
+from protocol.topics import BRIDGES
+from services.runtime.config import load
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -18,8 +21,8 @@ def services(name: str) -> dict[str, dict[str, Any]]:
 def test_no_process_has_a_network_and_the_stub_shares_acquisitions_loopback() -> None:
     modes = {name: service["network_mode"] for name, service in services("docker-compose.yml").items()}
     assert modes.pop("stub") == "service:acquisition"
-    bridges = {name: modes.pop(name) for name in ("ros2", "foxglove")}
-    assert bridges == {"ros2": "host", "foxglove": "bridge"}
+    bridges = {name: modes.pop(name) for name in ("page", "ros2", "foxglove")}
+    assert bridges == {"page": "bridge", "ros2": "host", "foxglove": "bridge"}
     assert set(modes.values()) == {"none"}
 
 
@@ -41,9 +44,18 @@ def test_only_the_helper_is_root_and_it_only_hands_folders_over() -> None:
 
 def test_a_bridge_runs_only_where_its_profile_is_named_and_is_seen_by_its_host_alone() -> None:
     found = services("docker-compose.yml")
-    for name in ("ros2", "foxglove"):
+    for name in BRIDGES:
         assert found[name]["profiles"] == [name]
+        assert found[name]["command"][:4] == ["python", "-m", "services.bridge", name]
+    for name in ("ros2", "foxglove"):
         assert found[name]["build"] == {"context": ".", "target": "bridge", "args": {"BRIDGE": name}}
         assert (ROOT / "requirements" / f"{name}.lock").is_file()
-    assert found["foxglove"]["ports"] == ["127.0.0.1:8765:8765"]
-    assert {name for name, service in found.items() if "ports" in service} == {"foxglove"}
+    for name, port in (("page", "${EITSKIN_PAGE_PORT:-8080}"), ("foxglove", "8765")):
+        assert found[name]["ports"] == [f"127.0.0.1:{port}:{port}"]
+        assert found[name]["command"][4:] == ["--host", "0.0.0.0", "--port", port], "whatever skin.toml says"
+    assert {name for name, service in found.items() if "ports" in service} == {"page", "foxglove"}
+
+
+def test_the_page_finds_the_recordings_where_its_section_looks_for_them() -> None:
+    inside = "/opt/eitskin/" + load(ROOT / "skin.toml").page.recordings
+    assert f"${{EITSKIN_RECORDINGS:-./recordings}}:{inside}" in services("docker-compose.yml")["page"]["volumes"]

@@ -53,6 +53,11 @@ COMMANDS = (
     ),
     Row(r"make venv EXTRAS=(ros2|foxglove)", "ci", says="make venv EXTRAS=ros2,foxglove"),
     Row(r"docker compose --profile (ros2|foxglove) up", "ci", says=r"--profile ros2 --profile foxglove up"),
+    Row(
+        "docker compose --profile demo --profile page up",
+        "ci",
+        says=r"docker compose -f \$compose --profile demo --profile page",
+    ),
     Row("docker compose --profile demo up", "ci", says=r"docker compose -f \$compose --profile demo"),
     Row("docker compose up", "ci", says=r"docker compose -f \$compose --profile demo"),
     # pressing, watching

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import re
 import select
@@ -93,6 +94,7 @@ class World:
             stderr=subprocess.STDOUT,
             text=True,
             start_new_session=True,
+            preexec_fn=_ends_with_us,
         )
         try:
             yield process
@@ -102,6 +104,17 @@ class World:
             process.wait()
             if process.stdout is not None:
                 process.stdout.close()
+
+
+LIBC = ctypes.CDLL(None)
+PR_SET_PDEATHSIG = 1
+
+
+def _ends_with_us() -> None:
+    """A command has a session of its own, so nobody else would end it where the tests themselves are killed. It keeps
+    this across exec, and ends what it started as it does after any SIGTERM.
+    """
+    LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 @contextlib.contextmanager

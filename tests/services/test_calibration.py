@@ -18,7 +18,7 @@ from services.calibration.force_presses import laws, wait_for_press, wait_for_re
 from services.contacts import calibration_file as calibration
 from services.contacts.force import ForceLaw, Look
 from services.contacts.force_curve import Curve
-from services.describe import describe
+from services.describe import describe, force
 from services.runtime.config import ConfigError, Indenter, Skin
 
 CONSTANT = 40.0  # N per (S/m)^0.8
@@ -129,9 +129,10 @@ def test_the_file_gives_the_law_back(file: Path, skin: Skin, bundle: Bundle) -> 
 
 
 def test_info_names_the_file(file: Path, skin: Skin, bundle: Bundle) -> None:
-    said = describe(skin.model_copy(update={"calibration": file}), bundle, None)
+    configured = skin.model_copy(update={"calibration": file})
+    said = describe(configured, bundle, force(configured, bundle), None)
     digest = calibration.save(file, fit(presses(25), laws(skin, bundle)), "palm", skin, bundle)
-    again = describe(skin.model_copy(update={"calibration": file}), bundle, None)
+    again = describe(configured, bundle, force(configured, bundle), None)
     assert len(said["calibration_hash"]) == 64 and again["calibration_hash"] == digest
     assert said["force_law"]["calibrated"] and said["force_law"]["of"] == "peak"
 

@@ -60,6 +60,16 @@ def test_what_the_engine_made_is_handed_over(
     assert changed == [(str(made), UID), (str(made), 0o700)]
 
 
+def test_root_itself_gets_what_the_engine_made_for_everybody(tmp_path: Path, changed: list[tuple[str, int]]) -> None:
+    made = folder(tmp_path, "new")
+    made.chmod(0o755)  # the services refuse such a runtime folder
+    assert "now belongs" in hand_over(str(made), "/tmp/new", 0, 0, mounts(made, "/tmp/new"))
+    assert changed == [(str(made), 0), (str(made), 0o700)]
+    (made / "frame").touch()
+    assert "already" in hand_over(str(made), "/tmp/new", 0, 0, mounts(made, "/tmp/new")), "nothing but an empty one"
+    assert len(changed) == 2
+
+
 @pytest.mark.parametrize(
     ("kind", "source", "says"),
     [

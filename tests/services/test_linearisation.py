@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace as replaced
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,10 @@ from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
 from protocol.frames import RawFrame
 from services import mounting
+from services.calibration.force_presses import of_file
+from services.contacts import calibration_file
+from services.contacts.force import ForceLaw
+from services.contacts.force_curve import Curve
 from services.estimation.tare import Baseline
 from services.linearisation import Linearisation
 from services.pipeline import Pipeline, Result
@@ -84,8 +89,22 @@ def iou(result: Result) -> float:
     return metrics.iou(image > 0.5 * image.max(), mask)[0]
 
 
-def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(sheet: MismatchedSheet, bundle: Bundle) -> None:
-    bench = Bench(sheet)
+@pytest.fixture
+def forces(tmp_path: Path, bundle: Bundle) -> Path:
+    """A calibration of forces, made with this bundle."""
+    file = tmp_path / "forces.json"
+    skin = Skin(port="stub", bundle=BUNDLE, frame_id="palm")
+    calibration_file.save(file, calibration_file.Calibration(Curve(12.0)), "palm", skin, bundle)
+    return file
+
+
+def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(
+    sheet: MismatchedSheet, bundle: Bundle, forces: Path
+) -> None:
+    bench = Bench(sheet, calibration=forces)
+    untared = bench.pipeline.pre.info()
+    assert untared is not None and untared["force_law"]["scale"] == 12.0
+    forces.unlink()  # while the service runs: it goes on with what it has read
     before = bench.feed(frames=80)
     assert not before.contact.valid and {"stale_baseline", "touched_at_start"} & set(before.contact.reasons)
     assert bench.pipeline.pre.linearisation.name == "" and not bench.pipeline.pre.linearisation.busy
@@ -97,14 +116,17 @@ def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(sheet: Misma
     info = bench.pipeline.pre.info()
     assert info is not None and info["bundle_hash"] == name != bundle.hash
     assert np.allclose(info["mounting"]["anisotropy"], 0.05, atol=0.03)
+    # Of the bundle as it was loaded, and still what the publisher uses.
+    assert info["calibration_hash"] == untared["calibration_hash"] and info["force_law"] == untared["force_law"]
     touched = bench.feed(TOUCH, frames=6)
     assert touched.contact.valid and iou(touched) > 0.9
     # another process, after a crash
     saved = bench.pipeline.pre.saved()
     assert saved is not None
+    calibration_file.save(forces, calibration_file.Calibration(Curve(12.0)), "palm", bench.skin, bundle)
     again = Preprocessing("palm", bench.skin, bundle)
     again.restore(saved, 1.0)
-    assert again.linearisation.name == name
+    assert again.linearisation.name == name and again.info() is not None
     assert again.baseline_estimator.baseline is not None
     off = Preprocessing("palm", bench.skin.model_copy(update={"tare": TareConfig(calibrate=False)}), bundle)
     with pytest.raises(Exception, match="another bundle"):
@@ -165,6 +187,27 @@ def test_the_switch_and_the_option_turn_it_off(sheet: MismatchedSheet) -> None:
     assert not bench.pipeline.pre.linearisation.busy
 
 
+def test_a_tare_without_scikit_fem_is_taken_and_says_that_nothing_was_calibrated(
+    sheet: MismatchedSheet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(sheet)
+    bench.feed(frames=80)
+    with monkeypatch.context() as lacking:
+        lacking.setitem(sys.modules, "skfem", None)
+        answer = bench.pipeline.pre.command("tare", {})
+    assert answer["frames"] == 64 and not answer["calibrating"]
+    assert "scikit-fem is not installed" in answer["problem"] and "service.lock" in answer["problem"]
+    assert answer["problem"] in bench.pipeline.pre.health().messages
+    assert bench.feed(frames=3).delta.calibration == "" and bench.pipeline.pre.baseline_estimator.baseline is not None
+    # what an earlier tare could not do is not said of one that was to calibrate nothing
+    bench.feed(frames=80)
+    assert bench.pipeline.pre.command("tare", {"calibrate": False, "force": True})["problem"] == ""
+    bench.sheet = MismatchedSheet(BUNDLE, named("none"), "stub")
+    bench.feed(frames=80)
+    assert bench.pipeline.pre.command("tare", {"force": True})["problem"] == ""
+    assert not bench.pipeline.pre.health().messages
+
+
 def test_a_calibration_that_inference_cannot_find_makes_frames_invalid(sheet: MismatchedSheet) -> None:
     bench = Bench(sheet)
     bench.feed(frames=80)
@@ -181,6 +224,23 @@ def _raw(bench: Bench) -> RawFrame:
         skin="palm", scan=999, z=z.astype(np.complex64), status=np.zeros(len(z), np.uint8),
         stamps={"sample": 999 * 45_000_000}, source="board", valid=True, board="b",
     )  # fmt: skip
+
+
+def test_forces_are_calibrated_on_the_images_that_a_tare_leads_to(
+    sheet: MismatchedSheet, bundle: Bundle, tmp_path: Path
+) -> None:
+    press = Shape("circle", -0.5, -0.5, 0.25, 0.3)
+    z0, z = (np.abs(sheet.solve(shapes).impedances()) for shapes in ((), (press,)))
+    noise = NOISE * np.random.default_rng(3).standard_normal((40, len(z)))
+    np.savez(tmp_path / "presses.npz", measurements=z[None], untouched=z0 * (1 + noise))
+
+    def newton(**config: Any) -> float:
+        skin = Skin(port="stub", bundle=BUNDLE, frame_id="palm", **config)
+        look = of_file(tmp_path / "presses.npz", skin, bundle, lambda text: None)(0)
+        return ForceLaw.of(skin, bundle).force(look).newton
+
+    assert newton() == pytest.approx(3.0, rel=0.06)
+    assert newton(tare=TareConfig(calibrate=False)) > 1.15 * 3.0
 
 
 def test_a_calibration_of_another_bundle_or_a_damaged_one_is_refused(bundle: Bundle, sheet: MismatchedSheet) -> None:

@@ -1,0 +1,296 @@
+"""One touch fitted to one frame: place, size, drop and kind, each with its posterior uncertainty (numpy and scipy).
+
+A touch has parameters theta = (x, y, log radius, logit drop, rotation, log aspect), as many as its kind needs.
+The frame is d = f(theta) + e, with f of `touch_response` and e normal of a covariance that the caller knows: noise,
+drift, and what no model gets right. Gauss-Newton steps, damped (Levenberg-Marquardt) and kept only where they raise the
+posterior, lead from the network's answer to the likeliest theta. There the posterior is taken as normal (Laplace),
+which gives each kind's evidence, and so what shape it is (MacKay, "Information Theory, Inference, and Learning
+Algorithms", chapters 27 and 28).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cholesky, solve_triangular
+
+from models.shapes import CLASSES, KINDS, Array, Shape
+from models.touch_response import TouchGrid, TouchResponse, effective_drop
+
+FREE = {"circle": 4, "hertz": 4, "triangle": 5, "rectangle": 6, "square": 5, "L": 5}  # parameters of each kind
+PERIOD = {"triangle": 2 * np.pi / 3, "rectangle": np.pi, "square": np.pi / 2, "L": 2 * np.pi}
+STARTS = {"triangle": 4, "rectangle": 6, "square": 3, "L": 8}  # rotations tried in one period
+TRIED = {"triangle": 2, "rectangle": 2, "square": 2, "L": 4}  # of them, the likeliest, are fitted to the end
+ROUNDER = {"circle": 1.0, "hertz": 1.1, "triangle": 1.55, "rectangle": 1.3, "square": 1.25, "L": 1.4}
+"""Circumscribed radius of each kind over that of the circle of its area."""
+
+# Prior of theta, normal: the ranges of models.scenes.TRAINING, wider. Rotation: any.
+MEAN = np.array([0.0, 0.0, np.log(0.27), -0.9, 0.0, np.log(1.9)])
+SD = np.array([0.6, 0.6, 0.45, 0.9, 3.0, 0.25])
+LOW = np.array([-1.0, -1.0, np.log(0.05), -5.0, -np.inf, 0.0])
+HIGH = np.array([1.0, 1.0, np.log(0.95), 3.5, np.inf, np.log(4.0)])
+MOST = np.array([0.2, 0.2, 0.4, 0.8, 0.5, 0.4])  # of one step
+STEP = np.array([0.02, 0.02, 0.03, 0.0, 0.05, 0.04])  # for derivatives of coverage; place: of the radius
+DONE = 0.05  # a step that raises the posterior by less, in nats times two, is the last
+STEPS = 12
+FLOOR = 1e-4  # of |Z|: no forward model is better
+MISFIT = 3e-3  # of |d|: what the response is wrong by, over the directions that touches make, and in each measurement
+MISFIT_POWER = 0.4  # of the Gram matrix's eigenvalues: that error looks almost as touches do
+UNLIKELY = 12.0  # nats behind the likeliest kind: not fitted further
+
+
+@dataclass(frozen=True)
+class KindFit:
+    """The likeliest touch of one kind. covariance: of theta; misfit: whitened energy it leaves, about K where it fits;
+    evidence: log, nats.
+    """
+
+    kind: str
+    theta: Array
+    covariance: Array
+    misfit: float
+    evidence: float
+
+    @property
+    def shape(self) -> Shape:
+        return shape_of(self.kind, self.theta)
+
+    def drawn(self, rng: np.random.Generator, n: int) -> list[Shape]:
+        """Shapes from the posterior."""
+        theta = rng.multivariate_normal(self.theta, self.covariance, n, method="cholesky")
+        count = len(self.theta)
+        return [shape_of(self.kind, row) for row in np.clip(theta, LOW[:count], HIGH[:count])]
+
+
+@dataclass(frozen=True)
+class TouchPosterior:
+    """What a frame says of one touch. Standard deviations are of the posterior over all kinds that were fitted."""
+
+    fits: tuple[KindFit, ...]  # likeliest first
+    probability: dict[str, float]  # of each of shapes.KINDS that was fitted
+    position: Array  # (2,) centroid, model units
+    position_covariance: Array  # (2, 2)
+    drop: tuple[float, float]  # peak, S: mean and standard deviation
+    integral: tuple[float, float]  # S times square model units
+    area: tuple[float, float]  # square model units
+    measurements: int
+
+    @property
+    def fits_frame(self) -> bool:
+        """Whether the likeliest touch explains the frame: else it is none of these kinds, or more than one."""
+        return bool(self.fits[0].misfit < self.measurements + 4 * (2 * self.measurements) ** 0.5)
+
+    @property
+    def classes(self) -> Array:
+        """(5,) probability of each of shapes.CLASSES; a Hertz contact is a circle."""
+        found = np.zeros(len(CLASSES))
+        for kind, share in self.probability.items():
+            found[0 if kind == "hertz" else CLASSES.index(kind)] += share
+        return found
+
+    def image(self, n: int, draws: int = 24, seed: int = 0) -> Array:
+        """(n, n) posterior mean of the drop: each kind by its probability, drawn from its posterior."""
+        rng, image = np.random.default_rng(seed), np.zeros((n, n))
+        shares = [(fit, self.probability[fit.kind]) for fit in self.fits if self.probability[fit.kind] > 0.5 / draws]
+        whole = sum(share for _, share in shares)
+        for fit, share in shares:
+            shapes = fit.drawn(rng, max(2, round(draws * share)))
+            for shape in shapes:
+                image += share / whole / len(shapes) * shape.drop * shape.fraction(n)
+        return image
+
+
+class TouchFit:
+    """Fits of single touches on one skin."""
+
+    def __init__(self, response: TouchResponse) -> None:
+        self.response = response
+
+    def __call__(
+        self, d: Array, covariance: Array, start: Shape, kinds: Sequence[str] = KINDS, radius: float | None = None
+    ) -> TouchPosterior:
+        """d (K,) with covariance (K, K), as `PreReconstructor.difference` gives it. start: about where and how large.
+        radius: of the indenter, where it is known; model units.
+
+        Raises ValueError where the covariance is none.
+        """
+        frame = _Whitened(self.response, d, covariance)
+        found: list[KindFit] = []
+        for kind in sorted(kinds, key=lambda k: FREE[k]):
+            best = max((fit.evidence for fit in found), default=-np.inf)
+            tried = [frame.fit(kind, theta, radius, best) for theta in self._starts(frame, kind, start, radius)]
+            found += sorted((fit for fit in tried if fit), key=lambda fit: -fit.evidence)[:1]
+        found.sort(key=lambda fit: -fit.evidence)
+        weight = np.exp([fit.evidence - found[0].evidence for fit in found])
+        return _posterior(tuple(found), weight / weight.sum(), len(d))
+
+    def _starts(self, frame: _Whitened, kind: str, start: Shape, radius: float | None) -> list[Array]:
+        """The likeliest rotations, place and area being the start's."""
+        size = radius or float(np.sqrt(start.area / np.pi)) * ROUNDER[kind]
+        drop = float(np.clip(start.drop * (1.2 if kind == "hertz" else 1.0), 0.03, 0.9))
+        x, y = start.centroid
+        theta = np.array([x, y, np.log(size), np.log(drop / (1 - drop)), 0.0, MEAN[5]])[: FREE[kind]]
+        if kind not in PERIOD:
+            return [theta]
+        turned = []
+        for rotation in PERIOD[kind] * np.arange(STARTS[kind]) / STARTS[kind]:
+            theta = theta.copy()
+            theta[4] = rotation
+            theta[:2] += (x, y) - shape_of(kind, theta).centroid  # an L's centroid is not its circle's centre
+            turned.append((frame.misfit(kind, theta), theta))
+        return [theta for _, theta in sorted(turned, key=lambda pair: pair[0])[: TRIED[kind]]]
+
+
+def frame_covariance(gram: Array, sigma: Array, d: Array, tare_frames: int = 64, drift: Array | None = None) -> Array:
+    """(K, K) covariance of d (K,) about what a touch makes of it.
+
+    gram (K, K): the bundle's; sigma (K,): standard deviation of d of one frame; drift (K, K): covariance of what drift
+    since the tare does.
+    """
+    noise = sigma**2 * (1 + 1 / tare_frames) + FLOOR**2 + (MISFIT * d) ** 2
+    factor = MISFIT * float(np.linalg.norm(d)) * misfit_factor(gram)
+    return np.asarray(np.diag(noise) + factor @ factor.T + (0.0 if drift is None else drift))
+
+
+def misfit_factor(gram: Array, power: float = MISFIT_POWER) -> Array:
+    """(K, K) factor of a covariance of trace 1 that lies where touches do: powers of the Gram matrix's eigenvalues."""
+    values, vectors = np.linalg.eigh(gram)
+    profile = np.maximum(values, 0) ** power
+    return np.asarray(vectors * (profile / np.linalg.norm(profile)))
+
+
+class _Whitened:
+    """One frame, whitened."""
+
+    def __init__(self, response: TouchResponse, d: Array, covariance: Array) -> None:
+        try:
+            self._root: Array = cholesky(covariance, lower=True)
+        except LinAlgError as why:
+            raise ValueError(f"a covariance that is none ({why})") from why
+        self._response, self._seen = response, self._white(d)
+        self._grid: TouchGrid | None = None
+
+    def _white(self, values: Array) -> Array:
+        return np.asarray(solve_triangular(self._root, values, lower=True, check_finite=False))
+
+    def _cells(self, shape: Shape) -> TouchGrid:
+        if self._grid is None or not self._grid.holds(shape) or self._grid.side * self._grid.cells > 3.4 * shape.radius:
+            self._grid = self._response.grid(shape.x, shape.y, 1.15 * shape.radius)
+        return self._grid
+
+    def misfit(self, kind: str, theta: Array) -> float:
+        shape = shape_of(kind, theta)
+        grid = self._cells(shape)
+        left = self._seen - self._white(self._response(grid, effective_drop(grid.coverage(shape), shape.drop, kind))[0])
+        return float(left @ left)
+
+    def _linear(self, kind: str, theta: Array) -> tuple[Array, Array]:
+        """(K,) what is left of the frame, and (K, n) the derivative of the response, whitened."""
+        shape = shape_of(kind, theta)
+        grid, drop = self._cells(shape), shape.drop
+        share = grid.coverage(shape)
+        now = effective_drop(share, drop, kind)
+        slope = np.zeros((len(share), len(theta)))
+        slope[:, 3] = (effective_drop(share, drop + 1e-4, kind) - now) * 1e4 * drop * (1 - drop)
+        for k in (0, 1, 2, *range(4, len(theta))):
+            step = np.zeros(len(theta))
+            step[k] = STEP[k] * (shape.radius if k < 2 else 1.0)
+            ahead, behind = (
+                effective_drop(grid.coverage(shape_of(kind, theta + sign * step)), drop, kind) for sign in (1, -1)
+            )
+            slope[:, k] = (ahead - behind) / (2 * step[k])
+        moved = np.flatnonzero(np.abs(slope).max(axis=1))
+        d, by_cell = self._response(grid, now, moved)
+        return self._seen - self._white(d), self._white(by_cell @ slope[moved])
+
+    def fit(self, kind: str, theta: Array, radius: float | None, best: float) -> KindFit | None:
+        """The likeliest touch of a kind near theta; None where it is so far behind the evidence `best` that it need
+        not be known.
+        """
+        count = len(theta)
+        mean, sd = MEAN[:count].copy(), SD[:count]
+        if count > 4:
+            mean[4] = theta[4]
+        held = np.arange(count) == 2 if radius else np.zeros(count, dtype=bool)  # a known size stays as it is
+        information = np.where(held, 1e12, 1 / sd**2)
+        if radius:
+            mean[2] = np.log(radius)
+        occam = float(np.log(sd[~held]).sum())
+        left, slope = self._linear(kind, theta)
+
+        def penalty(left: Array, theta: Array) -> float:
+            return float(left @ left + (information * (theta - mean) ** 2).sum())
+
+        cost, damping = penalty(left, theta), 1e-3
+        for step_number in range(STEPS):
+            if step_number == 3 and -0.5 * cost < best - 4 * UNLIKELY:
+                return None
+            hessian = slope.T @ slope + np.diag(information)
+            step = np.linalg.solve(
+                hessian + damping * np.diag(np.diag(hessian)), slope.T @ left - information * (theta - mean)
+            )
+            step *= min(1.0, float((MOST[:count] / np.maximum(np.abs(step), 1e-9)).min()))
+            there = np.clip(theta + step, LOW[:count], HIGH[:count])
+            left_there, slope_there = self._linear(kind, there)
+            cost_there = penalty(left_there, there)
+            if cost_there < cost:
+                done = cost - cost_there < DONE
+                theta, left, slope, cost, damping = there, left_there, slope_there, cost_there, damping * 0.3
+                if done:
+                    break
+            else:
+                damping *= 8
+                if damping > 1e2:
+                    break
+        hessian = slope.T @ slope + np.diag(information)
+        free = hessian[np.ix_(~held, ~held)]
+        evidence = -0.5 * cost - 0.5 * float(np.linalg.slogdet(free)[1]) - occam
+        return KindFit(kind, theta, np.linalg.inv(hessian), float(left @ left), evidence)
+
+
+def shape_of(kind: str, theta: Array) -> Shape:
+    turn = float(theta[4]) if len(theta) > 4 else 0.0
+    aspect = float(np.exp(theta[5])) if len(theta) > 5 else 1.0
+    drop = float(1 / (1 + np.exp(-theta[3])))
+    return Shape(kind, float(theta[0]), float(theta[1]), float(np.exp(theta[2])), drop, turn, aspect)
+
+
+def _posterior(fits: tuple[KindFit, ...], probability: Array, measurements: int) -> TouchPosterior:
+    """Moments over kinds: within each by its Gaussian, between them by their difference."""
+    rows = []
+    for fit in fits:
+        shape = fit.shape
+        c = fit.covariance
+        relative = (1 - shape.drop) ** 2 * c[3, 3]  # of the drop
+        area = 4 * c[2, 2]
+        both = relative + area + 4 * (1 - shape.drop) * c[2, 3]
+        rows.append((shape.centroid, c[:2, :2], (shape.drop, relative), (shape.integral, both), (shape.area, area)))
+    position = np.sum([p * row[0] for p, row in zip(probability, rows, strict=True)], axis=0)
+    spread = np.sum(
+        [
+            p * (row[1] + np.outer(row[0] - position, row[0] - position))
+            for p, row in zip(probability, rows, strict=True)
+        ],
+        axis=0,
+    )
+
+    def mixed(k: int) -> tuple[float, float]:
+        values = np.array([row[k][0] for row in rows])
+        variances = values**2 * np.array([row[k][1] for row in rows])
+        mean = float(probability @ values)
+        return mean, float(np.sqrt(probability @ (variances + (values - mean) ** 2)))
+
+    kinds: NDArray[np.str_] = np.array([fit.kind for fit in fits])
+    return TouchPosterior(
+        fits,
+        {str(kind): float(p) for kind, p in zip(kinds, probability, strict=True)},
+        np.asarray(position),
+        np.asarray(spread),
+        mixed(2),
+        mixed(3),
+        mixed(4),
+        measurements,
+    )

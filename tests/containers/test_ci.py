@@ -1,0 +1,30 @@
+"""What CI runs ends where a step fails: the script itself, with programs that only say what they were asked for."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SAYS = """#!/bin/sh
+echo "$(basename "$0") $*"
+case "$(basename "$0") $*" in "$FAILS"*) exit 7 ;; esac
+"""
+PROGRAMS = ("apt-get", "chromium", "g++", "git", "ls", "make", "python3", "roscore", "timeout")
+
+
+@pytest.mark.parametrize(
+    ("fails", "next_step"),
+    [("timeout 900 make ros-venv", "=== make test"), ("make test", "=== the bridge heard by the ROS 2 before")],
+)
+def test_a_step_that_fails_ends_it(tmp_path: Path, fails: str, next_step: str) -> None:
+    for name in PROGRAMS:
+        (tmp_path / name).write_text(SAYS)
+        (tmp_path / name).chmod(0o755)
+    environment = {**os.environ, "PATH": f"{tmp_path}:/usr/bin:/bin", "FAILS": fails}
+    ran = subprocess.run(["bash", ROOT / ".ci" / "run"], env=environment, capture_output=True, text=True, timeout=60)
+    assert fails in ran.stdout, ran.stdout + ran.stderr
+    assert ran.returncode == 7 and next_step not in ran.stdout, ran.stdout + ran.stderr
