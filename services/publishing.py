@@ -103,8 +103,8 @@ class Publishing(Stage):
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)
         # It began or went during the scan, or nothing of it is to be believed yet.
-        went = had and self._changing < CHANGING_FRAMES
-        changed = not self._touched or not (self._segments or (_explained(frame) and not went))
+        doubtful = (had or self.tracker.waits) and self._changing < CHANGING_FRAMES
+        changed = not self._touched or not (self._segments or (_explained(frame) and not doubtful))
         if out.valid and frame.touched and changed and not frame.held and not self._alone(frame):
             add_reason(out.reasons, "changing")
         self._changing = self._changing + 1 if "changing" in out.reasons else 0

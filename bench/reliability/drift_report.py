@@ -54,7 +54,9 @@ AS_WITHOUT, AS_FORCE = 2.0, 1.3  # "as without drift": percentage points of touc
 GATES = {
     **{f"{state} {what}": 0 for state in ("cold", "lost", "aged") for what in ("wrong", "late")},
     "gains untouched false": 0,
+    "gains untouched late": 0,
     "gains held false": 0,
+    "gains held late": 0,
     "history found": AS_WITHOUT,
     "history force": AS_FORCE,
     "history false": 0,

@@ -270,6 +270,12 @@ def test_these_faults_are_named_never_wrong_and_over_in_time(sheet, title):
     assert 100 < score.frames < 190 and figures["unseen"] == 0
 
 
+def test_no_frame_after_a_fault_hides_a_touch_that_waits_to_be_confirmed(sheet):
+    place = matrix.places(2, 5)[1]
+    score = matrix.run_case(sheet, workers.pipeline(), row_of("fifo_overflow"), "held", place, 6)
+    assert score.unseen == score.wrong == score.late == 0
+
+
 def test_without_a_fault_a_skin_says_what_touches(sheet):
     found = availability.session(sheet, workers.pipeline(), "ok", 600, 2).row()
     assert found["touches"] > 1 and found["reported_%"] == 100 and found["valid_%"] > 95 and found["wrong"] == 0
