@@ -34,7 +34,8 @@ def provenance(benchmark: str, arguments: Sequence[str] | None) -> dict[str, Any
     """How a report was made: command, commit, machine. arguments: as `main` was given them (None: the program's);
     where the report goes to is left out.
     """
-    words = ["skin", "bench", benchmark, *(sys.argv[1:] if arguments is None else arguments)]
+    program = sys.argv[3:] if sys.argv[1:2] == ["bench"] else sys.argv[1:]  # of `skin bench NAME`, or of the module
+    words = ["skin", "bench", benchmark, *(program if arguments is None else arguments)]
     if "--out" in words:
         del words[words.index("--out") : words.index("--out") + 2]
     return {"command": " ".join(words), "commit": manifest.commit(), "machine": machine(), "versions": versions()}
