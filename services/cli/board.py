@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import Annotated, Any
 
 import typer
 
-from services.cli.common import USAGE, JsonOption, SkinOption, control, emit, fail, of_service, skin_name
+from services.cli.common import USAGE, CliError, JsonOption, SkinOption, control, emit, fail, of_service, skin_name
+
+EARLY = ": wait"  # in a tare's refusal: too few frames came since the start or the last touch, and more will
 
 Metre = Annotated[float, typer.Option(help="Metres in the skin's frame, origin at its centre.")]
 
@@ -139,11 +142,20 @@ def tare(
     calibrate: Annotated[
         bool, typer.Option(help="Also fit how the skin is mounted, and use matrices that fit it; takes some seconds.")
     ] = True,
+    wait: Annotated[float, typer.Option(min=0.0, help="Seconds to try again for, where too few frames came.")] = 10.0,
     skin: SkinOption = "",
     as_json: JsonOption = False,
 ) -> None:
     """Take a new baseline from the last seconds, in which nothing touched the skin."""
-    answer = control("preprocessing", "tare", skin=skin_name(skin), force=force, calibrate=calibrate, timeout_s=10.0)
+    name, until = skin_name(skin), time.monotonic() + wait
+    while True:
+        try:
+            answer = control("preprocessing", "tare", skin=name, force=force, calibrate=calibrate, timeout_s=10.0)
+            break
+        except CliError as why:
+            if EARLY not in str(why) or time.monotonic() >= until:
+                raise
+        time.sleep(0.25)
     if as_json:
         emit(answer)
     else:
