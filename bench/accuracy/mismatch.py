@@ -46,7 +46,7 @@ LEVELS = ("none", "70")
 UNTOUCHED = 64
 SCORED_AT = 96
 NEWTONS_PER_SIEMENS = 10.0  # of the default force law
-# mean IoU with calibration, noise-free and at 70 dB, as the issue asks; None: no worse than without
+# mean IoU with calibration, noise-free and at 70 dB; None: no worse than without
 WANTED: dict[str, tuple[float | None, float | None]] = {
     "none": (0.93, 0.85),
     "anisotropy5": (0.93, 0.85),
