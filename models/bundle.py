@@ -265,13 +265,16 @@ def _read_matrices(path: Path) -> Matrices:
     missing = [f.name for f in fields(Matrices) if f.name not in data]
     if missing:
         raise BundleError(f"{path} lacks {', '.join(missing)}: build the bundle again")
-    arrays: dict[str, Any] = {f.name: data[f.name] for f in fields(Matrices)}
     try:
-        arrays["scale_index"], arrays["normalisation"] = int(arrays["scale_index"]), str(arrays["normalisation"])
-        arrays["model_error"] = float(arrays["model_error"])
+        return matrices_of({f.name: data[f.name] for f in fields(Matrices)})
     except (TypeError, ValueError) as why:
         raise BundleError(f"{path}: {why}: build the bundle again") from None
-    return Matrices(**arrays)
+
+
+def matrices_of(arrays: Mapping[str, Any]) -> Matrices:
+    """Matrices of what an npz file holds by their names. Raises TypeError or ValueError."""
+    scalars = {"scale_index": int(arrays["scale_index"]), "normalisation": str(arrays["normalisation"])}
+    return Matrices(**{**arrays, **scalars, "model_error": float(arrays["model_error"])})
 
 
 def _read_locator(path: Path, measurements: int) -> LocatorArrays:

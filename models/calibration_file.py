@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.bundle import Bundle
+from models.bundle import Bundle, matrices_of
 from models.bundle_check import Wrong, check
 from models.npz import npz
 from models.prereconstruction import Matrices
@@ -50,10 +50,8 @@ def unpack(packed: bytes, bundle: Bundle) -> Bundle:
         arrays: dict[str, Any] = dict(npz(io.BytesIO(packed), "the calibration", MOST_BYTES))
         said = json.loads(arrays.pop("said").tobytes())
         schema, made_for, skin = said.pop("schema"), said["bundle_hash"], dict(said.pop("skin"))
-        arrays["scale_index"], arrays["normalisation"] = int(arrays["scale_index"]), str(arrays["normalisation"])
-        arrays["model_error"] = float(arrays["model_error"])
         arrays["gram"] = _whole(arrays["gram"], len(arrays["z0"]))
-        matrices = Matrices(**arrays)
+        matrices = matrices_of(arrays)
     except (EitskinError, ValueError, KeyError, TypeError, OSError, AttributeError) as wrong:
         raise CalibrationFileError(f"no calibration ({str(wrong)[:120]}): run `skin tare` again") from None
     if schema != SCHEMA:

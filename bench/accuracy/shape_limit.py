@@ -31,11 +31,11 @@ from models.bundle import Bundle
 from models.prereconstruction import TARE_FRAMES
 from models.scenes import TARGETS, random_shape
 from models.shapes import CLASSES, Shape
+from models.touch_fit import PERIOD
 
 Array = NDArray[np.float64]
 
 PRIOR = replace(TARGETS, kinds=CLASSES, radius=(0.25, TARGETS.radius[1]))
-PERIOD = {"triangle": 2 * np.pi / 3, "rectangle": np.pi, "square": np.pi / 2, "L": 2 * np.pi}
 ANGLES = {"L": 6}  # rotations that a fit begins at
 GRID = 24  # pixels a side, the Jacobian's
 # x, y, radius, drop, rotation, aspect: bounds of the fits, and the steps in which they are taken

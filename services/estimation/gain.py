@@ -31,8 +31,6 @@ def common_factor(
     all. sigma (K,): relative standard deviation of one frame. earlier (K,): |Z| of a frame before `before`,
     where a touch moves: what it changed from there to `before` it may change again, in any amount of MOTION.
     """
-    if earlier is not None:
-        live = live & np.isfinite(earlier) & (earlier > 0)
     count = int(live.sum())
     if count < len(live) / 2:
         return None

@@ -24,6 +24,7 @@ CHANGING_FRAMES = 2  # in a row that may be explained by a touch that changes: a
 ENDED = 0.1  # of a touch's largest size, at most which is left of it where it ended
 AS_WELL = 2.0  # times what a changing touch leaves: a touch that did not change does as well
 KNOTS = 4  # moments of a scan between which a touch's size is a line: a force ramp begins or ends in one of three parts
+PAIRS = tuple(combinations_with_replacement(range(KNOTS), 2))
 TINY = 1e-300  # keeps a touch out that no measurement counts of
 RIDGE = 1e-6  # of a touch's own energy: keeps the fit of its sizes solvable where few measurements count
 
@@ -44,6 +45,7 @@ class ChangingTouch:
         time = np.linspace(0.0, 1.0, self._response.shape[1])  # the scan goes through the pattern in its order
         at = np.linspace(0.0, 1.0, KNOTS)
         self._size = np.maximum(0.0, 1.0 - np.abs(time - at[:, None]) * (KNOTS - 1))  # (KNOTS, K)
+        self._products = np.array([self._size[i] * self._size[j] for i, j in PAIRS]).T  # (K, pairs)
 
     def steady(self, difference: NDArray[np.floating], sigma: NDArray[np.floating]) -> bool:
         """Whether a touch that did not change explains a difference (K,) about as well as one that did. sigma (K,):
@@ -64,9 +66,9 @@ class ChangingTouch:
         if not self.knows or live.sum() < len(d) / 2 or not energy > noise:
             return None
         response, size = self._response * live, self._size
-        products = response**2 @ np.array([size[i] * size[j] for i, j in self._pairs()]).T
+        products = response**2 @ self._products
         gram = np.empty((len(response), KNOTS, KNOTS))
-        for n, (i, j) in enumerate(self._pairs()):
+        for n, (i, j) in enumerate(PAIRS):
             gram[:, i, j] = gram[:, j, i] = products[:, n]
         gram += RIDGE * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(KNOTS) + TINY * np.eye(KNOTS)
         columns, left = np.zeros((len(d), 0)), d
@@ -83,10 +85,6 @@ class ChangingTouch:
                 course = np.array(strength) @ sizes.reshape(-1, KNOTS)
                 return ScanChange(share, bool(course[-1] <= ENDED * course.max()))
         return None
-
-    @staticmethod
-    def _pairs() -> list[tuple[int, int]]:
-        return list(combinations_with_replacement(range(KNOTS), 2))
 
 
 def _counted(difference: NDArray[np.floating], sigma: NDArray[np.floating]) -> tuple[NDArray[np.bool_], Array, float]:
