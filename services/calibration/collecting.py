@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,12 +50,7 @@ class Collector:
         while self._reader.recv(0.0) is not None:  # what was measured before
             pass
         why = "no frame came: start the service with `skin up`"
-        end = self._clock() + self._patience_s
-        while self._clock() < end:
-            pair = self._pair()
-            if pair is None:
-                continue
-            image, z = pair
+        for image, z in self._pairs():
             if image.touched or not image.valid:
                 self._quiet.clear()
                 reasons = f" ({', '.join(image.reasons)})" if image.reasons else ""
@@ -70,12 +65,7 @@ class Collector:
     def pressed(self) -> tuple[Array, Look]:
         """(K,) mean |Z| of the next steady press, and what its image shows. Raises CalibrationError."""
         steady, recent = Steady(), deque[tuple[int, Array]]()
-        end = self._clock() + self._patience_s
-        while self._clock() < end:
-            pair = self._pair()
-            if pair is None:
-                continue
-            image, z = pair
+        for image, z in self._pairs():
             now = image.stamps.get("sample", 0)
             if not image.touched:
                 recent.clear()
@@ -85,6 +75,13 @@ class Collector:
             if (look := steady(image)) is not None:
                 return np.asarray(np.mean([row for _, row in recent], axis=0)), look
         raise CalibrationError(f"no steady press within {self._patience_s:g} s: {steady.trouble}")
+
+    def _pairs(self) -> Iterator[tuple[ImageFrame, Array]]:
+        """Image frames with their scans, until patience ends."""
+        end = self._clock() + self._patience_s
+        while self._clock() < end:
+            if (pair := self._pair()) is not None:
+                yield pair
 
     def _pair(self) -> tuple[ImageFrame, Array] | None:
         """The next image frame and the scan that it comes from."""
