@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from models import data, geometry
-from models.augmentation import Condition, Pixel, Symmetry, random_condition, symmetries
+from models.augmentation import Condition, OwnSkin, Pixel, Symmetry, random_condition, symmetries
 from models.losses import IGNORE, Target
 from models.prereconstruction import Array, PreReconstructor
 from models.shapes import from_rows
@@ -101,12 +101,14 @@ class Batches:
         size: int = 64,
         groups: int = 4,
         bank: int = 96,
+        own: OwnSkin | None = None,
     ) -> None:
         self.samples, self.pre, self.size, self.groups, self.limit = samples, pre, size, groups, bank
         self.rng = np.random.default_rng(seed)
-        self.symmetries = symmetries(skin)
+        self.own = own
+        self.symmetries = symmetries(skin) if own is None else symmetries(skin)[:1]
         self._weigh()
-        self.bank: list[Condition] = [random_condition(pre, self.rng) for _ in range(groups)]
+        self.bank: list[Condition] = [random_condition(pre, self.rng, own) for _ in range(groups)]
 
     def add(self, more: Samples) -> None:
         """Takes further scenes in."""
@@ -121,7 +123,7 @@ class Batches:
         self.cumulated = np.cumsum(KIND_WEIGHT[kind].sum(axis=1) / touches)
 
     def draw(self) -> Batch:
-        fresh = random_condition(self.pre, self.rng)
+        fresh = random_condition(self.pre, self.rng, self.own)
         if len(self.bank) < self.limit:
             self.bank.append(fresh)
         else:

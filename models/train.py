@@ -23,6 +23,7 @@ import torch
 from torch import nn
 
 from models import data, geometry, manifest, samples
+from models.augmentation import OwnSkin
 from models.bundle import Bundle
 from models.evaluation import LEVELS, evaluate, predict
 from models.losses import losses, total
@@ -30,22 +31,30 @@ from models.network import FAST, FULL, MMCNN, NetworkConfig, laid_out
 from models.optim import Muon
 from models.pace import Pace, TrainingBar
 from models.prereconstruction import PreReconstructor
+from models.warm_start import warm
 
 CONFIGS = {"full": FULL, "fast": FAST}
 MUON_RATE, ADAM_RATE = 0.02, 2e-3
 AVERAGE = 0.999
+START_RATE = 0.3  # of those, for a network that goes on from another skin's
 
 
 class Trainer:
     """One network's training state: everything that a checkpoint holds."""
 
     def __init__(
-        self, config: NetworkConfig, batches: samples.Batches, held_out: samples.Samples, seed: int = 0
+        self,
+        config: NetworkConfig,
+        batches: samples.Batches,
+        held_out: samples.Samples,
+        seed: int = 0,
+        start: Path | None = None,
     ) -> None:
         torch.manual_seed(seed)
         self.seed, self.commit = seed, manifest.commit()
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.model = laid_out(MMCNN(config).to(self.device), torch.channels_last)
+        fresh = MMCNN(config) if start is None else warm(start, config, batches)
+        self.model = laid_out(fresh.to(self.device), torch.channels_last)
         self.average = copy.deepcopy(self.model)
         self.config, self.batches, self.held_out = config, batches, held_out
         hidden = [
@@ -59,7 +68,8 @@ class Trainer:
             Muon(hidden, MUON_RATE),
             torch.optim.AdamW(rest, ADAM_RATE, betas=(0.9, 0.98), weight_decay=0.01),
         ]
-        self.rates = [MUON_RATE, ADAM_RATE]
+        share = 1.0 if start is None else START_RATE
+        self.rates = [share * MUON_RATE, share * ADAM_RATE]
         self.elapsed, self.steps = 0.0, 0  # seconds, batches
         self.curve: list[dict[str, Any]] = []
         self.best: dict[str, Any] | None = None
@@ -142,7 +152,9 @@ class Trainer:
         row: dict[str, Any] = {"minutes": self.elapsed / 60, "steps": self.steps, **terms}
         with self.pace.of("held-out"):
             for level, decibel in LEVELS.items():
-                figures = evaluate(predict(self.average), self.held_out, self.batches.pre, decibel)
+                figures = evaluate(
+                    predict(self.average), self.held_out, self.batches.pre, decibel, own=self.batches.own
+                )
                 row |= {f"{k}, {level}": v for k, v in figures.items()}
         row["scenes"] = len(self.batches.samples)
         self.curve.append(row)
@@ -230,10 +242,14 @@ def train(
     threads: int = 1,
     resume: bool = False,
     folder: Path | None = None,
+    own: OwnSkin | None = None,
+    start: Path | None = None,
 ) -> Trainer:
-    """Trains a variant of CONFIGS; leaves the checkpoint and its curves (PNG) behind. folder: see Trainer.run."""
+    """Trains a variant of CONFIGS; leaves the checkpoint and its curves (PNG) behind. folder: see Trainer.run.
+    own: what was measured of this very skin. start: the exported network to go on from.
+    """
     torch.set_num_threads(threads)
-    trainer = Trainer(CONFIGS[variant], samples.Batches(scenes, pre, skin, seed), held_out, seed)
+    trainer = Trainer(CONFIGS[variant], samples.Batches(scenes, pre, skin, seed, own=own), held_out, seed, start)
     if resume:
         trainer.resume(checkpoint)
     size = sum(p.numel() for p in trainer.model.parameters()) / 1e6

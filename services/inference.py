@@ -40,8 +40,9 @@ class Inference(Stage):
         self._network = network(str(path)) if path else OneStep(bundle)
         if isinstance(self._network, Network):
             self._network.check(bundle)
-        # Only a network's image is meant to explain a frame: a one-step image shows where, not how much.
-        self._refuses = isinstance(self._network, Network)
+        # Only a network's image is meant to explain a frame: a one-step image shows where, not how much. Nor is that of
+        # a registered skin: its presses leave too much open, and its locator says how well each touch is explained.
+        self._refuses = isinstance(self._network, Network) and bundle.locator is None
         self.linearisation = Linearisation(name, bundle)
         self._residual = Residual(bundle, to_scale=self._refuses)
         self._changing_touch = ChangingTouch(bundle)  # the bundle's: how a skin is mounted changes 3 % of d by little
