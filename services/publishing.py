@@ -131,7 +131,10 @@ class Publishing(Stage):
             places = [] if self._alone(frame) else self.tracker.expected(now)
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
         if not located:
-            seen = [Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
+            seen = [
+                Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m, _confidence(s))
+                for s in segments
+            ]
         tracks: Sequence[Track | None]
         ended: list[Track] = []
         if self._alone(frame):
