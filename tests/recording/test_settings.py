@@ -18,8 +18,8 @@ from models.bundle import Bundle
 from protocol.frames import RawFrame, pack
 from services.contacts import calibration_file as calibration
 from services.contacts.force_curve import Curve
-from services.recorder import _metadata
 from services.recordings import settings
+from services.recordings.recorder import metadata
 from services.recordings.recording import RecordingError, RecordingReader, RecordingWriter
 from services.recordings.replay import ReplayError
 from services.recordings.replay_session import _configuration, replay_file
@@ -73,7 +73,7 @@ def carried(tmp_path: Path, text: str) -> RecordingReader:
 
 
 def test_the_stages_get_what_they_had_and_no_more(config: ConfigFile, tmp_path: Path) -> None:
-    text = _metadata(["raw"], None)[settings.KEY]
+    text = metadata(["raw"], None)[settings.KEY]
     assert not [word for word in ("SECRET", "tcp://", "47999", "insecure", str(ROOT), "/dev") if word in text]
     reader = carried(tmp_path, text)
     (tmp_path / "SECRET.json").unlink()
