@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import logging
 import math
+import os
 import signal
 import sys
 import threading
@@ -20,7 +21,7 @@ from typing import Any
 
 from protocol import logs, transport
 from protocol.metering import StatusBeat
-from protocol.runtime import AlreadyRunning, RuntimeDirError, lock
+from protocol.runtime import AlreadyRunning, RuntimeDirError, lock, runtime_dir
 from protocol.sockets import ControlServer, Publisher
 from protocol.topics import RECORDER
 from protocol.transport import TransportError
@@ -74,11 +75,12 @@ class RecorderService:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.recorder.record(file_in(self.folder), named_by_time=True)
             self.gave_up = ""
-        else:
-            before = self.status()
-            self.recorder.stop()
-            return {**before, "recording": False}
-        return self.status()
+            _wanted().write_text(str(os.getppid()))
+            return self.status()
+        before = self.status()
+        _wanted().unlink(missing_ok=True)
+        self.recorder.stop()
+        return {**before, "recording": False}
 
     def _snapshot(self, args: dict[str, Any]) -> dict[str, Any]:
         snapshots = self.recorder.snapshots
@@ -148,8 +150,23 @@ class RecorderService:
         self.publisher.close()
 
 
-COUNTED = ("recording", "files", "deleted", "snapshots", "missed", "writing", "held_bytes")
+COUNTED = ("recording", "files", "deleted", "snapshots", "missed", "writing", "held_s", "held_bytes")
 """What status frames say in numbers."""
+
+
+def _wanted() -> Path:
+    """A file that is there while a recording is wanted: after a crash the next recorder goes on in a new file. It names
+    our parent: under another supervisor it means nothing.
+    """
+    return runtime_dir() / "recorder.wanted"
+
+
+def _crashed() -> bool:
+    """Whether the recorder before us was recording when it ended."""
+    try:
+        return _wanted().read_text() == str(os.getppid())
+    except (OSError, ValueError):
+        return False
 
 
 def rotation_of(section: RecorderSection) -> Rotation:
@@ -201,7 +218,7 @@ def _run(args: argparse.Namespace, config: ConfigFile, stop: threading.Event) ->
     if not args.wait:
         folder.mkdir(parents=True, exist_ok=True)
     keeping = keeping_of(section, folder) if args.folder is not None else None
-    path = None if args.wait else args.file or file_in(folder)
+    path = None if args.wait and not _crashed() else args.file or file_in(folder)
     with Recorder(None, args.topics.split(","), args.skin, rotation=rotation_of(section), keeping=keeping) as recorder:
         if path is not None:
             recorder.record(path, named_by_time=args.folder is not None)
@@ -219,6 +236,7 @@ def _run(args: argparse.Namespace, config: ConfigFile, stop: threading.Event) ->
                 if bool(recorder.problem) != full:
                     full = not full
                     log.log(logging.ERROR if full else logging.INFO, "%s", recorder.problem or "recording goes on")
+            _wanted().unlink(missing_ok=True)  # nobody wants it after an ordered end
         finally:
             process.close()
     counts = recorder.writer.counts if recorder.writer is not None else {}

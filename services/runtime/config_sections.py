@@ -139,7 +139,8 @@ class PageSection(Section):
     host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
     port: Annotated[int, Field(ge=1, le=65515, strict=True)] = 8080  # or the first free one of the twenty from there
     names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]{1,253}$")], ...] = ()  # further names it is asked for by
-    recordings: str = "recordings"  # folder of the button Record; "": no button
+    recordings: str = "recordings"  # folder of the button Record where there is no [recorder]; "": no button
+    metrics: Switch = False  # /metrics, for Prometheus
 
 
 class Ros2Section(Section):
