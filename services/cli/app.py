@@ -7,7 +7,20 @@ import sys
 
 import typer
 
-from services.cli import board, bridge, calibrate, collect, export, new_skin, offline, recordings, service, watch
+from services.cli import (
+    board,
+    bridge,
+    calibrate,
+    collect,
+    export,
+    golden,
+    info,
+    new_skin,
+    offline,
+    recordings,
+    service,
+    watch,
+)
 from services.cli.common import FAILED, expected_code, interrupted
 
 app = typer.Typer(
@@ -18,7 +31,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for group in (service, watch, board, recordings, export, calibrate, bridge, collect, new_skin, offline):
+for group in (service, watch, board, recordings, info, golden, export, calibrate, bridge, collect, new_skin, offline):
     group.register(app)
 
 
