@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from models import data, geometry
@@ -20,7 +21,8 @@ from models.shapes import from_rows
 
 N = 96
 GRID = 24
-KIND_WEIGHT = np.array([0.0, 0.85, 1.2, 1.2, 1.2, 1.2, 0.8])  # none, circle, triangle, rectangle, square, L, Hertz
+KIND_WEIGHT = np.array([0.0, 0.85, 1.2, 1.2, 1.2, 1.6, 0.8])  # none, circle, triangle, rectangle, square, L, Hertz
+SMALL_RADIUS, SMALL_WEIGHT = 0.22, 1.4  # touches of a smaller circle are hard, and few
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +49,18 @@ def load(folder: Path, split: str, pre: PreReconstructor, limit: int | None = No
     if pre.m.normalisation == "model":
         gain = np.median(z0 / pre.m.z0, axis=1, keepdims=True)
         d = d * z0 / (gain * pre.m.z0)
-    drop, mask, classes = picture(raw.shapes)
+    drop, mask, classes = picture(raw.shapes, raw.blur)
     return Samples(d.astype(np.float32), drop, mask, classes, raw.shapes)
 
 
 def picture(
-    shapes: npt.NDArray[np.floating],
+    shapes: npt.NDArray[np.floating], blur: npt.NDArray[np.floating] | None = None
 ) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Drop, mask and class pictures of (M, 3, 7) shape rows; see Samples."""
+    """Drop, mask and class pictures of (M, 3, 7) shape rows; see Samples.
+
+    blur (M,): of their edges, model units. A soft touch's mask is its blurred coverage, so that drop is amplitude times
+    mask for it too.
+    """
     m = len(shapes)
     drop = np.zeros((m, N, N), np.float16)
     mask = np.zeros((m, N, N), np.uint8)
@@ -67,6 +73,8 @@ def picture(
             image += shape.drop * (shape.fraction(N) if shape.kind == "hertz" else part)
             coarse = part.reshape(GRID, N // GRID, GRID, N // GRID).mean(axis=(1, 3))
             classes[k][coarse > 0.3] = shape.shape_class
+        if blur is not None and blur[k] > 0:
+            image, covered = (gaussian_filter(p, blur[k] * N / 2, mode="constant") for p in (image, covered))
         drop[k], mask[k] = image, np.round(255 * covered.clip(0, 1))
     return drop, mask, classes
 
@@ -115,10 +123,13 @@ class Batches:
         self._weigh()
 
     def _weigh(self) -> None:
-        """Scenes are drawn by what touches in them: round contacts teach least, and Hertz contacts are circles too."""
+        """Scenes are drawn by what touches in them: round contacts teach least, and Hertz contacts are circles too;
+        the L and small touches are hardest.
+        """
         kind = np.nan_to_num(self.samples.shapes[:, :, 0]).astype(int)
+        small = np.nan_to_num(self.samples.shapes[:, :, 3]) < SMALL_RADIUS
         touches = np.maximum((kind > 0).sum(axis=1), 1)
-        self.cumulated = np.cumsum(KIND_WEIGHT[kind].sum(axis=1) / touches)
+        self.cumulated = np.cumsum((KIND_WEIGHT[kind] * np.where(small, SMALL_WEIGHT, 1.0)).sum(axis=1) / touches)
 
     def draw(self) -> Batch:
         fresh = random_condition(self.pre, self.rng)

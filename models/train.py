@@ -30,10 +30,13 @@ from models.network import FAST, FULL, MMCNN, NetworkConfig, laid_out
 from models.optim import Muon
 from models.pace import Pace, TrainingBar
 from models.prereconstruction import PreReconstructor
+from models.warm_start import BATCHES, NoSuchNetwork, normalised, restored
 
+NUMBERS = ("elapsed", "steps", "curve", "best_score", "best_at", "rates", "start")  # of a checkpoint, and all plain
 CONFIGS = {"full": FULL, "fast": FAST}
 MUON_RATE, ADAM_RATE = 0.02, 2e-3
 AVERAGE = 0.999
+FINE = 0.3  # of the learning rates, where training starts from a trained network
 
 
 class Trainer:
@@ -61,6 +64,7 @@ class Trainer:
         ]
         self.rates = [MUON_RATE, ADAM_RATE]
         self.elapsed, self.steps = 0.0, 0  # seconds, batches
+        self.start: dict[str, Any] = {}  # what the manifest says of where it started
         self.curve: list[dict[str, Any]] = []
         self.best: dict[str, Any] | None = None
         self.best_score, self.best_at = -math.inf, 0.0
@@ -172,16 +176,30 @@ class Trainer:
                 "commit": self.commit,
                 "scenes": len(self.batches.samples),
                 "device": str(self.device),
+                **self.start,
             },
             "model": self.model.state_dict(),
             "average": self.average.state_dict(),
             "best": self.best,
             "optimizers": [o.state_dict() for o in self.optimizers],
-            "numbers": {k: getattr(self, k) for k in ("elapsed", "steps", "curve", "best_score", "best_at")},
+            "numbers": {k: getattr(self, k) for k in NUMBERS},
         }
         part = path.with_suffix(".part")
         torch.save(state, part)
         part.replace(path)
+
+    def start_from(self, bundle: Bundle, variant: str) -> None:
+        """The network of a bundle as the start, with lower learning rates. Raises NoSuchNetwork."""
+        path = bundle.network_path(variant)
+        if path is None:
+            raise NoSuchNetwork(f"the bundle {bundle.name} has no network {variant!r} to start from")
+        model = restored(path.read_bytes(), self.config)
+        batches = [self.batches.draw() for _ in range(BATCHES)]
+        normalised(model, [(b.stack, b.context) for b in batches])
+        for mine in (self.model, self.average):
+            mine.load_state_dict(model.state_dict())
+        self.rates = [FINE * rate for rate in self.rates]
+        self.start = {"from": {"bundle": bundle.hash, "network": bundle.manifest["files"][path.name]}}
 
     def resume(self, path: Path) -> None:
         state = torch.load(path, map_location=self.device, weights_only=True)
@@ -230,12 +248,17 @@ def train(
     threads: int = 1,
     resume: bool = False,
     folder: Path | None = None,
+    start: Bundle | None = None,
 ) -> Trainer:
-    """Trains a variant of CONFIGS; leaves the checkpoint and its curves (PNG) behind. folder: see Trainer.run."""
+    """Trains a variant of CONFIGS; leaves the checkpoint and its curves (PNG) behind. folder: see Trainer.run.
+    start: a bundle whose network is the start, instead of random weights.
+    """
     torch.set_num_threads(threads)
     trainer = Trainer(CONFIGS[variant], samples.Batches(scenes, pre, skin, seed), held_out, seed)
     if resume:
         trainer.resume(checkpoint)
+    elif start is not None:
+        trainer.start_from(start, variant)
     size = sum(p.numel() for p in trainer.model.parameters()) / 1e6
     print(f"{variant}: {size:.2f} M parameters, {len(scenes)} scenes, {trainer.device}", flush=True)
     before = trainer.steps
@@ -257,6 +280,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--from", dest="start", help="the bundle whose network to start from, at a lower rate")
     args = parser.parse_args(argv)
     skin = geometry.load(args.skin)
     folder = args.data or data.WORK / skin.name
@@ -264,8 +288,20 @@ def main(argv: list[str] | None = None) -> None:
     pre = Bundle.load(args.bundle or skin.name).prereconstructor()
     scenes, held_out = (samples.load(folder, split, pre, args.limit) for split in ("train", "valid"))
     more = None if args.limit else folder
+    start = Bundle.load(args.start) if args.start else None
     train(
-        args.variant, skin, pre, scenes, held_out, args.minutes, checkpoint, args.seed, args.threads, args.resume, more
+        args.variant,
+        skin,
+        pre,
+        scenes,
+        held_out,
+        args.minutes,
+        checkpoint,
+        args.seed,
+        args.threads,
+        args.resume,
+        more,
+        start,
     )
 
 
