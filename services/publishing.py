@@ -28,7 +28,6 @@ from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
-UNKNOWN_BELOW = 0.4  # probability of the best class, of five, below which a shape is "unknown"
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 
@@ -197,7 +196,6 @@ class Publishing(Stage):
         if touch is not None and not self.law.exists:
             force, sigma = touch.force_n, None if touch.force_n is None else touch.value_sigma
         best = int(np.argmax(classes)) if classes else -1
-        known = bool(classes) and classes[best] >= UNKNOWN_BELOW
         at = self.place(seen.x, seen.y)
         return Contact(
             id=track.id,
@@ -210,7 +208,7 @@ class Publishing(Stage):
             force_n=force,
             force_sigma_n=sigma,
             wrench=_wrench(at, force or 0.0),
-            shape=SHAPES[best] if known else "unknown",
+            shape=SHAPES[best] if classes else "unknown",  # how sure: its probability
             shape_probability=classes[best] if classes else None,
             confidence=_confidence(s),
             sheet=None if self.place.flat else [seen.x, seen.y],
