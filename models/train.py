@@ -36,7 +36,7 @@ NUMBERS = ("elapsed", "steps", "curve", "best_score", "best_at", "rates", "start
 CONFIGS = {"full": FULL, "fast": FAST}
 MUON_RATE, ADAM_RATE = 0.02, 2e-3
 AVERAGE = 0.999
-FINE = 0.3  # of the learning rates, where training starts from a trained network
+FINE = 0.15  # of the learning rates, where training starts from a trained network
 
 
 class Trainer:
