@@ -130,7 +130,13 @@ def soft_touched(model: Elements, shapes: Sequence[Shape], blur: float) -> Array
 def soft_drop(shapes: Sequence[Shape], blur: float, n: int) -> Array:
     """(n, n) conductivity drop of touches whose edges are blurred (Gaussian, standard deviation `blur` model units)."""
     fine = n * max(1, BLUR_GRID // n)
-    image = np.asarray(ndimage.gaussian_filter(drop_image(shapes, fine), blur * fine / 2, mode="constant"))
+    image, spread = drop_image(shapes, fine), blur * fine / 2
+    reach = int(np.ceil(BLUR_REACH * spread)) + 1
+    window = tuple(
+        slice(max(0, int(there[0]) - reach), int(there[-1]) + reach + 1)
+        for there in (np.flatnonzero(image.any(axis=axis)) for axis in (1, 0))
+    )
+    image[window] = ndimage.gaussian_filter(image[window], spread, mode="constant")
     return np.asarray(image.reshape(n, fine // n, n, fine // n).mean(axis=(1, 3)))
 
 

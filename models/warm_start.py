@@ -79,7 +79,7 @@ def normalised(model: MMCNN, batches: list[tuple[Tensor, Tensor]]) -> None:
         variance = (square - mean**2).clamp_min(1e-8)
         assert normal.running_mean is not None and normal.running_var is not None
         gain = normal.weight / torch.sqrt(normal.running_var + normal.eps)
-        normal.bias += gain * (mean - normal.running_mean)
+        normal.bias.add_(gain * (mean - normal.running_mean))
         normal.weight.copy_(gain * torch.sqrt(variance + normal.eps))
         normal.running_mean.copy_(mean)
         normal.running_var.copy_(variance)
