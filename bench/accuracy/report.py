@@ -52,6 +52,7 @@ TARGETS = (
 )
 CLASSICAL = ("NOSER", "total variation", "Gauss-Newton", "GREIT", "pyEIT")
 OF_CLASSICAL = 0.75  # the short form's gate: mean IoU missed, of what the best classical method misses
+MARKERS = "osD^vP"  # of methods that are not ours, in turn
 RMS = {
     "position_%": "position_rms_%",
     "force_%": "force_rms_%",
@@ -66,8 +67,12 @@ def progress(row: Row) -> None:
 
 
 def text(row: Row, key: str, form: str) -> str:
-    value = row.get(key)
-    return "" if value is None or not np.isfinite(value) else form.format(value)
+    """The figure, and its standard error where the row has one."""
+    value, error = row.get(key), row.get(f"{key}_se")
+    if value is None or not np.isfinite(value):
+        return ""
+    spread = f" +-{form.format(error)}" if error is not None and np.isfinite(error) else ""
+    return form.format(value) + spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,20 +157,29 @@ class Report:
 
         levels = [v for v in ("none", "70") if any(r["level"] == v for r in self.rows)]
         panels = [(v, key, label) for v in levels for key, label in (("mean_iou", "1 - mean IoU"), ("position_%", ""))]
-        figure, axes = plt.subplots(len(levels), 2, figsize=(11, 4.2 * len(levels)), squeeze=False)
+        figure, axes = plt.subplots(len(levels), 2, figsize=(13, 4.2 * len(levels)), squeeze=False)
+        names = list(dict.fromkeys(row["method"] for row in self.rows))
+        colours = plt.get_cmap("tab20").colors  # type: ignore[attr-defined]
+        style = {
+            name: {
+                "marker": "*" if name.startswith("shipped") else MARKERS[k % len(MARKERS)],
+                "ms": 14 if name.startswith("shipped") else 7,
+                "c": colours[k % len(colours)],
+            }
+            for k, name in enumerate(names)
+        }
         for axis, (level, key, _) in zip(axes.ravel(), panels, strict=True):
             for row in (r for r in self.rows if r["level"] == level and r.get(key) is not None):
                 error = 1 - row[key] if key == "mean_iou" else row[key]
-                shipped = row["method"].startswith("shipped")
-                axis.plot(
-                    row["ms"], error, "*" if shipped else "o", ms=13 if shipped else 6, c="C3" if shipped else "C0"
-                )
-                axis.annotate(row["method"], (row["ms"], error), (4, 4), textcoords="offset points", fontsize=7)
-            axis.margins(x=0.25, y=0.1)
+                axis.plot(row["ms"], error, ls="", label=row["method"], **style[row["method"]])
+            axis.margins(x=0.1, y=0.1)
             axis.set(xscale="log", yscale="log", xlabel="CPU time per frame, one thread [ms]")
             axis.set_ylabel("1 - mean IoU" if key == "mean_iou" else "position error [% of side]")
             axis.set_title(Level(level).title)
             axis.grid(True, which="both", alpha=0.3)
-        figure.tight_layout()
+        # One legend beside the panels: names at their points would print over each other.
+        known = {n: h for axis in axes.ravel() for h, n in zip(*axis.get_legend_handles_labels(), strict=True)}
+        figure.tight_layout(rect=(0, 0, 0.78, 1))
+        figure.legend(known.values(), known, loc="center left", bbox_to_anchor=(0.78, 0.5), fontsize=8)
         figure.savefig(path, dpi=120)
         plt.close(figure)
