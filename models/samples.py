@@ -15,6 +15,7 @@ from torch import Tensor
 
 from models import data, geometry
 from models.augmentation import Condition, Pixel, Symmetry, random_condition, symmetries
+from models.device_batches import ConditionTensors, SceneTensors, measured, stacks
 from models.losses import IGNORE, Target
 from models.prereconstruction import Array, PreReconstructor
 from models.shapes import from_rows
@@ -85,19 +86,10 @@ class Batch:
     context: Tensor
     target: Target
 
-    def to(self, device: torch.device) -> Batch:
-        t = self.target
-        layout = torch.channels_last
-        return Batch(
-            self.stack.to(device, memory_format=layout),
-            self.context.to(device),
-            Target(t.drop.to(device), t.mask.to(device), t.classes.to(device)),
-        )
-
 
 class Batches:
-    """Endless random batches. Operators depend on the noise, so a bank of conditions is kept and one is renewed
-    at every batch.
+    """Endless random batches on a device. Operators depend on the noise, so a bank of conditions is kept and one is
+    renewed at every batch.
     """
 
     def __init__(
@@ -109,12 +101,17 @@ class Batches:
         size: int = 64,
         groups: int = 4,
         bank: int = 96,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.samples, self.pre, self.size, self.groups, self.limit = samples, pre, size, groups, bank
-        self.rng = np.random.default_rng(seed)
+        self.rng, self.device = np.random.default_rng(seed), torch.device(device)
+        self._noise = torch.Generator(self.device).manual_seed(seed)
         self.symmetries = symmetries(skin)
         self._weigh()
-        self.bank: list[Condition] = [random_condition(pre, self.rng) for _ in range(groups)]
+        self.bank = [self._fresh() for _ in range(groups)]
+
+    def _fresh(self) -> ConditionTensors:
+        return ConditionTensors(random_condition(self.pre, self.rng), self.device)
 
     def add(self, more: Samples) -> None:
         """Takes further scenes in."""
@@ -130,20 +127,25 @@ class Batches:
         small = np.nan_to_num(self.samples.shapes[:, :, 3]) < SMALL_RADIUS
         touches = np.maximum((kind > 0).sum(axis=1), 1)
         self.cumulated = np.cumsum((KIND_WEIGHT[kind] * np.where(small, SMALL_WEIGHT, 1.0)).sum(axis=1) / touches)
+        s = self.samples
+        self._scenes = SceneTensors(s.d, s.drop, s.mask, s.classes, self.symmetries, self.device)
 
     def draw(self) -> Batch:
-        fresh = random_condition(self.pre, self.rng)
+        fresh = self._fresh()
         if len(self.bank) < self.limit:
             self.bank.append(fresh)
         else:
             self.bank[self.rng.integers(self.limit)] = fresh
-        chosen = self.rng.choice(len(self.bank), self.groups, replace=False)
-        parts = []
-        for c in chosen:
-            index = np.searchsorted(self.cumulated, self.rng.random(self.size // self.groups) * self.cumulated[-1])
-            turned = [self.symmetries[s] for s in self.rng.integers(len(self.symmetries), size=len(index))]
-            parts.append(make(self.samples, index, turned, self.bank[c], self.rng))
-        return join(parts)
+        chosen = [self.bank[c] for c in self.rng.choice(len(self.bank), self.groups, replace=False)]
+        n = self.size // self.groups
+        place = self.rng.random(self.groups * n) * self.cumulated[-1]
+        index = torch.from_numpy(np.searchsorted(self.cumulated, place)).to(self.device)
+        turn = torch.from_numpy(self.rng.integers(len(self.symmetries), size=len(place))).to(self.device)
+        clean, target = self._scenes.pick(index, turn)
+        seen = measured(chosen, clean.reshape(self.groups, n, -1), self._noise)
+        stack, context, scale = stacks(chosen, seen)
+        target.drop /= scale[:, None, None, None]
+        return Batch(stack.contiguous(memory_format=torch.channels_last), context, target)
 
 
 def make(
