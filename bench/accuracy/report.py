@@ -52,6 +52,7 @@ TARGETS = (
 )
 CLASSICAL = ("NOSER", "total variation", "Gauss-Newton", "GREIT", "pyEIT")
 OF_CLASSICAL = 0.75  # the short form's gate: mean IoU missed, of what the best classical method misses
+MARKERS = "osD^vP"  # of methods that are not ours, in turn
 RMS = {
     "position_%": "position_rms_%",
     "force_%": "force_rms_%",
@@ -66,8 +67,12 @@ def progress(row: Row) -> None:
 
 
 def text(row: Row, key: str, form: str) -> str:
-    value = row.get(key)
-    return "" if value is None or not np.isfinite(value) else form.format(value)
+    """The figure, and its standard error where the row has one."""
+    value, error = row.get(key), row.get(f"{key}_se")
+    if value is None or not np.isfinite(value):
+        return ""
+    spread = f" +-{form.format(error)}" if error is not None and np.isfinite(error) else ""
+    return form.format(value) + spread
 
 
 @dataclass(frozen=True, eq=False)
