@@ -5,7 +5,7 @@
     python -m models.build --skin square16 --minutes 3     for CI: proves the path, not the accuracy
     python -m models.build --skin square16 --no-network    matrices only: the services show the one-step image
     python -m models.build --skin square16 --package       trains nothing: ships the checkpoints in models/work/SKIN
-    python -m models.build --skin FOLDER --quick           of what `skin register` wrote: networks of that very skin
+    python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin
 
 Samples and checkpoints stay in models/work/SKIN; a second call uses what is there and makes what is missing.
 """
@@ -24,7 +24,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from models import bundle, calibrate, data, export, geometry, manifest, samples, train, verdict, warped
+from models import (
+    bundle,
+    calibrate,
+    class_temperature,
+    data,
+    export,
+    geometry,
+    manifest,
+    samples,
+    train,
+    verdict,
+    warped,
+)
 from models.augmentation import OwnSkin, random_condition
 from models.evaluation import LEVELS, evaluate, predict
 from models.forward import ForwardModel
@@ -68,16 +80,22 @@ def physics(
     """Matrices of a skin, and the held-out scenes in their normalisation."""
     # With z0 of the model as the divisor, contact impedances off by 30 % change d by 0.2 % instead of 0.5 %; but it
     # takes a converter that reads ohm. Skins recorded in counts of unknown gain a channel divide by their own baseline.
-    measured = "model" if skin.pattern_name == "pairs" else "measured"
-    matrices = linearise(ForwardModel(skin), measured) if model is None else model.matrices
+    normalisation = "model" if skin.pattern_name == "pairs" else "measured"
+    matrices = linearise(ForwardModel(skin), normalisation) if model is None else model.matrices
     held_out = _scenes(scenes, "valid", PreReconstructor(matrices), model)
     return replace(matrices, level=samples.levels(held_out, PreReconstructor(matrices))), held_out
 
 
 def networks(
-    folder: Path, pre: PreReconstructor, held_out: samples.Samples, own: OwnSkin | None = None
+    folder: Path,
+    pre: PreReconstructor,
+    held_out: samples.Samples,
+    presses: calibrate.SolvedPresses | None,
+    own: OwnSkin | None = None,
 ) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Exports the checkpoints in a folder: ONNX of each variant, and what the manifest says about them."""
+    """Exports the checkpoints in a folder: ONNX of each variant, and what the manifest says about them. presses: what
+    the temperature of the class probabilities is fitted to; a registered skin has none of known shapes.
+    """
     made: dict[str, bytes] = {}
     said: dict[str, Any] = {}
     stack, context = calibration(pre, held_out, own=own)
@@ -85,11 +103,16 @@ def networks(
         if not (folder / f"{variant}.pt").is_file():
             continue
         model, state = restore(folder / f"{variant}.pt")
+        shape_class = None
+        if presses is not None:
+            shape_class = class_temperature.seen_classes(presses, pre, predict(model)).said()
+            class_temperature.cooled(model, shape_class["temperature"])
         made[variant] = export.to_onnx(model, stack[:32], context[:32])
         said[variant] = {
             "parameters": sum(p.numel() for p in model.parameters()),
             "multiply_accumulates": multiply_accumulates(model.config),
             "config": model.config.to_dict(),
+            "shape_class": shape_class,
             "training": {
                 **state.get("said", {}),
                 "minutes": round(state["numbers"]["elapsed"] / 60, 1),
@@ -142,15 +165,13 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument(
         "--skin", default="square16", help="a shipped skin, a .toml file, or what `skin register` wrote"
     )
-    parser.add_argument(
-        "--out", type=Path, help="bundle folder (default models/bundles/SKIN; of a registered skin, its own)"
-    )
+    parser.add_argument("--out", type=Path, help="bundle folder (default: models/bundles/SKIN, or what was registered)")
     parser.add_argument("--work", type=Path, help="samples and checkpoints (default models/work/SKIN)")
-    cost = parser.add_mutually_exclusive_group()
-    cost.add_argument("--quick", action="store_true", help="a quarter of an hour in all")
-    cost.add_argument("--minutes", type=float, help="any other budget, for all of it on two idle cores")
-    cost.add_argument("--no-network", action="store_true", help="matrices only")
-    cost.add_argument("--package", action="store_true", help="export the checkpoints there are, train nothing")
+    budget = parser.add_mutually_exclusive_group()
+    budget.add_argument("--quick", action="store_true", help="a quarter of an hour in all")
+    budget.add_argument("--minutes", type=float, help="any other budget, for all of it on two idle cores")
+    budget.add_argument("--no-network", action="store_true", help="matrices only")
+    budget.add_argument("--package", action="store_true", help="export the checkpoints there are, train nothing")
     parser.add_argument("--matrices", type=Path, help="with --package: the bundle the checkpoints were trained with")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)
@@ -160,8 +181,8 @@ def main(argv: list[str] | None = None) -> None:
     model = None if registered is None else warped.warped(registered)
     own = None if model is None else model.own
     name = skin.name if registered is None else registered.path.resolve().name
-    out, work = args.out or (bundle.BUNDLES / name if registered is None else registered.path), args.work
-    work = work or data.WORK / name
+    out = args.out or (bundle.BUNDLES / name if registered is None else registered.path)
+    work = args.work or data.WORK / name
     plan = QUICK if args.quick else Plan.of(args.minutes) if args.minutes else FULL
     if not (args.package or args.no_network):
         print(plan.said(name), flush=True)
@@ -182,17 +203,17 @@ def main(argv: list[str] | None = None) -> None:
         if not args.package:
             scenes = _scenes(work, "train", pre, model)
             start = None if registered is None else warped.start(registered)
-            # One network is enough for a registered skin: what its presses leave open no larger one can know.
-            budget = (("full", plan.full), ("fast", plan.fast)) if start is None else (("full", plan.full + plan.fast),)
-            for variant, minutes in budget:
-                at = work / f"{variant}.pt"
-                train.train(
-                    variant, skin, pre, scenes, held_out, minutes, at, args.seed, args.jobs, own=own, start=start
-                )
-        made, said = networks(work, pre, held_out, own)
-        presses = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4
-        if own is None:  # forces of a registered skin are those of its presses
-            for variant, found in calibrate.uncertainty(skin, pre, made, presses, work / "presses.npz").items():
+            # One network is enough for a registered skin: what its presses leave open no other one can know.
+            trained = (
+                (("full", plan.full), ("fast", plan.fast)) if start is None else (("full", plan.full + plan.fast),)
+            )
+            for variant, minutes in trained:
+                at, seed, jobs = work / f"{variant}.pt", args.seed, args.jobs
+                train.train(variant, skin, pre, scenes, held_out, minutes, at, seed, jobs, start=start, own=own)
+        count, cache = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4, work / "presses.npz"
+        made, said = networks(work, pre, held_out, None if own else calibrate.solve(skin, count, cache=cache), own)
+        if own is None:  # the forces of a registered skin are those of its presses
+            for variant, found in calibrate.uncertainty(skin, pre, made, count, cache).items():
                 said[variant]["uncertainty"] = found
     if "full" in said:
         said["full"]["verdict"] = _verdict(args.skin, pre, held_out, said["full"], own).to_dict()

@@ -1,14 +1,11 @@
-"""A network that goes on from one that was exported: the weights of an ONNX file, in PyTorch again.
+"""A shipped network as the start of further training.
 
-The export folds each batch normalisation into the convolution before it. Here it becomes one again that changes
-nothing: its statistics are measured on batches, and its gain and offset undo them. So the network computes what it
-computed, and learns on as any other.
+A bundle has the network as ONNX, its batch normalisations folded into the convolutions. `restored` puts the weights
+back: exactly, for inference. `normalised` gives each normalisation the statistics of its own convolution on real
+batches, and the scale and offset that undo them, so that training goes on from the same function.
 """
 
 from __future__ import annotations
-
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -17,74 +14,72 @@ from onnx import numpy_helper
 from torch import Tensor, nn
 
 from models.network import MMCNN, NetworkConfig
-from models.samples import Batches
 from protocol.errors import EitskinError
 
-BATCHES = 4  # that statistics are taken over
+BATCHES = 8  # that statistics are taken over
 
 
-class OtherNetwork(EitskinError, ValueError):
-    """An ONNX file does not hold a network of the sizes that are to be trained."""
+class NoSuchNetwork(EitskinError, ValueError):
+    """An ONNX file that is not of this network; says what is missing."""
 
 
-def warm(path: Path, config: NetworkConfig, batches: Batches) -> MMCNN:
-    """The network of an ONNX file, ready to learn on. Raises OtherNetwork."""
+def restored(content: bytes, config: NetworkConfig) -> MMCNN:
+    """The network of an ONNX file that models/export.py wrote, in eval mode. Raises NoSuchNetwork."""
+    graph = onnx.load_model_from_string(content).graph
+    stored = {i.name: torch.from_numpy(np.array(numpy_helper.to_array(i))) for i in graph.initializer}
+    inputs = {n.name: list(n.input) for n in graph.node if n.op_type == "Conv"}
     model = MMCNN(config).eval()
-    weights = _weights(path)
-    norms = {name: layer for name, layer in model.named_modules() if isinstance(layer, nn.BatchNorm2d)}
-    chosen: dict[str, Tensor] = {}
-    for name, value in model.state_dict().items():
-        layer, _, kind = name.rpartition(".")
-        if layer in norms:  # changes nothing until its statistics are known
-            folded = weights.get(f"{layer.rpartition('.')[0]}.0.bias")
-            plain = {"weight": torch.ones_like(value), "running_var": torch.full_like(value, 1.0 - norms[layer].eps)}
-            found = folded if kind == "bias" else plain.get(kind, torch.zeros_like(value))
-        else:
-            found = weights.get(name)
-        if found is None or found.shape != value.shape:
-            held = "nothing" if found is None else f"{list(found.shape)}"
-            raise OtherNetwork(f"{path}: {name}: found {held}, expected {list(value.shape)}: train without --start")
-        chosen[name] = found
-    model.load_state_dict(chosen)
-    with torch.no_grad():
-        _measure(model, norms, batches)
+    state = model.state_dict()
+    for path, module in model.named_modules():
+        if not isinstance(module, nn.Sequential) or len(module) < 2 or not isinstance(module[1], nn.BatchNorm2d):
+            continue
+        found = inputs.get(_node(path))
+        if found is None or len(found) < 3:
+            raise NoSuchNetwork(f"the file has no convolution {_node(path)!r}: it is of another network than {config}")
+        normal = module[1]
+        stored[f"{path}.0.weight"], stored[f"{path}.1.bias"] = stored[found[1]], stored[found[2]]
+        stored[f"{path}.1.weight"] = torch.full_like(normal.weight.data, (1 + normal.eps) ** 0.5)
+        stored[f"{path}.1.running_mean"] = torch.zeros_like(normal.bias.data)
+        stored[f"{path}.1.running_var"] = torch.ones_like(normal.bias.data)
+        stored[f"{path}.1.num_batches_tracked"] = torch.zeros((), dtype=torch.long)
+    for name, value in state.items():
+        if name not in stored or stored[name].shape != value.shape:
+            found_shape = tuple(stored[name].shape) if name in stored else "nothing"
+            wanted = f"{tuple(value.shape)} in a network of {config}"
+            raise NoSuchNetwork(f"weight {name!r} is {found_shape} in the file, {wanted}")
+    model.load_state_dict({name: stored[name] for name in state})
     return model
 
 
-def _measure(model: MMCNN, norms: dict[str, nn.BatchNorm2d], batches: Batches) -> None:
-    sums = {name: torch.zeros(3, layer.num_features) for name, layer in norms.items()}
+def _node(path: str) -> str:
+    """The exporter's name of the convolution of the pair convolution and normalisation at `path`."""
+    parent, _, last = path.rpartition(".blocks.")
+    return f"/{parent}/blocks.{last}/blocks.{last}.0/Conv" if parent else f"/{path}/{path}.0/Conv"
 
-    def seen(name: str, _: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+
+@torch.no_grad()
+def normalised(model: MMCNN, batches: list[tuple[Tensor, Tensor]]) -> None:
+    """Statistics of every normalisation from (stack, context) batches; the function stays what it was."""
+    seen: dict[nn.BatchNorm2d, list[tuple[Tensor, Tensor]]] = {}
+
+    def keep(module: nn.Module, inputs: tuple[Tensor, ...], _: Tensor) -> None:
+        assert isinstance(module, nn.BatchNorm2d)
         x = inputs[0]
-        sums[name] += torch.stack([torch.ones(x.shape[1]), x.mean((0, 2, 3)), (x**2).mean((0, 2, 3))])
+        seen.setdefault(module, []).append((x.mean((0, 2, 3)), (x**2).mean((0, 2, 3))))
 
-    hooks = [layer.register_forward_pre_hook(partial(seen, name)) for name, layer in norms.items()]
-    for _ in range(BATCHES):
-        batch = batches.draw()
-        model.parts(batch.stack, batch.context)
+    normals = [m for m in model.modules() if isinstance(m, nn.BatchNorm2d)]
+    hooks = [m.register_forward_hook(keep) for m in normals]
+    model.eval()
+    for stack, context in batches:
+        model.parts(stack, context)
     for hook in hooks:
         hook.remove()
-    for name, layer in norms.items():
-        count, first, second = sums[name]
-        mean = first / count
-        variance = (second / count - mean**2).clamp_min(1e-8)
-        layer.running_mean, layer.running_var = mean, variance
-        layer.weight.copy_((variance + layer.eps).sqrt())
-        layer.bias.add_(mean)
-
-
-def _weights(path: Path) -> dict[str, Tensor]:
-    """Every weight by its name in PyTorch. A folded convolution's weights have the name of its node only."""
-    graph = onnx.load(str(path)).graph
-    arrays = {each.name: torch.from_numpy(np.array(numpy_helper.to_array(each))) for each in graph.initializer}
-    found = dict(arrays)
-    for node in graph.node:
-        if node.op_type == "Conv" and node.input[1] in arrays:
-            # "/stage1/blocks.0/blocks.0.0/Conv" is layer stage1.blocks.0.0: each part repeats the one before it
-            name = before = ""
-            for part in node.name.strip("/").split("/")[:-1]:
-                stem = name.removesuffix(before) if part.startswith(f"{before}.") else f"{name}."
-                name, before = (stem + part).lstrip("."), part
-            for kind, given in zip(("weight", "bias"), node.input[1:], strict=False):
-                found[f"{name}.{kind}"] = arrays[given]
-    return found
+    for normal in normals:
+        mean, square = (torch.stack(part).mean(0) for part in zip(*seen[normal], strict=True))
+        variance = (square - mean**2).clamp_min(1e-8)
+        assert normal.running_mean is not None and normal.running_var is not None
+        gain = normal.weight / torch.sqrt(normal.running_var + normal.eps)
+        normal.bias.add_(gain * (mean - normal.running_mean))
+        normal.weight.copy_(gain * torch.sqrt(variance + normal.eps))
+        normal.running_mean.copy_(mean)
+        normal.running_var.copy_(variance)

@@ -78,12 +78,13 @@ def registered(skin: str) -> Bundle | None:
     return found
 
 
-def start(registered: Bundle) -> Path:
-    """The network that training goes on from: this skin's own, else that of its kind, else the shipped square's."""
+def start(registered: Bundle) -> Bundle:
+    """The bundle whose network training goes on from: this skin's own, else that of its kind, else the shipped
+    square's.
+    """
     for each in (registered, *(Bundle.load(name) for name in (registered.name, SHIPPED) if _is_there(name))):
-        path = each.network_path("full")
-        if path is not None:
-            return path
+        if each.network_path("full") is not None:
+            return each
     raise NotRegistered(f"the shipped bundle {SHIPPED} has no network to go on from: restore models/bundles/{SHIPPED}")
 
 
