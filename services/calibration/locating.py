@@ -35,7 +35,7 @@ TELLS = 0.8  # of the spread: depths or forces that are not told better than tha
 MOST_FOR_SECOND = 100  # presses from which the thresholds of further touches are found
 SINGLE = 0.99  # share of single presses that are to count as one touch
 MARGIN = 1.3  # on that threshold
-GAP = 0.2  # variance by which a press that is not explained is off, of the skin's area for each press
+GAP = 0.15  # variance by which a press that is not explained is off, of the skin's area for each press
 POSE_FREEDOM = 2.5  # presses' worth of places that the pose was fitted to: five numbers of two coordinates each
 
 

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models import build, data, warped
-from models.bundle import Bundle
+from models import build, data, manifest, warped
+from models.bundle import Bundle, write
 from models.forward import ForwardModel
 from models.geometry import GeometryError, load
 from models.locator import Locator
 from models.samples import Samples, picture
 from models.shapes import Shape, to_rows
+from protocol.frames import DeltaFrame, ImageFrame
 from services.calibration.register_command import register_presses
 from services.calibration.registration import Similarity
 from services.inference import Inference
@@ -102,6 +103,28 @@ def test_names_and_folders_are_told_apart(registered: Bundle, folder: Path, tmp_
         load(tmp_path)
     with pytest.raises(GeometryError, match="skin register"):
         load(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize(("right", "stated"), [(0.3, False), (0.8, True)])
+def test_shapes_are_stated_only_where_they_were_told_apart(
+    registered: Bundle, tmp_path: Path, right: float, stated: bool
+) -> None:
+    path = Bundle.load("square16").network_path("full")
+    assert path is not None
+    said = {"full": {"held_out": {"noise-free": {"class": right}}}}
+    about = manifest.of_registered(registered, network=said)
+    made = write(tmp_path, about, registered.matrices, {"full": path.read_bytes()}, registered.locator)
+    stage = Inference("own", Skin(port="stub", bundle=str(tmp_path)), made)
+    assert registered.locator is not None
+    sigma = np.full(len(made.pattern), 1e-3)
+    difference = registered.locator.map[100]
+    stack, context, scale = made.prereconstructor().condition(sigma).stack(difference)
+    frame = DeltaFrame(skin="own", touched=True, stack=stack, context=context, scale=scale)
+    frame.difference, frame.sigma = difference.astype(np.float32), sigma.astype(np.float32)
+    (image,) = stage.process(frame, frozenset({"image"}))
+    assert isinstance(image, ImageFrame) and image.image.shape == (96, 96) and len(image.touches) == 1
+    assert bool(image.classes.size) == stated
+    assert "out_of_distribution" not in image.reasons
 
 
 @pytest.mark.slow
