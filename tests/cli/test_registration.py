@@ -153,7 +153,7 @@ def test_few_presses_say_that_they_know_little(bundle: Bundle, reference: Path) 
     found = [locator.locate(d, train.noise)[0] for d in test.difference]
     apart = np.array([[t.x, t.y] for t in found]) - true_places(test.xy, similarity)
     beyond = np.sqrt([a @ np.linalg.solve(t.covariance, a) / NINETY for a, t in zip(apart, found, strict=True)])
-    assert np.mean(beyond <= 1) >= 0.86 and np.mean(beyond > 1.5) <= 0.02
+    assert np.mean(beyond <= 1) >= 0.86 and np.mean(beyond > 1.5) <= 0.05
     far = np.linalg.norm(apart, axis=1) > 0.03  # where it is wrong, it says so
     assert far.sum() > 10 and np.median([t.sigma[0] for t in np.array(found, object)[far]]) > 0.02
 
