@@ -146,7 +146,7 @@ def load(name: str | Path) -> SkinGeometry:
     GeometryError, PatternError.
     """
     path = Path(name) if str(name).endswith(".toml") else SKINS / f"{name}.toml"
-    if not path.is_file() and Path(name, MANIFEST).is_file():
+    if is_folder(name):
         return _of_bundle(Path(name, MANIFEST))
     if not path.is_file():
         raise GeometryError(
@@ -161,6 +161,12 @@ def load(name: str | Path) -> SkinGeometry:
     said = f"unit = {data['unit']!r}" if "unit" in data else "metres_per_unit, half its longer side in metres"
     check_size(skin, f"correct {said} in {path}")
     return skin
+
+
+def is_folder(name: str | Path) -> bool:
+    """Whether a skin is named by the folder of its bundle. A name without a / is a skin's first, whatever lies here."""
+    named = "/" not in str(name) and (SKINS / f"{name}.toml").is_file()
+    return not named and not str(name).endswith(".toml") and Path(name, MANIFEST).is_file()
 
 
 def _of_bundle(path: Path) -> SkinGeometry:

@@ -24,7 +24,7 @@ from scipy import ndimage
 from models.augmentation import OwnSkin
 from models.bundle import BUNDLES, Bundle
 from models.forward import ForwardModel
-from models.geometry import SKINS, from_dict
+from models.geometry import from_dict, is_folder
 from models.linearise import linearise
 from models.locator import Locator
 from models.prereconstruction import Array, Matrices
@@ -67,7 +67,7 @@ def registered(skin: str) -> Bundle | None:
     """The registered bundle in a folder; None where `skin` names a shipped skin or a TOML file. Raises NotRegistered,
     BundleError.
     """
-    if str(skin).endswith(".toml") or (SKINS / f"{skin}.toml").is_file():
+    if not is_folder(skin):
         return None
     found = Bundle.load(Path(skin).resolve())
     if found.locator is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -95,6 +96,13 @@ def test_the_sensitivities_have_the_unit_of_the_scenes(registered: Bundle, model
 
 def test_names_and_folders_are_told_apart(registered: Bundle, folder: Path, tmp_path: Path) -> None:
     assert warped.registered("disc16") is None and warped.registered("some/where.toml") is None
+    with contextlib.chdir(folder.parent):
+        folder.rename("disc16")
+        try:  # the folder has a shipped skin's name: ./ says which is meant
+            assert warped.registered("disc16") is None and load("disc16").metres_per_unit == 0.08
+            assert warped.registered("./disc16") is not None and load("./disc16").metres_per_unit != 0.08
+        finally:
+            Path("disc16").rename(folder)
     assert load(folder).metres_per_unit == registered.metres_per_unit
     with pytest.raises(warped.NotRegistered, match="skin register"):
         warped.registered(str(Bundle.load("disc16").path))
