@@ -17,6 +17,7 @@ from models.bundle import Bundle
 from services.estimation.advice import ADVICE, DRIFTING, OK, OPEN, REASONS, SHORT, SWAPPED, UNKNOWN, listed
 from services.estimation.contact_drift import ChangedContacts, Reference
 from services.estimation.contact_evidence import ContactEvidence, ContactOpinion
+from services.estimation.coverage import Coverage
 from services.estimation.frame_check import MOSTLY, FrameCheck, FrameFindings
 from services.estimation.gain_steps import GainStep
 from services.estimation.saved import shaped
@@ -27,8 +28,6 @@ Mask = NDArray[np.bool_]
 
 QUIET = 5.0  # standard deviations within which a measurement is what it was
 TOO_MANY = 2  # electrodes at fault with which contacts can still be given
-LOST_MOST = 0.1  # share of measurements that a frame may lack beside those of electrodes at fault: with 15 of 120 lost
-# in a row, a touch that they would have seen has two thirds of its force
 WELL_FRAMES = 3  # in a row, after which an electrode counts again
 SUSPECTED = 3  # frames in a row after which a change that may be a touch on the electrode is the contact's
 WELL = 0.0015  # relative: how near its baseline a measurement of a well electrode is, and within 6 sigma more
@@ -59,6 +58,7 @@ class ElectrodeHealth:
         self._contacts = ChangedContacts(bundle, self.member)
         self._bundle = bundle
         self._evidence: ContactEvidence | None = None  # made when it is first asked
+        self._coverage: Coverage | None = None
         k, n = len(bundle.pattern), self.electrodes
         self._all_well = Verdict(np.ones(k, bool), np.zeros(k, bool), np.zeros(n, "u1"), [], True, None, np.zeros(k))
         for array in (v for v in vars(self._all_well).values() if isinstance(v, np.ndarray)):
@@ -119,13 +119,21 @@ class ElectrodeHealth:
         doubtful = bool(self._unsure.any() or self._suspected.any())
         if doubtful and "electrode_drift" not in reasons:
             reasons.append("electrode_drift")
-        enough = live.sum() >= len(live) / 2 and (seen.failed & ~at_fault & known).sum() <= LOST_MOST * len(live)
-        usable = bad <= TOO_MANY and not doubtful and bool(enough)
+        enough = bool(live.sum() >= len(live) / 2) and self._sees_enough(seen, live, ~at_fault & known, untouched)
+        usable = bad <= TOO_MANY and not doubtful and enough
         if bad == TOO_MANY:
             reasons.append("degraded")
         if not usable and not reasons and not reasons_of(status):
             reasons.append("out_of_distribution")
         return Verdict(live, seen.failed | wrong, states, reasons, usable, seen.order, self._shift(seen, untouched))
+
+    def _sees_enough(self, seen: FrameFindings, live: Mask, all_of: Mask, untouched: Reference | None) -> bool:
+        """Returns whether measurements that only this frame lacks leave enough of the skin in sight."""
+        if untouched is None or live.sum() == all_of.sum():
+            return True
+        self._coverage = self._coverage or Coverage(self._bundle)
+        d = np.where(live, seen.amplitude - untouched.z0, 0.0) / untouched.normaliser
+        return self._coverage.enough(d, live, all_of)
 
     def _unchanged(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference) -> bool:
         """Returns whether a frame without a mark differs from the untouched skin by its noise alone, and nothing was at
