@@ -117,8 +117,8 @@ def goals(cores: dict[int, list[float]], times: dict[int, list[float]]) -> list[
     return [
         Goal(f"pipeline's p99 with {MANY} viewers, over none", many["p99"] / none["p99"], at_most=RATIO),
         Goal(f"pipeline's p50 with {MANY} viewers, over none", many["p50"] / none["p50"], at_most=RATIO, gate=GATE),
-        Goal("page's process without a viewer [cores]", middle[0], at_most=0.005),
-        Goal("page's process with one viewer [cores]", middle[1], at_most=0.05),
+        Goal("page's process without a viewer (cores)", middle[0], at_most=0.005),
+        Goal("page's process with one viewer (cores)", middle[1], at_most=0.05),
         Goal(f"page's process with {MANY} viewers, over one", middle[MANY] / max(middle[1], 1e-3)),
     ]
 
