@@ -1,4 +1,4 @@
-"""The picture of docs/method.md: six touches, as they are, as a one-step image shows them, and as the shipped bundle does.
+"""The picture of docs/method.md: six touches: the truth, a one-step image, and what the shipped bundle shows.
 
     python -m bench.picture [--snr 70] [--out docs/touches.png]
 

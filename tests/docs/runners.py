@@ -219,6 +219,7 @@ COMMANDS = (
     Row(r"\./skin limits .*", "help"),
     Row("(./)?skin limits", "slow", says="position", instead="./skin limits"),
     Row("skin bench", "ends", says="accuracy"),
+    Row(r"\.venv/bin/python -m bench.plots", "slow", says="latency.png"),
     Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB"),
     Row(r"(\./)?skin bench (?P<name>\w+)( .*)?", "help"),
     Row(r"\.venv/bin/python -m bench\.speed\.page", "help"),
