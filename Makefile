@@ -13,7 +13,7 @@ TORCH := torch==2.13.0+cpu
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: up venv venv-dev ros-venv test lint site train lock clean
+.PHONY: up venv venv-dev ros-venv test golden lint site train lock wire clean
 
 up: venv
 	./skin up
@@ -56,6 +56,10 @@ $(ROS_VENV)/.done:
 
 test: venv-dev lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+# What recordings of tests/ give now is what they are to give from now on; git diff shows what changed.
+golden: venv-dev
+	./skin golden tests/recording/golden/*.mcap --accept
 
 lint: venv-dev
 	$(BIN)/ruff check .

@@ -9,7 +9,20 @@ from typing import Annotated
 import typer
 
 from protocol import __version__
-from services.cli import board, bridge, calibrate, collect, export, new_skin, offline, recordings, service, watch
+from services.cli import (
+    board,
+    bridge,
+    calibrate,
+    collect,
+    export,
+    golden,
+    info,
+    new_skin,
+    offline,
+    recordings,
+    service,
+    watch,
+)
 from services.cli.common import FAILED, expected_code, interrupted
 
 app = typer.Typer(
@@ -36,7 +49,7 @@ def _of_all_commands(
     """A tactile skin: start it, watch it, press it, record it, reconstruct from files."""
 
 
-for group in (service, watch, board, recordings, export, calibrate, bridge, collect, new_skin, offline):
+for group in (service, watch, board, recordings, info, golden, export, calibrate, bridge, collect, new_skin, offline):
     group.register(app)
 
 
