@@ -13,7 +13,7 @@ TORCH := torch==2.13.0+cpu
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: up venv venv-dev ros-venv test golden lint site train lock wire clean
+.PHONY: up venv venv-dev ros-venv test golden lint site train lock clean
 
 up: venv
 	./skin up

@@ -1,4 +1,4 @@
-"""The picture of docs/method.md: six touches: the truth, a one-step image, and what the shipped bundle shows.
+"""The picture of docs/method.md: six touches as they are, in a one-step image, and as the shipped bundle shows them.
 
     python -m bench.picture [--snr 70] [--out docs/touches.png]
 

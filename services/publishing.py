@@ -11,7 +11,7 @@ import numpy as np
 from models.bundle import Bundle
 from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, LocatedTouch, ShapeFrame
 from protocol.held import ANY, HeldImage
-from services.contacts.contact_writer import ContactWriter, class_probabilities
+from services.contacts.contact_writer import ContactWriter, class_probabilities, confidence
 from services.contacts.force import ForceLaw
 from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
@@ -130,7 +130,7 @@ class Publishing(Stage):
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
         if not located:
             seen = [
-                Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m, _confidence(s))
+                Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m, confidence(s))
                 for s in segments
             ]
         tracks: Sequence[Track | None]

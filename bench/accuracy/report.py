@@ -66,8 +66,12 @@ def progress(row: Row) -> None:
 
 
 def text(row: Row, key: str, form: str) -> str:
-    value = row.get(key)
-    return "" if value is None or not np.isfinite(value) else form.format(value)
+    """The figure, and its standard error where the row has one."""
+    value, error = row.get(key), row.get(f"{key}_se")
+    if value is None or not np.isfinite(value):
+        return ""
+    spread = f" +-{form.format(error)}" if error is not None and np.isfinite(error) else ""
+    return form.format(value) + spread
 
 
 @dataclass(frozen=True, eq=False)

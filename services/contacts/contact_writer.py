@@ -14,8 +14,6 @@ from services.contacts.registered import registered
 from services.contacts.segmentation import Segment
 from services.contacts.surface import Placed, Placement
 
-UNKNOWN_BELOW = 0.4  # probability of the best class, of five, below which a shape is "unknown"
-
 
 class ContactWriter:
     """tells_force: whether the skin's contacts have forces, by a force law or by registration."""
@@ -36,7 +34,6 @@ class ContactWriter:
         if touch is not None and not self.law.exists:
             force, sigma = touch.force_n, None if touch.force_n is None else touch.value_sigma
         best = int(np.argmax(classes)) if classes else -1
-        known = bool(classes) and classes[best] >= UNKNOWN_BELOW
         at = self.place(seen.x, seen.y)
         return Contact(
             id=track.id,
@@ -49,9 +46,9 @@ class ContactWriter:
             force_n=force,
             force_sigma_n=sigma,
             wrench=_wrench(at, force or 0.0),
-            shape=SHAPES[best] if known else "unknown",
+            shape=SHAPES[best] if classes else "unknown",  # how sure: its probability
             shape_probability=classes[best] if classes else None,
-            confidence=_confidence(s),
+            confidence=confidence(s),
             sheet=None if self.place.flat else [seen.x, seen.y],
             **({} if touch is None else registered(touch)),
         )
@@ -88,6 +85,6 @@ def _wrench(at: Placed, force: float) -> list[float]:
     return [*pressed.tolist(), *np.cross(at.point, pressed).tolist()]
 
 
-def _confidence(s: Segment) -> float:
+def confidence(s: Segment) -> float:
     """Probability that the peak is not noise, from its own standard deviation."""
     return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))
