@@ -144,6 +144,13 @@ COMMANDS = (
         instead="./skin record {folder}/all.mcap --overwrite --seconds 1 --topics raw,contact,image,shape,status,info",
     ),
     # recordings, files
+    Row(r"\.venv/bin/python node.py", "ends", instead=".venv/bin/python -c 'import msgpack, zmq'"),  # see PROGRAMS
+    Row(
+        r"\./skin info touch.mcap",
+        "ends",
+        says="contact/palm +[0-9]+",
+        instead="./skin record {folder}/info.mcap --seconds 1 --overwrite && ./skin info {folder}/info.mcap",
+    ),
     Row(
         r"\./skin record touch.mcap --seconds 10",
         "ends",
