@@ -146,7 +146,7 @@ COMMANDS = (
     # recordings, files
     Row(r"\.venv/bin/python node.py", "ends", instead=".venv/bin/python -c 'import msgpack, zmq'"),  # see PROGRAMS
     Row(
-        r"\./skin info touch.mcap",
+        r"(\./)?skin info( touch.mcap)?",
         "ends",
         says="contact/palm +[0-9]+",
         instead="./skin record {folder}/info.mcap --seconds 1 --overwrite && ./skin info {folder}/info.mcap",
