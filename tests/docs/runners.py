@@ -144,6 +144,13 @@ COMMANDS = (
         instead="./skin record {folder}/all.mcap --overwrite --seconds 1 --topics raw,contact,image,shape,status,info",
     ),
     # recordings, files
+    Row(r"\.venv/bin/python node.py", "ends", instead=".venv/bin/python -c 'import msgpack, zmq'"),  # see PROGRAMS
+    Row(
+        r"(\./)?skin info( touch.mcap)?",
+        "ends",
+        says="contact/palm +[0-9]+",
+        instead="./skin record {folder}/info.mcap --seconds 1 --overwrite && ./skin info {folder}/info.mcap",
+    ),
     Row(
         r"\./skin record touch.mcap --seconds 10",
         "ends",
@@ -246,6 +253,7 @@ COMMANDS = (
     Row(r"\./skin limits .*", "help"),
     Row("(./)?skin limits", "slow", says="position", instead="./skin limits"),
     Row("skin bench", "ends", says="accuracy"),
+    Row(r"\.venv/bin/python -m bench.plots", "slow", says="latency.png"),
     Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB"),
     Row(r"(\./)?skin bench (?P<name>\w+)( .*)?", "help"),
     Row(r"\.venv/bin/python -m bench\.speed\.page", "help"),
