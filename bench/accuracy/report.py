@@ -146,40 +146,6 @@ class Report:
         write_json(
             folder / "accuracy.json", {**self.head, "targets": targets, "floors": self.floors, "rows": self.rows}
         )
-        self.draw(folder / "accuracy.png")
+        from bench import plots  # matplotlib takes a while
 
-    def draw(self, path: Path) -> None:
-        """Run time against error: mean IoU missed and position, a panel a noise level for the first."""
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
-
-        levels = [v for v in ("none", "70") if any(r["level"] == v for r in self.rows)]
-        panels = [(v, key, label) for v in levels for key, label in (("mean_iou", "1 - mean IoU"), ("position_%", ""))]
-        figure, axes = plt.subplots(len(levels), 2, figsize=(13, 4.2 * len(levels)), squeeze=False)
-        names = list(dict.fromkeys(row["method"] for row in self.rows))
-        colours = plt.get_cmap("tab20").colors  # type: ignore[attr-defined]
-        style = {
-            name: {
-                "marker": "*" if name.startswith("shipped") else MARKERS[k % len(MARKERS)],
-                "ms": 14 if name.startswith("shipped") else 7,
-                "c": colours[k % len(colours)],
-            }
-            for k, name in enumerate(names)
-        }
-        for axis, (level, key, _) in zip(axes.ravel(), panels, strict=True):
-            for row in (r for r in self.rows if r["level"] == level and r.get(key) is not None):
-                error = 1 - row[key] if key == "mean_iou" else row[key]
-                axis.plot(row["ms"], error, ls="", label=row["method"], **style[row["method"]])
-            axis.margins(x=0.1, y=0.1)
-            axis.set(xscale="log", yscale="log", xlabel="CPU time per frame, one thread [ms]")
-            axis.set_ylabel("1 - mean IoU" if key == "mean_iou" else "position error [% of side]")
-            axis.set_title(Level(level).title)
-            axis.grid(True, which="both", alpha=0.3)
-        # One legend beside the panels: names at their points would print over each other.
-        known = {n: h for axis in axes.ravel() for h, n in zip(*axis.get_legend_handles_labels(), strict=True)}
-        figure.tight_layout(rect=(0, 0, 0.78, 1))
-        figure.legend(known.values(), known, loc="center left", bbox_to_anchor=(0.78, 0.5), fontsize=8)
-        figure.savefig(path, dpi=120)
-        plt.close(figure)
+        plots.draw(folder / "accuracy.json")
