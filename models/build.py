@@ -198,7 +198,7 @@ def _verdict(
 
 def make_scenes(skin: str, work: Path, scenes: int, valid: int, args: argparse.Namespace) -> None:
     """Scenes that `work` lacks, in chunks of the size that it has already, or that suits their number."""
-    chunk = data.chunk_size(work) or (1000 if scenes >= 4000 else 125)
+    chunk = data.chunk_size(work) or (1000 if scenes >= 4000 else 500 if scenes >= 2000 else 125)
     wanted = data.specs(skin, "valid", valid, args.seed, chunk) + data.specs(skin, "train", scenes, args.seed, chunk)
     if not data.generate(work, wanted, args.jobs):
         print(f"using the scenes in {work}: remove it to make others")
