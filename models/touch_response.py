@@ -8,7 +8,7 @@ with N the sheet's Neumann function, electrodes included (the Lippmann-Schwinger
 an impedance by int delta E0_sense . E_drive. A touch is cut into `cells` x `cells` squares over its own extent, each
 with one field (the Galerkin method), so a small touch is resolved as well as a large one. Gamma is the infinite
 sheet's, known in closed form for squares, plus what the outline and the electrodes add: that is smooth, so a bundle
-ships it on a coarse grid (`ResponseTables`, made by models/response_tables.py).
+ships it on a coarse grid (`ResponseTables`, made by models/response_tables.py; response_file.py is their file).
 
 Lengths are model units, drops S on a sheet of 1 S.
 """
