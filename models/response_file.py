@@ -19,7 +19,7 @@ MODES = 128
 MOST_FIELD = 1e4  # per model unit, of a unit current
 
 
-def arrays_of_tables(tables: ResponseTables) -> dict[str, npt.NDArray[Any]]:
+def arrays_of_tables(tables: ResponseTables) -> dict[str, Any]:
     """As response.npz holds them: fields (2, F * F, E), modes (2 * G * G, R), strength (R,), inside (G, G)."""
     side = tables.inside.size
     whole = tables.regular.astype(float).transpose(0, 2, 1, 3).reshape(2 * side, 2 * side)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.locator import Located, Locator
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
+from services.describe import ON, refinement
 from services.estimation.quality import SURE, Residual
 from services.estimation.sentinel import CoarseImage
 from services.estimation.within_scan import CHANGING_FRAMES, ChangingTouch
@@ -22,6 +23,9 @@ from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
+
+if TYPE_CHECKING:
+    from services.refinement import Refinement
 
 SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
@@ -45,15 +49,18 @@ class Inference(Stage):
         self.linearisation = Linearisation(name, bundle)
         self._residual = Residual(bundle, to_scale=self._refuses)
         self._changing_touch = ChangingTouch(bundle)  # the bundle's: how a skin is mounted changes 3 % of d by little
-        self.each_alone = False  # offline: frames that do not follow each other
+        self.each_alone = False  # offline: frames that do not follow each other; each waits for its fit
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
+        self._refinement = _refinement(name, skin, bundle)
         self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
 
     def reset(self) -> None:
+        if self._refinement is not None:
+            self._refinement.forget()
         self._last: ImageFrame | None = None  # of the touch that is being held
         self._refused = False  # whether it explains its frame too badly to be that of a touch
         self._last_scan = 0  # of the frame that it was reconstructed from
@@ -91,7 +98,17 @@ class Inference(Stage):
             self._counters["untouched"] += 1
             self._last, self._changing, self._changing_scan = None, 0, 0
             self._rest(frame.sigma)
+        if self._refinement is not None:
+            self._refine(frame, out)
         return [out]
+
+    def _refine(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        assert self._refinement is not None
+        if self.linearisation.name:  # the tables are those of the bundle as it is
+            return self._refinement.forget()
+        if self.each_alone:
+            self._refinement.fit_here()
+        out.refined = self._refinement(frame, out)
 
     def _follow(self, calibration: str) -> bool:
         """Use the matrices that frames are made with from now on; False where they cannot be found."""
@@ -251,7 +268,20 @@ class Inference(Stage):
     def health(self) -> Health:
         if isinstance(self._network, OneStep):
             return Health("OK", [f"bundle {self.bundle.name} has no network: one-step images"], dict(self._counters))
-        return Health("OK", [], dict(self._counters))
+        if self._refinement is None:
+            return Health("OK", [], dict(self._counters))
+        problem = self._refinement.problem
+        return Health(
+            "WARN" if problem else "OK", [problem] if problem else [], self._counters | self._refinement.counters
+        )
+
+
+def _refinement(name: str, skin: Skin, bundle: Bundle) -> Refinement | None:
+    if refinement(skin, bundle) != ON:
+        return None
+    from services.refinement import Refinement  # who refines nothing need not load what fits
+
+    return Refinement(name, skin, bundle)
 
 
 def _touch(found: Located, quantity: str) -> LocatedTouch:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
-from services.describe import BaselineNews, describe, force
+from services.describe import BaselineNews, describe, force, refinement
 from services.estimation import checks
 from services.estimation.baseline import believed
 from services.estimation.contact_drift import Reference
@@ -318,6 +318,7 @@ class Preprocessing(Stage):
             return None
         estimator = self.baseline_estimator
         said = describe(self.config, self.bundle, self._force, estimator.baseline, estimator.revision)
+        said["refinement"] = refinement(self.config, self.bundle, bool(self.linearisation.name))
         return said | {"mounting": self.linearisation.found} if self.linearisation.found else said
 
     def health(self) -> Health:

@@ -30,13 +30,12 @@ from bench.json_file import write_json
 from bench.machine import provenance
 from models import export, metrics
 from models.bundle import Bundle
-from models.forward import ForwardModel, shared
+from models.forward import ForwardModel
 from models.npz import read_npz
-from models.response_tables import response_tables
+from models.refine import refined_fit, responses_of, start_of
 from models.scenes import TRAINING, random_scene
 from models.shapes import KINDS, Array, Shape, from_rows, to_rows
-from models.touch_fit import TouchFit, TouchPosterior, frame_covariance
-from models.touch_response import ResponseTables, TouchResponse
+from models.touch_fit import TouchPosterior, frame_errors
 
 SKIN, MESH, N = "square16", "stub", 96
 MOST = 64 * 2**20
@@ -56,24 +55,6 @@ def frames(seed: int, count: int) -> tuple[list[Shape], Array]:
     WORK.mkdir(exist_ok=True)
     np.savez(path, shapes=np.array([to_rows([t]) for t in touches]), d=np.array(solved))
     return touches, np.array(solved)
-
-
-def tables() -> ResponseTables:
-    """Of the training mesh; kept in bench/work."""
-    path = WORK / f"response-{SKIN}.npz"
-    if not path.exists():
-        WORK.mkdir(exist_ok=True)
-        made = response_tables(shared(SKIN))
-        np.savez(path, fields=made.fields, regular=made.regular, inside=made.inside)
-    return ResponseTables(**read_npz(path, MOST))
-
-
-def start_of(image: Array) -> Shape:
-    """The network's touch: the circle of what exceeds half the peak."""
-    mask = image > 0.5 * image.max()
-    axis = -1 + 2 * (np.arange(len(image)) + 0.5) / len(image)
-    x, y = (float((mask * a).sum() / mask.sum()) for a in (axis, axis[:, None]))
-    return Shape("circle", x, y, float(np.sqrt(4 * mask.mean() / np.pi)), float(np.clip(image.max(), 0.03, 0.9)))
 
 
 def row_of(image: Array, touch: Shape) -> dict[str, float]:
@@ -107,7 +88,7 @@ def measured(level: str, touches: list[Shape], clean: Array, seed: int) -> dict[
     path = bundle.network_path("int8")
     assert path is not None
     network = export.session(path.read_bytes())
-    fit = TouchFit(TouchResponse(tables(), bundle.pattern, bundle.z0.astype(float)))
+    responses = responses_of(bundle)
     sigma = np.full(pre.measurements, noise.share)
     operator = pre.condition(sigma)
     d = clean + noise.share * np.sqrt(1 + 1 / 64) * rng.standard_normal(clean.shape)
@@ -127,10 +108,12 @@ def measured(level: str, touches: list[Shape], clean: Array, seed: int) -> dict[
                 "class %": 100.0 * (int(share.argmax()) == touch.shape_class),
             }
         )
-        covariance = frame_covariance(pre.m.gram.astype(float), sigma, one)
+        start = start_of(image)
+        assert start is not None
+        errors = frame_errors(pre.m.gram.astype(float), sigma, one, float(image.max()))
         for method, kinds in (("found", KINDS), ("declared", (touch.kind,))):
             began = time.perf_counter()
-            posterior = fit(one, covariance, start_of(image), kinds)
+            posterior = refined_fit(*responses, one, errors, start, kinds)
             took = 1e3 * (time.perf_counter() - began)
             found[method].append(
                 row_of(posterior.image(N), touch)
