@@ -15,6 +15,7 @@ from services.contacts.surface import Placed
 APART = 3.0  # standard uncertainties beyond which image and fit do not mean the same touch
 ASIDE = 0.3  # of the touch's radius: what an image's place may be off by, whatever the fit says of its own
 LARGER = 2.0  # times: areas that differ by more are of different touches
+KIND_UNKNOWN = 0.15  # of an image's force: what it is wrong by where the touch is soft, which it does not know
 ROUND = 48  # corners of an outline that is round
 
 
@@ -30,7 +31,8 @@ def agrees(contact: Contact, touch: RefinedTouch, force: Force) -> bool:
         return False
     if force.newton is None or contact.force_n is None:
         return True
-    unsure = math.hypot(force.sigma or 0.0, contact.force_sigma_n or 0.5 * contact.force_n)
+    own = max(contact.force_sigma_n or 0.0, KIND_UNKNOWN * contact.force_n)
+    unsure = math.hypot(force.sigma or 0.0, own)
     return abs(force.newton - contact.force_n) <= APART * unsure
 
 
