@@ -46,9 +46,10 @@ CORNERED = {"circle": 1.0, "hertz": 1.0, "square": 1.3, "L": 1.7, "triangle": 2.
 WIDER = {"circle": 1.15, "hertz": 1.15, "square": 1.2, "L": 1.25, "triangle": 1.45, "rectangle": 1.5}
 WIDER_INTEGRAL, WIDER_PLACE = 1.15, 1.08
 """Standard deviations (of drop and area for each kind) over those of the normal posterior: drop and size of a small
-touch trade off along a bent valley. Found on 300 touches of bench/accuracy/refined.py; its report checks them on others.
+touch trade off along a bent valley. Found on 300 touches; bench/accuracy/refined.py checks them on others.
 """
 LEFT = 0.8  # whitened energy that such an error leaves of a frame without noise, typically
+MOST_LEFT = 25.0  # that such an error leaves at most, where the touch is one of these kinds
 SURE_OF_IT = 0.15  # of LEFT: how much the assumed size of the error counts beside the one that is seen
 MISFIT_POWER = 0.4  # of the Gram matrix's eigenvalues: that error looks almost as touches do
 MOST_FOLLOWED = np.array([0.3, 0.3, 0.25, 0.6, 0.2, 0.3])  # of one step along a change; place: of the radius
@@ -70,6 +71,12 @@ class KindFit:
     evidence: float
     slope: Array
     gain: Array
+    noise: float  # energy that noise leaves of a frame, on the mean
+
+    @property
+    def fits_frame(self) -> bool:
+        """Whether this touch explains the frame."""
+        return bool(self.misfit < self.noise + 4 * (2 * self.noise) ** 0.5 + MOST_LEFT)
 
     @property
     def shape(self) -> Shape:
@@ -98,7 +105,7 @@ class TouchPosterior:
     @property
     def fits_frame(self) -> bool:
         """Whether the likeliest touch explains the frame: else it is none of these kinds, or more than one."""
-        return bool(self.fits[0].misfit < self.measurements + 4 * (2 * self.measurements) ** 0.5)
+        return self.fits[0].fits_frame
 
     def followed(self, change: Array, sigma: Array) -> TouchPosterior | None:
         """The same touch after the frame has changed by `change` (K,), whose standard deviation is sigma (K,): one
@@ -315,7 +322,7 @@ class _Whitened:
         covariance, misfit = np.linalg.inv(hessian), float(left @ left)
         gain = covariance @ solve_triangular(self._root.T, slope, lower=False, check_finite=False).T
         covariance += (self._wrong(misfit) - 1) * gain @ self._model @ gain.T
-        return KindFit(kind, theta, covariance, misfit, evidence, self._root @ slope, gain)
+        return KindFit(kind, theta, covariance, misfit, evidence, self._root @ slope, gain, self._noise)
 
     def _wrong(self, misfit: float) -> float:
         """Variance of the model's error over what was assumed: as large as what is left of the frame, as far as noise

@@ -280,28 +280,33 @@ class Refinement:
         return self._tare / max(1.0, (self._single / max(typical, 1e-12)) ** 2)
 
     def _told(self, found: TouchPosterior, scan: int) -> RefinedTouch:
-        unit, shape = self.bundle.metres_per_unit, found.fits[0].shape
-        values, axes = np.linalg.eigh(found.position_covariance)
-        longest = axes[:, 1]
-        angle = float((np.arctan2(longest[1], longest[0]) + np.pi / 2) % np.pi - np.pi / 2)
-        return RefinedTouch(
-            kind=shape.kind,
-            probability=min(1.0, found.probability[shape.kind]),
-            probabilities=[min(1.0, float(share)) for share in found.classes],
-            position=[float(v) * unit for v in found.position],
-            sigma=[float(np.sqrt(values[1])) * unit, float(np.sqrt(max(values[0], 0.0))) * unit, angle],
-            drop=found.drop[0],
-            drop_sigma=found.drop[1],
-            integral=found.integral[0] * unit**2,
-            integral_sigma=found.integral[1] * unit**2,
-            area_m2=found.area[0] * unit**2,
-            area_sigma_m2=found.area[1] * unit**2,
-            centre=[shape.x * unit, shape.y * unit],
-            radius_m=shape.radius * unit,
-            rotation=shape.rotation,
-            aspect=shape.aspect,
-            scan=scan,
-        )
+        return told(found, scan, self.bundle.metres_per_unit)
+
+
+def told(found: TouchPosterior, scan: int, unit: float) -> RefinedTouch:
+    """What a fit to a scan says, in metres; unit: metres per model unit."""
+    shape = found.fits[0].shape
+    values, axes = np.linalg.eigh(found.position_covariance)
+    longest = axes[:, 1]
+    angle = float((np.arctan2(longest[1], longest[0]) + np.pi / 2) % np.pi - np.pi / 2)
+    return RefinedTouch(
+        kind=shape.kind,
+        probability=min(1.0, found.probability[shape.kind]),
+        probabilities=[min(1.0, float(share)) for share in found.classes],
+        position=[float(v) * unit for v in found.position],
+        sigma=[float(np.sqrt(values[1])) * unit, float(np.sqrt(max(values[0], 0.0))) * unit, angle],
+        drop=found.drop[0],
+        drop_sigma=found.drop[1],
+        integral=found.integral[0] * unit**2,
+        integral_sigma=found.integral[1] * unit**2,
+        area_m2=found.area[0] * unit**2,
+        area_sigma_m2=found.area[1] * unit**2,
+        centre=[shape.x * unit, shape.y * unit],
+        radius_m=shape.radius * unit,
+        rotation=shape.rotation,
+        aspect=shape.aspect,
+        scan=scan,
+    )
 
 
 def _typical(sigma: NDArray[np.floating]) -> float:
