@@ -23,6 +23,7 @@ from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
+from services.symmetry import SymmetryMean, symmetries
 
 if TYPE_CHECKING:
     from services.refinement import Refinement
@@ -54,6 +55,9 @@ class Inference(Stage):
         self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
         self._refinement = _refinement(name, skin, bundle)
+        self._symmetry: SymmetryMean | None = None
+        if skin.touch.symmetry and isinstance(self._network, Network) and (turns := symmetries(bundle.skin)):
+            self._symmetry = SymmetryMean(self._network, turns)
         self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
@@ -61,6 +65,9 @@ class Inference(Stage):
     def reset(self) -> None:
         if self._refinement is not None:
             self._refinement.forget()
+        if self._symmetry is not None:
+            self._symmetry.forget()
+        self._surer: Pictures | None = None  # the mean over the symmetries of the image that is held
         self._last: ImageFrame | None = None  # of the touch that is being held
         self._refused = False  # whether it explains its frame too badly to be that of a touch
         self._last_scan = 0  # of the frame that it was reconstructed from
@@ -71,7 +78,17 @@ class Inference(Stage):
         self._stated = 0  # how many have stated it, one after the other
         self._changing = 0  # frames in a row whose touch changed during the scan
         self._changing_scan = 0  # of the last of them whose image shows nothing
-        names = ("networks_run", "held", "untouched", "unwanted", "missed", "refused", "changing", "uncalibrated")
+        names = (
+            "networks_run",
+            "held",
+            "untouched",
+            "unwanted",
+            "missed",
+            "refused",
+            "changing",
+            "uncalibrated",
+            "symmetric",
+        )
         self._counters = dict.fromkeys(names, 0)  # uncalibrated: frames whose calibration could not be found
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
@@ -97,6 +114,8 @@ class Inference(Stage):
         else:
             self._counters["untouched"] += 1
             self._last, self._changing, self._changing_scan = None, 0, 0
+            if self._symmetry is not None:
+                self._symmetry.forget()
             self._rest(frame.sigma)
         if self._refinement is not None:
             self._refine(frame, out)
@@ -150,6 +169,9 @@ class Inference(Stage):
 
     def prepare(self) -> bool:
         """Make the matrices that a touch would need now; not while the noise changes from frame to frame."""
+        if self._symmetry is not None and self._symmetry.busy:
+            self._surer = self._symmetry.step()
+            return True
         return self._quiet is not None and self._stated >= SETTLED and self._residual.prepare(self._quiet)
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
@@ -173,6 +195,8 @@ class Inference(Stage):
                 add_reason(out.reasons, "changing")
         self._judge(out)
         self._shows(frame, out)
+        if self._symmetry is not None and frame.touched and not self._refused:
+            self._symmetry.begin(frame, (out.image, out.sigma, out.classes))
 
     def _changes(self, frame: DeltaFrame, out: ImageFrame) -> bool:
         """Whether a touch that changed during the scan explains a frame that its image does not. Then the frame is
@@ -204,7 +228,7 @@ class Inference(Stage):
 
     def _shows(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """`out` has the image of `frame`, which later ones may hold."""
-        self._last, self._unseen = out, None
+        self._last, self._unseen, self._surer = out, None, None
         self._last_scan = out.reconstructed = frame.scan
         self._again = False
 
@@ -220,7 +244,9 @@ class Inference(Stage):
         subscribers.
         """
         last = self._last
-        if last is not None and self._last_scan == frame.reconstructed:
+        if last is not None and self._last_scan == frame.reconstructed and self._surer is not None and last.image.size:
+            self._shows_surer(frame, last, out)
+        elif last is not None and self._last_scan == frame.reconstructed:
             out.noise, out.residual = last.noise, last.residual
             self._shows_again(last, out)
             self._judge(out)
@@ -232,6 +258,16 @@ class Inference(Stage):
             out.valid = False
             out.reasons.append("gap")
             self._counters["missed"] += 1
+
+    def _shows_surer(self, frame: DeltaFrame, last: ImageFrame, out: ImageFrame) -> None:
+        """A better image of the scan that is held takes its place: it is a new one to readers."""
+        assert self._surer is not None
+        out.image, out.sigma, out.classes = self._surer
+        out.noise, out.touches, out.reconstructed = last.noise, last.touches, self._last_scan
+        out.residual = last.residual
+        self._last, self._surer, self._again = out, None, False
+        self._counters["symmetric"] += 1
+        self._judge(out)
 
     def _shows_again(self, last: ImageFrame, out: ImageFrame) -> None:
         out.held, out.reconstructed = True, self._last_scan

@@ -85,6 +85,7 @@ class TouchConfig(Section):
     false_alarms: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
     hold: Switch = True  # switch of the rule "nothing changed: do not reconstruct again"
     skip_untouched: Switch = True  # switch of the rule "nothing touches: do not reconstruct"
+    symmetry: Switch = False  # a held touch's image becomes the mean over the skin's symmetries: services/symmetry.py
 
 
 class Indenter(Section):
