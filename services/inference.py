@@ -26,7 +26,7 @@ from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason,
 from services.symmetry import SymmetryMean, symmetries
 
 if TYPE_CHECKING:
-    from services.refinement import Refinement
+    from services.refinement import RefineHere, Refinement, RefineProcess
 
 SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
@@ -120,6 +120,11 @@ class Inference(Stage):
         if self._refinement is not None:
             self._refine(frame, out)
         return [out]
+
+    def fit_by(self, fits: RefineProcess | RefineHere) -> None:
+        """Who fits touches, where any are: offline, in tests and to measure."""
+        if self._refinement is not None:
+            self._refinement.fit_by(fits)
 
     def _refine(self, frame: DeltaFrame, out: ImageFrame) -> None:
         assert self._refinement is not None

@@ -186,6 +186,9 @@ class Refinement:
     def problem(self) -> str:
         return "" if self._fits is None else self._fits.problem
 
+    def fit_by(self, fits: RefineProcess | RefineHere) -> None:
+        self._fits = fits
+
     def fit_here(self) -> None:
         """From now on each frame waits for its fit: offline."""
         if not isinstance(self._fits, RefineHere):

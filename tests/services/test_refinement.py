@@ -20,7 +20,7 @@ from services.contacts.force import Force
 from services.contacts.refined import agrees, refined_outline
 from services.describe import refinement
 from services.pipeline import Result
-from services.refinement import RefineProcess
+from services.refinement import RefineHere, RefineProcess
 from services.runtime.config import ConfigError, Indenter, Skin, parse
 from tests.services.stub_skin import StubSkin
 
@@ -34,7 +34,7 @@ def configured(kind: str = "circle", **more: object) -> Skin:
 
 def pressed(kind: str, *shapes: Shape, frames: int = 3, snr_db: float = 75.0) -> tuple[StubSkin, Result]:
     stub = StubSkin(snr_db, skin=configured(kind))
-    stub.pipeline.inference._refinement.fit_here()  # type: ignore[union-attr]
+    stub.pipeline.inference.fit_by(RefineHere())
     for _ in range(frames):
         found = stub.feel(shapes)
     return stub, found
@@ -97,29 +97,23 @@ def test_a_shape_that_was_not_declared_keeps_the_images_answer() -> None:
     assert stub.pipeline.inference.health().counters["refine_unexplained"] > 0
 
 
-class LateFits:
+class LateFits(RefineHere):
     """Answers when the test says so."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.jobs: list[RefineJob] = []
-        self._answers: list[RefineAnswer] = []
-        self._refiner = Refiner()
-        self.skipped: dict[str, int] = {}
-        self.problem = ""
 
     def offer(self, job: RefineJob) -> None:
         self.jobs.append(job)
 
-    def poll(self, skin: str) -> RefineAnswer | None:
-        return self._answers.pop() if self._answers else None
-
     def answer(self) -> None:
-        self._answers = [self._refiner(self.jobs[-1])]
+        super().offer(self.jobs[-1])
 
 
 def test_a_moving_touch_takes_its_answer_along_as_far_as_it_explains_the_frames() -> None:
     stub, fits = StubSkin(80.0, skin=configured()), LateFits()
-    stub.pipeline.inference._refinement._fits = fits  # type: ignore[union-attr, assignment]
+    stub.pipeline.inference.fit_by(fits)
     for _ in range(2):
         first = stub.feel((CIRCLE,))
     assert not the_contact(first).refined and fits.jobs  # no frame waits
@@ -142,7 +136,7 @@ def test_a_moving_touch_takes_its_answer_along_as_far_as_it_explains_the_frames(
 
 def test_an_answer_of_a_touch_that_is_gone_is_dropped() -> None:
     stub, fits = StubSkin(80.0, skin=configured()), LateFits()
-    stub.pipeline.inference._refinement._fits = fits  # type: ignore[union-attr, assignment]
+    stub.pipeline.inference.fit_by(fits)
     stub.feel((CIRCLE,))
     for _ in range(4):
         stub.feel()
