@@ -130,7 +130,7 @@ def likely(posterior: TouchPosterior) -> dict[str, Array]:
     return {fit.kind: fit.theta for fit in posterior.fits if posterior.probability[fit.kind] > UNLIKELY_NOW}
 
 
-def start_of(image: Array) -> Shape | None:
+def start_of(image: NDArray[np.floating]) -> Shape | None:
     """Where and how large the touch in an image (n, n) of the square [-1, 1]^2 is: the circle of what exceeds half the
     peak. None where it shows nothing.
     """
@@ -139,8 +139,9 @@ def start_of(image: Array) -> Shape | None:
         return None
     mask = image > 0.5 * peak
     axis = -1 + 2 * (np.arange(len(image)) + 0.5) / len(image)
-    x, y = (float((mask * a).sum() / mask.sum()) for a in (axis, axis[:, None]))
-    return Shape("circle", x, y, float(np.sqrt(4 * mask.mean() / np.pi)), float(np.clip(peak, 0.03, 0.9)))
+    count = int(mask.sum())
+    x, y = float(mask.sum(axis=0) @ axis) / count, float(mask.sum(axis=1) @ axis) / count
+    return Shape("circle", x, y, float(np.sqrt(4 * count / mask.size / np.pi)), float(np.clip(peak, 0.03, 0.9)))
 
 
 def main() -> None:

@@ -169,11 +169,12 @@ class Publishing(Stage):
         if touch is None or len(self._segments) != 1:
             return None
         contact = self._contacts[0]
-        if not agrees(contact, touch, self.law.of_fit(touch)):
+        force = self.law.of_fit(touch)
+        if not agrees(contact, touch, force):
             self._counters["disagreed"] += 1
             return None
         self._counters["refined"] += 1
-        at, force = self.place(*touch.position), self.law.of_fit(touch)
+        at = self.place(*touch.position)
         return refined(contact, touch, at, force, _wrench(at, force.newton or 0.0), flat=self.place.flat), touch
 
     def _alone(self, frame: ImageFrame) -> bool:

@@ -13,19 +13,20 @@ the newest frame waits for its turn, and older ones are skipped and counted.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import subprocess
 import sys
 import time
 from multiprocessing.connection import Connection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.refine import RefineAnswer, RefineJob, Refiner, likely, start_of
-from models.shapes import KINDS
+from models.shapes import KINDS, Shape
 from models.touch_fit import TouchPosterior
 from protocol.frames import DeltaFrame, ImageFrame, RefinedTouch
 from services.runtime.config import ROOT, Skin
@@ -170,6 +171,7 @@ class Refinement:
         self.name, self.bundle = name, bundle
         bundle.response()
         self._fits = fits
+        self._folder = str(bundle.path.resolve())
         self._kinds = KINDS if skin.indenter.kind == "any" else (skin.indenter.kind,)
         radius = skin.indenter.radius_m
         self._radius = None if radius is None else radius / bundle.metres_per_unit
@@ -203,52 +205,54 @@ class Refinement:
 
     def __call__(self, frame: DeltaFrame, out: ImageFrame) -> RefinedTouch | None:
         """The refined touch of this frame, or None. out: the image made of it, or of what it holds."""
-        self._take_answer()
-        if not frame.touched and np.isfinite(frame.sigma).any():
-            self._single = _typical(frame.sigma)
+        news = self._take_answer()
         if not frame.touched or not out.valid or "changing" in out.reasons:
             self.forget()
             return None
         if frame.stack.size:
-            self._new(frame, out)
-            self._take_answer()  # where a frame waits for its fit
-        if self._touch is not None:
-            self._counted["refined"] += 1
+            if (start := start_of(out.image)) is None:
+                self.forget()
+                return None
+            now = _Asked(frame.scan, frame.difference.astype(float), frame.sigma.astype(float))
+            self._single = max(self._single, _typical(now.sigma)) if self._now else _typical(now.sigma)
+            self._now = now
+            moved = self._moved()
+            self._ask(now, start, frame.context, {} if moved is None else likely(moved))
+            if self._take_answer():  # where a frame waits for its fit
+                moved = self._moved()
+            self._touch = self._told(moved)
+        elif news:
+            self._touch = self._told(self._moved())
+        self._counted["refined"] += self._touch is not None
         return self._touch
 
-    def _new(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        """A frame that is reconstructed: what is known moves along with it, and it is to be fitted itself."""
-        start = start_of(out.image.astype(float))
-        if start is None:
-            return self.forget()
-        self._now = _Asked(frame.scan, frame.difference.astype(float), frame.sigma.astype(float))
-        moved = self._moved()
-        self._touch = None if moved is None or self._answer is None else self._told(moved, self._answer[0].scan)
+    def _ask(self, now: _Asked, start: Shape, context: NDArray[np.float32], before: dict[str, Any]) -> None:
+        """A frame that is reconstructed is to be fitted."""
         self._number += 1
-        self._asked[self._number] = self._now
-        before = {} if moved is None else likely(moved)
-        drift = 10 ** (2 * float(frame.context[2]) - 5) if len(frame.context) > 2 else 0.0
+        self._asked[self._number] = now
+        drift = 10 ** (2 * float(context[2]) - 5) if len(context) > 2 else 0.0
         self._fits = self._fits or shared()
         self._fits.offer(
             RefineJob(
                 skin=self.name,
                 number=self._number,
-                bundle=str(self.bundle.path.resolve()),
-                d=self._now.d,
-                sigma=self._now.sigma,
+                bundle=self._folder,
+                d=now.d,
+                sigma=now.sigma,
                 start=start,
                 kinds=self._kinds,
                 radius=self._radius,
-                tare_frames=self._tare_frames(self._now.sigma),
+                tare_frames=self._tare / max(1.0, (self._single / max(_typical(now.sigma), 1e-12)) ** 2),
                 drift=drift if drift > QUIET_DRIFT else 0.0,
                 before=before,
             )
         )
 
-    def _take_answer(self) -> None:
+    def _take_answer(self) -> bool:
+        """Whether there is news of the touch."""
         answer = None if self._fits is None else self._fits.poll(self.name)
         if answer is None or answer.number not in self._asked:  # of a touch that is gone
-            return
+            return False
         asked = self._asked[answer.number]
         self._asked = {number: each for number, each in self._asked.items() if number > answer.number}
         self._counted["fits"] += 1
@@ -257,11 +261,10 @@ class Refinement:
         found = answer.posterior
         if found is None or not found.fits_frame:
             self._counted["unexplained"] += 1
-            self._answer = self._touch = None
-            return
-        self._answer = asked, found, answer.live
-        moved = self._moved()
-        self._touch = None if moved is None else self._told(moved, asked.scan)
+            self._answer = None
+        else:
+            self._answer = asked, found, answer.live
+        return True
 
     def _moved(self) -> TouchPosterior | None:
         """The answer, moved along to the frame that was reconstructed last."""
@@ -276,28 +279,27 @@ class Refinement:
         noise = np.sqrt(now.sigma[live] ** 2 + before.sigma[live] ** 2 + self.bundle.matrices.model_error**2)
         return found.followed((now.d - before.d)[live], noise)
 
-    def _tare_frames(self, sigma: NDArray[np.float64]) -> float:
-        """Of the tare, for each frame that this one is the mean of."""
-        typical = _typical(sigma)
-        self._single = max(self._single, typical)
-        return self._tare / max(1.0, (self._single / max(typical, 1e-12)) ** 2)
-
-    def _told(self, found: TouchPosterior, scan: int) -> RefinedTouch:
-        return told(found, scan, self.bundle.metres_per_unit)
+    def _told(self, found: TouchPosterior | None) -> RefinedTouch | None:
+        if found is None or self._answer is None:
+            return None
+        return told(found, self._answer[0].scan, self.bundle.metres_per_unit)
 
 
 def told(found: TouchPosterior, scan: int, unit: float) -> RefinedTouch:
     """What a fit to a scan says, in metres; unit: metres per model unit."""
     shape = found.fits[0].shape
-    values, axes = np.linalg.eigh(found.position_covariance)
-    longest = axes[:, 1]
-    angle = float((np.arctan2(longest[1], longest[0]) + np.pi / 2) % np.pi - np.pi / 2)
+    (xx, xy), (_, yy) = found.position_covariance.tolist()
+    middle, spread = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
     return RefinedTouch(
         kind=shape.kind,
         probability=min(1.0, found.probability[shape.kind]),
         probabilities=[min(1.0, float(share)) for share in found.classes],
         position=[float(v) * unit for v in found.position],
-        sigma=[float(np.sqrt(values[1])) * unit, float(np.sqrt(max(values[0], 0.0))) * unit, angle],
+        sigma=[
+            math.sqrt(middle + spread) * unit,
+            math.sqrt(max(middle - spread, 0.0)) * unit,
+            0.5 * math.atan2(2 * xy, xx - yy),
+        ],
         drop=found.drop[0],
         drop_sigma=found.drop[1],
         integral=found.integral[0] * unit**2,
@@ -312,5 +314,7 @@ def told(found: TouchPosterior, scan: int, unit: float) -> RefinedTouch:
     )
 
 
-def _typical(sigma: NDArray[np.floating]) -> float:
-    return float(np.median(sigma[np.isfinite(sigma)]))
+def _typical(sigma: NDArray[np.float64]) -> float:
+    """Root mean square of the finite ones."""
+    finite = sigma[np.isfinite(sigma)]
+    return math.sqrt(float(finite @ finite) / max(len(finite), 1))
