@@ -1,6 +1,6 @@
 """Single touches by the network, and refined: the touch's parameters fitted to the same frame.
 
-    skin bench refined [--touches 500] [--levels none 80 70 60] [--seed 33] [--quick]
+    skin bench refined [--touches 500] [--levels none 70] [--seed 33] [--quick]
 
 Touches are drawn as training draws them (models.scenes.TRAINING: radius 0.12 to 0.45 and, in one of five, 0.08 to 0.5;
 drop 0.1 to 0.5 and 0.05 to 0.9), of all six kinds alike, and solved on the stub's mesh, which neither training nor
@@ -263,7 +263,7 @@ def goals(report: dict[str, Any], quick: bool) -> list[Goal]:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench refined", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--touches", type=int, default=None, help="500; 60 with --quick")
-    parser.add_argument("--levels", nargs="+", default=None, help="none 80 70 60; none 70 with --quick")
+    parser.add_argument("--levels", nargs="+", default=["none", "70"])
     parser.add_argument("--seed", type=int, default=33)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--out", type=Path, default=REPORTS)
@@ -271,7 +271,7 @@ def main(argv: list[str] | None = None) -> int:
     touches, clean = frames(args.seed, args.touches or (60 if args.quick else 500))
     report: dict[str, Any] = {"levels": {}, "touches": len(touches), **provenance("refined", argv)}
     console = Console()
-    for level in args.levels or (["none", "70"] if args.quick else ["none", "80", "70", "60"]):
+    for level in args.levels:
         rows = measured(level, touches, clean, args.seed)
         report["levels"][level] = by_kind = {}
         for kind in ("all", *KINDS):
