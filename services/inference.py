@@ -172,6 +172,10 @@ class Inference(Stage):
         elif np.isfinite(sigma).any():
             self._quiet, self._stated = sigma, 1
 
+    def warm_up(self) -> None:
+        if self._refinement is not None:
+            self._refinement.warm_up()
+
     def prepare(self) -> bool:
         """Make the matrices that a touch would need now; not while the noise changes from frame to frame."""
         if self._symmetry is not None and self._symmetry.busy:

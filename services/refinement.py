@@ -54,6 +54,14 @@ class RefineProcess:
         self.skipped: dict[str, int] = {}  # jobs that a newer one of their skin replaced, or that were lost
         self.problem = ""
 
+    def start(self) -> None:
+        """Before the first job; where it cannot be started, the first job says so."""
+        try:
+            if self._process is None:
+                self._start()
+        except OSError as why:
+            log.warning("the process that refines touches cannot be started (%s)", why)
+
     def offer(self, job: RefineJob) -> None:
         if job.skin in self._waiting:
             self._skip(job.skin)
@@ -137,6 +145,9 @@ class RefineHere:
         self.skipped: dict[str, int] = {}
         self.problem = ""
 
+    def start(self) -> None:
+        """There is nothing to start."""
+
     def offer(self, job: RefineJob) -> None:
         self._answers[job.skin] = self._refiner(job)
 
@@ -187,6 +198,11 @@ class Refinement:
     @property
     def problem(self) -> str:
         return "" if self._fits is None else self._fits.problem
+
+    def warm_up(self) -> None:
+        """Start the process now: the first touch would wait for it."""
+        self._fits = self._fits or shared()
+        self._fits.start()
 
     def fit_by(self, fits: RefineProcess | RefineHere) -> None:
         self._fits = fits

@@ -174,6 +174,7 @@ def answered(process: RefineProcess, skin: str = "palm") -> RefineAnswer:
 
 
 def test_the_process_fits_the_newest_of_each_skin_and_counts_the_others(process: RefineProcess, bundle: Bundle) -> None:
+    process.start()
     began = time.monotonic()
     process.offer(job(bundle, 1))
     for number in (2, 3, 4):
@@ -206,6 +207,7 @@ def test_a_process_that_dies_is_started_again_and_said(
 
 def test_a_process_that_cannot_be_started_stops_nothing(bundle: Bundle) -> None:
     process = RefineProcess(("/nowhere/python",))
+    process.start()
     process.offer(job(bundle))
     assert "cannot be used" in process.problem and process.poll("palm") is None
 
