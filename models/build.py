@@ -6,6 +6,7 @@
     python -m models.build --skin square16 --no-network    matrices only: the services show the one-step image
     python -m models.build --skin square16 --package       trains nothing: ships the checkpoints in models/work/SKIN
     python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin
+    python -m models.build --skin square16 --response      adds what a fit of touches needs to the bundle there is
 
 Samples and checkpoints stay in models/work/SKIN; a second call uses what is there and makes what is missing.
 """
@@ -43,6 +44,7 @@ from models.forward import ForwardModel
 from models.linearise import linearise
 from models.network import MMCNN, NetworkConfig, multiply_accumulates
 from models.prereconstruction import Array, Matrices, PreReconstructor
+from models.response_tables import response_tables
 from protocol.errors import EitskinError
 
 VALID = 1000
@@ -172,6 +174,7 @@ def main(argv: list[str] | None = None) -> None:
     budget.add_argument("--minutes", type=float, help="any other budget, for all of it on two idle cores")
     budget.add_argument("--no-network", action="store_true", help="matrices only")
     budget.add_argument("--package", action="store_true", help="export the checkpoints there are, train nothing")
+    budget.add_argument("--response", action="store_true", help="response.npz alone, into the bundle there is")
     parser.add_argument("--matrices", type=Path, help="with --package: the bundle the checkpoints were trained with")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)
@@ -183,6 +186,10 @@ def main(argv: list[str] | None = None) -> None:
     name = skin.name if registered is None else registered.path.resolve().name
     out = args.out or (bundle.BUNDLES / name if registered is None else registered.path)
     work = args.work or data.WORK / name
+    if args.response:
+        added = bundle.add_response(bundle.Bundle.load(out), response_tables(ForwardModel(skin)))
+        print(f"{added.path}: response.npz added, {added.hash[:12]}, after {time.perf_counter() - began:.0f} s")
+        return
     plan = QUICK if args.quick else Plan.of(args.minutes) if args.minutes else FULL
     if not (args.package or args.no_network):
         print(plan.said(name), flush=True)
@@ -218,7 +225,9 @@ def main(argv: list[str] | None = None) -> None:
     if "full" in said:
         said["full"]["verdict"] = _verdict(args.skin, pre, held_out, said["full"], own).to_dict()
     if registered is None or model is None:
-        written = bundle.write(out, manifest.describe(skin.name, skin, matrices, network=said or None), matrices, made)
+        said_of = manifest.describe(skin.name, skin, matrices, network=said or None)
+        tables = response_tables(ForwardModel(skin)) if matrices.normalisation == "model" else None
+        written = bundle.write(out, said_of, matrices, made, response=tables)
     else:
         about = manifest.of_registered(registered, network=said or None, warped=model.said)
         written = bundle.write(out, about, matrices, made, registered.locator)
@@ -248,7 +257,7 @@ def _verdict(
 
 def make_scenes(skin: str, work: Path, scenes: int, valid: int, args: argparse.Namespace) -> None:
     """Scenes that `work` lacks, in chunks of the size that it has already, or that suits their number."""
-    chunk = data.chunk_size(work) or (1000 if scenes >= 4000 else 125)
+    chunk = data.chunk_size(work) or (1000 if scenes >= 4000 else 500 if scenes >= 2000 else 125)
     wanted = data.specs(skin, "valid", valid, args.seed, chunk) + data.specs(skin, "train", scenes, args.seed, chunk)
     if not data.generate(work, wanted, args.jobs):
         print(f"using the scenes in {work}: remove it to make others")

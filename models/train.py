@@ -6,7 +6,8 @@
 The budget sets the schedule: the learning rate rises over the first percent and falls to zero at the last minute,
 whatever the machine's speed. What is kept is the running average of the weights; the best on held-out scenes is kept
 aside, and training stops early where the average has not become better for a quarter of the budget; not before half
-of it, because a resumed run with a longer budget takes its learning rate up again.
+of it, because a resumed run with a longer budget takes its learning rate up again, and never where it started from a
+trained network.
 """
 
 from __future__ import annotations
@@ -164,7 +165,8 @@ class Trainer:
             self.best_score, self.best_at = score, self.elapsed
             self.best = copy.deepcopy(self.average.state_dict())
             return False
-        return self.elapsed - max(self.best_at, 0.5 * budget) > 0.25 * budget
+        # A trained network gets worse before it gets better: while the rate falls, nothing can be said.
+        return not self.start and self.elapsed - max(self.best_at, 0.5 * budget) > 0.25 * budget
 
     def result(self) -> MMCNN:
         """The averaged network that was best on held-out scenes, on the CPU, for inference."""

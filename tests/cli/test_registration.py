@@ -1,4 +1,4 @@
-"""Registration: known similarities are found again; the real hydrogel skin is located as well as README says."""
+"""Registration: known similarities are found again; the real hydrogel skin is located as docs/figures.md says."""
 
 from __future__ import annotations
 
