@@ -81,6 +81,12 @@ BENCHMARKS = (
         ("--seconds", "8", "--rounds", "2"),
         limits="p99 is waiting for a processor that the stub's physics, the pipeline or the listeners have.",
     ),
+    Benchmark(
+        "page",
+        "The live page",
+        ("--seconds", "8", "--rounds", "2"),
+        limits="What viewers cost the pipeline is the processor that ten of them, here on the same cores, have.",
+    ),
     Benchmark("tracking", "Ten minutes of contacts", ("--seconds", "60")),
     Benchmark(
         "faults",

@@ -28,6 +28,7 @@ from services.symmetry import SymmetryMean, symmetries
 if TYPE_CHECKING:
     from services.refinement import RefineHere, Refinement, RefineProcess
 
+TELLS = 0.6  # share of held-out touches whose class a registered skin's network must get right for it to be stated
 SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
 
@@ -45,10 +46,12 @@ class Inference(Stage):
         self._network = network(str(path)) if path else OneStep(bundle)
         if isinstance(self._network, Network):
             self._network.check(bundle)
-        # Only a network's image is meant to explain a frame: a one-step image shows where, not how much.
-        self._refuses = isinstance(self._network, Network)
+        # Only a network's image is meant to explain a frame: a one-step image shows where, not how much. Nor is that of
+        # a registered skin: its presses leave too much open, and its locator says how well each touch is explained.
+        self._refuses = isinstance(self._network, Network) and bundle.locator is None
         self.linearisation = Linearisation(name, bundle)
         self._residual = Residual(bundle, to_scale=self._refuses)
+        self._tells_shapes = tells_shapes(bundle)
         self._changing_touch = ChangingTouch(bundle)  # the bundle's: how a skin is mounted changes 3 % of d by little
         self.each_alone = False  # offline: frames that do not follow each other; each waits for its fit
         n = bundle.image_size
@@ -186,6 +189,8 @@ class Inference(Stage):
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
         ahead, self._ahead = self._ahead, None
         out.image, out.sigma, out.classes = ahead[1] if ahead and ahead[0] is frame else self._network.run(frame)
+        if not self._tells_shapes:
+            out.classes = ImageFrame(skin=self.skin).classes
         out.noise = _rms(frame.sigma)
         out.residual = self._residual(frame.difference, frame.sigma, out.image)
         if self._locator is not None and frame.touched:
@@ -327,6 +332,14 @@ def _refinement(name: str, skin: Skin, bundle: Bundle) -> Refinement | None:
     from services.refinement import Refinement  # who refines nothing need not load what fits
 
     return Refinement(name, skin, bundle)
+
+
+def tells_shapes(bundle: Bundle) -> bool:
+    """Whether shape classes are worth stating: what a registered skin's presses leave open may hide them."""
+    if bundle.locator is None:
+        return True
+    full = (bundle.manifest.get("network") or {}).get("full") or {}
+    return float(full.get("held_out", {}).get("noise-free", {}).get("class", 0.0)) >= TELLS
 
 
 def _touch(found: Located, quantity: str) -> LocatedTouch:
