@@ -41,6 +41,9 @@ SERVICES_USE_OF_MODELS = {
     "models.npz",
     "models.prereconstruction",
     "models.patterns",
+    "models.refine",
+    "models.shapes",
+    "models.touch_fit",
     "models.sentinel",
     "models.uncertainty",
 }
