@@ -210,10 +210,10 @@ def main(argv: list[str] | None = None) -> None:
         if not args.package:
             scenes = _scenes(work, "train", pre, model)
             start = None if registered is None else warped.start(registered)
-            variants: tuple[tuple[str, float], ...] = (("full", plan.full), ("fast", plan.fast))
-            if start is not None:  # of a registered skin: what its presses leave open no other network can know
-                variants = (("full", plan.full + plan.fast),)
-            for variant, minutes in variants:
+            trained = [("full", plan.full), ("fast", plan.fast)]
+            if start is not None:  # a registered skin: what its presses leave open no second network can know
+                trained = [("full", plan.full + plan.fast)]
+            for variant, minutes in trained:
                 at, seed, jobs = work / f"{variant}.pt", args.seed, args.jobs
                 train.train(variant, skin, pre, scenes, held_out, minutes, at, seed, jobs, start=start, own=own)
         count, cache = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4, work / "presses.npz"

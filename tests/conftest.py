@@ -71,7 +71,7 @@ def service(runtime: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 @pytest.fixture(scope="module")
 def shared_service() -> Iterator[Path]:
-    """The service without recorder, one for all tests of a file; gives its runtime folder, named by $EITSKIN_RUNTIME."""
+    """The service without recorder, one for all tests of a file; gives the runtime folder, $EITSKIN_RUNTIME."""
     folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
     try:
         with pytest.MonkeyPatch.context() as patch:
