@@ -231,8 +231,9 @@ class Board:
             self._event(EventCode.CHIP_ID, f"chip id {self._chip_id(start):#06x}: stopped", end)
             return
         scan = np.asarray(config.scan, np.int64)
-        transfer = self.field.over(start, end)
-        z, status = self.analog.measure(transfer, scan, config.dft_points, config.rtia_ohm, start)
+        instants = np.asarray(start + (np.arange(len(scan)) + 0.5) * ((end - start) / len(scan)))
+        transfer, weights = self.field.over(instants)
+        z, status = self.analog.measure(transfer, scan, config.dft_points, config.rtia_ohm, start, weights)
         if self.faults.active("frozen", start) is not None:
             z, status = self._sent.get(config.config, (z, status))
         self._sent[config.config] = z, status
