@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
 import tempfile
 import time
@@ -24,6 +25,7 @@ from protocol.errors import EitskinError
 OPSET = 17  # onnxruntime 1.20 and later read it
 INPUTS, OUTPUTS = ("stack", "context"), ("drop", "log_sigma", "classes")
 PARITY = 1e-5
+LOSS = 10.0  # times what PyTorch's own float32 loses against float64 on the same frames, where that is more than PARITY
 FLOAT = ("/stem/", "/stage2/attention", "/up2/", "/stage3/", "/classes/", "/up1/", "/out/", "/aside/")  # not in int8
 
 
@@ -52,21 +54,32 @@ def exported(model: nn.Module, example: tuple[Tensor, ...], inputs: Sequence[str
 def to_onnx(model: MMCNN, stack: Array, context: Array) -> bytes:
     """ONNX of a network in eval mode, checked against PyTorch on (N, C, h, w), (N, n). Raises ParityError.
 
-    Parity is of each output relative to its largest magnitude: 1e-5.
+    The reference is PyTorch in float64: two float32 programs order their sums differently, and how much of that a
+    network amplifies depends on its weights. An output may differ from it, relative to its largest magnitude, by
+    PARITY, or by LOSS times what PyTorch in float32 differs by.
     """
     model = model.eval()
     example = (torch.zeros(1, *stack.shape[1:]), torch.zeros(1, CONTEXT))
     content = exported(model, example, INPUTS, OUTPUTS)
     onnx.checker.check_model(onnx.load_model_from_string(content))
+    inputs = torch.from_numpy(stack), torch.from_numpy(context)
     with torch.no_grad():
-        expected = [t.numpy() for t in model(torch.from_numpy(stack), torch.from_numpy(context))]
-    for name, found, wanted in zip(OUTPUTS, run(session(content), stack, context), expected, strict=True):
-        error = float(np.abs(found - wanted).max() / np.abs(wanted).max())
-        if not error <= PARITY:
+        single = [t.numpy() for t in model(*inputs)]
+        double = [t.numpy() for t in copy.deepcopy(model).double()(*(t.double() for t in inputs))]
+    found = run(session(content), stack, context)
+    for name, output, float32, expected in zip(OUTPUTS, found, single, double, strict=True):
+        error, loss = _difference(output, expected), _difference(float32, expected)
+        if not error <= max(PARITY, LOSS * loss):
             raise ParityError(
-                f"output {name!r} of the ONNX file differs from PyTorch by {error:.1e}, allowed {PARITY:.0e}"
+                f"output {name!r} of the ONNX file differs from PyTorch in float64 by {error:.1e}: allowed are "
+                f"{PARITY:.0e}, or {LOSS:g} times what PyTorch in float32 differs by, {loss:.1e}"
             )
     return content
+
+
+def _difference(found: Array, expected: Array) -> float:
+    """Largest difference, relative to the largest magnitude expected."""
+    return float(np.abs(found - expected).max() / np.abs(expected).max())
 
 
 def to_int8(content: bytes, stack: Array, context: Array) -> bytes:

@@ -113,7 +113,7 @@ def test_resuming_continues_where_it_stopped(trainer, pre, scenes, tmp_path):
 
 
 def test_onnx_agrees_with_pytorch_for_any_batch(trainer, pre, scenes):
-    """to_onnx checks 1e-5 itself; here single frames against the batch, and int8 against float."""
+    """to_onnx checks parity itself; here single frames against the batch, and int8 against float."""
     model = trainer.result()
     rng = np.random.default_rng(2)
     batch = samples.make(scenes, np.arange(32), None, random_condition(pre, rng), rng)
@@ -137,6 +137,28 @@ def test_export_refuses_a_network_that_computes_something_else(trainer, monkeypa
     monkeypatch.setattr(export, "run", lambda *a: [1.001 * o for o in real(*a)])
     with pytest.raises(export.ParityError, match="differs from PyTorch"):
         export.to_onnx(trainer.result(), batch.stack.numpy(), batch.context.numpy())
+
+
+def test_export_allows_what_float32_loses_in_pytorch_too(trainer, pre, scenes):
+    """A network that adds a thousand and takes it away again loses digits in any float32 program."""
+
+    class Cancelling(torch.nn.Module):
+        def __init__(self, model):
+            super().__init__()
+            self.model = model
+
+        def forward(self, stack, context):
+            return tuple((1000.0 + output) - 1000.0 for output in self.model(stack, context))
+
+    rng = np.random.default_rng(4)
+    batch = samples.make(scenes, np.arange(4), None, random_condition(pre, rng), rng)
+    stack, context = batch.stack.numpy(), batch.context.numpy()
+    model = Cancelling(trainer.result()).eval()
+    content = export.to_onnx(model, stack, context)
+    with torch.no_grad():
+        exact = model.double()(torch.from_numpy(stack).double(), torch.from_numpy(context).double())
+    found = export.run(export.session(content), stack, context)
+    assert max(np.abs(f - e.numpy()).max() / e.abs().max() for f, e in zip(found, exact, strict=True)) > export.PARITY
 
 
 def test_uncertain_is_what_the_network_says_it_is():
