@@ -51,6 +51,7 @@ class Rig:
         unique_id: bytes = b"eitskin-stub",
         threaded: bool = False,
         answers_time: bool = True,
+        knows_parts: bool = True,
     ) -> None:
         script = scenes.load(scene)  # first, since it fails fast
         self.sheet = geometry if isinstance(geometry, Sheet) else Sheet(geometry, mismatch)
@@ -71,6 +72,7 @@ class Rig:
             speed=rate_hz * full_s if rate_hz else 1.0,
             crystal_ppm=crystal_ppm,
             answers_time=answers_time,
+            knows_parts=knows_parts,
             unique_id=unique_id,
             on_scan=self._scanned,
         )

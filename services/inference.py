@@ -150,7 +150,7 @@ class Inference(Stage):
             self._changing = 0
         elif self._refused and self._changes(frame, out):
             return
-        elif not self._changing_touch.steady(frame.difference, frame.sigma):
+        elif not self._changing_touch.steady(frame.difference, frame.sigma, frame.part):
             self._changing += 1
             if not self._refused:
                 add_reason(out.reasons, "changing")
@@ -162,7 +162,8 @@ class Inference(Stage):
         valid and says `changing`, also where the touch ended: it pressed in a part of the scan. Its image shows nothing
         new: that of before is held, and where there was none it is empty.
         """
-        found = self._changing_touch(frame.difference, frame.sigma) if self._changing < CHANGING_FRAMES else None
+        known = self._changing >= CHANGING_FRAMES
+        found = None if known else self._changing_touch(frame.difference, frame.sigma, frame.part)
         if found is None:
             return False
         add_reason(out.reasons, "changing")

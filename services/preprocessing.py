@@ -33,6 +33,7 @@ from services.estimation.touch_decision import FrameAverager, TouchDecision, sig
 from services.estimation.touch_estimator import TouchEstimator
 from services.kept_baseline import kept, take_over
 from services.linearisation import Linearisation
+from services.rolling_scans import RollingScans
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
 from services.sentinel_scans import SentinelScans
@@ -48,7 +49,7 @@ class Preprocessing(Stage):
     reads = "raw"
     writes = ("delta",)
     stamp = "preprocess"
-    commands = ("tare",)
+    commands = ("tare", "part")
     persists = True
 
     def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
@@ -62,6 +63,7 @@ class Preprocessing(Stage):
         self._unchecked = checks.sentence(bundle)
         self._force = force(skin, bundle)
         self.sentinel_scans = SentinelScans(skin, bundle)
+        self.rolling_scans = RollingScans(bundle)
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
         self.reset()
 
@@ -90,6 +92,7 @@ class Preprocessing(Stage):
 
     def reset(self) -> None:
         self.sentinel_scans.scan = 0
+        self.rolling_scans.reset()
         self._impossible_ns = 0  # since when every frame is of no touch
         self.gain.reset()
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
@@ -101,6 +104,8 @@ class Preprocessing(Stage):
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, RawFrame)
         out = DeltaFrame(**inherited(frame), calibration=self.linearisation.name)
+        if not self.rolling_scans.due(frame, out.stamps):
+            return []
         self._counters["frames"] += 1
         out.valid, out.reasons = as_sent(frame)  # measurements that failed are left out below
         for reason in reasons_of(frame.status):
@@ -239,6 +244,8 @@ class Preprocessing(Stage):
         self._begin_anew()
 
     def command(self, name: str, args: dict[str, Any]) -> dict[str, Any]:
+        if name == "part":
+            return {**self.rolling_scans.handed_on(int(args.get("scan", -1)))}
         if name != "tare":
             return super().command(name, args)
         try:
@@ -256,6 +263,7 @@ class Preprocessing(Stage):
         return {
             "touched": self.touch_estimator.touched,
             "coarse": self.sentinel_scans.scan,
+            "rolling": self.rolling_scans.state(),
             "impossible_ns": self._impossible_ns,
             "gain": self.gain.state(),
             "hold": self.frame_averager.state(),
@@ -280,6 +288,7 @@ class Preprocessing(Stage):
         self.baseline_estimator.load(state)
         self.touch_estimator.touched = bool(state["touched"])
         self.sentinel_scans.scan = int(state.get("coarse", 0))
+        self.rolling_scans.load(state.get("rolling", {}))
         self._impossible_ns = int(state.get("impossible_ns", 0))
         self.frame_averager.load(state["hold"], len(self.bundle.pattern))
         self.touch_detector.reset()

@@ -1,6 +1,6 @@
 """Reaction: from the instant a touch begins, or ends, to the contact frame that says so, live on the stub's board.
 
-    skin bench reaction [--steps 500] [--modes full adaptive] [--simulated] [--quick]
+    skin bench reaction [--steps 500] [--modes full adaptive rolling] [--simulated] [--quick]
 
 Real processes and a plain controller. The stub plays a scene that it has solved beforehand and says when it began, so
 every onset is known on this host's clock. A touch is seen with the first valid frame, neither `changing` nor `coarse`,
@@ -37,14 +37,13 @@ from protocol.sockets import ControlClient
 from protocol.transport import Context
 from services.runtime.config import ScanMode
 
-MODES: tuple[ScanMode, ...] = ("full", "adaptive")
+MODES: tuple[ScanMode, ...] = ("full", "adaptive", "rolling")
 STEPS, RAMPS, SLIDES = 500, 40, 40
 QUICK = 8
-IDLE_S: dict[ScanMode, float] = {
-    "full": 0.35,
-    "adaptive": 3.6,
-}  # between two touches: until the board scans as it does while nothing touches
-OF_FEWER: dict[ScanMode, int] = {"full": 1, "adaptive": 8}  # those long pauses are made so many times less often
+IDLE_S: dict[ScanMode, float] = {"full": 0.35, "adaptive": 3.6, "rolling": 0.35}
+"""Between two touches: until the board scans as it does while nothing touches."""
+OF_FEWER: dict[ScanMode, int] = {"full": 1, "adaptive": 8, "rolling": 1}
+"""Long pauses are made so many times less often."""
 SOLVE_S = 600.0
 SNR_DB = 80.0
 BASELINE_S = 7.0
