@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.locator import Located, Locator
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
+from services.estimation.part_image import PartImage
 from services.estimation.quality import SURE, Residual
 from services.estimation.sentinel import CoarseImage
 from services.estimation.within_scan import CHANGING_FRAMES, ChangingTouch
@@ -50,6 +51,7 @@ class Inference(Stage):
         self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
         self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
+        self._parts = PartImage(bundle) if skin.scan == "rolling" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
 
@@ -182,8 +184,24 @@ class Inference(Stage):
 
     def _roughly(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """The image of a few measurements, which no network was trained on."""
+        if frame.part:
+            self._of_parts(frame, out)
+            return
         self._coarse = self._coarse or CoarseImage(self.bundle)
         out.image, out.sigma, out.classes = self._coarse.run(frame)
+        self._shows(frame, out)
+
+    def _of_parts(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        """The image of one touch, from the parts since it began: `coarse` where its place is not sure."""
+        self._parts = self._parts or PartImage(self.bundle)
+        found = self._parts.fit(frame.difference, frame.sigma)
+        out.image, out.sigma = self._parts.image(found)
+        metres = self._parts.metres_per_unit
+        at, axes = [metres * found.x, metres * found.y], [metres * found.sigma[0], metres * found.sigma[1]]
+        size = found.drop * np.pi * (metres * found.radius) ** 2
+        out.touches = [LocatedTouch(position=at, sigma=[*axes, found.sigma[2]], amplitude=size)]
+        if found.sure:
+            out.reasons.remove("coarse")
         self._shows(frame, out)
 
     def _shows(self, frame: DeltaFrame, out: ImageFrame) -> None:
