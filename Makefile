@@ -4,21 +4,21 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 SKIN ?= square16
-# Bridges that `make venv` installs the packages of too: EXTRAS=ros2,foxglove
+# What else `make venv` installs the packages of: bridges, EXTRAS=ros2,foxglove, and `docs`, which `make site` needs
 EXTRAS ?=
 comma := ,
-BRIDGES := $(subst $(comma), ,$(EXTRAS))
+WANTED := $(subst $(comma), ,$(EXTRAS))
 # The CPU build of PyTorch by its full version: plain "torch" would bring several GB of CUDA.
 TORCH := torch==2.13.0+cpu
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: up venv venv-dev ros-venv test lint train lock wire clean
+.PHONY: up venv venv-dev ros-venv test golden lint site train lock clean
 
 up: venv
 	./skin up
 
-venv: $(VENV)/.service $(VENV)/.three $(BRIDGES:%=$(VENV)/.%)
+venv: $(VENV)/.service $(VENV)/.three $(WANTED:%=$(VENV)/.%)
 venv-dev: $(VENV)/.dev $(VENV)/.three
 
 $(BIN)/python:
@@ -29,7 +29,7 @@ $(VENV)/.service: requirements/service.lock | $(BIN)/python
 	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
 	@touch $@
 
-$(VENV)/.ros2 $(VENV)/.foxglove: $(VENV)/.%: requirements/%.lock | $(VENV)/.service
+$(VENV)/.ros2 $(VENV)/.foxglove $(VENV)/.docs: $(VENV)/.%: requirements/%.lock | $(VENV)/.service
 	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
 	@touch $@
 
@@ -57,9 +57,17 @@ $(ROS_VENV)/.done:
 test: venv-dev lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
+# What recordings of tests/ give now is what they are to give from now on; git diff shows what changed.
+golden: venv-dev
+	./skin golden tests/recording/golden/*.mcap --accept
+
 lint: venv-dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy protocol services bridges examples firmware_stub models bench
+
+# The documents as a site in build/site; a warning is an error. NO_MKDOCS_2_WARNING: advice of the theme's, not of ours.
+site: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -q
 
 # geometry -> forward model -> data -> network -> bundle in models/bundles/$(SKIN)
 train: venv-dev
@@ -69,8 +77,8 @@ train: venv-dev
 LOCK := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 lock:
 	$(LOCK) --extra service --extra stub -o requirements/service.lock pyproject.toml
-	for bridge in ros2 foxglove; do \
-	  $(LOCK) -c requirements/service.lock --extra $$bridge -o requirements/$$bridge.lock pyproject.toml || exit 1; done
+	for extra in ros2 foxglove docs; do \
+	  $(LOCK) -c requirements/service.lock --extra $$extra -o requirements/$$extra.lock pyproject.toml || exit 1; done
 	$(LOCK) -c requirements/service.lock --extra service --extra stub --extra offline --extra ros2 --extra foxglove --extra dev \
 	  -o requirements/dev.lock pyproject.toml requirements/torch-needs.in
 

@@ -1,4 +1,4 @@
-"""README's picture: six touches, as they are, as a one-step image shows them, and as the shipped bundle does.
+"""The picture of docs/method.md: six touches as they are, in a one-step image, and as the shipped bundle shows them.
 
     python -m bench.picture [--snr 70] [--out docs/touches.png]
 
@@ -60,17 +60,21 @@ def main(argv: list[str] | None = None) -> int:
     figure, axes = plt.subplots(3, len(TOUCHES), figsize=(2 * len(TOUCHES), 6.2), layout="constrained")
     rows: tuple[tuple[str, Iterable[Array]], ...] = (
         ("truth", [drop_image(shapes, 96) for shapes in TOUCHES]),
-        ("one-step (NOSER)", one_step),
+        ("NOSER", one_step),
         ("eitskin", images),
     )
     for row, (name, pictures) in zip(axes, rows, strict=True):
-        row[0].set_ylabel(name)
+        row[0].set_ylabel(name, fontsize=15)
         for axis, picture in zip(row, pictures, strict=True):
             shown = axis.imshow(picture, origin="lower", vmin=0, vmax=0.5, cmap="magma", extent=(-50, 50, -50, 50))
             axis.set(xticks=[], yticks=[])
-    figure.colorbar(shown, ax=axes, shrink=0.6, label="conductivity drop [S/m]")
+    axes[0, 0].set_title("100 mm", fontsize=13, pad=8)
+    axes[0, 0].annotate("", (0, 1.02), (1, 1.02), "axes fraction", arrowprops={"arrowstyle": "<->"})
+    scale = figure.colorbar(shown, ax=axes, shrink=0.8)
+    scale.set_label("conductivity drop, S/m", fontsize=15)
+    scale.ax.tick_params(labelsize=13)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(options.out, dpi=90)
+    figure.savefig(options.out, dpi=95)
     print(f"{options.out}: noise {options.snr:g} dB, the sheet is 100 mm wide")
     return 0
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from protocol.ages import Ages
-from protocol.frames import ContactFrame, ImageFrame
+from protocol.frames import ContactFrame, Frame, ImageFrame
 from protocol.freshness import NewestContacts, NotValid, Stale
 from protocol.held import HeldImage
 from protocol.runtime import host_id
@@ -101,19 +101,17 @@ class ContactFeed:
         self.want(False)
 
 
-class ImageFeed:
-    """The newest image of a skin, a held one put in again."""
+class NewestFeed:
+    """The newest frame of one topic of a skin, whatever it says."""
 
-    def __init__(self, skin: str, replay: bool = False) -> None:
-        self._skin, self._replay = skin, replay
+    def __init__(self, topic: str, skin: str) -> None:
+        self._topic, self._skin = topic, skin
         self._reader: NewestReader | None = None
-        self._ages = Ages()
-        self._held = HeldImage()
 
     def want(self, wanted: bool) -> None:
         """Subscribe, or no longer."""
         if wanted and self._reader is None:
-            self._reader = NewestReader("image", self._skin)
+            self._reader = NewestReader(self._topic, self._skin)
         elif not wanted and self._reader is not None:
             self._reader.close()
             self._reader = None
@@ -124,26 +122,46 @@ class ImageFeed:
         if self._reader is not None:
             yield self._reader.socket
 
+    def recv(self) -> Frame | None:
+        """The frame that has come since the last call."""
+        return None if self._reader is None else self._reader.recv(0.0)
+
+    def ask_again(self) -> None:
+        """Have sent again what whoever subscribes is sent."""
+        if self._reader is not None:
+            head = wire_topic(self._topic, self._skin) + b"\0"
+            self._reader.socket.unsubscribe(head)
+            self._reader.socket.subscribe(head)
+
+    def close(self) -> None:
+        self.want(False)
+
+
+class ImageFeed(NewestFeed):
+    """The newest image of a skin, a held one put in again."""
+
+    def __init__(self, skin: str, replay: bool = False) -> None:
+        super().__init__("image", skin)
+        self._replay = replay
+        self._ages = Ages()
+        self._held = HeldImage()
+
     def take(self, waited_ns: int) -> Picture | None:
         """The image that has come since the last call, where it may be shown. One of another host has come since
         `waited_ns`, and more is not known.
         """
-        if self._reader is None:
-            return None
-        frame = self._reader.recv(0.0)
+        frame = self.recv()
         if not isinstance(frame, ImageFrame) or (frame.source == "replay" and not self._replay):
             return None
         here = frame.host in ("", host_id())
         measured_ns = self._ages.measured_ns(frame, time.monotonic_ns() if here else waited_ns)
         if not self._held.complete(frame):
-            head = wire_topic("image", self._skin) + b"\0"
-            self._reader.socket.unsubscribe(head)  # whoever subscribes is sent it again
-            self._reader.socket.subscribe(head)
+            self.ask_again()
             return None
         if not frame.valid or measured_ns is None or self._ages.age_s(measured_ns) > frame.valid_for_s:
             return None
         return Picture(frame, measured_ns)
 
     def close(self) -> None:
-        self.want(False)
+        super().close()
         self._ages.close()

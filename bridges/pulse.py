@@ -7,7 +7,7 @@ from collections import Counter
 from typing import Any
 
 from protocol.frames import StatusFrame
-from protocol.metering import Meter
+from protocol.metering import StatusBeat
 
 EVERY_S = 1.0
 FLOWING_S = 0.5  # without a frame for so long, nothing flows
@@ -19,12 +19,11 @@ class Pulse:
     def __init__(self, process: str, skin: str) -> None:
         self.process, self.skin = process, skin
         self.level, self.messages, self.idle = "STALE", ["no frame yet"], True
-        self._meter = Meter()
+        self._beat = StatusBeat(process, skin)
+        self._meter = self._beat.meter
         self.sent = self._meter.sent
         self.drops: Counter[str] = Counter()
         self._heard = time.monotonic()
-        self._last: StatusFrame | None = None
-        self._next = 0.0
 
     def heard(self) -> None:
         """A frame came, whatever it says."""
@@ -42,28 +41,8 @@ class Pulse:
 
     def status(self, problems: list[str]) -> StatusFrame | None:
         """The status frame that is due: once a second, and at once when the level or the messages changed."""
-        now = time.monotonic()
         level = "WARN" if problems and self.level == "OK" else self.level
-        messages = [*self.messages, *problems]
-        last = self._last
-        if last is not None and (level, messages) == (last.level, last.messages) and now < self._next:
-            return None
-        self._meter.measure(now)
-        self._next = now + EVERY_S
-        self._last = StatusFrame(
-            skin=self.skin,
-            process=self.process,
-            valid=True,
-            valid_for_s=3 * EVERY_S,
-            level=level,
-            messages=messages,
-            rates=dict(self._meter.rates),
-            drops=dict(self.drops),
-            latency=self._meter.quantiles(),
-            cpu=self._meter.cpu,
-            stamps={"publish": time.monotonic_ns()},
-        )
-        return self._last
+        return self._beat.frame(level, [*self.messages, *problems], time.monotonic(), EVERY_S, self.drops)
 
     def summary(self) -> dict[str, Any]:
         """For the control command `status`."""

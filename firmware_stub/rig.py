@@ -22,10 +22,11 @@ from .faults import FAULTS, Faults
 from .field import Field
 from .port import BAUD, Line
 from .sheet import Sheet
-from .timeline import Timeline, press_track
+from .timeline import Timeline, TouchPath, press_track
 from .world import World
 
 UNTOUCHED = "demo"  # the scene in which nothing touches
+FELT_S = 1.0  # a scan that has felt a press ends within so much of the press's end
 SLEPT_S = 1.0  # after a longer pause between two calls the machine slept, not the board
 
 
@@ -137,7 +138,7 @@ class Rig:
                 )
         old = self.field.timeline
         finger = str(values.get("finger", ""))
-        presses = tuple(p for p in old.presses if p.times[-1] > now and not (finger and p.finger == finger))
+        presses = _lifted(old.presses, finger, now)
         track = press_track(now, seconds, touch, to, finger)
         self.field.play(Timeline(old.script, old.start, (*presses, track), old.electrodes), now)
         return {
@@ -146,7 +147,7 @@ class Rig:
             "radius": touch.radius,
             "drop": touch.drop,
             "seconds": seconds,
-            "presses": len(presses) + 1,
+            "presses": sum(p.times[-1] > now for p in presses) + 1,
         }
 
     def release(self, now: float, finger: str = "") -> dict[str, Any]:
@@ -156,8 +157,7 @@ class Rig:
         old = self.field.timeline
         gone = sum(p.times[-1] > now for p in old.presses if finger in ("", p.finger))
         if finger:
-            left = tuple(p for p in old.presses if p.times[-1] > now and p.finger != finger)
-            self.field.play(replace(old, presses=left), now)
+            self.field.play(replace(old, presses=_lifted(old.presses, finger, now)), now)
             return {"released": gone, "scene_ended": None, "faults": self.faults.listing(now)}
         self.play(UNTOUCHED, now)
         return {
@@ -253,3 +253,9 @@ class Rig:
         flipped ^= np.packbits(bits, axis=1)[:, 0]
         at = np.sort(self._rng.integers(0, len(data) + 1, self._rng.poisson(noise["garbage"] * len(data))))
         return np.insert(flipped, at, self._rng.integers(0, 256, len(at), np.uint8)).tobytes()
+
+
+def _lifted(presses: tuple[TouchPath, ...], finger: str, now: float) -> tuple[TouchPath, ...]:
+    """The presses without what is over. Those of `finger` end now: the scan that goes on has begun under them."""
+    cut = (p.until(now) if finger and p.finger == finger else p for p in presses)
+    return tuple(p for p in cut if p is not None and p.times[-1] > now - FELT_S)

@@ -27,6 +27,15 @@ class TouchPath:
         a, b = self.times[k - 1], self.times[k]
         return blend(World((self.poses[k - 1],)), World((self.poses[k],)), (t - a) / (b - a)).touches[0]
 
+    def until(self, t: float) -> TouchPath | None:
+        """The path as it is up to t; None where it begins later."""
+        if t >= self.times[-1]:
+            return self
+        if (last := self.pose(t, t)) is None or t == self.times[0]:
+            return None
+        k = bisect_right(self.times, t)
+        return replace(self, times=(*self.times[:k], t), poses=(*self.poses[:k], last))
+
 
 @dataclass(frozen=True)
 class PiecewiseLinear:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from models import bundle, calibrate, data, export, geometry, manifest, samples, train, verdict
+from models import bundle, calibrate, class_temperature, data, export, geometry, manifest, samples, train, verdict
 from models.augmentation import random_condition
 from models.evaluation import LEVELS, evaluate, predict
 from models.forward import ForwardModel
@@ -70,8 +70,12 @@ def physics(skin: geometry.SkinGeometry, scenes: Path) -> tuple[Matrices, sample
     return replace(matrices, level=samples.levels(held_out, PreReconstructor(matrices))), held_out
 
 
-def networks(folder: Path, pre: PreReconstructor, held_out: samples.Samples) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Exports the checkpoints in a folder: ONNX of each variant, and what the manifest says about them."""
+def networks(
+    folder: Path, pre: PreReconstructor, held_out: samples.Samples, presses: calibrate.SolvedPresses
+) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Exports the checkpoints in a folder: ONNX of each variant, and what the manifest says about them. presses: what
+    the temperature of the class probabilities is fitted to.
+    """
     made: dict[str, bytes] = {}
     said: dict[str, Any] = {}
     stack, context = calibration(pre, held_out)
@@ -79,11 +83,14 @@ def networks(folder: Path, pre: PreReconstructor, held_out: samples.Samples) -> 
         if not (folder / f"{variant}.pt").is_file():
             continue
         model, state = restore(folder / f"{variant}.pt")
+        shape_class = class_temperature.seen_classes(presses, pre, predict(model)).said()
+        class_temperature.cooled(model, shape_class["temperature"])
         made[variant] = export.to_onnx(model, stack[:32], context[:32])
         said[variant] = {
             "parameters": sum(p.numel() for p in model.parameters()),
             "multiply_accumulates": multiply_accumulates(model.config),
             "config": model.config.to_dict(),
+            "shape_class": shape_class,
             "training": {
                 **state.get("said", {}),
                 "minutes": round(state["numbers"]["elapsed"] / 60, 1),
@@ -166,9 +173,9 @@ def main(argv: list[str] | None = None) -> None:
             scenes = samples.load(work, "train", pre)
             for variant, minutes in (("full", plan.full), ("fast", plan.fast)):
                 train.train(variant, skin, pre, scenes, held_out, minutes, work / f"{variant}.pt", args.seed, args.jobs)
-        made, said = networks(work, pre, held_out)
-        presses = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4
-        for variant, found in calibrate.uncertainty(skin, pre, made, presses, work / "presses.npz").items():
+        count, cache = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4, work / "presses.npz"
+        made, said = networks(work, pre, held_out, calibrate.solve(skin, count, cache=cache))
+        for variant, found in calibrate.uncertainty(skin, pre, made, count, cache).items():
             said[variant]["uncertainty"] = found
     if "full" in said:
         said["full"]["verdict"] = _verdict(args.skin, pre, held_out, said["full"]).to_dict()

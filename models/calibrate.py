@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from models import bundle, geometry
 from models.evaluation import Predict, predict
 from models.export import session
 from models.forward import ForwardModel
-from models.prereconstruction import TARE_FRAMES, Array, Drift, PreReconstructor
+from models.prereconstruction import TARE_FRAMES, Array, Drift, Operator, PreReconstructor
 from models.scenes import Prior, random_shape
 from models.shapes import KINDS, Shape
 from models.uncertainty import (
@@ -106,14 +107,13 @@ def part(seen: ImageFeatures, rows: Array) -> ImageFeatures:
     return ImageFeatures(**{f.name: getattr(seen, f.name)[rows] for f in fields(ImageFeatures)})
 
 
-def see(
-    presses: SolvedPresses, pre: PreReconstructor, network: Predict, seed: int = 4, conditions: int = CONDITIONS
-) -> Sightings:
-    """What the network shows of the presses under noise from 57 dB to none, each condition with its own tare.
-    Undetected presses are left out.
+def scans(
+    presses: SolvedPresses, pre: PreReconstructor, seed: int, conditions: int
+) -> Iterator[tuple[float, float, Operator, Array, Array]]:
+    """The presses under noise from 57 dB to none, each condition with its own tare: decibel, rms sigma, operator, which
+    presses were detected, and their differences (N, K).
     """
     rng = np.random.default_rng([seed, 32])
-    index, decibels, found = [], [], []
     differences = presses.normalised(pre)
     for condition in range(conditions):
         free = condition < NOISE_FREE_SHARE * conditions
@@ -133,11 +133,18 @@ def see(
         d = true + (1 + true) * noise * rng.standard_normal(true.shape) - tare.mean(0)
         limit = operator.threshold(FALSE_ALARMS, TARE_FRAMES)
         touched = np.array([operator.score(row) > limit for row in d])
-        chosen, d = chosen[touched], d[touched]
+        yield decibel, float(np.sqrt((sigma**2).mean())), operator, chosen[touched], d[touched]
+
+
+def see(
+    presses: SolvedPresses, pre: PreReconstructor, network: Predict, seed: int = 4, conditions: int = CONDITIONS
+) -> Sightings:
+    """What the network shows of the presses under each of `scans`; undetected presses are left out."""
+    index, decibels, found = [], [], []
+    for decibel, rms, operator, chosen, d in scans(presses, pre, seed, conditions):
         stack, context, scale = operator.stacks(d)
         drop, log_sigma, _ = network(stack, context)
         factors = scale[:, None, None]
-        rms = float(np.sqrt((sigma**2).mean()))
         for k, image, spread in zip(chosen, drop[:, 0] * factors, np.exp(log_sigma[:, 0]) * factors, strict=True):
             one = look(image, spread, rms)
             if one is not None:

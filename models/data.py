@@ -3,7 +3,8 @@
     python -m models.data --skin square16 --n 20000 --jobs 2
 
 Each chunk is several hundred scenes on one skin as it might have been mounted (electrodes shifted along the outline,
-contact impedances and background off); 40 % of chunks are the nominal skin. A chunk depends on (seed, split, index)
+contact impedances and background off, a little anisotropy and a smooth field: what a calibration leaves of them); 40 %
+of chunks are the nominal skin. A touch in six has a soft edge. A chunk depends on (seed, split, index)
 alone, so a run can be stopped and taken up again, and any number of processes on any joblib backend gives the same
 files. Noise and drift are not in the data: training adds them, afresh each time.
 """
@@ -28,9 +29,11 @@ from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from models import geometry
+from models.condensed import CondensedSheet
 from models.forward import ForwardModel
+from models.mismatch import anisotropy_root, smooth_field, soft_drop, soft_touched, turned
 from models.scenes import TRAINING, random_scene
-from models.shapes import drop_image, from_rows, to_rows
+from models.shapes import Shape, drop_image, from_rows, to_rows
 from protocol.errors import EitskinError
 
 
@@ -41,12 +44,16 @@ class OtherScenes(EitskinError, ValueError):
 WORK = Path(__file__).parent / "work"
 SPLITS = ("test", "train", "valid")
 IMAGE = 48  # pixels a side
-SCHEMA = 1
+SCHEMA = 2  # of the chunk files: 1 had no soft edges
 
 NOMINAL_SHARE = 0.4
 CONTACT_SPREAD = 0.30  # each electrode, relative, uniform
 BACKGROUND_SPREAD = 0.05
 SHIFT_SPREAD = 0.03  # of the electrode spacing, standard deviation
+FIELD_LEFT, ANISOTROPY_LEFT = 0.015, 0.01  # largest of each, relative: what a calibration leaves of 5 to 10 %
+SOFT_SHARE = 0.16  # of scenes whose touches have soft edges
+SOFT_EDGE = (0.01, 0.1)  # standard deviation of the blur, model units: 0.5 to 5 mm on the square skin
+WORTH_INVERSE = 400  # scenes of a chunk from which the untouched sheet's inverse, two seconds, is worth its time
 
 
 @dataclass(frozen=True)
@@ -72,11 +79,18 @@ def _nominal(skin: str, mesh: str) -> ForwardModel:
     return ForwardModel(nominal, nominal.pattern, mesh=mesh)
 
 
+@lru_cache(maxsize=1)
+def _nominal_condensed(skin: str, mesh: str) -> CondensedSheet:
+    model = _nominal(skin, mesh)
+    return CondensedSheet(model, model.touched([]))
+
+
 def make_chunk(spec: ChunkSpec) -> dict[str, NDArray[Any]]:
     """Solve one chunk of S scenes on one variant of the skin; K measurements, E electrodes.
 
     difference (S, K) float32: |Z| / |Z0| - 1 against this variant's own Z0, without noise
     shapes (S, 3, 7) float32, image (S, 48, 48) float16: drop [S/m] on a background of 1
+    blur (S,) float32: standard deviation of the touches' soft edges [model units], 0: sharp
     z0 (K,) ohm, contact_impedance (E,), background (), shift (E,) of each electrode along the outline [model units]
     """
     rng = np.random.default_rng([spec.seed, SPLITS.index(spec.split), spec.index])
@@ -90,21 +104,39 @@ def make_chunk(spec: ChunkSpec) -> dict[str, NDArray[Any]]:
         model = ForwardModel(skin.moved(shift), skin.pattern, mesh=spec.mesh)
     contact = skin.contact_impedance * (1 + wide * CONTACT_SPREAD * rng.uniform(-1, 1, n))
     background = 1 + wide * BACKGROUND_SPREAD * rng.uniform(-1, 1)
-    z0 = np.abs(model.solve(background, contact).impedances())
+    field = smooth_field(skin, wide * FIELD_LEFT * rng.uniform(), int(rng.integers(2**31)))(model.centroids)
+    root = anisotropy_root(wide * ANISOTROPY_LEFT * rng.uniform(), rng.uniform(0, np.pi))
+
+    def sheet(scene: list[Shape], blur: float) -> NDArray[np.float64]:
+        """Conductivity tensors; a touch takes its share of whatever conducts where it is."""
+        touched = soft_touched(model, scene, blur) if scene and blur else model.touched(scene)
+        return turned(touched * (background * (1 + field))[:, None], root)
+
+    if spec.size >= WORTH_INVERSE:
+        solve = (
+            _nominal_condensed(spec.skin, spec.mesh) if nominal else CondensedSheet(model, sheet([], 0.0), contact)
+        ).impedances
+    else:
+
+        def solve(conductivity: NDArray[np.float64]) -> NDArray[np.float64]:
+            return model.solve(conductivity, contact).impedances()
+
+    z0 = np.abs(model.solve(sheet([], 0.0), contact).impedances())
     prior = TRAINING.on(skin)
     difference = np.empty((spec.size, len(z0)), np.float32)
     rows = np.empty((spec.size, 3, 7), np.float32)
     images = np.empty((spec.size, IMAGE, IMAGE), np.float16)
-    for k in range(spec.size):
+    blurs = np.where(rng.random(spec.size) < SOFT_SHARE, rng.uniform(*SOFT_EDGE, spec.size), 0.0).astype(np.float32)
+    for k, blur in enumerate(blurs.tolist()):
         rows[k] = to_rows(random_scene(rng, prior, skin.inside))
         scene = from_rows(rows[k].astype(float))  # the float32 rows: what is stored is what was solved
-        conductivity = model.touched(scene, background)
-        difference[k] = np.abs(model.solve(conductivity, contact).impedances()) / z0 - 1
-        images[k] = drop_image(scene, IMAGE)
+        difference[k] = np.abs(solve(sheet(scene, blur))) / z0 - 1
+        images[k] = soft_drop(scene, blur, IMAGE) if blur else drop_image(scene, IMAGE)
     return {
         "difference": difference,
         "shapes": rows,
         "image": images,
+        "blur": blurs,
         "z0": z0,
         "contact_impedance": contact,
         "background": np.array(background),
@@ -194,6 +226,7 @@ class Dataset:
     difference: NDArray[np.float32]
     image: NDArray[np.float16]
     shapes: NDArray[np.float32]
+    blur: NDArray[np.float32]
     variant: NDArray[np.int64]
     z0: NDArray[np.float64]
 
@@ -212,10 +245,10 @@ def load(folder: Path, split: str = "train", limit: int | None = None, skip: int
     if not parts:
         raise FileNotFoundError(f"no {split}-*.npz in {folder}: make some with python -m models.data")
     variant = np.repeat(np.arange(len(parts)), [len(p["difference"]) for p in parts])
-    rest = {k: np.concatenate([p[k] for p in parts]) for k in ("difference", "image", "shapes")}
+    rest = {k: np.concatenate([p[k] for p in parts]) for k in ("difference", "image", "shapes", "blur")}
     cut = slice(0, limit)
     z0 = np.stack([p["z0"] for p in parts])
-    return Dataset(rest["difference"][cut], rest["image"][cut], rest["shapes"][cut], variant[cut], z0)
+    return Dataset(variant=variant[cut], z0=z0, **{k: v[cut] for k, v in rest.items()})
 
 
 def _read(folder: Path, split: str, limit: int | None, skip: int) -> Iterator[dict[str, NDArray[Any]]]:

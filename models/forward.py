@@ -65,6 +65,26 @@ class ForwardModel(Elements):
         fields = self.factorise(self.matrix(conductivity, contact)).solve(self.currents)
         return Solution(self, contact, fields[self._position])
 
+    @property
+    def unknown_of_node(self) -> NDArray[np.int64]:
+        """(n_nodes + n - 1,) row of `matrix` of each node, then of each electrode but the last."""
+        return self._position
+
+    def read(self, transfer: Array, pattern: str | ArrayLike | None = None) -> Array:
+        """(K,) ohm, signed: V(sense+) - V(sense-) of unit current drive+ -> drive-, from a transfer matrix (n, n) as
+        Solution has it. None: the model's pattern.
+        """
+        drive_plus, drive_minus, plus, minus = self._rows(pattern).T
+        t = transfer
+        return np.asarray(t[plus, drive_plus] - t[plus, drive_minus] - t[minus, drive_plus] + t[minus, drive_minus])
+
+    def _rows(self, pattern: str | ArrayLike | None) -> NDArray[np.int64]:
+        if pattern is None:
+            return self.pattern
+        if isinstance(pattern, str):
+            return patterns.pattern(pattern, self.skin.n_electrodes)
+        return np.asarray(pattern, dtype=np.int64).reshape(-1, 4)  # any measurements, of whatever rank
+
     def solve_sources(self, sources: Array) -> Array:
         """(n_nodes, c) potentials on the untouched sheet of right-hand sides (n_nodes + n, c): of its nodes, then of
         its electrodes, the last of which is the ground.
@@ -187,10 +207,8 @@ class Solution:
         self.potentials[:, :-1] = fields[: model.n_nodes]
 
     def impedances(self, pattern: str | ArrayLike | None = None) -> Array:
-        """(K,) ohm, signed: V(sense+) - V(sense-) of unit current drive+ -> drive-. None: the model's pattern."""
-        t = self.transfer
-        drive_plus, drive_minus, plus, minus = self._rows(pattern).T
-        return np.asarray(t[plus, drive_plus] - t[plus, drive_minus] - t[minus, drive_plus] + t[minus, drive_minus])
+        """See ForwardModel.read."""
+        return self.model.read(self.transfer, pattern)
 
     def jacobian(self, pattern: str | ArrayLike | None = None) -> Array:
         """(K, n_elements) dZ/dconductivity [ohm/S] by the adjoint: -int_e grad u_drive . grad u_sense."""
@@ -220,15 +238,8 @@ class Solution:
         np.add.at(result, model._facet_electrode, mean * model._facet_lengths[:, None])
         return np.asarray((result / self.contact_impedance[:, None] ** 2).T)
 
-    def _rows(self, pattern: str | ArrayLike | None) -> NDArray[np.int64]:
-        if pattern is None:
-            return self.model.pattern
-        if isinstance(pattern, str):
-            return patterns.pattern(pattern, self.model.skin.n_electrodes)
-        return np.asarray(pattern, dtype=np.int64).reshape(-1, 4)  # any measurements, of whatever rank
-
     def _incidence(self, pattern: str | ArrayLike | None) -> tuple[Array, Array]:
-        rows, n = self._rows(pattern), self.model.skin.n_electrodes
+        rows, n = self.model._rows(pattern), self.model.skin.n_electrodes
         return patterns.incidence(rows[:, :2], n), patterns.incidence(rows[:, 2:], n)
 
 

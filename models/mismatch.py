@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from models import geometry
+from models.elements import Elements, barycentric
 from models.forward import ForwardModel, Solution
 from models.shapes import Shape, drop_image
 from protocol.errors import EitskinError
@@ -27,6 +28,8 @@ Array = NDArray[np.float64]
 WAVES = 48  # random waves that make a smooth field
 FIELD_LENGTH = 1.0  # correlation length of a field, model units: half a side of the square skin
 BLUR_GRID = 320  # pixels a side on which a soft edge is computed
+BLUR_REACH = 4.5  # standard deviations beyond which a blurred edge has ended
+NEXT_ELEMENTS = 0.1  # model units: no element is larger
 LARGEST_DROP = 0.97  # of the sheet: no touch cuts it through
 
 
@@ -90,7 +93,7 @@ class MismatchedSheet:
         self.mismatch = mismatch
         self.skin = mounted(self.nominal, mismatch)
         self.model = ForwardModel(self.skin, mesh=mesh)
-        self.root: Array = _root(mismatch.anisotropy, mismatch.angle)
+        self.root: Array = anisotropy_root(mismatch.anisotropy, mismatch.angle)
         self.field: Array = 1 + smooth_field(self.nominal, mismatch.field, mismatch.seed)(self.model.centroids)
 
     def solve(
@@ -105,26 +108,35 @@ class MismatchedSheet:
     def conductivity(self, shapes: Sequence[Shape] = (), background: float = 1.0) -> Array:
         """(n_elements, 3) tensors xx, xy, yy [S]. A touch takes its share of whatever conducts where it is."""
         soft = bool(shapes) and self.mismatch.blur_m > 0
-        drop = self._soft(shapes) if soft else self.model.touched(shapes)
+        blur = self.mismatch.blur_m / self.skin.metres_per_unit
+        drop = soft_touched(self.model, shapes, blur) if soft else self.model.touched(shapes)
         scaled: Array = drop * (background * self.field)[:, None]
         return turned(scaled, self.root)
 
-    def _soft(self, shapes: Sequence[Shape]) -> Array:
-        """(n_elements, 3) of a sheet whose touches have soft edges."""
-        image = soft_drop(shapes, self.mismatch.blur_m / self.skin.metres_per_unit, BLUR_GRID)
 
-        def at(points: Array) -> Array:
-            place = (points + 1) * BLUR_GRID / 2 - 0.5
-            return np.asarray(ndimage.map_coordinates(image, [place[..., 1], place[..., 0]], order=1, mode="nearest"))
-
-        left = 1 - np.minimum(self.model.average(at), LARGEST_DROP)
-        return np.column_stack([left, np.zeros_like(left), left])
+def soft_touched(model: Elements, shapes: Sequence[Shape], blur: float) -> Array:
+    """(n_elements, 3) conductivity of a sheet of 1 S under touches whose edges are blurred; see soft_drop."""
+    image = soft_drop(shapes, blur, BLUR_GRID)
+    reach = np.array([np.hypot(*(model.centroids - (s.x, s.y)).T) - s.radius for s in shapes]).min(axis=0)
+    near = np.flatnonzero(reach < BLUR_REACH * blur + NEXT_ELEMENTS)
+    points = np.einsum("qc,eck->eqk", barycentric(4), model.corners[near])
+    place = (points + 1) * BLUR_GRID / 2 - 0.5
+    drop = ndimage.map_coordinates(image, [place[..., 1], place[..., 0]], order=1, mode="nearest").mean(axis=1)
+    result = np.tile([1.0, 0.0, 1.0], (model.n_elements, 1))
+    result[near, 0] = result[near, 2] = 1 - np.minimum(drop, LARGEST_DROP)
+    return np.asarray(result)
 
 
 def soft_drop(shapes: Sequence[Shape], blur: float, n: int) -> Array:
     """(n, n) conductivity drop of touches whose edges are blurred (Gaussian, standard deviation `blur` model units)."""
     fine = n * max(1, BLUR_GRID // n)
-    image = np.asarray(ndimage.gaussian_filter(drop_image(shapes, fine), blur * fine / 2, mode="constant"))
+    image, spread = drop_image(shapes, fine), blur * fine / 2
+    reach = int(np.ceil(BLUR_REACH * spread)) + 1
+    window = tuple(
+        slice(max(0, int(there[0]) - reach), int(there[-1]) + reach + 1)
+        for there in (np.flatnonzero(image.any(axis=axis)) for axis in (1, 0))
+    )
+    image[window] = ndimage.gaussian_filter(image[window], spread, mode="constant")
     return np.asarray(image.reshape(n, fine // n, n, fine // n).mean(axis=(1, 3)))
 
 
@@ -171,7 +183,7 @@ def smooth_field(skin: geometry.SkinGeometry, sd: float, seed: int) -> SmoothFie
     return SmoothField(grid[skin.inside(grid)], sd, seed)
 
 
-def _root(anisotropy: float, angle: float) -> Array:
+def anisotropy_root(anisotropy: float, angle: float) -> Array:
     """(2, 2) square root of the tensor that multiplies an isotropic sheet."""
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s], [s, c]])

@@ -5,8 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -111,3 +113,27 @@ class TrainingBar:
             soft_wrap=True,
             highlight=False,
         )
+
+
+def plot(curve: list[dict[str, Any]], path: Path) -> None:
+    """Loss and held-out figures against minutes, as PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4))
+    minutes = [row["minutes"] for row in curve]
+    for name in ("image", "mask", "jaccard", "amplitude", "peak", "integral", "class"):
+        axes[0].semilogy(minutes, [row.get(name, np.nan) for row in curve], label=name)
+    for level in LEVELS:
+        for name in ("mean IoU", "contact IoU"):
+            axes[1].plot(minutes, [row[f"{name}, {level}"] for row in curve], label=f"{name}, {level}")
+    for axis, title in zip(axes, ("training loss, by term", "held-out single touches"), strict=True):
+        axis.set_xlabel("minutes")
+        axis.set_title(title)
+        axis.legend(fontsize=7)
+        axis.grid(alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -10,17 +10,20 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from models import data, geometry
 from models.augmentation import Condition, Pixel, Symmetry, random_condition, symmetries
+from models.device_batches import ConditionTensors, SceneTensors, measured, stacks
 from models.losses import IGNORE, Target
 from models.prereconstruction import Array, PreReconstructor
 from models.shapes import from_rows
 
 N = 96
 GRID = 24
-KIND_WEIGHT = np.array([0.0, 0.85, 1.2, 1.2, 1.2, 1.2, 0.8])  # none, circle, triangle, rectangle, square, L, Hertz
+KIND_WEIGHT = np.array([0.0, 0.85, 1.2, 1.2, 1.2, 1.6, 0.8])  # none, circle, triangle, rectangle, square, L, Hertz
+SMALL_RADIUS, SMALL_WEIGHT = 0.22, 1.4  # touches of a smaller circle are hard, and few
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +50,18 @@ def load(folder: Path, split: str, pre: PreReconstructor, limit: int | None = No
     if pre.m.normalisation == "model":
         gain = np.median(z0 / pre.m.z0, axis=1, keepdims=True)
         d = d * z0 / (gain * pre.m.z0)
-    drop, mask, classes = picture(raw.shapes)
+    drop, mask, classes = picture(raw.shapes, raw.blur)
     return Samples(d.astype(np.float32), drop, mask, classes, raw.shapes)
 
 
 def picture(
-    shapes: npt.NDArray[np.floating],
+    shapes: npt.NDArray[np.floating], blur: npt.NDArray[np.floating] | None = None
 ) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Drop, mask and class pictures of (M, 3, 7) shape rows; see Samples."""
+    """Drop, mask and class pictures of (M, 3, 7) shape rows; see Samples.
+
+    blur (M,): of their edges, model units. A soft touch's mask is its blurred coverage, so that drop is amplitude times
+    mask for it too.
+    """
     m = len(shapes)
     drop = np.zeros((m, N, N), np.float16)
     mask = np.zeros((m, N, N), np.uint8)
@@ -67,6 +74,8 @@ def picture(
             image += shape.drop * (shape.fraction(N) if shape.kind == "hertz" else part)
             coarse = part.reshape(GRID, N // GRID, GRID, N // GRID).mean(axis=(1, 3))
             classes[k][coarse > 0.3] = shape.shape_class
+        if blur is not None and blur[k] > 0:
+            image, covered = (gaussian_filter(p, blur[k] * N / 2, mode="constant") for p in (image, covered))
         drop[k], mask[k] = image, np.round(255 * covered.clip(0, 1))
     return drop, mask, classes
 
@@ -77,19 +86,10 @@ class Batch:
     context: Tensor
     target: Target
 
-    def to(self, device: torch.device) -> Batch:
-        t = self.target
-        layout = torch.channels_last
-        return Batch(
-            self.stack.to(device, memory_format=layout),
-            self.context.to(device),
-            Target(t.drop.to(device), t.mask.to(device), t.classes.to(device)),
-        )
-
 
 class Batches:
-    """Endless random batches. Operators depend on the noise, so a bank of conditions is kept and one is renewed
-    at every batch.
+    """Endless random batches on a device. Operators depend on the noise, so a bank of conditions is kept and one is
+    renewed at every batch.
     """
 
     def __init__(
@@ -101,12 +101,17 @@ class Batches:
         size: int = 64,
         groups: int = 4,
         bank: int = 96,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.samples, self.pre, self.size, self.groups, self.limit = samples, pre, size, groups, bank
-        self.rng = np.random.default_rng(seed)
+        self.rng, self.device = np.random.default_rng(seed), torch.device(device)
+        self._noise = torch.Generator(self.device).manual_seed(seed)
         self.symmetries = symmetries(skin)
         self._weigh()
-        self.bank: list[Condition] = [random_condition(pre, self.rng) for _ in range(groups)]
+        self.bank = [self._fresh() for _ in range(groups)]
+
+    def _fresh(self) -> ConditionTensors:
+        return ConditionTensors(random_condition(self.pre, self.rng), self.device)
 
     def add(self, more: Samples) -> None:
         """Takes further scenes in."""
@@ -115,24 +120,32 @@ class Batches:
         self._weigh()
 
     def _weigh(self) -> None:
-        """Scenes are drawn by what touches in them: round contacts teach least, and Hertz contacts are circles too."""
+        """Scenes are drawn by what touches in them: round contacts teach least, and Hertz contacts are circles too;
+        the L and small touches are hardest.
+        """
         kind = np.nan_to_num(self.samples.shapes[:, :, 0]).astype(int)
+        small = np.nan_to_num(self.samples.shapes[:, :, 3]) < SMALL_RADIUS
         touches = np.maximum((kind > 0).sum(axis=1), 1)
-        self.cumulated = np.cumsum(KIND_WEIGHT[kind].sum(axis=1) / touches)
+        self.cumulated = np.cumsum((KIND_WEIGHT[kind] * np.where(small, SMALL_WEIGHT, 1.0)).sum(axis=1) / touches)
+        s = self.samples
+        self._scenes = SceneTensors(s.d, s.drop, s.mask, s.classes, self.symmetries, self.device)
 
     def draw(self) -> Batch:
-        fresh = random_condition(self.pre, self.rng)
+        fresh = self._fresh()
         if len(self.bank) < self.limit:
             self.bank.append(fresh)
         else:
             self.bank[self.rng.integers(self.limit)] = fresh
-        chosen = self.rng.choice(len(self.bank), self.groups, replace=False)
-        parts = []
-        for c in chosen:
-            index = np.searchsorted(self.cumulated, self.rng.random(self.size // self.groups) * self.cumulated[-1])
-            turned = [self.symmetries[s] for s in self.rng.integers(len(self.symmetries), size=len(index))]
-            parts.append(make(self.samples, index, turned, self.bank[c], self.rng))
-        return join(parts)
+        chosen = [self.bank[c] for c in self.rng.choice(len(self.bank), self.groups, replace=False)]
+        n = self.size // self.groups
+        place = self.rng.random(self.groups * n) * self.cumulated[-1]
+        index = torch.from_numpy(np.searchsorted(self.cumulated, place)).to(self.device)
+        turn = torch.from_numpy(self.rng.integers(len(self.symmetries), size=len(place))).to(self.device)
+        clean, target = self._scenes.pick(index, turn)
+        seen = measured(chosen, clean.reshape(self.groups, n, -1), self._noise)
+        stack, context, scale = stacks(chosen, seen)
+        target.drop /= scale[:, None, None, None]
+        return Batch(stack.contiguous(memory_format=torch.channels_last), context, target)
 
 
 def make(

@@ -8,6 +8,7 @@ is drop * sqrt(1 - (r / R)^2), the pressure under a ball. Kinds are numbered 1-6
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -168,9 +169,18 @@ class Shape:
         exact (a circle is a polygon of equal area, 1e-4 of its radius off); a Hertz profile is averaged over points.
         """
         if self.kind == "hertz" and not covered:
-            centres = -1 + 2 * (np.arange(n * SUBPOINTS) + 0.5) / (n * SUBPOINTS)
-            points = np.stack(np.broadcast_arrays(centres[None, :], centres[:, None]), axis=-1)
-            return np.asarray(self.profile(points).reshape(n, SUBPOINTS, n, SUBPOINTS).mean((1, 3)))
+            image = np.zeros((n, n))
+            windows = []  # pixels that the circle reaches, along x and y
+            for middle in (self.x, self.y):
+                low, high = (math.floor((middle + side * self.radius + 1) * n / 2) for side in (-1, 1))
+                windows.append(slice(min(max(low, 0), n), min(max(high + 1, 0), n)))
+            x, y = (
+                -1 + 2 * (np.arange(w.start * SUBPOINTS, w.stop * SUBPOINTS) + 0.5) / (n * SUBPOINTS) for w in windows
+            )
+            points = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1)
+            part = self.profile(points).reshape(len(y) // SUBPOINTS, SUBPOINTS, len(x) // SUBPOINTS, SUBPOINTS)
+            image[windows[1], windows[0]] = part.mean((1, 3))
+            return image
         outline = self.outline(ROUND)
         if self.corners is None:
             outline = (outline - (self.x, self.y)) * np.sqrt(2 * np.pi / ROUND / np.sin(2 * np.pi / ROUND))

@@ -18,9 +18,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from models import data, geometry, manifest, samples
 from models.bundle import Bundle
@@ -28,12 +27,16 @@ from models.evaluation import LEVELS, evaluate, predict
 from models.losses import losses, total
 from models.network import FAST, FULL, MMCNN, NetworkConfig, laid_out
 from models.optim import Muon
-from models.pace import Pace, TrainingBar
+from models.pace import Pace, TrainingBar, plot
 from models.prereconstruction import PreReconstructor
+from models.warm_start import BATCHES, NoSuchNetwork, normalised, restored
 
+NUMBERS = ("elapsed", "steps", "curve", "best_score", "best_at", "rates", "start")  # of a checkpoint, and all plain
 CONFIGS = {"full": FULL, "fast": FAST}
 MUON_RATE, ADAM_RATE = 0.02, 2e-3
 AVERAGE = 0.999
+CPU_BATCH, GPU_BATCH = (64, 4), (1024, 16)  # scenes of a batch, and noise conditions among them
+FINE = 0.04  # of the learning rates, where training starts from a trained network: more, and it is lost first
 
 
 class Trainer:
@@ -44,9 +47,11 @@ class Trainer:
     ) -> None:
         torch.manual_seed(seed)
         self.seed, self.commit = seed, manifest.commit()
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.device = batches.device
         self.model = laid_out(MMCNN(config).to(self.device), torch.channels_last)
         self.average = copy.deepcopy(self.model)
+        # Compiling takes minutes on a processor and gains little there.
+        self._parts = torch.compile(self.model.parts) if self.device.type == "cuda" else self.model.parts
         self.config, self.batches, self.held_out = config, batches, held_out
         hidden = [
             p
@@ -61,26 +66,27 @@ class Trainer:
         ]
         self.rates = [MUON_RATE, ADAM_RATE]
         self.elapsed, self.steps = 0.0, 0  # seconds, batches
+        self.start: dict[str, Any] = {}  # what the manifest says of where it started
         self.curve: list[dict[str, Any]] = []
         self.best: dict[str, Any] | None = None
         self.best_score, self.best_at = -math.inf, 0.0
         self.pace = Pace(torch.get_num_threads(), self.device.type)
 
-    def step(self, done: float) -> dict[str, float]:
-        """One batch at fraction `done` of the budget."""
+    def step(self, done: float) -> dict[str, Tensor]:
+        """One batch at fraction `done` of the budget. The losses stay on the device: reading one waits for it."""
         with self.pace.of("batches"):
-            batch = self.batches.draw().to(self.device)
+            batch = self.batches.draw()
         with self.pace.of("network"):
             return self._learn(batch, done)
 
-    def _learn(self, batch: samples.Batch, done: float) -> dict[str, float]:
+    def _learn(self, batch: samples.Batch, done: float) -> dict[str, Tensor]:
         warm, factor = min(1.0, done / 0.01 + 0.01), 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
         for optimizer, rate in zip(self.optimizers, self.rates, strict=True):
             for group in optimizer.param_groups:
                 group["lr"] = rate * warm * factor
         self.model.train()
         with torch.autocast("cuda", torch.bfloat16, enabled=self.device.type == "cuda"):
-            parts = self.model.parts(batch.stack, batch.context)
+            parts = self._parts(batch.stack, batch.context)
         mask, amplitude, sigma, classes = (p.float() for p in parts)
         terms = losses((mask, amplitude, sigma, classes), batch.target)
         for optimizer in self.optimizers:
@@ -94,7 +100,7 @@ class Trainer:
         with torch.no_grad():
             for mine, theirs in zip(self.average.state_dict().values(), self.model.state_dict().values(), strict=True):
                 mine.lerp_(theirs, 1 - blend) if mine.dtype.is_floating_point else mine.copy_(theirs)
-        return {name: float(value.detach()) for name, value in terms.items()}
+        return {name: value.detach() for name, value in terms.items()}
 
     def run(
         self,
@@ -110,18 +116,18 @@ class Trainer:
         take at most a tenth of the time, however slow the machine is.
         """
         chunks = len(data.chunk_files(folder)) if folder else 0
-        budget, sums, count, saved = 60 * minutes, dict[str, float](), 0, self.elapsed
+        budget, sums, count, saved = 60 * minutes, dict[str, Tensor](), 0, self.elapsed
         began = time.perf_counter() - self.elapsed
         next_check = self.elapsed + max(budget / 30, 15.0)
         with TrainingBar(name, budget, quiet) as bar:
             while self.elapsed < budget:
                 terms = self.step(self.elapsed / budget)
-                sums = {k: sums.get(k, 0.0) + v for k, v in terms.items()}
+                sums = {k: sums[k] + v if k in sums else v for k, v in terms.items()}
                 count += 1
                 self.elapsed = time.perf_counter() - began
                 bar.at(self.elapsed, self.steps)
                 if self.elapsed >= next_check or self.elapsed >= budget:
-                    row = self._check({k: v / count for k, v in sums.items()})
+                    row = self._check({k: float(v) / count for k, v in sums.items()})
                     if folder and (found := len(data.chunk_files(folder))) > chunks:
                         self.batches.add(samples.load(folder, "train", self.batches.pre, skip=chunks))
                         chunks = found
@@ -172,16 +178,30 @@ class Trainer:
                 "commit": self.commit,
                 "scenes": len(self.batches.samples),
                 "device": str(self.device),
+                **self.start,
             },
             "model": self.model.state_dict(),
             "average": self.average.state_dict(),
             "best": self.best,
             "optimizers": [o.state_dict() for o in self.optimizers],
-            "numbers": {k: getattr(self, k) for k in ("elapsed", "steps", "curve", "best_score", "best_at")},
+            "numbers": {k: getattr(self, k) for k in NUMBERS},
         }
         part = path.with_suffix(".part")
         torch.save(state, part)
         part.replace(path)
+
+    def start_from(self, bundle: Bundle, variant: str) -> None:
+        """The network of a bundle as the start, with lower learning rates. Raises NoSuchNetwork."""
+        path = bundle.network_path(variant)
+        if path is None:
+            raise NoSuchNetwork(f"the bundle {bundle.name} has no network {variant!r} to start from")
+        model = restored(path.read_bytes(), self.config)
+        batches = [self.batches.draw() for _ in range(BATCHES)]
+        normalised(model, [(b.stack, b.context) for b in batches])
+        for mine in (self.model, self.average):
+            mine.load_state_dict(model.state_dict())
+        self.rates = [FINE * rate for rate in self.rates]
+        self.start = {"from": {"bundle": bundle.hash, "network": bundle.manifest["files"][path.name]}}
 
     def resume(self, path: Path) -> None:
         state = torch.load(path, map_location=self.device, weights_only=True)
@@ -192,30 +212,6 @@ class Trainer:
             optimizer.load_state_dict(saved)
         for name, value in state["numbers"].items():
             setattr(self, name, value)
-
-
-def plot(curve: list[dict[str, Any]], path: Path) -> None:
-    """Loss and held-out figures against minutes, as PNG."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4))
-    minutes = [row["minutes"] for row in curve]
-    for name in ("image", "mask", "jaccard", "amplitude", "peak", "integral", "class"):
-        axes[0].semilogy(minutes, [row.get(name, np.nan) for row in curve], label=name)
-    for level in LEVELS:
-        for name in ("mean IoU", "contact IoU"):
-            axes[1].plot(minutes, [row[f"{name}, {level}"] for row in curve], label=f"{name}, {level}")
-    for axis, title in zip(axes, ("training loss, by term", "held-out single touches"), strict=True):
-        axis.set_xlabel("minutes")
-        axis.set_title(title)
-        axis.legend(fontsize=7)
-        axis.grid(alpha=0.3)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def train(
@@ -230,14 +226,22 @@ def train(
     threads: int = 1,
     resume: bool = False,
     folder: Path | None = None,
+    start: Bundle | None = None,
 ) -> Trainer:
-    """Trains a variant of CONFIGS; leaves the checkpoint and its curves (PNG) behind. folder: see Trainer.run."""
+    """Trains a variant of CONFIGS; leaves the checkpoint and its curves (PNG) behind. folder: see Trainer.run.
+    start: a bundle whose network is the start, instead of random weights.
+    """
     torch.set_num_threads(threads)
-    trainer = Trainer(CONFIGS[variant], samples.Batches(scenes, pre, skin, seed), held_out, seed)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    size, groups = GPU_BATCH if device.type == "cuda" else CPU_BATCH
+    batches = samples.Batches(scenes, pre, skin, seed, size, groups, device=device)
+    trainer = Trainer(CONFIGS[variant], batches, held_out, seed)
     if resume:
         trainer.resume(checkpoint)
-    size = sum(p.numel() for p in trainer.model.parameters()) / 1e6
-    print(f"{variant}: {size:.2f} M parameters, {len(scenes)} scenes, {trainer.device}", flush=True)
+    elif start is not None:
+        trainer.start_from(start, variant)
+    weights = sum(p.numel() for p in trainer.model.parameters()) / 1e6
+    print(f"{variant}: {weights:.2f} M parameters, {len(scenes)} scenes, {trainer.device}", flush=True)
     before = trainer.steps
     trainer.run(minutes, checkpoint, folder=folder, name=variant)
     print(f"{variant}: {trainer.pace.said(trainer.steps - before, trainer.batches.size)}", flush=True)
@@ -257,6 +261,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--from", dest="start", help="the bundle whose network to start from, at a lower rate")
     args = parser.parse_args(argv)
     skin = geometry.load(args.skin)
     folder = args.data or data.WORK / skin.name
@@ -264,8 +269,20 @@ def main(argv: list[str] | None = None) -> None:
     pre = Bundle.load(args.bundle or skin.name).prereconstructor()
     scenes, held_out = (samples.load(folder, split, pre, args.limit) for split in ("train", "valid"))
     more = None if args.limit else folder
+    start = Bundle.load(args.start) if args.start else None
     train(
-        args.variant, skin, pre, scenes, held_out, args.minutes, checkpoint, args.seed, args.threads, args.resume, more
+        args.variant,
+        skin,
+        pre,
+        scenes,
+        held_out,
+        args.minutes,
+        checkpoint,
+        args.seed,
+        args.threads,
+        args.resume,
+        more,
+        start,
     )
 
 

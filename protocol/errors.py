@@ -30,6 +30,7 @@ class EitskinError(Exception):
         ├── OtherScenes (ValueError)          training scenes of another skin, or of this one as it was
         ├── CalibrationFileError              what a calibration found cannot be read, kept or used
         ├── OtherScenes (ValueError)          training scenes that must not be mixed with those of this run
+        ├── NoSuchNetwork (ValueError)        a file without the network that training is to start from
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── ConfigError                       services: skin.toml cannot be used

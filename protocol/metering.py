@@ -1,9 +1,12 @@
-"""How much a process does with one skin, and how fast: what its status frames say of it."""
+"""How much a process does with one skin, and how fast: what its status frames say of it, and when one is due."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+
+from .frame_types import StatusFrame
 
 KEPT = 256  # frames over which p50 and p99 are taken
 LEAST_S = 0.5  # a rate is a mean over at least so long
@@ -45,3 +48,51 @@ class Meter:
                 found[name + "p50"] = ordered[len(ordered) // 2]
                 found[name + "p99"] = ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]
         return found
+
+
+class StatusBeat:
+    """The status frames of one process about one skin: once in a while, and at once when something changed."""
+
+    def __init__(self, process: str, skin: str) -> None:
+        self.process, self.skin = process, skin
+        self.meter = Meter()
+        self.last: StatusFrame | None = None
+        self.next_s = 0.0
+        """When the next one is due whatever happens, by the monotonic clock."""
+
+    def frame(
+        self,
+        level: str,
+        messages: Sequence[str],
+        now: float,
+        every_s: float,
+        drops: Mapping[str, int],
+        counters: Mapping[str, int] | None = None,
+    ) -> StatusFrame | None:
+        """The status frame that is due: every_s after the last one, and when level or messages changed; else None."""
+        last = self.last
+        changed = last is None or level != last.level or _kinds(messages) != _kinds(last.messages)
+        if not changed and now < self.next_s:
+            return None
+        self.meter.measure(now)
+        self.next_s = now + every_s
+        self.last = StatusFrame(
+            skin=self.skin,
+            process=self.process,
+            valid=True,
+            valid_for_s=3 * every_s,
+            level=level,
+            messages=list(messages),
+            rates=dict(self.meter.rates),
+            drops=dict(drops),
+            counters=dict(counters or {}),
+            latency=self.meter.quantiles(),
+            cpu=self.meter.cpu,
+            stamps={"publish": time.monotonic_ns()},
+        )
+        return self.last
+
+
+def _kinds(messages: Sequence[str]) -> list[str]:
+    """Messages without their numbers: a count that goes up is no change worth a frame of its own."""
+    return ["".join(c for c in m if not c.isdigit()) for m in messages]

@@ -13,7 +13,9 @@ from . import frame_types as f
 
 BRIDGES = ("page", "ros2", "foxglove")
 """Processes that show contacts, or hand them on to other worlds. On our side they publish their status alone."""
-PRODUCERS = ("acquisition", "preprocessing", "inference", "publisher", "stub", *BRIDGES)
+RECORDER = "recorder"
+"""The process that records; it publishes its status alone, too."""
+PRODUCERS = ("acquisition", "preprocessing", "inference", "publisher", "stub", *BRIDGES, RECORDER)
 """Processes that own a data socket `<producer>.ipc`. A replay stands in for acquisition and binds its socket."""
 
 

@@ -10,6 +10,7 @@ import importlib.util
 import json
 import os
 import sys
+from pathlib import Path
 from typing import Any
 
 from protocol import logs
@@ -37,6 +38,9 @@ def check(name: str) -> None:
 def settings(name: str, config: ConfigFile, host: str = "", port: int = 0) -> str:
     """What the bridge is told, as JSON. `host`, `port`: where it listens, whatever the configuration says."""
     reach = config.transport()
+    options = getattr(config, name).model_dump(mode="json")
+    if options.get("recordings") and config.recorder is not None:
+        options["recordings"] = str(config.relative(Path(config.recorder.folder)))
     told: dict[str, Any] = {
         "skins": {
             skin: {"frame_id": found.frame_id, "stub": found.port == "stub"} for skin, found in config.skins.items()
@@ -49,9 +53,7 @@ def settings(name: str, config: ConfigFile, host: str = "", port: int = 0) -> st
             "operators": _absolute(reach.operators),
             "insecure": reach.insecure,
         },
-        "options": getattr(config, name).model_dump(mode="json")
-        | ({"host": host} if host else {})
-        | ({"port": port} if port else {}),
+        "options": options | ({"host": host} if host else {}) | ({"port": port} if port else {}),
         "log_level": config.logging.level,
     }
     return json.dumps(told)

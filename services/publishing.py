@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, LocatedTouch, ShapeFrame
 from protocol.held import ANY, HeldImage
-from services.contacts.force import ForceLaw, Look
+from services.contacts.contact_writer import ContactWriter, class_probabilities, confidence
+from services.contacts.force import ForceLaw
 from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
 from services.contacts.placing import placement
-from services.contacts.registered import measures_force, patches, registered
+from services.contacts.registered import measures_force, patches
 from services.contacts.segmentation import Segment, readable, segment
-from services.contacts.surface import Placed
 from services.contacts.tracking import Tracker
 from services.describe import geometry
 from services.estimation.quality import SURE
@@ -28,7 +26,6 @@ from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
-UNKNOWN_BELOW = 0.4  # probability of the best class, of five, below which a shape is "unknown"
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 
@@ -44,9 +41,10 @@ class Publishing(Stage):
         super().__init__(name)
         self.config = skin
         self.law = ForceLaw.of(skin, bundle, name)
-        self.place, self.frame_id = placement(skin, geometry(bundle)["outline"], name)
+        place, self.frame_id = placement(skin, geometry(bundle)["outline"], name)
         by_registration = measures_force(bundle)
         self._tells_force = self.law.exists or by_registration
+        self._writer = ContactWriter(self.law, place, self._tells_force)
         self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
         self.tracker = Tracker()
         self.each_alone = False  # offline: frames that do not follow each other
@@ -132,7 +130,10 @@ class Publishing(Stage):
             places = [] if self._alone(frame) else self.tracker.expected(now)
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
         if not located:
-            seen = [Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m) for s in segments]
+            seen = [
+                Patch(x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m, s.volume * m * m, s.reach * m, confidence(s))
+                for s in segments
+            ]
         tracks: Sequence[Track | None]
         ended: list[Track] = []
         if self._alone(frame):
@@ -143,14 +144,14 @@ class Publishing(Stage):
         said: Sequence[LocatedTouch | None] = located or [None] * len(segments)
         for track, place, s, touch in zip(tracks, seen, segments, said, strict=True):
             if track is not None:
-                classes = _class_probabilities(s, frame.classes)
-                present.append((self._contact(track, place, s, classes, frame, touch), s, classes))
+                classes = class_probabilities(s, frame.classes)
+                present.append((self._writer.present(track, place, s, classes, frame, touch), s, classes))
         if not located:  # those come strongest first
             present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
         self._segments, self._classes = [s for _, s, _ in present], [classes for _, _, classes in present]
         self._geometry, self._known = (m, [x0, y0]), True
         self._seen_in = frame.session, frame.reconstructed
-        self._contacts = [contact for contact, _, _ in present] + self._ends(ended)
+        self._contacts = [contact for contact, _, _ in present] + self._writer.ended(ended)
         self._counters["contacts"] += sum(track is not None and track.age == 1 for track in tracks)
 
     def _alone(self, frame: ImageFrame) -> bool:
@@ -175,7 +176,8 @@ class Publishing(Stage):
         """The same contacts a frame later."""
         ended = self.tracker.still(frame.stamps.get("sample", 0))
         present = [c for c in self._contacts if c.state != "end"]
-        self._contacts = [replace(c, state="hold", velocity=[0.0, 0.0, 0.0]) for c in present] + self._ends(ended)
+        held = [replace(c, state="hold", velocity=[0.0, 0.0, 0.0]) for c in present]
+        self._contacts = held + self._writer.ended(ended)
 
     def _miss(self, out: ContactFrame, reason: str) -> None:
         """Make a frame that says nothing about touches, not even that a contact ended."""
@@ -185,54 +187,9 @@ class Publishing(Stage):
         self._forget()
         self._counters["unknown"] += 1
 
-    def _contact(
-        self,
-        track: Track,
-        seen: Patch,
-        s: Segment,
-        classes: list[float],
-        frame: ImageFrame,
-        touch: LocatedTouch | None,
-    ) -> Contact:
-        force, sigma = self.law.force(Look.of(s, frame))
-        if touch is not None and not self.law.exists:
-            force, sigma = touch.force_n, None if touch.force_n is None else touch.value_sigma
-        best = int(np.argmax(classes)) if classes else -1
-        known = bool(classes) and classes[best] >= UNKNOWN_BELOW
-        at = self.place(seen.x, seen.y)
-        return Contact(
-            id=track.id,
-            state="begin" if track.age == 1 and track.begins else "hold",
-            position=at.point.tolist(),
-            velocity=(track.vx * at.along_x + track.vy * at.along_y).tolist(),
-            normal=at.normal.tolist(),
-            orientation=s.orientation,
-            area_m2=s.area * frame.metres_per_pixel**2,
-            force_n=force,
-            force_sigma_n=sigma,
-            wrench=_wrench(at, force or 0.0),
-            shape=SHAPES[best] if known else "unknown",
-            shape_probability=classes[best] if classes else None,
-            confidence=_confidence(s),
-            sheet=None if self.place.flat else [seen.x, seen.y],
-            **({} if touch is None else registered(touch)),
-        )
-
     def _drops(self) -> list[tuple[float, float | None]]:
         """(peak drop, force) of each touch."""
         return [(s.peak, c.force_n) for s, c in zip(self._segments, self._contacts, strict=False)]
-
-    def _ends(self, tracks: list[Track]) -> list[Contact]:
-        """The last contacts of touches that ended: their last places, without force."""
-        force = 0.0 if self._tells_force else None
-        ends = []
-        for t in tracks:
-            at, sheet = self.place(t.x, t.y), None if self.place.flat else [t.x, t.y]
-            where, normal = at.point.tolist(), at.normal.tolist()
-            ends.append(
-                Contact(id=t.id, state="end", position=where, normal=normal, force_n=force, confidence=0.0, sheet=sheet)
-            )
-        return ends
 
     def _force(self, frame: ContactFrame) -> ForceFrame:
         """The total force; valid if the contacts are."""
@@ -309,27 +266,3 @@ def _image_of(skin: str, kept: dict[str, Any]) -> ImageFrame:
 def _explained(frame: ImageFrame) -> bool:
     """Whether the image explains what was measured as one that held still does."""
     return (frame.residual or 0.0) <= SURE
-
-
-def _class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float]:
-    """Mean over the touch of the per-pixel class probabilities (5, h, w), which are on a coarser grid; [] where there
-    are none.
-    """
-    if not classes.size or not (classes.min() >= 0 and classes.max() <= 1.001):  # NaN compares false
-        return []
-    y, x = np.nonzero(s.mask)
-    count, h, w = classes.shape
-    pixels = np.bincount(y * h // s.mask.shape[0] * w + x * w // s.mask.shape[1], minlength=h * w)
-    total = classes.reshape(count, h * w) @ pixels.astype(np.float32)
-    return [min(1.0, float(p)) for p in total / max(float(total.sum()), 1e-9)]
-
-
-def _wrench(at: Placed, force: float) -> list[float]:
-    """On the skin, at its frame's origin: the touch presses against the normal."""
-    pressed = -force * at.normal
-    return [*pressed.tolist(), *np.cross(at.point, pressed).tolist()]
-
-
-def _confidence(s: Segment) -> float:
-    """Probability that the peak is not noise, from its own standard deviation."""
-    return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))

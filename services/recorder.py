@@ -1,205 +1,192 @@
-"""The recorder: `python -m services.recorder FILE` or `--folder FOLDER`. Only subscribes; nothing waits for it.
+"""The recorder as a process: `python -m services.recorder FILE`, or `--folder FOLDER`, which records at once, or with
+`--wait` only when told to. Its commands: `record`, `snapshot`, `status`.
 
-Recording does not wake lazy topics unless they are asked for. The recorder asks the stages for their state when the
-recording starts and after each new baseline. It stores the answers as `state/<skin>`; a replay begins from there.
+It keeps the last seconds in memory, for snapshots ([recorder] of skin.toml says how many).
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import logging
+import math
+import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import msgpack
-
-from models.bundle import BundleError
 from protocol import logs, transport
-from protocol.frames import Frame, InfoFrame
-from protocol.runtime import host_id
-from protocol.sockets import AllReader, ControlClient, ControlError, ControlServer
-from protocol.topics import TOPICS
+from protocol.metering import StatusBeat
+from protocol.runtime import AlreadyRunning, RuntimeDirError, lock, runtime_dir
+from protocol.sockets import ControlServer, Publisher
+from protocol.topics import RECORDER
 from protocol.transport import TransportError
-from services.recordings import settings
-from services.recordings.recording import STATE_TOPIC, RecordingError, RecordingWriter
-from services.runtime.config import ConfigError, load
-from services.runtime.stage import STAGES
+from services.recordings.recorder import DEFAULT_TOPICS, Recorder
+from services.recordings.recording import RecordingError
+from services.recordings.rotation import Rotation
+from services.recordings.snapshots import LONGEST_S, Keeping, file_in
+from services.runtime.config import ConfigError, ConfigFile, load
+from services.runtime.config_sections import RecorderSection
 
-DEFAULT_TOPICS = ("raw", "contact", "status", "info")
-POLL_S = 0.05
-STATE_TIMEOUT_S = 0.5
-MOST_SKINS = 64
 COMMANDS_AT_ONCE = 5  # answered between two turns of recording
+STATUS_S = 1.0
+MINUTE_S, MB = 60.0, 1e6
 
 log = logging.getLogger("recorder")
 
 
-class Recorder:
-    """Subscribes and writes. `step` often; not thread-safe."""
+class RecorderService:
+    """A recorder with its commands and its heartbeat. `turn` often."""
 
-    def __init__(
-        self, path: Path, topics: Iterable[str] = DEFAULT_TOPICS, skin: str | None = None, overwrite: bool = False
-    ) -> None:
-        topics = list(topics)
-        for name in topics:
-            if name not in TOPICS:
-                raise RecordingError(f"no topic {name!r}: expected some of {', '.join(TOPICS)}")
-        self.path = path
-        self.writer = RecordingWriter(path, _metadata(topics, skin), overwrite)
-        self.reader = AllReader(topics, skin)
-        self.states = _StateReader()
-        self._zero_ns = (
-            time.time_ns() - time.monotonic_ns()
-        )  # a clock that is set meanwhile must not tear the file's times
-        self._baselines: dict[str, Any] = {}
-        self._skins: set[str] = set()
+    def __init__(self, recorder: Recorder, folder: Path, skins: list[str]) -> None:
+        self.recorder, self.folder = recorder, folder
+        self.gave_up = ""
+        """Why the last recording ended by itself."""
+        commands = {"status": lambda _: self.status(), "record": self._record, "snapshot": self._snapshot}
+        self.control = ControlServer(RECORDER, commands)
+        self.publisher = Publisher(RECORDER)
+        self._beats = {skin: StatusBeat(RECORDER, skin) for skin in skins}
 
-    def step(self, seconds: float = POLL_S) -> int:
-        """Writes what arrives within `seconds`; how many messages that was."""
-        end, taken = time.monotonic() + seconds, 0
-        while True:
-            got = self.reader.recv_message(max(0.0, end - time.monotonic()))
-            self._write_states()
-            if got is None:
-                self.writer.flush_if_due()
-                return taken
-            frame, message = got
-            topic, _, data = message.partition(b"\0")
-            self.writer.write(topic.decode(), data, self._now_ns())
-            taken += 1
-            self._ask_states(frame)
+    def turn(self) -> None:
+        """Record for a moment, answer commands, say how it goes. Raises OSError where the disk is broken."""
+        self.recorder.step()
+        self.control.mind()
+        for _ in range(COMMANDS_AT_ONCE):
+            if not self.control.serve_once():
+                break
+        self.publisher.mind()
+        self.publisher.poll()
+        self._say()
 
-    @property
-    def problem(self) -> str:
-        """What is wrong with the recording, and what to do; "" while all is well."""
-        lost = f"{self.writer.lost} messages are lost so far" if self.writer.lost else "nothing is lost yet"
-        if self.writer.full:
-            folder = self.path.resolve().parent
-            return f"{self.writer.full}: make room in {folder}; {lost}, recording goes on by itself when there is room"
-        return f"{lost}: the disk was full" if self.writer.lost else ""
+    def give_up(self, why: OSError) -> None:
+        """The recording cannot go on; the recorder can."""
+        path = self.recorder.writer.path if self.recorder.writer is not None else self.folder
+        self.gave_up = f"the recording {path} ended: {why.strerror or why}"
+        log.error("%s", self.gave_up)
+        with contextlib.suppress(OSError):  # what it could not write it will not write now
+            self.recorder.stop()
 
-    def _ask_states(self, frame: Frame) -> None:
-        """Ask at the first frame of a skin, and after each tare: the state holds how drift is followed from there."""
-        if frame.skin not in self._skins and len(self._skins) < MOST_SKINS:
-            self._skins.add(frame.skin)
-            self.states.ask(frame.skin)
-        if isinstance(frame, InfoFrame) and (found := frame.info.get("tare_sample_ns")) is not None:
-            if self._baselines.setdefault(frame.skin, found) != found:
-                self._baselines[frame.skin] = found
-                self.states.ask(frame.skin)
+    def _record(self, args: dict[str, Any]) -> dict[str, Any]:
+        if args.get("on", True):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self.recorder.record(file_in(self.folder), named_by_time=True)
+            self.gave_up = ""
+            _wanted().write_text(str(os.getppid()))
+            return self.status()
+        before = self.status()
+        _wanted().unlink(missing_ok=True)
+        self.recorder.stop()
+        return {**before, "recording": False}
 
-    def _write_states(self) -> None:
-        for skin, packed in self.states.answers():
-            self.writer.write(f"{STATE_TOPIC}/{skin}", packed, self._now_ns())
+    def _snapshot(self, args: dict[str, Any]) -> dict[str, Any]:
+        snapshots = self.recorder.snapshots
+        if snapshots is None:
+            raise RecordingError("this recorder keeps nothing for snapshots: start it with --folder")
+        most = {"before_s": snapshots.keeping.before_s, "after_s": LONGEST_S}
+        wanted: dict[str, float] = {}
+        for name, limit in most.items():
+            value = args.get(name)
+            if value is None:
+                continue
+            if not isinstance(value, (int, float)) or not math.isfinite(value) or not 0 <= value <= limit:
+                hint = ": before_s in [recorder] of skin.toml says how much is kept" if name == "before_s" else ""
+                raise RecordingError(f"found {name} {value!r:.40}, expected 0 to {limit:g} s{hint}")
+            wanted[name] = float(value)
+        asked = str(args.get("why") or "by command")[:200]
+        path = snapshots.take("snapshot", asked, self.recorder.now_ns(), **wanted)
+        return {"file": str(path), "after_s": wanted.get("after_s", snapshots.keeping.after_s)}
 
-    def _now_ns(self) -> int:
-        return self._zero_ns + time.monotonic_ns()
+    def status(self) -> dict[str, Any]:
+        """`level` and `problems` as in status frames; `lost`: messages that there was no room for on the disk."""
+        recorder, snapshots = self.recorder, self.recorder.snapshots
+        writer = recorder.writer
+        problems = [text for text in (recorder.problem, self.gave_up) if text]
+        problems += self.control.problems + self.publisher.problems
+        found: dict[str, Any] = {
+            "recording": writer is not None,
+            "folder": str(self.folder),
+            "file": str(writer.path) if writer is not None else "",
+            "messages": {f"{topic}/{skin}": n for (topic, skin), n in recorder.heard.items()},
+            "gaps": recorder.gaps,
+            "lost": writer.lost if writer is not None else 0,
+            "files": writer.files if writer is not None else 0,
+            "deleted": (writer.deleted if writer is not None else 0) + (snapshots.deleted if snapshots else 0),
+            "level": "ERROR" if writer is not None and writer.full else "WARN" if problems else "OK",
+            "problems": problems,
+        }
+        if snapshots is not None:
+            found |= {
+                "held_s": snapshots.ring.held_s,
+                "held_bytes": snapshots.ring.bytes,
+                "forgotten": snapshots.ring.forgotten,
+                "snapshots": snapshots.taken,
+                "missed": snapshots.missed,
+                "writing": snapshots.writing,
+                "snapshot": snapshots.last,
+            }
+        return found
 
-    @property
-    def gaps(self) -> int:
-        """Messages that got lost before they reached us."""
-        return self.reader.gaps
-
-    def close(self) -> None:
-        self.states.close()
-        self._write_states()
-        self.reader.close()
-        self.writer.close()
-
-    def __enter__(self) -> Recorder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class _StateReader:
-    """Asks the stages for their state on a thread of its own, so that a silent stage holds up no message."""
-
-    def __init__(self) -> None:
-        self._asked: list[str] = []
-        self._answers: list[tuple[str, bytes]] = []
-        self._lock = threading.Condition()
-        self._closing = False
-        self._thread = threading.Thread(target=self._run, name="states", daemon=True)
-        self._thread.start()
-
-    def ask(self, skin: str) -> None:
-        with self._lock:
-            self._asked.append(skin)
-            self._lock.notify()
-
-    def answers(self) -> Iterator[tuple[str, bytes]]:
-        """(skin, msgpack map process -> state) not yet taken."""
-        with self._lock:
-            found, self._answers = self._answers, []
-        yield from found
-
-    def _run(self) -> None:
-        while True:
-            with self._lock:
-                while not self._asked and not self._closing:
-                    self._lock.wait()
-                if self._closing:
-                    return
-                skin = self._asked.pop(0)
-            packed: bytes = msgpack.packb(stage_states(skin))
-            with self._lock:
-                self._answers.append((skin, packed))
+    def _say(self) -> None:
+        now, said = time.monotonic(), self.status()
+        counters = {name: int(said[name]) for name in COUNTED if name in said}
+        doing = f"recording to {said['file']}" if said["recording"] else "not recording"
+        if said.get("writing"):
+            doing += f"; a snapshot is being written: {said['snapshot']}"
+        for skin, beat in self._beats.items():
+            beat.meter.sent.update(
+                {t: n - beat.meter.sent[t] for (t, s), n in self.recorder.heard.items() if s == skin}
+            )
+            drops = {"gaps": said["gaps"], "lost": said["lost"], "forgotten": said.get("forgotten", 0)}
+            frame = beat.frame(said["level"], [doing, *said["problems"]], now, STATUS_S, drops, counters)
+            if frame is not None:
+                self.publisher.send(frame)
 
     def close(self) -> None:
-        with self._lock:
-            self._closing = True
-            self._lock.notify()
-        self._thread.join(len(STAGES) * STATE_TIMEOUT_S + 0.5)
+        self.control.close()
+        self.publisher.close()
 
 
-def stage_states(skin: str) -> dict[str, Any]:
-    """process -> state, of the stages that answer, as their control command `state` gives it."""
-    found: dict[str, Any] = {}
-    for process in STAGES:
-        try:
-            found[process] = ControlClient(process, STATE_TIMEOUT_S).call("state", skin=skin)["state"]
-        except (ControlError, KeyError) as error:
-            log.warning("the state of %s is not in the recording: %s", process, error)
-    return found
+COUNTED = ("recording", "files", "deleted", "snapshots", "missed", "writing", "held_s", "held_bytes")
+"""What status frames say in numbers."""
 
 
-def _metadata(topics: list[str], skin: str | None) -> dict[str, str]:
+def _wanted() -> Path:
+    """A file that is there while a recording is wanted: after a crash the next recorder goes on in a new file. It names
+    our parent: under another supervisor it means nothing.
+    """
+    return runtime_dir() / "recorder.wanted"
+
+
+def _crashed() -> bool:
+    """Whether the recorder before us was recording when it ended."""
     try:
-        config = load()
-        wanted = {name: found for name, found in config.skins.items() if skin in (None, name)}
-        carried = settings.text_of(wanted, config.skip)
-    except (ConfigError, BundleError) as error:
-        log.warning("how the skins are configured is not in the recording: %s", error)
-        carried = ""
-    return {
-        "origin": "record",
-        "host": host_id(),
-        "topics": " ".join(topics),
-        "skin": skin or "",
-        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        settings.KEY: carried,
-    }
+        return _wanted().read_text() == str(os.getppid())
+    except (OSError, ValueError):
+        return False
 
 
-def file_in(folder: Path) -> Path:
-    """A file name that the folder does not have yet: the time, to the second, and a number where needed."""
-    stem = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-    names = (folder / f"{stem}{suffix}.mcap" for suffix in ("", *(f"-{n}" for n in range(1, 1000))))
-    return next(path for path in names if not path.exists())
+def rotation_of(section: RecorderSection) -> Rotation:
+    """When the next file of a recording begins."""
+    return Rotation(int(section.file_mb * MB), section.file_minutes * MINUTE_S, section.keep_files)
+
+
+def keeping_of(section: RecorderSection, folder: Path) -> Keeping:
+    """What is kept for snapshots."""
+    memory = int(section.memory_mb * MB)
+    return Keeping(folder, section.before_s, section.after_s, memory, section.triggers, section.keep_snapshots)
 
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="services.recorder", description="Records a running service.")
     parser.add_argument("file", nargs="?", type=Path)
-    parser.add_argument("--folder", type=Path, help="write a new file, named by the time, in this folder")
+    parser.add_argument("--folder", type=Path, help="write new files, named by the time, in this folder")
+    parser.add_argument(
+        "--wait", action="store_true", help="record only when told to; snapshots are taken all the same"
+    )
     parser.add_argument("--skin", help="only this skin")
     parser.add_argument("--topics", default=",".join(DEFAULT_TOPICS))
     args = parser.parse_args(argv)
@@ -214,58 +201,47 @@ def main(argv: list[str] | None = None) -> int:
     signal.signal(signal.SIGINT, on_signal)
     signal.signal(signal.SIGTERM, on_signal)
     try:
-        transport.configure(load().transport())
-    except (ConfigError, TransportError) as error:
+        config = load()
+        transport.configure(config.transport())
+        with lock(process=RECORDER):
+            return _run(args, config, stop)
+    except (AlreadyRunning, ConfigError, RecordingError, RuntimeDirError, TransportError) as error:
         log.error("%s", error)
-        return 2
-    try:
-        if args.folder is not None:
-            args.folder.mkdir(parents=True, exist_ok=True)
-        path = args.file or file_in(args.folder)
-        recorder = Recorder(path, args.topics.split(","), args.skin)
-    except (RecordingError, OSError) as error:
-        log.error("%s", error)
-        return 2
-    try:
-        server = ControlServer("recorder", {})
-    except TransportError as error:
-        recorder.close()
-        log.error("%s", error)
-        return 2
-    server.handlers["status"] = lambda _: _status(recorder, server)
-    log.info("recording to %s", path)
-    full = False
-    try:
-        with recorder:
+    except OSError as error:
+        log.error("%s: %s", error.filename or args.folder, error.strerror or error)
+    return 2
+
+
+def _run(args: argparse.Namespace, config: ConfigFile, stop: threading.Event) -> int:
+    section = config.recorder or RecorderSection()
+    folder = (args.folder or args.file.parent).absolute()
+    if not args.wait:
+        folder.mkdir(parents=True, exist_ok=True)
+    keeping = keeping_of(section, folder) if args.folder is not None else None
+    path = None if args.wait and not _crashed() else args.file or file_in(folder)
+    with Recorder(None, args.topics.split(","), args.skin, rotation=rotation_of(section), keeping=keeping) as recorder:
+        if path is not None:
+            recorder.record(path, named_by_time=args.folder is not None)
+            log.info("recording to %s", path)
+        process = RecorderService(recorder, folder, [args.skin] if args.skin else list(config.skins))
+        full = False
+        try:
             while not stop.is_set():
-                recorder.step()
-                server.mind()
-                for _ in range(COMMANDS_AT_ONCE):
-                    if not server.serve_once():
-                        break
-                if bool(recorder.writer.full) != full:
+                try:
+                    process.turn()
+                except OSError as error:  # the disk is broken, or gone
+                    process.give_up(error)
+                    if not args.wait:
+                        return 1
+                if bool(recorder.problem) != full:
                     full = not full
                     log.log(logging.ERROR if full else logging.INFO, "%s", recorder.problem or "recording goes on")
-    except OSError as error:  # the disk is broken, or gone
-        log.error("cannot go on writing %s: %s", path, error.strerror)
-        return 1
-    finally:
-        server.close()
-    log.info("recorded %s", ", ".join(f"{topic} {n}" for topic, n in recorder.writer.counts.items()) or "nothing")
+            _wanted().unlink(missing_ok=True)  # nobody wants it after an ordered end
+        finally:
+            process.close()
+    counts = recorder.writer.counts if recorder.writer is not None else {}
+    log.info("recorded %s", ", ".join(f"{topic} {n}" for topic, n in counts.items()) or "nothing")
     return 0
-
-
-def _status(recorder: Recorder, server: ControlServer) -> dict[str, Any]:
-    """`level` and `problems` as in status frames; `lost`: messages that there was no room for on the disk."""
-    problems = [text for text in (recorder.problem,) if text] + server.problems
-    return {
-        "file": str(recorder.path),
-        "messages": recorder.writer.counts,
-        "gaps": recorder.gaps,
-        "lost": recorder.writer.lost,
-        "level": "ERROR" if recorder.writer.full else "WARN" if problems else "OK",
-        "problems": problems,
-    }
 
 
 if __name__ == "__main__":

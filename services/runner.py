@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import gc
 import logging
-import os
-import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import cycle
 from typing import Any
 
@@ -29,7 +27,7 @@ from services.runtime.commands import Commands
 from services.runtime.config import ConfigFile
 from services.runtime.lateness import Lateness
 from services.runtime.stage import Refused, Stage, add_reason
-from services.runtime.waiting import Waiter
+from services.runtime.waiting import Waiter, wake_on_signals
 
 HEARTBEAT_S = 1.0
 TICK_S = 0.2  # how often at most silence, changes of health and new subscribers are looked for
@@ -84,7 +82,7 @@ class Runner:
 
     def run(self) -> None:
         """Drive the channels until told to stop."""
-        wake = _wake_on_signals(self._on_signal)
+        wake = wake_on_signals(self._on_signal)
         for socket in (wake, self.control.socket, self.publisher.socket, *self._by_socket):
             self._waiter.register(socket)
         self._minded = [(self.publisher, self.publisher.socket), (self.control, self.control.socket)]
@@ -291,12 +289,3 @@ def _settle() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 50, 50)
-
-
-def _wake_on_signals(stop: Callable[[], None]) -> int:
-    """Install handlers of SIGINT and SIGTERM; the returned descriptor becomes readable when one came."""
-    read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-    signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop())
-    return read

@@ -24,7 +24,7 @@ ALLOWED = {
 WIRE_NEEDS = {"numpy", "zmq", "msgpack"}
 RUNTIME_NEEDS = WIRE_NEEDS | {"serial", "onnxruntime", "scipy", "pydantic", "typer", "rich", "supervisor", "mcap"}
 BRIDGES_NEED = {
-    "page": {"aiohttp", "mcap"},
+    "page": {"aiohttp", "mcap", "prometheus_client"},
     "ros2": {"cyclonedds"},
     "foxglove": {"foxglove"},
     "export": {"mcap", "foxglove", "rerun"},

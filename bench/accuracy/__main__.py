@@ -31,6 +31,7 @@ from models.bundle import Bundle
 from models.shapes import Array
 from services.recordings.reconstruction import resampled
 
+SINGLES = 100  # of each shape and for force in the full form: 500 frames give the mean IoU to 0.003
 LEVELS = ("none", "50", "60", "70", "80", "70f")
 SCORED_AT = 96
 SLOW_SHARE = {"full": 3, "quick": 4}  # a slow method sees every third frame, or every fourth
@@ -135,8 +136,8 @@ def main(argv: list[str] | None = None) -> int:
     # first: it says within a second whether a peer's package is missing
     methods = _methods.classical() + _methods.peers() + _methods.published(bundle) + _methods.shipped(bundle)
     levels = args.levels or (("none", "70") if args.quick else LEVELS)
-    mesh, n = ("stub", 6) if args.quick else ("reference", 20)
-    frames = _frames.load(args.seed, n, mesh)
+    mesh, n, singles = ("stub", 6, None) if args.quick else ("reference", 20, SINGLES)
+    frames = _frames.load(args.seed, n, mesh, singles=singles)
     tuning = _frames.load(args.seed + 1000, 4, "stub", ("shapes", "hertz"))
     wanted = [m for m in methods if args.only is None or any(o in m.name for o in args.only)]
     began = time.perf_counter()

@@ -62,12 +62,15 @@ class Frames:
         return Frames(*(np.concatenate(pair) for pair in both))
 
 
-def scenes(seed: int, n: int) -> list[tuple[str, list[Shape]]]:
-    """The scenes to solve, with the names of their groups; n touches of each shape, other groups in proportion."""
+def scenes(seed: int, n: int, singles: int | None = None) -> list[tuple[str, list[Shape]]]:
+    """The scenes to solve, with the names of their groups; `singles` touches (default n) of each shape and force,
+    other groups in proportion to n.
+    """
+    singles = n if singles is None else singles
     rng = np.random.default_rng([seed, 77])
     made: list[tuple[str, list[Shape]]] = []
     for kind in CLASSES:
-        made += [("shapes", random_scene(rng, replace(TARGETS, kinds=(kind,)), n=1)) for _ in range(n)]
+        made += [("shapes", random_scene(rng, replace(TARGETS, kinds=(kind,)), n=1)) for _ in range(singles)]
     made += [("hertz", random_scene(rng, replace(TARGETS, kinds=("hertz",)), n=1)) for _ in range(n // 2)]
     for name, count in (("two", 2), ("three", 3)):
         made += [(name, random_scene(rng, TARGETS, n=count)) for _ in range(n)]
@@ -77,7 +80,7 @@ def scenes(seed: int, n: int) -> list[tuple[str, list[Shape]]]:
         pair = [Shape("circle", x, y, 0.15, 0.3) for x, y in (middle - step, middle + step)]
         made.append(("apart", pair))
     force = replace(TARGETS, kinds=("circle",), radius=(0.2, 0.2))
-    made += [("force", random_scene(rng, force, n=1)) for _ in range(n)]
+    made += [("force", random_scene(rng, force, n=1)) for _ in range(singles)]
     for spacing, drop in LDCI:
         places = metrics.ldci_positions(spacing)
         octant = places[(places[:, 0] >= -1e-9) & (places[:, 1] >= -1e-9) & (places[:, 0] >= places[:, 1] - 1e-9)]
@@ -136,8 +139,11 @@ def _solve(wanted: list[tuple[str, list[Shape]]], mesh: str, path: Path) -> Fram
     return Frames(group, shapes, pairs, np.tile(z0, (n, 1)), adjacents, np.tile(a0, (n, 1)))
 
 
-def load(seed: int = 5, n: int = 20, mesh: str = "reference", only: tuple[str, ...] = ()) -> Frames:
-    """Frames by arguments: read from bench/work, or solved now (about n * 10 + 40 solutions). EIDORS's come last.
+def load(
+    seed: int = 5, n: int = 20, mesh: str = "reference", only: tuple[str, ...] = (), singles: int | None = None
+) -> Frames:
+    """Frames by arguments: read from bench/work, or solved now (about 3.5 n + 6 singles + 40 solutions). EIDORS's come
+    last.
 
     mesh: "reference" (seconds a solution) or "stub" (quick; as far from the training mesh as from the reference).
     only: some groups, without EIDORS's.
@@ -145,8 +151,9 @@ def load(seed: int = 5, n: int = 20, mesh: str = "reference", only: tuple[str, .
     if mesh == "training":
         raise ValueError("test frames on the training mesh would flatter whatever was trained on it")
     WORK.mkdir(exist_ok=True)
-    wanted = [s for s in scenes(seed, n) if not only or s[0] in only]
-    frames = _solve(wanted, mesh, WORK / f"frames-{'-'.join((mesh, *only))}-seed{seed}-n{n}.npz")
+    wanted = [s for s in scenes(seed, n, singles) if not only or s[0] in only]
+    many = f"-singles{singles}" if singles else ""
+    frames = _solve(wanted, mesh, WORK / f"frames-{'-'.join((mesh, *only))}-seed{seed}-n{n}{many}.npz")
     if only:
         return frames
     frames = _ordered(frames)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,6 +121,12 @@ def session(path: Path) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
+def training(network: onnxruntime.InferenceSession) -> str:
+    """How long a published network's file was trained, in words: ours has had hours."""
+    said = network.get_modelmeta().custom_metadata_map.get("training")
+    return f"{json.loads(said)['minutes']:g} min" if said else "training time not recorded"
+
+
 def published(bundle: Bundle) -> list[Method]:
     """The paper's network and its twin without attention, where models/published.py has trained them."""
 
@@ -137,7 +144,7 @@ def published(bundle: Bundle) -> list[Method]:
 
             return image
 
-        return Method(name, build, gain=False)
+        return Method(f"{name}, {training(network)}", build, gain=False)
 
     files = {"MM-CNN as published": "mmcnn.onnx", "the same without attention": "cnn.onnx"}
     return [row(name, PUBLISHED / file) for name, file in files.items() if (PUBLISHED / file).exists()]

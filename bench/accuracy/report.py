@@ -52,6 +52,7 @@ TARGETS = (
 )
 CLASSICAL = ("NOSER", "total variation", "Gauss-Newton", "GREIT", "pyEIT")
 OF_CLASSICAL = 0.75  # the short form's gate: mean IoU missed, of what the best classical method misses
+MARKERS = "osD^vP"  # of methods that are not ours, in turn
 RMS = {
     "position_%": "position_rms_%",
     "force_%": "force_rms_%",
@@ -66,8 +67,12 @@ def progress(row: Row) -> None:
 
 
 def text(row: Row, key: str, form: str) -> str:
-    value = row.get(key)
-    return "" if value is None or not np.isfinite(value) else form.format(value)
+    """The figure, and its standard error where the row has one."""
+    value, error = row.get(key), row.get(f"{key}_se")
+    if value is None or not np.isfinite(value):
+        return ""
+    spread = f" +-{form.format(error)}" if error is not None and np.isfinite(error) else ""
+    return form.format(value) + spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,31 +146,6 @@ class Report:
         write_json(
             folder / "accuracy.json", {**self.head, "targets": targets, "floors": self.floors, "rows": self.rows}
         )
-        self.draw(folder / "accuracy.png")
+        from bench import plots  # matplotlib takes a while
 
-    def draw(self, path: Path) -> None:
-        """Run time against error: mean IoU missed and position, a panel a noise level for the first."""
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
-
-        levels = [v for v in ("none", "70") if any(r["level"] == v for r in self.rows)]
-        panels = [(v, key, label) for v in levels for key, label in (("mean_iou", "1 - mean IoU"), ("position_%", ""))]
-        figure, axes = plt.subplots(len(levels), 2, figsize=(11, 4.2 * len(levels)), squeeze=False)
-        for axis, (level, key, _) in zip(axes.ravel(), panels, strict=True):
-            for row in (r for r in self.rows if r["level"] == level and r.get(key) is not None):
-                error = 1 - row[key] if key == "mean_iou" else row[key]
-                shipped = row["method"].startswith("shipped")
-                axis.plot(
-                    row["ms"], error, "*" if shipped else "o", ms=13 if shipped else 6, c="C3" if shipped else "C0"
-                )
-                axis.annotate(row["method"], (row["ms"], error), (4, 4), textcoords="offset points", fontsize=7)
-            axis.margins(x=0.25, y=0.1)
-            axis.set(xscale="log", yscale="log", xlabel="CPU time per frame, one thread [ms]")
-            axis.set_ylabel("1 - mean IoU" if key == "mean_iou" else "position error [% of side]")
-            axis.set_title(Level(level).title)
-            axis.grid(True, which="both", alpha=0.3)
-        figure.tight_layout()
-        figure.savefig(path, dpi=120)
-        plt.close(figure)
+        plots.draw(folder / "accuracy.json")

@@ -56,6 +56,14 @@ def summarise(images: Array, frames: Frames, index: NDArray[np.int64], gain: tup
         "ssim": column("ssim", "shapes").mean(),
         "count_%": 100 * np.mean(_right(rows, group)),
     }
+    spread = {
+        "mean_iou": column("mean_iou", "shapes"),
+        "contact_iou": column("contact_iou", "shapes"),
+        "position_%": position,
+        "force_%": force_error,
+        "integral_%": integral_error,
+    }
+    out |= {f"{name}_se": standard_error(values) for name, values in spread.items()}
     for name in ("AR", "PE", "RES", "SD", "RNG"):
         out[f"greit_{name}"] = column(f"greit_{name}", "shapes").mean()
     out.update(_ldci(images.max((1, 2)), group))
@@ -64,6 +72,11 @@ def summarise(images: Array, frames: Frames, index: NDArray[np.int64], gain: tup
         gaps = [gap_of(frames, int(index[k])) for k in apart]
         out["separation"] = metrics.separation(gaps, [rows[k]["count"] == 2 for k in apart])
     return {k: None if v is None else float(v) for k, v in out.items()}
+
+
+def standard_error(values: Array) -> float:
+    """Of the mean; NaN of fewer than two."""
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
 
 def gap_of(frames: Frames, k: int) -> float:

@@ -225,26 +225,6 @@ def table(rows: dict[str, dict[str, Any]]) -> Table:
     return made
 
 
-def draw(samples: dict[str, Sample], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    for k, name in enumerate(BEGIN):
-        for values, style in ((samples[name].outside, "-"), (samples[name].floor, ":")):
-            share = np.arange(1, len(values) + 1) / len(values)
-            label = name if style == "-" else f"{name}: same stages in one process"
-            axis.plot(np.sort(values), share, style, color=f"C{k}", label=label)
-    axis.axvline(TARGET_MS["p50"], color="0.7", lw=0.8)
-    axis.set(xscale="log", xlabel="ms", ylabel="share of frames", title="board's last byte to controller's recv")
-    axis.legend(fontsize=8)
-    axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench latency", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--seconds", type=float, default=20.0, help="of each condition")
@@ -263,7 +243,9 @@ def main(argv: list[str] | None = None) -> int:
     report = {**provenance("latency", argv), "targets": [goal.to_dict() for goal in wanted], "rows": rows}
     report["left_out"] = left_out
     write_json(args.out / "latency.json", report)
-    draw(samples, args.out / "latency.png")
+    from bench import plots  # matplotlib takes a while
+
+    plots.draw(args.out / "latency.json")
     print(f"wrote {args.out / 'latency.json'} and latency.png")
     return 0
 

@@ -176,29 +176,6 @@ def table(rows: list[dict[str, Any]]) -> Table:
     return made
 
 
-def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    for k, share in enumerate(sorted({row["touched"] for row in rows})):
-        mine = [row for row in rows if row["touched"] == share]
-        skins, label = [row["skins"] for row in mine], f"{100 * share:.0f} % touched"
-        left.plot(skins, [row["p50_ms"] for row in mine], "o-", color=f"C{k}", label=f"p50, {label}")
-        left.plot(skins, [row["p99_ms"] for row in mine], "o:", color=f"C{k}", label=f"p99, {label}")
-        right.plot(skins, [row["cores"] for row in mine], "o-", color=f"C{k}", label=label)
-    left.axhline(TARGET["p99_ms"], color="0.7", lw=0.8)
-    left.set(xlabel="skins", ylabel="ms", xscale="log", yscale="log", title="frame read to controller's recv")
-    right.set(xlabel="skins", ylabel="cores used", xscale="log", yscale="log", title="CPU of all processes")
-    for axis in (left, right):
-        axis.legend(fontsize=8)
-        axis.grid(alpha=0.3, which="both")
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench scale", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--skins", type=int, nargs="+", default=[1, 4, 16, 32, 64])
@@ -213,7 +190,9 @@ def main(argv: list[str] | None = None) -> int:
     Console(width=120).print(_goals.table(wanted))
     report = {**provenance("scale", argv), "targets": [goal.to_dict() for goal in wanted], "rows": rows}
     write_json(args.out / "scale.json", report)
-    draw(rows, args.out / "scale.png")
+    from bench import plots  # matplotlib takes a while
+
+    plots.draw(args.out / "scale.json")
     print(f"wrote {args.out / 'scale.json'} and scale.png")
     return 0
 

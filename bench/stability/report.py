@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -113,100 +112,6 @@ def write(folder: Path, top: Mapping[str, Any], found: Found) -> None:
     targets = [goal.to_dict() for goal in goals(found)]
     content = {**top, "targets": targets, "broken": broken(found), "parts": dict(found)}
     write_json(folder / "stability.json", content)
-    if any(found.get(part) for part, *_ in PANELS):
-        draw(found, folder / "stability.png")
+    from bench import plots  # matplotlib takes a while
 
-
-PANELS = (  # part, x axis, log x, curves (key, label), log y
-    ("lambda", "lambda", True, ("position_%", "force_%"), True),
-    ("signal over noise", "dB", False, ("position_%", "force_%"), True),
-    ("a few noisy measurements", "times the others' noise", True, ("position_%", "force_%"), True),
-    ("measurement scale", "factor", True, ("position_%", "force_%"), True),
-    ("background", "S/m", True, ("position_%", "force_%"), True),
-    ("contact impedance", "factor", True, ("position_%", "force_%"), True),
-    ("electrode positions", "% of the spacing", False, ("position_%", "force_%"), True),
-    ("meshes, coarse to fine", "elements", True, ("difference_%", "position_%", "force_%"), True),
-    ("dead electrodes", "electrodes", False, ("valid_%", "position_%"), False),
-    ("saturated channels", "channels", False, ("valid_%", "position_%"), False),
-    ("not numbers in some channels", "channels", False, ("valid_%", "position_%"), False),
-    ("change within noise", "dB", False, ("median_mm", "max_mm"), True),
-    ("float32 against float64, by stage", "", False, ("error",), True),
-)
-LABELS = {
-    "position_%": "position, % of side",
-    "force_%": "force, %",
-    "valid_%": "valid, %",
-    "difference_%": "difference, %",
-}
-
-
-def draw(found: Found, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    panels = [p for p in PANELS if found.get(p[0])]
-    if not panels:
-        return
-    figure, axes = plt.subplots(-(-len(panels) // 3), 3, figsize=(15, 3.6 * -(-len(panels) // 3)), squeeze=False)
-    for axis in axes.ravel()[len(panels) :]:
-        axis.axis("off")
-    for axis, (part, label, log_x, keys, log_y) in zip(axes.ravel(), panels, strict=False):
-        rows = found[part]
-        if not label:
-            _bars(axis, rows)
-        else:
-            _curves(axis, rows, [key for key in keys if key != "valid_%"])
-            if "valid_%" in keys:  # its errors have another scale
-                other = axis.twinx()
-                _curves(other, rows, ["valid_%"], "C2")
-                other.legend(fontsize=7, loc="lower right")
-                axis.set_ylim(bottom=0)
-            axis.set_xlabel(label)
-            if axis.lines:
-                axis.legend(fontsize=7)
-        if log_x:
-            axis.set_xscale("log")
-        if log_y and label:
-            axis.set_yscale("log")
-        axis.set_title(part, fontsize=10)
-        axis.grid(True, which="major", alpha=0.3)
-    figure.tight_layout()
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
-def _curves(axis: Any, rows: list[Row], keys: Sequence[str], own_colour: str = "") -> None:
-    """One curve a figure; a part's noise levels in their own line styles."""
-    levels = list(dict.fromkeys(row.get("dB") for row in rows))
-    kinds = list(dict.fromkeys(row.get("kind") for row in rows))
-    for colour, key in enumerate(keys):
-        for style, (level, kind) in enumerate((level, kind) for level in levels for kind in kinds):
-            own = [r for r in rows if r.get("dB") == level and r.get("kind") == kind and r.get(key) is not None]
-            if not own:
-                continue
-            x, y = (np.array([row[k] for row in own], float) for k in ("value", key))
-            name = LABELS.get(key, key.replace("_", " "))
-            if level is not None:
-                name += ", noise-free" if np.isinf(level) else f", {level:g} dB"
-            if kind is not None:
-                name += f", {kind}"
-            axis.plot(
-                x,
-                y,
-                marker="o",
-                ms=3,
-                ls="-" if len(set(x)) == len(x) else "",
-                c=own_colour or f"C{colour}",
-                alpha=max(0.3, 1 - 0.3 * style),
-                label=name,
-            )
-
-
-def _bars(axis: Any, rows: list[Row]) -> None:
-    shown = [r for r in rows if r.get("error")]
-    values = [min(r["error"], 1.0) for r in shown]
-    axis.barh(range(len(shown)), values, color=["C3" if r["error"] > 1e-2 else "C0" for r in shown], log=True)
-    axis.set_yticks(range(len(shown)), [r["case"] for r in shown], fontsize=6)
-    axis.set_xlabel("largest relative error")
+    plots.draw(folder / "stability.json")

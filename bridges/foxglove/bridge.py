@@ -12,10 +12,10 @@ import foxglove
 from foxglove import Capability, Context
 
 from bridges.clock import WallClock
-from bridges.feeds import ContactFeed, ImageFeed, Measured, Refusal
+from bridges.feeds import ContactFeed, ImageFeed, Measured, NewestFeed, Refusal
 from bridges.process import Bridge, BridgedSkin, BridgeError, Handed, openable
 from protocol.frames import InfoFrame, ShapeFrame
-from protocol.sockets import AllReader, NewestReader
+from protocol.sockets import AllReader
 from protocol.transport import Socket
 
 from .channels import FoxgloveChannels, Outlines
@@ -36,7 +36,7 @@ class ShownSkin:
         self.channels = FoxgloveChannels(name, skin.frame_id, context)
         self.contacts, self.images = ContactFeed(name, replay), ImageFeed(name, replay)
         self.state: Measured | Refusal | None = None
-        self._shapes: NewestReader | None = None
+        self._shapes = NewestFeed("shape", name)
         self._outlines: tuple[str, Outlines] = "", {}  # session, outline of each contact
         self._said = ""
         self._info: InfoFrame | None = None
@@ -53,11 +53,7 @@ class ShownSkin:
         c = self.channels
         self.contacts.want(c.scene.has_sinks() or c.forces.has_sinks() or c.log.has_sinks())
         self.images.want(c.image.has_sinks())
-        if c.scene.has_sinks() and self._shapes is None:
-            self._shapes = NewestReader("shape", self.name)
-        elif not c.scene.has_sinks() and self._shapes is not None:
-            self._shapes.close()
-            self._shapes = None
+        self._shapes.want(c.scene.has_sinks())
         if (silent := self.contacts.silence()) is not None:
             self.state = silent
             self._say(silent.why)
@@ -92,7 +88,7 @@ class ShownSkin:
 
     def _outlines_of(self, session: str) -> Outlines:
         """Those of the newest shapes, where they are of this session's contacts."""
-        frame = None if self._shapes is None else self._shapes.recv(0.0)
+        frame = self._shapes.recv()
         if isinstance(frame, ShapeFrame) and frame.valid:
             self._outlines = frame.session, dict(zip(frame.ids, frame.outlines, strict=True))
         return self._outlines[1] if self._outlines[0] == session else {}
@@ -107,8 +103,7 @@ class ShownSkin:
     def close(self) -> None:
         self.contacts.close()
         self.images.close()
-        if self._shapes is not None:
-            self._shapes.close()
+        self._shapes.close()
 
 
 class FoxgloveBridge(Bridge):

@@ -1,5 +1,5 @@
-"""Services that Foxglove's users may call: tare; press and fault where the board is the stub. Each asks for the token,
-which only who started the bridge has seen: other users of this host reach its port too.
+"""Services that Foxglove's users may call: tare, record, snapshot; press and fault where the board is the stub. Each
+asks for the token, which only who started the bridge has seen: other users of this host reach its port too.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from foxglove import MessageSchema, Schema, Service, ServiceRequest, ServiceSche
 
 from bridges.process import BridgedSkin
 from protocol.control import ControlClient, ControlError
+from protocol.topics import RECORDER
 
 TARE_S = 10.0
 STUB_S = 3.0
+RECORDER_S = 5.0
 MOST_BYTES = 4096
 
 _NUMBER = {"type": "number"}
@@ -23,7 +25,10 @@ _NUMBER = {"type": "number"}
 
 def services(skins: dict[str, BridgedSkin], token: str) -> list[Service]:
     """The services of all skins."""
-    found = []
+    found = [
+        _service("/record", {"on": {"type": "boolean"}}, token, _record),
+        _service("/snapshot", {"before_s": _NUMBER, "after_s": _NUMBER}, token, _snapshot),
+    ]
     for name, skin in skins.items():
         found.append(_service(f"/{name}/tare", {}, token, _tare(name)))
         if skin.stub:
@@ -32,6 +37,26 @@ def services(skins: dict[str, BridgedSkin], token: str) -> list[Service]:
             fault = {"name": {"type": "string"}, "seconds": _NUMBER}
             found.append(_service(f"/{name}/fault", fault, token, _fault(name)))
     return found
+
+
+def _record(asked: dict[str, Any]) -> dict[str, Any]:
+    if not isinstance(on := asked.get("on", True), bool):
+        raise ValueError(f'found "on": {on!r:.40}, expected true or false')
+    return _recorder("record", {"on": on})
+
+
+def _snapshot(asked: dict[str, Any]) -> dict[str, Any]:
+    return _recorder("snapshot", asked)
+
+
+def _recorder(command: str, args: dict[str, Any]) -> dict[str, Any]:
+    """One recorder is for all skins."""
+    try:
+        return ControlClient(RECORDER, RECORDER_S).call(command, **args)
+    except ControlError as why:
+        if why.kind != "unreachable":
+            raise
+        raise ValueError("no recorder runs: [recorder] in skin.toml has `skin up` start one") from None
 
 
 def _tare(skin: str) -> Callable[[dict[str, Any]], dict[str, Any]]:

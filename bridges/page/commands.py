@@ -9,6 +9,8 @@ import secrets
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -17,19 +19,21 @@ from typing import Any
 
 from protocol.control import ControlClient, ControlError
 from protocol.runtime import runtime_dir
+from protocol.topics import RECORDER
 
 from .feed import SkinFeed
 from .replays import REPLAY, Replay, ReplayRefused, listed
 
 TOKEN_FILE = "page.token"
-TIMEOUT_S = {"preprocessing": 10.0, "stub": 2.0}
-AT_ONCE_S, STOP_S = 1.5, 5.0
+TIMEOUT_S = {"preprocessing": 10.0, "stub": 2.0, RECORDER: 10.0}
+THERE_S, BEGIN_S, STOP_S = 0.3, 8.0, 5.0
+"""For a recorder to answer that runs, to begin, to end."""
 
 
 @dataclass(frozen=True)
 class Button:
     """The process that a command goes to ("": the page itself), and the arguments it may have. `stub`: only where the
-    skin is the stub's.
+    skin is the stub's. The recorder is one for all skins.
     """
 
     process: str
@@ -43,7 +47,8 @@ BUTTONS = {
     "release": Button("stub", ("finger",)),
     "scene": Button("stub", ("name",)),
     "fault": Button("stub", ("name", "args", "seconds", "clear")),
-    "record": Button("", ("on",), stub=False),
+    "record": Button(RECORDER, ("on",), stub=False),
+    "snapshot": Button(RECORDER, ("before_s", "after_s"), stub=False),
     "recordings": Button("", stub=False),
     "replay": Button("", ("file", "skin", "speed", "from"), stub=False),
 }
@@ -72,7 +77,7 @@ class Buttons:
     def __init__(self, secret: str, feeds: dict[str, SkinFeed], recordings: str, tell: Callable[[bool], None]) -> None:
         """tell: called when there is news of a replay."""
         self._secret, self._feeds, self._tell = secret, feeds, tell
-        self.recording = RecorderProcess(Path(recordings)) if recordings else None
+        self.recording = OwnRecorder(Path(recordings)) if recordings else None
         self._replay: Replay | None = None
 
     def knows(self, given: str) -> bool:
@@ -90,7 +95,7 @@ class Buttons:
             return _no(f"{command} is for the stub's skin: {skin} is measured by {feed.source or 'nobody just now'}")
         if unknown := sorted(set(args) - set(button.args)):
             return _no(f"{command} has no argument {', '.join(unknown)[:80]}")
-        if button.process and skin == REPLAY:
+        if button.process not in ("", RECORDER) and skin == REPLAY:
             return _no(f"{command} is for a skin, not for a recording")
         try:
             return {"ok": True, "result": await self._carry_out(button.process, skin, command, args)}
@@ -98,13 +103,13 @@ class Buttons:
             return _no(str(why))
 
     async def _carry_out(self, process: str, skin: str, command: str, args: dict[str, Any]) -> dict[str, Any]:
-        if process:
+        if process and process != RECORDER:
             client = ControlClient(process, TIMEOUT_S[process])
             return await asyncio.to_thread(partial(client.call, command, skin=skin, **args))
         if self.recording is None:
             raise ReplayRefused("the page has no folder for recordings")
-        if command == "record":
-            return await asyncio.to_thread(self.recording.start if args.get("on") else self.recording.stop)
+        if process:
+            return await asyncio.to_thread(self.recording.call, command, args)
         if command == "recordings":
             return {"files": await asyncio.to_thread(listed, self.recording.folder)}
         return await self._replayed(skin, self.recording.folder, args)
@@ -132,26 +137,42 @@ class Buttons:
             await asyncio.to_thread(self.recording.stop)
 
 
-class RecorderProcess:
-    """A recorder that the page starts and ends."""
+class OwnRecorder:
+    """The service's recorder; where none runs, one that the page starts and ends."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.absolute()
         self._process: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()
 
-    def start(self) -> dict[str, Any]:
-        """Raises ReplayRefused where it ends at once: another one records, or the folder cannot be written to."""
-        if self._process is None or self._process.poll() is not None:
-            command = [sys.executable, "-m", "services.recorder", "--folder", str(self.folder)]
-            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-            try:
-                self._process.wait(AT_ONCE_S)
-            except subprocess.TimeoutExpired:
-                return {"recording": True, "folder": str(self.folder)}
-            raise ReplayRefused("the recorder ended at once; the service's output says why")
-        return {"recording": True, "folder": str(self.folder)}
+    def call(self, command: str, args: dict[str, Any]) -> dict[str, Any]:
+        """Its answer. Raises ControlError, and ReplayRefused where none can be started."""
+        with self._lock:
+            if not self._answers(THERE_S):
+                self._start()
+        return ControlClient(RECORDER, TIMEOUT_S[RECORDER]).call(command, **args)
 
-    def stop(self) -> dict[str, Any]:
+    def _start(self) -> None:
+        command = [sys.executable, "-m", "services.recorder", "--wait", "--folder", str(self.folder)]
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+        end = time.monotonic() + BEGIN_S
+        while not self._answers(THERE_S):
+            if self._process.poll() is not None or time.monotonic() > end:
+                self.stop()
+                raise ReplayRefused("no recorder runs, and none could be started; the service's output says why")
+
+    @staticmethod
+    def _answers(seconds: float) -> bool:
+        try:
+            ControlClient(RECORDER, seconds).call("status")
+        except ControlError as why:
+            if why.kind != "unreachable":
+                raise
+            return False
+        return True
+
+    def stop(self) -> None:
+        """End ours; the service's goes on."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
             try:
@@ -160,7 +181,6 @@ class RecorderProcess:
                 self._process.kill()
                 self._process.wait()
         self._process = None
-        return {"recording": False, "folder": str(self.folder)}
 
 
 def _no(why: str) -> dict[str, Any]:

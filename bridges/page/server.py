@@ -6,20 +6,24 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import importlib.util
 import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from aiohttp import web
 from aiohttp.typedefs import Handler, Middleware
 
+from bridges.process import BridgeError
 from protocol.frame_types import ELECTRODE_STATES, REASONS
 from protocol.logs import foreign
 from protocol.runtime import host_id
+from protocol.topics import RECORDER
 
 from .advice import ADVICE
 from .commands import BUTTONS, Buttons
@@ -28,6 +32,9 @@ from .fetch_three import three_folder, verified
 from .replays import REPLAY
 from .settings import LOOPBACK, PageSettings
 from .viewer import Viewer
+
+if TYPE_CHECKING:
+    from .metrics import SkinMetrics
 
 WEB = Path(__file__).with_name("web")
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
@@ -45,10 +52,13 @@ class PageServer:
 
     def __init__(self, settings: PageSettings, secret: str, handed_on: Callable[[str, int | None], None]) -> None:
         """handed_on: called with the skin, and when it was measured, of each scan that goes to the browsers."""
+        if settings.metrics and importlib.util.find_spec("prometheus_client") is None:
+            raise BridgeError("[page] metrics needs the package prometheus-client, which is not installed: `make venv`")
         self.settings, self.port, self._handed_on = settings, 0, handed_on
         self.feeds = {skin: SkinFeed(skin, partial(self._tell, skin)) for skin in settings.skins}
         self.buttons = Buttons(secret, self.feeds, settings.recordings, partial(self._tell, REPLAY))
         self._viewers: set[Viewer] = set()
+        self._metrics: SkinMetrics | None = None
         self._three = verified(three_folder())
         self._files = {f"/{path.name}": path.read_bytes() for path in WEB.iterdir() if path.suffix in TYPES}
         self._files |= {f"/three/{name}": content for name, content in self._three.items()}
@@ -76,6 +86,9 @@ class PageServer:
     def application(self) -> web.Application:
         found = web.Application(middlewares=[self._guarded()])
         found.router.add_get("/live", self._live)
+        if self.settings.metrics:
+            found.router.add_get("/metrics", self._measured)
+            found.cleanup_ctx.append(self._measuring)
         found.router.add_get("/{path:.*}", self._file)
         return found
 
@@ -113,6 +126,37 @@ class PageServer:
             "Cache-Control": "no-cache",
         }
 
+    async def _measuring(self, application: web.Application) -> AsyncIterator[None]:
+        """Count while the server runs, whether anybody looks or not."""
+        from .metrics import LOOK_S, SkinMetrics  # where it is off, its package is not needed
+
+        self._metrics = metrics = SkinMetrics(self.settings.skins)
+
+        async def look() -> None:
+            while True:
+                metrics.look()
+                await asyncio.sleep(LOOK_S)
+
+        looking = asyncio.create_task(look())
+        yield
+        looking.cancel()
+        await asyncio.gather(looking, return_exceptions=True)
+        self._metrics = None
+        metrics.close()
+
+    async def _measured(self, request: web.Request) -> web.Response:
+        """For Prometheus. Who may look may read it; beyond this host the token is asked for, as for looking."""
+        origin = request.headers.get("Origin")
+        if origin is not None and origin.removeprefix("http://") not in self.names:
+            raise web.HTTPForbidden(text="asked by another page: refused\n")
+        given = request.headers.get("Authorization", "").removeprefix("Bearer ") or request.query.get("token", "")
+        if not self.settings.local and not self.buttons.knows(given):
+            raise web.HTTPForbidden(text="metrics need the token here: authorization with credentials, Bearer\n")
+        if self._metrics is None:
+            raise web.HTTPServiceUnavailable(text="not yet\n")
+        headers = {**self._headers(), "Content-Type": "text/plain; version=0.0.4; charset=utf-8"}
+        return web.Response(body=self._metrics.text(), headers=headers)
+
     async def _live(self, request: web.Request) -> web.StreamResponse:
         origin = request.headers.get("Origin", "")
         if origin.removeprefix("http://") not in self.names or not origin.startswith("http://"):
@@ -144,7 +188,11 @@ class PageServer:
             "advice": ADVICE,
             "electrode_states": list(ELECTRODE_STATES),
             "three": bool(self._three),
-            "buttons": [name for name, button in BUTTONS.items() if button.process or self.buttons.recording],
+            "buttons": [
+                name
+                for name, button in BUTTONS.items()
+                if self.buttons.recording or button.process not in ("", RECORDER)
+            ],
         }
 
     @property

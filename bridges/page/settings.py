@@ -13,7 +13,7 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 class PageSettings:
     """`skins`: which to show. `host`, `port`: where to listen, or at the first free port from there on. `names`: host
     names beside those of the loopback under which browsers may ask for the page. `recordings`: folder of what the
-    page's button records; "": no button.
+    page's button records; "": no button. `metrics`: whether /metrics is there, for Prometheus.
     """
 
     skins: tuple[str, ...]
@@ -21,6 +21,7 @@ class PageSettings:
     port: int
     names: tuple[str, ...]
     recordings: str
+    metrics: bool = False
 
     @property
     def local(self) -> bool:
@@ -38,6 +39,7 @@ class PageSettings:
                 int(options["port"]),
                 tuple(map(str, options["names"])),
                 str(options["recordings"]),
+                bool(options.get("metrics")),
             )
         except (KeyError, TypeError, ValueError) as bad:
             raise BridgeError(

@@ -14,12 +14,12 @@ from cyclonedds.domain import DomainParticipant
 
 from bridges import views
 from bridges.clock import WallClock
-from bridges.feeds import ContactFeed, ImageFeed, Measured, Picture, Refusal
+from bridges.feeds import ContactFeed, ImageFeed, Measured, NewestFeed, Picture, Refusal
 from bridges.process import Bridge, BridgeError, Handed
 from protocol.control import ControlClient, ControlError
 from protocol.frame_types import ELECTRODE_STATES
 from protocol.frames import DeltaFrame, InfoFrame, StatusFrame
-from protocol.sockets import AllReader, NewestReader
+from protocol.sockets import AllReader
 from protocol.transport import Socket
 
 from . import dds, messages
@@ -43,8 +43,7 @@ class SkinTopics:
         self._frame_id, self._clock = frame_id, clock
         self.contacts = ContactFeed(skin, replay)
         self.images = ImageFeed(skin, replay)
-        self.electrodes: NewestReader | None = None
-        self._skin = skin
+        self.electrodes = NewestFeed("delta", skin)
 
         def writer(name: str, message: str, kind: dds.Kind = "state") -> RosWriter:
             return RosWriter(participant, f"{base}/{name}", message, kind)
@@ -76,11 +75,7 @@ class SkinTopics:
         self.wanted = {writer for writer in self.writers() if writer.wanted}
         self.contacts.want(diagnostics or not self.wanted.isdisjoint(self._of_contacts))
         self.images.want(not self.wanted.isdisjoint(self._of_images))
-        if diagnostics and self.electrodes is None:
-            self.electrodes = NewestReader("delta", self._skin)
-        elif not diagnostics and self.electrodes is not None:
-            self.electrodes.close()
-            self.electrodes = None
+        self.electrodes.want(diagnostics)
         if (silent := self.contacts.silence()) is not None:
             self.state = silent
         if isinstance(self.state, Refusal) and time.monotonic() - self._said_invalid >= VALID_S:
@@ -120,7 +115,7 @@ class SkinTopics:
 
     def electrode_states(self) -> list[str] | None:
         """The state of each electrode, by the newest scan; None where nothing has come since the last call."""
-        frame = None if self.electrodes is None else self.electrodes.recv(0.0)
+        frame = self.electrodes.recv()
         if not isinstance(frame, DeltaFrame):
             return None
         return [ELECTRODE_STATES[s] if s < len(ELECTRODE_STATES) else "unknown" for s in frame.electrodes.tolist()]
@@ -136,8 +131,7 @@ class SkinTopics:
     def close(self) -> None:
         self.contacts.close()
         self.images.close()
-        if self.electrodes is not None:
-            self.electrodes.close()
+        self.electrodes.close()
 
 
 class Ros2Bridge(Bridge):

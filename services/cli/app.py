@@ -4,21 +4,52 @@ from __future__ import annotations
 
 import os
 import sys
+from typing import Annotated
 
 import typer
 
-from services.cli import board, bridge, calibrate, collect, export, new_skin, offline, recordings, service, watch
+from protocol import __version__
+from services.cli import (
+    board,
+    bridge,
+    calibrate,
+    collect,
+    export,
+    golden,
+    info,
+    new_skin,
+    offline,
+    recordings,
+    service,
+    watch,
+)
 from services.cli.common import FAILED, expected_code, interrupted
 
 app = typer.Typer(
     name="skin",
-    help="A tactile skin: start it, watch it, press it, record it, reconstruct from files.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for group in (service, watch, board, recordings, export, calibrate, bridge, collect, new_skin, offline):
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"eitskin {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _of_all_commands(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """A tactile skin: start it, watch it, press it, record it, reconstruct from files."""
+
+
+for group in (service, watch, board, recordings, info, golden, export, calibrate, bridge, collect, new_skin, offline):
     group.register(app)
 
 

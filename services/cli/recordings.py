@@ -1,15 +1,16 @@
-"""Commands about recordings: record, replay, import."""
+"""Commands about recordings: record, snapshot, replay, import."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from services.cli.common import (
+    FAILED,
     USAGE,
     JsonOption,
     emit,
@@ -24,19 +25,29 @@ RecordedSkin = Annotated[str, typer.Option("--skin", help="Which skin; default: 
 
 if TYPE_CHECKING:
     from protocol.frames import ContactFrame
+    from services.recordings.recorder import Recorder
 
 
 def register(app: typer.Typer) -> None:
     app.command()(of_service(record))
+    app.command()(of_service(snapshot))
     app.command()(of_service(replay, starts=True))
     app.command("import")(import_file)
 
 
 def record(
-    file: Annotated[Path, typer.Argument(metavar="FILE.mcap")],
+    file: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="With --trigger: a folder, a file for each event.")],
     seconds: Annotated[float, typer.Option(help="Stop after so long; 0: at Ctrl-C.")] = 0.0,
     topics: Annotated[str, typer.Option(help="Which topics; naming a lazy one wakes it.")] = "raw,contact,status,info",
     skin: RecordedSkin = "",
+    file_mb: Annotated[float, typer.Option(min=0, help="Go on in FILE-2.mcap when FILE is so large; 0: never.")] = 0.0,
+    file_minutes: Annotated[float, typer.Option(min=0, help="Likewise, when it is so long.")] = 0.0,
+    keep: Annotated[int, typer.Option(min=0, help="Keep so many files, delete the oldest; 0: keep all.")] = 0,
+    trigger: Annotated[
+        list[str] | None, typer.Option(help="contact or fault: write only the time round each, to a folder.")
+    ] = None,
+    before: Annotated[float, typer.Option(min=0, help="With --trigger: so many seconds before it.")] = 10.0,
+    after: Annotated[float, typer.Option(min=0, help="With --trigger: so many seconds after it.")] = 5.0,
     overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -47,32 +58,95 @@ def record(
 
     from rich.console import Console
 
-    from services.recorder import Recorder
+    from services.recordings.recorder import Recorder
+    from services.recordings.rotation import Rotation
+    from services.recordings.snapshots import LONGEST_S, Keeping
+    from services.recordings.triggers import TRIGGERS
 
+    wanted = tuple(name for name in TRIGGERS if name in (trigger or ()))
+    if trigger and set(trigger) - set(wanted):
+        fail(f"found --trigger {' '.join(trigger)}, expected some of {', '.join(TRIGGERS)}", USAGE)
+    if trigger and (file.suffix == ".mcap" or file.is_file()):
+        fail(f"found the file {file}, but --trigger writes a file for each event: name a folder", USAGE)
+    if not 0 < before <= 600 or after > LONGEST_S:
+        fail(f"found --before {before:g} --after {after:g}, expected above 0 to 600 and 0 to {LONGEST_S:g} s", USAGE)
     use_configured_sockets()
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     console = Console(stderr=True)
     end = time.monotonic() + seconds if seconds > 0 else float("inf")
-    with Recorder(file, topics.split(","), skin or None, overwrite) as recorder:
-        with console.status(f"recording to {file}") as status:
+    rotation = Rotation(int(file_mb * 1e6), file_minutes * 60, keep)
+    keeping = Keeping(file, before, after, triggers=wanted, keep=keep) if wanted else None
+    what = f"waiting for a {' or a '.join(wanted)}, to {file}" if wanted else f"recording to {file}"
+    with Recorder(
+        None if wanted else file, topics.split(","), skin or None, overwrite, rotation=rotation, keeping=keeping
+    ) as recorder:
+        with console.status(what) as status:
             while not stop.is_set() and time.monotonic() < end:
                 recorder.step(0.1)
-                counts = ", ".join(f"{topic} {n}" for topic, n in recorder.writer.counts.items())
                 said = f"  {recorder.problem}" if recorder.problem else ""
-                status.update(f"recording to {file}: {counts or 'nothing yet'}{said}  (Ctrl-C ends it)")
-    size = file.stat().st_size
-    result = {"file": str(file), "messages": recorder.writer.counts, "gaps": recorder.gaps, "bytes": size}
+                status.update(f"{what}: {_counted(recorder) or 'nothing yet'}{said}  (Ctrl-C ends it)")
+    result: dict[str, Any] = {"file": str(file), "messages": _counts(recorder), "gaps": recorder.gaps}
+    if recorder.writer is not None:
+        result |= {"bytes": recorder.writer.bytes, "files": recorder.writer.files, "deleted": recorder.writer.deleted}
+    if (taken := recorder.snapshots) is not None:
+        result |= {"snapshots": taken.taken, "missed": taken.missed, "deleted": taken.deleted}
     if recorder.problem:
         print(f"skin: {file}: {recorder.problem}", file=sys.stderr)
     if as_json:
         emit(result)
+    elif taken is not None:
+        print(f"{file}: {taken.taken} snapshots, {taken.missed} could not be taken, {taken.deleted} old ones deleted")
     else:
-        counts = ", ".join(f"{topic} {n}" for topic, n in recorder.writer.counts.items())
-        print(f"{file}: {counts or 'nothing'}; {size / 1e6:.1f} MB; {recorder.gaps} messages missed")
-    if not recorder.writer.counts:
+        files = f" in {result['files']} files" if result["files"] > 1 else ""
+        size = f"{result['bytes'] / 1e6:.1f} MB{files}"
+        print(f"{file}: {_counted(recorder) or 'nothing'}; {size}; {recorder.gaps} messages missed")
+    if not recorder.heard:
         fail("nothing was recorded: is the service running (`skin up`)?", 3)
+
+
+def _counts(recorder: Recorder) -> dict[str, int]:
+    """Messages by topic: those recorded, or where snapshots alone are taken, those that came."""
+    if recorder.writer is not None:
+        return recorder.writer.counts
+    return {f"{topic}/{name}": n for (topic, name), n in recorder.heard.items()}
+
+
+def _counted(recorder: Recorder) -> str:
+    return ", ".join(f"{topic} {n}" for topic, n in _counts(recorder).items())
+
+
+def snapshot(
+    before: Annotated[float | None, typer.Option(min=0, help="So many of the last seconds; default: all kept.")] = None,
+    after: Annotated[float | None, typer.Option(min=0, help="And so many from now on; default: as configured.")] = None,
+    why: Annotated[str, typer.Option(help="A word on it, kept in the file.")] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Write the last seconds and the next ones to a file that replays. The service's recorder does."""
+    import time
+
+    from protocol.control import ControlClient, ControlError
+
+    use_configured_sockets()
+    client = ControlClient("recorder", 10.0)
+    wanted = {name: value for name, value in (("before_s", before), ("after_s", after)) if value is not None}
+    try:
+        made = client.call("snapshot", why=why, **wanted)
+        end = time.monotonic() + float(made["after_s"]) + 330
+        while (status := client.call("status")).get("writing") and status.get("snapshot") == made["file"]:
+            if time.monotonic() > end:
+                fail(f"{made['file']} is still being written: `skin top` shows how the recorder does")
+            time.sleep(0.1)
+    except ControlError as why_not:
+        hint = ": `[recorder]` in skin.toml has `skin up` start one" if why_not.kind == "unreachable" else ""
+        fail(f"{why_not}{hint}", 3 if hint else FAILED)
+    for problem in status.get("problems", []):
+        print(f"skin: {problem}", file=sys.stderr)
+    if as_json:
+        emit(made)
+    else:
+        print(made["file"])
 
 
 def replay(

@@ -30,7 +30,7 @@ def up(
     from protocol.runtime import lock
     from services.bridge import check
     from services.runtime.config import load
-    from services.runtime.supervision import Program, programs
+    from services.runtime.supervision import programs
     from services.runtime.supervision import up as supervise
 
     found = load()
@@ -38,8 +38,7 @@ def up(
     _check_calibrations(found)
     for name in found.bridges:
         check(name)
-    wanted = [p for p in programs(found) if not (no_board and p.name in ("acquisition", "stub"))]
-    extra = [Program("recorder", "services.recorder", ("--folder", str(record.resolve())))] if record else []
+    wanted = [p for p in programs(found, record) if not (no_board and p.name in ("acquisition", "stub"))]
     with lock():  # said before anything else where a service runs here already
         contacts = _addresses(found.transport(), [program.name for program in wanted])
     names, first = ", ".join(found.skins), next(iter(found.skins))
@@ -47,7 +46,7 @@ def up(
     print(
         "look with `./skin top`, press with `./skin press --x 0.02 --y -0.01 --force 3`, stop with Ctrl-C", flush=True
     )
-    raise typer.Exit(supervise(found, extra, wanted))
+    raise typer.Exit(supervise(found, wanted=wanted))
 
 
 def _check_mismatches(config: ConfigFile) -> None:

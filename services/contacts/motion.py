@@ -15,6 +15,7 @@ LONGEST_PREDICTION_S = 0.2  # a velocity says nothing about longer gaps
 SIZE_SIGMA = 0.4  # of the logarithm of an integrated drop, from frame to frame
 SIZE_SHARE = 0.3  # of what is seen, in the running mean of the size
 LEFT_OVER, LEFT_OVER_M = 0.3, 0.008  # share of its size, and distance, that no touch changes by at once as it goes on
+SAME_M, SAME_SIZE = 0.0015, 0.15  # a steady touch from image to image: place, logarithm of an integrated drop
 MOST_FOR_SIZE = 9.0  # a touch may grow quickly: its size alone makes it no other touch
 
 
@@ -25,6 +26,7 @@ class Patch(NamedTuple):
     y: float
     size: float = 0.0  # integrated drop, any unit; 0: unknown
     reach: float = 0.0  # m from the centroid to the patch's farthest point
+    confidence: float = 1.0  # probability that its peak is no noise
 
 
 @dataclass
@@ -44,6 +46,9 @@ class Track:
     vv: float = FIRST_SPEED**2
     missing: int = 0  # frames since it was seen
     age: int = 1  # frames in which it was seen
+    sure_frames: int = 0  # of those, with an image that explained its frame, or that was like the one before
+    confidence: float = 1.0  # of the last image's patch
+    last: list[float] = field(default_factory=list)  # place [m] and size in the last image
     begins: bool = True  # whether it was looked for, and not there, just before
     sure: list[float] = field(default_factory=list)  # m, where the last image that explained its frame showed it
     since_ns: int = 0  # when the last one of `inside` came
@@ -61,7 +66,8 @@ class Track:
     def move(self, seen: Patch, sample_ns: int, sure: bool = True) -> None:
         """Update with where an image shows it. sure: the image explains its frame; else it shows roughly where."""
         if sure:
-            self.sure = [seen.x, seen.y]
+            self.sure, self.sure_frames = [seen.x, seen.y], self.sure_frames + 1
+        self.last, self.confidence = [seen.x, seen.y, seen.size], seen.confidence
         real = max(0.0, (sample_ns - self.seen_ns) * 1e-9)
         if real > 1e-6:
             self._filter(seen, real)
@@ -88,6 +94,15 @@ class Track:
     def ghost(self) -> Track:
         """A copy of it as one of its own `inside`: what it was before others came."""
         return replace(self, inside=[])
+
+
+def is_same(track: Track, seen: Patch) -> bool:
+    """Whether a patch is where the image before showed the track, and as large."""
+    if not track.last or track.missing:
+        return False
+    x, y, size = track.last
+    grown = abs(math.log(seen.size / size)) if size > 0 and seen.size > 0 else 0.0
+    return math.hypot(seen.x - x, seen.y - y) <= SAME_M and grown <= SAME_SIZE
 
 
 def is_left_over(track: Track, seen: Patch) -> bool:

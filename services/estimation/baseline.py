@@ -15,18 +15,13 @@ from services.estimation.drift import DriftRates
 from services.estimation.drift_filter import DriftFilter
 from services.estimation.drift_in_touch import drifted, explain
 from services.estimation.evidence import Explanation, TouchEvidence, evidence_of
+from services.estimation.first_baseline import PRESSED, first_baseline
 from services.estimation.references import References
-from services.estimation.start import StartVerdict, judge_start
-from services.estimation.tare import Baseline, NoBaseline, noisy, plausible_noise
+from services.estimation.tare import Baseline, NoBaseline, noisy, plausible_noise, saved_noise
 from services.estimation.tare_window import TareWindow
 
 Array = NDArray[np.float64]
 
-UNSURE = (
-    "this skin differs from its bundle by as much as a touch may make: see that nothing touches it and run `skin tare` "
-    "once"
-)
-PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare`"
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is worth keeping again
 STEADY_S = 0.25  # what is known not to have drifted is as good as a baseline of this age
 DRIFT_KNOWN_S = 4.0  # a drift that was found under a touch leaves as much open as a baseline of this age
@@ -113,20 +108,14 @@ class BaselineEstimator:
     def _begin(self, found: Baseline) -> bool:
         """Use the first baseline, unless something touches: whether there is one now."""
         trusted = self.trusted if self.trusted is not None and self.trusted.board == found.board else None
-        start = judge_start(
-            found.z0, found.sigma / np.sqrt(found.frames), self.evidence, None if trusted is None else trusted.z0
-        )
-        self.touched_at_start = start.verdict is StartVerdict.TOUCHED
-        if start.verdict is StartVerdict.UNKNOWN and not found.doubt:
-            found = dataclasses.replace(found, doubt=UNSURE)
-        if not self.touched_at_start:
-            self.set_baseline(found, self.last_sample_ns)
-            return True
-        if trusted is None or start.explanation is None or not start.explanation.fits:
+        first = first_baseline(found, trusted, self.evidence)
+        self.touched_at_start = first.touched
+        if first.baseline is None:
             self.problem = PRESSED
             return False
-        self.set_baseline(dataclasses.replace(trusted, sigma=found.sigma), self.last_sample_ns)
-        self.drifted(start.explanation.drift, self.last_sample_ns)
+        self.set_baseline(first.baseline, self.last_sample_ns)
+        if first.drift is not None:
+            self.drifted(first.drift, self.last_sample_ns)
         return True
 
     def explain(self, d: Array, live: NDArray[np.bool_], since_s: float, creep: Array | None = None) -> Explanation:
@@ -282,14 +271,7 @@ class BaselineEstimator:
             self._use(Baseline.from_dict(state["baseline"], k))
             assert self.baseline is not None
             if state["bundle"] == self.bundle.hash:
-                normaliser = np.array(state["normaliser"], dtype=float)
-                if normaliser.shape != (k,) or not (np.isfinite(normaliser) & (normaliser >= 0)).all():
-                    raise NoBaseline(f"the saved normaliser is not {k} numbers from 0 on: tare again")
-                self.normaliser = normaliser
-                self.sigma = np.array(state.get("sigma", self.baseline.sigma / normaliser), dtype=float)
-                self.sigma = np.where(np.isfinite(self.baseline.sigma), self.sigma, np.inf)
-                if self.sigma.shape != (k,) or not (self.sigma > 0).all():
-                    raise NoBaseline(f"the saved noise is not {k} numbers above 0: tare again")
+                self.normaliser, self.sigma = saved_noise(state, self.baseline)
         if "references" in state:  # older recordings have none
             self.references.load(state["references"])
         self.window.load(state)

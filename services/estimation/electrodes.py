@@ -27,6 +27,8 @@ Mask = NDArray[np.bool_]
 
 QUIET = 5.0  # standard deviations within which a measurement is what it was
 TOO_MANY = 2  # electrodes at fault with which contacts can still be given
+LOST_MOST = 0.1  # share of measurements that a frame may lack beside those of electrodes at fault: with 15 of 120 lost
+# in a row, a touch that they would have seen has two thirds of its force
 WELL_FRAMES = 3  # in a row, after which an electrode counts again
 SUSPECTED = 3  # frames in a row after which a change that may be a touch on the electrode is the contact's
 WELL = 0.0015  # relative: how near its baseline a measurement of a well electrode is, and within 6 sigma more
@@ -117,7 +119,8 @@ class ElectrodeHealth:
         doubtful = bool(self._unsure.any() or self._suspected.any())
         if doubtful and "electrode_drift" not in reasons:
             reasons.append("electrode_drift")
-        usable = bad <= TOO_MANY and not doubtful and bool(live.sum() >= len(live) / 2)
+        enough = live.sum() >= len(live) / 2 and (seen.failed & ~at_fault & known).sum() <= LOST_MOST * len(live)
+        usable = bad <= TOO_MANY and not doubtful and bool(enough)
         if bad == TOO_MANY:
             reasons.append("degraded")
         if not usable and not reasons and not reasons_of(status):

@@ -172,3 +172,18 @@ def implausibility(z0: Array, pre: PreReconstructor) -> float:
     columns = np.column_stack([np.ones(int(live.sum())), pre.m.contact[live]])
     fitted, *_ = np.linalg.lstsq(columns, residual, rcond=1e-6)
     return float(np.sqrt(np.mean((residual - columns @ fitted) ** 2)))
+
+
+def saved_noise(state: dict[str, Any], baseline: Baseline) -> tuple[Array, Array]:
+    """What differences are divided by and their standard deviation (K,), of a state's baseline. Raises NoBaseline where
+    they cannot be; KeyError, TypeError or ValueError where a part does not fit.
+    """
+    k = len(baseline.z0)
+    normaliser = np.array(state["normaliser"], dtype=float)
+    if normaliser.shape != (k,) or not (np.isfinite(normaliser) & (normaliser >= 0)).all():
+        raise NoBaseline(f"the saved normaliser is not {k} numbers from 0 on: tare again")
+    sigma = np.array(state.get("sigma", baseline.sigma / normaliser), dtype=float)
+    sigma = np.where(np.isfinite(baseline.sigma), sigma, np.inf)
+    if sigma.shape != (k,) or not (sigma > 0).all():
+        raise NoBaseline(f"the saved noise is not {k} numbers above 0: tare again")
+    return normaliser, sigma

@@ -117,6 +117,11 @@ class RecordingWriter:
         return self._file.full
 
     @property
+    def bytes(self) -> int:
+        """Size of the file, with what still waits to be written."""
+        return self._file.tell()
+
+    @property
     def counts(self) -> dict[str, int]:
         """Messages taken so far, by topic."""
         return dict(self._sequence)

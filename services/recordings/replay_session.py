@@ -107,7 +107,7 @@ def _stages(skins: list[str], reader: RecordingReader, bundle: Path | None) -> I
             yield []
             return
         folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="replay-", dir=runtime_dir())))
-        file, warnings = _configuration(skins, reader, bundle, folder)
+        file, warnings = configuration_of(skins, reader, bundle, folder)
         environment = os.environ | {"EITSKIN_CONFIG": str(file)}
         for name in STAGES:
             cleanup.callback(stop, _start(name, environment))
@@ -136,7 +136,7 @@ def stop(process: subprocess.Popen[Any]) -> None:
         process.wait()
 
 
-def _configuration(
+def configuration_of(
     skins: list[str], reader: RecordingReader, bundle: Path | None, folder: Path
 ) -> tuple[Path, list[str]]:
     """A file in `folder` that configures all `skins`, and what is to be warned of: each as the recording says, else as

@@ -23,6 +23,7 @@ from services.runtime.config_sections import (
     Logging,
     PageSection,
     RealTime,
+    RecorderSection,
     Ros2Section,
     Section,
     Security,
@@ -156,6 +157,7 @@ class ConfigFile(Section):
     page: PageSection = PageSection()
     ros2: Ros2Section = Ros2Section()
     foxglove: FoxgloveSection = FoxgloveSection()
+    recorder: RecorderSection | None = None  # without it, `skin up` starts no recorder
     logging: Logging = Logging()
     path: Annotated[Path, Field(exclude=True)] = Path("skin.toml")
 

@@ -29,7 +29,7 @@ class Sockets(Section):
     @classmethod
     def known(cls, addresses: dict[str, str]) -> dict[str, str]:
         for name, address in addresses.items():
-            if name.removesuffix(".ctl") not in (*PRODUCERS, "recorder"):
+            if name.removesuffix(".ctl") not in PRODUCERS:
                 raise ValueError(f"producers {', '.join(PRODUCERS)}, or one of these with .ctl (found {name!r})")
             port = address.rpartition(":")[2] if address.startswith("tcp://") else "1"
             if not re.fullmatch(r"(tcp://\S+:\d{1,5}|ipc://\S+)", address) or not 1 <= int(port) <= 65535:
@@ -68,8 +68,8 @@ class Security(Section):
     @classmethod
     def known(cls, keys: dict[str, Path]) -> dict[str, Path]:
         for name in keys:
-            if name not in (*PRODUCERS, "recorder"):
-                raise ValueError(f"producers {', '.join(PRODUCERS)} or recorder (found {name!r})")
+            if name not in PRODUCERS:
+                raise ValueError(f"producers {', '.join(PRODUCERS)} (found {name!r})")
         return keys
 
     @model_validator(mode="after")
@@ -119,13 +119,28 @@ class Skip(Section):
     unwanted: Switch = True  # what nobody subscribes to (force, shape) is not made
 
 
+class RecorderSection(Section):
+    """The recorder that `skin up` starts where there is this section: services/recorder.py, docs/recording.md."""
+
+    folder: str = "recordings"  # relative to the folder of this file
+    before_s: Annotated[float, Field(gt=0, le=600)] = 10.0  # what a snapshot has of the time before its event
+    after_s: Annotated[float, Field(ge=0, le=300)] = 5.0
+    triggers: tuple[Literal["contact", "fault"], ...] = ()  # events that a snapshot is taken of by itself
+    keep_snapshots: Annotated[int, Field(ge=0, strict=True)] = 100  # of those taken by themselves; 0: all
+    memory_mb: Annotated[float, Field(gt=0, le=4096)] = 64.0  # for the time before
+    file_mb: Annotated[float, Field(ge=0)] = 0.0  # a recording goes on in another file then; 0: whatever its size
+    file_minutes: Annotated[float, Field(ge=0)] = 0.0  # likewise; 0: however long
+    keep_files: Annotated[int, Field(ge=0, strict=True)] = 0  # of one recording, the oldest are deleted; 0: all
+
+
 class PageSection(Section):
     """The live page: bridges/page, docs/page.md."""
 
     host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
     port: Annotated[int, Field(ge=1, le=65515, strict=True)] = 8080  # or the first free one of the twenty from there
     names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]{1,253}$")], ...] = ()  # further names it is asked for by
-    recordings: str = "recordings"  # folder of the button Record; "": no button
+    recordings: str = "recordings"  # folder of the button Record where there is no [recorder]; "": no button
+    metrics: Switch = False  # /metrics, for Prometheus
 
 
 class Ros2Section(Section):

@@ -8,7 +8,7 @@ from collections import Counter
 from typing import Any
 
 from protocol.frames import Frame, StatusFrame
-from protocol.metering import Meter
+from protocol.metering import StatusBeat
 from protocol.runtime import host_id
 from services.runtime.stage import Health
 
@@ -20,7 +20,8 @@ FAILURE_S = 5.0  # how long a frame that could not be processed is spoken of
 class Heartbeat:
     def __init__(self, process: str, skin: str) -> None:
         self.process, self.skin = process, skin
-        self._meter = Meter()
+        self._beat = StatusBeat(process, skin)
+        self._meter = self._beat.meter
         self.sent = self._meter.sent
         self.drops: Counter[str] = Counter({"late": 0, "failed": 0})
         self.late = 0  # frames that were sent too old to be acted on
@@ -28,8 +29,6 @@ class Heartbeat:
         self._failure, self._failed_at = "", 0.0
         self._since = self._heard = time.monotonic()
         self._heard_any = False
-        self._last: StatusFrame | None = None
-        self._next = 0.0
 
     @property
     def failure(self) -> str:
@@ -64,8 +63,9 @@ class Heartbeat:
     def deadline(self, limit_s: float) -> float:
         """When the next status is due, or the silence since the last frame becomes one to speak of."""
         silent_at = self._heard + limit_s
-        spoken_of = self._last is not None and self._last.stamps["publish"] * 1e-9 > silent_at
-        return self._next if spoken_of else min(self._next, silent_at)
+        last, due = self._beat.last, self._beat.next_s
+        spoken_of = last is not None and last.stamps["publish"] * 1e-9 > silent_at
+        return due if spoken_of else min(due, silent_at)
 
     def status(
         self, health: Health, silent: str, now: float, every_s: float, asleep: bool = False
@@ -86,32 +86,12 @@ class Heartbeat:
             )
         if asleep:
             messages.append("idle: nobody subscribes")
-        last = self._last
-        changed = last is None or level != last.level or _kinds(messages) != _kinds(last.messages)
-        if not changed and now < self._next:
-            return None
-        self._meter.measure(now)
-        self._next = now + every_s
-        self._last = StatusFrame(
-            skin=self.skin,
-            process=self.process,
-            valid=True,
-            valid_for_s=3 * every_s,
-            level=level,
-            messages=messages,
-            rates=dict(self._meter.rates),
-            drops=dict(self.drops),
-            counters={**health.counters, "late": self.late},
-            latency=self._meter.quantiles(),
-            cpu=self._meter.cpu,
-            stamps={"publish": time.monotonic_ns()},
-        )
-        return self._last
+        return self._beat.frame(level, messages, now, every_s, self.drops, {**health.counters, "late": self.late})
 
     def summary(self, asleep: bool, silent_s: float) -> dict[str, Any]:
         """For the control command `status`."""
         quiet = time.monotonic() - self._heard
-        last = self._last
+        last = self._beat.last
         return {
             "flowing": asleep or (self._heard_any and quiet < silent_s),
             "idle": asleep,
@@ -122,8 +102,3 @@ class Heartbeat:
             "drops": dict(self.drops),
             "latency": self._meter.quantiles(),
         }
-
-
-def _kinds(messages: list[str]) -> list[str]:
-    """Messages without their numbers: a count that goes up is no change worth a frame of its own."""
-    return ["".join(c for c in m if not c.isdigit()) for m in messages]

@@ -26,6 +26,7 @@ from supervisor.states import ProcessStates
 from supervisor.supervisord import Supervisor
 
 from protocol.runtime import CONFIG_LINK, lock, runtime_dir
+from protocol.topics import RECORDER
 from services.runtime.config import BUNDLES, MANIFEST, ROOT, ConfigFile
 from services.runtime.stage import PROCESSES
 
@@ -46,10 +47,17 @@ class Program:
     environment: dict[str, str] = field(default_factory=dict)
 
 
-def programs(config: ConfigFile) -> list[Program]:
-    """What a configuration needs: the stages, its bridges, and the stub where a skin's port is "stub"."""
+def programs(config: ConfigFile, record: Path | None = None) -> list[Program]:
+    """What a configuration needs: the stages, its bridges, its recorder, and the stub where a skin's port is "stub".
+    record: to this folder, from the start.
+    """
     found = [Program(name, f"services.{name}") for name in PROCESSES]
     found += [Program(name, "services.bridge", (name,)) for name in config.bridges]
+    if record is not None:
+        found.append(Program(RECORDER, "services.recorder", ("--folder", str(record.resolve()))))
+    elif config.recorder is not None:
+        folder = config.relative(Path(config.recorder.folder))
+        found.append(Program(RECORDER, "services.recorder", ("--wait", "--folder", str(folder))))
     if on_stub := stub_arguments(config):
         found.insert(0, Program("stub", "firmware_stub", on_stub))
     return found

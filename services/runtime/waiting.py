@@ -9,7 +9,10 @@ again before the next wait, and all of them whenever `doubt` says so.
 from __future__ import annotations
 
 import contextlib
+import os
 import select
+import signal
+from collections.abc import Callable
 
 import zmq
 
@@ -60,3 +63,12 @@ class Waiter:
 
     def close(self) -> None:
         self._epoll.close()
+
+
+def wake_on_signals(stop: Callable[[], None]) -> int:
+    """Install handlers of SIGINT and SIGTERM; the returned descriptor becomes readable when one came."""
+    read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop())
+    return read

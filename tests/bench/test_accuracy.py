@@ -80,6 +80,26 @@ def test_perfect_images_score_perfectly_and_poor_ones_do_not():
     assert _scores.summarise(truth * 0.5, frames, index, (2.0, 2.0))["force_%"] < 0.1
 
 
+def test_figures_have_their_standard_errors():
+    """Half the touches found, half missed by a quarter of the skin: the error of a mean of such values is known."""
+    round_one = [Shape("circle", -0.3, 0.1, 0.35, 0.3)]
+    frames = frames_of([("shapes", round_one)] * 8 + [("force", round_one), ("two", round_one)])
+    images = np.array([drop_image(frames.scene(0), 96)] * 8)
+    images[::2] = np.roll(images[::2], 24, axis=2)
+    both = np.concatenate([images, images[1:3]])
+    row = _scores.summarise(both, frames, np.arange(10), None)
+    found = [_scores.score_mask(i, frames, 0) for i in images]
+    assert row["mean_iou_se"] == pytest.approx(np.std(found, ddof=1) / np.sqrt(8), rel=1e-6)
+    assert 0 < row["mean_iou_se"] < row["mean_iou"]
+    assert _report.text(row, "mean_iou", "{:.2f}") == f"{row['mean_iou']:.2f} +-{row['mean_iou_se']:.2f}"
+    assert _report.text({"mean_iou": 0.5, "mean_iou_se": float("nan")}, "mean_iou", "{:.2f}") == "0.50"
+
+
+def test_the_full_form_has_five_hundred_touches_of_the_five_shapes():
+    groups = [name for name, _ in _frames.scenes(1, 20, accuracy.SINGLES)]
+    assert groups.count("shapes") >= 500 and groups.count("force") >= 100 and groups.count("two") == 20
+
+
 def test_the_hyperparameter_that_fits_is_chosen():
     scene = [Shape("circle", 0.1, 0.1, 0.4, 0.3)]
     frames = frames_of([("shapes", scene)] * 2)

@@ -6,6 +6,7 @@ import csv
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -182,3 +183,42 @@ def test_what_cannot_be_exported_is_said_in_a_line(skin: Skin, recording: Path, 
     assert not list(tmp_path.glob(".*.part"))
     if importlib.util.find_spec("rerun") is None:
         assert "rerun-sdk" in skin("export", recording, "--rerun").err
+
+
+def test_rerun_is_read_by_rerun(skin: Skin, recording: Path) -> None:  # noqa: F811
+    if importlib.util.find_spec("rerun") is None:
+        pytest.skip("RERUN MISSING: pip install 'rerun-sdk>=0.41'; what --rerun writes was not read back")
+    chunk = pytest.importorskip("rerun.chunk", reason="RERUN TOO OLD: its files are read from rerun-sdk 0.41 on")
+    assert skin("export", recording, "--rerun").code == 0
+    found: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+    for part in chunk.RrdReader(str(recording.with_suffix(".rrd"))).stream():
+        for row in part.to_record_batch().to_pylist():
+            if "measured" in row:
+                found.setdefault(part.entity_path, []).append((row["measured"], row))
+    for rows in found.values():
+        rows.sort(key=lambda row: row[0])
+
+    def at(path: str) -> list[int]:
+        return [int(np.datetime64(when, "ns").astype(np.int64)) for when, _ in found[path]]
+
+    def near(k: int) -> Any:
+        return pytest.approx(measured_ns(k), abs=1000)  # rerun's rows are read back as datetimes, to the microsecond
+
+    assert at("/palm/contacts") == [near(k) for k in range(FRAMES)] == at("/palm/valid")
+    assert [row["Scalars:scalars"] for _, row in found["/palm/valid"]] == [
+        [float(k not in INVALID)] for k in range(FRAMES)
+    ]
+    arrows = [row["Arrows3D:vectors"] for _, row in found["/palm/contacts"]]
+    assert [len(each or []) for each in arrows] == [k >= 2 and k not in INVALID for k in range(FRAMES)]
+    _, touched = found["/palm/contacts"][3]
+    tip = np.add(touched["Arrows3D:origins"], touched["Arrows3D:vectors"])
+    assert np.allclose(tip, [[0.02, 0.01, 0.0]], atol=1e-6) and touched["Arrows3D:labels"] == ["7 3.0 N unknown"]
+    forces = [row["Scalars:scalars"][0] for _, row in found["/palm/force_n"]]
+    assert forces == [0.0, 0.0] + [3.0] * (FRAMES - 2 - len(INVALID))
+    image = found["/palm/image"][0][1]
+    assert {key: value for key, value in image["DepthImage:format"][0].items() if key in ("width", "height")} == {
+        "width": 8,
+        "height": 8,
+    }
+    pixels = np.frombuffer(bytes(image["DepthImage:buffer"][0]), "<f4").reshape(8, 8)
+    assert pixels[8 - 1 - 4, 6] == np.float32(0.3) and np.count_nonzero(pixels) == 1  # its rows run downwards

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from tornado.httpclient import HTTPClientError
 
 from bridges.foxglove.door import brings
+from protocol.control import ControlServer
 from tests.bridges.conftest import FakeService, RunningBridge
 from tests.bridges.viewer import Viewer
 
@@ -117,6 +119,46 @@ def test_services_ask_for_the_token(fake: FakeService, bridge: tuple[RunningBrid
         assert {"/palm/press", "/palm/fault"} <= viewer.services.keys()
         absent = await viewer.call("/palm/press", token=token, x=0.0, y=0.0, force=1.0)  # no stub runs here
         assert absent["success"] is False and "stub does not answer" in absent["message"]
+        viewer.close()
+
+    asyncio.run(call())
+
+
+def test_the_recorder_is_told_by_who_has_the_token(
+    fake: FakeService, bridge: tuple[RunningBridge, str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, address, token = bridge
+    told: list[tuple[str, dict[str, object]]] = []
+    ended = threading.Event()
+
+    def recorder() -> None:
+        def taking(command: str) -> Callable[[dict[str, object]], dict[str, object]]:
+            return lambda args: told.append((command, args)) or {"file": "20260101T000000Z.mcap"}
+
+        server = ControlServer("recorder", {name: taking(name) for name in ("record", "snapshot")})
+        while not ended.is_set():
+            server.serve_once(0.02)
+        server.close()
+
+    async def call() -> None:
+        viewer = await Viewer.connect(address)
+        absent = await viewer.call("/record", token=token, on=True)
+        assert absent["success"] is False and "[recorder] in skin.toml" in absent["message"]
+        serving = threading.Thread(target=recorder)
+        serving.start()
+        try:
+            for wrong in ({}, {"token": "x"}):
+                assert (await viewer.call("/record", **wrong))["success"] is False
+            odd = await viewer.call("/record", token=token, on="yes")
+            assert odd["success"] is False and "true or false" in odd["message"] and not told
+            done = await viewer.call("/record", token=token, on=True)
+            assert done["success"] is True and "20260101" in done["message"]
+            await viewer.call("/record", token=token, on=False)
+            await viewer.call("/snapshot", token=token, before_s=5)
+        finally:
+            ended.set()
+            serving.join()
+        assert told == [("record", {"on": True}), ("record", {"on": False}), ("snapshot", {"before_s": 5})]
         viewer.close()
 
     asyncio.run(call())

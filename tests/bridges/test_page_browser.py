@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -19,6 +20,8 @@ from typing import Any
 import pytest
 
 from bridges.page.fetch_three import three_folder, verified
+from protocol.frames import unpack
+from services.recordings.recording import RecordingReader
 
 ROOT = Path(__file__).resolve().parents[2]
 VECTORS = ROOT / "protocol" / "vectors"
@@ -332,6 +335,44 @@ def test_the_surface_dents(launch: Callable[..., Any], address: str) -> None:
         }"""
         x, y, z = page.evaluate(deepest)
         assert z < -0.05 and abs(x + 0.5) < 0.06 and abs(y) < 0.06
+
+
+def test_a_snapshot_has_the_press_before_it(page: Open) -> None:
+    found = page()
+    until(lambda: re.search(r"the last \d+ s are kept", found.inner_text("#recorder")))
+    found.mouse.move(*place(found, -15, 15))
+    found.mouse.down()
+    until(lambda: true_at(found, -15, 15))
+    found.mouse.up()
+    until(lambda: nothing_touches(found))
+    found.click("#snapshot")
+    made = Path(until(lambda: found.inner_text("#said").partition("Snapshot: ")[2]))
+    try:
+        until(lambda: "being written" in found.inner_text("#recorder"))
+        until(lambda: "are kept" in found.inner_text("#recorder"))
+        frames = [unpack(message.wire) for message in RecordingReader(made).messages({"contact"})]
+        touched = [c.position[:2] for frame in frames for c in frame.contacts]  # type: ignore[attr-defined]
+        assert any(math.dist(at, (-0.015, 0.015)) < 0.003 for at in touched)
+    finally:
+        made.unlink()
+
+
+def test_a_recording_goes_on_when_the_recorder_was_killed(page: Open, shared_service: Path) -> None:
+    found = page()
+    found.click("#record")
+    until(lambda: "Recording to" in found.inner_text("#recorder"))
+    before = found.inner_text("#recorder")
+    time.sleep(1)
+    os.kill(int((shared_service / "recorder.lock").read_text()), signal.SIGKILL)
+    until(lambda: (said := found.inner_text("#recorder")).startswith("Recording to") and said[:40] != before[:40])
+    found.click("#record")
+    until(lambda: found.inner_text("#said").startswith("Recorded "))
+    last = Path(found.inner_text("#said").removeprefix("Recorded "))
+    until(lambda: "Not recording" in found.inner_text("#recorder"))
+    first = last.parent / re.search(r"\S+\.mcap", before)[0]  # type: ignore[index]
+    for path in (first, last):
+        assert sum(1 for _ in RecordingReader(path).messages({"contact"})) > 0
+        path.unlink()
 
 
 def test_a_recording_is_made_and_replayed(page: Open) -> None:

@@ -94,11 +94,11 @@ def test_options_are_added_and_taken_away_again() -> None:
     assert seen == [(3, "b")]
 
 
-def test_readme_counts_the_faults() -> None:
+def test_the_table_of_commands_counts_the_faults() -> None:
     ones = ("", "-one", "-two", "-three", "-four", "-five", "-six", "-seven", "-eight", "-nine")
     words = {20 + k: f"twenty{one}" for k, one in enumerate(ones)}
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert f"{words[len(FAULTS)]} faults" in readme
+    commands = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
+    assert f"{words[len(FAULTS)]} faults" in commands
     table = (ROOT / "firmware_stub" / "README.md").read_text(encoding="utf-8")
     for name, row in FAULTS.items():
         assert f"| `{name}`{' (sticky)' if row.sticky else ''} |" in table

@@ -11,11 +11,12 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-How = Literal["ends", "runs", "help", "slow", "ci", "service", "walk"]
+How = Literal["ends", "runs", "help", "slow", "ci", "service", "walk", "elsewhere"]
 """ends: run to its end, exit status 0. runs: run until it printed `says`, then Ctrl-C, no traceback. help: too long to
 be run at all; its program knows every option that is named (.ci/run runs benchmarks in short form). slow: as `ends`,
 but in .ci/run only. ci: .ci/run has this step, `says` is the line. service: it is how the service of these tests was
-started. walk: a test of the page's own types it, in the page's order (TRIED_ELSEWHERE).
+started. walk: a test of the page's own types it, in the page's order (TRIED_ELSEWHERE). elsewhere: it changes the
+reader's system; the test file `says` tries what it installs.
 """
 
 
@@ -35,6 +36,17 @@ COMMANDS = (
     Row("make up", "slow", says="contacts at"),
     Row("make test", "ci", says="make test"),
     Row("make lint", "ci", says="make test"),  # which begins with it
+    Row("make site", "ci", says="make site"),
+    Row("make lock", "ends", says="uv pip compile", instead="make -n lock"),
+    Row("make train", "ends", says="models.build", instead="make -n train"),
+    Row("skin --version", "ends", says="^eitskin [0-9]"),
+    Row(r"\.venv/bin/python -m pytest tests/protocol", "ci", says="make test"),
+    Row(
+        r"\.venv/bin/python -m tests\.bridges\.pictures ADDRESS",
+        "ends",
+        instead='.venv/bin/python -c "import tests.bridges.pictures"',
+    ),
+    Row("cp docs/systemd/.*|systemctl .*|journalctl .*", "elsewhere", says="tests/docs/test_systemd.py"),
     Row("make venv-dev", "ci", says="make test"),  # its first prerequisite
     Row("make venv", "ci", says="make up"),  # whose first prerequisite it is
     Row(
@@ -45,6 +57,7 @@ COMMANDS = (
     ),
     Row("make train SKIN=square16 QUICK=1", "ci", says="models.build --skin square16 --minutes 3"),
     Row("(./)?skin up", "service"),
+    Row("(./)?skin up --no-board", "ends", says="--no-board", instead="./skin up --help"),
     Row(
         "export EITSKIN_UID=.*",
         "ends",
@@ -72,6 +85,7 @@ COMMANDS = (
     Row(
         "(./)?skin top", "runs", says='"skin": "palm"', instead="./skin top --json"
     ),  # as a picture: test_top_screen.py
+    Row("skin top --json", "runs", says='"skin": "palm"', instead="./skin top --json"),
     Row("(./)?skin echo contact", "runs", says="contact/palm scan +[0-9]+ valid"),
     Row("skin echo TOPIC", "ends", says="raw/palm scan", instead="./skin echo raw -n 2"),
     Row("(./)?skin scene paper_49", "ends", says="playing paper_49"),
@@ -93,7 +107,8 @@ COMMANDS = (
         instead="EITSKIN_RUNTIME={folder}/stub .venv/bin/python -m firmware_stub",
     ),
     Row(
-        "python -m services.alarm|python -m services.health alarm",  # the process that docs/extending.md adds
+        # the process that docs/extending.md adds; any process
+        "python -m services.alarm|python -m services.health (alarm|PROCESS)",
         "ends",
         instead=".venv/bin/python -m services.health publisher",
     ),
@@ -106,6 +121,7 @@ COMMANDS = (
         instead="ROS_DOMAIN_ID=97 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST ./skin bridge ros2",
     ),
     Row(r"(\./)?skin bridge foxglove", "runs", says="foxglove: open ws://127.0.0.1:", instead="./skin bridge foxglove"),
+    Row("skin export", "ends", says="--csv", instead="./skin export --help"),
     Row("skin bridge NAME", "ends", instead="./skin bridge --help"),
     Row(
         r"(\./)?skin export FILE.mcap --rerun",
@@ -128,6 +144,18 @@ COMMANDS = (
         instead="./skin record {folder}/all.mcap --overwrite --seconds 1 --topics raw,contact,image,shape,status,info",
     ),
     # recordings, files
+    Row(
+        r"\./skin record touch.mcap --seconds 10",
+        "ends",
+        says="contact/palm [0-9]+",
+        instead="./skin record {folder}/touch.mcap --seconds 2",
+    ),
+    Row(
+        r"\./skin replay touch.mcap --private --fast",
+        "ends",
+        says="contact frames",
+        instead="./skin replay {folder}/touch.mcap --private --fast",
+    ),
     Row("skin record", "ends", says="contact/palm [0-9]+", instead="./skin record {folder}/demo.mcap --seconds 2"),
     Row(
         "skin replay",
@@ -154,7 +182,7 @@ COMMANDS = (
         instead="./skin reconstruct {measurements} {folder}/out.npz --skin square16",
     ),
     Row(
-        "skin calibrate force",
+        "(./)?skin calibrate force",
         "ends",
         says="force = ",
         instead="./skin calibrate force --csv {forces} --out {folder}/palm-force.json",
@@ -184,11 +212,12 @@ COMMANDS = (
     ),
     Row(r"g\+\+ .* -o /tmp/subscribe && /tmp/subscribe palm", "slow", says=r"frame \d+ valid"),
     # keys, in the order of their page
+    Row("skin keys new", "ends", says="NAME|name", instead="./skin keys new --help"),
     Row(r"\./skin keys new \w+", "ends", says="public: "),
     Row("mkdir -p keys/.*", "ends"),
     # offline
     Row(r"\./skin limits .*", "help"),
-    Row("skin limits", "slow", says="position"),
+    Row("(./)?skin limits", "slow", says="position", instead="./skin limits"),
     Row("skin bench", "ends", says="accuracy"),
     Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB"),
     Row(r"(\./)?skin bench (?P<name>\w+)( .*)?", "help"),
@@ -226,12 +255,15 @@ class Program:
 
 PROGRAMS = (
     Program("README.md", "zmq.Context()", 4.0, 10),
-    Program("README.md", "from eitskin.client import", 3.0, 0),
+    Program("docs/clients.md", "from eitskin.client import", 3.0, 0),
     Program("protocol/WIRE.md", "zmq.Context()", 4.0, 10),
 )
 
 SCENES = (("firmware_stub/README.md", "[[press]]"),)
 """Blocks of TOML that are scenes of the stub: (file, marker)."""
+
+CONFIGS = (("docs/operations.md", "[skins.left-palm]"),)
+"""Blocks of TOML that are a whole skin.toml: (file, marker)."""
 
 NOT_RUN = (("protocol/WIRE.md", "01 Hello: "),)
 """Blocks that are nothing to run: (file, how it begins). The link's schema: tests/protocol/test_wire_doc.py has it."""

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-DOCUMENTS = (ROOT / "README.md", ROOT / "protocol" / "WIRE.md", ROOT / "firmware_stub" / "README.md")
+BESIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "protocol/WIRE.md", "firmware_stub/README.md")
+DOCUMENTS = tuple(ROOT / name for name in BESIDE)
 """Besides all of docs/. bench/reports/README.md is generated from what its commands printed (tests/bench/test_page)."""
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)

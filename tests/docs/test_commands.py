@@ -17,7 +17,8 @@ import pytest
 
 from protocol.frames import ContactFrame
 from protocol.sockets import ControlClient, NewestReader
-from tests.docs.runners import NOT_RUN, PROGRAMS, SCENES, TRIED_ELSEWHERE, Row, row_for
+from services.runtime.config import load
+from tests.docs.runners import CONFIGS, NOT_RUN, PROGRAMS, SCENES, TRIED_ELSEWHERE, Row, row_for
 from tests.docs.snippets import ROOT, Snippet, in_text, snippets
 from tests.docs.world import START_S, World, world
 
@@ -139,6 +140,11 @@ def test_ci_has_the_step(snippet: Snippet) -> None:
     assert re.search(the_row(snippet).says, (ROOT / ".ci" / "run").read_text(encoding="utf-8"))
 
 
+@pytest.mark.parametrize("snippet", shown("elsewhere"), ids=str)
+def test_another_file_tries_it(snippet: Snippet) -> None:
+    assert (ROOT / the_row(snippet).says).is_file()
+
+
 @pytest.mark.parametrize("snippet", blocks("python"), ids=str)
 def test_a_program_reads_contacts(place: World, untouched: None, snippet: Snippet) -> None:
     """As an outsider's script: without the checkout on its path, but for the wheel's `eitskin`."""
@@ -160,7 +166,17 @@ def test_a_program_reads_contacts(place: World, untouched: None, snippet: Snippe
     assert len(out.splitlines()) >= known[0].lines, f"printed only, in {known[0].seconds:g} s:\n{out}"
 
 
-@pytest.mark.parametrize("snippet", blocks("toml"), ids=str)
+def is_config(snippet: Snippet) -> bool:
+    return any(snippet.file == file and marker in snippet.text for file, marker in CONFIGS)
+
+
+@pytest.mark.parametrize("snippet", filter(is_config, blocks("toml")), ids=str)
+def test_a_configuration_is_one(tmp_path: Path, snippet: Snippet) -> None:
+    (tmp_path / "skin.toml").write_text(snippet.text)
+    assert set(load(tmp_path / "skin.toml").skins) == set(re.findall(r"\[skins\.(\S+)\]", snippet.text))
+
+
+@pytest.mark.parametrize("snippet", [s for s in blocks("toml") if not is_config(s)], ids=str)
 def test_a_scene_plays(place: World, untouched: None, snippet: Snippet) -> None:
     assert any(snippet.file == file and marker in snippet.text for file, marker in SCENES), snippet
     file = place.folder / "scene.toml"

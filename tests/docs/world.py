@@ -123,7 +123,7 @@ def world(*, installed: bool = True) -> Iterator[World]:
     folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))  # short: a socket's path has at most 107 bytes
     try:
         checkout = folder / "eitskin"
-        for name in _tracked():
+        for name in tracked():
             (checkout / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, checkout / name, follow_symlinks=False)
         if installed:
@@ -141,7 +141,7 @@ def world(*, installed: bool = True) -> Iterator[World]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _tracked() -> list[str]:
+def tracked() -> list[str]:
     """What a clone has, as it stands here: also what is not committed yet."""
     listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()

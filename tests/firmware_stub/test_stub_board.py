@@ -250,6 +250,23 @@ def test_a_finger_moves_and_lifts_alone(host):
     assert rig.release(0.5)["released"] == 1 and not rig.field.timeline.at(0.6).touches
 
 
+def test_a_finger_that_presses_on_is_felt_by_every_scan(host):
+    """A page tells a press again several times a second, at any time of a scan."""
+    board = host()
+    board.start()
+    untouched, began = board.z(0.5)[-1], board.now
+    measured = []
+    for k in range(20):
+        board.rig.press({"x": -0.02 + 0.002 * k, "y": 0.01, "force": 2.0, "finger": "one"}, board.now)
+        measured += list(board.z(0.0613))
+    felt = [len(world.touches) for scan, world, _ in board.rig.scans if scan.start > began]
+    assert len(felt) > 20 and set(felt) == {1}
+    changes = np.abs(np.array(measured[3:]) / untouched - 1).max(axis=1)  # of the first ones the scan was under way
+    assert len(changes) > 20 and changes.min() > 3e-3
+    assert board.rig.release(board.now, "one")["released"] == 1
+    assert np.abs(board.z(0.5)[-1] / untouched - 1).max() < 2e-3
+
+
 def test_a_mirrored_press_gives_the_mirrored_measurements(host):
     """The square is its own mirror image: electrode k of the bottom, right, top, left becomes 3 - k (mod 16)."""
     mirror = (3 - np.arange(16)) % 16

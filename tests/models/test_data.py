@@ -8,6 +8,7 @@ import pytest
 
 from models import data
 from models.forward import shared
+from models.mismatch import soft_drop, soft_touched
 from models.shapes import drop_image, from_rows
 
 
@@ -65,9 +66,11 @@ def test_differences_are_those_of_the_stored_shapes(folder):
         z0 = model.solve(1.0).impedances()
         for k in range(len(chunk["shapes"])):
             scene = from_rows(chunk["shapes"][k].astype(float))
-            z = model.solve(model.touched(scene)).impedances()
+            blur = float(chunk["blur"][k])
+            z = model.solve(soft_touched(model, scene, blur) if blur else model.touched(scene)).impedances()
             np.testing.assert_allclose(chunk["difference"][k], z / z0 - 1, rtol=1e-4, atol=1e-7, err_msg=name)
-            np.testing.assert_allclose(chunk["image"][k], drop_image(scene, data.IMAGE), atol=5e-4)
+            image = soft_drop(scene, blur, data.IMAGE) if blur else drop_image(scene, data.IMAGE)
+            np.testing.assert_allclose(chunk["image"][k], image, atol=5e-4)
         return
     pytest.fail("no nominal chunk among those made: choose another seed for this test")
 

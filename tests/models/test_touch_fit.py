@@ -64,9 +64,7 @@ def test_a_known_radius_stays_and_makes_the_drop_sure(response: TouchResponse, g
     touch = Shape("circle", -0.2, 0.3, 0.2, 0.3)
     d = frame(response, touch)
     covariance = frame_covariance(gram, SIGMA, d)
-    free, known = (
-        TouchFit(response)(d, covariance, near(touch), ("circle",), radius=radius) for radius in (None, 0.2)
-    )
+    free, known = (TouchFit(response)(d, covariance, near(touch), ("circle",), radius=radius) for radius in (None, 0.2))
     assert known.fits[0].shape.radius == pytest.approx(0.2, rel=1e-3)
     assert known.drop[1] < 0.5 * free.drop[1]
     assert known.drop[0] == pytest.approx(0.3, abs=3 * known.drop[1] + 0.01)

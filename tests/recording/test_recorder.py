@@ -18,9 +18,9 @@ import pytest
 
 from protocol.frames import ContactFrame, InfoFrame, RawFrame
 from protocol.sockets import ControlClient, ControlServer, Publisher
-from services.recorder import Recorder
 from services.recordings import patient_file
 from services.recordings.patient_file import PatientFile
+from services.recordings.recorder import Recorder
 from services.recordings.recording import RecordedMessage, RecordingError, RecordingReader, RecordingWriter
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -18,11 +18,11 @@ from models.bundle import Bundle
 from protocol.frames import RawFrame, pack
 from services.contacts import calibration_file as calibration
 from services.contacts.force_curve import Curve
-from services.recorder import _metadata
 from services.recordings import settings
+from services.recordings.recorder import metadata
 from services.recordings.recording import RecordingError, RecordingReader, RecordingWriter
 from services.recordings.replay import ReplayError
-from services.recordings.replay_session import _configuration, replay_file
+from services.recordings.replay_session import configuration_of, replay_file
 from services.runtime.config import ROOT, ConfigFile, load, parse
 
 HERE = Path("recording.mcap")
@@ -73,14 +73,14 @@ def carried(tmp_path: Path, text: str) -> RecordingReader:
 
 
 def test_the_stages_get_what_they_had_and_no_more(config: ConfigFile, tmp_path: Path) -> None:
-    text = _metadata(["raw"], None)[settings.KEY]
+    text = metadata(["raw"], None)[settings.KEY]
     assert not [word for word in ("SECRET", "tcp://", "47999", "insecure", str(ROOT), "/dev") if word in text]
     reader = carried(tmp_path, text)
     (tmp_path / "SECRET.json").unlink()
     os.environ["EITSKIN_CONFIG"] = str(tmp_path / "gone.toml")  # another machine (monkeypatch puts it back)
     folder = tmp_path / "private"
     folder.mkdir()
-    file, warnings = _configuration(["palm"], reader, None, folder)
+    file, warnings = configuration_of(["palm"], reader, None, folder)
     again, before = load(file), config.skins["palm"]
     skin = again.skins["palm"]
     assert warnings == [] and again.skip == config.skip
@@ -154,23 +154,23 @@ def test_a_bundle_is_found_by_its_hash_and_never_by_a_path(
     reader = carried(tmp_path, text)
     monkeypatch.chdir(tmp_path)  # where a folder of the recorded name lies
     with pytest.raises(RecordingError, match="is not installed.*--bundle PATH"):
-        _configuration(["palm"], reader, None, runtime)
-    file, warnings = _configuration(["palm"], reader, other.path, runtime)
+        configuration_of(["palm"], reader, None, runtime)
+    file, warnings = configuration_of(["palm"], reader, other.path, runtime)
     assert load(file).skins["palm"].bundle == str(other.path) and warnings == []
-    file, warnings = _configuration(["palm"], reader, shipped.path, runtime)
+    file, warnings = configuration_of(["palm"], reader, shipped.path, runtime)
     assert "contacts will differ" in warnings[0] and load(file).skins["palm"].bundle == str(shipped.path)
     (tmp_path / "skin.toml").write_text('[skins.any]\nport = "stub"\nbundle = "./square16"\n')
     monkeypatch.setenv("EITSKIN_CONFIG", str(tmp_path / "skin.toml"))
-    file, _ = _configuration(["palm"], reader, None, runtime)
+    file, _ = configuration_of(["palm"], reader, None, runtime)
     assert Bundle.load(load(file).skins["palm"].bundle).hash == other.hash
 
 
 def test_without_settings_ours_count_else_the_bundle_that_is_named(runtime: Path, tmp_path: Path) -> None:
     reader = carried(tmp_path, "")
-    assert load(_configuration(["palm"], reader, None, runtime)[0]).skins["palm"].pose.parent == "wrist"
+    assert load(configuration_of(["palm"], reader, None, runtime)[0]).skins["palm"].pose.parent == "wrist"
     with pytest.raises(ReplayError, match="--bundle PATH"):
-        _configuration(["elbow"], reader, None, runtime)
-    file, _ = _configuration(["elbow"], reader, Path("disc16"), runtime)
+        configuration_of(["elbow"], reader, None, runtime)
+    file, _ = configuration_of(["elbow"], reader, Path("disc16"), runtime)
     assert Bundle.load(load(file).skins["elbow"].bundle).name == "disc16"
 
 

@@ -86,7 +86,7 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         (
             {"skins": {"palm": PALM}, "loging": {}},
             "unknown key; allowed here: skins, sockets, security, realtime, skip, bridges, "
-            "page, ros2, foxglove, logging",
+            "page, ros2, foxglove, recorder, logging",
         ),
     ],
 )

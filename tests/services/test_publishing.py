@@ -280,8 +280,17 @@ def test_shape_class_is_the_mean_over_the_touch(stage: Publishing) -> None:
     classes[4] = 0.8
     (c,) = contacts(stage, image_frame(discs((0.02, 0.01, 0.01, 0.3)), classes=classes)).contacts
     assert c.shape == "L" and c.shape_probability == pytest.approx(0.8)
-    (c,) = contacts(stage, image_frame(discs((0.02, 0.01, 0.01, 0.3)), 2, classes=classes * 0 + 0.2)).contacts
-    assert c.shape == "unknown"
+
+
+def test_a_doubtful_shape_is_named_with_its_probability(stage: Publishing) -> None:
+    """Readers choose how sure is sure; only a bundle without a network has no answer."""
+    disc = discs((0.02, 0.01, 0.01, 0.3))
+    classes = np.full((5, 24, 24), 0.19, np.float32)
+    classes[1] = 0.24
+    (c,) = contacts(stage, image_frame(disc, classes=classes)).contacts
+    assert c.shape == "triangle" and c.shape_probability == pytest.approx(0.24)
+    (c,) = contacts(stage, image_frame(disc, 2, classes=np.zeros((0, 0, 0), np.float32))).contacts
+    assert c.shape == "unknown" and c.shape_probability is None
 
 
 def _shoelace(polygon: list[list[float]]) -> float:

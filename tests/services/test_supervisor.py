@@ -140,8 +140,19 @@ def test_a_stop_leaves_only_what_is_to_stay(up: Callable[..., subprocess.Popen[s
     assert {p.name for p in runtime.iterdir()} == {"a", "s", "lock", "state", *others}
 
 
-def test_the_demo_has_a_stub_and_a_page_and_every_stage_names_itself() -> None:
+def test_the_demo_has_a_stub_a_page_and_a_recorder_and_every_stage_names_itself() -> None:
     found = {p.name: p.module for p in programs(load(ROOT / "skin.toml"))}
     assert found.pop("stub") == "firmware_stub" and found.pop("page") == "services.bridge"
     assert all(module == f"services.{name}" for name, module in found.items())
-    assert list(found) == ["acquisition", "preprocessing", "inference", "publisher"]
+    assert list(found) == ["acquisition", "preprocessing", "inference", "publisher", "recorder"]
+
+
+def test_a_recorder_is_started_where_it_is_configured_and_records_at_once_where_asked(tmp_path: Path) -> None:
+    config = tmp_path / "skin.toml"
+    config.write_text('[skins.palm]\nport = "stub"\nbundle = "square16"\n')
+    assert "recorder" not in {p.name for p in programs(load(config))}
+    assert "--wait" not in {p.name: p for p in programs(load(config), tmp_path / "x")}["recorder"].arguments
+    with config.open("a") as file:
+        file.write('[recorder]\nfolder = "kept"\n')
+    arguments = {p.name: p for p in programs(load(config))}["recorder"].arguments
+    assert arguments == ("--wait", "--folder", str(tmp_path / "kept"))

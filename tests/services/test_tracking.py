@@ -251,3 +251,47 @@ def test_a_touch_that_moves_fast_or_lightens_in_its_place_goes_on() -> None:
     for n, believed in enumerate(sure, 2):
         moved += tracker.update([touch(0.002 + 0.01 * (n - 1), size=SIZE)], n * FRAME_NS, sure=believed)[0]
     assert [t and t.id for t in moved] == [first.id] * 4
+
+
+def updates(tracker: Tracker, *frames: tuple[list[Patch], bool]) -> list[list[int]]:
+    """Ids of what each frame's contacts are, (patches, whether the image explains its frame)."""
+    found = []
+    for n, (seen, sure) in enumerate(frames, 1):
+        tracks, _ = tracker.update(seen, n * FRAME_NS, sure)
+        found.append([t.id for t in tracks if t is not None])
+    return found
+
+
+def test_what_the_image_of_a_changing_touch_shows_beside_it_begins_nowhere() -> None:
+    """The force still rises in the second scan, whose image explains most of it, and shows the same ghost."""
+    ghost = touch(-0.02, 0.01, 0.2 * SIZE)
+    tracker = Tracker()
+    tracker.update([], 0)
+    rising = ([touch(0.02, size=0.5 * SIZE), ghost], False), ([touch(0.02), ghost], True)
+    assert updates(tracker, *rising, ([touch(0.02)], True)) == [[], [1], [1]]
+
+
+def test_a_second_touch_begins_beside_one_that_leaves_much_unexplained() -> None:
+    """A strong touch at the edge leaves more than a changing one may; but every image is like the one before."""
+    held = [touch(-0.036, -0.036, 6 * SIZE), touch(-0.013, 0.016)]
+    changing = [touch(-0.04, -0.026, 3 * SIZE), touch(-0.013, 0.007)]
+    tracker = Tracker()
+    tracker.update([], 0)
+    assert updates(tracker, (changing, False), (held, False), (held, False), (held, False))[-1] == [1, 2]
+
+
+def test_a_touch_that_only_doubtful_images_showed_does_not_keep_the_true_one_waiting() -> None:
+    tracker = Tracker()
+    tracker.update([], 0)
+    wrong, grown, true = touch(0.012, 0.02), touch(0.012, 0.02, 2 * SIZE), touch(0.036, 0.02, 3 * SIZE)
+    assert updates(tracker, ([wrong], False), ([grown], False), ([true], True)) == [[], [1], [2]]
+
+
+def test_a_faint_patch_begins_alone_and_not_beside_a_touch() -> None:
+    faint = touch(0.0, 0.03)._replace(confidence=0.9)
+    tracker = Tracker()
+    tracker.update([], 0)
+    assert updates(tracker, *[([touch(0.0), faint], True)] * 3) == [[1]] * 3
+    alone = Tracker()
+    alone.update([], 0)
+    assert updates(alone, ([faint], True)) == [[1]]

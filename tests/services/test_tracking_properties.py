@@ -33,7 +33,7 @@ NOTHING = np.zeros((0, 0), np.float32)
 ALL = frozenset({"contact", "force", "shape"})
 
 places = st.floats(-0.05, 0.05)
-patches = st.builds(Patch, places, places, st.floats(1e-6, 1e-3), st.floats(0.002, 0.02))
+patches = st.builds(Patch, places, places, st.floats(1e-6, 1e-3), st.floats(0.002, 0.02), st.floats(0.0, 1.0))
 lists = st.lists(patches, max_size=4)
 happenings = st.one_of(lists, lists, st.sampled_from(["still", "reset", "reload", "pause", "same time"]))
 shapes = st.builds(

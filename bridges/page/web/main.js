@@ -43,7 +43,7 @@ const link = new Link({
     const select = by("skin");
     select.replaceChildren(...message.skins.map((name) => new Option(name, name)));
     select.value = message.skins.includes(state.skin) ? state.skin : message.skins[0];
-    by("record").hidden = by("recordings").hidden = !message.buttons.includes("record");
+    by("record").hidden = by("snapshot").hidden = by("recordings").hidden = !message.buttons.includes("record");
     by("surface-panel").hidden = !message.three;
     if (message.three && !surface) Surface.on(by("surface")).then(hasSurface);
     watch();
@@ -136,7 +136,13 @@ function look() {
   by("press-why").textContent = why;
   by("tools").disabled = !press.enabled;
   for (const button of by("faults").children) button.disabled = !(token && link.connected && state.statuses.has("stub"));
-  for (const id of ["tare", "record", "play"]) by(id).disabled = !(token && link.connected);
+  const replaying = state.skin === "replay"; // whose statuses are those of its own stages
+  for (const id of ["tare", "play"]) by(id).disabled = !(token && link.connected);
+  const recorder = panels.recorder(state.statuses, link.clock, state.hello?.host);
+  by("record").disabled = !(token && link.connected && !replaying);
+  by("snapshot").disabled = by("record").disabled || !recorder.there;
+  by("record").setAttribute("aria-pressed", `${recorder.recording}`);
+  panels.text("record", recorder.recording ? "Stop recording" : "Record");
 }
 
 function draw(now) {
@@ -208,13 +214,13 @@ by("tare").addEventListener("click", async () => {
   said(answer.ok ? `New baseline from ${answer.result.frames} frames, ${answer.result.snr_db.toFixed(0)} dB.` : answer.error);
 });
 by("record").addEventListener("click", async () => {
-  const button = by("record"), on = button.getAttribute("aria-pressed") !== "true";
+  const on = by("record").getAttribute("aria-pressed") !== "true";
   const answer = await link.command(state.skin, "record", { on });
-  if (answer.ok) {
-    button.setAttribute("aria-pressed", `${on}`);
-    button.textContent = on ? "Stop recording" : "Record";
-  }
-  said(answer.ok ? `${on ? "Recording to" : "Recorded to"} ${answer.result.folder}` : answer.error);
+  said(!answer.ok ? answer.error : on ? "" : `Recorded ${answer.result.file}`);
+});
+by("snapshot").addEventListener("click", async () => {
+  const answer = await link.command(state.skin, "snapshot");
+  said(answer.ok ? `Snapshot: ${answer.result.file}` : answer.error);
 });
 by("picture").addEventListener("click", () => {
   const away = document.createElement("a");

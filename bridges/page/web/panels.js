@@ -8,7 +8,7 @@ const SIGN = { OK: "✓", WARN: "!", ERROR: "✕", STALE: "…" };
 
 export const by = (id) => document.getElementById(id);
 
-function text(id, value) {
+export function text(id, value) {
   const element = by(id);
   if (element.textContent !== value) element.textContent = value;
 }
@@ -106,10 +106,15 @@ export function summary(list, ok) {
   text("summary", list.length ? `${list.length} ${list.length > 1 ? "contacts" : "contact"}: ${each.join("; ")}.` : "Nothing touches.");
 }
 
+/** Seconds since a process last said how it does. */
+function quietOf({ frame, heard }, clock, host) {
+  const here = frame.host === host && clock.known;
+  return (here ? clock.now() - frame.stamps.publish / 1e6 : performance.now() - heard) / 1e3;
+}
+
 export function processes(statuses, clock, host) {
   const rows = [...statuses.values()].sort((a, b) => (a.frame.process < b.frame.process ? -1 : 1)).map(({ frame, heard }) => {
-    const here = frame.host === host && clock.known;
-    const quiet = (here ? clock.now() - frame.stamps.publish / 1e6 : performance.now() - heard) / 1e3;
+    const quiet = quietOf({ frame, heard }, clock, host);
     const level = quiet > frame.valid_for_s ? "STALE" : frame.level;
     const item = element("li", `level-${level}`);
     const says = level === "STALE" && quiet > frame.valid_for_s ? `silent for ${quiet.toFixed(0)} s` : frame.messages.join("; ");
@@ -119,6 +124,22 @@ export function processes(statuses, clock, host) {
     return item;
   });
   by("processes").replaceChildren(...rows);
+}
+
+/** What the recorder does, by its own word: {there, recording}. One that is silent does nothing that could be shown. */
+export function recorder(statuses, clock, host) {
+  const found = statuses.get("recorder"), line = by("recorder");
+  const silent = !found || quietOf(found, clock, host) > found.frame.valid_for_s;
+  const said = found?.frame.counters ?? {}, there = !silent, recording = there && said.recording > 0;
+  line.hidden = !found;
+  line.dataset.level = !found ? "" : silent ? "STALE" : found.frame.level;
+  const [doing, ...problems] = found?.frame.messages ?? [];
+  const file = doing?.match(/^recording to .*?([^/]+\.mcap)/)?.[1];
+  text("recorder", !found ? "" : silent ? "The recorder is silent: nothing is recorded." : [
+    recording ? `Recording to ${file ?? "a file"}` : "Not recording",
+    said.writing ? "a snapshot is being written" : `the last ${said.held_s ?? 0} s are kept for a snapshot`,
+    ...problems].join("; ") + ".");
+  return { there, recording };
 }
 
 /** One-step image: the plane of delta's stack with the published lambda; the network's image of the same frame. */

@@ -1,0 +1,90 @@
+"""The fields of a contact: of a touch that is there, and of one that ended."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import SHAPES, Contact, ImageFrame, LocatedTouch
+from services.contacts.force import ForceLaw, Look
+from services.contacts.motion import Patch, Track
+from services.contacts.registered import registered
+from services.contacts.segmentation import Segment
+from services.contacts.surface import Placed, Placement
+
+
+class ContactWriter:
+    """tells_force: whether the skin's contacts have forces, by a force law or by registration."""
+
+    def __init__(self, law: ForceLaw, place: Placement, tells_force: bool) -> None:
+        self.law, self.place, self.tells_force = law, place, tells_force
+
+    def present(
+        self,
+        track: Track,
+        seen: Patch,
+        s: Segment,
+        classes: list[float],
+        frame: ImageFrame,
+        touch: LocatedTouch | None,
+    ) -> Contact:
+        force, sigma = self.law.force(Look.of(s, frame))
+        if touch is not None and not self.law.exists:
+            force, sigma = touch.force_n, None if touch.force_n is None else touch.value_sigma
+        best = int(np.argmax(classes)) if classes else -1
+        at = self.place(seen.x, seen.y)
+        return Contact(
+            id=track.id,
+            state="begin" if track.age == 1 and track.begins else "hold",
+            position=at.point.tolist(),
+            velocity=(track.vx * at.along_x + track.vy * at.along_y).tolist(),
+            normal=at.normal.tolist(),
+            orientation=s.orientation,
+            area_m2=s.area * frame.metres_per_pixel**2,
+            force_n=force,
+            force_sigma_n=sigma,
+            wrench=_wrench(at, force or 0.0),
+            shape=SHAPES[best] if classes else "unknown",  # how sure: its probability
+            shape_probability=classes[best] if classes else None,
+            confidence=confidence(s),
+            sheet=None if self.place.flat else [seen.x, seen.y],
+            **({} if touch is None else registered(touch)),
+        )
+
+    def ended(self, tracks: list[Track]) -> list[Contact]:
+        """The last contacts of touches that ended: their last places, without force."""
+        force = 0.0 if self.tells_force else None
+        ends = []
+        for t in tracks:
+            at, sheet = self.place(t.x, t.y), None if self.place.flat else [t.x, t.y]
+            where, normal = at.point.tolist(), at.normal.tolist()
+            ends.append(
+                Contact(id=t.id, state="end", position=where, normal=normal, force_n=force, confidence=0.0, sheet=sheet)
+            )
+        return ends
+
+
+def class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float]:
+    """Mean over the touch of the per-pixel class probabilities (5, h, w), which are on a coarser grid; [] where there
+    are none.
+    """
+    if not classes.size or not (classes.min() >= 0 and classes.max() <= 1.001):  # NaN compares false
+        return []
+    y, x = np.nonzero(s.mask)
+    count, h, w = classes.shape
+    pixels = np.bincount(y * h // s.mask.shape[0] * w + x * w // s.mask.shape[1], minlength=h * w)
+    total = classes.reshape(count, h * w) @ pixels.astype(np.float32)
+    return [min(1.0, float(p)) for p in total / max(float(total.sum()), 1e-9)]
+
+
+def _wrench(at: Placed, force: float) -> list[float]:
+    """On the skin, at its frame's origin: the touch presses against the normal."""
+    pressed = -force * at.normal
+    return [*pressed.tolist(), *np.cross(at.point, pressed).tolist()]
+
+
+def confidence(s: Segment) -> float:
+    """Probability that the peak is not noise, from its own standard deviation."""
+    return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))

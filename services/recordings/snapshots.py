@@ -1,0 +1,159 @@
+"""Snapshots: the last seconds before an event and those after it, as a file that replays. Taken by command, and by
+themselves of contacts and faults. What goes wrong is said and counted; it never stops the recorder.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from protocol.frames import Frame
+from services.recordings.recording import RecordingError, RecordingWriter
+from services.recordings.ring import Ring, RingEntry
+from services.recordings.rotation import removed
+from services.recordings.triggers import Trigger, TriggerWatch
+
+STATE_EVERY_S = 5.0
+"""How often the stages are asked for their state, so that a snapshot may begin there."""
+LONGEST_S = 300.0
+"""Of one snapshot after its first event: further ones that come meanwhile make it longer."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """What is kept for snapshots. keep: so many of those that were taken by themselves, the oldest go."""
+
+    folder: Path
+    before_s: float = 10.0
+    after_s: float = 5.0
+    memory_bytes: int = 64_000_000
+    triggers: tuple[Trigger, ...] = ()
+    keep: int = 100
+
+
+@dataclass
+class OpenSnapshot:
+    """One that is being written."""
+
+    path: Path
+    writer: RecordingWriter
+    end_ns: int
+    last_end_ns: int
+
+
+class Snapshots:
+    """Hears every message. `mind` often."""
+
+    def __init__(self, keeping: Keeping, metadata: Callable[[str], dict[str, str]]) -> None:
+        """metadata: of a file, given the event."""
+        self.keeping, self._metadata = keeping, metadata
+        self.ring = Ring(keeping.before_s + STATE_EVERY_S + 1.0, keeping.memory_bytes)
+        self._watch = TriggerWatch(keeping.triggers)
+        self._open: OpenSnapshot | None = None
+        self._automatic: deque[Path] = deque()
+        self.taken, self.missed, self.deleted, self.lost = 0, 0, 0, 0
+        """Snapshots begun; events of which none could be; old ones deleted; messages that there was no room for."""
+        self.last = ""
+        """The newest file."""
+        self.problem = ""
+
+    @property
+    def writing(self) -> bool:
+        """Whether one is not whole yet."""
+        return self._open is not None
+
+    def hear(self, heard: RingEntry, frame: Frame | None) -> None:
+        """A message, the newest; frame: what is in it, None for a state."""
+        event = self._watch(frame) if frame is not None else None
+        self.ring.add(heard)
+        if self._open is not None and not heard.again:
+            message = heard.message
+            self._guarded(lambda one: one.writer.write(message.topic, message.data, message.log_time_ns))
+        if event is not None:
+            kind, what = event
+            try:
+                self.take(kind, what, heard.message.log_time_ns)
+            except RecordingError:
+                pass  # said in `problem`, and counted
+
+    def take(
+        self, kind: str, what: str, now_ns: int, before_s: float | None = None, after_s: float | None = None
+    ) -> Path:
+        """Begin a snapshot, or have the one that is being written go on for longer; its file. kind: a trigger's name,
+        or "snapshot" where somebody asked for it. Raises RecordingError.
+        """
+        before = self.keeping.before_s if before_s is None else before_s
+        end_ns = now_ns + int((self.keeping.after_s if after_s is None else after_s) * 1e9)
+        if self._open is not None:
+            self._open.end_ns = min(max(self._open.end_ns, end_ns), self._open.last_end_ns)
+            return self._open.path
+        try:
+            self.keeping.folder.mkdir(parents=True, exist_ok=True)
+            path = file_in(self.keeping.folder, f"-{kind}")
+            writer = RecordingWriter(path, self._metadata(f"{kind}: {what}"))
+            self._open = OpenSnapshot(path, writer, end_ns, now_ns + int(LONGEST_S * 1e9))
+            for message in self.ring.since(now_ns - int(before * 1e9)):
+                writer.write(message.topic, message.data, message.log_time_ns)
+            writer.flush()
+        except (RecordingError, OSError) as why:
+            self.missed += 1
+            self._end()
+            self._failed(f"no snapshot of {kind} ({what}): {why}")
+            raise RecordingError(self.problem) from None
+        self.taken += 1
+        self.last, self.problem = str(path), ""
+        log.info("snapshot of %s (%s): %s", kind, what, path)
+        if kind != "snapshot":
+            self._automatic.append(path)
+            while 0 < self.keeping.keep < len(self._automatic):
+                self.deleted += removed(self._automatic.popleft())
+        return path
+
+    def mind(self, now_ns: int) -> None:
+        """End what is long enough, and write what is due."""
+        if self._open is not None:
+            self._guarded(lambda one: one.writer.flush_if_due())
+        if self._open is not None and now_ns >= self._open.end_ns:
+            self._end()
+
+    def _guarded(self, act: Callable[[OpenSnapshot], None]) -> None:
+        assert self._open is not None
+        try:
+            act(self._open)
+        except OSError as why:  # the disk is broken, or gone
+            path = self._open.path
+            self._end()
+            self._failed(f"the snapshot {path} ends early: {why.strerror or why}")
+
+    def _end(self) -> None:
+        found, self._open = self._open, None
+        if found is None:
+            return
+        try:
+            found.writer.close()
+        except OSError as why:
+            self._failed(f"the snapshot {found.path} has no end: {why.strerror or why}")
+        self.lost += found.writer.lost
+        if found.writer.full or found.writer.lost:
+            self._failed(f"the snapshot {found.path} is not whole: the disk was full")
+
+    def _failed(self, why: str) -> None:
+        if why != self.problem:
+            log.error("%s", why)
+        self.problem = why
+
+    def close(self) -> None:
+        self._end()
+
+
+def file_in(folder: Path, kind: str = "") -> Path:
+    """A file name that the folder does not have yet: the time, to the second, and a number where needed."""
+    stem = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime()) + kind
+    names = (folder / f"{stem}{suffix}.mcap" for suffix in ("", *(f"-{n}" for n in range(1, 1000))))
+    return next(path for path in names if not path.exists())

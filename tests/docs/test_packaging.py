@@ -1,0 +1,34 @@
+"""Version, licence and citation: each stated once, or the same wherever it is stated."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+
+import protocol
+from tests.docs.snippets import ROOT
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    """setuptools reads protocol.__version__; the other two are for people."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["dynamic"] == ["version"]
+    newest = re.search(r"^## \[(\d+\.\d+\.\d+)\] - \d{4}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    assert newest and cited
+    assert newest[1] == cited[1] == protocol.__version__
+
+
+def test_skin_says_its_version() -> None:
+    ran = subprocess.run([sys.executable, ROOT / "skin", "--version"], capture_output=True, text=True)
+    assert (ran.returncode, ran.stdout) == (0, f"eitskin {protocol.__version__}\n")
+
+
+def test_the_licence_is_apache_2() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    text = (ROOT / "LICENSE").read_text()
+    assert project["license"] == "Apache-2.0" and project["license-files"] == ["LICENSE"]
+    assert re.search(r"Apache License\s+Version 2\.0, January 2004", text) and "END OF TERMS AND CONDITIONS" in text
+    assert "license: Apache-2.0" in (ROOT / "CITATION.cff").read_text()
