@@ -88,6 +88,7 @@ class EstimatorStage(Stage):
         """There is another baseline."""
         self.electrodes.tared()
         self.touch_estimator.begin_anew()
+        self.rolling_scans.begin_anew()
         self.gain.reset()
         self.frame_averager.reset()
 

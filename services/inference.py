@@ -198,6 +198,7 @@ class Inference(Stage):
         out.image, out.sigma = self._parts.image(found)
         metres = self._parts.metres_per_unit
         at, axes = [metres * found.x, metres * found.y], [metres * found.sigma[0], metres * found.sigma[1]]
+        out.residual = found.unexplained
         size = found.drop * np.pi * (metres * found.radius) ** 2
         out.touches = [LocatedTouch(position=at, sigma=[*axes, found.sigma[2]], amplitude=size)]
         if found.sure:

@@ -44,7 +44,7 @@ class Preprocessing(EstimatorStage):
         out.valid, out.reasons = as_sent(frame)  # measurements that failed are left out below
         for reason in reasons_of(frame.status):
             add_reason(out.reasons, reason)
-        if not self.rolling_scans.due(frame, out.stamps):
+        if not self.rolling_scans.due(frame, out.stamps, self.baseline_estimator):
             return [*self.rolling_scans.part(out, frame, self.baseline_estimator)]
         made = self._scan(out, frame)
         self.rolling_scans.judged(made, frame)

@@ -42,7 +42,12 @@ class RollingScans:
         self._whole.last = -1
         self._seen = self._handed_on = -1  # scans of messages
         self._sample_ns = 0  # of the last delta frame
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """There is another baseline, or none: parts say nothing before an untouched whole scan."""
         self._rest: Array | None = None  # difference of the untouched skin lately
+        self._rests = 0  # whole scans that it is the mean of
         self._held: Array | None = None  # difference of the touch that the last whole scan saw
         self._sound = False  # the last whole scan
         self._moved = False  # the next whole scan was put off since the last one
@@ -52,7 +57,7 @@ class RollingScans:
     def warm_up(self) -> None:
         self._ready()
 
-    def due(self, frame: RawFrame, stamps: dict[str, int]) -> bool:
+    def due(self, frame: RawFrame, stamps: dict[str, int], estimator: BaselineEstimator) -> bool:
         """Whether the message is to be taken for a whole scan; then `sample` in stamps is set to the mean time of its
         values, for which what is made of it stands, and never before what was said last.
         """
@@ -62,6 +67,10 @@ class RollingScans:
         if not self._fits(frame):
             return True  # another skin's: said once a message, as of whole scans
         if not self._whole.due(frame.scan, frame.parts):
+            return False
+        values = None if self._moved else self._values(frame, estimator)
+        if values is not None and self._changes(values):
+            self._moved = True  # a touch that began or ended within these values is seen in the next whole scan
             return False
         new = frame.new.astype(bool)
         sample = stamps.get("sample", 0)
@@ -77,33 +86,28 @@ class RollingScans:
         known = len(out.difference) == len(frame.z) and bool(np.isfinite(out.sigma).all())
         self._sound = known and out.valid and not out.electrodes.any() and not {"gain", "gap"} & set(out.reasons)
         self._moved = self._ended = False
-        self._began_us, self._held = None, None
+        touched, self._began_us, self._held = self._held is not None, None, None
         if not self._sound:
-            self._rest = None
+            self._rest, self._rests = None, 0
         elif out.touched:
             self._held = out.difference.astype(float)
         else:
-            new = out.difference.astype(float)
-            self._rest = new if self._rest is None else self._rest + (new - self._rest) / REMEMBERED
+            drifted = touched or self._rest is None
+            self._rests = 1 if drifted else min(self._rests + 1, REMEMBERED)
+            before = 0.0 if self._rest is None else self._rest
+            self._rest = before + (out.difference.astype(float) - before) / self._rests
 
     def part(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> list[DeltaFrame]:
         """The delta frame of a message that is no whole scan, where there is something to say."""
         evidence, image = self._ready()
-        baseline = estimator.baseline
-        sound = self._sound and as_sent(frame)[0] and not frame.status.any() and not frame.reasons
-        if not (evidence.knows and sound) or baseline is None or baseline.doubt or self._rest is None:
+        if (values := self._values(frame, estimator)) is None or not self._changes(values):
             return []
-        amplitude = np.abs(frame.z.astype(np.complex128))
-        d = (amplitude - baseline.z0) / estimator.normaliser
-        noise = WIDER * np.hypot(estimator.sigma, DRIFT)
-        age = frame.age_us.astype(float)
-        if not (np.isfinite(d).all() and np.isfinite(noise).all()):
-            return []
+        d, noise, age = values
         if self._held is not None:
-            return self._end(out, evidence, d, noise, age)
-        d = d - self._rest
-        if self._began_us is None and evidence.sigmas(d, noise, age) < SUSPECTED:
-            return []
+            self._ended = True
+            self._put_off(frame.scan)
+            out.difference, out.sigma = np.zeros(len(d), np.float32), noise.astype(np.float32)
+            return self._said(out)
         since = None if self._began_us is None else frame.device_us - self._began_us
         onset = evidence.began(d, noise, age, since)
         if onset is None:
@@ -122,15 +126,24 @@ class RollingScans:
         add_reason(out.reasons, "coarse")
         return self._said(out)
 
-    def _end(self, out: DeltaFrame, evidence: PartEvidence, d: Array, noise: Array, age: Array) -> list[DeltaFrame]:
-        assert self._held is not None and self._rest is not None
-        if self._ended or not evidence.ended(d - self._rest, self._held - self._rest, noise, age):
-            return []
-        self._ended = True
-        self._put_off(out.scan)
-        out.difference = np.zeros(len(d), np.float32)
-        out.sigma = noise.astype(np.float32)
-        return self._said(out)
+    def _values(self, frame: RawFrame, estimator: BaselineEstimator) -> tuple[Array, Array, Array] | None:
+        """(K,) each: difference to the untouched skin lately, its standard deviation, age [us]; None where the last
+        whole scan was not sound, or this message is not.
+        """
+        baseline = estimator.baseline
+        sound = self._sound and as_sent(frame)[0] and not frame.status.any() and set(frame.reasons) <= {"replay"}
+        if not (sound and self._ready()[0].knows) or baseline is None or baseline.doubt or self._rest is None:
+            return None
+        d = (np.abs(frame.z.astype(np.complex128)) - baseline.z0) / estimator.normaliser - self._rest
+        noise = WIDER * np.hypot(estimator.sigma * np.sqrt(1 + 1 / self._rests), DRIFT)
+        return (d, noise, frame.age_us.astype(float)) if np.isfinite(d).all() and np.isfinite(noise).all() else None
+
+    def _changes(self, values: tuple[Array, Array, Array]) -> bool:
+        """Whether a touch began, by all that a quick look tells, or the one that there was has ended."""
+        evidence, (d, noise, age) = self._ready()[0], values
+        if self._held is None or self._rest is None:
+            return self._began_us is not None or evidence.sigmas(d, noise, age) >= SUSPECTED
+        return not self._ended and evidence.ended(d, self._held - self._rest, noise, age)
 
     def _said(self, out: DeltaFrame) -> list[DeltaFrame]:
         self._handed_on = out.scan
@@ -161,6 +174,7 @@ class RollingScans:
             "sample_ns": self._sample_ns,
             "flags": [self._sound, self._moved, self._ended],
             "rest": self._rest,
+            "rests": self._rests,
             "held": self._held,
             "began_us": self._began_us,
         }
@@ -173,4 +187,4 @@ class RollingScans:
         self._whole.last, self._sample_ns = int(state["whole"]), int(state["sample_ns"])
         self._sound, self._moved, self._ended = (bool(each) for each in state["flags"])
         self._rest, self._held = (None if state[n] is None else np.array(state[n], float) for n in ("rest", "held"))
-        self._began_us = state["began_us"]
+        self._began_us, self._rests = state["began_us"], int(state["rests"])

@@ -29,6 +29,7 @@ SIGMAS = 7.0
 OUTSIDE_SIGMAS = 4.0  # without any two electrodes
 GAIN_MARGIN = 10.0  # nats times two, by which a touch is likelier than a change of gain
 LINEAR = 0.1  # of d: by so much the linear picture of a touch on a grid position may be wrong
+MISFIT = 0.3  # of what one touch explains: so much may be left
 NEWEST = 3  # parts within which a touch may have begun that nothing is known of yet
 RAMP_PARTS = 5  # the same of one that grows
 NEAR = 0.5  # parts by which a known beginning may be off
@@ -94,7 +95,7 @@ class PartEvidence:
         wide = np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * (d**2).mean())
         explained = float(_filters(response, d, wide, one).max()) ** 2
         left = float(((d / wide) ** 2).sum()) - explained
-        if left > len(d) + 3 * np.sqrt(2 * len(d)) + LINEAR * explained:
+        if left > len(d) + 3 * np.sqrt(2 * len(d)) + MISFIT * explained:
             return False
         gain = float((d * f / noise**2).sum()) ** 2 / float((f**2 / noise**2).sum())
         if float(_filters(response, d, noise, one).max()) ** 2 < gain + GAIN_MARGIN:

@@ -24,6 +24,7 @@ MEAN = np.log([0.2, 0.2])  # prior of log radius [model units], log drop [S/m]
 SD = np.array([0.5, 0.9])
 COARSE = 0.05  # of the side: a standard deviation beyond it is coarse
 STEPS = 8
+MOST_MISFIT = 6.0  # squares left per value, beyond which it is no touch of this kind; below, they widen what is stated
 MOST = np.array([0.1, 0.1, 0.3, 0.5])  # of one step
 AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
 
@@ -40,6 +41,7 @@ class PartTouch:
     sigma: tuple[float, float, float]
     fits: bool  # whether it explains the values
     sure: bool  # whether its place is known to within COARSE
+    unexplained: float  # share of what was measured
 
 
 class PartImage:
@@ -84,15 +86,18 @@ class PartImage:
             else:
                 damping *= 10
         covariance = np.linalg.inv(slope.T @ slope + information + 1e-9 * np.eye(4))
+        chi2 = float(left @ left)
+        misfit = max(1.0, chi2 / len(rows))
+        covariance *= misfit
         values, vectors = np.linalg.eigh(covariance[:2, :2])
         short, long = np.maximum(WIDER * np.sqrt(np.maximum(values, 0.0)), LEAST)
         angle = float(np.arctan2(vectors[1, 1], vectors[0, 1]))
-        chi2 = float(left @ left)
         x, y, radius, drop = float(theta[0]), float(theta[1]), float(np.exp(theta[2])), float(np.exp(theta[3]))
         drop_sigma = WIDER * drop * float(np.sqrt(covariance[3, 3]))
-        fits = chi2 < len(rows) + 3 * np.sqrt(2 * len(rows))
+        unexplained = max(0.0, chi2 - len(rows)) / float(((seen / noise) ** 2).sum())
         sure = long <= COARSE * 2 * self._half
-        return PartTouch(x, y, radius, drop, drop_sigma, (float(long), float(short), angle), bool(fits), bool(sure))
+        axes = float(long), float(short), angle
+        return PartTouch(x, y, radius, drop, drop_sigma, axes, misfit < MOST_MISFIT, bool(sure), unexplained)
 
     def image(self, touch: PartTouch) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(H, W) drop [S/m] and its standard deviation."""

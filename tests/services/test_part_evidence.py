@@ -158,6 +158,21 @@ def test_while_nothing_touches_a_part_makes_no_frame(host):
     assert all(f.valid and not f.contacts for f in frames)
 
 
+def test_a_tare_makes_no_contact_and_is_followed_by_touches_again(host):
+    """The differences that parts are compared with were to the baseline before."""
+    host.until(host.now + 3.5)
+    first = len(host.contacts)
+    host.pipeline.pre.command("tare", {"calibrate": False})
+    assert host.pipeline.pre.rolling_scans.state()["rest"] is None
+    host.until(host.now + 0.5)
+    assert not any(f.contacts for _, f in host.contacts[first:])
+    began, first = host.now, len(host.contacts)
+    host.press(x=0.01, y=0.0, force=2.0, radius=0.01, seconds=0.2)
+    host.until(began + 0.1)
+    assert [t for t, f in host.contacts[first:] if f.valid and f.contacts][0] - began < 0.025
+    host.until(began + 0.6)
+
+
 @pytest.mark.parametrize("fault", [{"name": "electrode_open", "args": {"electrode": 4}}, {"name": "gain", "args": {}}])
 def test_a_fault_of_the_board_makes_no_contact(fault):
     host = AdaptiveHost("rolling", snr_db=80.0, seed=11)

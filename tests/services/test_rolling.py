@@ -172,6 +172,7 @@ def test_a_part_makes_no_delta_frame_and_its_state_goes_with_a_recording(host):
     state = first.pre.state()
     second = RollingScans(first.pre.bundle)
     second.load(state["rolling"])
-    assert [second.due(raw, {}) for raw in raws[25:]] == [k % 10 == 5 for k in range(15)]
+    estimator = first.pre.baseline_estimator
+    assert [second.due(raw, {}, estimator) for raw in raws[25:]] == [k % 10 == 5 for k in range(15)]
     assert second.handed_on(raws[-1].scan) == {"seen": True, "handed_on": False}
     assert first.pre.command("part", {"scan": raws[20].scan}) == {"seen": False, "handed_on": True}
