@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 SUSPECTED = 5.0  # sigmas of the newest part, below which it is not looked at further
 WIDER = 1.05  # noise is estimated from a few dozen scans
 DRIFT = 3e-5  # relative, since the untouched scans that parts are compared with
+MOST_WAITED = 8  # messages
 REMEMBERED = 8  # untouched whole scans whose mean that is
 
 
@@ -52,6 +53,8 @@ class RollingScans:
         self._sound = False  # the last whole scan
         self._moved = False  # the next whole scan was put off since the last one
         self._ended = False  # the touch of the last whole scan has
+        self._grown_us = 0.0  # when it was all there, likewise
+        self._waited = 0  # messages by which the whole scan was put off for that
         self._began_us: float | None = None  # when a touch began, by the board's clock less the length of a part
 
     def warm_up(self) -> None:
@@ -72,6 +75,10 @@ class RollingScans:
         if values is not None and self._changes(values):
             self._moved = True  # a touch that began or ended within these values is seen in the next whole scan
             return False
+        if frame.device_us - float(frame.age_us.max()) < self._grown_us and self._waited < MOST_WAITED:
+            self._waited += 1  # the oldest of these values felt a touch that still grew
+            self._whole.last = frame.scan - frame.parts + 1
+            return False
         new = frame.new.astype(bool)
         sample = stamps.get("sample", 0)
         mean = sample - round(1e3 * float(frame.age_us.mean() - frame.age_us[new].mean()))
@@ -86,6 +93,7 @@ class RollingScans:
         known = len(out.difference) == len(frame.z) and bool(np.isfinite(out.sigma).all())
         self._sound = known and out.valid and not out.electrodes.any() and not {"gain", "gap"} & set(out.reasons)
         self._moved = self._ended = False
+        self._grown_us, self._waited = 0.0, 0
         touched, self._began_us, self._held = self._held is not None, None, None
         if not self._sound:
             self._rest, self._rests = None, 0
@@ -113,6 +121,7 @@ class RollingScans:
         if onset is None:
             return []
         self._put_off(frame.scan)
+        self._grown_us = frame.device_us - onset.grown
         if self._began_us is None:
             self._began_us = frame.device_us - onset.since
         on = onset.course > 0
@@ -177,6 +186,7 @@ class RollingScans:
             "rests": self._rests,
             "held": self._held,
             "began_us": self._began_us,
+            "grown": [self._grown_us, self._waited],
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -187,4 +197,5 @@ class RollingScans:
         self._whole.last, self._sample_ns = int(state["whole"]), int(state["sample_ns"])
         self._sound, self._moved, self._ended = (bool(each) for each in state["flags"])
         self._rest, self._held = (None if state[n] is None else np.array(state[n], float) for n in ("rest", "held"))
+        self._grown_us, self._waited = float(state["grown"][0]), int(state["grown"][1])
         self._began_us, self._rests = state["began_us"], int(state["rests"])

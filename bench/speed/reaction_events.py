@@ -60,6 +60,11 @@ class TouchEvent:
         return self.x + since * self.velocity[0], self.y + since * self.velocity[1]
 
     @property
+    def released(self) -> float:
+        """When force begins to fall."""
+        return self.end - self.kind.ramp_s
+
+    @property
     def keys(self) -> list[tuple[float, float, float, float]]:
         """(t, x, y, force), as in a scene."""
         ramp, times = self.kind.ramp_s, [(self.onset, self.kind.force), (self.end, self.kind.force)]
@@ -151,7 +156,7 @@ class SeenFrame:
 def react(event: TouchEvent, until: float, frames: Sequence[SeenFrame]) -> Reaction:
     """frames: in order, from the event's onset to `until`, when the next touch begins or the scene ends."""
     found = Reaction()
-    during = [seen for seen in frames if event.onset <= seen.received < event.end]
+    during = [seen for seen in frames if event.onset <= seen.received < event.released]
     first = _last_run([seen.in_place(event) for seen in during])
     if first < len(during):
         found.contact_s = during[first].received - event.onset

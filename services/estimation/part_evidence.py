@@ -32,6 +32,7 @@ LINEAR = 0.1  # of d: by so much the linear picture of a touch on a grid positio
 MISFIT = 0.3  # of what one touch explains: so much may be left
 NEWEST = 3  # parts within which a touch may have begun that nothing is known of yet
 RAMP_PARTS = 5  # the same of one that grows
+RAMPS = (2.5, 4.5, 7.0, 11.0)  # parts that a force may take to grow, once its beginning is known
 NEAR = 0.5  # parts by which a known beginning may be off
 FAINT = 0.2  # of a ramp's newest value, below which a value tells too little
 HELD_SIGMAS = 12.0  # that a held touch must have in one part for its absence to be seen there
@@ -44,6 +45,7 @@ class PartOnset:
 
     sigmas: float
     since: float  # age of the oldest value that felt it
+    grown: float  # of the oldest value that felt all of it
     course: NDArray[np.float64]
 
 
@@ -88,7 +90,7 @@ class PartEvidence:
             return None
         course = np.zeros(len(d))
         course[rows] = f
-        return PartOnset(found, float(age[rows].max()), course)
+        return PartOnset(found, float(age[rows].max()), float(age[rows][f >= 1.0].max()), course)
 
     def _is_touch(self, d: Array, noise: Array, f: Array, rows: NDArray[np.intp]) -> bool:
         response, one = self._response[:, rows], f[None]
@@ -130,7 +132,12 @@ def _courses(age: Array, count: int, least: int = 2) -> Array:
     most = NEWEST * count if least == 2 else len(age)
     steps = [np.arange(len(age)) < n for n in range(least, min(most, len(age)) + 1)]
     ramps = []
-    for n in range(count, len(age) + 1, count // 2):
-        f = np.clip((age[n - 1] - age) / max(float(age[n - 1] - age[0]), 1e-9), 0.0, 1.0)
-        ramps.append(np.where(f > FAINT, f, 0.0))
+    for n in range(max(count, least), len(age) + 1, max(1, count // (2 if least == 2 else 4))):
+        since = float(age[n - 1])
+        lasts = [since - float(age[0])]
+        if least > 2:
+            lasts += [took for each in RAMPS if (took := each * count * float(np.median(np.diff(age)))) < lasts[0]]
+        for took in lasts:
+            f = np.clip((since - age) / max(took, 1e-9), 0.0, 1.0)
+            ramps.append(np.where(f > FAINT, f, 0.0))
     return np.array([*steps, *ramps], dtype=np.float64)
