@@ -29,6 +29,8 @@ SIGMAS = 7.0
 OUTSIDE_SIGMAS = 4.0  # without any two electrodes
 GAIN_MARGIN = 10.0  # nats times two, by which a touch is likelier than a change of gain
 LINEAR = 0.1  # of d: by so much the linear picture of a touch on a grid position may be wrong
+ELSEWHERE = 0.25  # model units: a touch so far from another is in another place
+UNLIKELY = 8.0  # nats by which other places must be less likely
 MISFIT = 0.3  # of what one touch explains: so much may be left
 NEWEST = 3  # parts within which a touch may have begun that nothing is known of yet
 RAMP_PARTS = 5  # the same of one that grows
@@ -56,7 +58,9 @@ class PartEvidence:
         m = bundle.matrices
         self.knows = m.normalisation == "model" and parts > 1
         half_width = float(bundle.manifest["image"].get("half_width", 1.0))
-        self._response = np.asarray(touches(m, half_width).response, dtype=np.float64)  # (M, K)
+        grid = touches(m, half_width)
+        self._response = np.asarray(grid.response, dtype=np.float64)  # (M, K)
+        self._position = np.asarray(grid.position, dtype=np.float64)
         self._count = len(bundle.pattern) // parts  # values in a part
         electrodes = int(bundle.pattern.max()) + 1
         uses = np.array([np.isin(np.arange(electrodes), row) for row in bundle.pattern])
@@ -82,7 +86,7 @@ class PartEvidence:
         z = _filters(self._response[:, rows], d[rows], noise[rows], courses)
         touch, best = np.unravel_index(int(z.argmax()), z.shape)
         f, found = courses[best], float(z[touch, best])
-        if found < SIGMAS:
+        if found < SIGMAS or not self._in_one_place(d[rows], noise[rows], courses, rows):
             return None
         on = f > 0
         rows, f = rows[on], f[on]
@@ -92,9 +96,17 @@ class PartEvidence:
         course[rows] = f
         return PartOnset(found, float(age[rows].max()), float(age[rows][f >= 1.0].max()), course)
 
+    def _in_one_place(self, d: Array, noise: Array, courses: Array, rows: NDArray[np.intp]) -> bool:
+        """Whether no touch elsewhere, of whatever course, is nearly as likely as the likeliest: a few values may fit
+        two places.
+        """
+        z = _filters(self._response[:, rows], d, _with_misfit(d, noise), courses).max(axis=1).clip(0.0)
+        far = np.hypot(*(self._position - self._position[int(z.argmax())]).T) > ELSEWHERE
+        return bool(z.max() ** 2 - z[far].max() ** 2 > 2 * UNLIKELY)
+
     def _is_touch(self, d: Array, noise: Array, f: Array, rows: NDArray[np.intp]) -> bool:
         response, one = self._response[:, rows], f[None]
-        wide = np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * (d**2).mean())
+        wide = _with_misfit(d, noise)
         explained = float(_filters(response, d, wide, one).max()) ** 2
         left = float(((d / wide) ** 2).sum()) - explained
         if left > len(d) + 3 * np.sqrt(2 * len(d)) + MISFIT * explained:
@@ -115,6 +127,13 @@ class PartEvidence:
         left = float(((d[rows] / noise[rows]) ** 2).sum())
         silent = left < count + 3 * np.sqrt(2 * count) and self.sigmas(d, noise, age) < GONE_SIGMAS + 1.0
         return expected > HELD_SIGMAS**2 + count and silent
+
+
+def _with_misfit(d: Array, noise: Array) -> Array:
+    """Standard deviation of d (n,) against the linear picture of a touch on a grid position."""
+    felt = d**2 > (3 * noise) ** 2
+    size = float((d[felt] ** 2).mean()) if felt.any() else 0.0
+    return np.asarray(np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * size))
 
 
 def _filters(response: Array, d: Array, noise: Array, courses: Array) -> Array:
