@@ -88,6 +88,12 @@ BENCHMARKS = (
         ("--seconds", "8", "--rounds", "2"),
         limits="p99 is waiting for a processor that the stub's physics, the pipeline or the listeners have.",
     ),
+    Benchmark(
+        "page",
+        "The live page",
+        ("--seconds", "8", "--rounds", "2"),
+        limits="What viewers cost the pipeline is the processor that ten of them, here on the same cores, have.",
+    ),
     Benchmark("tracking", "Ten minutes of contacts", ("--seconds", "60")),
     Benchmark(
         "faults",
@@ -109,6 +115,13 @@ BENCHMARKS = (
         ("accuracy",),
         "At 70 dB an ideal classifier names 78 % of the shapes (`skin bench shape_limit`); the rest is a network small "
         "enough for a millisecond, after three and a half hours of training on one core.",
+    ),
+    Benchmark(
+        "refined",
+        "Touches refined by physics",
+        ("--quick",),
+        limits="The response of a touch without a mesh is known to 0.2 % for round touches and 0.5 % for those with "
+        "corners; without noise that is what is left. At 70 dB shapes are what noise lets be told apart.",
     ),
     Benchmark(
         "mismatch",

@@ -36,6 +36,8 @@ class Status:
             skin=self._skin,
             source="stub",
             valid=True,
+            valid_for_s=3 * EVERY_S,
+            stamps={"publish": time.monotonic_ns()},
             process="stub",
             level="WARN" if messages else "OK",
             messages=messages,

@@ -69,6 +69,14 @@ def _key(measurement: npt.NDArray[np.integer]) -> tuple[tuple[int, ...], ...]:
     return (first, second)
 
 
+@dataclass(frozen=True, eq=False)
+class OwnSkin:
+    """What was measured of one very skin; it looks like itself only as it is, so it has no symmetries."""
+
+    error: Array  # (K, K) factor of the covariance of what is wrong with its model, of |d|
+    noise: Array  # (K,) standard deviation of d
+
+
 @dataclass(frozen=True)
 class Condition:
     """What one tare found, and the true noise and drift."""
@@ -93,22 +101,32 @@ class Condition:
         return np.where(self.live, d, 0.0)
 
 
-def random_condition(pre: PreReconstructor, rng: np.random.Generator) -> Condition:
-    """Weighted to what is measured most: a third without noise, most of the rest between 58 and 85 dB."""
+def random_condition(pre: PreReconstructor, rng: np.random.Generator, own: OwnSkin | None = None) -> Condition:
+    """Weighted to what is measured most: a third without noise, most of the rest between 58 and 85 dB; of a skin of
+    one's own, half with about the noise that it has.
+    """
     m = pre.m
     kind = rng.random()
     decibel = 120.0 if kind < 0.33 else rng.uniform(58, 85) if kind < 0.8 else rng.uniform(45, 110)
     share = rng.choice([0.0, rng.uniform()])  # of the noise that is the converter's, the same in ohm on every channel
     sigma = 10 ** (-decibel / 20) * np.sqrt(1 - share + share * (np.median(m.z0) / m.z0) ** 2)
+    if own is not None and rng.random() < 0.5:
+        sigma = np.maximum(own.noise * 10 ** rng.uniform(-0.5, 0.5), 1e-6)
     kind = rng.random()
     drift = Drift() if kind < 0.4 else SERVICE_DRIFT
     if kind > 0.65:
         drift = Drift(scale=10 ** rng.uniform(-4.5, -2.5), contact=10 ** rng.uniform(-3.5, -1.5))
-    return condition(pre, rng, sigma, drift, dead=int(rng.choice(3, p=[0.9, 0.07, 0.03])))
+    return condition(pre, rng, sigma, drift, dead=int(rng.choice(3, p=[0.9, 0.07, 0.03])), own=own)
 
 
 def condition(
-    pre: PreReconstructor, rng: np.random.Generator, sigma: Array, drift: Drift, dead: int = 0, exact: bool = False
+    pre: PreReconstructor,
+    rng: np.random.Generator,
+    sigma: Array,
+    drift: Drift,
+    dead: int = 0,
+    exact: bool = False,
+    own: OwnSkin | None = None,
 ) -> Condition:
     """The condition of a true sigma (K,), as a tare of 64 frames would see it. exact: no model error."""
     m, k = pre.m, pre.measurements
@@ -118,5 +136,5 @@ def condition(
         live[np.isin(m.pattern, electrodes).any(axis=1)] = False
     estimate = sigma * np.clip(1 + 0.06 * rng.standard_normal(k), 0.7, 1.3)
     operator = pre.condition(estimate, drift=drift, weights=live.astype(float))
-    error = MODEL_ERROR * misfit_factor(m.gram.astype(float)) * (not exact)
+    error = (MODEL_ERROR * misfit_factor(m.gram.astype(float)) if own is None else own.error) * (not exact)
     return Condition(operator, sigma, drift, m.contact, error, live, 64)

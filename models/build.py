@@ -5,6 +5,8 @@
     python -m models.build --skin square16 --minutes 3     for CI: proves the path, not the accuracy
     python -m models.build --skin square16 --no-network    matrices only: the services show the one-step image
     python -m models.build --skin square16 --package       trains nothing: ships the checkpoints in models/work/SKIN
+    python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin
+    python -m models.build --skin square16 --response      adds what a fit of touches needs to the bundle there is
 
 Samples and checkpoints stay in models/work/SKIN; a second call uses what is there and makes what is missing.
 """
@@ -23,13 +25,26 @@ from typing import Any
 import numpy as np
 import torch
 
-from models import bundle, calibrate, class_temperature, data, export, geometry, manifest, samples, train, verdict
-from models.augmentation import random_condition
+from models import (
+    bundle,
+    calibrate,
+    class_temperature,
+    data,
+    export,
+    geometry,
+    manifest,
+    samples,
+    train,
+    verdict,
+    warped,
+)
+from models.augmentation import OwnSkin, random_condition
 from models.evaluation import LEVELS, evaluate, predict
 from models.forward import ForwardModel
 from models.linearise import linearise
 from models.network import MMCNN, NetworkConfig, multiply_accumulates
 from models.prereconstruction import Array, Matrices, PreReconstructor
+from models.response_tables import response_tables
 from protocol.errors import EitskinError
 
 VALID = 1000
@@ -61,30 +76,39 @@ class Plan:
 FULL, QUICK = Plan(57000, 214.0, 13.0), Plan.of(12.5)  # packaging takes another two minutes
 
 
-def physics(skin: geometry.SkinGeometry, scenes: Path) -> tuple[Matrices, samples.Samples]:
+def physics(
+    skin: geometry.SkinGeometry, scenes: Path, model: warped.WarpedModel | None = None
+) -> tuple[Matrices, samples.Samples]:
     """Matrices of a skin, and the held-out scenes in their normalisation."""
     # With z0 of the model as the divisor, contact impedances off by 30 % change d by 0.2 % instead of 0.5 %; but it
     # takes a converter that reads ohm. Skins recorded in counts of unknown gain a channel divide by their own baseline.
-    matrices = linearise(ForwardModel(skin), "model" if skin.pattern_name == "pairs" else "measured")
-    held_out = samples.load(scenes, "valid", PreReconstructor(matrices))
+    normalisation = "model" if skin.pattern_name == "pairs" else "measured"
+    matrices = linearise(ForwardModel(skin), normalisation) if model is None else model.matrices
+    held_out = _scenes(scenes, "valid", PreReconstructor(matrices), model)
     return replace(matrices, level=samples.levels(held_out, PreReconstructor(matrices))), held_out
 
 
 def networks(
-    folder: Path, pre: PreReconstructor, held_out: samples.Samples, presses: calibrate.SolvedPresses
+    folder: Path,
+    pre: PreReconstructor,
+    held_out: samples.Samples,
+    presses: calibrate.SolvedPresses | None,
+    own: OwnSkin | None = None,
 ) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Exports the checkpoints in a folder: ONNX of each variant, and what the manifest says about them. presses: what
-    the temperature of the class probabilities is fitted to.
+    the temperature of the class probabilities is fitted to; a registered skin has none of known shapes.
     """
     made: dict[str, bytes] = {}
     said: dict[str, Any] = {}
-    stack, context = calibration(pre, held_out)
+    stack, context = calibration(pre, held_out, own=own)
     for variant in train.CONFIGS:
         if not (folder / f"{variant}.pt").is_file():
             continue
         model, state = restore(folder / f"{variant}.pt")
-        shape_class = class_temperature.seen_classes(presses, pre, predict(model)).said()
-        class_temperature.cooled(model, shape_class["temperature"])
+        shape_class = None
+        if presses is not None:
+            shape_class = class_temperature.seen_classes(presses, pre, predict(model)).said()
+            class_temperature.cooled(model, shape_class["temperature"])
         made[variant] = export.to_onnx(model, stack[:32], context[:32])
         said[variant] = {
             "parameters": sum(p.numel() for p in model.parameters()),
@@ -104,15 +128,16 @@ def networks(
         session = export.session(content)
         said[variant]["run_time_ms"] = export.run_time_ms(content, stack, context)
         said[variant]["held_out"] = {
-            level: {k: round(v, 4) for k, v in evaluate(predict(session), held_out, pre, decibel, limit=400).items()}
+            level: {k: round(v, 4) for k, v in found.items()}
             for level, decibel in LEVELS.items()
+            for found in [evaluate(predict(session), held_out, pre, decibel, limit=400, own=own)]
         }
         milliseconds = said[variant]["run_time_ms"]["median"]
-        found = "; ".join(
+        text = "; ".join(
             f"{level}: contact IoU {row['contact IoU']:.3f}, position {row['position % of side']:.2f} % of the side"
             for level, row in said[variant]["held_out"].items()
         )
-        print(f"{variant}: {len(content) / 1024:.0f} kB, {milliseconds:.2f} ms a frame; held out, {found}", flush=True)
+        print(f"{variant}: {len(content) / 1024:.0f} kB, {milliseconds:.2f} ms a frame; held out, {text}", flush=True)
     return made, said
 
 
@@ -124,37 +149,50 @@ def restore(checkpoint: Path) -> tuple[MMCNN, dict[str, Any]]:
     return model.eval(), state
 
 
-def calibration(pre: PreReconstructor, held_out: samples.Samples, frames: int = 256) -> tuple[Array, Array]:
+def calibration(
+    pre: PreReconstructor, held_out: samples.Samples, frames: int = 256, own: OwnSkin | None = None
+) -> tuple[Array, Array]:
     """Stacks and contexts as they will be met: every kind of noise, drift and dead electrode of training."""
     rng = np.random.default_rng(7)
     parts = []
     for _ in range(frames // 16):
         index = rng.integers(len(held_out), size=16)
-        parts.append(samples.make(held_out, index, None, random_condition(pre, rng), rng))
+        parts.append(samples.make(held_out, index, None, random_condition(pre, rng, own), rng))
     batch = samples.join(parts)
     return batch.stack.numpy(), batch.context.numpy()
 
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m models.build", description="Build a skin's bundle.")
-    parser.add_argument("--skin", default="square16", help="a shipped skin or a .toml file")
-    parser.add_argument("--out", type=Path, help="bundle folder (default models/bundles/SKIN)")
+    parser.add_argument(
+        "--skin", default="square16", help="a shipped skin, a .toml file, or what `skin register` wrote"
+    )
+    parser.add_argument("--out", type=Path, help="bundle folder (default: models/bundles/SKIN, or what was registered)")
     parser.add_argument("--work", type=Path, help="samples and checkpoints (default models/work/SKIN)")
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument("--quick", action="store_true", help="a quarter of an hour in all")
     budget.add_argument("--minutes", type=float, help="any other budget, for all of it on two idle cores")
     budget.add_argument("--no-network", action="store_true", help="matrices only")
     budget.add_argument("--package", action="store_true", help="export the checkpoints there are, train nothing")
+    budget.add_argument("--response", action="store_true", help="response.npz alone, into the bundle there is")
     parser.add_argument("--matrices", type=Path, help="with --package: the bundle the checkpoints were trained with")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args(argv)
     began = time.perf_counter()
-    skin = geometry.load(args.skin)
-    out, work = args.out or bundle.BUNDLES / skin.name, args.work or data.WORK / skin.name
+    skin, registered = geometry.load(args.skin), warped.registered(args.skin)
+    model = None if registered is None else warped.warped(registered)
+    own = None if model is None else model.own
+    name = skin.name if registered is None else registered.path.resolve().name
+    out = args.out or (bundle.BUNDLES / name if registered is None else registered.path)
+    work = args.work or data.WORK / name
+    if args.response:
+        added = bundle.add_response(bundle.Bundle.load(out), response_tables(ForwardModel(skin)))
+        print(f"{added.path}: response.npz added, {added.hash[:12]}, after {time.perf_counter() - began:.0f} s")
+        return
     plan = QUICK if args.quick else Plan.of(args.minutes) if args.minutes else FULL
     if not (args.package or args.no_network):
-        print(plan.said(skin.name), flush=True)
+        print(plan.said(name), flush=True)
     valid = VALID if plan.scenes >= 4 * VALID else max(100, plan.scenes // 5)
     if not args.package:
         if not args.no_network:
@@ -163,23 +201,36 @@ def main(argv: list[str] | None = None) -> None:
             make_scenes(args.skin, work, 0, 250, args)
     if args.package:
         matrices = bundle.Bundle.load(args.matrices or out).matrices  # a checkpoint fits those it was trained with
-        held_out = samples.load(work, "valid", PreReconstructor(matrices))
+        held_out = _scenes(work, "valid", PreReconstructor(matrices), model)
     else:
-        matrices, held_out = physics(skin, work)
+        matrices, held_out = physics(skin, work, model)
     pre, made, said = PreReconstructor(matrices), dict[str, bytes](), dict[str, Any]()
     print(f"physics ready after {time.perf_counter() - began:.0f} s", flush=True)
     if not args.no_network:
         if not args.package:
-            scenes = samples.load(work, "train", pre)
-            for variant, minutes in (("full", plan.full), ("fast", plan.fast)):
-                train.train(variant, skin, pre, scenes, held_out, minutes, work / f"{variant}.pt", args.seed, args.jobs)
+            scenes = _scenes(work, "train", pre, model)
+            start = None if registered is None else warped.start(registered)
+            # One network is enough for a registered skin: what its presses leave open no other one can know.
+            trained = (
+                (("full", plan.full), ("fast", plan.fast)) if start is None else (("full", plan.full + plan.fast),)
+            )
+            for variant, minutes in trained:
+                at, seed, jobs = work / f"{variant}.pt", args.seed, args.jobs
+                train.train(variant, skin, pre, scenes, held_out, minutes, at, seed, jobs, start=start, own=own)
         count, cache = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4, work / "presses.npz"
-        made, said = networks(work, pre, held_out, calibrate.solve(skin, count, cache=cache))
-        for variant, found in calibrate.uncertainty(skin, pre, made, count, cache).items():
-            said[variant]["uncertainty"] = found
+        made, said = networks(work, pre, held_out, None if own else calibrate.solve(skin, count, cache=cache), own)
+        if own is None:  # the forces of a registered skin are those of its presses
+            for variant, found in calibrate.uncertainty(skin, pre, made, count, cache).items():
+                said[variant]["uncertainty"] = found
     if "full" in said:
-        said["full"]["verdict"] = _verdict(args.skin, pre, held_out, said["full"]).to_dict()
-    written = bundle.write(out, manifest.describe(skin.name, skin, matrices, network=said or None), matrices, made)
+        said["full"]["verdict"] = _verdict(args.skin, pre, held_out, said["full"], own).to_dict()
+    if registered is None or model is None:
+        said_of = manifest.describe(skin.name, skin, matrices, network=said or None)
+        tables = response_tables(ForwardModel(skin)) if matrices.normalisation == "model" else None
+        written = bundle.write(out, said_of, matrices, made, response=tables)
+    else:
+        about = manifest.of_registered(registered, network=said or None, warped=model.said)
+        written = bundle.write(out, about, matrices, made, registered.locator)
     for curve in work.glob("*.png") if made else ():
         shutil.copy(curve, out / f"training_{curve.name}")
     size = sum(f.stat().st_size for f in written.path.iterdir()) / 2**20
@@ -188,17 +239,25 @@ def main(argv: list[str] | None = None) -> None:
         print(f"verdict: {said['full']['verdict']['text']}")
 
 
+def _scenes(folder: Path, split: str, pre: PreReconstructor, model: warped.WarpedModel | None) -> samples.Samples:
+    """A split of a folder; of a registered skin, as that skin would have measured it."""
+    scenes = samples.load(folder, split, pre)
+    return scenes if model is None else model.samples(scenes)
+
+
 def _verdict(
-    skin: str, pre: PreReconstructor, held_out: samples.Samples, said: dict[str, Any]
+    skin: str, pre: PreReconstructor, held_out: samples.Samples, said: dict[str, Any], own: OwnSkin | None
 ) -> verdict.TrainingVerdict:
-    training = said["training"]
-    without, floor = verdict.one_step(held_out, pre), verdict.position_floor(skin, held_out)
+    training, without = said["training"], verdict.one_step(held_out, pre, own)
+    if own is not None:
+        return verdict.judge_registered(said["held_out"], training["batches"], training["minutes"], without)
+    floor = verdict.position_floor(skin, held_out)
     return verdict.judge(said["held_out"], training["batches"], training["minutes"], without, floor)
 
 
 def make_scenes(skin: str, work: Path, scenes: int, valid: int, args: argparse.Namespace) -> None:
     """Scenes that `work` lacks, in chunks of the size that it has already, or that suits their number."""
-    chunk = data.chunk_size(work) or (1000 if scenes >= 4000 else 125)
+    chunk = data.chunk_size(work) or (1000 if scenes >= 4000 else 500 if scenes >= 2000 else 125)
     wanted = data.specs(skin, "valid", valid, args.seed, chunk) + data.specs(skin, "train", scenes, args.seed, chunk)
     if not data.generate(work, wanted, args.jobs):
         print(f"using the scenes in {work}: remove it to make others")

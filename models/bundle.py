@@ -7,6 +7,7 @@
                             network_fast.onnx  "fast"
                             network_int8.onnx  "int8"
                             locator.npz        of a registered skin: see locator.LocatorArrays
+                            response.npz       what a touch does to it, without a mesh: see response_file.py
 
 The manifest holds the hash of every other file, so the manifest's own hash covers the whole. Networks may be missing. A
 bundle without any is a working bundle: the services then show the one-step image.
@@ -35,6 +36,8 @@ from models.files import FileError, read_bytes
 from models.locator_arrays import LocatorArrays, arrays_of
 from models.npz import read_npz
 from models.prereconstruction import Matrices, PreReconstructor
+from models.response_file import arrays_of_tables, tables_of
+from models.touch_response import ResponseTables
 from protocol.errors import EitskinError
 
 SCHEMA = 1
@@ -43,7 +46,7 @@ MAX_BYTES = 8 * 1024 * 1024
 MAX_MANIFEST = 1024 * 1024
 MAX_MATRICES = 64 * 1024 * 1024  # unpacked
 SEAL = "SHA256"
-LOCATOR = "locator.npz"
+LOCATOR, RESPONSE = "locator.npz", "response.npz"
 NETWORKS = {"full": "network.onnx", "fast": "network_fast.onnx", "int8": "network_int8.onnx"}
 CLASSES = ("circle", "triangle", "rectangle", "square", "L")
 
@@ -103,6 +106,22 @@ class Bundle:
             raise BundleError(f"network variant {variant!r} does not exist; choose one of {', '.join(NETWORKS)}")
         return self.path / NETWORKS[variant] if NETWORKS[variant] in self.manifest["files"] else None
 
+    @property
+    def has_response(self) -> bool:
+        """Whether it ships what a fit of touches needs."""
+        return RESPONSE in self.manifest["files"]
+
+    def response(self) -> ResponseTables:
+        """Read when asked for: who only reconstructs does without. Raises BundleError, also where there are none."""
+        if not self.has_response:
+            raise BundleError(
+                f"{self.path} has no {RESPONSE}: add it with `python -m models.build --skin {self.name} --response`"
+            )
+        try:
+            return tables_of(read_npz(self.path / RESPONSE, MAX_MATRICES), self.matrices.contact.shape[1])
+        except (FileError, Wrong) as why:
+            raise BundleError(f"{self.path}: {why}: build the bundle again") from None
+
     @staticmethod
     def load(name_or_path: str | os.PathLike[str]) -> Bundle:
         """Loads a shipped bundle by name, else one by path, and checks each file's hash. Raises BundleError.
@@ -154,6 +173,7 @@ def write(
     matrices: Matrices,
     networks: Mapping[str, bytes] | None = None,
     locator: LocatorArrays | None = None,
+    response: ResponseTables | None = None,
 ) -> Bundle:
     """Writes a bundle folder and loads it back. networks: variant -> ONNX bytes. `files` and `schema` are filled in
     here.
@@ -175,6 +195,10 @@ def write(
         own: dict[str, Any] = {f.name: np.asarray(getattr(locator, f.name)) for f in fields(LocatorArrays)}
         np.savez_compressed(path / LOCATOR, **own)
         names.append(LOCATOR)
+    (path / RESPONSE).unlink(missing_ok=True)
+    if response is not None:
+        np.savez_compressed(path / RESPONSE, **arrays_of_tables(response))
+        names.append(RESPONSE)
     size = sum((path / name).stat().st_size for name in names)
     if size > MAX_BYTES:
         raise BundleError(
@@ -183,6 +207,16 @@ def write(
     return replace_manifest(
         path, {"schema": SCHEMA, **manifest, "files": {name: sha256(path / name) for name in names}}
     )
+
+
+def add_response(bundle: Bundle, response: ResponseTables) -> Bundle:
+    """The bundle there is, with these tables."""
+    packed = arrays_of_tables(response)
+    np.savez_compressed(bundle.path / RESPONSE, **packed)
+    files = {**bundle.manifest["files"], RESPONSE: sha256(bundle.path / RESPONSE)}
+    added = replace_manifest(bundle.path, {**bundle.manifest, "files": files})
+    added.response()
+    return added
 
 
 def replace_manifest(path: Path, full: Mapping[str, Any]) -> Bundle:
@@ -230,7 +264,7 @@ def _manifest(path: Path, text: bytes) -> dict[str, Any]:
         raise BundleError(f"{place} is no bundle manifest ({str(error)[:80]}): build the bundle again") from None
     if schema != SCHEMA:
         raise BundleError(f"{path}: manifest schema {schema}, this program reads {SCHEMA}: build the bundle again")
-    known = ("matrices.npz", LOCATOR, *NETWORKS.values())
+    known = ("matrices.npz", LOCATOR, RESPONSE, *NETWORKS.values())
     for file, digest in files.items():
         if file not in known or not (isinstance(digest, str) and re.fullmatch("[0-9a-f]{64}", digest)):
             raise BundleError(

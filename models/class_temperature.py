@@ -15,14 +15,14 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from models.calibrate import CONDITIONS, SolvedPresses, scans
+from models.calibrate import SolvedPresses, scans
 from models.evaluation import Predict
 from models.network import MMCNN
 from models.prereconstruction import Array, PreReconstructor
 
 TEMPERATURES = np.geomspace(0.4, 3.0, 27)
 BINS = 10  # of the probability, for the expected calibration error
-SEED = 14
+SEED, CONDITIONS = 14, 16  # of noise: 2400 sightings give the calibration error to about 0.01
 
 
 @dataclass(frozen=True, eq=False)

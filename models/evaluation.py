@@ -9,7 +9,7 @@ import onnxruntime
 import torch
 
 from models import samples
-from models.augmentation import condition
+from models.augmentation import OwnSkin, condition
 from models.network import MMCNN
 from models.prereconstruction import Array, Drift, PreReconstructor
 
@@ -39,6 +39,7 @@ def evaluate(
     decibel: float,
     limit: int = 256,
     exact: bool = False,
+    own: OwnSkin | None = None,
 ) -> dict[str, float]:
     """Mean figures on at most `limit` single touches, no drift; a touch is what exceeds half its peak.
 
@@ -47,7 +48,7 @@ def evaluate(
     single = np.flatnonzero(~(held_out.shapes[:, 1, 0] > 0))[:limit]
     rng = np.random.default_rng(0)
     sigma = np.full(pre.measurements, 10 ** (-decibel / 20))
-    batch = samples.make(held_out, single, None, condition(pre, rng, sigma, Drift(), exact=exact), rng)
+    batch = samples.make(held_out, single, None, condition(pre, rng, sigma, Drift(), exact=exact, own=own), rng)
     stack, context = batch.stack.numpy(), batch.context.numpy()
     parts = [network(stack[k : k + 64], context[k : k + 64]) for k in range(0, len(single), 64)]
     drop, log_sigma, classes = (np.concatenate([p[i] for p in parts]) for i in range(3))

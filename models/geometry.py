@@ -6,6 +6,7 @@ TOML with `unit = "mm"` (or m, cm, inch) in its place gives its lengths in that 
 
 from __future__ import annotations
 
+import json
 import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from models.outline import Array, GeometryError, Outline
 __all__ = ["GeometryError", "Outline", "SkinGeometry", "from_dict", "load", "shipped"]
 
 SKINS = Path(__file__).parent / "skins"
+MANIFEST = "manifest.json"  # of a bundle's folder, which holds its skin too
 ON_OUTLINE = 1e-6  # how far from the outline an electrode's centre may be given, model units
 DRAWN_ON_OUTLINE = 0.02  # the same where lengths were drawn or measured: 0.6 mm of a disc of 60 mm
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
@@ -140,11 +142,16 @@ def shipped() -> list[str]:
 
 
 def load(name: str | Path) -> SkinGeometry:
-    """A shipped skin by name ("square16", "disc16") or any TOML file by path. Raises GeometryError, PatternError."""
+    """A shipped skin by name ("square16", "disc16"), any TOML file by path, or that of a bundle's folder. Raises
+    GeometryError, PatternError.
+    """
     path = Path(name) if str(name).endswith(".toml") else SKINS / f"{name}.toml"
+    if is_folder(name):
+        return _of_bundle(Path(name, MANIFEST))
     if not path.is_file():
         raise GeometryError(
-            f"no skin {str(name)!r}: expected one of {', '.join(shipped())}, or the path of a .toml file"
+            f"no skin {str(name)!r}: expected one of {', '.join(shipped())}, the path of a .toml file, or the folder "
+            "that `skin register` made"
         )
     try:
         data = tomllib.loads(path.read_text())
@@ -154,6 +161,20 @@ def load(name: str | Path) -> SkinGeometry:
     said = f"unit = {data['unit']!r}" if "unit" in data else "metres_per_unit, half its longer side in metres"
     check_size(skin, f"correct {said} in {path}")
     return skin
+
+
+def is_folder(name: str | Path) -> bool:
+    """Whether a skin is named by the folder of its bundle. A name without a / is a skin's first, whatever lies here."""
+    named = "/" not in str(name) and (SKINS / f"{name}.toml").is_file()
+    return not named and not str(name).endswith(".toml") and Path(name, MANIFEST).is_file()
+
+
+def _of_bundle(path: Path) -> SkinGeometry:
+    try:
+        said = dict(json.loads(path.read_text(encoding="utf-8"))["skin"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as why:
+        raise GeometryError(f"{path} says nothing of a skin ({str(why)[:80]}): register or build it again") from None
+    return from_dict(said)
 
 
 def check_size(skin: SkinGeometry, do: str) -> None:

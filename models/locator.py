@@ -140,9 +140,7 @@ class Locator:
         if self._press is not None:
             said, unsure = self._press(features)
             value, value_sigma = max(float(said[0]), 0.0), float(unsure[0]) * touches
-        factor, floor = (float(v) for v in self.a.spread)
-        doubt = max(1.0, seen.misfit / float(self.a.misfit))  # it explains less than it does a press: less is known
-        whole = doubt * (factor * seen.covariance + floor * np.eye(2))
+        whole = uncertain(seen.covariance, self.a.spread, doubt(seen, float(self.a.misfit)))
         return Located(float(place[0]), float(place[1]), whole, seen.amplitude, value, value_sigma)
 
     def seen(self, now: WhitenedMap, z: Array) -> Likely | None:
@@ -193,6 +191,20 @@ class Locator:
                 break
             chosen, explained = more, whole
         return chosen
+
+
+def doubt(seen: Likely, usual: float) -> float:
+    """How many times more a press leaves unexplained than others do, 1 at least; stronger ones may leave more."""
+    return max(1.0, seen.misfit / (usual * max(1.0, seen.amplitude**2)))
+
+
+def uncertain(covariance: Array, spread: Array, doubts: npt.ArrayLike) -> Array:
+    """(..., 2, 2) m^2 of posteriors' covariances and doubts (...). A press that the map does not explain is likely to
+    be where it knows little, between presses or beyond them.
+    """
+    factor, floor, gap = (float(v) for v in spread)
+    times = np.asarray(doubts, float)[..., None, None]
+    return np.asarray(times * (factor * covariance + floor * np.eye(2)) + (times - 1.0) * gap * np.eye(2))
 
 
 def posterior(now: WhitenedMap, z: Array) -> Array | None:

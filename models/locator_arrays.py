@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -47,7 +47,7 @@ class LocatorArrays:
     noise: Array  # (K,) standard deviation of the noise that is in `error`
     measured: npt.NDArray[np.bool_]  # (K,) measurements that the presses had
     misfit: Array  # () mean square whitened residual of a press that the map was not made of
-    spread: Array  # (2,) factor and floor [m^2]: covariance = factor * posterior's + floor
+    spread: Array  # (3,) factor, floor [m^2], gap [m^2]: see locator.uncertain
     more: Array  # (2,) share of the residual that a second, a third touch must explain to count
     rotation: Array  # (K, F) of whitened unit differences into features
     middle: Array  # (K,) their mean
@@ -89,6 +89,8 @@ def arrays_of(data: Mapping[str, npt.NDArray[Any]], measurements: int) -> Locato
     if missing:
         raise ValueError(f"lacks {', '.join(missing)}")
     a = LocatorArrays(**{name: data[name] for name in names})
+    if a.spread.shape == (2,):  # registered before there was a gap
+        a = replace(a, spread=np.append(a.spread, 0.0))
     sides = a.shape.tolist() if a.shape.shape == (2,) and a.shape.dtype.kind in "iu" else [0, 0]
     if min(sides) < 1 or sides[0] * sides[1] > MOST_PLACES:
         raise ValueError(f"shape: found {a.shape}, expected two sides of a grid of at most {MOST_PLACES} places")
@@ -96,7 +98,7 @@ def arrays_of(data: Mapping[str, npt.NDArray[Any]], measurements: int) -> Locato
         raise ValueError(f"allowed: found {a.allowed.dtype} {a.allowed.shape}, expected booleans, some of them true")
     k, p, f = measurements, int(a.allowed.sum()), a.rotation.shape[-1] if a.rotation.ndim == 2 else 0
     shapes: dict[str, tuple[int, ...]] = {"corner": (2,), "spacing": (), "map": (p, k), "error": (k, k), "noise": (k,)}
-    shapes |= {"measured": (k,), "misfit": (), "spread": (2,), "more": (2,), "reach": (3,)}
+    shapes |= {"measured": (k,), "misfit": (), "spread": (3,), "more": (2,), "reach": (3,)}
     shapes |= {"loudness": (), "quantity": ()}
     live = int(a.measured.sum()) if a.measured.dtype.kind == "b" else -1
     shapes |= {"rotation": (live, f), "middle": (live,)}
@@ -109,7 +111,7 @@ def arrays_of(data: Mapping[str, npt.NDArray[Any]], measurements: int) -> Locato
         array = getattr(a, name)
         if array.shape != shape or array.dtype.kind not in "biuf" or not np.isfinite(array).all():
             raise ValueError(f"{name}: found {array.dtype} {array.shape}, expected finite numbers {shape}")
-    positive = (a.spacing, a.misfit, a.place_length, a.press_length, np.diag(a.error), a.spread)
+    positive = (a.spacing, a.misfit, a.place_length, a.press_length, np.diag(a.error), a.spread[:2])
     if live < FEWEST_LIVE or not all((np.asarray(v) > 0).all() for v in positive) or int(a.quantity) not in (0, 1, 2):
         raise ValueError("numbers out of range")
     return a

@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from models.bundle import Bundle
 from models.geometry import SkinGeometry
 from models.linearise import NOSER_POWER
 from models.prereconstruction import ONE_STEP_LAMBDA, THRESHOLD_T, Matrices
@@ -42,6 +43,13 @@ def describe(name: str, skin: SkinGeometry, matrices: Matrices, **more: Any) -> 
         "network": None,
         **more,
     }
+
+
+def of_registered(registered: Bundle, **more: Any) -> dict[str, Any]:
+    """That of a registered bundle with the networks that were trained for it; `more` is added as given."""
+    kept = {key: value for key, value in registered.manifest.items() if key not in ("files", "schema")}
+    built = {"utc": datetime.now(UTC).isoformat(timespec="seconds"), "commit": commit(), "versions": versions()}
+    return {**kept, "trained": {**built, "from": registered.hash}, **more}
 
 
 def commit() -> str:

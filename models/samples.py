@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from models import data, geometry
-from models.augmentation import Condition, Pixel, Symmetry, random_condition, symmetries
+from models.augmentation import Condition, OwnSkin, Pixel, Symmetry, random_condition, symmetries
 from models.device_batches import ConditionTensors, SceneTensors, measured, stacks
 from models.losses import IGNORE, Target
 from models.prereconstruction import Array, PreReconstructor
@@ -102,16 +102,18 @@ class Batches:
         groups: int = 4,
         bank: int = 96,
         device: torch.device | str = "cpu",
+        own: OwnSkin | None = None,
     ) -> None:
         self.samples, self.pre, self.size, self.groups, self.limit = samples, pre, size, groups, bank
         self.rng, self.device = np.random.default_rng(seed), torch.device(device)
         self._noise = torch.Generator(self.device).manual_seed(seed)
-        self.symmetries = symmetries(skin)
+        self.own = own
+        self.symmetries = symmetries(skin) if own is None else symmetries(skin)[:1]
         self._weigh()
         self.bank = [self._fresh() for _ in range(groups)]
 
     def _fresh(self) -> ConditionTensors:
-        return ConditionTensors(random_condition(self.pre, self.rng), self.device)
+        return ConditionTensors(random_condition(self.pre, self.rng, self.own), self.device)
 
     def add(self, more: Samples) -> None:
         """Takes further scenes in."""

@@ -8,7 +8,7 @@ with N the sheet's Neumann function, electrodes included (the Lippmann-Schwinger
 an impedance by int delta E0_sense . E_drive. A touch is cut into `cells` x `cells` squares over its own extent, each
 with one field (the Galerkin method), so a small touch is resolved as well as a large one. Gamma is the infinite
 sheet's, known in closed form for squares, plus what the outline and the electrodes add: that is smooth, so a bundle
-ships it on a coarse grid (`ResponseTables`, made by models/response_tables.py).
+ships it on a coarse grid (`ResponseTables`, made by models/response_tables.py; response_file.py is their file).
 
 Lengths are model units, drops S on a sheet of 1 S.
 """
@@ -90,10 +90,15 @@ class TouchResponse:
     """
 
     def __init__(self, tables: ResponseTables, pattern: npt.NDArray[np.integer], z0: Array, cells: int = CELLS) -> None:
+        self._pattern = pattern
         electrodes = tables.fields.shape[2]
         self.tables, self.cells, self.z0 = tables, cells, np.asarray(z0, dtype=float)
         self._drive, self._sense = (incidence(pattern[:, k : k + 2].astype(np.int64), electrodes).T for k in (0, 2))
         self._free = _infinite_sheet(cells)
+
+    def of_rows(self, rows: npt.NDArray[np.bool_]) -> TouchResponse:
+        """The same of these measurements alone."""
+        return TouchResponse(self.tables, self._pattern[rows], self.z0[rows], self.cells)
 
     def grid(self, x: float, y: float, radius: float) -> TouchGrid:
         """Cells for touches of about this place and circumscribed radius."""

@@ -6,7 +6,8 @@
 The budget sets the schedule: the learning rate rises over the first percent and falls to zero at the last minute,
 whatever the machine's speed. What is kept is the running average of the weights; the best on held-out scenes is kept
 aside, and training stops early where the average has not become better for a quarter of the budget; not before half
-of it, because a resumed run with a longer budget takes its learning rate up again.
+of it, because a resumed run with a longer budget takes its learning rate up again, and never where it started from a
+trained network.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from models import data, geometry, manifest, samples
+from models.augmentation import OwnSkin
 from models.bundle import Bundle
 from models.evaluation import LEVELS, evaluate, predict
 from models.losses import losses, total
@@ -37,6 +39,7 @@ MUON_RATE, ADAM_RATE = 0.02, 2e-3
 AVERAGE = 0.999
 CPU_BATCH, GPU_BATCH = (64, 4), (1024, 16)  # scenes of a batch, and noise conditions among them
 FINE = 0.04  # of the learning rates, where training starts from a trained network: more, and it is lost first
+OTHER_SKIN = 0.3  # the same for a registered skin, which the network has not seen: there is much to learn
 
 
 class Trainer:
@@ -148,7 +151,8 @@ class Trainer:
         row: dict[str, Any] = {"minutes": self.elapsed / 60, "steps": self.steps, **terms}
         with self.pace.of("held-out"):
             for level, decibel in LEVELS.items():
-                figures = evaluate(predict(self.average), self.held_out, self.batches.pre, decibel)
+                own = self.batches.own
+                figures = evaluate(predict(self.average), self.held_out, self.batches.pre, decibel, own=own)
                 row |= {f"{k}, {level}": v for k, v in figures.items()}
         row["scenes"] = len(self.batches.samples)
         self.curve.append(row)
@@ -161,7 +165,8 @@ class Trainer:
             self.best_score, self.best_at = score, self.elapsed
             self.best = copy.deepcopy(self.average.state_dict())
             return False
-        return self.elapsed - max(self.best_at, 0.5 * budget) > 0.25 * budget
+        # A trained network gets worse before it gets better: while the rate falls, nothing can be said.
+        return not self.start and self.elapsed - max(self.best_at, 0.5 * budget) > 0.25 * budget
 
     def result(self) -> MMCNN:
         """The averaged network that was best on held-out scenes, on the CPU, for inference."""
@@ -190,8 +195,8 @@ class Trainer:
         torch.save(state, part)
         part.replace(path)
 
-    def start_from(self, bundle: Bundle, variant: str) -> None:
-        """The network of a bundle as the start, with lower learning rates. Raises NoSuchNetwork."""
+    def start_from(self, bundle: Bundle, variant: str, share: float = FINE) -> None:
+        """The network of a bundle as the start, with a share of the learning rates. Raises NoSuchNetwork."""
         path = bundle.network_path(variant)
         if path is None:
             raise NoSuchNetwork(f"the bundle {bundle.name} has no network {variant!r} to start from")
@@ -200,7 +205,7 @@ class Trainer:
         normalised(model, [(b.stack, b.context) for b in batches])
         for mine in (self.model, self.average):
             mine.load_state_dict(model.state_dict())
-        self.rates = [FINE * rate for rate in self.rates]
+        self.rates = [share * rate for rate in self.rates]
         self.start = {"from": {"bundle": bundle.hash, "network": bundle.manifest["files"][path.name]}}
 
     def resume(self, path: Path) -> None:
@@ -227,19 +232,20 @@ def train(
     resume: bool = False,
     folder: Path | None = None,
     start: Bundle | None = None,
+    own: OwnSkin | None = None,
 ) -> Trainer:
     """Trains a variant of CONFIGS; leaves the checkpoint and its curves (PNG) behind. folder: see Trainer.run.
-    start: a bundle whose network is the start, instead of random weights.
+    start: a bundle whose network is the start, instead of random weights. own: what was measured of this very skin.
     """
     torch.set_num_threads(threads)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     size, groups = GPU_BATCH if device.type == "cuda" else CPU_BATCH
-    batches = samples.Batches(scenes, pre, skin, seed, size, groups, device=device)
+    batches = samples.Batches(scenes, pre, skin, seed, size, groups, device=device, own=own)
     trainer = Trainer(CONFIGS[variant], batches, held_out, seed)
     if resume:
         trainer.resume(checkpoint)
     elif start is not None:
-        trainer.start_from(start, variant)
+        trainer.start_from(start, variant, FINE if own is None else OTHER_SKIN)
     weights = sum(p.numel() for p in trainer.model.parameters()) / 1e6
     print(f"{variant}: {weights:.2f} M parameters, {len(scenes)} scenes, {trainer.device}", flush=True)
     before = trainer.steps

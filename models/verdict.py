@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from models.augmentation import OwnSkin
 from models.evaluation import LEVELS, Predict, evaluate
 from models.fisher import floors
 from models.prereconstruction import Array, PreReconstructor
@@ -43,7 +44,7 @@ class TrainingVerdict:
         return {"grade": self.grade, "text": self.text, **{k: round(v, 4) for k, v in self.figures.items()}}
 
 
-def one_step(held_out: Samples, pre: PreReconstructor) -> float:
+def one_step(held_out: Samples, pre: PreReconstructor, own: OwnSkin | None = None) -> float:
     """Contact IoU of the best one-step image of the stack, without noise: what there is without a network."""
 
     def image(rung: int) -> Predict:
@@ -57,7 +58,7 @@ def one_step(held_out: Samples, pre: PreReconstructor) -> float:
 
     rungs = range(len(pre.m.ladder))
     level = LEVELS["noise-free"]
-    return max(evaluate(image(rung), held_out, pre, level, limit=128)["contact IoU"] for rung in rungs)
+    return max(evaluate(image(rung), held_out, pre, level, limit=128, own=own)["contact IoU"] for rung in rungs)
 
 
 def position_floor(skin: str, held_out: Samples, decibel: float = 70.0) -> float:
@@ -105,6 +106,28 @@ def judge(
     figures = {"contact_iou": iou, "one_step_contact_iou": single_step, "position_percent": place}
     figures |= {"position_floor_percent": floor, "expected_contact_iou": iou + gain, "batches": float(batches)}
     return TrainingVerdict(grade, text, figures)
+
+
+def judge_registered(
+    held_out: Mapping[str, Mapping[str, float]], batches: int, minutes: float, single_step: float
+) -> TrainingVerdict:
+    """Of a registered skin: what its presses leave unexplained is in the held-out scenes, and no floor is known."""
+    clean = held_out["noise-free"]
+    iou, place = clean["contact IoU"], clean["position % of side"]
+    gain = (1 - iou) * (1 - TIMES**-EXPONENT)
+    grade = "too little" if iou < single_step + BETTER else "usable"
+    first = {
+        "usable": "usable: it shows more than the image without a network",
+        "too little": "too little: the image without a network is about as good",
+    }[grade]
+    text = (
+        f"{first}. Held-out touches, simulated and warped to this skin, with what its presses leave unexplained: "
+        f"contact IoU {iou:.2f} (the one-step image: {single_step:.2f}), position off by {place:.2f} % of the side. "
+        f"It has seen {batches} batches in {minutes:.0f} minutes; more presses bring more than more time does. "
+        "Positions of contacts remain those of the presses' own likelihood."
+    )
+    figures = {"contact_iou": iou, "one_step_contact_iou": single_step, "position_percent": place}
+    return TrainingVerdict(grade, text, figures | {"expected_contact_iou": iou + gain, "batches": float(batches)})
 
 
 def _round(minutes: float) -> int:

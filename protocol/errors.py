@@ -31,6 +31,7 @@ class EitskinError(Exception):
         ├── CalibrationFileError              what a calibration found cannot be read, kept or used
         ├── OtherScenes (ValueError)          training scenes that must not be mixed with those of this run
         ├── NoSuchNetwork (ValueError)        a file without the network that training is to start from
+        ├── NotRegistered (ValueError)        a folder to train for holds a bundle of no registered skin
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── ConfigError                       services: skin.toml cannot be used

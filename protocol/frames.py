@@ -17,6 +17,7 @@ from .fields import FieldError, brief
 from .frame_types import (
     ELECTRODE_STATES,
     INFO_KEYS,
+    KINDS,
     NAME,
     REASONS,
     SCHEMA,
@@ -36,6 +37,7 @@ from .frame_types import (
     InfoFrame,
     LocatedTouch,
     RawFrame,
+    RefinedTouch,
     ShapeFrame,
     StatusFrame,
     TrueTouch,
@@ -45,11 +47,11 @@ from .records import Record
 from .topics import TOPIC_OF, TOPICS
 
 __all__ = [
-    "ELECTRODE_STATES", "INFO_KEYS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
+    "ELECTRODE_STATES", "INFO_KEYS", "KINDS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
     "Contact", "ContactFrame", "DeltaFrame", "ForceFrame", "Frame", "FrameError", "ImageFrame", "InfoFrame",
-    "LocatedTouch", "RawFrame", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map",
-    "unpack",
+    "LocatedTouch", "RawFrame", "RefinedTouch", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent",
+    "pack", "read_map", "unpack",
 ]  # fmt: skip
 
 MAX_MESSAGE = 4 * 1024 * 1024

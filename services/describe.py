@@ -13,6 +13,7 @@ from services.contacts.force import ForceLaw
 from services.estimation.tare import Baseline
 from services.runtime.config import Skin
 
+ON = "on"
 CORNERS = 64  # of the polygon that stands for a disc
 MOVED = 2e-4  # relative: as two frames of 80 dB differ; a baseline that drifted by more is told again
 EVERY_S = 5.0  # but that at most so often
@@ -62,6 +63,26 @@ def _stack(bundle: Bundle) -> dict[str, Any]:
     ladder = np.asarray(bundle.matrices.ladder, dtype=float)
     nearest = np.argmin(np.abs(np.log(ladder) - 2 * np.log(ONE_STEP_LAMBDA)))
     return {"lambda_squared": ladder.tolist(), "one_step": int(nearest)}
+
+
+def refinement(skin: Skin, bundle: Bundle, calibrated: bool = False) -> str:
+    """Whether touches of this skin are refined by a fit: "on", or why not. calibrated: to the skin as it is mounted."""
+    if skin.indenter is None:
+        return "off: skin.toml names no `indenter`"
+    if not skin.indenter.refine:
+        return "off: `refine = false`"
+    if bundle.matrices.normalisation != "model" or bundle.locator is not None:
+        return f"off: bundle {bundle.name} is measured, not modelled, so a touch's response is not known"
+    if not bundle.has_response:
+        return (
+            f"off: bundle {bundle.name} has no response tables: "
+            f"`python -m models.build --skin {bundle.name} --response` adds them"
+        )
+    if skin.network == "none" or bundle.network_path("full") is None:
+        return "off: a fit starts at a network's image, and there is no network"
+    if calibrated:
+        return "off: the skin is calibrated as it is mounted, the response tables are those of its file"
+    return ON
 
 
 class _Told(NamedTuple):

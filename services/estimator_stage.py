@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from models.bundle import Bundle
-from services.describe import BaselineNews, describe, force
+from services.describe import BaselineNews, describe, force, refinement
 from services.estimation import checks
 from services.estimation.drift import DriftRates
 from services.estimation.electrodes import ElectrodeHealth
@@ -183,6 +183,7 @@ class EstimatorStage(Stage):
             return None
         estimator = self.baseline_estimator
         said = describe(self.config, self.bundle, self._force, estimator.baseline, estimator.revision)
+        said["refinement"] = refinement(self.config, self.bundle, bool(self.linearisation.name))
         return said | {"mounting": self.linearisation.found} if self.linearisation.found else said
 
     def health(self) -> Health:

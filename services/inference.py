@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.locator import Located, Locator
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
+from services.describe import ON, refinement
 from services.estimation.part_image import PartImage
 from services.estimation.quality import SURE, Residual
 from services.estimation.sentinel import CoarseImage
@@ -23,7 +24,12 @@ from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
+from services.symmetry import SymmetryMean, symmetries
 
+if TYPE_CHECKING:
+    from services.refinement import RefineHere, Refinement, RefineProcess
+
+TELLS = 0.6  # share of held-out touches whose class a registered skin's network must get right for it to be stated
 SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
 
@@ -41,21 +47,32 @@ class Inference(Stage):
         self._network = network(str(path)) if path else OneStep(bundle)
         if isinstance(self._network, Network):
             self._network.check(bundle)
-        # Only a network's image is meant to explain a frame: a one-step image shows where, not how much.
-        self._refuses = isinstance(self._network, Network)
+        # Only a network's image is meant to explain a frame: a one-step image shows where, not how much. Nor is that of
+        # a registered skin: its presses leave too much open, and its locator says how well each touch is explained.
+        self._refuses = isinstance(self._network, Network) and bundle.locator is None
         self.linearisation = Linearisation(name, bundle)
         self._residual = Residual(bundle, to_scale=self._refuses)
+        self._tells_shapes = tells_shapes(bundle)
         self._changing_touch = ChangingTouch(bundle)  # the bundle's: how a skin is mounted changes 3 % of d by little
-        self.each_alone = False  # offline: frames that do not follow each other
+        self.each_alone = False  # offline: frames that do not follow each other; each waits for its fit
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
+        self._refinement = _refinement(name, skin, bundle)
+        self._symmetry: SymmetryMean | None = None
+        if skin.touch.symmetry and isinstance(self._network, Network) and (turns := symmetries(bundle.skin)):
+            self._symmetry = SymmetryMean(self._network, turns)
         self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
         self._parts = PartImage(bundle) if skin.scan == "rolling" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
 
     def reset(self) -> None:
+        if self._refinement is not None:
+            self._refinement.forget()
+        if self._symmetry is not None:
+            self._symmetry.forget()
+        self._surer: Pictures | None = None  # the mean over the symmetries of the image that is held
         self._last: ImageFrame | None = None  # of the touch that is being held
         self._refused = False  # whether it explains its frame too badly to be that of a touch
         self._last_scan = 0  # of the frame that it was reconstructed from
@@ -66,7 +83,17 @@ class Inference(Stage):
         self._stated = 0  # how many have stated it, one after the other
         self._changing = 0  # frames in a row whose touch changed during the scan
         self._changing_scan = 0  # of the last of them whose image shows nothing
-        names = ("networks_run", "held", "untouched", "unwanted", "missed", "refused", "changing", "uncalibrated")
+        names = (
+            "networks_run",
+            "held",
+            "untouched",
+            "unwanted",
+            "missed",
+            "refused",
+            "changing",
+            "uncalibrated",
+            "symmetric",
+        )
         self._counters = dict.fromkeys(names, 0)  # uncalibrated: frames whose calibration could not be found
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
@@ -92,8 +119,25 @@ class Inference(Stage):
         else:
             self._counters["untouched"] += 1
             self._last, self._changing, self._changing_scan = None, 0, 0
+            if self._symmetry is not None:
+                self._symmetry.forget()
             self._rest(frame.sigma)
+        if self._refinement is not None:
+            self._refine(frame, out)
         return [out]
+
+    def fit_by(self, fits: RefineProcess | RefineHere) -> None:
+        """Who fits touches, where any are: offline, in tests and to measure."""
+        if self._refinement is not None:
+            self._refinement.fit_by(fits)
+
+    def _refine(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        assert self._refinement is not None
+        if self.linearisation.name:  # the tables are those of the bundle as it is
+            return self._refinement.forget()
+        if self.each_alone:
+            self._refinement.fit_here()
+        out.refined = self._refinement(frame, out)
 
     def _follow(self, calibration: str) -> bool:
         """Use the matrices that frames are made with from now on; False where they cannot be found."""
@@ -133,13 +177,22 @@ class Inference(Stage):
         elif np.isfinite(sigma).any():
             self._quiet, self._stated = sigma, 1
 
+    def warm_up(self) -> None:
+        if self._refinement is not None:
+            self._refinement.warm_up()
+
     def prepare(self) -> bool:
         """Make the matrices that a touch would need now; not while the noise changes from frame to frame."""
+        if self._symmetry is not None and self._symmetry.busy:
+            self._surer = self._symmetry.step()
+            return True
         return self._quiet is not None and self._stated >= SETTLED and self._residual.prepare(self._quiet)
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
         ahead, self._ahead = self._ahead, None
         out.image, out.sigma, out.classes = ahead[1] if ahead and ahead[0] is frame else self._network.run(frame)
+        if not self._tells_shapes:
+            out.classes = ImageFrame(skin=self.skin).classes
         out.noise = _rms(frame.sigma)
         out.residual = self._residual(frame.difference, frame.sigma, out.image)
         if self._locator is not None and frame.touched:
@@ -158,6 +211,8 @@ class Inference(Stage):
                 add_reason(out.reasons, "changing")
         self._judge(out)
         self._shows(frame, out)
+        if self._symmetry is not None and frame.touched and not self._refused:
+            self._symmetry.begin(frame, (out.image, out.sigma, out.classes))
 
     def _changes(self, frame: DeltaFrame, out: ImageFrame) -> bool:
         """Whether a touch that changed during the scan explains a frame that its image does not. Then the frame is
@@ -207,7 +262,7 @@ class Inference(Stage):
 
     def _shows(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """`out` has the image of `frame`, which later ones may hold."""
-        self._last, self._unseen = out, None
+        self._last, self._unseen, self._surer = out, None, None
         self._last_scan = out.reconstructed = frame.scan
         self._again = False
 
@@ -223,7 +278,9 @@ class Inference(Stage):
         subscribers.
         """
         last = self._last
-        if last is not None and self._last_scan == frame.reconstructed:
+        if last is not None and self._last_scan == frame.reconstructed and self._surer is not None and last.image.size:
+            self._shows_surer(frame, last, out)
+        elif last is not None and self._last_scan == frame.reconstructed:
             out.noise, out.residual = last.noise, last.residual
             self._shows_again(last, out)
             self._judge(out)
@@ -235,6 +292,16 @@ class Inference(Stage):
             out.valid = False
             out.reasons.append("gap")
             self._counters["missed"] += 1
+
+    def _shows_surer(self, frame: DeltaFrame, last: ImageFrame, out: ImageFrame) -> None:
+        """A better image of the scan that is held takes its place: it is a new one to readers."""
+        assert self._surer is not None
+        out.image, out.sigma, out.classes = self._surer
+        out.noise, out.touches, out.reconstructed = last.noise, last.touches, self._last_scan
+        out.residual = last.residual
+        self._last, self._surer, self._again = out, None, False
+        self._counters["symmetric"] += 1
+        self._judge(out)
 
     def _shows_again(self, last: ImageFrame, out: ImageFrame) -> None:
         out.held, out.reconstructed = True, self._last_scan
@@ -271,7 +338,28 @@ class Inference(Stage):
     def health(self) -> Health:
         if isinstance(self._network, OneStep):
             return Health("OK", [f"bundle {self.bundle.name} has no network: one-step images"], dict(self._counters))
-        return Health("OK", [], dict(self._counters))
+        if self._refinement is None:
+            return Health("OK", [], dict(self._counters))
+        problem = self._refinement.problem
+        return Health(
+            "WARN" if problem else "OK", [problem] if problem else [], self._counters | self._refinement.counters
+        )
+
+
+def _refinement(name: str, skin: Skin, bundle: Bundle) -> Refinement | None:
+    if refinement(skin, bundle) != ON:
+        return None
+    from services.refinement import Refinement  # who refines nothing need not load what fits
+
+    return Refinement(name, skin, bundle)
+
+
+def tells_shapes(bundle: Bundle) -> bool:
+    """Whether shape classes are worth stating: what a registered skin's presses leave open may hide them."""
+    if bundle.locator is None:
+        return True
+    full = (bundle.manifest.get("network") or {}).get("full") or {}
+    return float(full.get("held_out", {}).get("noise-free", {}).get("class", 0.0)) >= TELLS
 
 
 def _touch(found: Located, quantity: str) -> LocatedTouch:

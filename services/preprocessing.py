@@ -82,7 +82,7 @@ class Preprocessing(EstimatorStage):
         reference = (
             Reference(known.z0, self.baseline_estimator.normaliser, self.baseline_estimator.sigma) if known else None
         )
-        found = self.electrodes(amplitude, frame.status, reference)
+        found = self.electrodes(amplitude, frame.status, reference, out.stamps.get("sample", 0) * 1e-9)
         out.electrodes = found.states
         for reason in found.reasons:
             add_reason(out.reasons, reason)

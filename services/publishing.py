@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -9,13 +10,24 @@ from typing import Any
 import numpy as np
 
 from models.bundle import Bundle
-from protocol.frames import SHAPES, Contact, ContactFrame, ForceFrame, Frame, ImageFrame, LocatedTouch, ShapeFrame
+from protocol.frames import (
+    SHAPES,
+    Contact,
+    ContactFrame,
+    ForceFrame,
+    Frame,
+    ImageFrame,
+    LocatedTouch,
+    RefinedTouch,
+    ShapeFrame,
+)
 from protocol.held import ANY, HeldImage
 from services.contacts.contact_writer import ContactWriter, class_probabilities, confidence
 from services.contacts.force import ForceLaw
 from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
 from services.contacts.placing import placement
+from services.contacts.refined import refined_outline
 from services.contacts.registered import measures_force, patches
 from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.tracking import Tracker
@@ -54,7 +66,7 @@ class Publishing(Stage):
         self.tracker.reset()
         self.held = HeldImage()
         self._forget()
-        self._counters = {"frames": 0, "contacts": 0, "unknown": 0}
+        self._counters = {"frames": 0, "contacts": 0, "unknown": 0, "refined": 0, "disagreed": 0}
 
     def new_session(self) -> None:
         self.tracker = Tracker()
@@ -95,7 +107,8 @@ class Publishing(Stage):
             self._miss(out, "non_finite")
         else:
             self._see(frame)
-        out.contacts = list(self._contacts)
+        fitted = self._fitted(frame.refined if out.valid else None)
+        out.contacts = list(self._contacts) if fitted is None else [fitted[0], *self._contacts[1:]]
         if any((c.force_n or 0.0) > self.law.most_n for c in out.contacts):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
@@ -116,7 +129,7 @@ class Publishing(Stage):
         if "force" in wanted:
             frames.append(self._force(out))
         if "shape" in wanted:
-            frames.append(self._shape(out))
+            frames.append(self._shape(out, None if fitted is None else fitted[1]))
         return frames
 
     def _see(self, frame: ImageFrame) -> None:
@@ -153,6 +166,14 @@ class Publishing(Stage):
         self._seen_in = frame.session, frame.reconstructed
         self._contacts = [contact for contact, _, _ in present] + self._writer.ended(ended)
         self._counters["contacts"] += sum(track is not None and track.age == 1 for track in tracks)
+
+    def _fitted(self, touch: RefinedTouch | None) -> tuple[Contact, RefinedTouch] | None:
+        """The contact as a fit has it, where there is one contact, and image and fit agree on it."""
+        if touch is None or len(self._segments) != 1:
+            return None
+        contact = self._writer.fitted(self._contacts[0], touch)
+        self._counters["disagreed" if contact is None else "refined"] += 1
+        return None if contact is None else (contact, touch)
 
     def _alone(self, frame: ImageFrame) -> bool:
         """Whether this frame follows no other."""
@@ -193,20 +214,31 @@ class Publishing(Stage):
 
     def _force(self, frame: ContactFrame) -> ForceFrame:
         """The total force; valid if the contacts are."""
-        present = [c for c in self._contacts if c.state != "end"]
+        present = [c for c in frame.contacts if c.state != "end"]
         total = None if not self._tells_force else sum(c.force_n or 0.0 for c in present)
         wrench = np.sum([c.wrench for c in present], axis=0).tolist() if present else [0.0] * 6
-        return ForceFrame(**inherited(frame), wrench=wrench, force_n=total)
+        sigmas = [c.force_sigma_n for c in present]
+        known = [sigma for sigma in sigmas if sigma is not None]
+        return ForceFrame(
+            **inherited(frame),
+            wrench=wrench,
+            force_n=total,
+            force_sigma_n=math.hypot(*known) if known and len(known) == len(sigmas) else None,
+            refined=any(c.refined for c in present),
+        )
 
-    def _shape(self, frame: ContactFrame) -> ShapeFrame:
+    def _shape(self, frame: ContactFrame, fitted: RefinedTouch | None) -> ShapeFrame:
         metres, origin = self._geometry
-        present = [c for c in self._contacts if c.state != "end"]
+        present = [c for c in frame.contacts if c.state != "end"]
+        outlines = [outline(s.mask, metres, origin) for s in self._segments]
+        probabilities = [p or [0.0] * len(SHAPES) for p in self._classes]
         return ShapeFrame(
             **inherited(frame),
             ids=[c.id for c in present],
-            outlines=[outline(s.mask, metres, origin) for s in self._segments],
-            orientation=[s.orientation for s in self._segments],
-            probabilities=[p or [0.0] * len(SHAPES) for p in self._classes],
+            outlines=outlines if fitted is None else [refined_outline(fitted)],
+            orientation=[c.orientation for c in present],
+            probabilities=probabilities if fitted is None else [fitted.probabilities],
+            refined=fitted is not None,
         )
 
     def state(self) -> dict[str, Any]:

@@ -42,6 +42,9 @@ SERVICES_USE_OF_MODELS = {
     "models.prereconstruction",
     "models.patterns",
     "models.rolling",
+    "models.refine",
+    "models.shapes",
+    "models.touch_fit",
     "models.sentinel",
     "models.uncertainty",
 }

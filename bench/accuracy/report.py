@@ -52,7 +52,6 @@ TARGETS = (
 )
 CLASSICAL = ("NOSER", "total variation", "Gauss-Newton", "GREIT", "pyEIT")
 OF_CLASSICAL = 0.75  # the short form's gate: mean IoU missed, of what the best classical method misses
-MARKERS = "osD^vP"  # of methods that are not ours, in turn
 RMS = {
     "position_%": "position_rms_%",
     "force_%": "force_rms_%",

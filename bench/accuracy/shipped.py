@@ -11,7 +11,7 @@ from bench.accuracy import frames as _frames
 from bench.accuracy.frames import Frames
 from bench.accuracy.methods import session
 from bench.accuracy.report import progress
-from bench.accuracy.scores import Row, gap_of, summarise
+from bench.accuracy.scores import Row, gap_of, standard_error, summarise
 from models import fisher, metrics
 from models.bundle import Bundle
 from models.shapes import CLASSES, Array
@@ -103,8 +103,12 @@ def contacts(found: dict[str, Array], frames: Frames) -> Row:
     matrix = metrics.confusion(
         [t for t, s in named if s in CLASSES], [CLASSES.index(s) for _, s in named if s in CLASSES]
     )
+    right = np.array([s in CLASSES and CLASSES.index(s) == t for t, s in named], dtype=float)
     apart = frames.of("apart")
     return {
+        "position_%_se": standard_error(distance),
+        "force_%_se": standard_error(errors),
+        "shape_%_se": 100 * standard_error(right),
         "missed": missed,
         "position_%": float(distance.mean()),
         "position_rms_%": float(np.sqrt((distance**2).mean())),

@@ -57,7 +57,7 @@ GATES: dict[str, float] = {
     "electrode open reported": 90,
     "electrode dead valid": 95,
     "electrode dead reported": 90,
-    "electrode drifting valid": 92,
+    "electrode drifting valid": 95,
     "electrode drifting reported": 90,
     "soak phantoms": 0,
     "soak off": 0,

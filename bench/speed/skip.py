@@ -35,9 +35,11 @@ from bench.speed.skip_averaging import SNR_DB, averaging
 from bench.speed.skip_batching import TOGETHER, batch_table, batched
 from bench.tracking.scene import Recorded, record
 from models.bundle import Bundle
+from models.refine import RefineJob
 from protocol.frames import ContactFrame, Frame, RawFrame, pack, unpack
 from services.pipeline import build_stages
-from services.runtime.config import Skin, TouchConfig
+from services.refinement import RefineHere
+from services.runtime.config import Indenter, Skin, TouchConfig
 from services.runtime.stage import PROCESSES, Stage
 
 QUIET_S = 5.0  # of each scene, before it begins: the tare
@@ -56,9 +58,26 @@ class Variant:
 
     touch: TouchConfig = TouchConfig()
     wanted: frozenset[str] = PLAIN
+    indenter: Indenter | None = None
 
     def skin(self) -> Skin:
-        return Skin(port="stub", bundle="square16", frame_id="palm", touch=self.touch)
+        return Skin(port="stub", bundle="square16", frame_id="palm", touch=self.touch, indenter=self.indenter)
+
+
+class FitsBetween(RefineHere):
+    """Fits while no frame waits, as the process that refines touches does beside inference."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._job: RefineJob | None = None
+
+    def offer(self, job: RefineJob) -> None:
+        self._job = job
+
+    def between(self) -> None:
+        if self._job is not None:
+            job, self._job = self._job, None
+            super().offer(job)
 
 
 VARIANTS = {
@@ -67,6 +86,8 @@ VARIANTS = {
     "no hold": Variant(TouchConfig(hold=False)),
     "force and shape subscribed": Variant(wanted=EVERYTHING),
     "no rule": Variant(TouchConfig(skip_untouched=False, hold=False), EVERYTHING),
+    "held images averaged over symmetries": Variant(TouchConfig(symmetry=True)),
+    "touches refined, indenter a circle": Variant(indenter=Indenter(kind="circle")),
 }
 
 
@@ -103,12 +124,15 @@ def _toml(points: list[dict[str, Any]], end: float) -> str:
 
 def run(recorded: Recorded, variant: Variant, bundle: Bundle) -> tuple[list[ContactFrame], float]:
     """(contact frames, CPU seconds per frame after the quiet time) of a scene through the stages and their wire."""
-    stages = build_stages("palm", variant.skin(), bundle)
+    stages, fits = build_stages("palm", variant.skin(), bundle), FitsBetween()
+    if variant.indenter is not None:
+        stages[1].fit_by(fits)
     contacts, used, counted = [], 0.0, 0
     for k in range(len(recorded)):
         contact, seconds = run_once(stages, recorded.frame(k), variant.wanted)
         if recorded.seconds[k] > QUIET_S:
             used, counted = used + seconds, counted + 1
+        fits.between()
         contacts.append(contact)
     return contacts, used / counted
 
@@ -224,6 +248,12 @@ def goals(
         alone = ours[scene]["cpu_ms"] / ours["moving"]["cpu_ms"]
         found.append(Goal(f"{scene}: CPU of a moving touch's, four processes", live_ratio, at_most=most))
         found.append(Goal(f"{scene}: CPU of a moving touch's, stages alone", alone, at_most=most, gate=GATES[scene]))
+    refined = variants["touches refined, indenter a circle"]
+    for scene in ("still", "moving"):
+        ratio = refined[scene]["cpu_ms"] / ours[scene]["cpu_ms"]
+        found.append(Goal(f"{scene}: CPU of a frame's stages, refined, of without", ratio, at_most=1.1, gate=1.6))
+        closer = refined[scene]["force_%"] / ours[scene]["force_%"]
+        found.append(Goal(f"{scene}: force error, refined, of without", closer, at_most=1.0))
     for scene in ("still", "moving"):
         for what in ("seen", "released"):
             late, plain = (of[scene][f"{what}_after_frames"] for of in (ours, without))

@@ -35,6 +35,8 @@ TELLS = 0.8  # of the spread: depths or forces that are not told better than tha
 MOST_FOR_SECOND = 100  # presses from which the thresholds of further touches are found
 SINGLE = 0.99  # share of single presses that are to count as one touch
 MARGIN = 1.3  # on that threshold
+GAP = 0.15  # variance by which a press that is not explained is off, of the skin's area for each press
+POSE_FREEDOM = 2.5  # presses' worth of places that the pose was fitted to: five numbers of two coordinates each
 
 
 @dataclass(frozen=True)
@@ -95,12 +97,14 @@ def build(presses: Presses, similarity: Similarity, bundle: Bundle) -> tuple[Loc
     left = machine.left if kept else left
     covariance = np.array([s.covariance for s in seen])
     factor, floor, inside = ellipses(left, covariance)
+    factor, floor = (each * len(left) / (len(left) - POSE_FREEDOM) for each in (factor, floor))
+    gap = GAP * np.pi * reach**2 / len(presses)
     found = replace(
         plain,
         rotation=rotation,
         middle=form.mean(axis=0),
         reach=np.array([per_metre, *middle]),
-        spread=np.array([factor, floor]),
+        spread=np.array([factor, floor, gap]),
         **(named("place", machine, near, spread) if kept else {}),
     )
     error = None
@@ -140,7 +144,7 @@ def _plain(presses: Presses, whole: ResponseFit, similarity: Similarity, bundle:
         noise=np.where(presses.measured, presses.noise, 0.0),
         measured=presses.measured,
         misfit=np.array(1.0),
-        spread=np.array([1.0, 1e-12]),
+        spread=np.array([1.0, 1e-12, 0.0]),
         more=np.array([np.finfo(float).max, np.finfo(float).max]),
         rotation=np.zeros((k, 0)),
         middle=np.zeros(k),
@@ -225,23 +229,29 @@ def ellipses(left: Array, covariance: Array) -> tuple[float, float, float]:
     """factor and floor [m^2] of the covariances factor * (N, 2, 2) + floor that hold 90 % of these distances (N, 2) in
     their 90 % ellipses, and the share that they hold.
 
-    The floor beside the factor is that of the greatest likelihood; both are then scaled to the 90 %.
+    The floor beside the factor is that of the greatest likelihood; both are then scaled to the 90 %, of few presses to
+    more: those still to come scatter more than those that this was found from.
     """
-    level = float((left**2).mean())
+    n, level = len(left), float((left**2).mean())
     typical = float(np.trace(covariance.mean(axis=0)) / 2)
+    held = min(1.0, 0.9 * (n + 1) / n)
     best: tuple[float, float, float] | None = None
     for part in (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0):
         shape = covariance + (part * typical + 1e-6 * level) * np.eye(2)
-        square = np.einsum("ni,nij,nj->n", left, np.linalg.inv(shape), left)
-        scale = float(np.quantile(square, 0.9)) / NINETY
+        square = _squares(left, shape)
+        scale = float(np.quantile(square, held, method="inverted_cdf")) / NINETY
         cost = float((np.log(np.linalg.det(scale * shape)) + square / scale).mean())
         if best is None or cost < best[0]:
             best = cost, scale, scale * (part * typical + 1e-6 * level)
     assert best is not None
     _, factor, floor = best
-    whole = factor * covariance + floor * np.eye(2)
-    square = np.einsum("ni,nij,nj->n", left, np.linalg.inv(whole), left)
-    return factor, floor, float((square <= NINETY).mean())
+    square = _squares(left, factor * covariance + floor * np.eye(2))
+    return factor, floor, float((square <= NINETY * (1 + 1e-9)).mean())
+
+
+def _squares(left: Array, covariance: Array) -> Array:
+    """(N,) of distances (N, 2), in standard deviations."""
+    return np.asarray(np.einsum("ni,nij,nj->n", left, np.linalg.inv(covariance), left))
 
 
 def _tells(

@@ -25,7 +25,7 @@ ConfigOption = Annotated[
     Path | None, typer.Option("--config", help="Configuration; default: the running service's, else skin.toml.")
 ]
 RuntimeOption = Annotated[
-    Path | None, typer.Option("--runtime", help="Runtime folder of the service; default: as README says.")
+    Path | None, typer.Option("--runtime", help="Runtime folder of the service; default: as docs/clients.md says.")
 ]
 SkinOption = Annotated[str, typer.Option("--skin", help="Which skin; default: the first of skin.toml.", metavar="NAME")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]

@@ -23,7 +23,7 @@ from services.cli.doctor_live import Finding
 from services.cli.doctor_mounting import mounting_found
 from services.contacts.force import ForceLaw
 from services.contacts.placing import placement
-from services.describe import geometry
+from services.describe import ON, geometry, refinement
 from services.estimation import checks
 from services.estimation.tare import implausibility
 from services.runtime.config import RECORDINGS, ConfigError, ConfigFile, Skin, config_path, load
@@ -84,6 +84,8 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
     )
     yield Finding("OK", f"{name}: bundle", f"{bundle.name}, every sha256 right ({bundle.hash[:12]}), {network}")
     yield Finding("OK", f"{name}: checks", checks.sentence(bundle) or "all of them, on every frame")
+    if skin.indenter is not None and not running:
+        yield refined(name, refinement(skin, bundle))
     if skin.calibration is not None:
         yield _calibration(name, skin, bundle)
     if skin.surface is not None:
@@ -103,6 +105,8 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
         yield from live.processes(name)
         info = live.info(name)
         yield from live.compared(name, skin, bundle, info)
+        if skin.indenter is not None and isinstance(info.get("refinement"), str):
+            yield refined(name, info["refinement"])
         said = info.get("mounting")
         if isinstance(said, dict):
             yield mounting_found(name, said, info)
@@ -110,6 +114,16 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
             yield electrode_order(name, live.baseline(info), bundle)
     else:
         yield Finding("SKIP", f"{name}: electrodes", "their order is looked at while the service runs: `skin up`")
+
+
+def refined(name: str, said: str) -> Finding:
+    """said: as info/<skin> has it; skin.toml names an indenter."""
+    good = "touches are refined by a fit of their shape"
+    return (
+        Finding("OK", f"{name}: indenter", good)
+        if said == ON
+        else Finding("WARN", f"{name}: indenter", f"refinement {said}")
+    )
 
 
 def _wrapped(name: str, skin: Skin, bundle: Bundle) -> Finding:

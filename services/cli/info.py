@@ -104,7 +104,7 @@ def _told(found: SessionSummary, rows: int) -> list[str]:
         bad = f"  {topic.malformed} malformed" if topic.malformed else ""
         lines.append(f"{name:<18}{topic.messages:>9}{rate:>12}{topic.missing:>9}{topic.bytes / 1e6:>8.2f}{bad}")
     for skin, course in found.courses.items():
-        force, valid, most = strip(course, found.duration_s, COLUMNS)
+        force, valid, most = strip(course, found.duration_s, min(COLUMNS, max(8, len(course.times_s) // 3)))
         lines += ["", f"{skin}: force, at most {most:.1f} N, over {found.duration_s:.1f} s; below it ✕ where not valid"]
         lines += [f"  {force}", f"  {valid}"]
     contacts, gaps = found.contacts, _gaps(found)

@@ -7,9 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.frames import SHAPES, Contact, ImageFrame, LocatedTouch
+from protocol.frames import SHAPES, Contact, ImageFrame, LocatedTouch, RefinedTouch
 from services.contacts.force import ForceLaw, Look
 from services.contacts.motion import Patch, Track
+from services.contacts.refined import agrees, refined
 from services.contacts.registered import registered
 from services.contacts.segmentation import Segment
 from services.contacts.surface import Placed, Placement
@@ -52,6 +53,14 @@ class ContactWriter:
             sheet=None if self.place.flat else [seen.x, seen.y],
             **({} if touch is None else registered(touch)),
         )
+
+    def fitted(self, contact: Contact, touch: RefinedTouch) -> Contact | None:
+        """The contact as a fit has it; None where image and fit do not mean the same touch."""
+        force = self.law.of_fit(touch)
+        if not agrees(contact, touch, force):
+            return None
+        at = self.place(*touch.position)
+        return refined(contact, touch, at, force, _wrench(at, force.newton or 0.0), flat=self.place.flat)
 
     def ended(self, tracks: list[Track]) -> list[Contact]:
         """The last contacts of touches that ended: their last places, without force."""

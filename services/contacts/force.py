@@ -20,7 +20,7 @@ import numpy as np
 from models import uncertainty
 from models.bundle import NETWORKS, Bundle
 from models.uncertainty import Map
-from protocol.frames import ImageFrame
+from protocol.frames import ImageFrame, RefinedTouch
 from services.contacts import calibration_file as calibration
 from services.contacts.calibration_file import Of
 from services.contacts.force_curve import Curve
@@ -158,6 +158,16 @@ class ForceLaw:
             relative = look.peak_sigma / look.peak
         return value * factor * (unit**2 if self.reads == "integral" else 1.0), relative
 
+    def of_fit(self, touch: RefinedTouch) -> Force:
+        """Force and standard uncertainty of a touch that was fitted to the measurements."""
+        peak = self.reads == "peak"
+        value, sigma = (touch.drop, touch.drop_sigma) if peak else (touch.integral, touch.integral_sigma)
+        if self.curve is None or not value > 0:
+            return NOTHING
+        newton = self.curve(value, *touch.position)
+        spread = math.hypot(self.curve.exponent * sigma / value, self.own_error)
+        return Force(newton, newton * spread) if math.isfinite(newton) else NOTHING
+
     def force(self, look: Look) -> Force:
         """Force and standard uncertainty of one touch."""
         if self.curve is None or not look.peak > 0:
@@ -173,7 +183,8 @@ class ForceLaw:
 def _surroundings(skin: Skin, bundle: Bundle) -> dict[str, Any]:
     """What every law needs to know of the skin."""
     unit = bundle.metres_per_unit
-    area = None if skin.indenter is None else math.pi * (skin.indenter.radius_m / unit) ** 2
+    radius = None if skin.indenter is None else skin.indenter.radius_m
+    area = None if radius is None else math.pi * (radius / unit) ** 2
     variant = skin.network if bundle.network_path("full" if skin.network == "none" else skin.network) else "full"
     try:
         maps = {} if variant == "none" else uncertainty.maps(bundle.manifest, variant, NETWORKS[variant])

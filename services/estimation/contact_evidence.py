@@ -8,8 +8,9 @@ close to an electrode by about what a contact does: of 120 touches within 6 mm o
 contact had changed too (by 5 nats and more; up to 271). So the evidence names nothing by itself. It is asked of an
 electrode that ContactDrift suspects, or that is named already. Of 900 touches right on an electrode (radius 2.5 to 20
 mm, drop 0.03 to 0.85 S/m) ContactDrift suspects 21, all of them light, and the evidence speaks for a changed contact by
-76 nats at most; contacts that rose 1.2 times or more, untouched, have 130 and more. A contact that is well has fewer
-than 0.
+76 nats at most; of 700 within 6 mm it suspects 10, and one of them (radius 3 mm, drop 0.23 S/m, on the electrode's
+middle) has 208. A contact that rose 1.3 times, untouched, has 90 to 110; one that is well has fewer than 0, and its
+likeliest rise is next to nothing. What drifts is named sooner by its pace (steady_change.py).
 """
 
 from __future__ import annotations
@@ -26,18 +27,21 @@ from services.estimation.tuning import TUNING, Tuning
 
 Array = NDArray[np.float64]
 
+WELL_WITHIN = 0.05  # relative: a contact that is farther off its old impedance is not well, however likely drift is
+
 
 class ContactOpinion(NamedTuple):
     odds: float  # nats by which a changed contact is likelier than none
     elsewhere: bool  # whether touches, if any, are far enough from the electrode for `odds` to name it
     felt: Array  # (K,) d that the change makes at pairs of other electrodes
+    rise: float  # of the contact impedance, relative: the likeliest, if it changed
 
     def changed(self, tuning: Tuning = TUNING) -> bool:
         return self.elsewhere and self.odds > tuning.contact_nats
 
     @property
     def well(self) -> bool:
-        return self.odds < 0
+        return self.odds < 0 and abs(self.rise) < WELL_WITHIN
 
 
 class ContactEvidence:
@@ -65,9 +69,11 @@ class ContactEvidence:
         changed = self._evidence(d, error, np.column_stack([columns, own]), prior, live)
         alone = changed.untouched >= changed.touched
         apart = [float(np.linalg.norm(t.position - self._centre[electrode])) for t in changed.touches]
-        felt = np.where(self._members[:, electrode], 0.0, self._rest[:, electrode] * changed.drift[-1])
+        common = changed.drift[1 + electrode]
+        felt = np.where(self._members[:, electrode], 0.0, self._rest[:, electrode] * (common + changed.drift[-1]))
         return ContactOpinion(
             max(changed.touched, changed.untouched) - max(well.touched, well.untouched),
             alone or min(apart, default=np.inf) > self.tuning.contact_apart,
             felt,
+            float(common + changed.drift[-2]),
         )

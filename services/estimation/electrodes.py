@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from services.estimation.advice import ADVICE, DRIFTING, OK, OPEN, REASONS, SHORT, SWAPPED, UNKNOWN, listed
-from services.estimation.contact_drift import ChangedContacts, Reference
+from services.estimation.changed_contacts import ChangedContacts
+from services.estimation.contact_drift import Reference
 from services.estimation.contact_evidence import ContactEvidence, ContactOpinion
+from services.estimation.coverage import Coverage
 from services.estimation.frame_check import MOSTLY, FrameCheck, FrameFindings
 from services.estimation.gain_steps import GainStep
 from services.estimation.saved import shaped
@@ -27,11 +29,11 @@ Mask = NDArray[np.bool_]
 
 QUIET = 5.0  # standard deviations within which a measurement is what it was
 TOO_MANY = 2  # electrodes at fault with which contacts can still be given
-LOST_MOST = 0.1  # share of measurements that a frame may lack beside those of electrodes at fault: with 15 of 120 lost
-# in a row, a touch that they would have seen has two thirds of its force
 WELL_FRAMES = 3  # in a row, after which an electrode counts again
 SUSPECTED = 3  # frames in a row after which a change that may be a touch on the electrode is the contact's
 WELL = 0.0015  # relative: how near its baseline a measurement of a well electrode is, and within 6 sigma more
+WELL_AGAIN = 0.0005  # the same, where the contact drifted: it passes by its old value on its way
+STILL_S = 10.0  # for which a contact that drifted must have been well
 ASK_EVERY = 4  # frames from one question about a contact under a touch to the next: each takes 20 ms
 
 
@@ -59,6 +61,7 @@ class ElectrodeHealth:
         self._contacts = ChangedContacts(bundle, self.member)
         self._bundle = bundle
         self._evidence: ContactEvidence | None = None  # made when it is first asked
+        self._coverage: Coverage | None = None
         k, n = len(bundle.pattern), self.electrodes
         self._all_well = Verdict(np.ones(k, bool), np.zeros(k, bool), np.zeros(n, "u1"), [], True, None, np.zeros(k))
         for array in (v for v in vars(self._all_well).values() if isinstance(v, np.ndarray)):
@@ -71,14 +74,16 @@ class ElectrodeHealth:
         self._unsure = np.zeros(self.electrodes, dtype=bool)  # drifting, unless somebody presses right on it
         self._suspected = np.zeros(self.electrodes, dtype=np.int64)  # frames in a row
         self._asked = np.zeros(self.electrodes, dtype=np.int64)  # frames until the evidence is asked again
+        self._off_s = np.full(self.electrodes, np.nan)  # when a contact that drifts was last seen off; NaN: none does
         self._shown = self._states
         self._fault = ""  # of the board as a whole
+        self._now_s = 0.0
         self._contacts.reset()
 
     def tared(self) -> None:
         """Takes note of a new baseline: what changed against the old one is forgotten."""
         self._states[(self._states == DRIFTING) | (self._states == UNKNOWN)] = OK
-        self._unsure[:], self._suspected[:] = False, 0
+        self._unsure[:], self._suspected[:], self._off_s[:] = False, 0, np.nan
         self._contacts.keep(())
 
     def rescale(self, step: GainStep) -> None:
@@ -87,10 +92,13 @@ class ElectrodeHealth:
         if step.lasted:
             self._contacts.forget_past()
 
-    def __call__(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
-        """Judges a frame: (K,) |Z| and status bits."""
+    def __call__(
+        self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None, now_s: float = 0.0
+    ) -> Verdict:
+        """Judges a frame: (K,) |Z| and status bits. now_s: when it was measured; 0 where nobody says."""
+        self._now_s = now_s
         found = self._judge(amplitude, status, untouched)
-        self._contacts.follow(amplitude if found.order is None else amplitude[found.order])
+        self._contacts.follow(amplitude if found.order is None else amplitude[found.order], now_s)
         return found
 
     def _judge(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
@@ -119,13 +127,21 @@ class ElectrodeHealth:
         doubtful = bool(self._unsure.any() or self._suspected.any())
         if doubtful and "electrode_drift" not in reasons:
             reasons.append("electrode_drift")
-        enough = live.sum() >= len(live) / 2 and (seen.failed & ~at_fault & known).sum() <= LOST_MOST * len(live)
-        usable = bad <= TOO_MANY and not doubtful and bool(enough)
+        enough = bool(live.sum() >= len(live) / 2) and self._sees_enough(seen, live, ~at_fault & known, untouched)
+        usable = bad <= TOO_MANY and not doubtful and enough
         if bad == TOO_MANY:
             reasons.append("degraded")
         if not usable and not reasons and not reasons_of(status):
             reasons.append("out_of_distribution")
         return Verdict(live, seen.failed | wrong, states, reasons, usable, seen.order, self._shift(seen, untouched))
+
+    def _sees_enough(self, seen: FrameFindings, live: Mask, all_of: Mask, untouched: Reference | None) -> bool:
+        """Returns whether measurements that only this frame lacks leave enough of the skin in sight."""
+        if untouched is None or live.sum() == all_of.sum():
+            return True
+        self._coverage = self._coverage or Coverage(self._bundle)
+        d = np.where(live, seen.amplitude - untouched.z0, 0.0) / untouched.normaliser
+        return self._coverage.enough(d, live, all_of)
 
     def _unchanged(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference) -> bool:
         """Returns whether a frame without a mark differs from the untouched skin by its noise alone, and nothing was at
@@ -176,17 +192,29 @@ class ElectrodeHealth:
         """Returns (K,) which measurements are between electrodes that count."""
         return ~seen.failed & np.isfinite(untouched.sigma) & ~self.member[~counts].any(axis=0)
 
+    def _live_with(self, k: int, seen: FrameFindings, untouched: Reference) -> Mask:
+        """Returns (K,) which measurements are between electrode k and those that are well."""
+        return self._live(seen, untouched, (self._states == OK) | (np.arange(self.electrodes) == k))
+
     def _remember(self, seen: FrameFindings, untouched: Reference | None) -> None:
         """Takes faults over at once, recovery after WELL_FRAMES."""
         faulty = seen.states != OK
         self._states[faulty] = seen.states[faulty]
         self._well[faulty] = 0
+        self._off_s[faulty & np.isfinite(self._off_s)] = self._now_s
         self._unsure &= (self._states == DRIFTING) & ~faulty
         again = np.arange(self.electrodes) == seen.suspect
         self._suspected = np.where(again, self._suspected + 1, 0)
         lasts = (self._suspected >= SUSPECTED) & (self._states == OK)
         self._states[lasts], self._unsure[lasts], self._asked[lasts] = DRIFTING, True, 0
         self._suspected[(self._states != OK) & ~self._unsure] = 0
+        for k in np.flatnonzero(self._unsure | (self._suspected > 0)):
+            if untouched is None:
+                break
+            live = self._live_with(int(k), seen, untouched)
+            if self._contacts.drifts(int(k), seen.amplitude, self._now_s, untouched, live):
+                self._states[k], self._unsure[k], self._suspected[k], self._well[k] = DRIFTING, False, 0, 0
+                self._off_s[k] = self._now_s
         for k in np.flatnonzero((self._states != OK) & ~faulty):
             self._look_again(int(k), seen, untouched)
 
@@ -201,18 +229,20 @@ class ElectrodeHealth:
         elif (opinion := self._ask(k, seen, untouched)) is not None:
             self._asked[k] = ASK_EVERY - 1
             self._well[k] = self._well[k] + 1 if opinion.well else 0
-            if opinion.changed() and self._states[k] == DRIFTING:
+            drifts = bool(np.isfinite(self._off_s[k]))
+            if drifts and not opinion.well:
+                self._off_s[k] = self._now_s
+            if self._states[k] == DRIFTING and (opinion.changed() or (drifts and opinion.elsewhere)):
                 self._unsure[k], self._suspected[k] = False, 0
                 self._contacts.felt[k] = opinion.felt
-        if self._well[k] >= WELL_FRAMES:
-            self._states[k], self._unsure[k] = OK, False
+        moves = 0 <= self._now_s - self._off_s[k] < STILL_S  # False for NaN
+        if self._well[k] >= WELL_FRAMES and not moves:
+            self._states[k], self._unsure[k], self._off_s[k] = OK, False, np.nan
             self._contacts.forget(k)
 
     def _ask(self, k: int, seen: FrameFindings, untouched: Reference) -> ContactOpinion | None:
         """Asks whether the contact of electrode k is changed, whatever touches; None where nothing tells."""
-        counts = self._states == OK
-        counts[k] = True
-        live = self._live(seen, untouched, counts)
+        live = self._live_with(k, seen, untouched)
         if not self._contacts.knows or live.sum() < len(live) / 2 or not live[self.member[k]].any():
             return None
         self._evidence = self._evidence or ContactEvidence(self._bundle)
@@ -236,7 +266,8 @@ class ElectrodeHealth:
         if not rows.any():
             return True
         off = np.abs(amplitude[rows] - since[rows]) / untouched.normaliser[rows]
-        return bool((off <= WELL + 6 * untouched.sigma[rows]).mean() >= MOSTLY)
+        near = WELL_AGAIN if np.isfinite(self._off_s[k]) else WELL
+        return bool((off <= near + 6 * untouched.sigma[rows]).mean() >= MOSTLY)
 
     def _shift(self, seen: FrameFindings, untouched: Reference | None) -> Array:
         """Returns (K,) what the drifting electrodes do to the pairs of the others."""
@@ -246,6 +277,8 @@ class ElectrodeHealth:
             return np.zeros(len(seen.amplitude))
 
         def like(k: int, past: Array) -> bool:
+            if np.isfinite(self._off_s[k]):  # a contact that drifts was not well a few frames ago either
+                return True
             tells = bool((self.member[k] & ~seen.failed).any())
             return tells and self._like(k, seen.amplitude, past, seen.failed, untouched)
 
@@ -261,6 +294,7 @@ class ElectrodeHealth:
             "unsure": self._unsure.astype(np.uint8),
             "suspected": self._suspected.copy(),
             "asked": self._asked.copy(),
+            "off_s": self._off_s.copy(),
             **self._contacts.state(),
         }
 
@@ -275,4 +309,5 @@ class ElectrodeHealth:
             self._unsure = shaped(state["unsure"], states.shape) > 0
             self._suspected = shaped(state["suspected"], states.shape).astype(np.int64)
             self._asked = shaped(state.get("asked", self._asked), states.shape).astype(np.int64)
+            self._off_s = shaped(state.get("off_s", self._off_s), states.shape, finite=False)
         self._contacts.load(state)

@@ -114,7 +114,9 @@ class Recorder:
     def _take(self, frame: Frame, message: bytes) -> None:
         name, _, data = message.partition(b"\0")
         found = RecordedMessage(name.decode(), self.now_ns(), data)
-        self.heard[found.topic.partition("/")[0], frame.skin] += 1
+        counted = found.topic.partition("/")[0], frame.skin
+        if counted in self.heard or len(self.heard) < MOST_LATCHED:
+            self.heard[counted] += 1
         key = ""
         if isinstance(frame, (StatusFrame, InfoFrame)):
             key = f"{found.topic}/{frame.process}"

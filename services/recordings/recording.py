@@ -148,7 +148,8 @@ class Damage:
     too_large: int = 0
 
     def __str__(self) -> str:
-        parts = [f"cut short: the last {self.lost_bytes} bytes are not a whole chunk"] if self.truncated else []
+        last = f"the last {self.lost_bytes} bytes are not a whole chunk" if self.lost_bytes else "after a whole chunk"
+        parts = [f"cut short: {last}"] if self.truncated else []
         parts += [f"{self.bad_chunks} chunk(s) with a wrong checksum left out"] if self.bad_chunks else []
         parts += [f"{self.too_large} record(s) of more than {MAX_RECORD} bytes left out"] if self.too_large else []
         return "; ".join(parts) or "whole"

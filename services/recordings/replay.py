@@ -257,6 +257,8 @@ class Replayer:
                     messages=problems,
                     source="replay",
                     valid=True,
+                    valid_for_s=3.0,
+                    stamps={"publish": time.monotonic_ns()},
                     counters=counts,
                 )
             )

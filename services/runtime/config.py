@@ -86,13 +86,36 @@ class TouchConfig(Section):
     false_alarms: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
     hold: Switch = True  # switch of the rule "nothing changed: do not reconstruct again"
     skip_untouched: Switch = True  # switch of the rule "nothing touches: do not reconstruct"
+    symmetry: Switch = False  # a held touch's image becomes the mean over the skin's symmetries: services/symmetry.py
 
 
 class Indenter(Section):
-    """What presses this skin, where that is always the same: its area fixes the drop (contacts/force.py)."""
+    """What presses this skin, one touch at a time: touches are refined by a fit of that shape (services/refinement.py).
 
-    radius_m: Annotated[float, Field(gt=0, le=1)]
-    shape: Literal["circle"] = "circle"
+    kind: "circle", a flat round face; "hertz", a ball or a fingertip, whose pressure falls off to its edge; "any",
+    found for each touch. A known radius fixes a circle's drop (contacts/force.py).
+    """
+
+    kind: Literal["circle", "hertz", "any"] = "circle"
+    radius_m: Annotated[float, Field(gt=0, le=1)] | None = None
+    refine: Switch = True  # switch of the fit
+
+    @model_validator(mode="before")
+    @classmethod
+    def older(cls, given: Any) -> Any:
+        """Recordings from before there were kinds say `shape`."""
+        if isinstance(given, dict) and given.get("shape") == "circle" and "kind" not in given:
+            return {key: value for key, value in given.items() if key != "shape"}
+        return given
+
+    @model_validator(mode="after")
+    def a_radius_of_a_circle(self) -> Indenter:
+        if self.radius_m is not None and self.kind != "circle":
+            raise ValueError(
+                f'`radius_m` with kind = "circle" alone: how large a touch of kind {self.kind!r} is depends on how '
+                f"hard it presses (found {self.radius_m!r})"
+            )
+        return self
 
 
 NetworkFile = Literal["full", "fast", "int8", "none"]

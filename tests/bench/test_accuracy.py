@@ -13,6 +13,7 @@ from bench.accuracy import frames as _frames
 from bench.accuracy import peers as _peers
 from bench.accuracy import report as _report
 from bench.accuracy import scores as _scores
+from bench.accuracy import shipped as _shipped
 from bench.accuracy.frames import Frames  # noqa: E402
 from bench.accuracy.methods import Method, Tare  # noqa: E402
 from models import metrics, patterns  # noqa: E402
@@ -93,6 +94,24 @@ def test_figures_have_their_standard_errors():
     assert 0 < row["mean_iou_se"] < row["mean_iou"]
     assert _report.text(row, "mean_iou", "{:.2f}") == f"{row['mean_iou']:.2f} +-{row['mean_iou_se']:.2f}"
     assert _report.text({"mean_iou": 0.5, "mean_iou_se": float("nan")}, "mean_iou", "{:.2f}") == "0.50"
+
+
+def test_a_contacts_own_standard_errors_replace_those_of_the_image():
+    frames = frames_of(
+        [("shapes", [Shape("circle", 0, 0, 0.3, 0.2)])] * 3 + [("force", [Shape("circle", 0, 0, 0.2, 0.2)])] * 2
+    )
+    five = np.arange(5)
+    found = {
+        "count": np.ones(5, int),
+        "position": np.column_stack([0.001 * five, 0 * five])[:, None],  # m; 0, 1, 2 ... % of the side of 0.1 m
+        "force": np.array([[2.0], [2.0], [2.0], [2.2], [1.4]]),
+        "force_sigma": np.ones((5, 1)),
+        "shape": np.array([["circle"], ["circle"], ["L"], ["circle"], ["circle"]]),
+    }
+    row = _shipped.contacts(found, frames)
+    assert row["position_%"] == pytest.approx(2) and row["position_%_se"] == pytest.approx(np.sqrt(2.5 / 5))
+    assert row["force_%"] == pytest.approx(20) and row["force_%_se"] == pytest.approx(10)
+    assert row["shape_%"] == pytest.approx(200 / 3) and row["shape_%_se"] == pytest.approx(100 / 3)
 
 
 def test_the_full_form_has_five_hundred_touches_of_the_five_shapes():

@@ -25,7 +25,7 @@ SECONDS = 11.0
 PRESS_S, SLIDE_S, TWO_S, UNPLUG_S, LIFT_S = 0.3, 1.5, 3.7, 5.7, 7.2  # what happens when in the film
 LEAST_S = 0.045  # pictures that come sooner after one are left out
 TRIES, TAKES = 40, 12
-WIDE, NARROW, FILM = (1360, 1060), (390, 844), (1320, 620)
+WIDE, NARROW, FILM = (1360, 1130), (390, 844), (1320, 620)
 PLACE = "([x, y]) => { const p = new DOMPoint(x, -y).matrixTransform(overlay.getScreenCTM()); return [p.x, p.y]; }"
 
 
@@ -51,6 +51,8 @@ def opened(browser: Any, address: str, size: tuple[int, int], **options: Any) ->
     page.goto(address)
     page.wait_for_selector("#overlay .outline", state="attached")
     page.wait_for_selector("body[data-trust=yes]")
+    # Nothing fades: a surface that is drawn by software is not there meanwhile, and a picture is of one moment.
+    page.evaluate("document.styleSheets[0].insertRule('* { transition: none !important; }')")
     page.wait_for_timeout(1500)
     return page
 
@@ -97,8 +99,6 @@ def take(page: Any) -> tuple[int, Painted]:
 
     session.on("Page.screencastFrame", keep)
     session.send("Page.startScreencast", {"format": "jpeg", "quality": 92})
-    # While a surface that is drawn by software fades it is not there at all.
-    page.evaluate("document.styleSheets[0].insertRule('* { transition: none !important; }')")
     began, unplugged = time.monotonic(), False
     while (now := time.monotonic() - began) < SECONDS:
         hand.at(*story(now))

@@ -198,6 +198,48 @@ def test_commands_need_the_token_and_presses_the_stub(runtime: Path) -> None:
     publisher.close()
 
 
+def test_the_services_recorder_is_told(runtime: Path, tmp_path: Path) -> None:
+    asked: list[dict[str, Any]] = []
+
+    async def test() -> None:
+        answers = {"status": lambda args: {}, "snapshot": lambda args: asked.append(args) or {"file": "a.mcap"}}
+        recorder = ControlServer("recorder", answers)  # type: ignore[arg-type]
+        async with serving(settings(recordings=str(tmp_path))) as server, looking(server) as browser:
+            ended = asyncio.Event()
+
+            async def serve() -> None:
+                while not ended.is_set():
+                    recorder.serve_once()
+                    await asyncio.sleep(0.01)
+
+            answering = asyncio.create_task(serve())
+            assert "token" in (await browser.command("snapshot", token=""))["error"] and not asked
+            answer = await browser.command("snapshot", after_s=1)
+            assert answer["ok"] and answer["result"] == {"file": "a.mcap"} and asked == [{"after_s": 1}]
+            assert "no argument folder" in (await browser.command("record", folder="/etc"))["error"]
+            ended.set()
+            await answering
+        recorder.close()
+
+    run(test)
+
+
+def test_where_no_recorder_runs_the_page_has_one_while_it_runs(runtime: Path, tmp_path: Path) -> None:
+    async def test() -> None:
+        async with serving(settings(recordings=str(tmp_path))) as server, looking(server) as browser:
+            answer = await browser.command("record", on=True)
+            assert answer["ok"] and answer["result"]["recording"], answer
+            file = Path(answer["result"]["file"])
+            assert file.parent == tmp_path and file.exists()
+            assert server.buttons.recording is not None
+            process = server.buttons.recording._process
+            assert process is not None and process.poll() is None
+            assert (await browser.command("record", on=False))["result"]["file"] == str(file)
+        assert process.poll() == 0
+
+    run(test)
+
+
 def test_nothing_is_subscribed_to_while_nobody_looks(runtime: Path) -> None:
     publisher = Publisher("publisher")
 
@@ -360,3 +402,4 @@ def test_what_the_page_of_the_page_configures_is_understood() -> None:
     (block,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "page.md").read_text(), re.DOTALL)
     found = parse(tomllib.loads(block) | {"skins": {"palm": {"port": "stub", "bundle": "square16"}}})
     assert found.bridges == ("page",) and found.page.host == "0.0.0.0" and found.page.names == ("robot.lan",)
+    assert found.page.metrics

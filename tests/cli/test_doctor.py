@@ -31,6 +31,17 @@ def test_what_the_bundle_cannot_tell_is_said(skin, tmp_path) -> None:  # type: i
     assert "not checked with the bundle disc16: shorts" in " ".join(skin("doctor", "--config", file).out.split())
 
 
+def test_why_touches_are_not_refined_is_said(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    for bundle, says in (
+        ("square16", "touches are refined by a fit"),
+        ("disc16", "refinement off: bundle disc16 is measured"),
+    ):
+        file = tmp_path / f"{bundle}.toml"
+        file.write_text(f'[skins.palm]\nport = "stub"\nbundle = "{bundle}"\nindenter = {{ kind = "any" }}\n')
+        assert says in " ".join(skin("doctor", "--config", file).out.split())
+    assert "refine" not in skin("doctor").out
+
+
 def test_electrodes_in_order(bundle: Bundle) -> None:
     noise = 1 + 1e-4 * np.random.default_rng(0).standard_normal(120)
     assert electrode_order("palm", 3.0 * bundle.z0 * noise, bundle).level == "OK"

@@ -50,7 +50,7 @@ def folder() -> Iterator[Path]:
                 end, taring = time.monotonic() + 120, time.monotonic() + 15
                 while (frame := reader.recv(0.5)) is None or not frame.valid:
                     assert time.monotonic() < end and process.poll() is None, (folder / "log.txt").read_text()
-                    # A bundle that cannot tell a touch at the start wants one tare, as README says.
+                    # A bundle that cannot tell a touch at the start wants one tare: docs/operations.md.
                     if frame is not None and "stale_baseline" in frame.reasons and time.monotonic() > taring:
                         skin(folder, "tare", "--skin", name, check=False)
                         taring = time.monotonic() + 5

@@ -144,6 +144,13 @@ COMMANDS = (
         instead="./skin record {folder}/all.mcap --overwrite --seconds 1 --topics raw,contact,image,shape,status,info",
     ),
     # recordings, files
+    Row(r"\.venv/bin/python node.py", "ends", instead=".venv/bin/python -c 'import msgpack, zmq'"),  # see PROGRAMS
+    Row(
+        r"(\./)?skin info( touch.mcap)?",
+        "ends",
+        says="contact/palm +[0-9]+",
+        instead="./skin record {folder}/info.mcap --seconds 1 --overwrite && ./skin info {folder}/info.mcap",
+    ),
     Row(
         r"\./skin record touch.mcap --seconds 10",
         "ends",
@@ -156,6 +163,33 @@ COMMANDS = (
         says="contact frames",
         instead="./skin replay {folder}/touch.mcap --private --fast",
     ),
+    Row(
+        "(./)?skin record touch.mcap --file-mb .*",
+        "ends",
+        says="contact/palm [0-9]+",
+        instead="./skin record {folder}/long.mcap --overwrite --seconds 1 --file-mb 500 --file-minutes 60 --keep 24",
+    ),
+    Row(
+        "(./)?skin record kept --trigger .*",
+        "ends",
+        says="[0-9]+ snapshots, 0 could not be taken",
+        instead="./skin record {folder}/kept --trigger contact --trigger fault --before 10 --after 5 --seconds 1",
+    ),
+    Row(
+        "(./)?skin snapshot.*",
+        "ends",
+        says="-snapshot.mcap",
+        instead='made=$(./skin snapshot --after 0.2 --why "the arm stopped") && echo $made && rm $made',
+    ),
+    Row(
+        "(./)?skin info.*",
+        "ends",
+        says="raw/palm",
+        instead="./skin record {folder}/info.mcap --seconds 1 --overwrite && "
+        "./skin info {folder}/info.mcap --png {folder}/info.png",
+    ),
+    Row("(./)?skin golden.*", "ends", says="as accepted", instead="./skin golden tests/recording/golden/faults.mcap"),
+    Row("make golden", "ends", says="--accept", instead="make -n golden"),
     Row("skin record", "ends", says="contact/palm [0-9]+", instead="./skin record {folder}/demo.mcap --seconds 2"),
     Row(
         "skin replay",
@@ -219,16 +253,18 @@ COMMANDS = (
     Row(r"\./skin limits .*", "help"),
     Row("(./)?skin limits", "slow", says="position", instead="./skin limits"),
     Row("skin bench", "ends", says="accuracy"),
+    Row(r"\.venv/bin/python -m bench.plots", "slow", says="latency.png"),
     Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB"),
     Row(r"(\./)?skin bench (?P<name>\w+)( .*)?", "help"),
     Row(r"\.venv/bin/python -m bench\.speed\.page", "help"),
+    Row(r"\.venv/bin/python -m bench\.registered_network FILE my-skin", "help"),
     Row("python -m models.average", "help"),
-    Row("python -m models.build .*", "help"),
+    Row(r"(\.venv/bin/)?python -m models.build .*", "help"),
     Row("python -m protocol.wire_doc", "ends", instead=".venv/bin/python -m protocol.wire_doc"),
     # docs/your-skin.md, in its order
     Row(r"(\./)?skin new( .*)?", "walk"),
     Row(r"(\./)?skin collect", "ends", says="OUT.npz", instead="./skin collect --help"),
-    Row("make train SKIN=my-skin QUICK=1", "walk"),
+    Row("make train SKIN=(my-skin QUICK=1|my-registered MINUTES=10)", "walk"),
     Row(r"\./skin up --config mine.toml", "walk"),
     Row(r"\./skin (tare|release|echo contact -n 5)", "walk"),
     Row(r"\./skin press --x 0.012 .*", "walk"),
@@ -271,6 +307,7 @@ NOT_RUN = (("protocol/WIRE.md", "01 Hello: "),)
 TRIED_ELSEWHERE = {
     "docs/security.md": "tests/cli/test_security.py",
     "docs/page.md": "tests/bridges/test_page.py",
+    "docs/recording.md": "tests/recording/test_snapshots.py",
     "docs/extending.md": "tests/docs/test_extending.py",
     "docs/your-skin.md": "tests/docs/test_your_skin.py",
     "docs/ros.md": "tests/bridges/test_ros_page.py",

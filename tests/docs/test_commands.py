@@ -170,7 +170,7 @@ def is_config(snippet: Snippet) -> bool:
     return any(snippet.file == file and marker in snippet.text for file, marker in CONFIGS)
 
 
-@pytest.mark.parametrize("snippet", filter(is_config, blocks("toml")), ids=str)
+@pytest.mark.parametrize("snippet", [s for s in blocks("toml") if is_config(s)], ids=str)
 def test_a_configuration_is_one(tmp_path: Path, snippet: Snippet) -> None:
     (tmp_path / "skin.toml").write_text(snippet.text)
     assert set(load(tmp_path / "skin.toml").skins) == set(re.findall(r"\[skins\.(\S+)\]", snippet.text))

@@ -30,9 +30,11 @@ SHORTER = {
     "make train SKIN=my-skin QUICK=1": ".venv/bin/python -m models.build --skin my-skin --no-network --jobs 1",
     "./skin collect presses.npz --stub 40": "./skin collect presses.npz --stub 6",
     "./skin register presses.npz --skin my-skin --out my-registered": "",
+    "make train SKIN=my-registered MINUTES=10": "",
 }
 TRAINED = {
     "make train SKIN=my-skin QUICK=1": ".venv/bin/python -m models.build --skin my-skin --minutes 4",
+    "make train SKIN=my-registered MINUTES=10": ".venv/bin/python -m models.build --skin my-registered --minutes 2",
 }
 
 

@@ -8,6 +8,10 @@ import pytest
 
 from models import bundle
 from models.bundle import Bundle, BundleError
+from models.bundle_check import Wrong
+from models.response_file import arrays_of_tables, tables_of
+from models.shapes import Shape
+from models.touch_response import ResponseTables, TouchResponse
 from tests.models.test_prereconstruction import matrices
 
 MANIFEST = {"name": "tiny", "skin": {}, "image": {"n": 96, "half_width": 1.0, "metres_per_unit": 0.05}}
@@ -172,3 +176,46 @@ def test_matrices_that_unpack_to_gigabytes_are_not_unpacked(made):
     resealed(made.path, lambda m: m["files"].update({"matrices.npz": digest}))
     with pytest.raises(BundleError, match="unpack to 104857600, expected at most"):
         Bundle.load(made.path)
+
+
+def test_the_shipped_square_has_response_tables_that_a_bundle_without_them_lacks(tmp_path):
+    shipped = Bundle.load("square16")
+    tables = shipped.response()
+    response = TouchResponse(tables, shipped.pattern, shipped.z0)
+    d = response.of(Shape("circle", 0.2, -0.1, 0.25, 0.2))
+    linear = shipped.matrices.jacobian @ -np.log(1 - 0.2 * Shape("circle", 0.2, -0.1, 0.25, 1.0).fraction(24)).ravel()
+    assert np.linalg.norm(d - linear) < 0.1 * np.linalg.norm(linear)  # the Jacobian is the mesh's, the tables are not
+    (tmp_path / "without").mkdir()
+    without = bundle.write(tmp_path / "without", shipped.manifest, shipped.matrices)
+    assert not without.has_response
+    with pytest.raises(BundleError, match="has no response.npz: add it with `python -m models.build"):
+        without.response()
+    again = bundle.add_response(without, tables)
+    assert again.has_response and again.hash != without.hash
+    assert TouchResponse(again.response(), shipped.pattern, shipped.z0).of(
+        Shape("circle", 0.2, -0.1, 0.25, 0.2)
+    ) == pytest.approx(d, rel=1e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("fields", np.zeros((2, 16, 3), np.float16)),
+        ("modes", np.full((32, 4), np.nan, np.float16)),
+        ("strength", np.zeros(5, np.float32)),
+        ("inside", np.zeros((4, 4), bool)),
+        ("inside", None),
+    ],
+)
+def test_response_tables_that_cannot_be_are_refused(name, value):
+    rng = np.random.default_rng(0)
+    tables = ResponseTables(
+        rng.normal(size=(2, 16, 2)).astype(np.float32),
+        rng.normal(size=(2, 2, 16, 16)).astype(np.float32),
+        np.ones((4, 4), bool),
+    )
+    arrays = arrays_of_tables(tables)
+    tables_of(arrays, 2)
+    wrong = {key: each for key, each in {**arrays, name: value}.items() if each is not None}
+    with pytest.raises(Wrong, match="response.npz"):
+        tables_of(wrong, 2)

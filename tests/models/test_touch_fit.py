@@ -8,7 +8,7 @@ import pytest
 from models.forward import shared
 from models.response_tables import response_tables
 from models.shapes import Array, Shape
-from models.touch_fit import TouchFit, frame_covariance
+from models.touch_fit import FrameErrors, TouchFit, frame_errors
 from models.touch_response import TouchResponse
 
 SIGMA = np.full(120, 10 ** (-70 / 20))
@@ -48,7 +48,7 @@ def near(touch: Shape) -> Shape:
 )
 def test_it_finds_the_touch_and_its_kind(response: TouchResponse, gram: Array, touch: Shape) -> None:
     d = frame(response, touch)
-    found = TouchFit(response)(d, frame_covariance(gram, SIGMA, d), near(touch))
+    found = TouchFit(response)(d, frame_errors(gram, SIGMA, d, 0.3), near(touch))
     assert found.fits_frame and found.classes.argmax() == touch.shape_class
     assert found.position == pytest.approx(touch.centroid, abs=0.02)
     assert abs(found.drop[0] - touch.drop) < 3 * found.drop[1] < 0.6 * touch.drop
@@ -63,7 +63,7 @@ def test_it_finds_the_touch_and_its_kind(response: TouchResponse, gram: Array, t
 def test_a_known_radius_stays_and_makes_the_drop_sure(response: TouchResponse, gram: Array) -> None:
     touch = Shape("circle", -0.2, 0.3, 0.2, 0.3)
     d = frame(response, touch)
-    covariance = frame_covariance(gram, SIGMA, d)
+    covariance = frame_errors(gram, SIGMA, d, 0.3)
     free, known = (TouchFit(response)(d, covariance, near(touch), ("circle",), radius=radius) for radius in (None, 0.2))
     assert known.fits[0].shape.radius == pytest.approx(0.2, rel=1e-3)
     assert known.drop[1] < 0.5 * free.drop[1]
@@ -75,17 +75,19 @@ def test_the_stated_uncertainty_is_that_of_the_errors(response: TouchResponse, g
     touch, ratios = Shape("circle", 0.15, 0.25, 0.25, 0.3), []
     for seed in range(30):
         d = frame(response, touch, seed)
-        found = TouchFit(response)(d, np.diag(SIGMA**2), near(touch), ("circle",))
+        found = TouchFit(response)(d, FrameErrors(np.diag(SIGMA**2), np.zeros((120, 120))), near(touch), ("circle",))
         ratios.append((found.drop[0] - touch.drop) ** 2 / found.drop[1] ** 2)
     assert 0.5 < np.mean(ratios) < 1.8  # six standard errors about 1 would be -0.5 to 2.5
 
 
 def test_what_no_touch_explains_is_said(response: TouchResponse, gram: Array) -> None:
     d = frame(response, Shape("circle", 0.4, 0.4, 0.2, 0.4)) + frame(response, Shape("circle", -0.5, -0.4, 0.2, 0.4))
-    found = TouchFit(response)(d, frame_covariance(gram, SIGMA, d), Shape("circle", 0.4, 0.4, 0.25, 0.4), ("circle",))
+    found = TouchFit(response)(d, frame_errors(gram, SIGMA, d, 0.3), Shape("circle", 0.4, 0.4, 0.25, 0.4), ("circle",))
     assert not found.fits_frame
 
 
 def test_a_covariance_that_is_none(response: TouchResponse) -> None:
     with pytest.raises(ValueError, match="a covariance that is none"):
-        TouchFit(response)(np.zeros(120), -np.eye(120), Shape("circle", 0, 0, 0.2, 0.3))
+        TouchFit(response)(
+            np.zeros(120), FrameErrors(-np.eye(120), np.zeros((120, 120))), Shape("circle", 0, 0, 0.2, 0.3)
+        )

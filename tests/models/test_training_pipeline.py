@@ -14,6 +14,7 @@ from models.bundle import Bundle  # noqa: E402
 from models.class_temperature import TEMPERATURES, SeenClasses, calibration_error, cooled, pooled  # noqa: E402
 from models.condensed import CondensedSheet  # noqa: E402
 from models.device_batches import ConditionTensors, SceneTensors, measured, stacks  # noqa: E402
+from models.evaluation import LEVELS  # noqa: E402
 from models.forward import shared  # noqa: E402
 from models.losses import losses  # noqa: E402
 from models.mismatch import BLUR_GRID, anisotropy_root, soft_drop, soft_touched, turned  # noqa: E402
@@ -212,6 +213,12 @@ def test_training_goes_on_from_a_shipped_network(bundle, pre, scenes, tmp_path):
     assert trainer.start["from"]["network"] == bundle.manifest["files"]["network_fast.onnx"]
     assert trainer.rates[0] == pytest.approx(FINE * MUON_RATE)
     trainer.step(0.5)
+    trainer.best_score, trainer.elapsed = 9.0, 99.0
+    worse = {f"contact IoU, {level}": 0.1 for level in LEVELS}
+    assert not trainer._no_better(worse, budget=100.0)  # worse until its rate has fallen: no reason to stop
+    trainer.start, kept = {}, trainer.start
+    assert trainer._no_better(worse, budget=100.0)
+    trainer.start = kept
     trainer.save(tmp_path / "fast.pt")
     again = Trainer(FAST, batches, scenes)
     again.resume(tmp_path / "fast.pt")

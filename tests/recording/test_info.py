@@ -79,10 +79,19 @@ def test_it_is_told_in_text_and_as_json(skin: Skin, recording: Path) -> None:  #
     assert plain["gaps"][0]["topic"] == "contact/palm" and plain["damage"] == "whole"
 
 
-def test_a_file_that_was_cut_is_told_as_far_as_it_goes(skin: Skin, recording: Path) -> None:  # noqa: F811
+def test_a_file_that_was_cut_is_told_as_far_as_it_goes(
+    skin: Skin,  # noqa: F811
+    recording: Path,
+    tmp_path: Path,
+) -> None:
     recording.write_bytes(recording.read_bytes()[:-3000])
     ran = skin("info", recording)
     assert ran.code == 0 and "cut short" in ran.out
+    with RecordingWriter(tmp_path / "killed.mcap") as writer:
+        writer.write("contact/palm", pack(contact(0)).partition(b"\0")[2], 10**18)
+        writer.flush()
+        (tmp_path / "copy.mcap").write_bytes((tmp_path / "killed.mcap").read_bytes())
+    assert summarise(tmp_path / "copy.mcap").damage == "cut short: after a whole chunk"
     recording.write_bytes(b"")
     assert "is empty" in (ran := skin("info", recording)).err and ran.code == 2
 

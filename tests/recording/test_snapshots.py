@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 
 from protocol.frames import Contact, ContactFrame, Frame, InfoFrame, StatusFrame, pack, unpack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
+from services.recorder import keeping_of, rotation_of
 from services.recordings import rotation, snapshots
 from services.recordings.recorder import Recorder
 from services.recordings.recording import RecordedMessage, RecordingError, RecordingReader
@@ -21,6 +23,9 @@ from services.recordings.ring import RingEntry
 from services.recordings.rotation import RotatingWriter, Rotation
 from services.recordings.snapshots import Keeping, Snapshots
 from services.recordings.triggers import TRIGGERS, TriggerWatch
+from services.runtime.config import parse
+from services.runtime.config_sections import RecorderSection
+from tests.docs.snippets import snippets
 
 ROOT = Path(__file__).resolve().parents[2]
 S = 1_000_000_000
@@ -288,3 +293,20 @@ def test_by_trigger_the_time_round_a_contact_is_written(runtime: Path, tmp_path:
     publisher.close()
     (path,) = tmp_path.glob("*-contact.mcap")
     assert len(contacts_in(path)) >= 6
+
+
+def test_what_docs_recording_md_shows_is_so(waiting: tuple[Publisher, ControlClient], tmp_path: Path) -> None:
+    blocks = {s.kind: s.text for s in snippets() if s.file == "docs/recording.md" and s.kind in ("toml", "python")}
+    palm = '[skins.palm]\nport = "stub"\nbundle = "square16"\n'
+    section = parse(tomllib.loads(palm + blocks["toml"])).recorder
+    assert section is not None and keeping_of(section, tmp_path).triggers == TRIGGERS
+    assert rotation_of(section) == Rotation(500_000_000, 0.0, 20)
+    default = RecorderSection()
+    assert (section.before_s, section.after_s, section.keep_snapshots) == (
+        default.before_s,
+        default.after_s,
+        default.keep_snapshots,
+    )
+    said: list[str] = []
+    exec(blocks["python"].replace("eitskin", "protocol"), {"print": said.append})
+    assert said[0].startswith(str(tmp_path / "kept"))

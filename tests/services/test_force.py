@@ -140,6 +140,6 @@ def test_the_calibrations_own_error_adds_to_the_images(bundle: Bundle) -> None:
 
 
 def test_an_indenter_is_checked(tmp_path: Path) -> None:
-    assert Indenter(radius_m=0.01).shape == "circle"
+    assert Indenter(radius_m=0.01).kind == "circle"
     with pytest.raises(ValueError, match="greater than 0"):
         Indenter(radius_m=0.0)

@@ -1,0 +1,73 @@
+"""A contact as a fit of its shape to the measurements finds it, in the place of what its image shows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from models.shapes import Shape
+from protocol.frames import SHAPES, Contact, RefinedTouch
+from services.contacts.force import Force
+from services.contacts.surface import Placed
+
+APART = 3.0  # standard uncertainties beyond which image and fit do not mean the same touch
+ASIDE = 0.3  # of the touch's radius: what an image's place may be off by, whatever the fit says of its own
+LARGER = 2.0  # times: areas that differ by more are of different touches
+KIND_UNKNOWN = 0.15  # of an image's force: what it is wrong by where the touch is soft, which it does not know
+ROUND = 48  # corners of an outline that is round
+
+
+def agrees(contact: Contact, touch: RefinedTouch, force: Force) -> bool:
+    """Whether fit and image differ by no more than they state: in place, force and area."""
+    x, y = contact.on_sheet
+    radius = math.sqrt(max(touch.area_m2, 1e-12) / math.pi)
+    aside = math.hypot(touch.position[0] - x, touch.position[1] - y)
+    if not aside <= math.hypot(APART * touch.sigma[0], ASIDE * radius):
+        return False
+    ratio = touch.area_m2 / max(contact.area_m2, 1e-12)
+    if not 1 / LARGER <= ratio <= LARGER * (1 + APART * touch.area_sigma_m2 / max(touch.area_m2, 1e-12)):
+        return False
+    if force.newton is None or contact.force_n is None:
+        return True
+    own = max(contact.force_sigma_n or 0.0, KIND_UNKNOWN * contact.force_n)
+    unsure = math.hypot(force.sigma or 0.0, own)
+    return abs(force.newton - contact.force_n) <= APART * unsure
+
+
+def refined(
+    contact: Contact, touch: RefinedTouch, at: Placed, force: Force, wrench: list[float], flat: bool
+) -> Contact:
+    """at: the fit's place on the skin."""
+    best = int(np.argmax(touch.probabilities))
+    return replace(
+        contact,
+        position=at.point.tolist(),
+        normal=at.normal.tolist(),
+        sheet=None if flat else list(touch.position),
+        orientation=_half_turn(touch.rotation) if touch.kind == "rectangle" else contact.orientation,
+        area_m2=touch.area_m2,
+        area_sigma_m2=touch.area_sigma_m2,
+        force_n=force.newton,
+        force_sigma_n=force.sigma,
+        wrench=wrench,
+        shape=SHAPES[best],
+        shape_probability=touch.probabilities[best],
+        position_sigma=list(touch.sigma),
+        refined=True,
+        kind=touch.kind,
+        kind_probability=touch.probability,
+    )
+
+
+def refined_outline(touch: RefinedTouch) -> list[list[float]]:
+    """Closed polygon of (x, y), counter-clockwise, metres."""
+    x, y = touch.centre
+    shape = Shape(touch.kind, x, y, touch.radius_m, touch.drop, touch.rotation, touch.aspect)
+    return [[float(x), float(y)] for x, y in shape.outline(ROUND)]
+
+
+def _half_turn(angle: float) -> float:
+    """An axis has no direction: -pi/2 to pi/2."""
+    return (angle + math.pi / 2) % math.pi - math.pi / 2

@@ -1,0 +1,336 @@
+"""A touch refined by physics: its place, size, drop and kind fitted to the measurements (models/touch_fit.py), where
+skin.toml names the `indenter`.
+
+    delta, image --> job --> python -m models.refine   (a process of its own, niced; tens of milliseconds)
+                       |<----------- answer
+    image frames carry it as `refined` from the next frame on
+
+No frame waits for a fit. An answer belongs to the frame it was made of; for later ones it moves along by one
+Gauss-Newton step while that explains how the measurements have changed, and goes where it does not. While a fit runs,
+the newest frame waits for its turn, and older ones are skipped and counted.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import subprocess
+import sys
+import time
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from models.refine import RefineAnswer, RefineJob, Refiner, likely, start_of
+from models.shapes import KINDS, Shape
+from models.touch_fit import TouchPosterior
+from protocol.frames import DeltaFrame, ImageFrame, RefinedTouch
+from services.runtime.config import ROOT, Skin
+
+log = logging.getLogger(__name__)
+
+STUCK_S = 30.0  # a fit that takes longer on however busy a machine has failed
+WAIT_S = (1.0, 60.0)  # before a fit's process that ended is started again: at first, and at most
+QUIET_DRIFT = 1e-6  # rms: less is none
+
+
+class RefineProcess:
+    """The process that fits, for all skins of this one. `offer` and `poll` never wait."""
+
+    def __init__(self, command: tuple[str, ...] = (sys.executable, "-m", "models.refine")) -> None:
+        self._command = command
+        self._process: subprocess.Popen[bytes] | None = None
+        self._to: Connection | None = None
+        self._from: Connection | None = None
+        self._waiting: dict[str, RefineJob] = {}  # the newest of each skin
+        self._begun: RefineJob | None = None
+        self._begun_s = self._not_before_s = 0.0
+        self._pause_s = WAIT_S[0]
+        self._answers: dict[str, RefineAnswer] = {}
+        self.skipped: dict[str, int] = {}  # jobs that a newer one of their skin replaced, or that were lost
+        self.problem = ""
+
+    def start(self) -> None:
+        """Before the first job; where it cannot be started, the first job says so."""
+        try:
+            if self._process is None:
+                self._start()
+        except OSError as why:
+            log.warning("the process that refines touches cannot be started (%s)", why)
+
+    def offer(self, job: RefineJob) -> None:
+        if job.skin in self._waiting:
+            self._skip(job.skin)
+        self._waiting[job.skin] = job
+        self._next()
+
+    def poll(self, skin: str) -> RefineAnswer | None:
+        """The newest answer for a skin, once."""
+        if self._begun is not None:
+            self._receive()
+        self._next()
+        return self._answers.pop(skin, None)
+
+    def close(self) -> None:
+        for end in (self._to, self._from):
+            if end is not None:
+                end.close()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        self._process = self._to = self._from = self._begun = None
+
+    def _receive(self) -> None:
+        assert self._from is not None and self._begun is not None
+        try:
+            if self._from.poll():
+                answer: RefineAnswer = self._from.recv()
+                self._answers[answer.skin] = answer
+                self._begun, self._pause_s, self.problem = None, WAIT_S[0], ""
+                return
+        except (EOFError, OSError):
+            return self._lost("ended")
+        if time.monotonic() > self._begun_s + STUCK_S:
+            self._lost(f"gave no answer within {STUCK_S:.0f} s")
+
+    def _lost(self, why: str) -> None:
+        assert self._begun is not None
+        self._skip(self._begun.skin)
+        self.close()
+        self.problem = f"the process that refines touches {why}; it is started again"
+        log.warning("%s", self.problem)
+        self._not_before_s, self._pause_s = time.monotonic() + self._pause_s, min(2 * self._pause_s, WAIT_S[1])
+
+    def _next(self) -> None:
+        """Hand over one job: so little waits in the pipe that writing never does."""
+        if self._begun is not None or not self._waiting or time.monotonic() < self._not_before_s:
+            return
+        skin = next(iter(self._waiting))
+        self._begun, self._begun_s = self._waiting.pop(skin), time.monotonic()
+        try:
+            if self._process is None:
+                self._start()
+            assert self._to is not None
+            self._to.send(self._begun)
+        except OSError as why:
+            self._lost(f"cannot be used ({why})")
+
+    def _start(self) -> None:
+        self._process = subprocess.Popen(
+            self._command,
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        )
+        assert self._process.stdin is not None and self._process.stdout is not None
+        with self._process.stdin as stdin, self._process.stdout as stdout:
+            self._to = Connection(os.dup(stdin.fileno()), readable=False)
+            self._from = Connection(os.dup(stdout.fileno()), writable=False)
+
+    def _skip(self, skin: str) -> None:
+        self.skipped[skin] = self.skipped.get(skin, 0) + 1
+
+
+class RefineHere:
+    """The same at once: for frames from a file, and to measure."""
+
+    def __init__(self) -> None:
+        self._refiner = Refiner()
+        self._answers: dict[str, RefineAnswer] = {}
+        self.skipped: dict[str, int] = {}
+        self.problem = ""
+
+    def start(self) -> None:
+        """There is nothing to start."""
+
+    def offer(self, job: RefineJob) -> None:
+        self._answers[job.skin] = self._refiner(job)
+
+    def poll(self, skin: str) -> RefineAnswer | None:
+        return self._answers.pop(skin, None)
+
+
+_shared: RefineProcess | None = None
+
+
+def shared() -> RefineProcess:
+    """One process for all skins of this one."""
+    global _shared
+    _shared = _shared or RefineProcess()
+    return _shared
+
+
+class _Asked(NamedTuple):
+    """A frame that is fitted: its scan, difference (K,) and the difference's standard deviation."""
+
+    scan: int
+    d: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+
+class Refinement:
+    """Of one skin."""
+
+    def __init__(self, name: str, skin: Skin, bundle: Bundle, fits: RefineProcess | RefineHere | None = None) -> None:
+        """Raises BundleError where the bundle's tables cannot be read."""
+        assert skin.indenter is not None
+        self.name, self.bundle = name, bundle
+        bundle.response()
+        self._fits = fits
+        self._folder = str(bundle.path.resolve())
+        self._kinds = KINDS if skin.indenter.kind == "any" else (skin.indenter.kind,)
+        radius = skin.indenter.radius_m
+        self._radius = None if radius is None else radius / bundle.metres_per_unit
+        self._number, self._single, self._tare = 0, 0.0, skin.tare.frames
+        self._counted = {"fits": 0, "refined": 0, "unexplained": 0}
+        self.forget()
+
+    @property
+    def counters(self) -> dict[str, int]:
+        skipped = 0 if self._fits is None else self._fits.skipped.get(self.name, 0)
+        return {f"refine_{name}": n for name, n in (self._counted | {"skipped": skipped}).items()}
+
+    @property
+    def problem(self) -> str:
+        return "" if self._fits is None else self._fits.problem
+
+    def warm_up(self) -> None:
+        """Start the process now: the first touch would wait for it."""
+        self._fits = self._fits or shared()
+        self._fits.start()
+
+    def fit_by(self, fits: RefineProcess | RefineHere) -> None:
+        self._fits = fits
+
+    def fit_here(self) -> None:
+        """From now on each frame waits for its fit: offline."""
+        if not isinstance(self._fits, RefineHere):
+            self._fits = RefineHere()
+
+    def forget(self) -> None:
+        """Nothing touches, or nothing is known of what does."""
+        self._asked: dict[int, _Asked] = {}  # by number
+        self._answer: tuple[_Asked, TouchPosterior, NDArray[np.bool_]] | None = None
+        self._now: _Asked | None = None  # frame last reconstructed
+        self._touch: RefinedTouch | None = None
+
+    def __call__(self, frame: DeltaFrame, out: ImageFrame) -> RefinedTouch | None:
+        """The refined touch of this frame, or None. out: the image made of it, or of what it holds."""
+        news = self._take_answer()
+        if not frame.touched or not out.valid or "changing" in out.reasons:
+            self.forget()
+            return None
+        if frame.stack.size:
+            if (start := start_of(out.image)) is None:
+                self.forget()
+                return None
+            now = _Asked(frame.scan, frame.difference.astype(float), frame.sigma.astype(float))
+            self._single = max(self._single, _typical(now.sigma)) if self._now else _typical(now.sigma)
+            self._now = now
+            moved = self._moved()
+            self._ask(now, start, frame.context, {} if moved is None else likely(moved))
+            if self._take_answer():  # where a frame waits for its fit
+                moved = self._moved()
+            self._touch = self._told(moved)
+        elif news:
+            self._touch = self._told(self._moved())
+        self._counted["refined"] += self._touch is not None
+        return self._touch
+
+    def _ask(self, now: _Asked, start: Shape, context: NDArray[np.float32], before: dict[str, Any]) -> None:
+        """A frame that is reconstructed is to be fitted."""
+        self._number += 1
+        self._asked[self._number] = now
+        drift = 10 ** (2 * float(context[2]) - 5) if len(context) > 2 else 0.0
+        self._fits = self._fits or shared()
+        self._fits.offer(
+            RefineJob(
+                skin=self.name,
+                number=self._number,
+                bundle=self._folder,
+                d=now.d,
+                sigma=now.sigma,
+                start=start,
+                kinds=self._kinds,
+                radius=self._radius,
+                tare_frames=self._tare / max(1.0, (self._single / max(_typical(now.sigma), 1e-12)) ** 2),
+                drift=drift if drift > QUIET_DRIFT else 0.0,
+                before=before,
+            )
+        )
+
+    def _take_answer(self) -> bool:
+        """Whether there is news of the touch."""
+        answer = None if self._fits is None else self._fits.poll(self.name)
+        if answer is None or answer.number not in self._asked:  # of a touch that is gone
+            return False
+        asked = self._asked[answer.number]
+        self._asked = {number: each for number, each in self._asked.items() if number > answer.number}
+        self._counted["fits"] += 1
+        if answer.problem:
+            log.warning("%s: %s", self.name, answer.problem)
+        found = answer.posterior
+        if found is None or not found.fits_frame:
+            self._counted["unexplained"] += 1
+            self._answer = None
+        else:
+            self._answer = asked, found, answer.live
+        return True
+
+    def _moved(self) -> TouchPosterior | None:
+        """The answer, moved along to the frame that was reconstructed last."""
+        if self._answer is None or self._now is None:
+            return None
+        before, found, live = self._answer
+        now = self._now
+        if now.scan == before.scan:
+            return found
+        if not np.array_equal(np.isfinite(now.sigma), live):
+            return None
+        noise = np.sqrt(now.sigma[live] ** 2 + before.sigma[live] ** 2 + self.bundle.matrices.model_error**2)
+        return found.followed((now.d - before.d)[live], noise)
+
+    def _told(self, found: TouchPosterior | None) -> RefinedTouch | None:
+        if found is None or self._answer is None:
+            return None
+        return told(found, self._answer[0].scan, self.bundle.metres_per_unit)
+
+
+def told(found: TouchPosterior, scan: int, unit: float) -> RefinedTouch:
+    """What a fit to a scan says, in metres; unit: metres per model unit."""
+    shape = found.fits[0].shape
+    (xx, xy), (_, yy) = found.position_covariance.tolist()
+    middle, spread = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    return RefinedTouch(
+        kind=shape.kind,
+        probability=min(1.0, found.probability[shape.kind]),
+        probabilities=[min(1.0, float(share)) for share in found.classes],
+        position=[float(v) * unit for v in found.position],
+        sigma=[
+            math.sqrt(middle + spread) * unit,
+            math.sqrt(max(middle - spread, 0.0)) * unit,
+            0.5 * math.atan2(2 * xy, xx - yy),
+        ],
+        drop=found.drop[0],
+        drop_sigma=found.drop[1],
+        integral=found.integral[0] * unit**2,
+        integral_sigma=found.integral[1] * unit**2,
+        area_m2=found.area[0] * unit**2,
+        area_sigma_m2=found.area[1] * unit**2,
+        centre=[shape.x * unit, shape.y * unit],
+        radius_m=shape.radius * unit,
+        rotation=shape.rotation,
+        aspect=shape.aspect,
+        scan=scan,
+    )
+
+
+def _typical(sigma: NDArray[np.float64]) -> float:
+    """Root mean square of the finite ones."""
+    finite = sigma[np.isfinite(sigma)]
+    return math.sqrt(float(finite @ finite) / max(len(finite), 1))

@@ -1,0 +1,107 @@
+"""A held touch's image made surer by the skin's symmetries: a square seen in a mirror is the same square.
+
+The network does not know that. So what it makes of the turned and mirrored input, turned back, is as good an answer of
+its own, and their mean better than each. One of them is computed for each spare frame while a touch is held; when all
+are there, the mean takes the image's place. No frame waits for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import DeltaFrame
+from services.networks import Network, Pictures
+
+SAME = 1e-6  # model units: places that are the same
+Turn = tuple[bool, int]
+"""Mirrored left to right first, or not; then turned clockwise by so many right angles."""
+
+TURNS: tuple[Turn, ...] = tuple((mirrored, times) for mirrored in (False, True) for times in range(4))[1:]
+
+
+def turned(array: NDArray[Any], turn: Turn) -> NDArray[Any]:
+    """Images (..., n, n), [iy, ix]."""
+    mirrored, times = turn
+    return np.rot90(array[..., ::-1] if mirrored else array, times, axes=(-2, -1))
+
+
+def turned_back(array: NDArray[Any], turn: Turn) -> NDArray[Any]:
+    mirrored, times = turn
+    back = np.rot90(array, -times, axes=(-2, -1))
+    return back[..., ::-1] if mirrored else back
+
+
+def symmetries(skin: Mapping[str, Any]) -> tuple[Turn, ...]:
+    """Those of TURNS that leave a bundle's geometry as it is: outline, electrodes, widths, contact impedances."""
+    electrodes = skin.get("electrodes", {})
+    outline = np.asarray(skin.get("outline", ()), float).reshape(-1, 2)
+    centres = np.asarray(electrodes.get("centre", ()), float).reshape(-1, 2)
+    if not len(outline) or not len(centres):
+        return ()
+    each = [
+        np.broadcast_to(np.asarray(value, float), len(centres))
+        for value in (electrodes.get("width", 0.0), skin.get("contact_impedance", 0.0))
+    ]
+    marked = np.column_stack([centres, *each])
+    return tuple(
+        turn
+        for turn in TURNS
+        if _same(outline, _moved(outline, turn)) and _same(marked, np.column_stack([_moved(centres, turn), *each]))
+    )
+
+
+def _moved(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
+    mirrored, times = turn
+    x, y = points.T * (np.array([[-1.0], [1.0]]) if mirrored else 1.0)
+    for _ in range(times):
+        x, y = y, -x
+    return np.column_stack([x, y])
+
+
+def _same(rows: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+    """Whether both are the same set of rows."""
+    apart = np.abs(rows[:, None] - others[None]).max(axis=2)
+    return bool((apart.min(axis=1) < SAME).all() and (apart.min(axis=0) < SAME).all())
+
+
+class SymmetryMean:
+    """Of one frame at a time."""
+
+    def __init__(self, network: Network, turns: tuple[Turn, ...]) -> None:
+        self._network, self._turns = network, turns
+        self.forget()
+
+    def forget(self) -> None:
+        self._frame: DeltaFrame | None = None
+        self._made: list[Pictures] = []
+
+    def begin(self, frame: DeltaFrame, pictures: Pictures) -> None:
+        """A frame and what the network made of it. Where electrodes are missing, the skin has no symmetry."""
+        self.forget()
+        if np.isfinite(frame.sigma).all():
+            self._frame, self._made = frame, [pictures]
+
+    def step(self) -> Pictures | None:
+        """Compute one more; the mean of all when it was the last."""
+        if self._frame is None or not self._turns:
+            return None
+        turn = self._turns[len(self._made) - 1]
+        frame = replace(self._frame, stack=np.ascontiguousarray(turned(self._frame.stack, turn)))
+        drop, sigma, classes = (turned_back(each, turn) for each in self._network.run(frame))
+        self._made.append((drop, sigma, classes))
+        if len(self._made) <= len(self._turns):
+            return None
+        images, sigmas, shares = (
+            np.asarray(np.mean(each, axis=0), np.float32) for each in zip(*self._made, strict=True)
+        )
+        self.forget()
+        return images, sigmas, shares
+
+    @property
+    def busy(self) -> bool:
+        return self._frame is not None

@@ -1,0 +1,47 @@
+"""What `skin bench refined` is scored on: shapes that nobody knows, and which row counts as worse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bench.accuracy.odd_shapes import FLAT, HOLE, ODD, OddShape, random_odd
+from bench.accuracy.refined import gains, summary
+from models.forward import shared
+
+
+@pytest.mark.parametrize("kind, share", [("ellipse", FLAT), ("ring", 1 - HOLE**2), ("crescent", None)])
+def test_an_odd_shape_has_its_area_as_image_and_on_the_mesh(kind: str, share: float | None) -> None:
+    shape = OddShape(kind, 0.2, -0.1, 0.4, 0.3, 0.7)
+    area = 4 * float(shape.fraction(96).mean())
+    assert 0.2 < area / (np.pi * 0.4**2) < 0.9
+    assert share is None or area == pytest.approx(np.pi * 0.4**2 * share, rel=0.01)
+    model = shared("square16", "inverse")
+    dropped = float(((1 - shape.conductivity(model)) * model.areas).sum())
+    assert dropped == pytest.approx(0.3 * area, rel=0.02)
+
+
+def test_an_ellipse_turns_with_its_rotation() -> None:
+    shape = OddShape("ellipse", 0.0, 0.0, 0.4, 0.3, np.pi / 2)  # its long axis along y
+    assert shape.contains(np.array([[0.0, 0.39], [0.39, 0.0]])).tolist() == [True, False]
+
+
+def test_odd_shapes_lie_on_the_skin() -> None:
+    rng = np.random.default_rng(0)
+    assert all(abs(s.x) + s.radius <= 1 and abs(s.y) + s.radius <= 1 for s in (random_odd(rng, k) for k in ODD * 5))
+
+
+def test_a_row_is_worse_by_the_networks_standard_errors() -> None:
+    names = ("mean IoU", "contact IoU", "position rms %", "force %", "integral %")
+    network = dict.fromkeys(names, (1.0, 0.1))
+    better = {"mean IoU": 1.1, "contact IoU": 1.1, "position rms %": 0.9, "force %": 0.9, "integral %": 0.9}
+    service = {name: (value, 0.1) for name, value in better.items()}
+    assert gains("circle", network, service) == pytest.approx([1.0] * 5)
+    assert min(gains("circle", network, service | {"force %": (1.2, 0.1)})) == pytest.approx(-2.0)
+    assert min(gains("hertz", network, service | {"mean IoU": (0.5, 0.1)})) > 0
+
+
+def test_touches_without_a_row_do_not_count() -> None:
+    rows = [{"force %": 1.0, "force in 68 %": 100.0}, None, {"force %": 3.0, "force in 68 %": 0.0}]
+    assert summary(rows, [0, 1, 2])["force in 68 %"][0] == 50.0
+    assert summary([None], [0]) == {}
