@@ -5,8 +5,8 @@
     python -m models.build --skin square16 --minutes 3     for CI: proves the path, not the accuracy
     python -m models.build --skin square16 --no-network    matrices only: the services show the one-step image
     python -m models.build --skin square16 --package       trains nothing: ships the checkpoints in models/work/SKIN
-    python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin
     python -m models.build --skin square16 --response      adds what a fit of touches needs to the bundle there is
+    python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin
 
 Samples and checkpoints stay in models/work/SKIN; a second call uses what is there and makes what is missing.
 """
@@ -225,9 +225,9 @@ def main(argv: list[str] | None = None) -> None:
     if "full" in said:
         said["full"]["verdict"] = _verdict(args.skin, pre, held_out, said["full"], own).to_dict()
     if registered is None or model is None:
-        said_of = manifest.describe(skin.name, skin, matrices, network=said or None)
         tables = response_tables(ForwardModel(skin)) if matrices.normalisation == "model" else None
-        written = bundle.write(out, said_of, matrices, made, response=tables)
+        about = manifest.describe(skin.name, skin, matrices, network=said or None)
+        written = bundle.write(out, about, matrices, made, response=tables)
     else:
         about = manifest.of_registered(registered, network=said or None, warped=model.said)
         written = bundle.write(out, about, matrices, made, registered.locator)

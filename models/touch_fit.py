@@ -44,7 +44,7 @@ MISFIT_EACH = 0.2  # of that: in each measurement by itself
 CORNERED = {"circle": 1.0, "hertz": 1.0, "square": 1.3, "L": 1.7, "triangle": 2.8, "rectangle": 2.8}
 """What the response of each kind is wrong by, over a circle's: the cells do not resolve the field at corners."""
 WIDER = {"circle": 1.15, "hertz": 1.15, "square": 1.2, "L": 1.25, "triangle": 1.45, "rectangle": 1.5}
-WIDER_INTEGRAL, WIDER_PLACE = 1.15, 1.08
+WIDER_INTEGRAL = 1.15
 """Standard deviations (of drop and area for each kind) over those of the normal posterior: drop and size of a small
 touch trade off along a bent valley. Found on 300 touches; bench/accuracy/refined.py checks them on others.
 """
@@ -352,7 +352,7 @@ def _posterior(fits: tuple[KindFit, ...], probability: Array, measurements: int)
     position = np.sum([p * row[0] for p, row in zip(probability, rows, strict=True)], axis=0)
     spread = np.sum(
         [
-            p * (WIDER_PLACE**2 * row[1] + np.outer(row[0] - position, row[0] - position))
+            p * (row[1] + np.outer(row[0] - position, row[0] - position))
             for p, row in zip(probability, rows, strict=True)
         ],
         axis=0,

@@ -2,6 +2,7 @@
 
     python -m models.train --skin square16 --minutes 80            writes models/work/square16/full.pt and full.png
     python -m models.train --skin square16 --minutes 80 --resume   goes on from the checkpoint
+    python -m models.train --skin square16 --minutes 80 --from square16   starts from a bundle's network, at low rates
 
 The budget sets the schedule: the learning rate rises over the first percent and falls to zero at the last minute,
 whatever the machine's speed. What is kept is the running average of the weights; the best on held-out scenes is kept

@@ -118,7 +118,8 @@ def judge_registered(
     grade = "too little" if iou < single_step + BETTER else "usable"
     first = {
         "usable": "usable: it shows more than the image without a network",
-        "too little": "too little: the image without a network is about as good",
+        "too little": 'too little: the image without a network is about as good or better, and `network = "none"` in '
+        "skin.toml shows that one",
     }[grade]
     text = (
         f"{first}. Held-out touches, simulated and warped to this skin, with what its presses leave unexplained: "

@@ -27,7 +27,7 @@ from services.contacts.force import ForceLaw
 from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
 from services.contacts.placing import placement
-from services.contacts.refined import refined_outline
+from services.contacts.refined import both, refined_outline
 from services.contacts.registered import measures_force, patches
 from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.tracking import Tracker
@@ -171,6 +171,7 @@ class Publishing(Stage):
         """The contact as a fit has it, where there is one contact, and image and fit agree on it."""
         if touch is None or len(self._segments) != 1:
             return None
+        touch = replace(touch, probabilities=both(touch.probabilities, self._classes[0]))
         contact = self._writer.fitted(self._contacts[0], touch)
         self._counters["disagreed" if contact is None else "refined"] += 1
         return None if contact is None else (contact, touch)

@@ -17,7 +17,7 @@ from models.shapes import Shape
 from models.touch_response import TouchResponse
 from protocol.frames import Contact, RefinedTouch
 from services.contacts.force import Force
-from services.contacts.refined import agrees, refined_outline
+from services.contacts.refined import agrees, both, refined_outline
 from services.describe import refinement
 from services.pipeline import Result
 from services.refinement import RefineHere, RefineProcess
@@ -264,6 +264,12 @@ def test_a_fit_counts_where_it_and_the_image_mean_the_same_touch(
     touch: RefinedTouch, newton: float, same: bool
 ) -> None:
     assert agrees(CONTACT, touch, Force(newton, 0.1)) == same
+
+
+def test_the_shape_is_what_fit_and_network_say_together() -> None:
+    assert both([0.5, 0.5, 0.0, 0.0, 0.0], [0.1, 0.9, 0.0, 0.0, 0.0]) == pytest.approx([0.25, 0.75, 0.0, 0.0, 0.0])
+    assert both([0.5, 0.5, 0.0, 0.0, 0.0], []) == [0.5, 0.5, 0.0, 0.0, 0.0]
+    assert both([1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]) == [1.0, 0.0, 0.0, 0.0, 0.0]
 
 
 def test_an_outline_is_that_of_the_likeliest_shape() -> None:
