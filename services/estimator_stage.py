@@ -116,6 +116,7 @@ class EstimatorStage(Stage):
     def state(self) -> dict[str, Any]:
         return {
             "touched": self.touch_estimator.touched,
+            "waits": self.touch_estimator.state(),
             "coarse": self.sentinel_scans.scan,
             "rolling": self.rolling_scans.state(),
             "impossible_ns": self._impossible_ns,
@@ -141,6 +142,7 @@ class EstimatorStage(Stage):
             self._news = BaselineNews()
         self.baseline_estimator.load(state)
         self.touch_estimator.touched = bool(state["touched"])
+        self.touch_estimator.load(state.get("waits", {"last": None}))
         self.sentinel_scans.scan = int(state.get("coarse", 0))
         self.rolling_scans.load(state.get("rolling", {}))
         self._impossible_ns = int(state.get("impossible_ns", 0))

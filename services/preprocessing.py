@@ -103,9 +103,9 @@ class Preprocessing(EstimatorStage):
             return out
         if not (trusted := believed(frame)):
             self.frame_averager.reset()  # a mean of the same scan again and again is no surer
-        return self._compare(out, amplitude - found.shift, found, learns=trusted and not separate)
+        return self._compare(out, amplitude - found.shift, found, trusted, separate)
 
-    def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict, learns: bool) -> DeltaFrame:
+    def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict, trusted: bool, separate: bool) -> DeltaFrame:
         """Difference, decision, and the stack where one is needed."""
         measured = np.isfinite(self.baseline_estimator.sigma)
         live = found.live & measured & np.isfinite(amplitude)
@@ -114,9 +114,13 @@ class Preprocessing(EstimatorStage):
             live = measured & np.isfinite(amplitude) if np.isfinite(amplitude).sum() > len(live) / 2 else measured
             amplitude = np.where(np.isfinite(amplitude), amplitude, self.baseline_estimator.baseline.z0)  # type: ignore[union-attr]
         now_ns = out.stamps.get("sample", 0)
-        d, found_now = self.touch_estimator(amplitude, live, now_ns)
+        still = separate or self.always_reconstruct  # a row of a file: whoever measured it waited
+        d, found_now = self.touch_estimator(amplitude, live, now_ns, still)
+        if self.touch_estimator.waits:
+            out.valid = False
+            add_reason(out.reasons, "stale_baseline")
         self.frame_averager.under(live, self.touch_detector.step)
-        teaches = learns  # whether the baseline is to learn from this frame
+        teaches = learns = trusted and not separate  # whether the baseline is to learn from this frame
         # Measured bundles have no sign model, so this check is skipped.
         if self.bundle.matrices.normalisation == "model" and impossible(
             d, self.baseline_estimator.sigma, live & self.electrodes.check.self_sensing, self.touch_estimator.touched

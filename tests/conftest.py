@@ -69,14 +69,27 @@ def service(runtime: Path) -> Iterator[subprocess.Popen[bytes]]:
         yield process
 
 
-@pytest.fixture(scope="module")
-def shared_service() -> Iterator[Path]:
-    """The service without recorder, one for all tests of a file; gives the runtime folder, $EITSKIN_RUNTIME."""
+@contextlib.contextmanager
+def _shared(without: bool) -> Iterator[Path]:
     folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
     try:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("EITSKIN_RUNTIME", str(folder))
-            with serving(folder, "--config", str(without_recorder(folder))):
+            with serving(folder, *(("--config", str(without_recorder(folder))) if without else ())):
                 yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def shared_service() -> Iterator[Path]:
+    """The whole service, one for all tests of a file; gives its runtime folder, which $EITSKIN_RUNTIME names."""
+    with _shared(without=False) as folder:
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def service_that_nobody_hears() -> Iterator[Path]:
+    """The same without recorder."""
+    with _shared(without=True) as folder:
+        yield folder

@@ -1,8 +1,9 @@
 """Does a touch that came, went or changed while it was scanned explain a frame that no image explains?
 
 A scan takes its measurements one after the other, so a touch whose force changes meanwhile is in each with another
-size. One touch on the grid of the estimation, its size a line through KNOTS moments of the scan, leaves next to nothing
-of such a frame; two touches are tried, one after the other. Of what is no touch the same model leaves most.
+size. A touch that came or went at once is in those after an instant, or in those before it. Else one touch on the grid
+of the estimation, its size a line through KNOTS moments of the scan, leaves next to nothing of such a frame; two
+touches are tried, one after the other. Of what is no touch the same models leave most.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ ENDED = 0.1  # of a touch's largest size, at most which is left of it where it e
 AS_WELL = 2.0  # times what a changing touch leaves: a touch that did not change does as well
 KNOTS = 4  # moments of a scan between which a touch's size is a line: a force ramp begins or ends in one of three parts
 PAIRS = tuple(combinations_with_replacement(range(KNOTS), 2))
+FEWEST = 6  # measurements that felt a touch which came or went at once: any one is explained by some touch
 TINY = 1e-300  # keeps a touch out that no measurement counts of
 RIDGE = 1e-6  # of a touch's own energy: keeps the fit of its sizes solvable where few measurements count
 
@@ -81,6 +83,9 @@ class ChangingTouch:
         for n, (i, j) in enumerate(PAIRS):
             gram[:, i, j] = gram[:, j, i] = products[:, n]
         gram += RIDGE * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(KNOTS) + TINY * np.eye(KNOTS)
+        stepped = _stepped(response, d)
+        if (share := max(0.0, energy - stepped[0] - noise) / energy) <= TUNING.changing_left:
+            return ScanChange(share, stepped[1])
         columns, left = np.zeros((len(d), 0)), d
         strength: list[float] = []
         for _ in range(2):
@@ -95,6 +100,14 @@ class ChangingTouch:
                 course = np.array(strength) @ sizes.reshape(-1, KNOTS)
                 return ScanChange(share, bool(course[-1] <= ENDED * course.max()))
         return None
+
+
+def _stepped(response: Array, d: Array) -> tuple[float, bool]:
+    """Energy of d (K,) explained by the best touch, of response (M, K), that came or went at once; whether it went."""
+    seen, energy = np.cumsum(response * d, axis=1), np.cumsum(response**2, axis=1)
+    came = (np.maximum(seen[:, -1:] - seen, 0.0) ** 2 / (energy[:, -1:] - energy + TINY))[:, :-FEWEST].max()
+    went = (np.maximum(seen, 0.0) ** 2 / (energy + TINY))[:, FEWEST:].max()
+    return float(max(came, went)), bool(went > came)
 
 
 def _counted(difference: NDArray[np.floating], sigma: NDArray[np.floating]) -> tuple[NDArray[np.bool_], Array, float]:

@@ -42,7 +42,7 @@ def press(x: float, y: float, newtons: float) -> None:
 
 
 @pytest.fixture
-def untouched(shared_service: Path) -> None:
+def untouched(service_that_nobody_hears: Path) -> None:
     release()
 
 

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
+from models.sentinel import touches
 from models.shapes import Shape
 from services.estimation.within_scan import ChangingTouch
 from services.pipeline import Result
@@ -133,3 +134,25 @@ def difference(bundle: Bundle, t: TRANSFER) -> NDArray[np.float64]:
     i, j = np.asarray(bundle.pattern)[:, :2].T
     free = transfer()
     return np.asarray((t[i, i] + t[j, j] - 2 * t[i, j]) / (free[i, i] + free[j, j] - 2 * free[i, j]) - 1)
+
+
+@pytest.mark.parametrize("came", [True, False])
+def test_a_touch_that_comes_or_goes_at_once_explains_its_scan(came: bool) -> None:
+    """No ramp: of so many measurements each has felt all of it, or nothing."""
+    found = touches(Bundle.load("square16").matrices, 1.0, (0.2,))
+    d = 0.3 * found.response[len(found.response) // 3].astype(float)
+    changing, sigma = ChangingTouch(Bundle.load("square16")), np.full(len(d), 1e-4)
+    for felt in (10, 37, 64, 100):
+        part = d.copy()
+        part[: len(d) - felt] *= not came
+        part[len(d) - felt :] *= came
+        explained = changing(part, sigma)
+        assert explained is not None and explained.ended == (not came)
+
+
+def test_one_measurement_that_is_off_is_no_touch() -> None:
+    changing, sigma = ChangingTouch(Bundle.load("square16")), np.full(120, 1e-4)
+    for at in (0, 60, 119):
+        d = np.zeros(120)
+        d[at] = 0.05
+        assert changing(d, sigma) is None
