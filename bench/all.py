@@ -68,6 +68,13 @@ BENCHMARKS = (
         "32 skins need all of two such cores where other machines slow them down. What is lost was overtaken by newer "
         "frames of the same skin, and is counted.",
     ),
+    Benchmark(
+        "reaction",
+        "From a touch to its contact",
+        ("--quick", "--simulated"),
+        ("reaction",),
+        "A scan takes 45 ms, and a touch that begins within one is known for certain from the next.",
+    ),
     Benchmark("sentinel", "Adaptive scan", ("--quick",)),
     Benchmark(
         "peers",

@@ -112,7 +112,7 @@ def main(argv: list[str] | None = None) -> int:
         begin_ns = _open(options, skins)
         publisher = Publisher("stub", context)
         rigs = {name: skin.rig for name, skin in skins.items()}
-        control = Control(rigs, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context)
+        control = Control(rigs, lambda: (time.monotonic_ns() - begin_ns) * 1e-9, context, begin_ns)
         for name, skin in skins.items():
             sheet = "" if skin.rig.sheet.mismatch == "none" else f", mismatch {skin.rig.sheet.mismatch}"
             log.info("board of %s at %s, scene %s%s", name, skin.port.url, options.scene, sheet)

@@ -7,6 +7,7 @@ brings 10 uA across a few of them into the converter's range.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,15 +76,18 @@ class Analog:
 
     def measure(
         self,
-        transfer: tuple[NDArray[np.float64], NDArray[np.float64]],
+        transfer: Sequence[NDArray[np.float64]] | NDArray[np.float64],
         scan_list: NDArray[np.int64],
         points: int,
         rtia: float,
         now: float,
+        weights: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.complex64], NDArray[np.uint8]]:
-        """Z (K,) ohm and status (K,) of one scan, while the sheet goes from one transfer matrix to the other."""
+        """Z (K,) ohm and status (K,) of one scan. transfer: m matrices; weights (K, m): each one's share in what each
+        measurement feels. Without weights the sheet goes steadily from the first of two matrices to the second.
+        """
         rows, driven, sensed = self._routed(scan_list, len(transfer[0]), now)
-        z = self._sheet(transfer, rows, now)
+        z = self._sheet(transfer, rows, now, weights)
         current = np.full(len(z), CURRENT_A * EXCITATION)
         voltage = z * PHASE * current
         sigma = self.noise.sigma(z, points) * CURRENT_A
@@ -120,16 +124,20 @@ class Analog:
         return np.minimum(rows, electrodes - 1), np.all(reached[:, :2], axis=1), np.all(reached[:, 2:], axis=1)
 
     def _sheet(
-        self, transfer: tuple[NDArray[np.float64], NDArray[np.float64]], rows: NDArray[np.int64], now: float
+        self,
+        transfer: Sequence[NDArray[np.float64]] | NDArray[np.float64],
+        rows: NDArray[np.int64],
+        now: float,
+        weights: NDArray[np.float64] | None,
     ) -> NDArray[np.float64]:
-        first, last = transfer
         if (short := self.faults.active("electrodes_shorted", now)) is not None:
-            a, b = (e % len(first) for e in short["electrodes"])
-            first, last = (shorted(m, a, b) for m in (first, last)) if a != b else (first, last)
-        z = four_terminal(first, rows)
-        if last is not first:
-            z = z + (np.arange(len(rows)) + 0.5) / len(rows) * (four_terminal(last, rows) - z)
-        return z
+            a, b = (e % len(transfer[0]) for e in short["electrodes"])
+            transfer = [shorted(m, a, b) for m in transfer] if a != b else transfer
+        z = np.array([four_terminal(m, rows) for m in transfer])
+        if weights is None:
+            share = (np.arange(len(rows)) + 0.5) / len(rows)
+            weights = np.stack([1 - share, share], axis=1)
+        return np.asarray(np.einsum("km,mk->k", weights, z))
 
     # --- the converter ---
 

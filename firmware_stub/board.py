@@ -32,9 +32,11 @@ def measurement_s(points: int) -> float:
 
 @dataclass(frozen=True)
 class Scan:
-    """A scan that was measured, whether or not it reached the host. Times in seconds since the stub started."""
+    """A scan, or a part of one, that was measured, whether or not it reached the host. Times in seconds since the stub
+    started.
+    """
 
-    seq: int
+    seq: int  # of its message: a part has one too
     start: float
     end: float
 
@@ -43,7 +45,8 @@ class Board:
     """The state machine. It is scanning from START to STOP, a scan every `measurement_s` times its list's length.
 
     speed: how many times faster than a real board it measures. crystal_ppm: how much too fast its clock runs.
-    answers_time: whether its firmware knows TIME_ASK. on_scan is called with each scan once it is measured.
+    answers_time, knows_parts: whether its firmware knows TIME_ASK, and scans in parts. on_scan is called with each
+    scan, or part of one, once it is measured.
     """
 
     def __init__(
@@ -57,11 +60,12 @@ class Board:
         crystal_ppm: float = 12.0,
         unique_id: bytes = b"eitskin-stub",
         answers_time: bool = True,
+        knows_parts: bool = True,
         on_scan: Callable[[Scan], None] | None = None,
     ) -> None:
         self.field, self.analog, self.faults = field, analog, faults
         self.electrodes, self.speed, self.crystal_ppm, self.unique_id = electrodes, speed, crystal_ppm, unique_id
-        self.answers_time, self.on_scan = answers_time, on_scan
+        self.answers_time, self.knows_parts, self.on_scan = answers_time, knows_parts, on_scan
         self.power_cycle(0.0)
 
     # --- life ---
@@ -71,12 +75,13 @@ class Board:
         self.faults.power_cycled()
         self._decoder = link.Decoder()
         self._booted = now
-        self._sent: dict[int, tuple[NDArray[np.complex64], NDArray[np.uint8]]] = {}  # by configuration, last
+        self._sent: dict[tuple[int, int], tuple[NDArray[np.complex64], NDArray[np.uint8]]] = {}
+        """The last values of each configuration and part."""
         self._configs: dict[int, link.Config] = {}
         self._running: link.Config | None = None
         self._next: link.Config | None = None
         self._scan_start = now
-        self._seq = 0
+        self._seq = self._part = 0
         self._reported: dict[EventCode, float] = {}
         self._out: list[tuple[float, bytes]] = []
         self._say(link.Event(EventCode.BOOT, f"{FIRMWARE} is up"), now)
@@ -130,7 +135,9 @@ class Board:
                     schema_hash=self._schema(now),
                     chip_id=self._chip_id(now),
                     unique_id=self.unique_id[:12].ljust(12, b"\0"),
-                    capabilities=CAPABILITIES | (link.Capability.TIME if self.answers_time else 0),
+                    capabilities=CAPABILITIES
+                    | (link.Capability.TIME if self.answers_time else 0)
+                    | (link.Capability.PARTS if self.knows_parts else 0),
                     electrodes=self.electrodes,
                     max_scan=link.MAX_SCAN,
                     firmware=FIRMWARE,
@@ -169,6 +176,8 @@ class Board:
             wrong = f"electrode {config.scan.max()}: 0 to {self.electrodes - 1}"
         elif (config.scan[:, 0] == config.scan[:, 1]).any() or (config.scan[:, 2] == config.scan[:, 3]).any():
             wrong = "a measurement drives or senses one electrode against itself"
+        elif config.parts not in (link.PARTS if self.knows_parts else (1,)) or len(config.scan) % config.parts:
+            wrong = f"{config.parts} parts of {len(config.scan)} measurements: 1, 2, 4, 5 or 10 equal ones, where known"
         if wrong:
             self._refuse(config, NakReason.BAD_CONFIG, wrong, now)
             return
@@ -191,7 +200,7 @@ class Board:
             self._refuse(start, NakReason.CHIP_ID, text, now)
         else:
             if self._running is None:
-                self._running, self._seq, self._scan_start = config, 0, now
+                self._running, self._seq, self._part, self._scan_start = config, 0, 0, now
             else:
                 self._next = config
             self._done(start, start.config, now)
@@ -216,7 +225,8 @@ class Board:
     # --- scanning ---
 
     def _duration(self, config: link.Config) -> float:
-        return len(config.scan) * measurement_s(config.dft_points) / self.speed
+        """Seconds until the board sends something: of a scan, or of a part."""
+        return len(config.scan) // config.parts * measurement_s(config.dft_points) / self.speed
 
     def _scan(self) -> None:
         config = self._running
@@ -224,20 +234,22 @@ class Board:
         start, end = self._scan_start, self.next_s()
         seq, self._seq = self._seq, self._seq + 1 & 0xFFFFFFFF
         self._scan_start = end
-        if self._next is not None:
+        part, self._part = self._part, (self._part + 1) % config.parts
+        if self._next is not None and not self._part:
             self._running, self._next = self._next, None
         if self._chip_id(start) != link.CHIP_ID:
             self._running = None
             self._event(EventCode.CHIP_ID, f"chip id {self._chip_id(start):#06x}: stopped", end)
             return
-        scan = np.asarray(config.scan, np.int64)
-        transfer = self.field.over(start, end)
-        z, status = self.analog.measure(transfer, scan, config.dft_points, config.rtia_ohm, start)
+        scan = np.split(np.asarray(config.scan, np.int64), config.parts)[part]
+        instants = np.asarray(start + (np.arange(len(scan)) + 0.5) * ((end - start) / len(scan)))
+        transfer, weights = self.field.over(instants)
+        z, status = self.analog.measure(transfer, scan, config.dft_points, config.rtia_ohm, start, weights)
         if self.faults.active("frozen", start) is not None:
-            z, status = self._sent.get(config.config, (z, status))
-        self._sent[config.config] = z, status
+            z, status = self._sent.get((config.config, part), (z, status))
+        self._sent[config.config, part] = z, status
         self._notice(start, end)
-        self._send(seq, start, end, config, z, status)
+        self._send(seq, start, end, config, part, z, status)
         if self.on_scan is not None:
             self.on_scan(Scan(seq, start, end))
 
@@ -247,6 +259,7 @@ class Board:
         start: float,
         end: float,
         config: link.Config,
+        part: int,
         z: NDArray[np.complex64],
         status: NDArray[np.uint8],
     ) -> None:
@@ -254,7 +267,9 @@ class Board:
         if gap is not None and self.analog.rng.random() < gap["fraction"]:
             return
         duration_us = round((end - start) * 1e6)
-        self._say(link.ScanFrame(seq, self.device_us(start), duration_us, config.config, z, status), end)
+        begun_us = self.device_us(start)
+        frame = link.ScanFrame(seq, begun_us, duration_us, config.config, z, status, part, config.parts)
+        self._say(frame, end)
 
     def device_us(self, t: float) -> int:
         """The microcontroller's clock at time t."""

@@ -16,13 +16,18 @@ from .faults import FAULTS
 from .rig import Rig
 
 log = logging.getLogger(__name__)
+SOON_S = 0.5  # a scene that was solved before begins so long after its answer was made, on time
 
 
 class Control:
-    """Serves the commands of all rigs (by skin) until `close`. `clock` gives their time in seconds."""
+    """Serves the commands of all rigs (by skin) until `close`. `clock` gives their time in seconds; begin_ns: this
+    host's monotonic clock when that was zero.
+    """
 
-    def __init__(self, rigs: Mapping[str, Rig], clock: Callable[[], float], context: zmq.Context[Any]) -> None:
-        self._rigs, self._clock, self._context = rigs, clock, context
+    def __init__(
+        self, rigs: Mapping[str, Rig], clock: Callable[[], float], context: zmq.Context[Any], begin_ns: int = 0
+    ) -> None:
+        self._rigs, self._clock, self._context, self._begin_ns = rigs, clock, context, begin_ns
         self._stop = threading.Event()
         self._server = self._bind()
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
@@ -49,7 +54,11 @@ class Control:
     def _scene(self, args: dict[str, Any]) -> dict[str, Any]:
         if not args.get("name"):
             return {"scenes": {name: scenes.load(name).about for name in scenes.names()}}
-        return self._rig(args).play(str(args["name"]), self._clock())
+        rig, name = self._rig(args), str(args["name"])
+        solved = rig.solve(name) if args.get("solved") else None
+        now, wait_s = self._clock(), SOON_S if solved else 0.0
+        played = rig.play(name, now, wait_s)
+        return played | {"start_ns": self._begin_ns + round((now + wait_s) * 1e9), "poses": solved}
 
     def _fault(self, args: dict[str, Any]) -> dict[str, Any]:
         rig, now, name = self._rig(args), self._clock(), args.get("name")

@@ -52,6 +52,7 @@ class Rig:
         unique_id: bytes = b"eitskin-stub",
         threaded: bool = False,
         answers_time: bool = True,
+        knows_parts: bool = True,
     ) -> None:
         script = scenes.load(scene)  # first, since it fails fast
         self.sheet = geometry if isinstance(geometry, Sheet) else Sheet(geometry, mismatch)
@@ -72,6 +73,7 @@ class Rig:
             speed=rate_hz * full_s if rate_hz else 1.0,
             crystal_ppm=crystal_ppm,
             answers_time=answers_time,
+            knows_parts=knows_parts,
             unique_id=unique_id,
             on_scan=self._scanned,
         )
@@ -119,7 +121,7 @@ class Rig:
     # --- what is done to the skin ---
 
     def press(self, values: Mapping[str, Any], now: float) -> dict[str, Any]:
-        """Press from now on; the next scan to start feels it. Keys as in `scene.touch`, and seconds, to_x, to_y;
+        """Press from now on: what is measured from now on feels it. Keys as in `scene.touch`, and seconds, to_x, to_y;
         `finger`, a name: the press takes the place of the one of that name.
 
         Raises ValueError for what no skin could feel.
@@ -164,10 +166,14 @@ class Rig:
             "faults": self.faults.listing(now),
         }
 
-    def play(self, name: str, now: float) -> dict[str, Any]:
-        """Begin a scene. Raises SceneError."""
-        timeline = Timeline(scenes.load(name), now, (), self.sheet.electrodes)
-        self.field.play(timeline, now)
+    def solve(self, name: str) -> int:
+        """Solve every pose of a scene before it is played; returns how many. Raises SceneError, ValueError."""
+        return self.field.solve_all(scenes.load(name), self.sheet.electrodes)
+
+    def play(self, name: str, now: float, wait_s: float = 0.0) -> dict[str, Any]:
+        """Begin a scene now, or after wait_s seconds. Raises SceneError."""
+        timeline = Timeline(scenes.load(name), now + wait_s, (), self.sheet.electrodes)
+        self.field.play(timeline, now + wait_s)
         self._cued = now
         script = timeline.script
         return {"scene": script.name, "about": script.about, "seconds": script.duration, "loop": script.loop}
@@ -185,7 +191,7 @@ class Rig:
         return {"fault": name, "args": full, "what": row.what, "sticky": row.sticky, "seconds": seconds}
 
     def status(self, now: float) -> dict[str, Any]:
-        world = self.field.timeline.at(now)
+        world = self.field.at(now)
         return {
             "scene": self.field.timeline.script.name,
             "touches": len(world.touches),
@@ -204,10 +210,9 @@ class Rig:
     # --- inside ---
 
     def _scanned(self, scan: Scan) -> None:
-        """Note what the scan felt: the world at its middle, as `Field.over` has it."""
-        segment = self.field.segment(scan.start)
+        """Note what the scan felt: the world at its middle."""
         middle = (scan.start + scan.end) / 2
-        self.scans.append((scan, segment.at(min(middle, segment.end)), middle))
+        self.scans.append((scan, self.field.at(middle), middle))
 
     def _cues(self, now: float) -> None:
         """Faults that the scene asks for at a time between the last call and this one."""

@@ -210,10 +210,9 @@ def main(argv: list[str] | None = None) -> None:
         if not args.package:
             scenes = _scenes(work, "train", pre, model)
             start = None if registered is None else warped.start(registered)
-            # One network is enough for a registered skin: what its presses leave open no other one can know.
-            trained = (
-                (("full", plan.full), ("fast", plan.fast)) if start is None else (("full", plan.full + plan.fast),)
-            )
+            trained = [("full", plan.full), ("fast", plan.fast)]
+            if start is not None:  # a registered skin: what its presses leave open no second network can know
+                trained = [("full", plan.full + plan.fast)]
             for variant, minutes in trained:
                 at, seed, jobs = work / f"{variant}.pt", args.seed, args.jobs
                 train.train(variant, skin, pre, scenes, held_out, minutes, at, seed, jobs, start=start, own=own)

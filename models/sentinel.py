@@ -115,8 +115,8 @@ def design(
     deflection = NEWTON * grid.response[judged] / sigma
     signed = m.normalisation == "model"
     smallest = shortest_list(deflection, length, signed)
-    slopes = _slopes(grid, judged, sigma)
-    return Sentinel(np.sort(for_place(smallest, slopes, length)), np.sort(smallest), grid, signed)
+    by_place = slopes(grid, judged, sigma)
+    return Sentinel(np.sort(for_place(smallest, by_place, length)), np.sort(smallest), grid, signed)
 
 
 def shortest_list(deflection: Array, longest: int, signed: bool = True) -> Rows:
@@ -205,7 +205,7 @@ def _directions(deflection: Array, signed: bool) -> Array:
     return unit if signed else np.concatenate([unit, -unit])
 
 
-def _slopes(grid: Touches, judged: npt.NDArray[np.bool_], sigma: float) -> Array:
+def slopes(grid: Touches, judged: npt.NDArray[np.bool_], sigma: float) -> Array:
     """(M, K, 3) of d over sigma, to x, y and the log of drop times area, which a linear touch changes d in proportion
     to; of the judged touches of one newton.
     """

@@ -89,7 +89,8 @@ class Frame(Heard):
         Text(16, form="[0-9a-f]{16}"), "random, new each time the producer starts", "0" * 16, always=True
     )
     seq: int = wire(_COUNT, "number of this frame: counts up by one, per topic, in this session", 0, always=True)
-    scan: int = wire(_COUNT, "the board's number of the scan that this frame comes from", 0)
+    scan: int = wire(_COUNT, "the board's number of the scan, or part of one, that this frame comes from", 0)
+    part: int = wire(Int(0, 10), "of a scan in parts: the part measured last, from 1 on; 0: a whole scan", 0)
     host: str = wire(
         Text(64), "host whose monotonic clock the stamps are of (its boot id): where it was measured", "", always=True
     )
@@ -110,7 +111,9 @@ class Frame(Heard):
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class RawFrame(Frame):
-    """One scan of the board, in the scan list's order."""
+    """One scan of the board, in the pattern's order. Of a scan in parts: the newest value of each measurement, after
+    each part; `sample` is the middle of the newest one.
+    """
 
     same_length: ClassVar[tuple[str, ...]] = ("z", "status")
 
@@ -128,6 +131,15 @@ class RawFrame(Frame):
     board: str = wire(Text(64), "unique id of the board", "")
     pattern: str = wire(_NAME, "name of the drive pattern", "pairs")
     unit: str = wire(Text(choices=("ohm", "counts")), "unit of z", "ohm")
+    parts: int = wire(Int(1, 10), "in how many parts the board measures a scan", 1)
+    age_us: NDArray[np.float32] = wire(
+        Array("<f4", ("K",), "us", or_empty=True),
+        "by how much each value is older than the end of the newest part; empty: a whole scan, in its order",
+        _empty("<f4", 1),
+    )
+    new: NDArray[np.uint8] = wire(
+        Array("|u1", ("K",), or_empty=True), "1: measured in the newest part; empty: all are new", _empty("|u1", 1)
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

@@ -20,6 +20,7 @@ from .link_messages import (
     MAX_SCAN,
     MAX_TEXT,
     MESSAGES,
+    PARTS,
     SCHEMA_HASH,
     SCHEMA_TEXT,
     Ack,
@@ -43,7 +44,7 @@ from .link_messages import (
 )  # fmt: skip
 
 __all__ = [
-    "CHIP_ID", "LINK_VERSION", "MAX_BODY", "MAX_SCAN", "MAX_TEXT", "MESSAGES", "SCHEMA_HASH", "SCHEMA_TEXT",
+    "CHIP_ID", "LINK_VERSION", "MAX_BODY", "MAX_SCAN", "MAX_TEXT", "MESSAGES", "PARTS", "SCHEMA_HASH", "SCHEMA_TEXT",
     "Ack", "Capability", "Config", "Decoder", "Event", "EventCode", "Hello", "Ident", "LinkError", "Message",
     "Nak", "NakReason", "ScanFrame", "SelfTest", "SelfTestFault", "Start", "Stop", "Time", "TimeAsk", "encode",
 ]  # fmt: skip

@@ -20,6 +20,8 @@ from .errors import EitskinError
 LINK_VERSION = 1
 MAX_SCAN = 512
 """Most measurements in a scan list."""
+PARTS = (1, 2, 4, 5, 10)
+"""Into how many equal parts a scan may be sent."""
 MAX_BODY = 8192
 """Longest body with its CRC, in bytes; a receiver drops what is longer."""
 MAX_TEXT = 200
@@ -39,6 +41,7 @@ class Capability(IntFlag):
     SELF_TEST = 2
     VARIABLE_DFT = 4
     TIME = 8
+    PARTS = 16
 
 
 class NakReason(IntEnum):
@@ -87,7 +90,7 @@ def _wired(kind: str, doc: str, default: Any = ...) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Message:
-    """Base: the fields of a fixed size come first; what has no fixed size is packed by `_tail` and read by
+    """Base: the fields of a fixed size are sent first; what has no fixed size is packed by `_tail` and read by
     `_read_tail`.
     """
 
@@ -103,7 +106,8 @@ class Message:
     @classmethod
     def layout(cls) -> list[tuple[str, str, str]]:
         """(name, kind, what it is) of each field, in the order sent."""
-        return [(n, f.metadata["kind"], f.metadata["doc"]) for n, f in cls.__dataclass_fields__.items() if f.metadata]
+        of = [(n, f.metadata["kind"], f.metadata["doc"]) for n, f in cls.__dataclass_fields__.items() if f.metadata]
+        return sorted(of, key=lambda each: each[1] not in STRUCT_CODES)
 
     @classmethod
     def _head(cls) -> tuple[list[str], struct.Struct]:
@@ -175,6 +179,7 @@ class Config(Message):
     scan: NDArray[np.uint8] = _wired(
         "n u16, n x 4 u8", "electrodes drive+, drive-, sense+, sense- of each measurement, from 0"
     )
+    parts: int = _wired("u8", "equal parts of the list, a FRAME each; over 1 only with PARTS", 1)
 
     def _tail(self) -> bytes:
         scan = np.asarray(self.scan)
@@ -259,18 +264,20 @@ class Nak(_WithText):
 
 @dataclass(frozen=True, eq=False)
 class ScanFrame(Message):
-    """One scan."""
+    """One scan, or one part of a scan in parts."""
 
     number, sender, wire_name = 0x84, "board", "Frame"
-    seq: int = _wired("u32", "counts scans since START, also those that could not be sent; wraps to 0")
-    device_us: int = _wired("u64", "the microcontroller's clock at the start of the scan [us]")
-    duration_us: int = _wired("u32", "how long the scan took [us]")
+    seq: int = _wired("u32", "counts FRAMEs since START, also those that could not be sent; wraps to 0")
+    device_us: int = _wired("u64", "the microcontroller's clock at the start of this scan or part [us]")
+    duration_us: int = _wired("u32", "how long this scan or part took [us]")
     config: int = _wired("u16", "id of the configuration that was scanned")
     z: NDArray[np.complex64] = _wired("n u16, n x (re, im f32)", "impedance of each measurement [ohm]")
     status: NDArray[np.uint8] = _wired(
         "ceil(n/2) u8",
         "4 bits a measurement, the first in the low half: 1 clipped, 2 open, 4 RTIA overrange, 8 FIFO or missed",
     )
+    part: int = _wired("u8", "which part of the list this is, from 0", 0)
+    parts: int = _wired("u8", "of how many; 1: a whole scan", 1)
 
     def _tail(self) -> bytes:
         z, status = np.ascontiguousarray(self.z, "<c8"), np.asarray(self.status)

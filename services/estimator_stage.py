@@ -20,6 +20,7 @@ from services.estimation.touch_decision import FrameAverager
 from services.estimation.touch_estimator import TouchEstimator
 from services.kept_baseline import kept, take_over
 from services.linearisation import Linearisation
+from services.rolling_scans import RollingScans
 from services.runtime.config import Skin
 from services.runtime.stage import Health, Refused, Stage
 from services.sentinel_scans import SentinelScans
@@ -28,7 +29,7 @@ from services.sentinel_scans import SentinelScans
 class EstimatorStage(Stage):
     """Everything of preprocessing but the way of a frame: commands, kept state, what info and status say."""
 
-    commands = ("tare",)
+    commands = ("tare", "part")
     persists = True
 
     def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
@@ -42,6 +43,7 @@ class EstimatorStage(Stage):
         self._unchecked = checks.sentence(bundle)
         self._force = force(skin, bundle)
         self.sentinel_scans = SentinelScans(skin, bundle)
+        self.rolling_scans = RollingScans(bundle)
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
         self.reset()
 
@@ -70,6 +72,7 @@ class EstimatorStage(Stage):
 
     def reset(self) -> None:
         self.sentinel_scans.scan = 0
+        self.rolling_scans.reset()
         self._impossible_ns = 0  # since when every frame is of no touch
         self.gain.reset()
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
@@ -85,6 +88,7 @@ class EstimatorStage(Stage):
         """There is another baseline."""
         self.electrodes.tared()
         self.touch_estimator.begin_anew()
+        self.rolling_scans.begin_anew()
         self.gain.reset()
         self.frame_averager.reset()
 
@@ -94,6 +98,8 @@ class EstimatorStage(Stage):
         self._begin_anew()
 
     def command(self, name: str, args: dict[str, Any]) -> dict[str, Any]:
+        if name == "part":
+            return {**self.rolling_scans.handed_on(int(args.get("scan", -1)))}
         if name != "tare":
             return super().command(name, args)
         try:
@@ -111,6 +117,7 @@ class EstimatorStage(Stage):
         return {
             "touched": self.touch_estimator.touched,
             "coarse": self.sentinel_scans.scan,
+            "rolling": self.rolling_scans.state(),
             "impossible_ns": self._impossible_ns,
             "gain": self.gain.state(),
             "hold": self.frame_averager.state(),
@@ -135,6 +142,7 @@ class EstimatorStage(Stage):
         self.baseline_estimator.load(state)
         self.touch_estimator.touched = bool(state["touched"])
         self.sentinel_scans.scan = int(state.get("coarse", 0))
+        self.rolling_scans.load(state.get("rolling", {}))
         self._impossible_ns = int(state.get("impossible_ns", 0))
         self.frame_averager.load(state["hold"], len(self.bundle.pattern))
         self.touch_detector.reset()
@@ -161,6 +169,8 @@ class EstimatorStage(Stage):
         _ = self.baseline_estimator.evidence
         if self.config.scan == "adaptive":
             self.sentinel_scans.warm_up()
+        if self.config.scan == "rolling":
+            self.rolling_scans.warm_up()
         if self.baseline_estimator.baseline is not None:
             live = np.isfinite(self.baseline_estimator.sigma)
             operator, decision = self.touch_detector.operator(live, self.touch_estimator.noise(), 0)

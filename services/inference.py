@@ -16,6 +16,7 @@ from models.bundle import Bundle
 from models.locator import Located, Locator
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
 from services.describe import ON, refinement
+from services.estimation.part_image import PartImage
 from services.estimation.quality import SURE, Residual
 from services.estimation.sentinel import CoarseImage
 from services.estimation.within_scan import CHANGING_FRAMES, ChangingTouch
@@ -63,6 +64,7 @@ class Inference(Stage):
         if skin.touch.symmetry and isinstance(self._network, Network) and turns:
             self._symmetry = SymmetryMean(self._network, turns)
         self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
+        self._parts = PartImage(bundle) if skin.scan == "rolling" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
 
@@ -204,7 +206,7 @@ class Inference(Stage):
             self._changing = 0
         elif self._refused and self._changes(frame, out):
             return
-        elif not self._changing_touch.steady(frame.difference, frame.sigma):
+        elif not self._changing_touch.steady(frame.difference, frame.sigma, frame.part):
             self._changing += 1
             if not self._refused:
                 add_reason(out.reasons, "changing")
@@ -218,7 +220,8 @@ class Inference(Stage):
         valid and says `changing`, also where the touch ended: it pressed in a part of the scan. Its image shows nothing
         new: that of before is held, and where there was none it is empty.
         """
-        found = self._changing_touch(frame.difference, frame.sigma) if self._changing < CHANGING_FRAMES else None
+        known = self._changing >= CHANGING_FRAMES
+        found = None if known else self._changing_touch(frame.difference, frame.sigma, frame.part)
         if found is None:
             return False
         add_reason(out.reasons, "changing")
@@ -237,8 +240,25 @@ class Inference(Stage):
 
     def _roughly(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """The image of a few measurements, which no network was trained on."""
+        if frame.part:
+            self._of_parts(frame, out)
+            return
         self._coarse = self._coarse or CoarseImage(self.bundle)
         out.image, out.sigma, out.classes = self._coarse.run(frame)
+        self._shows(frame, out)
+
+    def _of_parts(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        """The image of one touch, from the parts since it began: `coarse` where its place is not sure."""
+        self._parts = self._parts or PartImage(self.bundle)
+        found = self._parts.fit(frame.difference, frame.sigma)
+        out.image, out.sigma = self._parts.image(found)
+        metres = self._parts.metres_per_unit
+        at, axes = [metres * found.x, metres * found.y], [metres * found.sigma[0], metres * found.sigma[1]]
+        out.residual = found.unexplained
+        size = found.drop * np.pi * (metres * found.radius) ** 2
+        out.touches = [LocatedTouch(position=at, sigma=[*axes, found.sigma[2]], amplitude=size)]
+        if found.sure:
+            out.reasons.remove("coarse")
         self._shows(frame, out)
 
     def _shows(self, frame: DeltaFrame, out: ImageFrame) -> None:

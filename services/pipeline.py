@@ -43,8 +43,17 @@ class Pipeline:
         self.pre.always_reconstruct = self.inference.each_alone = self.publishing.each_alone = always_reconstruct
 
     def run(self, raw: RawFrame) -> Result:
-        """What the processes would publish for one raw frame; stamps are filled in."""
-        delta = self.pre.process(raw, ALL)[0]
+        """What the processes would publish for one raw frame, which is a whole scan; stamps are filled in."""
+        result = self.step(raw)
+        assert result is not None, "a part of a scan: only `step` takes those"
+        return result
+
+    def step(self, raw: RawFrame) -> Result | None:
+        """The same; None for a part of a scan that only preprocessing takes note of."""
+        made = self.pre.process(raw, ALL)
+        if not made:
+            return None
+        delta = made[0]
         delta.stamps[self.pre.stamp] = time.monotonic_ns()
         image = self.inference.process(delta, ALL)[0]
         image.stamps[self.inference.stamp] = time.monotonic_ns()

@@ -44,11 +44,19 @@ class Preprocessing(EstimatorStage):
         out.valid, out.reasons = as_sent(frame)  # measurements that failed are left out below
         for reason in reasons_of(frame.status):
             add_reason(out.reasons, reason)
+        if not self.rolling_scans.due(frame, out.stamps, self.baseline_estimator):
+            return [*self.rolling_scans.part(out, frame, self.baseline_estimator)]
+        made = self._scan(out, frame)
+        self.rolling_scans.judged(made, frame)
+        return [made]
+
+    def _scan(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
+        """What one scan says."""
         if frame.kind == "sentinel":
-            return [self._sentinel(out, frame)]
+            return self._sentinel(out, frame)
         self.sentinel_scans.scan = 0
         if len(frame.z) != len(self.bundle.pattern):
-            return [self._no_scan(out, frame)]
+            return self._no_scan(out, frame)
         self._foreign = ""
         self.baseline_estimator.follow(frame)
         amplitude = np.abs(frame.z.astype(np.complex128))
@@ -85,17 +93,17 @@ class Preprocessing(EstimatorStage):
             self._begin_anew()
         if self.baseline_estimator.baseline is None:
             reason = "touched_at_start" if self.baseline_estimator.touched_at_start else "stale_baseline"
-            return [_unusable(out, reason, len(amplitude))]
+            return _unusable(out, reason, len(amplitude))
         if self.baseline_estimator.baseline.doubt:
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
         if frame.kind == "reference":  # untouched, as the file says: there is nothing to decide
             out.difference = np.zeros(len(amplitude), np.float32)
             out.sigma = np.asarray(self.baseline_estimator.sigma, np.float32)
-            return [out]
+            return out
         if not (trusted := believed(frame)):
             self.frame_averager.reset()  # a mean of the same scan again and again is no surer
-        return [self._compare(out, amplitude - found.shift, found, learns=trusted and not separate)]
+        return self._compare(out, amplitude - found.shift, found, learns=trusted and not separate)
 
     def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict, learns: bool) -> DeltaFrame:
         """Difference, decision, and the stack where one is needed."""

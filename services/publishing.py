@@ -116,7 +116,8 @@ class Publishing(Stage):
         # It began or went during the scan, or nothing of it is to be believed yet.
         doubtful = (had or self.tracker.waits) and self._changing < CHANGING_FRAMES
         changed = not self._touched or not (self._segments or (_explained(frame) and not doubtful))
-        if out.valid and frame.touched and changed and not frame.held and not self._alone(frame):
+        since = bool(frame.part and frame.touches)  # made only of what was measured since the touch began
+        if out.valid and frame.touched and changed and not (frame.held or since or self._alone(frame)):
             add_reason(out.reasons, "changing")
         self._changing = self._changing + 1 if "changing" in out.reasons else 0
         self._touched = frame.touched

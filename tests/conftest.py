@@ -31,13 +31,23 @@ def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.rmtree(folder, ignore_errors=True)
 
 
+def without_recorder(folder: Path) -> Path:
+    """The shipped configuration without its recorder, which listens to every contact and keeps the publisher awake."""
+    lines = (ROOT / "skin.toml").read_text().splitlines(keepends=True)
+    begin = next(k for k, line in enumerate(lines) if line.startswith("[recorder]"))
+    end = next(k for k, line in enumerate(lines) if k > begin and line.startswith("# ["))
+    path = folder / "skin.toml"
+    path.write_text("".join(lines[:begin] + lines[end:]))
+    return path
+
+
 @contextlib.contextmanager
-def serving(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+def serving(folder: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
     """`skin up` with the stub board in this runtime folder, once valid contact frames come; ended afterwards."""
     from protocol.sockets import NewestReader  # here: numpy's threads are still to be limited by who needs it first
 
     with open(folder / "log.txt", "wb") as log:
-        command = [sys.executable, str(ROOT / "skin"), "up"]
+        command = [sys.executable, str(ROOT / "skin"), "up", *options]
         environment = {**os.environ, "EITSKIN_RUNTIME": str(folder)}
         process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
         try:
@@ -61,12 +71,12 @@ def service(runtime: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 @pytest.fixture(scope="module")
 def shared_service() -> Iterator[Path]:
-    """The whole service, one for all tests of a file; gives its runtime folder, which $EITSKIN_RUNTIME names."""
+    """The service without recorder, one for all tests of a file; gives the runtime folder, $EITSKIN_RUNTIME."""
     folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
     try:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("EITSKIN_RUNTIME", str(folder))
-            with serving(folder):
+            with serving(folder, "--config", str(without_recorder(folder))):
                 yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)

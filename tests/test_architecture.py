@@ -41,6 +41,7 @@ SERVICES_USE_OF_MODELS = {
     "models.npz",
     "models.prereconstruction",
     "models.patterns",
+    "models.rolling",
     "models.refine",
     "models.shapes",
     "models.touch_fit",

@@ -265,13 +265,13 @@ def goals(report: dict[str, Any], quick: bool) -> list[Goal]:
                     Goal(f"{title}: {what} within the stated {percent} %, off by", abs(within - percent), at_most=3)
                 )
         worst = min(gain for kind, row in by_kind.items() for gain in gains(kind, row["network"], row["service"]))
-        made.append(Goal(f"{title}: worst row, service less network, standard errors", worst, at_least=-1.0, gate=-2.5))
+        made.append(Goal(f"{title}: worst row, service less network, standard errors", worst, at_least=-1.0))
         for kind, most in (("circle", 14 if level != "none" else 3), ("hertz", 14 if level != "none" else 3)):
             force = by_kind[kind]["declared"]["force %"][0]
             made.append(Goal(f"{title}: force, {kind} declared, median error, %", force, at_most=most))
     for level, found in report["odd"].items():
         title = f"{Level(level).title}, shapes that neither knows: worst row, service less network, standard errors"
-        made.append(Goal(title, worst_odd(found), at_least=-1.0, gate=-2.5))
+        made.append(Goal(title, worst_odd(found), at_least=-1.0))
     return made
 
 

@@ -40,6 +40,7 @@ class AdaptiveHost:
         self.source = BoardSource("palm", skin, bundle)
         self.adaptive = self.source.adaptive()
         self.link = BoardLink(self.source.scanning, 0.0, self.source.idling)
+        self.newest = self.source.newest()
         self.pipeline = Pipeline(skin, "palm", bundle)
         self.pipeline.pre.warm_up()
         self.kinds: Counter[str] = Counter()
@@ -80,7 +81,9 @@ class AdaptiveHost:
         self.kinds[kind] += 1
         if self.deaf:
             return
-        raw = self.source.raw_frame(scan, self.link, round(self.now * 1e9), kind)
-        delta, _, contact = self.pipeline.run(raw)
+        raw = self.source.handed_on(scan, self.link, round(self.now * 1e9), self.newest, kind)
+        if raw is None or (result := self.pipeline.step(raw)) is None:
+            return
+        delta, _, contact = result
         heapq.heappush(self._verdicts, (self.now + CHAIN_S, len(self.contacts), delta))
         self.contacts.append((self.now + CHAIN_S, contact))

@@ -146,7 +146,7 @@ class _Recorder:
             {k: v for k, v in f.faults.items() if k in ELECTRODE_FAULTS} | drifts
             for f, drifts in zip(felt, drifting, strict=True)
         ]
-        rows = [row for k, f in enumerate(felt) for row in self._touches(script, k, f.start, f.world)]
+        rows = [row for k, f in enumerate(felt) for row in self._touches(script, k, f.middle, f.world)]
         names = [([name for t, name in script.sections if t <= f.middle] or [""])[-1] for f in felt]
 
         def column(of: Callable[[RawFrame], object]) -> NDArray[Any]:
@@ -167,9 +167,9 @@ class _Recorder:
             sections=np.array(names),
         )
 
-    def _touches(self, script: Script, k: int, start: float, world: World) -> list[list[float]]:
+    def _touches(self, script: Script, k: int, middle: float, world: World) -> list[list[float]]:
         """Rows of `Recorded.touches`: the world lists its touches in the order of the script's tracks."""
-        there = [n for n, track in enumerate(script.tracks) if track.times[0] <= start < track.times[-1]]
+        there = [n for n, track in enumerate(script.tracks) if track.times[0] <= middle < track.times[-1]]
         rows = []
         for n, touch in zip(there, world.touches, strict=True):
             if touch.drop > 0:

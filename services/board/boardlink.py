@@ -29,7 +29,8 @@ NO_CURRENT = STATUS_OPEN | STATUS_RTIA
 
 
 class BoardLink:
-    """One connection. `state` is hello, config, start, running or refused.
+    """One connection. `state` is hello, config, start, running or refused. `scanning`: what the board scans; whole
+    where its firmware knows no parts.
 
     `clock` maps the board's time to this host's. It begins anew only where START and its answer say so.
     idle: a second configuration that a running board may be switched to (`switch`), where its firmware can.
@@ -37,6 +38,7 @@ class BoardLink:
 
     def __init__(self, scanning: Scanning, now_s: float, idle: Scanning | None = None) -> None:
         self.scanning, self._idle = scanning, idle
+        self.knows_no_parts = False  # and so scans whole, although parts were wanted
         self._pending: list[Scanning] = []  # configurations to send before START
         self._started = scanning  # what the board was last told to scan
         self._wanted = scanning
@@ -141,7 +143,11 @@ class BoardLink:
             if self.state == "config":
                 return link.encode(
                     link.Config(
-                        config=s.config, dft_points=s.dft_points, rtia_ohm=s.rtia_ohm, scan=s.pattern.astype("u1")
+                        config=s.config,
+                        dft_points=s.dft_points,
+                        rtia_ohm=s.rtia_ohm,
+                        scan=s.scan_list.astype("u1"),
+                        parts=s.parts,
                     )
                 )
             self._start_s = now_s if self._start_s is None else self._start_s
@@ -197,6 +203,9 @@ class BoardLink:
     def _introduced(self, ident: link.Ident, now_s: float) -> None:
         self.ident = ident
         self.clock.timed = bool(ident.capabilities & link.Capability.TIME)
+        if not ident.capabilities & link.Capability.PARTS:
+            self.knows_no_parts = self.knows_no_parts or self.scanning.parts > 1
+            self.scanning = self.scanning.whole
         if wrong := unfit(ident, self.scanning):
             self._refuse(wrong, now_s)
         elif self.state in ("hello", "refused"):
@@ -253,7 +262,7 @@ class BoardLink:
     def _watch(self, scan: link.ScanFrame, now_s: float) -> None:
         """Looks for a brown-out that lost the registers without a word: then no measurement has a current."""
         self._dead_scans = self._dead_scans + 1 if (scan.status & NO_CURRENT).all() else 0
-        if self._dead_scans >= DEAD_SCANS and now_s - self._dead_s >= DEAD_AGAIN_S:
+        if self._dead_scans >= DEAD_SCANS * scan.parts and now_s - self._dead_s >= DEAD_AGAIN_S:
             self._dead_scans, self._dead_s = 0, now_s
             self._restart(
                 now_s, "no current through any electrode: configuring the board again; is the skin connected?"
@@ -262,12 +271,14 @@ class BoardLink:
     def _is_ours(self, scan: link.ScanFrame, first_byte_s: float, now_s: float) -> bool:
         """Returns whether this is to be believed as the board's next scan; counts what it is otherwise."""
         known = (self.scanning, self._idle) if self.switches else (self.scanning,)
-        ours = any(s is not None and scan.config == s.config and len(scan.z) == len(s.pattern) for s in known)
+        ours = any(s is not None and s.sent(scan) for s in known)
         if self.state != "running" or not ours:
             self.counts["foreign"] += 1
             return False
         # The first byte leaves as the scan ends; the last one as much later as the line is slow.
-        what = self._check(scan, _ns(first_byte_s), fit=scan.config == self.scanning.config)
+        what = self._check(
+            scan, _ns(first_byte_s), fit=scan.config == self.scanning.config and scan.part == scan.parts - 1
+        )
         self.counts[what] += 1
         if self._check.jumped:
             self._clock_jumped(now_s)

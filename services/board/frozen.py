@@ -24,31 +24,32 @@ class FrozenScans:
     def __init__(self) -> None:
         self.noisy = False
         self.frozen = False  # of the last scan
-        self._last: dict[int, NDArray[np.complex64]] = {}  # by configuration
-        self._steps: dict[int, NDArray[np.float32]] = {}
-        self._same: dict[int, int] = {}
+        self._last: dict[tuple[int, int], NDArray[np.complex64]] = {}  # by configuration and part
+        self._steps: dict[tuple[int, int], NDArray[np.float32]] = {}
+        self._same: dict[tuple[int, int], int] = {}
         self._by_turns = 0
 
     def __call__(self, scan: link.ScanFrame) -> bool:
         """Whether this scan of a live board is one of FROZEN or more."""
-        last = self._last.get(scan.config)
-        self._last[scan.config] = scan.z
+        which = scan.config, scan.part
+        last = self._last.get(which)
+        self._last[which] = scan.z
         if last is None or len(last) != len(scan.z):
-            self._steps.pop(scan.config, None)
-            self._same[scan.config] = 1
+            self._steps.pop(which, None)
+            self._same[which] = 1
             return False
         same = last.tobytes() == scan.z.tobytes()
-        self._same[scan.config] = self._same[scan.config] + 1 if same else 1
+        self._same[which] = self._same[which] + 1 if same else 1
         if not self.noisy:
             self._learn(scan, last)
-        self.frozen = self.noisy and self._same[scan.config] >= FROZEN
+        self.frozen = self.noisy and self._same[which] >= FROZEN
         return self.frozen
 
     def _learn(self, scan: link.ScanFrame, last: NDArray[np.complex64]) -> None:
         with np.errstate(all="ignore"):
             step = scan.z.real - last.real
-            before = self._steps.get(scan.config)
-            self._steps[scan.config] = step
+            before = self._steps.get((scan.config, scan.part))
+            self._steps[scan.config, scan.part] = step
             turned = before is not None and np.mean(np.sign(step) * np.sign(before) < 0) > 0.5
         self._by_turns = self._by_turns + 1 if turned else 0
         self.noisy = self._by_turns >= PROOF

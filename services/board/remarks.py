@@ -12,6 +12,7 @@ UNTIMED = (
     "this board's firmware does not tell its time (TIME_ASK): a delay of its line that was there from the start, "
     f"or that grows by less than {MAX_RATE_ERROR * 1e3:g} ms/s, is not seen"
 )
+WHOLE = 'this board\'s firmware knows whole scans only: scan = "rolling" is without effect'
 FROZEN = "the board sends the same scan again and again, with new numbers: its frames are not valid; power-cycle it"
 UNKNOWN = (
     f"how old the board's frames are is not known within {WIDE_NS / 1e6:.0f} ms, for its answers take too long: "
@@ -36,6 +37,8 @@ class Remarks:
         if board.state == "running":
             if not board.clock.timed:
                 levels[UNTIMED] = "WARN"
+            if board.knows_no_parts:
+                levels[WHOLE] = "WARN"
             if board.clock_unknown:
                 levels[UNKNOWN] = "ERROR"
             if board.frozen:

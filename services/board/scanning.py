@@ -13,19 +13,39 @@ from protocol import link
 
 @dataclass(frozen=True)
 class Scanning:
-    """What the board is to do: scan list (K, 4) of electrodes, DFT points, gain resistor."""
+    """What the board is to do: measurements (K, 4) of electrodes, DFT points, gain resistor. A scan in parts has an
+    order of the measurements (K,): part after part.
+    """
 
     pattern: NDArray[np.integer]
     dft_points: int
     rtia_ohm: float
+    parts: int = 1
+    order: NDArray[np.integer] | None = None
+
+    @property
+    def scan_list(self) -> NDArray[np.integer]:
+        """(K, 4), as the board measures them."""
+        return self.pattern if self.order is None else self.pattern[self.order]
+
+    @property
+    def whole(self) -> Scanning:
+        """The same as whole scans, in the pattern's order."""
+        return self if self.order is None else Scanning(self.pattern, self.dft_points, self.rtia_ohm)
 
     @property
     def config(self) -> int:
         """Id of this configuration on the board: from its content, so that one of an earlier session is never taken
         for it.
         """
-        text = self.pattern.astype("u1").tobytes() + f"{self.dft_points} {self.rtia_ohm:g}".encode()
+        text = self.scan_list.astype("u1").tobytes() + f"{self.dft_points} {self.rtia_ohm:g}".encode()
+        text += f" {self.parts}".encode() if self.parts > 1 else b""
         return zlib.crc32(text) & 0xFFFF
+
+    def sent(self, scan: link.ScanFrame) -> bool:
+        """Whether a FRAME is one of this list, or of its parts."""
+        whole = scan.parts == self.parts and scan.part < self.parts
+        return scan.config == self.config and whole and len(scan.z) * self.parts == len(self.pattern)
 
 
 def unfit(ident: link.Ident, scanning: Scanning) -> str:

@@ -11,6 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Generator, Iterator
+from dataclasses import replace
 
 from models.bundle import Bundle
 from protocol import link
@@ -21,8 +22,10 @@ from services.board.adaptive import AdaptiveScan, Passed
 from services.board.boardlink import BoardLink
 from services.board.clock import UNSETTLED_NS
 from services.board.host_time import STOOD_STILL_S, HostTime, Suspensions
+from services.board.newest_values import NewestValues
 from services.board.remarks import Remarks
 from services.board.scanning import Scanning
+from services.estimation.rolling import parts_of, rolling_order
 from services.estimation.sentinel import sentinel_of
 from services.runtime.config import Skin
 from services.runtime.stage import Health, add_reason, valid_for_s
@@ -83,6 +86,8 @@ class BoardSource(Source):
         self._verdicts: NewestReader | None = None  # what preprocessing makes of the frames
         if skin.scan == "adaptive":
             self.idling = Scanning(bundle.pattern[sentinel_of(bundle).rows], skin.dft_points, skin.rtia_ohm)
+        if skin.scan == "rolling":
+            self.scanning = replace(self.scanning, parts=parts_of(bundle), order=rolling_order(bundle))
         self._port: ports.Port | None = None
         self._board = ""  # unique id of the board that we know
         self._usb_serial: str | None = None
@@ -130,7 +135,7 @@ class BoardSource(Source):
         """
         opened = last = self._now()
         board, suspensions = BoardLink(self.scanning, opened, self.idling), Suspensions(self.host)
-        adaptive = self.adaptive()
+        adaptive, newest = self.adaptive(), self.newest()
         seen: Counter[str] = Counter()
         counted = 0.0
         try:
@@ -168,12 +173,12 @@ class BoardSource(Source):
                 passed = [p for scan in scans for p in (adaptive.scanned(scan, last) if adaptive else [(scan, "full")])]
                 if stood_s > STOOD_STILL_S:
                     passed = self._newest(passed, board, stood_s, last)
-                frames = [self.raw_frame(scan, board, read_ns, kind) for scan, kind in passed]
+                frames = [self.handed_on(scan, board, read_ns, newest, kind) for scan, kind in passed]
                 if last - counted > COUNT_EVERY_S or not scans:
                     counted = last
                     self._count(board, seen, adaptive)
                     self.remarks.look(board, last)
-                yield from frames
+                yield from (frame for frame in frames if frame is not None)
                 if not scans:
                     yield None
         finally:
@@ -217,10 +222,23 @@ class BoardSource(Source):
             if isinstance(delta, DeltaFrame):
                 adaptive.heard(delta, now_s)
 
+    def newest(self) -> NewestValues | None:
+        """Returns what collects a new connection's values, where they come in parts."""
+        return None if self.scanning.order is None else NewestValues(self.scanning.order)
+
+    def handed_on(
+        self, scan: link.ScanFrame, board: BoardLink, read_ns: int, newest: NewestValues | None, kind: str = "full"
+    ) -> RawFrame | None:
+        """Returns what goes on to preprocessing; None while values are missing."""
+        if newest is not None and not newest.take(scan):
+            return None
+        frame = self.raw_frame(scan, board, read_ns, kind)
+        return frame if newest is None else newest.frame(frame, scan)
+
     def raw_frame(self, scan: link.ScanFrame, board: BoardLink, read_ns: int, kind: str = "full") -> RawFrame:
         """Returns the raw frame of a board's scan, with this host's stamps; `read_ns`: when its last byte was read."""
         if kind == "full":
-            self._full_s = scan.duration_us * 1e-6
+            self._full_s = scan.duration_us * scan.parts * 1e-6
         middle_us = scan.device_us + scan.duration_us // 2
         unknown, sigma_ns = board.clock.unknown(middle_us), board.clock.sigma_ns(middle_us)
         reasons = list(board.reasons.get(scan.seq, ()))

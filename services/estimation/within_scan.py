@@ -16,6 +16,7 @@ from scipy.optimize import nnls
 
 from models.bundle import Bundle
 from models.sentinel import touches
+from services.estimation.rolling import measured_at
 from services.estimation.tuning import TUNING
 
 Array = NDArray[np.float64]
@@ -42,31 +43,40 @@ class ChangingTouch:
         self.knows = m.normalisation == "model"
         half_width = float(bundle.manifest["image"].get("half_width", 1.0))
         self._response = np.asarray(touches(m, half_width, TUNING.radii).response, dtype=float)  # (M, K)
-        time = np.linspace(0.0, 1.0, self._response.shape[1])  # the scan goes through the pattern in its order
-        at = np.linspace(0.0, 1.0, KNOTS)
-        self._size = np.maximum(0.0, 1.0 - np.abs(time - at[:, None]) * (KNOTS - 1))  # (KNOTS, K)
-        self._products = np.array([self._size[i] * self._size[j] for i, j in PAIRS]).T  # (K, pairs)
+        self._bundle = bundle
+        self._courses: dict[int, tuple[Array, Array]] = {}  # by the part measured last
 
-    def steady(self, difference: NDArray[np.floating], sigma: NDArray[np.floating]) -> bool:
+    def _course(self, part: int) -> tuple[Array, Array]:
+        """(KNOTS, K) by how much each moment counts in each measurement, and (K, pairs) their products."""
+        if part not in self._courses:
+            at = np.linspace(0.0, 1.0, KNOTS)
+            size = np.maximum(0.0, 1.0 - np.abs(measured_at(self._bundle, part) - at[:, None]) * (KNOTS - 1))
+            self._courses[part] = size, np.array([size[i] * size[j] for i, j in PAIRS]).T
+        return self._courses[part]
+
+    def steady(self, difference: NDArray[np.floating], sigma: NDArray[np.floating], part: int = 0) -> bool:
         """Whether a touch that did not change explains a difference (K,) about as well as one that did. sigma (K,):
-        standard deviation of d, infinite where a measurement does not count.
+        standard deviation of d, infinite where a measurement does not count. part: the one measured last, of a scan
+        in parts.
         """
         live, d, noise = _counted(difference, sigma)
-        changed = self(difference, sigma)
+        changed = self(difference, sigma, part)
         if changed is None:
             return False
         response = self._response * live
         gain = float(((response @ d) ** 2 / ((response**2).sum(axis=1) + TINY)).max())
         return float(d @ d) - gain - noise <= AS_WELL * changed.left * float(d @ d)
 
-    def __call__(self, difference: NDArray[np.floating], sigma: NDArray[np.floating]) -> ScanChange | None:
+    def __call__(
+        self, difference: NDArray[np.floating], sigma: NDArray[np.floating], part: int = 0
+    ) -> ScanChange | None:
         """The change that explains a difference (K,); None where it leaves too much."""
         live, d, noise = _counted(difference, sigma)
         energy = float(d @ d)
         if not self.knows or live.sum() < len(d) / 2 or not energy > noise:
             return None
-        response, size = self._response * live, self._size
-        products = response**2 @ self._products
+        response, (size, by_pairs) = self._response * live, self._course(part)
+        products = response**2 @ by_pairs
         gram = np.empty((len(response), KNOTS, KNOTS))
         for n, (i, j) in enumerate(PAIRS):
             gram[:, i, j] = gram[:, j, i] = products[:, n]

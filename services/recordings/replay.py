@@ -22,6 +22,7 @@ from services.runtime.stage import STAGES, add_reason
 
 CHAIN_S = 20.0  # for the stages to start and find each other
 ANSWER_S = 5.0  # for the contacts of one frame
+PART_EVERY_S = 0.002  # a part of a scan that is not answered is asked after
 PRIME_EVERY_S = 0.25
 LONGEST_PAUSE_S = 10.0  # between two recorded frames: a file's times are its maker's, and nobody is to wait for years
 MOST_SKINS = 64
@@ -116,7 +117,7 @@ class Replayer:
         self._status_due = 0.0
 
     def run(self, source: Iterator[Step]) -> Iterator[ContactFrame]:
-        """The contact frames, one for each raw frame. Raises ReplayError where one does not come."""
+        """The contact frames, one for each scan. Raises ReplayError where one does not come."""
         for step in source:
             if step.skin not in self.skins:
                 continue
@@ -125,14 +126,14 @@ class Replayer:
                 self._prime(step.skin)
                 if step.raw is not None:
                     self._begin(step.skin, {})
-                    yield self._send(step, step.raw)
+                    yield from self._send(step, step.raw)
                 else:
                     self._begin(step.skin, step.states)
             elif step.raw is None:
                 self._load(step.skin, {name: s for name, s in step.states.items() if name == "preprocessing"})
             else:
                 self._pace(step.at_ns)
-                yield self._send(step, step.raw)
+                yield from self._send(step, step.raw)
 
     def _pace(self, at_ns: int) -> None:
         if self.speed is None:
@@ -146,17 +147,29 @@ class Replayer:
             time.sleep(min(left, 0.2))
             self._report()
 
-    def _send(self, step: Step, raw: RawFrame) -> ContactFrame:
+    def _send(self, step: Step, raw: RawFrame) -> Iterator[ContactFrame]:
+        """Yields the answer; none to a part of a scan that preprocessing only takes note of."""
         mark(raw)
         self.publisher.send(raw)
         self.counts["frames"] += 1
-        contact = self._contact(step.skin, raw.scan, ANSWER_S)
-        if contact is None:
-            raise ReplayError(
-                f"no contacts of scan {raw.scan} came within {ANSWER_S:g} s: is a stage down? `skin top` shows which"
-            )
+        contact = self._answer(step.skin, raw)
         self._report()
-        return contact
+        if contact is not None:
+            yield contact
+
+    def _answer(self, skin: str, raw: RawFrame) -> ContactFrame | None:
+        """Returns the contacts made of a raw frame; None where it is known that there will be none."""
+        end = time.monotonic() + ANSWER_S
+        while time.monotonic() < end:
+            wait_s = ANSWER_S if raw.parts == 1 else PART_EVERY_S
+            if (contact := self._contact(skin, raw.scan, wait_s)) is not None:
+                return contact
+            told = {} if raw.parts == 1 else self._call("preprocessing", "part", skin=skin, scan=raw.scan)
+            if told.get("seen") and not told.get("handed_on"):
+                return None
+        raise ReplayError(
+            f"no contacts of scan {raw.scan} came within {ANSWER_S:g} s: is a stage down? `skin top` shows which"
+        )
 
     def _contact(self, skin: str, scan: int, timeout_s: float) -> ContactFrame | None:
         end = time.monotonic() + timeout_s

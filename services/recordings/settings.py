@@ -56,7 +56,7 @@ class RecordedSkin(Section):
     network: Literal["full", "fast", "int8", "none"] = "int8"
     indenter: Indenter | None = None
     dft_points: Literal[128, 256, 512] = 128
-    scan: Literal["full", "adaptive"] = "full"
+    scan: Literal["full", "adaptive", "rolling"] = "full"
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0
     tare: TareConfig = TareConfig()
     touch: TouchConfig = TouchConfig()

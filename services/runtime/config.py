@@ -119,7 +119,7 @@ class Indenter(Section):
 
 
 NetworkFile = Literal["full", "fast", "int8", "none"]
-ScanMode = Literal["full", "adaptive"]
+ScanMode = Literal["full", "adaptive", "rolling"]
 
 
 class Skin(Section):
@@ -136,7 +136,7 @@ class Skin(Section):
     indenter: Indenter | None = None
     network: NetworkFile = "int8"
     dft_points: Literal[128, 256, 512] = 128
-    scan: ScanMode = "full"  # a short list while nothing touches: board/adaptive.py
+    scan: ScanMode = "full"  # adaptive: a short list while nothing touches; rolling: scans in parts
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
     tare: TareConfig = TareConfig()
     touch: TouchConfig = TouchConfig()

@@ -134,6 +134,7 @@ def inherited(frame: Frame) -> dict[str, Any]:
         "skin": frame.skin,
         "host": frame.host,
         "scan": frame.scan,
+        "part": frame.part,
         "stamps": dict(frame.stamps),
         "sample_sigma_ns": frame.sample_sigma_ns,
         "source": frame.source,

@@ -63,7 +63,9 @@ def run(arguments: list[str]) -> dict[str, Any]:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             code = skin()
     signal.alarm(0)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    # Not ru_maxrss: that one begins with the size of the process that started this one.
+    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM:"))
+    peak = int(line.split()[1]) * 1024
     return {"code": code, "err": err.getvalue(), "seconds": time.monotonic() - began, "peak": peak}
 
 

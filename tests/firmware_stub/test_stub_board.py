@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_stub.analog import four_terminal
 from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
 from models.mismatch import MismatchedSheet, named
@@ -14,6 +15,7 @@ from models.shapes import Shape
 from protocol import link
 
 PAIRS = pattern("pairs").astype("u1")
+RAMP = "{ t = 0.52, force = 0 }, { t = 0.57, force = 2 }, { t = 0.8, force = 2 }, { t = 0.83, force = 0 }"
 REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data"), "eidors_reference.npz")
 
 
@@ -151,23 +153,89 @@ def read(transfer, pairs):
     return t[rows, pairs[:, 2]] - t[rows, pairs[:, 3]]
 
 
-def test_a_press_is_in_the_next_scan_and_gone_after_its_seconds(host):
+def test_a_press_is_felt_from_its_instant_on_and_gone_after_its_seconds(host):
     board = host(snr_db=100.0)
     board.start()
     before = board.z(0.3).mean(0)
     at = board.now
     board.rig.press({"x": 0.02, "y": -0.01, "force": 3.0, "seconds": 1.0}, at)
-    frames = board.frames(0.2)
-    truth = {scan.seq: (scan.start, len(world.touches)) for scan, world, _ in board.rig.scans}
+    scans, frames = [], board.frames(0.2)
+    truth = {scan.seq: (scan, len(world.touches)) for scan, world, _ in board.rig.scans}
+    still = board.z(0.2).mean(0)
     for frame in frames:
-        start, touches = truth[frame.seq]
-        change = np.abs(frame.z) / before - 1
-        assert touches == (start >= at)
-        assert (change.max() > 3e-3) == (start >= at)
-    assert truth[frames[-1].seq][1] == 1
+        scan, touches = truth[frame.seq]
+        instants = scan.start + (np.arange(120) + 0.5) / 120 * (scan.end - scan.start)
+        expected = np.where(instants >= at, still, before)
+        assert np.abs(np.abs(frame.z) / expected - 1).max() < 1e-4
+        assert touches == ((scan.start + scan.end) / 2 >= at)
+        scans.append(np.mean(instants >= at))
+    assert sum(0.0 < share < 1.0 for share in scans) == 1, "the scan under way is partly touched"
     board.wait(1.0)
     assert np.abs(board.z(0.2)[-1] / before - 1).max() < 1e-4
     assert len(board.rig.scans[-1][1].touches) == 0
+
+
+@pytest.mark.parametrize(("keys", "most"), [("{ t = 0.52, force = 2 }, { t = 0.83, force = 2 }", 3), (RAMP, 9)])
+def test_jumps_and_ramps_within_a_scan_are_felt_where_they_are(host, tmp_path, keys, most):
+    scene = tmp_path / "step.toml"
+    scene.write_text(f"duration = 2.0\n[[touch]]\nradius = 0.01\nx = 0.01\ny = 0.0\nkeys = [{keys}]\n")
+    board = host(snr_db=160.0)
+    board.start()
+    untouched = board.z(0.2).mean(0)
+    begin = board.now + 0.1
+    board.rig.play(str(scene), begin)
+    board.frames(1.5)
+    rig, sheet = board.rig, board.rig.sheet
+    seen = 0
+    for scan, _, _ in list(rig.scans):
+        instants = scan.start + (np.arange(120) + 0.5) / 120 * (scan.end - scan.start)
+        worlds = [rig.field.timeline.at(t) for t in instants]
+        if len({len(world.touches) for world in worlds}) < 2:
+            continue
+        seen += 1
+        (frame,) = (m for m in board.messages if isinstance(m, link.ScanFrame) and m.seq == scan.seq)
+        for k in range(0, 120, 7):
+            z = np.abs(four_terminal(sheet.transfer(worlds[k]), PAIRS[k : k + 1].astype(int)))[0]
+            assert abs(abs(frame.z[k]) / z - 1) < 3e-5, f"measurement {k}"
+            if not worlds[k].touches:
+                assert abs(abs(frame.z[k]) / untouched[k] - 1) < 3e-5
+    assert seen == 2 and rig.field.solves <= most
+
+
+def test_poses_are_as_dense_as_a_fast_slide_needs(host, tmp_path):
+    scene = tmp_path / "fast.toml"
+    keys = "{ t = 0.1, x = -0.03 }, { t = 0.3, x = 0.03 }"  # 0.3 m/s
+    scene.write_text(f"duration = 0.4\n[[touch]]\nradius = 0.01\ny = 0.0\nforce = 2.0\nkeys = [{keys}]\n")
+    rig = host().rig
+    rig.play(str(scene), 0.0)
+    sheet, untouched = rig.sheet, rig.sheet.transfer(World())
+    pattern = PAIRS.astype(int)
+    instants = np.arange(0.11, 0.29, 0.0131)
+    transfer, weights = rig.field.over(instants)
+    for t, share in zip(instants, weights, strict=True):
+        exact = four_terminal(sheet.transfer(rig.field.at(float(t))), pattern)
+        felt = four_terminal(np.tensordot(share, transfer, 1), pattern)
+        signal = exact - four_terminal(untouched, pattern)
+        assert np.linalg.norm(felt - exact) < 0.01 * np.linalg.norm(signal)
+
+
+def test_what_was_measured_before_a_command_stays_what_it_was(host):
+    """The command's instant lies within the scan under way, whose first values have been measured."""
+    board = host(snr_db=160.0)
+    board.start()
+    board.rig.press({"x": 0.02, "y": 0.0, "force": 3.0, "finger": "one"}, board.now)
+    board.frames(0.3)
+    held = board.z(0.1)[-1]
+    at = board.now + 0.02
+    board.wait(0.02)
+    board.rig.release(at)
+    frames = board.frames(0.2)
+    free = board.z(0.1)[-1]
+    scan = next(scan for scan, _, _ in board.rig.scans if scan.start < at < scan.end)
+    (mixed,) = (frame for frame in frames if frame.seq == scan.seq)
+    instants = scan.start + (np.arange(120) + 0.5) / 120 * (scan.end - scan.start)
+    assert 5 < (instants < at).sum() < 115
+    assert np.abs(np.abs(mixed.z) / np.where(instants < at, held, free) - 1).max() < 3e-5
 
 
 def test_a_finger_moves_and_lifts_alone(host):
@@ -232,9 +300,11 @@ def test_presses_no_skin_could_feel_are_refused(host):
 def test_interpolation_between_key_poses_stays_below_the_noise(host):
     rig = host(scene="slide").rig
     worst = 0.0
-    for t in np.arange(1.3, 6.0, 0.377).tolist():
-        exact = rig.sheet.transfer(rig.field.timeline.at(t))
-        worst = max(worst, np.abs(rig.field.over(t, t)[0] - exact)[:15, :15].max() / exact.max())
+    instants = np.arange(1.3, 6.0, 0.377)
+    transfer, weights = rig.field.over(instants)
+    for t, share in zip(instants.tolist(), weights, strict=True):
+        exact = rig.sheet.transfer(rig.field.at(t))
+        worst = max(worst, np.abs(np.tensordot(share, transfer, 1) - exact)[:15, :15].max() / exact.max())
     assert worst < 3e-5
     assert rig.field.solves < 45
 

@@ -89,7 +89,7 @@ def test_frames_and_truth_over_the_pty(stub, folder):
     client = ControlClient("stub", 20.0)
     healthy = np.abs(stub.until(link.ScanFrame).z)
     assert client.call("press", x=0.02, y=-0.01, force=3, seconds=5)["drop"] == pytest.approx(0.3)
-    # what is on the line or under way does not feel it; all later scans do
+    # what was measured before does not feel it; all later scans do
     frames = [stub.until(link.ScanFrame) for _ in range(5)]
     assert np.abs(np.abs(frames[-1].z) / healthy - 1).max() > 3e-3
     true = truth.recv(10.0)

@@ -19,7 +19,7 @@ ITEM = {"<f4": "f", "<f8": "d", "<c8": "ff", "|u1": "B"}
 # number and fixed fields of each message of the link, from WIRE.md's tables
 LINK = {
     "Hello": (0x01, "<BI", ("link_version", "schema_hash")),
-    "Config": (0x02, "<HHf", ("config", "dft_points", "rtia_ohm")),
+    "Config": (0x02, "<HHfB", ("config", "dft_points", "rtia_ohm", "parts")),
     "Start": (0x03, "<H", ("config",)),
     "Stop": (0x04, "<", ()),
     "SelfTest": (0x05, "<", ()),
@@ -31,7 +31,7 @@ LINK = {
     ),
     "Ack": (0x82, "<BIQ", ("of", "value", "device_us")),
     "Nak": (0x83, "<BB", ("of", "reason")),
-    "Frame": (0x84, "<IQIH", ("seq", "device_us", "duration_us", "config")),
+    "Frame": (0x84, "<IQIHBB", ("seq", "device_us", "duration_us", "config", "part", "parts")),
     "Event": (0x85, "<H", ("code",)),
     "Time": (0x86, "<IQ", ("nonce", "device_us")),
 }

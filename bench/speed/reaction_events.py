@@ -1,0 +1,190 @@
+"""What the reaction benchmark does to the skin, as a scene of known times, and the score of the frames that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from protocol.frames import Contact, ContactFrame
+
+SIDE_M = 0.1  # of the square skin
+UNIT_M = SIDE_M / 2  # metres of a model unit
+NEAR = 0.03  # of the side: a contact so near is in its place
+SIGMAS = 3.0
+DOUBTFUL = ("changing", "coarse")
+FIRST_S = 1.0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A sort of event. radius: in model units, from and to; ramp_s: of force, at both ends."""
+
+    name: str
+    force: float
+    radius: tuple[float, float]
+    ramp_s: float = 0.0
+    speed: float = 0.0  # m/s
+
+
+KINDS = (
+    Kind("2 N, radius 0.1 to 0.2", 2.0, (0.1, 0.2)),
+    Kind("1 N, radius 0.1", 1.0, (0.1, 0.1)),
+    Kind("2 N over 20 ms", 2.0, (0.1, 0.2), ramp_s=0.02),
+    Kind("2 N over 50 ms", 2.0, (0.1, 0.2), ramp_s=0.05),
+    Kind("sliding at 0.1 m/s", 2.0, (0.2, 0.2), speed=0.1),
+    Kind("sliding at 0.3 m/s", 2.0, (0.2, 0.2), speed=0.3),
+)
+SLIDE_M = 0.05
+SETTLED_S = 0.2  # a sliding touch stays still for so long before it moves
+
+
+@dataclass(frozen=True)
+class TouchEvent:
+    """One touch: from `onset` s of the scene, when force leaves zero, to `end`, when it is back at zero. It moves from
+    `moves` on, along `velocity` [m/s], until it ends.
+    """
+
+    kind: Kind
+    onset: float
+    end: float
+    x: float
+    y: float
+    radius_m: float
+    moves: float
+    velocity: tuple[float, float] = (0.0, 0.0)
+
+    def at(self, t: float) -> tuple[float, float]:
+        since = max(0.0, min(t, self.end) - self.moves)
+        return self.x + since * self.velocity[0], self.y + since * self.velocity[1]
+
+    @property
+    def released(self) -> float:
+        """When force begins to fall."""
+        return self.end - self.kind.ramp_s
+
+    @property
+    def keys(self) -> list[tuple[float, float, float, float]]:
+        """(t, x, y, force), as in a scene."""
+        ramp, times = self.kind.ramp_s, [(self.onset, self.kind.force), (self.end, self.kind.force)]
+        if ramp:
+            times = [
+                (self.onset, 0.0),
+                (self.onset + ramp, self.kind.force),
+                (self.end - ramp, self.kind.force),
+                (self.end, 0.0),
+            ]
+        if self.kind.speed:
+            times.insert(1, (self.moves, self.kind.force))
+        return [(t, *self.at(t), force) for t, force in times]
+
+
+def events(counts: dict[str, int], pause_s: float, seed: int) -> list[TouchEvent]:
+    """So many of each kind of KINDS, in random order, places and phases of the scan; pause_s: between two of them."""
+    rng = np.random.default_rng([seed, 15])
+    kinds = [kind for kind in KINDS for _ in range(counts.get(kind.name, 0))]
+    t, made = FIRST_S, []
+    for k in rng.permutation(len(kinds)):
+        kind = kinds[k]
+        radius = float(rng.uniform(*kind.radius)) * UNIT_M
+        t = round(t + pause_s + float(rng.uniform(0.0, 0.2)), 6)
+        half = SIDE_M / 2 - radius
+        x, y = rng.uniform(-half, half, 2).tolist()
+        held, velocity, moves = 0.3 + float(rng.uniform(0.0, 0.1)) + 2 * kind.ramp_s, (0.0, 0.0), np.inf
+        if kind.speed:
+            angle = float(rng.uniform(-np.pi, np.pi))
+            along = np.array([np.cos(angle), np.sin(angle)])
+            middle = rng.uniform(-1, 1, 2) * np.maximum(half - np.abs(along) * SLIDE_M / 2, 0.0)
+            x, y = (middle - along * SLIDE_M / 2).tolist()
+            velocity = (float(along[0]) * kind.speed, float(along[1]) * kind.speed)
+            held, moves = SETTLED_S + SLIDE_M / kind.speed, round(t + SETTLED_S, 6)
+        made.append(TouchEvent(kind, t, round(t + held, 6), x, y, radius, moves, velocity))
+        t = made[-1].end
+    return made
+
+
+def scene(of: Sequence[TouchEvent]) -> str:
+    """The events as a scene's TOML."""
+    parts = [f'about = "the reaction benchmark\'s touches"\nduration = {of[-1].end + 1.0}']
+    for event in of:
+        keys = ", ".join(f"{{ t = {t!r}, x = {x!r}, y = {y!r}, force = {f!r} }}" for t, x, y, f in event.keys)
+        parts.append(f"[[touch]]\nradius = {event.radius_m!r}\nkeys = [{keys}]")
+    return "\n".join(parts) + "\n"
+
+
+@dataclass
+class Reaction:
+    """What a controller saw of one event; times in s after force left zero, or came back to it. NaN: never."""
+
+    contact_s: float = np.nan  # the first of the valid frames that are all in place until the release
+    any_s: float = np.nan  # the first valid frame with a contact, changing and coarse ones included
+    gone_s: float = np.nan  # the first of the valid frames without it, after the release
+    wrong: int = 0  # valid frames before `contact_s` that are off by more than 3 of their own standard deviations
+    unstated: int = 0  # valid ones before it, neither changing nor coarse, off by more than 3 % and without a sigma
+    errors_m: list[float] = field(default_factory=list)  # of valid frames in place, while moving: against recv
+    slip: list[float] = field(default_factory=list)  # relative error of their velocity
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """A contact frame: when it was received, and the time that it stands for; s of the scene."""
+
+    received: float
+    sampled: float
+    frame: ContactFrame
+
+    @property
+    def present(self) -> list[Contact]:
+        """The contacts of a valid frame; none of another."""
+        return [contact for contact in self.frame.contacts if contact.state != "end" and self.frame.valid]
+
+    @property
+    def doubtful(self) -> bool:
+        return bool(set(DOUBTFUL) & set(self.frame.reasons))
+
+    def off(self, contact: Contact, event: TouchEvent) -> float:
+        """Metres from where the touch was at the time that the frame stands for."""
+        return float(np.hypot(*np.subtract(contact.on_sheet, event.at(max(self.sampled, event.onset)))))
+
+    def in_place(self, event: TouchEvent) -> bool:
+        """Valid, not doubtful, and one contact where the touch is."""
+        near = [self.off(contact, event) <= NEAR * SIDE_M for contact in self.present]
+        return near == [True] and not self.doubtful
+
+
+def react(event: TouchEvent, until: float, frames: Sequence[SeenFrame]) -> Reaction:
+    """frames: in order, from the event's onset to `until`, when the next touch begins or the scene ends."""
+    found = Reaction()
+    during = [seen for seen in frames if event.onset <= seen.received < event.released]
+    first = _last_run([seen.in_place(event) for seen in during])
+    if first < len(during):
+        found.contact_s = during[first].received - event.onset
+    touched = [seen.received for seen in during if seen.present]
+    found.any_s = touched[0] - event.onset if touched else np.nan
+    for seen in during[:first]:
+        for contact in seen.present:
+            off = seen.off(contact, event)
+            if contact.position_sigma is not None:
+                found.wrong += off > SIGMAS * max(contact.position_sigma[:2])
+            elif not seen.doubtful:
+                found.unstated += off > NEAR * SIDE_M
+    after = [seen for seen in frames if event.end <= seen.received < until]
+    free = _last_run([seen.frame.valid and not seen.present for seen in after])
+    if free < len(after):
+        found.gone_s = after[free].received - event.end
+    for seen in during:
+        if seen.received > event.moves and len(seen.present) == 1:
+            (contact,) = seen.present
+            found.errors_m.append(float(np.hypot(*np.subtract(contact.on_sheet, event.at(seen.received)))))
+            wrong = np.hypot(*np.subtract(contact.velocity[:2], event.velocity))
+            found.slip.append(float(wrong) / event.kind.speed)
+    return found
+
+
+def _last_run(good: Sequence[bool]) -> int:
+    """Where the run of True that lasts to the end begins; the length where there is none."""
+    first = len(good)
+    while first and good[first - 1]:
+        first -= 1
+    return first

@@ -1,0 +1,136 @@
+"""Where one touch is, and how sure that is, from the values that the parts since its beginning have measured.
+
+The touch is a circle of the bundle's linear model, theta = (x, y, log radius, log drop). It starts from the likeliest
+of a grid and goes to the likeliest of all by Gauss-Newton steps; there its posterior is taken as normal. What the
+linear model is wrong by is part of the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from models.sentinel import touches
+
+Array = NDArray[np.floating]
+
+LINEAR = 0.05  # of d: by so much the linear response of a circle is wrong, once it is in its place
+WIDER = 1.5  # times the posterior's standard deviation: what is stated
+LEAST = 0.01  # model units that are stated at least
+MEAN = np.log([0.2, 0.2])  # prior of log radius [model units], log drop [S/m]
+SD = np.array([0.5, 0.9])
+COARSE = 0.05  # of the side: a standard deviation beyond it is coarse
+STEPS = 8
+MOST_MISFIT = 6.0  # squares left per value, beyond which it is no touch of this kind; below, they widen what is stated
+MOST = np.array([0.1, 0.1, 0.3, 0.5])  # of one step
+AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
+
+
+@dataclass(frozen=True)
+class PartTouch:
+    """Lengths in model units. sigma: along the longest and the shortest axis, angle of the longest [rad]."""
+
+    x: float
+    y: float
+    radius: float
+    drop: float
+    drop_sigma: float
+    sigma: tuple[float, float, float]
+    fits: bool  # whether it explains the values
+    sure: bool  # whether its place is known to within COARSE
+    unexplained: float  # share of what was measured
+
+
+class PartImage:
+    """For one bundle."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        m = bundle.matrices
+        self._jacobian = np.asarray(m.jacobian, dtype=np.float64)
+        self._inside = np.asarray(m.inside, dtype=np.float64)
+        self._half = float(bundle.manifest["image"].get("half_width", 1.0))
+        self._grid = touches(m, self._half)
+        h, w = m.inside.shape
+        self._pixel = 2 * self._half / w
+        x, y = ((np.arange(n) + 0.5) * self._pixel - self._half for n in (w, h))
+        self._x, self._y = np.meshgrid(x, y)
+        self._fine = bundle.image_size // h
+        self.metres_per_unit = bundle.metres_per_pixel * bundle.image_size / (2 * self._half)
+
+    def fit(self, d: Array, sigma: Array) -> PartTouch:
+        """d (K,) with standard deviation sigma (K,), infinite where nothing was measured since the touch began."""
+        rows = np.flatnonzero(np.isfinite(sigma))
+        seen, jacobian = d[rows].astype(float), self._jacobian[rows]
+        noise = np.sqrt(sigma[rows].astype(float) ** 2 + (LINEAR * seen) ** 2 + (LINEAR / 2) ** 2 * (seen**2).mean())
+        theta = self._start(rows, seen, noise)
+        cost, left, slope = self._linear(theta, jacobian, seen, noise)
+        information = np.diag([0.0, 0.0, *SD**-2])
+        damping = 1e-3
+        for _ in range(STEPS):
+            hessian = slope.T @ slope + information
+            pull = slope.T @ left - np.array([0.0, 0.0, *(SD**-2 * (theta[2:] - MEAN))])
+            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), pull)
+            step *= min(1.0, float((MOST / np.maximum(np.abs(step), 1e-9)).min()))
+            there = theta + step
+            there[:2] = np.clip(there[:2], -self._half, self._half)
+            there[2:] = np.clip(there[2:], np.log([0.04, 0.005]), np.log([0.9, 0.97]))
+            found = self._linear(there, jacobian, seen, noise)
+            if found[0] < cost:
+                theta, damping, done = there, damping * 0.3, cost - found[0] < 0.01
+                cost, left, slope = found
+                if done:
+                    break
+            else:
+                damping *= 10
+        covariance = np.linalg.inv(slope.T @ slope + information + 1e-9 * np.eye(4))
+        chi2 = float(left @ left)
+        misfit = max(1.0, chi2 / len(rows))
+        covariance *= misfit
+        values, vectors = np.linalg.eigh(covariance[:2, :2])
+        short, long = np.maximum(WIDER * np.sqrt(np.maximum(values, 0.0)), LEAST)
+        angle = float(np.arctan2(vectors[1, 1], vectors[0, 1]))
+        x, y, radius, drop = float(theta[0]), float(theta[1]), float(np.exp(theta[2])), float(np.exp(theta[3]))
+        drop_sigma = WIDER * drop * float(np.sqrt(covariance[3, 3]))
+        unexplained = max(0.0, chi2 - len(rows)) / float(((seen / noise) ** 2).sum())
+        sure = long <= COARSE * 2 * self._half
+        axes = float(long), float(short), angle
+        return PartTouch(x, y, radius, drop, drop_sigma, axes, misfit < MOST_MISFIT, bool(sure), unexplained)
+
+    def image(self, touch: PartTouch) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(H, W) drop [S/m] and its standard deviation."""
+        share = self._share(touch.x, touch.y, touch.radius)[0].reshape(self._x.shape)
+        ones = np.ones((self._fine, self._fine))
+        drop, sigma = (np.kron(share * value, ones).astype(np.float32) for value in (touch.drop, touch.drop_sigma))
+        return drop, sigma
+
+    def _start(self, rows: NDArray[np.intp], d: Array, noise: Array) -> Array:
+        whitened = self._grid.response[:, rows] / noise
+        size = np.maximum(np.linalg.norm(whitened, axis=1), 1e-12)
+        z = whitened @ (d / noise) / size
+        best = int(z.argmax())
+        drop = float(np.clip(z[best] / size[best], 0.01, 0.9))
+        return np.array([*self._grid.position[best], np.log(self._grid.radius[best]), np.log(drop)])
+
+    def _linear(self, theta: Array, jacobian: Array, d: Array, noise: Array) -> tuple[float, Array, Array]:
+        """Penalty, what is left of d, and the derivative of the response; whitened."""
+        drop = float(np.exp(theta[3]))
+        around = [theta[:3]] + [
+            theta[:3] + sign * a * e for a, e in zip(AHEAD, np.eye(3), strict=True) for sign in (1, -1)
+        ]
+        shares = np.concatenate([self._share(x, y, float(np.exp(log_r))) for x, y, log_r in around])
+        responses = drop * (shares @ jacobian.T) / noise
+        ahead, behind = responses[1::2], responses[2::2]
+        slope = np.column_stack([*((ahead - behind) / (2 * AHEAD[:, None])), responses[0]])
+        left = d / noise - responses[0]
+        penalty = float(left @ left) + float((((theta[2:] - MEAN) / SD) ** 2).sum())
+        return penalty, left, slope
+
+    def _share(self, x: float, y: float, radius: float) -> Array:
+        """(1, P) share of each pixel under a circle, of the circle's area in all where it lies on the skin."""
+        share = np.clip((radius - np.hypot(self._x - x, self._y - y)) / self._pixel + 0.5, 0.0, 1.0)
+        area = float(share.sum())
+        scale = np.pi * radius**2 / self._pixel**2 / max(area, 1e-9)
+        return np.asarray(share * self._inside * scale).reshape(1, -1)

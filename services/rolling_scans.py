@@ -1,0 +1,201 @@
+"""Messages of a scan in parts: which of them preprocessing takes for a whole scan, and what it says of the others."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from protocol.frames import DeltaFrame, RawFrame, as_sent
+from services.estimation.baseline import BaselineEstimator
+from services.estimation.part_evidence import SIGMAS, PartEvidence
+from services.estimation.part_image import PartImage
+from services.estimation.rolling import WholeScans, parts_of
+from services.runtime.stage import add_reason
+
+Array = NDArray[np.float64]
+
+SUSPECTED = 5.0  # sigmas of the newest part, below which it is not looked at further
+WIDER = 1.05  # noise is estimated from a few dozen scans
+DRIFT = 3e-5  # relative, since the untouched scans that parts are compared with
+MOST_WAITED = 8  # messages
+REMEMBERED = 8  # untouched whole scans whose mean that is
+
+
+class RollingScans:
+    """Of one skin. A message has the newest value of every measurement, so each could stand for a whole scan; those
+    that share no value with the one before do, so that noise, electrodes and drift are judged as in whole scans.
+
+    The other messages say only, and only where the last whole scan was sound, that a touch began, with the values
+    measured since (services/estimation/part_evidence.py); or that the touch ended. Then the next whole scan is the
+    first of values that are all newer than that.
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._bundle, self._parts = bundle, parts_of(bundle)
+        self._whole = WholeScans()
+        self._models: tuple[PartEvidence, PartImage] | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        self._whole.last = -1
+        self._seen = self._handed_on = -1  # scans of messages
+        self._sample_ns = 0  # of the last delta frame
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """There is another baseline, or none: parts say nothing before an untouched whole scan."""
+        self._rest: Array | None = None  # difference of the untouched skin lately
+        self._rests = 0  # whole scans that it is the mean of
+        self._held: Array | None = None  # difference of the touch that the last whole scan saw
+        self._sound = False  # the last whole scan
+        self._moved = False  # the next whole scan was put off since the last one
+        self._ended = False  # the touch of the last whole scan has
+        self._grown_us = 0.0  # when it was all there, likewise
+        self._waited = 0  # messages by which the whole scan was put off for that
+        self._began_us: float | None = None  # when a touch began, by the board's clock less the length of a part
+
+    def warm_up(self) -> None:
+        self._ready()
+
+    def due(self, frame: RawFrame, stamps: dict[str, int], estimator: BaselineEstimator) -> bool:
+        """Whether the message is to be taken for a whole scan; then `sample` in stamps is set to the mean time of its
+        values, for which what is made of it stands, and never before what was said last.
+        """
+        if frame.parts == 1:
+            return True
+        self._seen = frame.scan
+        if not self._fits(frame):
+            return True  # another skin's: said once a message, as of whole scans
+        if not self._whole.due(frame.scan, frame.parts):
+            return False
+        values = None if self._moved else self._values(frame, estimator)
+        if values is not None and self._changes(values):
+            self._moved = True  # a touch that began or ended within these values is seen in the next whole scan
+            return False
+        if frame.device_us - float(frame.age_us.max()) < self._grown_us and self._waited < MOST_WAITED:
+            self._waited += 1  # the oldest of these values felt a touch that still grew
+            self._whole.last = frame.scan - frame.parts + 1
+            return False
+        new = frame.new.astype(bool)
+        sample = stamps.get("sample", 0)
+        mean = sample - round(1e3 * float(frame.age_us.mean() - frame.age_us[new].mean()))
+        stamps["sample"] = self._sample_ns = max(mean, min(self._sample_ns, sample))
+        self._handed_on = frame.scan
+        return True
+
+    def judged(self, out: DeltaFrame, frame: RawFrame) -> None:
+        """Take what preprocessing said of a whole scan."""
+        if frame.parts == 1:
+            return
+        known = len(out.difference) == len(frame.z) and bool(np.isfinite(out.sigma).all())
+        self._sound = known and out.valid and not out.electrodes.any() and not {"gain", "gap"} & set(out.reasons)
+        self._moved = self._ended = False
+        self._grown_us, self._waited = 0.0, 0
+        touched, self._began_us, self._held = self._held is not None, None, None
+        if not self._sound:
+            self._rest, self._rests = None, 0
+        elif out.touched:
+            self._held = out.difference.astype(float)
+        else:
+            drifted = touched or self._rest is None
+            self._rests = 1 if drifted else min(self._rests + 1, REMEMBERED)
+            before = 0.0 if self._rest is None else self._rest
+            self._rest = before + (out.difference.astype(float) - before) / self._rests
+
+    def part(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> list[DeltaFrame]:
+        """The delta frame of a message that is no whole scan, where there is something to say."""
+        evidence, image = self._ready()
+        if (values := self._values(frame, estimator)) is None or not self._changes(values):
+            return []
+        d, noise, age = values
+        if self._held is not None:
+            self._ended = True
+            self._put_off(frame.scan)
+            out.difference, out.sigma = np.zeros(len(d), np.float32), noise.astype(np.float32)
+            return self._said(out)
+        since = None if self._began_us is None else frame.device_us - self._began_us
+        onset = evidence.began(d, noise, age, since)
+        if onset is None:
+            return []
+        self._put_off(frame.scan)
+        self._grown_us = frame.device_us - onset.grown
+        if self._began_us is None:
+            self._began_us = frame.device_us - onset.since
+        on = onset.course > 0
+        share = np.where(on, onset.course, 1.0)
+        out.difference = np.where(on, d / share, 0.0).astype(np.float32)
+        out.sigma = np.where(on, noise / share, np.inf).astype(np.float32)
+        if not image.fit(out.difference, out.sigma).fits:
+            return []
+        out.touched, out.score, out.threshold = True, onset.sigmas, SIGMAS
+        out.reconstructed = frame.scan
+        add_reason(out.reasons, "coarse")
+        return self._said(out)
+
+    def _values(self, frame: RawFrame, estimator: BaselineEstimator) -> tuple[Array, Array, Array] | None:
+        """(K,) each: difference to the untouched skin lately, its standard deviation, age [us]; None where the last
+        whole scan was not sound, or this message is not.
+        """
+        baseline = estimator.baseline
+        sound = self._sound and as_sent(frame)[0] and not frame.status.any() and set(frame.reasons) <= {"replay"}
+        if not (sound and self._ready()[0].knows) or baseline is None or baseline.doubt or self._rest is None:
+            return None
+        d = (np.abs(frame.z.astype(np.complex128)) - baseline.z0) / estimator.normaliser - self._rest
+        noise = WIDER * np.hypot(estimator.sigma * np.sqrt(1 + 1 / self._rests), DRIFT)
+        return (d, noise, frame.age_us.astype(float)) if np.isfinite(d).all() and np.isfinite(noise).all() else None
+
+    def _changes(self, values: tuple[Array, Array, Array]) -> bool:
+        """Whether a touch began, by all that a quick look tells, or the one that there was has ended."""
+        evidence, (d, noise, age) = self._ready()[0], values
+        if self._held is None or self._rest is None:
+            return self._began_us is not None or evidence.sigmas(d, noise, age) >= SUSPECTED
+        return not self._ended and evidence.ended(d, self._held - self._rest, noise, age)
+
+    def _said(self, out: DeltaFrame) -> list[DeltaFrame]:
+        self._handed_on = out.scan
+        self._sample_ns = out.stamps.get("sample", 0)
+        return [out]
+
+    def _put_off(self, scan: int) -> None:
+        """The next whole scan is of values newer than this message's: once between two whole scans."""
+        if not self._moved:
+            self._moved, self._whole.last = True, scan
+
+    def handed_on(self, scan: int) -> dict[str, bool]:
+        """Whether the message `scan` was seen, and whether a delta frame was made of it: a replay asks."""
+        return {"seen": self._seen == scan, "handed_on": self._handed_on == scan}
+
+    def _ready(self) -> tuple[PartEvidence, PartImage]:
+        if self._models is None:
+            self._models = PartEvidence(self._bundle, self._parts), PartImage(self._bundle)
+        return self._models
+
+    def _fits(self, frame: RawFrame) -> bool:
+        count = len(frame.z)
+        return frame.parts == self._parts and len(frame.age_us) == len(frame.new) == count and bool(frame.new.any())
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "whole": self._whole.last,
+            "sample_ns": self._sample_ns,
+            "flags": [self._sound, self._moved, self._ended],
+            "rest": self._rest,
+            "rests": self._rests,
+            "held": self._held,
+            "began_us": self._began_us,
+            "grown": [self._grown_us, self._waited],
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Older recordings have none."""
+        self.reset()
+        if not state:
+            return
+        self._whole.last, self._sample_ns = int(state["whole"]), int(state["sample_ns"])
+        self._sound, self._moved, self._ended = (bool(each) for each in state["flags"])
+        self._rest, self._held = (None if state[n] is None else np.array(state[n], float) for n in ("rest", "held"))
+        self._grown_us, self._waited = float(state["grown"][0]), int(state["grown"][1])
+        self._began_us, self._rests = state["began_us"], int(state["rests"])

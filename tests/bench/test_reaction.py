@@ -1,0 +1,73 @@
+"""The reaction benchmark: its scene says what its truth says, and what counts as a touch seen in place."""
+
+import numpy as np
+import pytest
+
+from bench.speed.reaction_events import KINDS, SIDE_M, SeenFrame, TouchEvent, events, react, scene
+from firmware_stub import scene as scenes
+from firmware_stub.timeline import Timeline
+from protocol.frames import Contact, ContactFrame
+
+STILL = TouchEvent(KINDS[0], 1.0, 1.3, 0.01, 0.0, 0.01, np.inf)
+
+
+def seen(t, *at, valid=True, reasons=(), sigma=None, state="hold", sampled=None, velocity=(0.0, 0.0)):
+    contacts = [
+        Contact(id=1, state=state, position=[x, y, 0.0], position_sigma=sigma, velocity=[*velocity, 0.0]) for x, y in at
+    ]
+    frame = ContactFrame(skin="palm", valid=valid, reasons=list(reasons), contacts=contacts)
+    return SeenFrame(t, t - 0.02 if sampled is None else sampled, frame)
+
+
+def test_the_scene_plays_the_events_with_one_touch_at_a_time(tmp_path):
+    plan = events({kind.name: 4 for kind in KINDS}, 0.35, seed=3)
+    path = tmp_path / "reaction.toml"
+    path.write_text(scene(plan))
+    timeline = Timeline(scenes.load(path), 100.0)
+    assert len(plan) == 4 * len(KINDS)
+    for event in plan:
+        assert timeline.at(100.0 + event.onset - 1e-4).touches == ()
+        assert timeline.at(100.0 + event.end + 1e-4).touches == ()
+        for t in np.linspace(event.onset + 0.06, event.end - 0.06, 5).tolist():
+            (touch,) = timeline.at(100.0 + t).touches
+            assert (touch.x, touch.y) == pytest.approx(event.at(t), abs=1e-9)
+            assert touch.drop == pytest.approx(0.1 * event.kind.force)
+            assert max(abs(touch.x), abs(touch.y)) + touch.radius <= SIDE_M / 2 + 1e-9
+    phases = {round(event.onset % 0.0436, 3) for event in plan}
+    assert len(phases) > len(plan) / 2
+
+
+def test_a_touch_is_seen_with_the_first_of_the_frames_that_all_are_in_place():
+    there, off = (0.01, 0.0), (0.02, 0.0)
+    frames = [seen(1.02), seen(1.06, off, reasons=["changing"]), seen(1.11, there), seen(1.15, off)]
+    found = react(STILL, 2.0, [*frames, seen(1.2, there), seen(1.25, there), seen(1.4, there), seen(1.5), seen(1.6)])
+    assert found.contact_s == pytest.approx(0.2)
+    assert found.any_s == pytest.approx(0.06)
+    assert found.gone_s == pytest.approx(0.2)
+    assert (found.wrong, found.unstated) == (0, 1), "the frame that says changing is not held against it"
+
+
+@pytest.mark.parametrize("bad", [{"valid": False}, {"reasons": ["coarse"]}, {"reasons": ["changing"]}])
+def test_a_doubtful_frame_before_the_release_is_no_touch_seen(bad):
+    frames = [seen(1.05, (0.01, 0.0)), seen(1.2, (0.01, 0.0), **bad)]
+    found = react(STILL, 2.0, frames)
+    assert np.isnan(found.contact_s) and np.isnan(found.gone_s)
+
+
+def test_an_early_frame_is_wrong_beyond_three_of_its_own_sigmas_whatever_it_says():
+    sigma = [0.002, 0.001, 0.0]
+    near = seen(1.03, (0.015, 0.0), sigma=sigma, reasons=["coarse"])
+    far = seen(1.04, (0.017, 0.0), sigma=sigma, reasons=["coarse"])
+    found = react(STILL, 2.0, [near, far, seen(1.1, (0.01, 0.0))])
+    assert (found.wrong, found.unstated) == (1, 0)
+    assert react(STILL, 2.0, [seen(1.04, (0.02, 0.0), sigma=sigma, valid=False)]).wrong == 0
+
+
+def test_a_slide_is_scored_against_the_truth_at_recv_and_at_the_sample():
+    kind = KINDS[-1]
+    slide = TouchEvent(kind, 1.0, 1.4, 0.0, 0.0, 0.01, 1.2, (0.3, 0.0))
+    frame = seen(1.3, (0.015, 0.0), sampled=1.25, velocity=(0.27, 0.0))
+    found = react(slide, 2.0, [frame])
+    assert found.errors_m == pytest.approx([0.015])
+    assert found.slip == pytest.approx([0.1])
+    assert found.contact_s == pytest.approx(0.3), "where it was when it was measured"
