@@ -191,6 +191,12 @@ def _plain(value: Any) -> Any:
     return value
 
 
+STARTED_BY = {
+    "stub": 'a skin with port = "stub" in its configuration has one',
+    "recorder": "`[recorder]` in skin.toml has `skin up` start one",
+}
+
+
 def control(process: str, command: str, *, timeout_s: float = 2.0, **args: Any) -> dict[str, Any]:
     """Give one command over a process's control socket. CliError where nobody answers or the answer is a refusal."""
     from protocol import transport
@@ -200,7 +206,7 @@ def control(process: str, command: str, *, timeout_s: float = 2.0, **args: Any) 
     who = "the stub board" if process == "stub" else process
     address = transport.current().control_address(process)
     if address.startswith("ipc://") and not os.path.exists(address.removeprefix("ipc://")):
-        what = 'a skin with port = "stub" in its configuration has one' if process == "stub" else "start it: `skin up`"
+        what = STARTED_BY.get(process, "start it: `skin up`")
         found = f"{who} does not run here (no {address})"
         if os.path.exists(transport.current().control_address("publisher").removeprefix("ipc://")):
             fail(f"{found}: {what}", NOT_RUNNING)

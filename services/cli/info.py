@@ -95,7 +95,7 @@ def _told(found: SessionSummary, rows: int) -> list[str]:
     began = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(found.start_ns * 1e-9))
     lines = [f"{found.path}: {found.duration_s:.1f} s from {began} UTC, {found.bytes / 1e6:.2f} MB, {found.damage}"]
     if event := found.metadata.get("event"):
-        lines.append(f"a snapshot of {event}")
+        lines.append(f"a snapshot: {event}")
     if not found.topics:
         return [*lines, "it holds no message"]
     lines += ["", f"{'topic':<18}{'messages':>9}{'per second':>12}{'missing':>9}{'MB':>8}"]
@@ -108,15 +108,15 @@ def _told(found: SessionSummary, rows: int) -> list[str]:
         lines += ["", f"{skin}: force, at most {most:.1f} N, over {found.duration_s:.1f} s; below it ✕ where not valid"]
         lines += [f"  {force}", f"  {valid}"]
     contacts, gaps = found.contacts, _gaps(found)
-    lines += ["", f"{len(contacts) + found.left_out['contacts']} contacts"]
+    lines += ["", f"contacts: {len(contacts) + found.left_out['contacts']}"]
     for c in contacts[:rows]:
         force = "force not known" if c.most_n is None else f"up to {c.most_n:.2f} N"
         x, y = (f"{1e3 * v:+.1f}" for v in c.place[:2])
         lines.append(f"  {_when(c)}  {c.skin} {c.what}: {force} at {x}, {y} mm")
     lines += _more(len(contacts), rows)
-    lines.append(f"{len(found.faults) + found.left_out['faults']} faults")
+    lines.append(f"faults: {len(found.faults) + found.left_out['faults']}")
     lines += [f"  {_when(f)}  {f.skin}: {f.what}" for f in found.faults[:rows]] + _more(len(found.faults), rows)
-    lines.append(f"{len(gaps)} gaps")
+    lines.append(f"gaps: {len(gaps)}")
     lines += [f"  {at:8.2f} s  {name}: nothing for {seconds:.2f} s" for name, at, seconds in gaps[:rows]]
     return lines + _more(len(gaps), rows)
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from services.cli.common import (
-    FAILED,
     USAGE,
     JsonOption,
+    control,
     emit,
     fail,
     load_npz,
@@ -126,22 +126,14 @@ def snapshot(
     """Write the last seconds and the next ones to a file that replays. The service's recorder does."""
     import time
 
-    from protocol.control import ControlClient, ControlError
-
-    use_configured_sockets()
-    client = ControlClient("recorder", 10.0)
     wanted = {name: value for name, value in (("before_s", before), ("after_s", after)) if value is not None}
-    try:
-        made = client.call("snapshot", why=why, **wanted)
-        end = time.monotonic() + float(made["after_s"]) + 330
-        while (status := client.call("status")).get("writing") and status.get("snapshot") == made["file"]:
-            if time.monotonic() > end:
-                fail(f"{made['file']} is still being written: `skin top` shows how the recorder does")
-            time.sleep(0.1)
-    except ControlError as why_not:
-        hint = ": `[recorder]` in skin.toml has `skin up` start one" if why_not.kind == "unreachable" else ""
-        fail(f"{why_not}{hint}", 3 if hint else FAILED)
-    for problem in status.get("problems", []):
+    made = control("recorder", "snapshot", timeout_s=10.0, why=why, **wanted)
+    end = time.monotonic() + float(made["after_s"]) + 330
+    while (now := control("recorder", "status", timeout_s=10.0)).get("writing") and now.get("snapshot") == made["file"]:
+        if time.monotonic() > end:
+            fail(f"{made['file']} is still being written: `skin top` shows how the recorder does")
+        time.sleep(0.1)
+    for problem in now.get("problems", []):
         print(f"skin: {problem}", file=sys.stderr)
     if as_json:
         emit(made)

@@ -89,6 +89,7 @@ class Snapshots:
         or "snapshot" where somebody asked for it. Raises RecordingError.
         """
         before = self.keeping.before_s if before_s is None else before_s
+        event = what if kind == "snapshot" else f"{kind}: {what}"
         end_ns = now_ns + int((self.keeping.after_s if after_s is None else after_s) * 1e9)
         if self._open is not None:
             self._open.end_ns = min(max(self._open.end_ns, end_ns), self._open.last_end_ns)
@@ -96,7 +97,7 @@ class Snapshots:
         try:
             self.keeping.folder.mkdir(parents=True, exist_ok=True)
             path = file_in(self.keeping.folder, f"-{kind}")
-            writer = RecordingWriter(path, self._metadata(f"{kind}: {what}"))
+            writer = RecordingWriter(path, self._metadata(event))
             self._open = OpenSnapshot(path, writer, end_ns, now_ns + int(LONGEST_S * 1e9))
             for message in self.ring.since(now_ns - int(before * 1e9)):
                 writer.write(message.topic, message.data, message.log_time_ns)
@@ -104,11 +105,11 @@ class Snapshots:
         except (RecordingError, OSError) as why:
             self.missed += 1
             self._end()
-            self._failed(f"no snapshot of {kind} ({what}): {why}")
+            self._failed(f"no snapshot ({event}): {why}")
             raise RecordingError(self.problem) from None
         self.taken += 1
         self.last, self.problem = str(path), ""
-        log.info("snapshot of %s (%s): %s", kind, what, path)
+        log.info("snapshot (%s): %s", event, path)
         if kind != "snapshot":
             self._automatic.append(path)
             while 0 < self.keeping.keep < len(self._automatic):

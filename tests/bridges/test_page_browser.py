@@ -251,6 +251,14 @@ def test_dark_and_light_and_without_motion(page: Open) -> None:
     assert light.evaluate("getComputedStyle(map).transitionDuration") != "0s"
 
 
+def test_the_course_of_the_force_is_drawn_whole_when_its_panel_grows(page: Open) -> None:
+    """The panel takes the height that its neighbours leave, and they change after the first drawing."""
+    found = page()
+    for height in (400, 230):
+        found.evaluate("h => { timeline.style.flex = 'none'; timeline.style.height = `${h}px`; }", height)
+        until(lambda height=height: found.evaluate("timeline.height / devicePixelRatio") == height)
+
+
 def test_it_reads_the_wire_as_the_vectors_say(page: Open) -> None:
     """The page's own msgpack reader, on messages made by a program that shares no code with ours."""
     found = page()

@@ -83,6 +83,12 @@ def test_a_broken_configuration_is_named_where_the_skin_is_not_found(skin, tmp_p
     assert ran.code == 0  # a bundle needs no configuration
 
 
+def test_a_snapshot_without_a_recorder_says_so_at_once(skin) -> None:  # type: ignore[no-untyped-def]
+    """Not after the ten seconds that an answer may take."""
+    ran = skin("snapshot")
+    assert ran.code == 3 and ran.out == "" and "recorder does not run here" in ran.err and "`skin up`" in ran.err
+
+
 @pytest.mark.parametrize("command", [*PRESS_AND_WATCH, ("top", "--once", "--json", "--seconds", 0.1)])
 def test_no_service_is_said_at_once(skin, command) -> None:  # type: ignore[no-untyped-def]
     ran = skin(*command)

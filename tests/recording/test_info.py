@@ -62,7 +62,8 @@ def test_topics_gaps_faults_and_contacts_are_found(recording: Path) -> None:
 
 def test_it_is_told_in_text_and_as_json(skin: Skin, recording: Path) -> None:  # noqa: F811
     told = skin("info", recording).out
-    assert "a snapshot of fault: palm: acquisition ERROR" in told and "10.0 s from 2023-11-14 22:13:20 UTC" in told
+    assert "a snapshot: fault: palm: acquisition ERROR" in told and "10.0 s from 2023-11-14 22:13:20 UTC" in told
+    assert "contacts: 1\n" in told and "gaps: 1\n" in told
     assert "palm 3: up to 4.00 N at +10.0, +20.0 mm" in told and "1 malformed" in told
     assert "contact/palm: nothing for 1.05 s" in told and "palm: electrode_open" in told
     force, valid = told.split("where not valid\n")[1].splitlines()[:2]

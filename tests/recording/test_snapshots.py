@@ -123,8 +123,8 @@ def test_a_folder_that_cannot_be_written_to_is_said_and_counted(tmp_path: Path) 
     (tmp_path / "file").touch()
     made = Clock(Keeping(tmp_path / "file", triggers=("contact",)))
     made.hear(touched(), touched(1), touched(1))
-    assert made.of.missed == 1 and "no snapshot of contact" in made.of.problem
-    with pytest.raises(RecordingError, match="no snapshot of snapshot"):
+    assert made.of.missed == 1 and "no snapshot (contact: palm" in made.of.problem
+    with pytest.raises(RecordingError, match=r"no snapshot \(by hand\)"):
         made.of.take("snapshot", "by hand", made.ns)
 
 
@@ -250,7 +250,7 @@ def test_it_records_and_takes_snapshots_when_told_to(waiting: tuple[Publisher, C
     ended = control.call("record", on=False)
     assert not control.call("status")["recording"] and ended["file"] == begun["file"]
     snapshot, recording = Path(made["file"]), Path(begun["file"])
-    assert len(contacts_in(snapshot)) >= 50 and RecordingReader(snapshot).metadata["event"] == "snapshot: a test"
+    assert len(contacts_in(snapshot)) >= 50 and RecordingReader(snapshot).metadata["event"] == "a test"
     assert len(contacts_in(recording)) == 40
     for path in (snapshot, recording):  # what is latched is in both, though it was said long before
         assert [m.topic for m in RecordingReader(path).messages({"info"})] == ["info/palm"]

@@ -53,7 +53,8 @@ export class Timeline {
     this.drawn = nowMs;
     const { canvas } = this, ratio = Math.min(2, devicePixelRatio), { clientWidth: w, clientHeight: h } = canvas;
     if (!w || !h) return;
-    if (canvas.width !== Math.round(w * ratio)) [canvas.width, canvas.height] = [Math.round(w * ratio), Math.round(h * ratio)];
+    const size = [Math.round(w * ratio), Math.round(h * ratio)];
+    if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
     const c = canvas.getContext("2d"), style = getComputedStyle(canvas);
     const ink = style.color, faint = style.getPropertyValue("--faint"), doubt = style.getPropertyValue("--doubt");
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
