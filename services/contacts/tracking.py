@@ -96,13 +96,13 @@ class Tracker:
 
     def _confirm(self, found: list[Track], sure: bool) -> None:
         """Give ids to touches that begin: those that an earlier sure image showed too, or the largest one where no
-        other touch is known; at once where the image is sure, else when a second image shows it.
+        other touch is known; at once where the image is sure, else when a third image shows it.
         """
         new = [t for t in found if t.id == UNCONFIRMED]
         begin = [t for t in new if t.sure_frames > 1 and t.confidence >= LEAST_CONFIDENCE]
         # A touch that no sure image ever showed may be where nothing touches.
         known = sure and any(t.id != UNCONFIRMED and t.sure for t in self.tracks)
-        first = [t for t in new if sure or t.age > 1]
+        first = [t for t in new if sure or t.age > 2]
         if first and not begin and not known and len(new) == len(found):
             begin = [max(first, key=lambda t: t.size)]
         for track in begin:

@@ -98,6 +98,7 @@ class TouchDetector:
         if found.touched:
             self._follow(d, live, noise, now_ns)
         else:
+            self.creep.untouched(d, found.operator, now_ns)
             self._look_ns, self._again_s = 0, AGAIN_S
             self._gather(0)
             self._question = None

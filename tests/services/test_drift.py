@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
 from models.bundle import Bundle
+from models.prereconstruction import PreReconstructor
+from models.sentinel import touches
 from protocol.frames import DeltaFrame, RawFrame
+from services.estimation.creep import Creep
 from services.estimation.drift import DriftRates
 from services.estimation.drift_filter import DriftFilter
 from services.estimation.tare import take
@@ -340,3 +343,18 @@ def test_the_filter_goes_on_from_its_state(skin: Skin, bundle: Bundle) -> None:
     filters[1].begin(0)
     filters[1].load(old)
     assert filters[1].since_s(300 * FRAME_NS) == filters[0].since_s(300 * FRAME_NS)
+
+
+def test_a_light_press_where_a_strong_one_was_is_no_creep() -> None:
+    """What a strong touch leaves behind fades: what comes back is a touch."""
+    operator = PreReconstructor(Bundle.load("square16").matrices).condition(np.full(120, 1e-4))
+    held = touches(Bundle.load("square16").matrices, 1.0, (0.2,)).response[100].astype(float)
+    creep, second = Creep(120), 10**9
+    creep.begin(held, second)
+    assert creep.taken_out(0.03 * held, operator, 2 * second) is not None  # just released
+    for k in range(30):
+        creep.untouched(0.03 * np.exp(-k / 5) * held, operator, (2 + k) * second)
+    assert creep.taken_out(0.03 * held, operator, 33 * second) is None
+    assert creep.taken_out(0.001 * held, operator, 33 * second) is not None
+    creep.begin(0.5 * held, 40 * second)  # held again
+    assert creep.taken_out(0.03 * held, operator, 41 * second) is not None

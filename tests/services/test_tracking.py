@@ -256,7 +256,7 @@ def test_a_touch_that_moves_fast_or_lightens_in_its_place_goes_on() -> None:
 def updates(tracker: Tracker, *frames: tuple[list[Patch], bool]) -> list[list[int]]:
     """Ids of what each frame's contacts are, (patches, whether the image explains its frame)."""
     found = []
-    for n, (seen, sure) in enumerate(frames, 1):
+    for n, (seen, sure) in enumerate(frames, 1 + (tracker._looked_ns or 0) // FRAME_NS):
         tracks, _ = tracker.update(seen, n * FRAME_NS, sure)
         found.append([t.id for t in tracks if t is not None])
     return found
@@ -283,8 +283,9 @@ def test_a_second_touch_begins_beside_one_that_leaves_much_unexplained() -> None
 def test_a_touch_that_only_doubtful_images_showed_does_not_keep_the_true_one_waiting() -> None:
     tracker = Tracker()
     tracker.update([], 0)
-    wrong, grown, true = touch(0.012, 0.02), touch(0.012, 0.02, 2 * SIZE), touch(0.036, 0.02, 3 * SIZE)
-    assert updates(tracker, ([wrong], False), ([grown], False), ([true], True)) == [[], [1], [2]]
+    wrong = [touch(0.012, 0.02, k * SIZE) for k in (1, 2, 4)]
+    assert updates(tracker, *(([each], False) for each in wrong)) == [[], [], [1]]
+    assert updates(tracker, ([touch(0.036, 0.02, 5 * SIZE)], True)) == [[2]]
 
 
 def test_a_faint_patch_begins_alone_and_not_beside_a_touch() -> None:
