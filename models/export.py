@@ -24,7 +24,8 @@ from protocol.errors import EitskinError
 
 OPSET = 17  # onnxruntime 1.20 and later read it
 INPUTS, OUTPUTS = ("stack", "context"), ("drop", "log_sigma", "classes")
-PARITY = 1e-5
+PARITY = 1e-4  # ONNX Runtime's sigmoid is wrong by up to 6e-8 whatever its value: gates that are all but closed let
+# that much of activations of some hundreds through, which made 1.8e-5 and 4.2e-5 of an output
 LOSS = 10.0  # times what PyTorch's own float32 loses against float64 on the same frames, where that is more than PARITY
 # Not in int8. The first two read the widest features: converting those takes longer than int8 saves.
 FLOAT = ("/stem/", "/down1/", "/stage2/attention", "/up2/", "/stage3/", "/classes/", "/up1/", "/out/", "/aside/")
