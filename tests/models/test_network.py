@@ -100,6 +100,7 @@ def test_the_loss_is_least_at_the_truth(pre, scenes):
 
 
 def test_resuming_continues_where_it_stopped(trainer, pre, scenes, tmp_path):
+    trainer.step(0.2)
     trainer.save(tmp_path / "a.pt")
     batches = samples.Batches(scenes, pre, geometry.load("square16"), seed=0, size=16, groups=2, bank=4)
     again = Trainer(TINY, batches, scenes)
