@@ -5,7 +5,6 @@ dead electrodes, model error.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +12,7 @@ import numpy.typing as npt
 from models.geometry import SkinGeometry
 from models.prereconstruction import Array, Drift, Operator, PreReconstructor
 from models.touch_fit import misfit_factor
+from models.turns import TURNS, Turn
 
 # What two meshes or two solvers differ by, of |d|. It is no noise: it looks like the signal of a touch that is not
 # there, a thousandth of what is, and falls off with the Gram matrix's eigenvalues almost as touches do (their power 0.4
@@ -20,45 +20,31 @@ from models.touch_fit import misfit_factor
 MODEL_ERROR = 1.2e-3
 SERVICE_DRIFT = Drift(scale=2e-5, contact=1e-4)  # a little less than services allow for at rest
 
-Pixel = TypeVar("Pixel", bound=np.generic)
-
 
 @dataclass(frozen=True)
 class Symmetry:
-    """d'[k] = d[measurements[k]] belongs to the image transposed (if so), then flipped along y and x (if so)."""
+    """d'[k] = d[measurements[k]] belongs to the turned image."""
 
     measurements: npt.NDArray[np.integer]
-    transpose: bool
-    flip_y: bool
-    flip_x: bool
-
-    def image(self, images: npt.NDArray[Pixel]) -> npt.NDArray[Pixel]:
-        """Transforms (..., n, n) images [iy, ix]."""
-        if self.transpose:
-            images = np.swapaxes(images, -1, -2)
-        if self.flip_y:
-            images = images[..., ::-1, :]
-        return images[..., ::-1] if self.flip_x else images
+    turn: Turn
 
 
 def symmetries(skin: SkinGeometry) -> list[Symmetry]:
-    """Those of the square grid's eight that map the skin's electrodes (place, width) onto themselves and the
+    """Those of the square's eight that map the skin's electrodes (place, width) onto themselves and the
     pattern onto itself.
     """
     points = skin.point(skin.electrodes)
     row = {_key(m): k for k, m in enumerate(skin.pattern)}
     found = []
-    for code in range(8):
-        transpose, flip_y, flip_x = bool(code & 4), bool(code & 2), bool(code & 1)
-        moved = points[:, ::-1] if transpose else points
-        moved = moved * [-1 if flip_x else 1, -1 if flip_y else 1]
+    for turn in TURNS:
+        moved = turn.points(points)
         distance = np.linalg.norm(points[:, None] - moved[None], axis=2)
         source = distance.argmin(axis=1)  # electrode e stands where `source[e]` has been moved to
         if distance.min(axis=1).max() > 1e-6 or not np.allclose(skin.widths, skin.widths[source]):
             continue
         keys = [_key(source[m]) for m in skin.pattern]
         if all(k in row for k in keys):
-            found.append(Symmetry(np.array([row[k] for k in keys]), transpose, flip_y, flip_x))
+            found.append(Symmetry(np.array([row[k] for k in keys]), turn))
     return found
 
 

@@ -94,8 +94,13 @@ class Bundle:
         return float(self.manifest["image"]["metres_per_unit"])
 
     @property
+    def half_width(self) -> float:
+        """Model units: half the side of every image, about the origin."""
+        return float(self.manifest["image"]["half_width"])
+
+    @property
     def metres_per_pixel(self) -> float:
-        return self.metres_per_unit * 2.0 * float(self.manifest["image"]["half_width"]) / self.image_size
+        return self.metres_per_unit * 2.0 * self.half_width / self.image_size
 
     def prereconstructor(self) -> PreReconstructor:
         return PreReconstructor(self.matrices)

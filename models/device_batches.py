@@ -33,7 +33,7 @@ class SceneTensors:
         self._measurements = torch.from_numpy(np.stack([s.measurements for s in symmetries])).long().to(device)
         self._pixels = {
             n: torch.from_numpy(
-                np.stack([s.image(np.arange(n * n).reshape(n, n)).reshape(-1) for s in symmetries]).copy()
+                np.stack([s.turn.image(np.arange(n * n).reshape(n, n)).reshape(-1) for s in symmetries]).copy()
             ).to(device)
             for n in (drop.shape[1], classes.shape[1])
         }

@@ -106,7 +106,7 @@ def _batch(
     index = rng.integers(len(scenes), size=64)
     turned = [turns[k] for k in rng.integers(len(turns), size=64)]
     d = np.stack([scenes.d[i][t.measurements] for i, t in zip(index, turned, strict=True)])
-    truth = np.stack([t.image(scenes.drop[i]) for i, t in zip(index, turned, strict=True)]).astype(np.float32)
+    truth = np.stack([t.turn.image(scenes.drop[i]) for i, t in zip(index, turned, strict=True)]).astype(np.float32)
     image = torch.from_numpy(inputs(spoiled.operator, spoiled.spoil(d, rng)))
     return image.to(memory_format=torch.channels_last), torch.from_numpy(truth)[:, None]
 

@@ -14,11 +14,12 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from models import data, geometry
-from models.augmentation import Condition, OwnSkin, Pixel, Symmetry, random_condition, symmetries
+from models.augmentation import Condition, OwnSkin, Symmetry, random_condition, symmetries
 from models.device_batches import ConditionTensors, SceneTensors, measured, stacks
 from models.losses import IGNORE, Target
 from models.prereconstruction import Array, PreReconstructor
 from models.shapes import from_rows
+from models.turns import Pixel
 
 N = 96
 GRID = 24
@@ -163,7 +164,7 @@ def make(
 
     def pictures(images: npt.NDArray[Pixel]) -> npt.NDArray[Pixel]:
         return np.stack(
-            [images[i] if t is None else t.image(images[i]) for i, t in zip(index, turned or same, strict=True)]
+            [images[i] if t is None else t.turn.image(images[i]) for i, t in zip(index, turned or same, strict=True)]
         )
 
     stack, context, scale = condition.operator.stacks(condition.spoil(d, rng))

@@ -28,8 +28,6 @@ class EitskinError(Exception):
         ├── TooFewMeasured                    an untouched frame in which too little was measured to calibrate on
         ├── CalibrationFileError              what a calibration found cannot be read, kept or used
         ├── OtherScenes (ValueError)          training scenes of another skin, or of this one as it was
-        ├── CalibrationFileError              what a calibration found cannot be read, kept or used
-        ├── OtherScenes (ValueError)          training scenes that must not be mixed with those of this run
         ├── NoSuchNetwork (ValueError)        a file without the network that training is to start from
         ├── NotRegistered (ValueError)        a folder to train for holds a bundle of no registered skin
         ├── ParityError                       an exported network does not compute what PyTorch computes

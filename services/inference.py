@@ -60,9 +60,8 @@ class Inference(Stage):
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
         self._refinement = _refinement(name, skin, bundle)
         self._symmetry: SymmetryMean | None = None
-        turns = symmetries(bundle.skin) if bundle.locator is None else ()  # what was registered is like itself alone
-        if skin.touch.symmetry and isinstance(self._network, Network) and turns:
-            self._symmetry = SymmetryMean(self._network, turns)
+        if skin.touch.symmetry and isinstance(self._network, Network) and bundle.locator is None:
+            self._symmetry = SymmetryMean(self._network, symmetries(bundle.skin))  # one registered is like itself alone
         self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
         self._parts = PartImage(bundle) if skin.scan == "rolling" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2

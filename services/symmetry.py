@@ -14,30 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from models.turns import TURNS, Turn
 from protocol.frames import DeltaFrame
 from services.networks import Network, Pictures
 
 SAME = 1e-6  # model units: places that are the same
-Turn = tuple[bool, int]
-"""Mirrored left to right first, or not; then turned clockwise by so many right angles."""
-
-TURNS: tuple[Turn, ...] = tuple((mirrored, times) for mirrored in (False, True) for times in range(4))[1:]
-
-
-def turned(array: NDArray[Any], turn: Turn) -> NDArray[Any]:
-    """Images (..., n, n), [iy, ix]."""
-    mirrored, times = turn
-    return np.rot90(array[..., ::-1] if mirrored else array, times, axes=(-2, -1))
-
-
-def turned_back(array: NDArray[Any], turn: Turn) -> NDArray[Any]:
-    mirrored, times = turn
-    back = np.rot90(array, -times, axes=(-2, -1))
-    return back[..., ::-1] if mirrored else back
 
 
 def symmetries(skin: Mapping[str, Any]) -> tuple[Turn, ...]:
-    """Those of TURNS that leave a bundle's geometry as it is: outline, electrodes, widths, contact impedances."""
+    """The turns, but for the first, that leave a bundle's geometry as it is: outline, electrodes, widths, contact
+    impedances.
+    """
     electrodes = skin.get("electrodes", {})
     outline = np.asarray(skin.get("outline", ()), float).reshape(-1, 2)
     centres = np.asarray(electrodes.get("centre", ()), float).reshape(-1, 2)
@@ -50,17 +37,9 @@ def symmetries(skin: Mapping[str, Any]) -> tuple[Turn, ...]:
     marked = np.column_stack([centres, *each])
     return tuple(
         turn
-        for turn in TURNS
-        if _same(outline, _moved(outline, turn)) and _same(marked, np.column_stack([_moved(centres, turn), *each]))
+        for turn in TURNS[1:]
+        if _same(outline, turn.points(outline)) and _same(marked, np.column_stack([turn.points(centres), *each]))
     )
-
-
-def _moved(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
-    mirrored, times = turn
-    x, y = points.T * (np.array([[-1.0], [1.0]]) if mirrored else 1.0)
-    for _ in range(times):
-        x, y = y, -x
-    return np.column_stack([x, y])
 
 
 def _same(rows: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
@@ -83,16 +62,16 @@ class SymmetryMean:
     def begin(self, frame: DeltaFrame, pictures: Pictures) -> None:
         """A frame and what the network made of it. Where electrodes are missing, the skin has no symmetry."""
         self.forget()
-        if np.isfinite(frame.sigma).all():
+        if self._turns and np.isfinite(frame.sigma).all():
             self._frame, self._made = frame, [pictures]
 
     def step(self) -> Pictures | None:
         """Compute one more; the mean of all when it was the last."""
-        if self._frame is None or not self._turns:
+        if self._frame is None:
             return None
         turn = self._turns[len(self._made) - 1]
-        frame = replace(self._frame, stack=np.ascontiguousarray(turned(self._frame.stack, turn)))
-        drop, sigma, classes = (turned_back(each, turn) for each in self._network.run(frame))
+        frame = replace(self._frame, stack=np.ascontiguousarray(turn.image(self._frame.stack)))
+        drop, sigma, classes = (turn.back.image(each) for each in self._network.run(frame))
         self._made.append((drop, sigma, classes))
         if len(self._made) <= len(self._turns):
             return None

@@ -43,6 +43,7 @@ SERVICES_USE_OF_MODELS = {
     "models.patterns",
     "models.rolling",
     "models.refine",
+    "models.turns",
     "models.shapes",
     "models.touch_fit",
     "models.sentinel",

@@ -192,5 +192,4 @@ def _surroundings(skin: Skin, bundle: Bundle) -> dict[str, Any]:
         raise ConfigError(
             f"{bundle.path}/manifest.json: its uncertainties cannot be read ({why}); build it again"
         ) from None
-    half_width = float(bundle.manifest["image"]["half_width"])
-    return {"metres_per_unit": unit, "half_width": half_width, "indenter_area": area, "maps": maps}
+    return {"metres_per_unit": unit, "half_width": bundle.half_width, "indenter_area": area, "maps": maps}

@@ -29,8 +29,8 @@ class Coverage:
     """For one bundle: K measurements, touches at M places."""
 
     def __init__(self, bundle: Bundle) -> None:
-        half_width = float(bundle.manifest["image"].get("half_width", 1.0))
-        self._response = np.asarray(touches(bundle.matrices, half_width, (RADIUS,)).response, dtype=float)  # (M, K)
+        grid = touches(bundle.matrices, bundle.half_width, (RADIUS,))
+        self._response = np.asarray(grid.response, dtype=float)  # (M, K)
 
     def found_again(self, live: Mask) -> Array:
         """(M,) share of a touch at each place that the measurements live (K,) find again."""

@@ -49,12 +49,9 @@ class Creep:
 
     def taken_out(self, d: Array, operator: Operator, now_ns: int) -> Array | None:
         """d (K,) without the creep in it; None where there can be none, or where d is too large for it."""
-        size = float(self._touch @ self._touch)
-        if now_ns >= self._ends_ns or not size or float(d @ d) > 4 * SHARE**2 * size:
+        if self.direction(now_ns) is None or float(d @ d) > 4 * SHARE**2 * float(self._touch @ self._touch):
             return None
-        white = operator.whiten @ self._touch
-        energy = max(float(white @ white), 1e-30)
-        share = float(white @ (operator.whiten @ d)) / energy
+        share, energy = self._share(d, operator)
         if share + self._followed > self._left + GROWS + GROWS_SIGMA / np.sqrt(energy):
             return None
         return d - self._possible(share) * self._touch
@@ -63,11 +60,16 @@ class Creep:
         """A frame without a touch: what it shows of the creep is all that is left."""
         if self.direction(now_ns) is None:
             return
-        white = operator.whiten @ self._touch
-        share = float(white @ (operator.whiten @ d)) / max(float(white @ white), 1e-30)
+        share, _ = self._share(d, operator)
         elapsed_s = max(0.0, (now_ns - self._seen_ns) * 1e-9)
         self._left = float(np.clip(share + self._followed, self._left * np.exp(-elapsed_s / FADES_S), SHARE))
         self._seen_ns = now_ns
+
+    def _share(self, d: Array, operator: Operator) -> tuple[float, float]:
+        """How much of the touch d (K,) shows, and the energy of the touch in standard deviations squared."""
+        white = operator.whiten @ self._touch
+        energy = max(float(white @ white), 1e-30)
+        return float(white @ (operator.whiten @ d)) / energy, energy
 
     def _possible(self, share: float) -> float:
         return float(np.clip(share, -self._followed, SHARE - self._followed))

@@ -228,6 +228,5 @@ def evidence_of(bundle: Bundle) -> TouchEvidence:
         skin, series = bundle.skin, None
         if "contact_impedance" in skin:
             series = np.asarray(skin["contact_impedance"], float) / np.asarray(skin["electrodes"]["width"], float)
-        half_width = float(bundle.manifest["image"].get("half_width", 1.0))
-        _made[bundle.hash] = TouchEvidence(SkinPhysics.of(bundle.matrices, half_width, series))
+        _made[bundle.hash] = TouchEvidence(SkinPhysics.of(bundle.matrices, bundle.half_width, series))
     return _made[bundle.hash]

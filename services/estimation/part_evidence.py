@@ -57,8 +57,7 @@ class PartEvidence:
     def __init__(self, bundle: Bundle, parts: int) -> None:
         m = bundle.matrices
         self.knows = m.normalisation == "model" and parts > 1
-        half_width = float(bundle.manifest["image"].get("half_width", 1.0))
-        grid = touches(m, half_width)
+        grid = touches(m, bundle.half_width)
         self._response = np.asarray(grid.response, dtype=np.float64)  # (M, K)
         self._position = np.asarray(grid.position, dtype=np.float64)
         self._count = len(bundle.pattern) // parts  # values in a part

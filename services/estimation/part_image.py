@@ -51,7 +51,7 @@ class PartImage:
         m = bundle.matrices
         self._jacobian = np.asarray(m.jacobian, dtype=np.float64)
         self._inside = np.asarray(m.inside, dtype=np.float64)
-        self._half = float(bundle.manifest["image"].get("half_width", 1.0))
+        self._half = bundle.half_width
         self._grid = touches(m, self._half)
         h, w = m.inside.shape
         self._pixel = 2 * self._half / w

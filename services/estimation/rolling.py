@@ -19,8 +19,7 @@ def parts_of(bundle: Bundle) -> int:
 def rolling_order(bundle: Bundle) -> NDArray[np.integer]:
     """The order of this bundle's scan in parts: computed once in a process, the same in every process."""
     if bundle.hash not in _orders:
-        half_width = float(bundle.manifest["image"].get("half_width", 1.0))
-        _orders[bundle.hash] = rolling.order(bundle.matrices, bundle.pattern, parts_of(bundle), half_width)
+        _orders[bundle.hash] = rolling.order(bundle.matrices, bundle.pattern, parts_of(bundle), bundle.half_width)
     return _orders[bundle.hash]
 
 

@@ -47,8 +47,7 @@ _designs: dict[str, Sentinel] = {}  # by the bundle's hash
 def sentinel_of(bundle: Bundle) -> Sentinel:
     """The list of a bundle: computed once in a process, the same in every process."""
     if bundle.hash not in _designs:
-        half_width = float(bundle.manifest["image"].get("half_width", 1.0))
-        _designs[bundle.hash] = designs.design(bundle.matrices, half_width=half_width)
+        _designs[bundle.hash] = designs.design(bundle.matrices, half_width=bundle.half_width)
     return _designs[bundle.hash]
 
 

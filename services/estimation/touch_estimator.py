@@ -37,9 +37,7 @@ class TouchEstimator:
         self._waited = 0  # frames
 
     def reset(self) -> None:
-        self.touched = False
-        self._forget()
-        self.touch_detector.reset()
+        self.begin_anew()
         self.baseline_estimator.reset()
 
     def begin_anew(self) -> None:

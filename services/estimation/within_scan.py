@@ -43,8 +43,7 @@ class ChangingTouch:
     def __init__(self, bundle: Bundle) -> None:
         m = bundle.matrices
         self.knows = m.normalisation == "model"
-        half_width = float(bundle.manifest["image"].get("half_width", 1.0))
-        self._response = np.asarray(touches(m, half_width, TUNING.radii).response, dtype=float)  # (M, K)
+        self._response = np.asarray(touches(m, bundle.half_width, TUNING.radii).response, dtype=float)  # (M, K)
         self._bundle = bundle
         self._courses: dict[int, tuple[Array, Array]] = {}  # by the part measured last
 

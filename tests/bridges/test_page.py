@@ -17,7 +17,6 @@ import aiohttp
 import msgpack
 import numpy as np
 import pytest
-from aiohttp import web
 
 from bridges.page import fetch_three
 from bridges.page.advice import ADVICE
@@ -28,28 +27,9 @@ from bridges.process import BridgeError, Handed, openable
 from protocol.frames import REASONS, ContactFrame, Frame, ImageFrame, unpack
 from protocol.sockets import ControlServer, Publisher
 from protocol.transport import Transport
+from tests.bridges.page_server import SECRET, serving, settings
 
-SECRET = "a-token-of-the-test"
 WAIT_S = 20.0
-
-
-def settings(**changes: Any) -> PageSettings:
-    known = {"skins": ("palm", "sole"), "host": "127.0.0.1", "port": 18080, "names": (), "recordings": ""}
-    return PageSettings(**{**known, **changes})
-
-
-@asynccontextmanager
-async def serving(given: PageSettings | None = None) -> AsyncIterator[PageServer]:
-    server = PageServer(given or settings(), SECRET, lambda skin, measured_ns: None)
-    listening = server.listen()
-    runner = web.AppRunner(server.application(), shutdown_timeout=0.1)
-    await runner.setup()
-    await web.SockSite(runner, listening).start()
-    try:
-        yield server
-    finally:
-        await server.close()
-        await runner.cleanup()
 
 
 class Browser:
@@ -140,7 +120,7 @@ def test_asked_by_another_name_or_from_another_page_it_refuses(runtime: Path) ->
 
 def test_beyond_the_loopback_looking_needs_the_token_too(runtime: Path) -> None:
     async def test() -> None:
-        async with serving(settings(host="0.0.0.0", names=("robot.lan",))) as server:
+        async with serving(host="0.0.0.0", names=("robot.lan",)) as server:
             with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
                 async with looking(server):
                     pass
@@ -204,7 +184,7 @@ def test_the_services_recorder_is_told(runtime: Path, tmp_path: Path) -> None:
     async def test() -> None:
         answers = {"status": lambda args: {}, "snapshot": lambda args: asked.append(args) or {"file": "a.mcap"}}
         recorder = ControlServer("recorder", answers)  # type: ignore[arg-type]
-        async with serving(settings(recordings=str(tmp_path))) as server, looking(server) as browser:
+        async with serving(recordings=str(tmp_path)) as server, looking(server) as browser:
             ended = asyncio.Event()
 
             async def serve() -> None:
@@ -226,7 +206,7 @@ def test_the_services_recorder_is_told(runtime: Path, tmp_path: Path) -> None:
 
 def test_where_no_recorder_runs_the_page_has_one_while_it_runs(runtime: Path, tmp_path: Path) -> None:
     async def test() -> None:
-        async with serving(settings(recordings=str(tmp_path))) as server, looking(server) as browser:
+        async with serving(recordings=str(tmp_path)) as server, looking(server) as browser:
             answer = await browser.command("record", on=True)
             assert answer["ok"] and answer["result"]["recording"], answer
             file = Path(answer["result"]["file"])

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 import numpy as np
 import pytest
-from aiohttp import web
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -21,23 +19,12 @@ from bridges.page.settings import PageSettings
 from bridges.process import BridgeError
 from protocol.frames import Contact, ContactFrame, DeltaFrame, StatusFrame
 from protocol.sockets import Publisher
+from tests.bridges import page_server
+from tests.bridges.page_server import SECRET
 
-SECRET = "a-token-of-the-test"
 
-
-@asynccontextmanager
-async def serving(**changes: Any) -> AsyncIterator[PageServer]:
-    known = {"skins": ("palm",), "host": "127.0.0.1", "port": 18180, "names": (), "recordings": "", "metrics": True}
-    server = PageServer(PageSettings(**{**known, **changes}), SECRET, lambda skin, measured_ns: None)
-    listening = server.listen()
-    runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=0.5)
-    await runner.setup()
-    await web.SockSite(runner, listening).start()
-    try:
-        yield server
-    finally:
-        await server.close()
-        await runner.cleanup()
+def serving(**changes: Any) -> AbstractAsyncContextManager[PageServer]:
+    return page_server.serving(**{"skins": ("palm",), "port": 18180, "metrics": True, **changes})
 
 
 async def asked(server: PageServer, query: str = "", **headers: str) -> tuple[int, str, str]:

@@ -17,27 +17,11 @@ from models.forward import ForwardModel  # noqa: E402
 from models.losses import losses, total  # noqa: E402
 from models.network import NetworkConfig, compose  # noqa: E402
 from models.published import PublishedMMCNN  # noqa: E402
-from models.scenes import random_scene  # noqa: E402
-from models.shapes import Shape, to_rows  # noqa: E402
+from models.shapes import Shape  # noqa: E402
 from models.train import Trainer  # noqa: E402
 
 REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "eidors_reference.npz"
 TINY = NetworkConfig(channels=(8, 8, 8), blocks=(1, 1, 1))
-
-
-@pytest.fixture(scope="module")
-def pre():
-    return Bundle.load("square16").prereconstructor()
-
-
-@pytest.fixture(scope="module")
-def scenes(pre):
-    """96 scenes, their differences by the linearised model: enough to learn something from."""
-    rng = np.random.default_rng(0)
-    rows = np.stack([to_rows(random_scene(rng)) for _ in range(96)]).astype(np.float32)
-    drop, mask, classes = samples.picture(rows)
-    coarse = drop.astype(float).reshape(96, 24, 4, 24, 4).mean(axis=(2, 4)).reshape(96, -1)
-    return samples.Samples((coarse @ pre.m.jacobian.T).astype(np.float32), drop, mask, classes, rows)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +44,7 @@ def test_symmetries_are_those_of_the_forward_model():
     found = symmetries(model.skin)
     assert len(found) == 8
     for symmetry in found:
-        turned = difference(symmetry.image(image))
+        turned = difference(symmetry.turn.image(image))
         assert np.linalg.norm(turned - d[symmetry.measurements]) < 0.015 * np.linalg.norm(turned)
 
 

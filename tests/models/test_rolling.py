@@ -4,12 +4,6 @@ import numpy as np
 import pytest
 
 from models import rolling, sentinel
-from models.bundle import Bundle
-
-
-@pytest.fixture(scope="module")
-def bundle():
-    return Bundle.load("square16")
 
 
 @pytest.mark.parametrize("parts", [10, 5, 4, 2, 1])

@@ -14,11 +14,6 @@ from models.shapes import Shape
 
 
 @pytest.fixture(scope="module")
-def bundle():
-    return Bundle.load("square16")
-
-
-@pytest.fixture(scope="module")
 def found(bundle):
     return sentinel.design(bundle.matrices)
 

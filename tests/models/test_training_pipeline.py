@@ -10,7 +10,6 @@ torch = pytest.importorskip("torch")
 
 from models import data, export, geometry, samples  # noqa: E402
 from models.augmentation import condition, random_condition, symmetries  # noqa: E402
-from models.bundle import Bundle  # noqa: E402
 from models.class_temperature import TEMPERATURES, SeenClasses, calibration_error, cooled, pooled  # noqa: E402
 from models.condensed import CondensedSheet  # noqa: E402
 from models.device_batches import ConditionTensors, SceneTensors, measured, stacks  # noqa: E402
@@ -20,31 +19,11 @@ from models.losses import losses  # noqa: E402
 from models.mismatch import BLUR_GRID, anisotropy_root, soft_drop, soft_touched, turned  # noqa: E402
 from models.network import FAST, FULL, MMCNN, NetworkConfig  # noqa: E402
 from models.prereconstruction import Drift  # noqa: E402
-from models.scenes import random_scene  # noqa: E402
-from models.shapes import Shape, drop_image, from_rows, to_rows  # noqa: E402
+from models.shapes import Shape, drop_image, from_rows  # noqa: E402
 from models.train import FINE, MUON_RATE, Trainer  # noqa: E402
 from models.warm_start import NoSuchNetwork, normalised, restored  # noqa: E402
 
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module")
-def bundle():
-    return Bundle.load("square16")
-
-
-@pytest.fixture(scope="module")
-def pre(bundle):
-    return bundle.prereconstructor()
-
-
-@pytest.fixture(scope="module")
-def scenes(pre):
-    rng = np.random.default_rng(3)
-    rows = np.stack([to_rows(random_scene(rng)) for _ in range(48)]).astype(np.float32)
-    drop, mask, classes = samples.picture(rows)
-    coarse = drop.astype(float).reshape(48, 24, 4, 24, 4).mean(axis=(2, 4)).reshape(48, -1)
-    return samples.Samples((coarse @ pre.m.jacobian.T).astype(np.float32), drop, mask, classes, rows)
 
 
 # -- scenes ---------------------------------------------------------------------------------------------------------

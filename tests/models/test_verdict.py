@@ -2,7 +2,6 @@
 
 import io
 
-import numpy as np
 import pytest
 from rich.console import Console
 
@@ -12,8 +11,6 @@ from models import build, geometry, samples, verdict  # noqa: E402
 from models.bundle import Bundle  # noqa: E402
 from models.network import NetworkConfig  # noqa: E402
 from models.pace import Pace, TrainingBar  # noqa: E402
-from models.scenes import random_scene  # noqa: E402
-from models.shapes import to_rows  # noqa: E402
 from models.train import Trainer  # noqa: E402
 
 
@@ -100,13 +97,8 @@ def test_the_verdict(iou, position, grade, says):
 
 
 @pytest.fixture(scope="module")
-def scenes():
-    pre = Bundle.load("square16").prereconstructor()
-    rng = np.random.default_rng(0)
-    rows = np.stack([to_rows(random_scene(rng, n=1)) for _ in range(48)]).astype(np.float32)
-    drop, mask, classes = samples.picture(rows)
-    coarse = drop.astype(float).reshape(48, 24, 4, 24, 4).mean(axis=(2, 4)).reshape(48, -1)
-    return samples.Samples((coarse @ pre.m.jacobian.T).astype(np.float32), drop, mask, classes, rows)
+def scenes(drawn):
+    return drawn(48, seed=0, n=1)
 
 
 def test_what_there_is_without_a_network(scenes):
