@@ -12,6 +12,7 @@ import typer
 from services.cli.common import (
     USAGE,
     JsonOption,
+    config_file,
     control,
     emit,
     fail,
@@ -80,7 +81,7 @@ def record(
     keeping = Keeping(file, before, after, triggers=wanted, keep=keep) if wanted else None
     what = f"waiting for a {' or a '.join(wanted)}, to {file}" if wanted else f"recording to {file}"
     with Recorder(
-        None if wanted else file, topics.split(","), skin or None, overwrite, rotation=rotation, keeping=keeping
+        None if wanted else file, topics.split(","), skin or None, overwrite, rotation, keeping, config_file()
     ) as recorder:
         with console.status(what) as status:
             while not stop.is_set() and time.monotonic() < end:

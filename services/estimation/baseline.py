@@ -130,8 +130,13 @@ class BaselineEstimator:
         self.drift_filter.begin(sample_ns, DRIFT_KNOWN_S)
         self._run = 0
 
+    def undrifted(self, z0: Array, sample_ns: int) -> None:
+        """Take such a drift back: a frame has just shown the skin as z0 (K,) has it."""
+        self._move(z0)
+        self.steady(sample_ns)
+
     def steady(self, sample_ns: int) -> None:
-        """Nothing has drifted: a frame under a touch says so."""
+        """Nothing has drifted: a frame says so."""
         self.drift_filter.begin(sample_ns, STEADY_S)
 
     def difference(self, amplitude: Array, live: NDArray[np.bool_]) -> Array:

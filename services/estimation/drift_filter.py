@@ -29,7 +29,7 @@ from services.estimation.tuning import TUNING
 Array = NDArray[np.float64]
 
 BLOCK_S = 0.5  # frames are taken in by their means over so long
-SHORT_BLOCK_S, STALE_S = 0.2, 10.0  # over so long after a gap of so long: who taps again and again leaves no more
+SHORT_BLOCK, STALE_S = 4, 10.0  # of so many frames after a gap of so long: who taps again and again leaves no more
 WALK_S = 0.5  # beside its steady rate: a random walk, as large as the rate makes in so long
 BACK_S = 2.0  # how far back the baseline goes when a touch begins
 TREND_S = 8.0  # before that: how it drifted over so long, it is taken to have gone on
@@ -97,8 +97,8 @@ class DriftFilter:
                 self._past.append((self._at_ns, z0.copy(), self.mean, self.covariance))
         self._sum += np.where(live, amplitude, 0.0)
         self._count += live
-        block_s = BLOCK_S if self.since_s(now_ns) < STALE_S else SHORT_BLOCK_S
-        if (now_ns - self._since_ns) * 1e-9 < block_s:
+        enough = self.since_s(now_ns) >= STALE_S and self._count.max() >= SHORT_BLOCK
+        if not enough and (now_ns - self._since_ns) * 1e-9 < BLOCK_S:
             return False
         self._take_in(z0, sigma, now_ns, creep)
         self._past.append((now_ns, z0.copy(), self.mean, self.covariance))

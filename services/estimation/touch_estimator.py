@@ -12,12 +12,14 @@ from services.estimation.baseline import STEADY_S, BaselineEstimator
 from services.estimation.drift import DriftRates
 from services.estimation.evidence import Explanation
 from services.estimation.saved import shaped
+from services.estimation.tare import Baseline
 from services.estimation.touch_detector import Noise, TouchDetector, TouchVerdict
 
 Array = NDArray[np.float64]
 
 STILL = 0.1  # of |d|: two scans that differ by less felt the same
 READ_WITHIN = 5  # frames, after which drift is read from a touch that does not hold still
+AS_BEFORE = 2.0  # standard deviations, rms over a frame: so far off an older baseline, that one was right
 
 
 class TouchEstimator:
@@ -32,9 +34,10 @@ class TouchEstimator:
         self._forget()
 
     def _forget(self) -> None:
-        """No touch waits for its drift to be read."""
+        """No touch waits for its drift to be read, and none was read from this one."""
         self._last: Array | None = None  # |Z| (K,) of the frame before, of a touch that waits
         self._waited = 0  # frames
+        self._undrifted: Array | None = None  # |Z0| (K,) from before drift was read from this touch
 
     def reset(self) -> None:
         self.begin_anew()
@@ -58,6 +61,7 @@ class TouchEstimator:
         baseline. live (K,): measurements that count. still: nothing began or ended during this scan.
         """
         estimator, detector, noise = self.baseline_estimator, self.touch_detector, self.noise()
+        self._take_back(amplitude, live, now_ns)
         d = estimator.difference(amplitude, live)
         since_s = estimator.since_s(now_ns)
         if self.waits or (not self.touched and detector.uncertain(since_s)):
@@ -94,10 +98,22 @@ class TouchEstimator:
             if estimator.explain(d, live, STEADY_S, creep).as_good(explained):
                 estimator.steady(now_ns)  # no drift is read into noise
             else:
+                self._undrifted = self.baseline.z0.copy()
                 estimator.drifted(explained.drift, now_ns, creep)
                 d = estimator.difference(amplitude, live)
         found = detector.begin(d, live, noise, estimator.since_s(now_ns), now_ns, alone=self.touched)
         return d, found._replace(touched=self.touched, score=explained.odds, threshold=limit)
+
+    def _take_back(self, amplitude: Array, live: NDArray[np.bool_], now_ns: int) -> None:
+        """Nothing had drifted where the skin is as it was before: what was read as drift was a part of the touch."""
+        if self._undrifted is None:
+            return
+        estimator = self.baseline_estimator
+        known = live & (self._undrifted > 0) & np.isfinite(estimator.sigma)
+        off = (amplitude - self._undrifted)[known] / (estimator.normaliser * estimator.sigma)[known]
+        if 2 * known.sum() >= len(known) and float(np.mean(off**2)) <= AS_BEFORE**2:
+            estimator.undrifted(self._undrifted, now_ns)
+            self._undrifted = None
 
     def _still(self, d: Array, amplitude: Array, live: NDArray[np.bool_]) -> bool:
         """Whether the frame before felt the same touch, or enough were waited for."""
@@ -112,21 +128,31 @@ class TouchEstimator:
         if self.touched:
             self.baseline_estimator.touched(amplitude, live, now_ns)
         else:
+            self._undrifted = None
             self.baseline_estimator.untouched(amplitude, live, now_ns, self.touch_detector.creep)
 
     def state(self) -> dict[str, Any]:
-        return {"last": None if self._last is None else self._last.copy(), "waited": self._waited}
+        last, undrifted = (None if row is None else row.copy() for row in (self._last, self._undrifted))
+        return {"last": last, "waited": self._waited, "undrifted": undrifted}
 
     def load(self, state: dict[str, Any]) -> None:
         """Raises KeyError, TypeError or ValueError where it does not fit."""
         self._forget()
+        shape = (self.baseline_estimator.pre.measurements,)
         if state["last"] is not None:
-            self._last = shaped(state["last"], (self.baseline_estimator.pre.measurements,), finite=False)
+            self._last = shaped(state["last"], shape, finite=False)
             self._waited = int(state["waited"])
+        if state.get("undrifted") is not None:
+            self._undrifted = shaped(state["undrifted"], shape)
+
+    @property
+    def baseline(self) -> Baseline:
+        found = self.baseline_estimator.baseline
+        assert found is not None, "no frame is judged before there is a baseline"
+        return found
 
     def noise(self) -> Noise:
-        baseline = self.baseline_estimator.baseline
-        assert baseline is not None
+        baseline = self.baseline
         return Noise(self.baseline_estimator.sigma, baseline.frames, baseline.noise_frames)
 
     def prepare(self) -> bool:

@@ -24,6 +24,7 @@ from services.recordings.recording import RecordingError, RecordingReader
 from services.recordings.replay import Step, mark, skins_in, steps
 from services.recordings.replay_session import configuration_of
 from services.runtime.config import BUNDLES, load
+from services.runtime.persistence import arrays
 from services.runtime.stage import STAGES, Refused
 
 SUFFIX = ".golden"
@@ -152,7 +153,7 @@ def _load(pipeline: Pipeline, states: dict[str, Any], wanted: tuple[str, ...]) -
     for name, stage in zip(STAGES, (pipeline.pre, pipeline.inference, pipeline.publishing), strict=True):
         if name in wanted and isinstance(state := states.get(name), dict):
             try:
-                stage.load(state)
+                stage.load(arrays(state))
             except (Refused, KeyError, TypeError, ValueError):
                 stage.reset()
 

@@ -48,8 +48,11 @@ class Recorder:
         overwrite: bool = False,
         rotation: Rotation | None = None,
         keeping: Keeping | None = None,
+        config: Path | None = None,
     ) -> None:
-        """path: record to this file from now on. Raises RecordingError."""
+        """path: record to this file from now on. config: the configuration of what is recorded; None: this process's
+        own. Raises RecordingError.
+        """
         self.topics, self.skin, self.rotation = list(topics), skin, rotation or Rotation()
         for name in self.topics:
             if name not in TOPICS:
@@ -64,7 +67,7 @@ class Recorder:
         self._zero_ns = (
             time.time_ns() - time.monotonic_ns()
         )  # a clock that is set meanwhile must not tear the file's times
-        self._said = metadata(self.topics, skin)  # as the service was started: files may change meanwhile
+        self._said = metadata(self.topics, skin, config)  # as the service was started: files may change meanwhile
         if path is not None:
             self.record(path, overwrite)
         self.snapshots = None if keeping is None else Snapshots(keeping, lambda event: self._metadata(event))
@@ -201,10 +204,10 @@ class Recorder:
         self.close()
 
 
-def metadata(topics: list[str], skin: str | None) -> dict[str, str]:
+def metadata(topics: list[str], skin: str | None, file: Path | None = None) -> dict[str, str]:
     """What a recording says of itself: where it was made, and the settings of its skins."""
     try:
-        config = load()
+        config = load(file)
         wanted = {name: found for name, found in config.skins.items() if skin in (None, name)}
         carried = settings.text_of(wanted, config.skip)
     except (ConfigError, BundleError) as error:

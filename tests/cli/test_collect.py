@@ -1,8 +1,12 @@
 """`skin collect` where it cannot begin; what it measures: tests/services/test_collecting.py, tests/docs."""
 
+import numpy as np
 import pytest
 
+from models.bundle import Bundle
+from services.calibration.force_fit import CalibrationError
 from services.cli import collect
+from services.contacts.force import Look
 
 
 def test_what_cannot_be_collected(skin, tmp_path):
@@ -29,3 +33,31 @@ def test_what_cannot_be_collected(skin, tmp_path):
 )
 def test_what_is_typed_is_millimetres_and_newtons(text, numbers):
     assert collect._numbers(text) == pytest.approx(numbers) if numbers else collect._numbers(text) is None
+
+
+class Touched:
+    """A collector of a skin that is not free before these presses."""
+
+    def __init__(self, *presses: int) -> None:
+        self.busy, self.asked = presses, 0
+
+    def untouched(self):
+        self.asked += 1
+        if self.asked in self.busy:
+            raise CalibrationError("no untouched scans within 20 s: something touches")
+        return np.ones(120)
+
+    def pressed(self):
+        return np.ones(120), Look(1.0, 0.0, 1.0, 1.0, 0.0, 0.0, None)
+
+
+@pytest.mark.parametrize(("busy", "kept"), [((2, 5), 4), ((3, 4, 5), 2)])
+def test_presses_that_do_not_count_lose_no_others(monkeypatch, capsys, busy, kept):
+    """Three in a row end it, with what there is."""
+    told = []
+    monkeypatch.setattr(collect, "control", lambda *what, **more: told.append(what[1]))
+    found = list(collect._on_the_stub(Touched(*busy), "palm", Bundle.load("square16"), 6, 0.005))
+    said = capsys.readouterr().err
+    assert len(found) == kept and said.count("something touches; this press does not count") == len(busy)
+    assert ("3 presses in a row did not count" in said) == (kept == 2)
+    assert told[-1] == "release"

@@ -9,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from services.pipeline import Pipeline
 from services.recordings import golden
-from services.recordings.recording import RecordingError
+from services.recordings.recording import RecordingError, RecordingReader
+from services.recordings.replay import steps
+from services.runtime.stage import STAGES
 from tests.cli.conftest import Ran, skin  # noqa: F401
 
 HERE = Path(__file__).with_name("golden")
@@ -100,3 +103,11 @@ def test_by_command(skin: Skin, tmp_path: Path) -> None:  # noqa: F811
     ran = skin("golden", file)
     assert ran.code == 1 and "1 differ from faults.golden" in ran.out and f"scan {touched['scan']}" in ran.out
     assert skin("golden", file, "--accept").code == 0 and skin("golden", file).code == 0
+
+
+@pytest.mark.parametrize("name", ["contacts", "faults"])
+def test_it_begins_with_the_state_that_the_service_had(name: str) -> None:
+    step = next(step for step in steps(RecordingReader(HERE / f"{name}.mcap")) if step.raw is None)
+    pipeline = Pipeline("square16", step.skin)
+    golden._load(pipeline, step.states, STAGES)
+    assert pipeline.pre.touch_estimator.baseline_estimator.last_sample_ns > 0  # 0: the state was not taken over

@@ -93,6 +93,13 @@ def test_the_stages_get_what_they_had_and_no_more(config: ConfigFile, tmp_path: 
     assert (law.curve.scale, law.most_n) == (7.0, 4.0)
 
 
+def test_a_recording_says_how_the_service_was_configured_not_who_records(config: ConfigFile, tmp_path: Path) -> None:
+    other = tmp_path / "theirs.toml"
+    other.write_text('[skins.theirs]\nport = "stub"\nbundle = "square16"\n')
+    own, theirs = (settings.read(metadata(["raw"], None, file)[settings.KEY], HERE) for file in (None, other))
+    assert list(own.skins) == list(config.skins) and list(theirs.skins) == ["theirs"]
+
+
 def said(**changes: object) -> dict[str, object]:
     bundle = Bundle.load("square16")
     return {"bundle": "square16", "bundle_hash": bundle.hash, **changes}
