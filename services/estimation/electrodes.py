@@ -204,6 +204,8 @@ class ElectrodeHealth:
         self._off_s[faulty & np.isfinite(self._off_s)] = self._now_s
         self._unsure &= (self._states == DRIFTING) & ~faulty
         again = np.arange(self.electrodes) == seen.suspect
+        for k in np.flatnonzero((self._suspected > 0) & ~again & (self._states == OK)):
+            self._no_longer_suspected(int(k), seen, untouched)
         self._suspected = np.where(again, self._suspected + 1, 0)
         lasts = (self._suspected >= SUSPECTED) & (self._states == OK)
         self._states[lasts], self._unsure[lasts], self._asked[lasts] = DRIFTING, True, 0
@@ -217,6 +219,15 @@ class ElectrodeHealth:
                 self._off_s[k] = self._now_s
         for k in np.flatnonzero((self._states != OK) & ~faulty):
             self._look_again(int(k), seen, untouched)
+
+    def _no_longer_suspected(self, k: int, seen: FrameFindings, untouched: Reference | None) -> None:
+        """Asks once whether the contact of electrode k changed at once and stays so: then no frame differs from the
+        few before by it any more.
+        """
+        opinion = None if untouched is None else self._ask(k, seen, untouched)
+        if opinion is not None and opinion.changed():
+            self._states[k], self._well[k], self._asked[k] = DRIFTING, 0, ASK_EVERY - 1
+            self._contacts.felt[k] = opinion.felt
 
     def _look_again(self, k: int, seen: FrameFindings, untouched: Reference | None) -> None:
         """Looks at an electrode at fault whose fault this frame does not show by itself."""
