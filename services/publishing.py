@@ -152,7 +152,8 @@ class Publishing(Stage):
         if self._alone(frame):
             tracks, ended = self.tracker.alone(seen, now)
         else:
-            tracks, ended = self.tracker.update(seen, now, _explained(frame))
+            well = not any(reason.startswith("electrode") for reason in frame.reasons)
+            tracks, ended = self.tracker.update(seen, now, _explained(frame), well)
         present = []
         said: Sequence[LocatedTouch | None] = located or [None] * len(segments)
         for track, place, s, touch in zip(tracks, seen, segments, said, strict=True):
