@@ -32,7 +32,7 @@ from services.contacts.registered import measures_force, patches
 from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.tracking import Tracker
 from services.describe import geometry
-from services.estimation.quality import SURE
+from services.estimation.quality import NEARLY, SURE
 from services.estimation.within_scan import CHANGING_FRAMES
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
@@ -153,7 +153,8 @@ class Publishing(Stage):
             tracks, ended = self.tracker.alone(seen, now)
         else:
             well = not any(reason.startswith("electrode") for reason in frame.reasons)
-            tracks, ended = self.tracker.update(seen, now, _explained(frame), well)
+            near = (frame.residual or 0.0) <= NEARLY
+            tracks, ended = self.tracker.update(seen, now, _explained(frame), well, near)
         present = []
         said: Sequence[LocatedTouch | None] = located or [None] * len(segments)
         for track, place, s, touch in zip(tracks, seen, segments, said, strict=True):

@@ -10,7 +10,8 @@ The first touch begins at once, if its image is sure. A touch that appears besid
 shows it too: if a touch comes or goes during a scan, that scan's image may show touches that are not there, and so may
 the next one. A faint one takes a third sure image. While an electrode is at fault, it takes four and must not be faint:
 what that contact does to other pairs comes and goes in the image. An image is sure if it explains its measurements, or
-if it is like the image before: a strong touch at the edge leaves a twentieth unexplained for as long as it is held.
+if it is like the image before and explains all but a little: a strong touch at the edge leaves a twentieth for as long
+as it is held, a contact that rose with a touch a tenth and more.
 """
 
 from __future__ import annotations
@@ -71,18 +72,19 @@ class Tracker:
         return list(self.tracks), ended
 
     def update(
-        self, seen: Sequence[Patch], sample_ns: int, sure: bool = True, well: bool = True
+        self, seen: Sequence[Patch], sample_ns: int, sure: bool = True, well: bool = True, near: bool = True
     ) -> tuple[list[Track | None], list[Track]]:
         """Take in the patches of one frame. Returns the track of each patch, in their order (None for one that is to be
         confirmed), and the tracks that ended. sure: whether new touches of this frame can be believed at once. well:
-        no electrode is at fault.
+        no electrode is at fault. near: it leaves so little unexplained that it counts as sure if it is like the one
+        before.
         """
         begins = not self.forgotten(sample_ns)
         ended = self._begin_frame(sample_ns)
         owners = self._assign(seen, sample_ns)
         self._merge(owners, seen, sample_ns)
         self._part(owners, seen, sample_ns)
-        steady = bool(seen) and all(t is not None and is_same(t, entry) for t, entry in zip(owners, seen, strict=True))
+        steady = near and bool(seen) and all(t and is_same(t, entry) for t, entry in zip(owners, seen, strict=True))
         sure = sure or steady
         found: list[Track] = []
         for entry, track in zip(seen, owners, strict=True):
