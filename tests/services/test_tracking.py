@@ -294,6 +294,15 @@ def test_a_second_touch_begins_beside_one_that_leaves_much_unexplained() -> None
     assert updates(tracker, (changing, False), (held, False), (held, False), (held, False))[-1] == [1, 2]
 
 
+def test_no_second_touch_begins_in_images_that_leave_much_unexplained_however_alike_they_are() -> None:
+    """A contact that rose just as the touch began: the image shows the touch, and another one at that electrode."""
+    tracker = Tracker()
+    tracker.update([], 0)
+    shown = [touch(-0.026, -0.001, 4 * SIZE), touch(0.013, -0.048, 3 * SIZE)]
+    ids = [[t and t.id for t in tracker.update(shown, n * FRAME_NS, sure=False, near=False)[0]] for n in range(1, 12)]
+    assert ids[-1] == [1, None] and all(second is None for _, second in ids)
+
+
 def test_a_touch_that_only_doubtful_images_showed_does_not_keep_the_true_one_waiting() -> None:
     tracker = Tracker()
     tracker.update([], 0)
