@@ -232,7 +232,7 @@ def goals(rows: dict[str, Row]) -> list[Goal]:
     overtaken = rows["counts"].get("skipped", 0) + rows["counts"].get("late", 0)
     found = []
     for name in OF_CONTACTS:
-        lost = rows[name]["sent"] - rows[name]["received"] - overtaken
+        lost = max(0.0, rows[name]["sent"] - rows[name]["received"] - overtaken)
         found.append(Goal(f"{name}: lost, beside what the bridge counted as overtaken", lost, at_most=0, gate=0))
     found.append(Goal("frames overtaken in the bridge, or too late, all counted", overtaken, at_most=0))
     clouds = rows["pressure"]
