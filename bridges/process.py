@@ -23,7 +23,6 @@ import zmq
 from protocol import logs, transport
 from protocol.control import ControlServer
 from protocol.errors import EitskinError
-from protocol.garbage import settle
 from protocol.publishing import Publisher
 from protocol.runtime import AlreadyRunning, RuntimeDirError, lock
 from protocol.transport import Socket, Transport, TransportError
@@ -33,8 +32,6 @@ from .pulse import Pulse
 SETTINGS = "EITSKIN_BRIDGE"
 TICK_S = 0.1
 """How often a bridge looks who wants what; also the longest wait, see protocol/freshness.py:WAIT_SLICE_S."""
-WARM_MESSAGES = 50
-"""Handed on; then what is made once has been made, and is no garbage."""
 
 log = logging.getLogger(__name__)
 
@@ -152,13 +149,12 @@ class _Loop:
         self._bridge = bridge
         self._publisher = Publisher(bridge.name)
         self._control = ControlServer(bridge.name, {"status": self._status})
-        self._stop = self._warm = False
+        self._stop = False
 
     def run(self) -> None:
         """Until SIGTERM; Ctrl-C raises KeyboardInterrupt, here as before the loop."""
         signal.signal(signal.SIGTERM, self._on_signal)
         next_tick = 0.0
-        settle()
         try:
             while not self._stop:
                 waited_ns = time.monotonic_ns()
@@ -191,9 +187,6 @@ class _Loop:
             frame = pulse.status(problems)
             if frame is not None:
                 self._publisher.send(frame)
-        if not self._warm and sum(sum(p.sent.values()) for p in self._bridge.pulses.values()) >= WARM_MESSAGES:
-            self._warm = True
-            settle()
 
     def _status(self, args: dict[str, Any]) -> dict[str, Any]:
         skin = args.get("skin") or next(iter(self._bridge.pulses))

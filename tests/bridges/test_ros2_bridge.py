@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import os
-import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -151,55 +149,6 @@ def test_what_the_user_says_of_cyclone_comes_after_ours(monkeypatch: pytest.Monk
     monkeypatch.setenv("CYCLONEDDS_URI", "")
     dds.configure("")
     assert 'NetworkInterface name="lo"' in os.environ["CYCLONEDDS_URI"]
-
-
-class StoppingBridge(Bridge):
-    """Hands `sent` messages on, notes what the garbage collector walks when it is served first, and last; then ends."""
-
-    def __init__(self, handed: Handed, sent: int) -> None:
-        super().__init__("ros2", handed)
-        self._sent, self.walked, self.made = sent, list[int](), list[list[int]]()
-
-    def sockets(self) -> list[Any]:
-        return []
-
-    def serve(self, waited_ns: int) -> None:
-        self.walked.append(len(gc.get_objects()))
-        self.made = self.made or [[number] for number in range(5000)]
-
-    def tick(self) -> None:
-        self.pulses["palm"].sent["/a"] += self._sent
-        if len(self.walked) > 3:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    def close(self) -> None: ...
-
-
-@pytest.mark.parametrize("sent", [0, 50])
-def test_the_garbage_collector_leaves_alone_what_a_bridge_keeps(
-    runtime: Path, monkeypatch: pytest.MonkeyPatch, sent: int
-) -> None:
-    """A full collection over all modules of a bridge takes 15 ms and more, in which no frame is handed on."""
-    reach = {"addresses": {}, "secret_key": None, "server_keys": {}, "clients": None, "operators": None}
-    told = {"skins": {"palm": {"frame_id": "", "stub": False}}, "transport": {**reach, "insecure": False}}
-    monkeypatch.setenv("EITSKIN_BRIDGE", json.dumps({**told, "options": {}, "log_level": "info"}))
-    made: list[StoppingBridge] = []
-
-    def make(handed: Handed) -> Bridge:
-        made.append(StoppingBridge(handed, sent))
-        return made[0]
-
-    thresholds, handler = gc.get_threshold(), signal.getsignal(signal.SIGTERM)
-    before = len(gc.get_objects())
-    try:
-        assert main("ros2", make) == 0
-    finally:
-        gc.set_threshold(*thresholds)
-        gc.unfreeze()
-        signal.signal(signal.SIGTERM, handler)
-    first, last = made[0].walked[0], made[0].walked[-1]
-    assert first < 0.1 * before
-    assert (last > first + 4000) is (sent == 0), "what is made while it warms up is kept too"
 
 
 def test_ctrl_c_while_it_is_being_made_ends_it_without_a_word(
