@@ -17,14 +17,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
+from scipy.special import erf
 
 from models.shapes import CLASSES, KINDS, Array, Shape
 from models.touch_response import TouchGrid, TouchResponse, effective_drop
 
 FREE = {"circle": 4, "hertz": 4, "triangle": 5, "rectangle": 6, "square": 5, "L": 5}  # parameters of each kind
 PERIOD = {"triangle": 2 * np.pi / 3, "rectangle": np.pi, "square": np.pi / 2, "L": 2 * np.pi}
-STARTS = {"triangle": 4, "rectangle": 6, "square": 3, "L": 8}  # rotations tried in one period
-TRIED = {"triangle": 2, "rectangle": 2, "square": 2, "L": 4}  # of them, the likeliest, are fitted to the end
+STARTS = {"triangle": 4, "rectangle": 6, "square": 4, "L": 8}  # rotations looked at in one period
+TRIED = {"triangle": 2, "rectangle": 3, "square": 2, "L": 4}  # of them, evenly apart, are fitted to the end
 ROUNDER = {"circle": 1.0, "hertz": 1.1, "triangle": 1.55, "rectangle": 1.3, "square": 1.25, "L": 1.4}
 """Circumscribed radius of each kind over that of the circle of its area."""
 
@@ -37,7 +38,7 @@ MOST = np.array([0.2, 0.2, 0.4, 0.8, 0.5, 0.4])  # of one step
 STEP = np.array([0.02, 0.02, 0.03, 0.0, 0.05, 0.04])  # for derivatives of coverage; place: of the radius
 DONE = 0.05  # a step that raises the posterior by less, in nats times two, is the last
 STEPS = 12
-FLOOR = 3e-5  # of |Z|: no forward model is better
+FLOOR = 5e-6  # of |Z|: two meshes differ by as much where a touch does least
 MISFIT = 3.5e-3  # of |d|: what the response is wrong by, over the directions that touches make
 MISFIT_ODDS = 0.55  # and it grows with the drop's odds: a drop of a half has all of it, one of a tenth a third
 MISFIT_EACH = 0.2  # of that: in each measurement by itself
@@ -56,6 +57,7 @@ MOST_FOLLOWED = np.array([0.3, 0.3, 0.25, 0.6, 0.2, 0.3])  # of one step along a
 UNFOLLOWED = 0.01  # of a change's energy: what one step may leave of it
 CURVED = 0.15  # of one step: standard deviation of what it is off by
 UNLIKELY = 12.0  # nats behind the likeliest kind: not fitted further
+SAME_TURN = 0.08  # of a kind's period: rotations no further apart are of one optimum
 
 
 @dataclass(frozen=True)
@@ -185,13 +187,15 @@ class TouchFit:
             best = max((fit.evidence for fit in found), default=-np.inf)
             starts = [before[kind]] if before else self._starts(frame, kind, start, radius)
             tried = [frame.fit(kind, theta, radius, best) for theta in starts]
-            found += sorted((fit for fit in tried if fit), key=lambda fit: -fit.evidence)[:1]
+            found += over_rotations([fit for fit in tried if fit])
         found.sort(key=lambda fit: -fit.evidence)
         weight = np.exp([fit.evidence - found[0].evidence for fit in found])
         return _posterior(tuple(found), weight / weight.sum(), len(d))
 
     def _starts(self, frame: _Whitened, kind: str, start: Shape, radius: float | None) -> list[Array]:
-        """The likeliest rotations, place and area being the start's."""
+        """The likeliest rotation, place and area being the start's, and those that divide the period with it: its
+        neighbours lead to the same optimum, and the right one may look unlikely until size and drop fit it.
+        """
         size = radius or float(np.sqrt(start.area / np.pi)) * ROUNDER[kind]
         drop = float(np.clip(start.drop * (1.2 if kind == "hertz" else 1.0), 0.03, 0.9))
         x, y = start.centroid
@@ -203,8 +207,37 @@ class TouchFit:
             theta = theta.copy()
             theta[4] = rotation
             theta[:2] += (x, y) - shape_of(kind, theta).centroid  # an L's centroid is not its circle's centre
-            turned.append((frame.misfit(kind, theta), theta))
-        return [theta for _, theta in sorted(turned, key=lambda pair: pair[0])[: TRIED[kind]]]
+            turned.append(theta)
+        best = int(np.argmin([frame.misfit(kind, theta) for theta in turned]))
+        return [turned[(best + k * STARTS[kind] // TRIED[kind]) % STARTS[kind]] for k in range(TRIED[kind])]
+
+
+def over_rotations(optima: list[KindFit]) -> list[KindFit]:
+    """The likeliest of one kind's optima, with the evidence of all rotations: each optimum's Gaussian, as far as the
+    next optimum. A Gaussian alone would count rotations that are not there, more than a period of them where a small
+    touch says nothing of its rotation, and a square would be likelier than the circle that explains as much.
+    """
+    optima = sorted(optima, key=lambda fit: -fit.evidence)
+    if not optima or optima[0].kind not in PERIOD:
+        return optima[:1]
+    evidence, period = [], PERIOD[optima[0].kind]
+    distinct: list[KindFit] = []
+    for fit in optima:
+        if all(abs(_turn(fit, other)) > SAME_TURN * period for other in distinct):
+            distinct.append(fit)
+    for fit in distinct:
+        turns = [_turn(fit, other) for other in distinct if other is not fit]
+        ahead = min((turn % period for turn in turns), default=period) / 2
+        behind = min((-turn % period for turn in turns), default=period) / 2
+        wide = float(np.sqrt(2 * fit.covariance[4, 4]))
+        evidence.append(fit.evidence + float(np.log(0.5 * (erf(ahead / wide) + erf(behind / wide)))))
+    return [replace(distinct[0], evidence=float(np.logaddexp.reduce(evidence)))]
+
+
+def _turn(fit: KindFit, other: KindFit) -> float:
+    """The rotation from one fit of a kind to another: within half a period of none."""
+    period = PERIOD[fit.kind]
+    return float((other.theta[4] - fit.theta[4] + period / 2) % period - period / 2)
 
 
 def frame_errors(
@@ -297,12 +330,12 @@ class _Whitened:
 
         cost, damping = penalty(left, theta), 1e-3
         for step_number in range(STEPS):
-            if step_number == 3 and -0.5 * cost - self._volume < best - 4 * UNLIKELY:
-                return None
-            hessian = slope.T @ slope + np.diag(information)
-            step = np.linalg.solve(
-                hessian + damping * np.diag(np.diag(hessian)), slope.T @ left - information * (theta - mean)
-            )
+            hessian, uphill = slope.T @ slope + np.diag(information), slope.T @ left - information * (theta - mean)
+            if step_number >= 3:  # a whole step would lead to `promised`, if the response were linear
+                promised = cost - float(uphill @ np.linalg.solve(hessian, uphill))
+                if -0.5 * promised - self._volume < best - 4 * UNLIKELY:
+                    return None
+            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), uphill)
             step *= min(1.0, float((MOST[:count] / np.maximum(np.abs(step), 1e-9)).min()))
             there = np.clip(theta + step, LOW[:count], HIGH[:count])
             left_there, slope_there = self._linear(kind, there)
@@ -320,9 +353,9 @@ class _Whitened:
         free = hessian[np.ix_(~held, ~held)]
         evidence = -0.5 * cost - 0.5 * float(np.linalg.slogdet(free)[1]) - occam - self._volume
         covariance, misfit = np.linalg.inv(hessian), float(left @ left)
-        gain = covariance @ solve_triangular(self._root.T, slope, lower=False, check_finite=False).T
-        covariance += (self._wrong(misfit) - 1) * gain @ self._model @ gain.T
-        return KindFit(kind, theta, covariance, misfit, evidence, self._root @ slope, gain, self._noise)
+        follow = covariance @ solve_triangular(self._root.T, slope, lower=False, check_finite=False).T
+        covariance += (self._wrong(misfit) - 1) * follow @ self._model @ follow.T
+        return KindFit(kind, theta, covariance, misfit, evidence, self._root @ slope, follow, self._noise)
 
     def _wrong(self, misfit: float) -> float:
         """Variance of the model's error over what was assumed: as large as what is left of the frame, as far as noise
