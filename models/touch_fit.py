@@ -36,7 +36,7 @@ LOW = np.array([-1.0, -1.0, np.log(0.05), -5.0, -np.inf, 0.0])
 HIGH = np.array([1.0, 1.0, np.log(0.95), 3.5, np.inf, np.log(4.0)])
 MOST = np.array([0.2, 0.2, 0.4, 0.8, 0.5, 0.4])  # of one step
 STEP = np.array([0.02, 0.02, 0.03, 0.0, 0.05, 0.04])  # for derivatives of coverage; place: of the radius
-DONE = 0.05  # a step that raises the posterior by less, in nats times two, is the last
+DONE = 0.05  # where a step promises less, in nats times two, it is not taken
 STEPS = 12
 FLOOR = 5e-6  # of |Z|: two meshes differ by as much where a touch does least
 MISFIT = 3.5e-3  # of |d|: what the response is wrong by, over the directions that touches make
@@ -57,6 +57,8 @@ MOST_FOLLOWED = np.array([0.3, 0.3, 0.25, 0.6, 0.2, 0.3])  # of one step along a
 UNFOLLOWED = 0.01  # of a change's energy: what one step may leave of it
 CURVED = 0.15  # of one step: standard deviation of what it is off by
 UNLIKELY = 12.0  # nats behind the likeliest kind: not fitted further
+NO_MORE = 1.0  # where a step promised less and kept nothing, the cells' own error is what is left
+NEAR = 0.04  # in every parameter: the same optimum
 SAME_TURN = 0.08  # of a kind's period: rotations no further apart are of one optimum
 
 
@@ -102,6 +104,7 @@ class TouchPosterior:
     drop: tuple[float, float]  # peak, S: mean and standard deviation
     integral: tuple[float, float]  # S times square model units
     area: tuple[float, float]  # square model units
+    between_kinds: tuple[float, float]  # how far the kinds differ in drop and in area: relative standard deviations
     measurements: int
 
     @property
@@ -186,8 +189,11 @@ class TouchFit:
             frame = _Whitened(self.response, d, FrameErrors(errors.noise, CORNERED[kind] ** 2 * errors.model))
             best = max((fit.evidence for fit in found), default=-np.inf)
             starts = [before[kind]] if before else self._starts(frame, kind, start, radius)
-            tried = [frame.fit(kind, theta, radius, best) for theta in starts]
-            found += over_rotations([fit for fit in tried if fit])
+            optima: list[KindFit] = []
+            for theta in starts:
+                fit = frame.fit(kind, theta, radius, best, [other.theta for other in optima])
+                optima += [fit] if fit else []
+            found += over_rotations(optima)
         found.sort(key=lambda fit: -fit.evidence)
         weight = np.exp([fit.evidence - found[0].evidence for fit in found])
         return _posterior(tuple(found), weight / weight.sum(), len(d))
@@ -223,10 +229,10 @@ def over_rotations(optima: list[KindFit]) -> list[KindFit]:
     evidence, period = [], PERIOD[optima[0].kind]
     distinct: list[KindFit] = []
     for fit in optima:
-        if all(abs(_turn(fit, other)) > SAME_TURN * period for other in distinct):
+        if all(abs(_turn(fit.kind, fit.theta, other.theta)) > SAME_TURN * period for other in distinct):
             distinct.append(fit)
     for fit in distinct:
-        turns = [_turn(fit, other) for other in distinct if other is not fit]
+        turns = [_turn(fit.kind, fit.theta, other.theta) for other in distinct if other is not fit]
         ahead = min((turn % period for turn in turns), default=period) / 2
         behind = min((-turn % period for turn in turns), default=period) / 2
         wide = float(np.sqrt(2 * fit.covariance[4, 4]))
@@ -234,10 +240,18 @@ def over_rotations(optima: list[KindFit]) -> list[KindFit]:
     return [replace(distinct[0], evidence=float(np.logaddexp.reduce(evidence)))]
 
 
-def _turn(fit: KindFit, other: KindFit) -> float:
-    """The rotation from one fit of a kind to another: within half a period of none."""
-    period = PERIOD[fit.kind]
-    return float((other.theta[4] - fit.theta[4] + period / 2) % period - period / 2)
+def _apart(kind: str, theta: Array, other: Array) -> float:
+    """The largest difference of two parameters."""
+    off = np.abs(theta - other)
+    if kind in PERIOD:
+        off[4] = abs(_turn(kind, theta, other))
+    return float(off.max())
+
+
+def _turn(kind: str, theta: Array, other: Array) -> float:
+    """The rotation from one touch of a kind to another: within half a period of none."""
+    period = PERIOD[kind]
+    return float((other[4] - theta[4] + period / 2) % period - period / 2)
 
 
 def frame_errors(
@@ -309,9 +323,11 @@ class _Whitened:
         d, by_cell = self._response(grid, now, moved)
         return self._seen - self._white(d), self._white(by_cell @ slope[moved])
 
-    def fit(self, kind: str, theta: Array, radius: float | None, best: float) -> KindFit | None:
+    def fit(
+        self, kind: str, theta: Array, radius: float | None, best: float, known: Sequence[Array] = ()
+    ) -> KindFit | None:
         """The likeliest touch of a kind near theta; None where it is so far behind the evidence `best` that it need
-        not be known.
+        not be known, or where it comes to one of the optima that are `known`.
         """
         count = len(theta)
         mean, sd = MEAN[:count].copy(), SD[:count].copy()
@@ -325,30 +341,30 @@ class _Whitened:
         occam = float(np.log(sd[~held]).sum())
         left, slope = self._linear(kind, theta)
 
-        def penalty(left: Array, theta: Array) -> float:
-            return float(left @ left + (information * (theta - mean) ** 2).sum())
+        def penalty(theta: Array) -> float:
+            return float((information * (theta - mean) ** 2).sum())
 
-        cost, damping = penalty(left, theta), 1e-3
+        cost, damping = float(left @ left) + penalty(theta), 1e-3
         for step_number in range(STEPS):
             hessian, uphill = slope.T @ slope + np.diag(information), slope.T @ left - information * (theta - mean)
-            if step_number >= 3:  # a whole step would lead to `promised`, if the response were linear
-                promised = cost - float(uphill @ np.linalg.solve(hessian, uphill))
-                if -0.5 * promised - self._volume < best - 4 * UNLIKELY:
-                    return None
+            promised = float(uphill @ np.linalg.solve(hessian, uphill))  # by a whole step, if the response were linear
+            if promised < DONE:
+                break
+            if step_number >= 3 and -0.5 * (cost - promised) - self._volume < best - 4 * UNLIKELY:
+                return None
+            if any(_apart(kind, theta, other) < NEAR for other in known):
+                return None
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), uphill)
             step *= min(1.0, float((MOST[:count] / np.maximum(np.abs(step), 1e-9)).min()))
             there = np.clip(theta + step, LOW[:count], HIGH[:count])
-            left_there, slope_there = self._linear(kind, there)
-            cost_there = penalty(left_there, there)
-            if cost_there < cost:
-                done = cost - cost_there < DONE
-                theta, left, slope, cost, damping = there, left_there, slope_there, cost_there, damping * 0.3
-                if done:
-                    break
+            if self.misfit(kind, there) + penalty(there) < cost:
+                theta, damping = there, damping * 0.3
+                left, slope = self._linear(kind, theta)
+                cost = float(left @ left) + penalty(theta)
+            elif damping > 1e2 or promised < NO_MORE:
+                break
             else:
                 damping *= 8
-                if damping > 1e2:
-                    break
         hessian = slope.T @ slope + np.diag(information)
         free = hessian[np.ix_(~held, ~held)]
         evidence = -0.5 * cost - 0.5 * float(np.linalg.slogdet(free)[1]) - occam - self._volume
@@ -398,6 +414,11 @@ def _posterior(fits: tuple[KindFit, ...], probability: Array, measurements: int)
         wider = np.array([WIDER_INTEGRAL if k == 3 else WIDER[fit.kind] for fit in fits])
         return mean, float(np.sqrt(probability @ (wider**2 * variances + (values - mean) ** 2)))
 
+    def apart(k: int) -> float:
+        values = np.array([row[k][0] for row in rows])
+        mean = float(probability @ values)
+        return float(np.sqrt(probability @ (values - mean) ** 2)) / mean
+
     kinds: NDArray[np.str_] = np.array([fit.kind for fit in fits])
     return TouchPosterior(
         fits,
@@ -407,5 +428,6 @@ def _posterior(fits: tuple[KindFit, ...], probability: Array, measurements: int)
         mixed(2),
         mixed(3),
         mixed(4),
+        (apart(2), apart(4)),
         measurements,
     )
