@@ -33,14 +33,14 @@ def pictures(network: Any, made: tuple[Any, Any, float], turns: Sequence[Turn] =
 
 
 def ldci(
-    network: Any, bundle: Bundle, mesh: str, sigma: Array, refined: Callable[[Array, Array], float]
+    network: Any, bundle: Bundle, mesh: str, sigma: Array, refined: dict[str, Callable[[Array, Array], float]]
 ) -> dict[str, float]:
-    """Noise-free: of the image, of the mean over the symmetries, and of the drop that `refined` makes of difference and
-    image. Every one of the 49 places is solved.
+    """Noise-free: of the image, of the mean over the symmetries, and of the drop that each of `refined` makes of
+    difference and image. Every one of the 49 places is solved.
     """
     model, operator = shared(bundle.name, mesh), bundle.prereconstructor().condition(sigma)
     z0 = np.abs(model.solve().impedances())
-    peaks: dict[str, list[float]] = {"network": [], "symmetry": [], "refined": []}
+    peaks: dict[str, list[float]] = {name: [] for name in ("network", "symmetry", *refined)}
     for x, y in metrics.ldci_positions():
         touched = model.touched([Shape("circle", float(x), float(y), RADIUS, DROP)])
         d = np.abs(model.solve(touched).impedances()) / z0 - 1
@@ -48,5 +48,6 @@ def ldci(
         images = {name: pictures(network, made, turns)[0] for name, turns in (("network", ONE), ("symmetry", TURNS))}
         for name, image in images.items():
             peaks[name].append(float(image.max()))
-        peaks["refined"].append(refined(d, images["network"]))
+        for name, fitted in refined.items():
+            peaks[name].append(fitted(d, images["network"]))
     return {name: metrics.ldci(found) for name, found in peaks.items()}
