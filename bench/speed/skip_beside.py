@@ -27,12 +27,12 @@ SWITCHES = {
 
 
 def beside(recorded: Recorded, bundle: Bundle, after_s: float) -> dict[str, Any]:
-    """switch -> p50 and p99 of a frame's time through the stages [ms], fits and frames that were skipped. Fits run in
-    their process, as they do live. Frames before after_s are not counted.
+    """switch -> p50 and p99 of a frame's time through the stages, and of the CPU that it takes [ms]; fits, and frames
+    that were skipped. Fits run in their process, as they do live. Frames before after_s are not counted.
     """
     fits = RefineProcess()
     sets = {name: build_stages("palm", skin, bundle) for name, skin in SWITCHES.items()}
-    took: dict[str, list[float]] = {name: [] for name in sets}
+    took: dict[str, list[tuple[float, float]]] = {name: [] for name in sets}
     try:
         for stages in sets.values():
             stages[1].fit_by(fits)
@@ -42,9 +42,9 @@ def beside(recorded: Recorded, bundle: Bundle, after_s: float) -> dict[str, Any]
             counted = bool(recorded.seconds[k] > after_s)
             names = list(sets)
             for name in names[k % len(names) :] + names[: k % len(names)]:  # none is always the first
-                seconds = _through(sets[name], raw)
+                times = _through(sets[name], raw)
                 if counted:
-                    took[name].append(1e3 * seconds)
+                    took[name].append(times)
             for stages in sets.values():
                 for stage in stages:
                     stage.prepare()
@@ -53,34 +53,42 @@ def beside(recorded: Recorded, bundle: Bundle, after_s: float) -> dict[str, Any]
         counters = sets["touches refined, indenter any"][1].health().counters
     finally:
         fits.close()
-    found: dict[str, Any] = {
-        name: {"p50_ms": float(np.median(ms)), "p99_ms": float(np.quantile(ms, 0.99)), "frames": len(ms)}
-        for name, ms in took.items()
-    }
+    found: dict[str, Any] = {}
+    for name, times_s in took.items():
+        wall, cpu = 1e3 * np.array(times_s).T
+        found[name] = {"p50_ms": float(np.median(wall)), "p99_ms": float(np.quantile(wall, 0.99)), "frames": len(wall)}
+        found[name] |= {"cpu_p50_ms": float(np.median(cpu)), "cpu_p99_ms": float(np.quantile(cpu, 0.99))}
     found["touches refined, indenter any"] |= {
         key: counters[f"refine_{key}"] for key in ("fits", "refined", "skipped", "unexplained")
     }
     return found
 
 
-def _through(stages: list[Stage], raw: RawFrame) -> float:
+def _through(stages: list[Stage], raw: RawFrame) -> tuple[float, float]:
+    """Seconds on the clock and of CPU."""
     message, wanted = pack(raw), frozenset({"delta", "image", "contact"})
-    began = time.perf_counter()
+    began, used = time.perf_counter(), time.thread_time()
     for stage in stages:
         message = pack(stage.process(unpack(message), wanted)[0])
-    return time.perf_counter() - began
+    return time.perf_counter() - began, time.thread_time() - used
 
 
 def ratios(found: dict[str, Any]) -> dict[str, float]:
-    """p99 of each switch over that of neither."""
-    return {name: row["p99_ms"] / found["neither"]["p99_ms"] for name, row in found.items() if name != "neither"}
+    """p99 of each switch over that of neither; and of the CPU, which other programs on the machine move less."""
+    return {
+        f"{name}{said}": row[key] / found["neither"][key]
+        for name, row in found.items()
+        for key, said in (("p99_ms", ""), ("cpu_p99_ms", ", CPU"))
+        if name != "neither"
+    }
 
 
 def table_of(found: dict[str, Any]) -> Table:
     table = Table(title="a moving touch's frames, switches in turn, fits in their own process", title_justify="left")
-    for heading in ("", "p50 ms", "p99 ms", "frames", "fits", "refined", "skipped"):
+    for heading in ("", "p50 ms", "p99 ms", "CPU p50 ms", "CPU p99 ms", "frames", "fits", "refined", "skipped"):
         table.add_column(heading, justify="right" if heading else "left")
     for name, row in found.items():
         counts = [str(row.get(key, "")) for key in ("frames", "fits", "refined", "skipped")]
-        table.add_row(name, f"{row['p50_ms']:.2f}", f"{row['p99_ms']:.2f}", *counts)
+        times = [f"{row[key]:.2f}" for key in ("p50_ms", "p99_ms", "cpu_p50_ms", "cpu_p99_ms")]
+        table.add_row(name, *times, *counts)
     return table
