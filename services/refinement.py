@@ -71,11 +71,15 @@ class RefineProcess:
         self._next()
 
     def poll(self, skin: str) -> RefineAnswer | None:
-        """The newest answer for a skin, once."""
+        """The newest answer for a skin, once. The next job waits for what the skin offers now that it knows the answer:
+        a fit that begins there takes a fraction of the time.
+        """
         if self._begun is not None:
             self._receive()
-        self._next()
-        return self._answers.pop(skin, None)
+        answer = self._answers.pop(skin, None)
+        if answer is None:
+            self._next()
+        return answer
 
     def close(self) -> None:
         for end in (self._to, self._from):

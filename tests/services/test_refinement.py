@@ -236,6 +236,14 @@ def test_the_process_fits_the_newest_of_each_skin_and_counts_the_others(process:
     assert answered(process, "sole").number == 5
 
 
+def test_a_job_that_knows_the_answer_goes_before_one_that_did_not(process: RefineProcess, bundle: Bundle) -> None:
+    process.offer(job(bundle, 1))
+    process.offer(job(bundle, 2))  # made while the first is fitted
+    assert answered(process).number == 1
+    process.offer(job(bundle, 3))
+    assert answered(process).number == 3 and process.skipped == {"palm": 1}
+
+
 def test_a_process_that_dies_is_started_again_and_said(
     process: RefineProcess, bundle: Bundle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
