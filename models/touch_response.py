@@ -110,7 +110,7 @@ class TouchResponse:
         off = np.argwhere(~np.pad(self.tables.inside, 1))
         y, x = (-1 + 2 * (off - 0.5) / n).T
         nearest = float(np.hypot(x - shape.x, y - shape.y).min())
-        return max(0.0, nearest - 1 / n - shape.radius)
+        return float(max(0.0, nearest - 1 / n - shape.radius))
 
     def __call__(
         self, grid: TouchGrid, drop: Array, slope_at: npt.NDArray[np.integer] | None = None

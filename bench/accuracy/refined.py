@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -209,7 +210,8 @@ def consistency() -> dict[str, float]:
         assert start is not None
         return refined_fit(*responses, d, frame_errors(gram, sigma, d, start.drop), start, kinds).drop[0]
 
-    fits = {"found": refined, "declared": partial(refined, kinds=("circle",))}
+    declared: Callable[[Array, Array], float] = partial(refined, kinds=("circle",))
+    fits = {"found": refined, "declared": declared}
     return ldci(export.session(shipped().read_bytes()), bundle, MESH, sigma, fits)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,7 @@ def beside(recorded: Recorded, bundle: Bundle, after_s: float) -> dict[str, Any]
     return found
 
 
-def _through(stages: list[Stage], raw: RawFrame) -> tuple[float, float]:
+def _through(stages: Sequence[Stage], raw: RawFrame) -> tuple[float, float]:
     """Seconds on the clock and of CPU."""
     message, wanted = pack(raw), frozenset({"delta", "image", "contact"})
     began, used = time.perf_counter(), time.thread_time()
