@@ -23,6 +23,7 @@ from protocol.frames import (
 )
 from protocol.held import ANY, HeldImage
 from services.contacts.contact_writer import ContactWriter, class_probabilities, confidence
+from services.contacts.following import Following
 from services.contacts.force import ForceLaw
 from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
@@ -59,6 +60,7 @@ class Publishing(Stage):
         self._writer = ContactWriter(self.law, place, self._tells_force)
         self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
         self.tracker = Tracker()
+        self.following = Following()
         self.each_alone = False  # offline: frames that do not follow each other
         self.reset()
 
@@ -78,6 +80,7 @@ class Publishing(Stage):
     def _forget(self) -> None:
         """Nothing is known of what touches."""
         self._known = self._touched = False
+        self.following.forget()
         self._changing = 0  # frames in a row that said so
         self._seen_in = (ANY, -1)  # session and scan of the image that the contacts were seen in
         self._contacts: list[Contact] = []  # of the frame made last, strongest first; those that ended come last
@@ -107,8 +110,17 @@ class Publishing(Stage):
             self._miss(out, "non_finite")
         else:
             self._see(frame)
+            if frame.whole:
+                self.following.anchor(self._contacts, frame.followed)
         fitted = self._fitted(frame.refined if out.valid else None)
         out.contacts = list(self._contacts) if fitted is None else [fitted[0], *self._contacts[1:]]
+        if frame.followed and out.valid:
+            motion = self.following.motion(frame.followed)
+            out.contacts = self.following.moved(out.contacts, frame.followed, self._writer.place)
+            self.tracker.carry(motion, frame.stamps.get("sample", 0))
+            moves = any(any(touch.velocity) for touch in frame.followed)
+            if moves and any(c.id not in motion for c in out.contacts if c.state != "end"):
+                add_reason(out.reasons, "changing")
         if any((c.force_n or 0.0) > self.law.most_n for c in out.contacts):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
@@ -128,7 +140,7 @@ class Publishing(Stage):
         frames: list[Frame] = [out]
         if "force" in wanted:
             frames.append(self._force(out))
-        if "shape" in wanted:
+        if "shape" in wanted and frame.whole:
             frames.append(self._shape(out, None if fitted is None else fitted[1]))
         return frames
 
@@ -245,6 +257,7 @@ class Publishing(Stage):
     def state(self) -> dict[str, Any]:
         return {
             "tracker": self.tracker.state(),
+            "following": self.following.state(),
             "known": self._known,
             "touched": self._touched,
             "changing": self._changing,
@@ -258,6 +271,7 @@ class Publishing(Stage):
 
     def load(self, state: dict[str, Any]) -> None:
         self.tracker.load(state["tracker"])
+        self.following.load(state.get("following", []))  # older recordings have none
         self._known, self._touched = bool(state["known"]), bool(state.get("touched", False))
         self._changing = int(state.get("changing", 0))
         self._seen_in = (ANY, int(state.get("reconstructed", -1)))  # older recordings have none
