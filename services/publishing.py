@@ -33,7 +33,7 @@ from services.contacts.registered import measures_force, patches
 from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.tracking import Tracker
 from services.describe import geometry
-from services.estimation.quality import SURE
+from services.estimation.quality import NEARLY, SURE
 from services.estimation.within_scan import CHANGING_FRAMES
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
@@ -164,7 +164,9 @@ class Publishing(Stage):
         if self._alone(frame):
             tracks, ended = self.tracker.alone(seen, now)
         else:
-            tracks, ended = self.tracker.update(seen, now, _explained(frame))
+            well = not any(reason.startswith("electrode") for reason in frame.reasons)
+            near = (frame.residual or 0.0) <= NEARLY
+            tracks, ended = self.tracker.update(seen, now, _explained(frame), well, near)
         present = []
         said: Sequence[LocatedTouch | None] = located or [None] * len(segments)
         for track, place, s, touch in zip(tracks, seen, segments, said, strict=True):

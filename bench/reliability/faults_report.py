@@ -46,11 +46,11 @@ SOAK = (
     ("invalid %", "invalid_%", "{:.1f}"),
 )
 # What held in the quick form on 22 November 2026, by the goal's key: to be tightened as the figures get better. Goals
-# that are not here have no gate yet. The first two were 0 and `ok changing` 2 while the stub smeared what happened in a
-# scan over all of it: a contact that rises under a slide is now missed at one of two places (docs/reliability.md).
+# that are not here have no gate yet. `ok changing` is 3 because the forces of these scenes rise within 0.1 s, which may
+# begin in one scan and end in the third after it.
 GATES: dict[str, float] = {
-    "matrix wrong": 14,
-    "matrix unnamed": 2,
+    "matrix wrong": 0,
+    "matrix unnamed": 0,
     "matrix late": 0,
     "ok valid": 99.5,
     "ok changing": 3,

@@ -35,7 +35,7 @@ def up(
 
     found = load()
     _check_mismatches(found)
-    _check_calibrations(found)
+    _check_bundles(found)
     for name in found.bridges:
         check(name)
     wanted = [p for p in programs(found, record) if not (no_board and p.name in ("acquisition", "stub"))]
@@ -61,14 +61,19 @@ def _check_mismatches(config: ConfigFile) -> None:
                 )
 
 
-def _check_calibrations(config: ConfigFile) -> None:
-    """Refuse a calibration of forces that cannot be used, likewise. Raises BundleError, ConfigError."""
+def _check_bundles(config: ConfigFile) -> None:
+    """Refuse a bundle or a calibration of forces that cannot be used, likewise. Raises ConfigError."""
+    from models.bundle import Bundle, BundleError
+
     for name, skin in config.skins.items():
+        try:
+            bundle = Bundle.load(skin.bundle)
+        except BundleError as why:
+            fail(f"{config.path}: skins.{name}.bundle: {why}", USAGE)
         if skin.calibration is not None:
-            from models.bundle import Bundle
             from services.contacts.force import ForceLaw
 
-            ForceLaw.of(skin, Bundle.load(skin.bundle), name)
+            ForceLaw.of(skin, bundle, name)
 
 
 def _addresses(transport: Transport, processes: list[str]) -> str:

@@ -8,8 +8,10 @@ after a start or after a pause, may have been there for long.
 
 The first touch begins at once, if its image is sure. A touch that appears beside others begins when a second sure image
 shows it too: if a touch comes or goes during a scan, that scan's image may show touches that are not there, and so may
-the next one. An image is sure if it explains its measurements, or if it is like the image before: a strong touch at the
-edge leaves a twentieth unexplained for as long as it is held.
+the next one. A faint one takes a third sure image. While an electrode is at fault, it takes four and must not be faint:
+what that contact does to other pairs comes and goes in the image. An image is sure if it explains its measurements, or
+if it is like the image before and explains all but a little: a strong touch at the edge leaves a twentieth for as long
+as it is held, a contact that rose with a touch a tenth and more.
 """
 
 from __future__ import annotations
@@ -29,7 +31,12 @@ FORGOTTEN_S = 1.0  # after so long without a frame, nobody knows whether a touch
 NEVER = 1e6  # cost of what is out of reach
 UNCONFIRMED = 0  # id of what was seen once, beside others
 LEAST_CONFIDENCE = 0.95  # with which a touch begins beside others: where the skin is nearly blind, as at an electrode
-# that is out, a strong touch elsewhere leaves patches of less; of 363 frames of true second touches none had less
+# that is out, a strong touch elsewhere leaves patches of less
+FAINT_CONFIDENCE = 0.92  # the same, where FAINT_FRAMES sure images show it: a newton at the middle of the skin
+SURE_FRAMES, FAINT_FRAMES = 2, 3
+DOUBTED_FRAMES = (
+    4  # instead of SURE_FRAMES where an electrode is at fault: what its contact does to other pairs flickers
+)
 
 
 class Tracker:
@@ -65,17 +72,19 @@ class Tracker:
         return list(self.tracks), ended
 
     def update(
-        self, seen: Sequence[Patch], sample_ns: int, sure: bool = True
+        self, seen: Sequence[Patch], sample_ns: int, sure: bool = True, well: bool = True, near: bool = True
     ) -> tuple[list[Track | None], list[Track]]:
         """Take in the patches of one frame. Returns the track of each patch, in their order (None for one that is to be
-        confirmed), and the tracks that ended. sure: whether new touches of this frame can be believed at once.
+        confirmed), and the tracks that ended. sure: whether new touches of this frame can be believed at once. well:
+        no electrode is at fault. near: it leaves so little unexplained that it counts as sure if it is like the one
+        before.
         """
         begins = not self.forgotten(sample_ns)
         ended = self._begin_frame(sample_ns)
         owners = self._assign(seen, sample_ns)
         self._merge(owners, seen, sample_ns)
         self._part(owners, seen, sample_ns)
-        steady = bool(seen) and all(t is not None and is_same(t, entry) for t, entry in zip(owners, seen, strict=True))
+        steady = near and bool(seen) and all(t and is_same(t, entry) for t, entry in zip(owners, seen, strict=True))
         sure = sure or steady
         found: list[Track] = []
         for entry, track in zip(seen, owners, strict=True):
@@ -87,19 +96,19 @@ class Tracker:
                 if track.inside:
                     follow(track, entry, sample_ns)
             found.append(track)
-        self._confirm(found, sure)
+        self._confirm(found, sure, well)
         coasting = [t for t in self.tracks if t.id != UNCONFIRMED and not any(t is f for f in found)]
         self.tracks = found + coasting
         if not sure:
             coasting = [t for t in coasting if sample_ns - t.seen_ns > UNSEEN_S * 1e9]
         return [t if t.id != UNCONFIRMED else None for t in found], ended + self._lose(coasting, sample_ns)
 
-    def _confirm(self, found: list[Track], sure: bool) -> None:
-        """Give ids to touches that begin: those that an earlier sure image showed too, or the largest one where no
+    def _confirm(self, found: list[Track], sure: bool, well: bool) -> None:
+        """Give ids to touches that begin: those that earlier sure images showed too, or the largest one where no
         other touch is known; at once where the image is sure, else when a third image shows it.
         """
         new = [t for t in found if t.id == UNCONFIRMED]
-        begin = [t for t in new if t.sure_frames > 1 and t.confidence >= LEAST_CONFIDENCE]
+        begin = [t for t in new if _believed(t, well)]
         # A touch that no sure image ever showed may be where nothing touches.
         known = sure and any(t.id != UNCONFIRMED and t.sure for t in self.tracks)
         first = [t for t in new if sure or t.age > 2]
@@ -223,6 +232,13 @@ class Tracker:
         self._next_id = max(self._next_id, int(state["next_id"]))
         looked_ns = int(state["looked_ns"])
         self._looked_ns = None if looked_ns < 0 else looked_ns
+
+
+def _believed(track: Track, well: bool) -> bool:
+    """Whether what appears beside others is a touch. well: no electrode is at fault."""
+    if track.confidence >= LEAST_CONFIDENCE:
+        return track.sure_frames >= (SURE_FRAMES if well else DOUBTED_FRAMES)
+    return well and track.sure_frames >= FAINT_FRAMES and track.confidence >= FAINT_CONFIDENCE
 
 
 def _new(number: int, seen: Patch, sample_ns: int, begins: bool = True, sure: bool = True) -> Track:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from services.estimation.advice import ADVICE, DRIFTING, OK, OPEN, REASONS, SHORT, SWAPPED, UNKNOWN, listed
 from services.estimation.changed_contacts import ChangedContacts
+from services.estimation.contact_doubts import ContactDoubts
 from services.estimation.contact_drift import Reference
 from services.estimation.contact_evidence import ContactEvidence, ContactOpinion
 from services.estimation.coverage import Coverage
 from services.estimation.frame_check import MOSTLY, FrameCheck, FrameFindings
 from services.estimation.gain_steps import GainStep
-from services.estimation.saved import shaped
 from services.estimation.status_bits import reasons_of
 
 Array = NDArray[np.floating]
@@ -30,11 +30,8 @@ Mask = NDArray[np.bool_]
 QUIET = 5.0  # standard deviations within which a measurement is what it was
 TOO_MANY = 2  # electrodes at fault with which contacts can still be given
 WELL_FRAMES = 3  # in a row, after which an electrode counts again
-SUSPECTED = 3  # frames in a row after which a change that may be a touch on the electrode is the contact's
 WELL = 0.0015  # relative: how near its baseline a measurement of a well electrode is, and within 6 sigma more
 WELL_AGAIN = 0.0005  # the same, where the contact drifted: it passes by its old value on its way
-STILL_S = 10.0  # for which a contact that drifted must have been well
-ASK_EVERY = 4  # frames from one question about a contact under a touch to the next: each takes 20 ms
 
 
 @dataclass
@@ -60,6 +57,7 @@ class ElectrodeHealth:
         self.electrodes, self.member = self.check.electrodes, self.check.member
         self._contacts = ChangedContacts(bundle, self.member)
         self._bundle = bundle
+        self._doubts = ContactDoubts(self.electrodes)
         self._evidence: ContactEvidence | None = None  # made when it is first asked
         self._coverage: Coverage | None = None
         k, n = len(bundle.pattern), self.electrodes
@@ -71,19 +69,16 @@ class ElectrodeHealth:
     def reset(self) -> None:
         self._states = np.zeros(self.electrodes, dtype=np.uint8)
         self._well = np.zeros(self.electrodes, dtype=np.int64)  # frames in a row
-        self._unsure = np.zeros(self.electrodes, dtype=bool)  # drifting, unless somebody presses right on it
-        self._suspected = np.zeros(self.electrodes, dtype=np.int64)  # frames in a row
-        self._asked = np.zeros(self.electrodes, dtype=np.int64)  # frames until the evidence is asked again
-        self._off_s = np.full(self.electrodes, np.nan)  # when a contact that drifts was last seen off; NaN: none does
         self._shown = self._states
         self._fault = ""  # of the board as a whole
         self._now_s = 0.0
+        self._doubts.reset()
         self._contacts.reset()
 
     def tared(self) -> None:
         """Takes note of a new baseline: what changed against the old one is forgotten."""
         self._states[(self._states == DRIFTING) | (self._states == UNKNOWN)] = OK
-        self._unsure[:], self._suspected[:], self._off_s[:] = False, 0, np.nan
+        self._doubts.reset()
         self._contacts.keep(())
 
     def rescale(self, step: GainStep) -> None:
@@ -124,7 +119,7 @@ class ElectrodeHealth:
         live = ~seen.failed & ~at_fault & known
         reasons = [reason for state, reason in REASONS.items() if (states == state).any()]
         bad = int((states != OK).sum())
-        doubtful = bool(self._unsure.any() or self._suspected.any())
+        doubtful = bool(self._doubts)
         if doubtful and "electrode_drift" not in reasons:
             reasons.append("electrode_drift")
         enough = bool(live.sum() >= len(live) / 2) and self._sees_enough(seen, live, ~at_fault & known, untouched)
@@ -159,7 +154,9 @@ class ElectrodeHealth:
         """Returns whether nothing is wrong, as in most touched frames: what follows would find the same at twice the
         work.
         """
-        wrong = seen.states.any() or status.any() or seen.failed.any() or self._states.any() or self._suspected.any()
+        wrong = (
+            seen.states.any() or status.any() or seen.failed.any() or self._states.any() or self._doubts.suspected.any()
+        )
         quiet = seen.suspect is None and not wrong
         return quiet and not self._contacts.felt and bool(np.isfinite(untouched.sigma).all())
 
@@ -180,7 +177,7 @@ class ElectrodeHealth:
         """Adds to what a frame shows an electrode whose contact changed."""
         if untouched is None or seen.fault or np.isin(seen.states, (SHORT, OPEN)).any():
             return
-        well = (self._states == OK) | self._unsure | ((self._states == SWAPPED) & (seen.states == SWAPPED))
+        well = (self._states == OK) | self._doubts.unsure | ((self._states == SWAPPED) & (seen.states == SWAPPED))
         changed = self._contacts.changed(seen.amplitude, untouched, self._live(seen, untouched, well))
         if changed is not None and seen.states[changed.electrode] == OK:
             if changed.sure:
@@ -201,22 +198,30 @@ class ElectrodeHealth:
         faulty = seen.states != OK
         self._states[faulty] = seen.states[faulty]
         self._well[faulty] = 0
-        self._off_s[faulty & np.isfinite(self._off_s)] = self._now_s
-        self._unsure &= (self._states == DRIFTING) & ~faulty
-        again = np.arange(self.electrodes) == seen.suspect
-        self._suspected = np.where(again, self._suspected + 1, 0)
-        lasts = (self._suspected >= SUSPECTED) & (self._states == OK)
-        self._states[lasts], self._unsure[lasts], self._asked[lasts] = DRIFTING, True, 0
-        self._suspected[(self._states != OK) & ~self._unsure] = 0
-        for k in np.flatnonzero(self._unsure | (self._suspected > 0)):
+        doubts = self._doubts
+        doubts.named(faulty, self._states, self._now_s)
+        for k in doubts.passed(seen.suspect, self._states):
+            self._no_longer_suspected(int(k), seen, untouched)
+        self._states[doubts.suspect(seen.suspect, self._states)] = DRIFTING
+        for k in np.flatnonzero(doubts.unsure | (doubts.suspected > 0)):
             if untouched is None:
                 break
             live = self._live_with(int(k), seen, untouched)
             if self._contacts.drifts(int(k), seen.amplitude, self._now_s, untouched, live):
-                self._states[k], self._unsure[k], self._suspected[k], self._well[k] = DRIFTING, False, 0, 0
-                self._off_s[k] = self._now_s
+                self._states[k], self._well[k] = DRIFTING, 0
+                doubts.drifts(int(k), self._now_s)
         for k in np.flatnonzero((self._states != OK) & ~faulty):
             self._look_again(int(k), seen, untouched)
+
+    def _no_longer_suspected(self, k: int, seen: FrameFindings, untouched: Reference | None) -> None:
+        """Asks once whether the contact of electrode k changed at once and stays so: then no frame differs from the
+        few before by it any more.
+        """
+        opinion = None if untouched is None else self._ask(k, seen, untouched)
+        if opinion is not None and opinion.changed():
+            self._states[k], self._well[k] = DRIFTING, 0
+            self._doubts.asked(k)
+            self._contacts.felt[k] = opinion.felt
 
     def _look_again(self, k: int, seen: FrameFindings, untouched: Reference | None) -> None:
         """Looks at an electrode at fault whose fault this frame does not show by itself."""
@@ -224,20 +229,18 @@ class ElectrodeHealth:
             self._well[k] += 1
         elif self._states[k] not in (DRIFTING, SWAPPED) or untouched is None:
             self._well[k] = 0
-        elif self._asked[k] > 0:
-            self._asked[k] -= 1
-        elif (opinion := self._ask(k, seen, untouched)) is not None:
-            self._asked[k] = ASK_EVERY - 1
+        elif self._doubts.may_ask(k) and (opinion := self._ask(k, seen, untouched)) is not None:
+            self._doubts.asked(k)
             self._well[k] = self._well[k] + 1 if opinion.well else 0
-            drifts = bool(np.isfinite(self._off_s[k]))
-            if drifts and not opinion.well:
-                self._off_s[k] = self._now_s
+            if not opinion.well:
+                self._doubts.still_off(k, self._now_s)
+            drifts = self._doubts.known_to_drift(k)
             if self._states[k] == DRIFTING and (opinion.changed() or (drifts and opinion.elsewhere)):
-                self._unsure[k], self._suspected[k] = False, 0
+                self._doubts.sure(k)
                 self._contacts.felt[k] = opinion.felt
-        moves = 0 <= self._now_s - self._off_s[k] < STILL_S  # False for NaN
-        if self._well[k] >= WELL_FRAMES and not moves:
-            self._states[k], self._unsure[k], self._off_s[k] = OK, False, np.nan
+        if self._well[k] >= WELL_FRAMES and not self._doubts.moves(k, self._now_s):
+            self._states[k] = OK
+            self._doubts.well(k)
             self._contacts.forget(k)
 
     def _ask(self, k: int, seen: FrameFindings, untouched: Reference) -> ContactOpinion | None:
@@ -266,7 +269,7 @@ class ElectrodeHealth:
         if not rows.any():
             return True
         off = np.abs(amplitude[rows] - since[rows]) / untouched.normaliser[rows]
-        near = WELL_AGAIN if np.isfinite(self._off_s[k]) else WELL
+        near = WELL_AGAIN if self._doubts.known_to_drift(k) else WELL
         return bool((off <= near + 6 * untouched.sigma[rows]).mean() >= MOSTLY)
 
     def _shift(self, seen: FrameFindings, untouched: Reference | None) -> Array:
@@ -277,7 +280,7 @@ class ElectrodeHealth:
             return np.zeros(len(seen.amplitude))
 
         def like(k: int, past: Array) -> bool:
-            if np.isfinite(self._off_s[k]):  # a contact that drifts was not well a few frames ago either
+            if self._doubts.known_to_drift(k):  # a contact that drifts was not well a few frames ago either
                 return True
             tells = bool((self.member[k] & ~seen.failed).any())
             return tells and self._like(k, seen.amplitude, past, seen.failed, untouched)
@@ -291,10 +294,7 @@ class ElectrodeHealth:
         return {
             "states": self._states.copy(),
             "well": self._well.copy(),
-            "unsure": self._unsure.astype(np.uint8),
-            "suspected": self._suspected.copy(),
-            "asked": self._asked.copy(),
-            "off_s": self._off_s.copy(),
+            **self._doubts.state(),
             **self._contacts.state(),
         }
 
@@ -305,9 +305,5 @@ class ElectrodeHealth:
             raise ValueError(f"the saved health is of {states.size} electrodes, expected {self.electrodes}")
         self.reset()
         self._states, self._well = states, well
-        if "unsure" in state:  # older recordings have neither
-            self._unsure = shaped(state["unsure"], states.shape) > 0
-            self._suspected = shaped(state["suspected"], states.shape).astype(np.int64)
-            self._asked = shaped(state.get("asked", self._asked), states.shape).astype(np.int64)
-            self._off_s = shaped(state.get("off_s", self._off_s), states.shape, finite=False)
+        self._doubts.load(state)
         self._contacts.load(state)

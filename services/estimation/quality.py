@@ -24,6 +24,7 @@ MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through
 DRIFT = Drift(scale=2e-3, contact=1e-2)  # a change that drift of this size explains is not held against the image
 CHANCE = 4.0  # standard deviations of chi-square that the noise may come to
 SURE = 0.05  # share not explained above which the touch may have changed during the scan; steady ones hardly have it
+NEARLY = 0.09  # the same of an image like the one before: a strong touch at the edge leaves no more
 REFUSED = 0.5  # share not explained from which an image is none of a touch
 FAINT = 100.0  # energy over the noise's below which it is refused from REFUSED_FAINT on:
 REFUSED_FAINT = 0.15  # of a faint touch noise hides what the image gets wrong, of a faint anything-else it does not

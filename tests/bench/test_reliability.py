@@ -270,6 +270,13 @@ def test_these_faults_are_named_never_wrong_and_over_in_time(sheet, title):
     assert 100 < score.frames < 190 and figures["unseen"] == 0
 
 
+def test_a_contact_that_jumps_under_a_slide_is_named_and_is_no_second_touch(sheet):
+    """It differs from the frames before for a few frames only, and the touch is not where it was."""
+    found = matrix.run_case(sheet, workers.pipeline(), row_of(CONTACT_RISES), "sliding", matrix.places(2, 5)[0], 5)
+    assert (found.wrong, found.named, found.late) == (0, 1, 0)
+    assert found.during_valid > found.during / 2
+
+
 def test_no_frame_after_a_fault_hides_a_touch_that_waits_to_be_confirmed(sheet):
     place = matrix.places(2, 5)[1]
     score = matrix.run_case(sheet, workers.pipeline(), row_of("fifo_overflow"), "held", place, 6)

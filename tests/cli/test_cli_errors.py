@@ -137,6 +137,13 @@ def test_a_damaged_configuration_is_explained(skin, tmp_path, monkeypatch) -> No
     assert ran.code == 1 and ran.out.startswith("FAIL  configuration")
 
 
+def test_a_bundle_that_is_not_there_is_said_before_anything_starts(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    file = tmp_path / "mine.toml"
+    file.write_text('[skins.palm]\nport = "stub"\nbundle = "no-such"\n')
+    ran = skin("up", "--config", file)
+    assert ran.code == 2 and "skins.palm.bundle: no bundle 'no-such': shipped are" in ran.err and not ran.out
+
+
 def test_a_calibration_of_forces_that_is_not_there_is_said_before_anything_starts(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
     file = tmp_path / "mine.toml"
     file.write_text('[skins.palm]\nport = "stub"\nbundle = "square16"\ncalibration = "forces.json"\n')

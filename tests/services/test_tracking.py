@@ -157,6 +157,20 @@ def test_frames_that_show_the_same_do_not_count_as_lost_ones() -> None:
     assert play(tracker, [[touch(-0.02), touch(0.02)]], 8) == ([[1, 2]], [])
 
 
+@pytest.mark.parametrize(
+    ("confidence", "well", "begins"),
+    [(0.98, True, 2), (0.93, True, 3), (0.98, False, 4), (0.93, False, 0), (0.8, True, 0)],
+)
+def test_what_appears_beside_others_begins_later_if_faint(confidence: float, well: bool, begins: int) -> None:
+    tracker = Tracker()
+    second = touch(0.03)._replace(confidence=confidence)
+    shown = [
+        [t and t.id for t in tracker.update([touch(0.0, size=2 * SIZE), second], n * FRAME_NS, well=well)[0]][1]
+        for n in range(1, 9)
+    ]
+    assert shown == [None] * (begins - 1) + [2] * (9 - begins) if begins else shown == [None] * 8
+
+
 def test_what_appears_beside_others_or_in_a_bad_image_has_to_appear_twice() -> None:
     tracker = Tracker()
     first, _ = tracker.update([touch(0.0), touch(0.03, size=2 * SIZE)], FRAME_NS)
@@ -278,6 +292,15 @@ def test_a_second_touch_begins_beside_one_that_leaves_much_unexplained() -> None
     tracker = Tracker()
     tracker.update([], 0)
     assert updates(tracker, (changing, False), (held, False), (held, False), (held, False))[-1] == [1, 2]
+
+
+def test_no_second_touch_begins_in_images_that_leave_much_unexplained_however_alike_they_are() -> None:
+    """A contact that rose just as the touch began: the image shows the touch, and another one at that electrode."""
+    tracker = Tracker()
+    tracker.update([], 0)
+    shown = [touch(-0.026, -0.001, 4 * SIZE), touch(0.013, -0.048, 3 * SIZE)]
+    ids = [[t and t.id for t in tracker.update(shown, n * FRAME_NS, sure=False, near=False)[0]] for n in range(1, 12)]
+    assert ids[-1] == [1, None] and all(second is None for _, second in ids)
 
 
 def test_a_touch_that_only_doubtful_images_showed_does_not_keep_the_true_one_waiting() -> None:
