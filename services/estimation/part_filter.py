@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from services.estimation.part_image import WIDER, PartImage
 from services.estimation.rolling import parts_of
+from services.estimation.saved import shaped
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -288,17 +289,19 @@ class PartFilter:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Older recordings have none."""
+        """Older recordings have none. Raises KeyError, TypeError or ValueError where it does not fit."""
         self.forget()
         if not state:
             return
+        count = len(state["touches"])
         self.number, self._still, self._at_us = int(state["number"]), bool(state["still"]), float(state["at_us"])
-        self.touches = np.array(state["touches"], float).reshape(-1, 6)
-        self._covariance = np.array(state["covariance"], float)
-        self._placed = np.array(state["placed"], float).reshape(-1, 2, 2)
-        self._past.extend((float(at), np.array(touches, float).reshape(-1, 6)) for at, touches in state["past"])
+        self.touches = shaped(state["touches"], (count, 6))
+        if not self._still and state["reference"] is not None:
+            self._covariance = shaped(state["covariance"], (6 * count, 6 * count))
+        self._placed = shaped(state["placed"], (count, 2, 2))
+        self._past.extend((float(at), shaped(touches, (count, 6))) for at, touches in state["past"])
         if state["reference"] is not None:
-            self._reference, self._noise = (np.array(row, float) for row in state["reference"][:2])
-            self._there = np.array(state["reference"][2], float).reshape(-1, 6)
-            self._scans = int(state["reference"][3])
+            d, noise, there, scans = state["reference"]
+            self._reference, self._noise = shaped(d, self._all.shape), shaped(noise, self._all.shape)
+            self._there, self._scans = shaped(there, (count, 6)), int(scans)
             self._refer()

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
 from bench.speed.sentinel_host import AdaptiveHost
 from models.bundle import Bundle
+from protocol.frames import pack, unpack
 from services.estimation.part_filter import PartFilter
 from services.estimation.part_image import PartImage
 from services.estimation.rolling import measured_at
+from services.pipeline import Pipeline
+from services.runtime.config import Skin
+from services.runtime.persistence import arrays, plain
 
+ROLLING = Skin(port="stub", bundle="square16", scan="rolling")
 SIGMA = 1e-4
 PART_US = 4360.0
 NOISE = np.full(120, SIGMA)
@@ -141,6 +148,15 @@ def test_its_state_goes_with_a_recording(bundle):
 @pytest.fixture(scope="module")
 def host():
     host = AdaptiveHost("rolling", snr_db=80.0, seed=8)
+    host.raws = []
+    hand_on = host.source.handed_on
+
+    def kept(*args):
+        frame = hand_on(*args)
+        host.raws += [pack(frame)] if frame else []
+        return frame
+
+    host.source.handed_on = kept
     host.until(5.0)
     yield host
     host.rig.close()
@@ -178,3 +194,23 @@ def test_contacts_of_a_held_and_then_sliding_touch_come_at_the_part_rate(host):
     host.until(began + 0.3)
     gone = [t for t, f in host.contacts[first:] if f.valid and all(c.state == "end" for c in f.contacts)]
     assert gone[0] - began < 0.025
+
+
+def test_a_recording_that_begins_while_a_touch_slides_plays_as_it_was(host):
+    host.until(host.now + 0.5)
+    host.press(x=-0.02, y=-0.01, force=2.0, radius=0.01, seconds=60.0, finger="one")
+    host.until(host.now + 0.2)
+    host.press(x=-0.02, y=-0.01, force=2.0, radius=0.01, seconds=0.3, to_x=0.02, to_y=0.01, finger="one")
+    host.until(host.now + 0.1)
+    stages = (host.pipeline.pre, host.pipeline.inference, host.pipeline.publishing)
+    states = [plain(stage.state()) for stage in stages]
+    first, raw = len(host.contacts), len(host.raws)
+    host.until(host.now + 0.3)
+    again = Pipeline(ROLLING, "palm")
+    for stage, state in zip((again.pre, again.inference, again.publishing), states, strict=True):
+        stage.load(arrays(state))
+    made = [found.contact for message in host.raws[raw:] if (found := again.step(unpack(message))) is not None]
+    assert len(made) == len(host.contacts) - first > 40
+    for one, (_, other) in zip(made, host.contacts[first:], strict=True):
+        assert (one.scan, one.valid, one.reasons) == (other.scan, other.valid, other.reasons)
+        assert [asdict(c) for c in one.contacts] == [asdict(c) for c in other.contacts]
