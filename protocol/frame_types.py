@@ -282,7 +282,8 @@ class Contact:
     id: int = wire(_COUNT, "stays the same while the touch lasts; unique in a session")
     state: str = wire(
         Text(choices=("begin", "hold", "end")),
-        "first frame of the touch; in between, or not known to be the first; last one",
+        "first frame of the touch; in between, or not known to be the first; last one. Of a scan in parts `begin` and "
+        "`end` stay for 50 ms",
         "hold",
     )
     position: list[float] = wire(Vector(3, "m"), "centroid of the contact patch, in the frame `frame_id`")

@@ -196,6 +196,23 @@ def test_contacts_of_a_held_and_then_sliding_touch_come_at_the_part_rate(host):
     assert gone[0] - began < 0.025
 
 
+def test_a_reader_of_30_hz_misses_neither_begin_nor_end(host):
+    host.until(host.now + 0.5)
+    first, began = len(host.contacts), host.now
+    host.press(x=0.01, y=0.02, force=2.0, radius=0.01, seconds=0.2)
+    host.until(began + 0.6)
+    seen = host.contacts[first:]
+    for phase in np.linspace(0, 1 / 30, 5):
+        looks = np.arange(began + phase, began + 0.6, 1 / 30)
+        read = [[f for t, f in seen if t <= look][-1:] for look in looks]
+        states = [contact.state for frames in read for f in frames for contact in f.contacts]
+        assert {"begin", "hold", "end"} <= set(states)
+    for state in ("begin", "end"):
+        samples = [f.stamps["sample"] for _, f in seen for contact in f.contacts if contact.state == state]
+        assert 40e6 < max(samples) - min(samples) < 60e6
+        assert len({contact.id for _, f in seen for contact in f.contacts if contact.state == state}) == 1
+
+
 def test_a_recording_that_begins_while_a_touch_slides_plays_as_it_was(host):
     host.until(host.now + 0.5)
     host.press(x=-0.02, y=-0.01, force=2.0, radius=0.01, seconds=60.0, finger="one")
