@@ -300,12 +300,12 @@ class Inference(Stage):
     def _part(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """Hold the last image, whatever scan it is of: where its touch is by now goes with it."""
         last = self._last
-        if last is None or 0 < self._changing_scan == frame.reconstructed:
+        if last is None:
             out.valid = False
             add_reason(out.reasons, "gap")
             return
         out.noise, out.residual, out.refined = last.noise, last.residual, self._refined
-        if "changing" in last.reasons:
+        if "changing" in last.reasons or 0 < self._changing_scan == frame.reconstructed:
             add_reason(out.reasons, "changing")
         self._shows_again(last, out)
         self._judge(out)

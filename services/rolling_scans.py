@@ -101,7 +101,7 @@ class RollingScans:
             return False
         follows = self._filter.part(*values, frame.device_us)
         if follows and self._filter.moves:
-            self.change = self._filter.at_once(values[2])
+            self.change = self._filter.at_once(*values)
         return follows
 
     def judged(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> None:

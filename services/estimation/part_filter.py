@@ -38,7 +38,9 @@ WINDOWS = (1, 3, 6, 10)  # newest parts among which a change is looked for
 STILL = 24.0  # chi-square of a touch's place and strength, up to which it did not change: one in 10^4 parts exceeds it
 SPREAD = 6.0  # standard deviations of chi-square that the noise of a part may come to
 LIKELY, EXPLAINED = 2.7, 4.0  # chi-square per value up to which a part is, without and with a sudden change
-SLOW, SLOW_SIGMAS = 0.4, 3.0  # model units/s, standard deviations: a touch slower than both is held
+SLOW_SIGMAS = 2.0  # standard deviations of its velocity, below which a touch may not move at all
+AS_WELL = 1.05  # times what a whole scan leaves of a touch that moves: one that holds still does as well
+FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
 LONGEST_US = 2e5  # without a part: nothing is known of what happened meanwhile
 REMEMBERED = 8  # whole scans of a touch that is held, whose mean it is compared with
 KEPT = 12  # parts whose states are kept: those of a whole scan
@@ -77,6 +79,7 @@ class PartFilter:
         self._covariance: Array = np.zeros((0, 0))
         self._placed: Array = np.zeros((0, 2, 2))  # covariance of each place, as the whole scan has it
         self._still = False
+        self._as_still = 0  # whole scans in a row that a touch which holds still explains better
         self._at_us = 0.0
         self._past: deque[tuple[float, Array]] = deque(maxlen=KEPT)  # (when, touches)
         self._scans = 0  # whole scans whose mean the reference is
@@ -96,7 +99,7 @@ class PartFilter:
         """Take a whole scan of a touch that was there all the time: d (K,) as it was at at_us (see `at_once`), noise
         (K,). shown: an image is made of it; else it is the same as before.
         """
-        if self.moves and not self._slow():
+        if self.moves:
             return
         held = self._still and self._reference is not None
         if shown or self._reference is None:
@@ -153,9 +156,10 @@ class PartFilter:
                 return False
         return True
 
-    def at_once(self, age: Array) -> Array:
+    def at_once(self, d: Array, noise: Array, age: Array) -> Array:
         """(K,) what to add to a whole scan's d, of which each value has its age [us], so that all are as if they had
-        been measured when the newest part was.
+        been measured when the newest part was. Zero where nothing moves, or a touch that holds still explains the
+        scan better; twice in a row, or where it is slow, it is held from here on.
         """
         change = np.zeros(len(age))
         if not self.moves:
@@ -168,7 +172,27 @@ class PartFilter:
         for k in np.unique(nearest):
             rows = np.flatnonzero(nearest == k)
             change[rows] = now[rows] - self._model(self._past[k][1], rows, 1e-6 * (measured[rows] - then[k]))[0]
-        return change
+        still, moving = self._misfit(d, noise), self._misfit(d + change, noise)
+        self._as_still = 0 if still > moving else self._as_still + 1
+        if moving > FITS or self._as_still > 1 or (self._slow() and still <= AS_WELL * moving):
+            self.forget()
+        return change if self.moves and not self._as_still else np.zeros(len(age))
+
+    def _misfit(self, d: Array, noise: Array) -> float:
+        """Chi-square per value of a whole scan that touches of about the present places leave, if they hold still."""
+        touches, tau = self.touches.copy(), np.zeros(len(d))
+        variance = noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean())
+        for _ in range(2):
+            expected, slope = self._model(touches, self._all, tau)
+            slope = (
+                slope[:, [6 * k + n for k in range(len(touches)) for n in range(MODEL)]] / np.sqrt(variance)[:, None]
+            )
+            damped = slope.T @ slope + np.diag(np.tile(KNOWN[:MODEL] ** -2 / 25, len(touches)))
+            step = np.linalg.solve(damped, slope.T @ ((d - expected) / np.sqrt(variance)))
+            touches[:, :MODEL] += step.reshape(-1, MODEL)
+            touches = self._possible(touches.ravel()).reshape(-1, 6)
+        left = d - self._model(touches, self._all, tau)[0]
+        return float((left**2 / variance).mean())
 
     def states(self) -> list[FollowedState]:
         """The touches, as the newest part has them."""
@@ -184,21 +208,21 @@ class PartFilter:
     def _begin(self, d: Array, noise: Array) -> None:
         """Fit the touches to a whole scan."""
         before, one = self.touches, self._image.fit(d, noise)
-        self.touches = np.zeros((1 if one.fits else 0, 6))
-        self._placed = np.zeros((len(self.touches), 2, 2))
-        if one.fits:
-            self.touches[0, :MODEL] = one.x, one.y, np.log(one.radius), np.log(one.drop)
-            long, short, angle = one.sigma
-            axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            self._placed[0] = axes @ np.diag([long**2, short**2]) @ axes.T / WIDER**2
+        self.touches, self._placed = np.zeros((1, 6)), np.zeros((1, 2, 2))
+        self.touches[0, :MODEL] = one.x, one.y, np.log(one.radius), np.log(one.drop)
+        long, short, angle = one.sigma
+        axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        self._placed[0] = axes @ np.diag([long**2, short**2]) @ axes.T / WIDER**2
+        if not one.fits or self._misfit(d, noise) > FITS:
+            self.touches, self._placed = np.zeros((0, 6)), np.zeros((0, 2, 2))
         if len(before) != len(self.touches) or (np.hypot(*(self.touches - before).T[:2]) > NEAR).any():
             self.number += 1
 
     def _slow(self) -> bool:
-        """Whether what moved may be held by now."""
+        """Whether no touch moves for sure."""
         speed = np.hypot(*self.touches.T[MODEL:])
         variance = np.diag(self._covariance).reshape(-1, 6)[:, MODEL:].sum(axis=1)
-        return bool((speed < np.minimum(SLOW, SLOW_SIGMAS * np.sqrt(variance))).all())
+        return bool((speed < SLOW_SIGMAS * np.sqrt(variance)).all())
 
     def _changed(self, d: Array, noise: Array, by_age: Rows, fresh: int) -> int:
         """Among how many of the newest values a change shows against the reference; 0: all is noise. fresh: values that
@@ -279,7 +303,7 @@ class PartFilter:
             "number": self.number,
             "touches": self.touches.copy(),
             "covariance": self._covariance.copy(),
-            "still": self._still,
+            "still": [self._still, self._as_still],
             "at_us": self._at_us,
             "past": [[at, touches.copy()] for at, touches in self._past],
             "reference": None
@@ -294,7 +318,8 @@ class PartFilter:
         if not state:
             return
         count = len(state["touches"])
-        self.number, self._still, self._at_us = int(state["number"]), bool(state["still"]), float(state["at_us"])
+        self.number, self._at_us = int(state["number"]), float(state["at_us"])
+        self._still, self._as_still = bool(state["still"][0]), int(state["still"][1])
         self.touches = shaped(state["touches"], (count, 6))
         if not self._still and state["reference"] is not None:
             self._covariance = shaped(state["covariance"], (6 * count, 6 * count))

@@ -55,7 +55,7 @@ def run(bundle, at, parts=60, seed=0):
         d, age, now = skin.values(1 + k % 10)
         explained = k > 0 and follower.part(d, NOISE, age, now)
         if k % 10 == 0:
-            follower.whole(d + follower.at_once(age), NOISE, now, shown=follower.moves or not follower.knows)
+            follower.whole(d + follower.at_once(d, NOISE, age), NOISE, now, shown=follower.moves or not follower.knows)
         (state,) = follower.states() or [None]
         if k:
             seen.append((1e-6 * (now - PART_US / 2), explained, state, follower))
@@ -142,7 +142,7 @@ def test_its_state_goes_with_a_recording(bundle):
         d, age, now = skin.values(1 + k % 10)
         assert first.part(d, NOISE, age, now) == second.part(d, NOISE, age, now)
         assert first.states() == second.states()
-    np.testing.assert_array_equal(first.at_once(age), second.at_once(age))
+    np.testing.assert_array_equal(first.at_once(d, NOISE, age), second.at_once(d, NOISE, age))
 
 
 @pytest.fixture(scope="module")
