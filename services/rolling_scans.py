@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from protocol.frames import DeltaFrame, FollowedTouch, RawFrame, as_sent
 from services.estimation.baseline import BaselineEstimator
 from services.estimation.part_evidence import SIGMAS, PartEvidence
 from services.estimation.part_filter import PartFilter
-from services.estimation.part_image import PartImage
+from services.estimation.part_image import PartImage, PartTouch
 from services.estimation.rolling import WholeScans, parts_of
 from services.runtime.stage import add_reason
 
@@ -21,7 +22,7 @@ Array = NDArray[np.float64]
 SUSPECTED = 5.0  # sigmas of the newest part, below which it is not looked at further
 WIDER = 1.05  # noise is estimated from a few dozen scans
 DRIFT = 3e-5  # relative, since the untouched scans that parts are compared with
-MOST_WAITED = 8  # messages
+MOST_WAITED = 10  # messages
 REMEMBERED = 8  # untouched whole scans whose mean that is
 
 
@@ -59,6 +60,7 @@ class RollingScans:
         self._grown_us = 0.0  # when it was all there, likewise
         self._waited = 0  # messages by which the whole scan was put off for that
         self._began_us: float | None = None  # when a touch began, by the board's clock less the length of a part
+        self._began: PartTouch | None = None  # as the newest parts have it
         self._image_scan = 0  # of the last image of the touch
         self.change: Array | None = None  # to the whole scan's difference, for its values to be of one instant
         if self._filter is not None:
@@ -78,12 +80,12 @@ class RollingScans:
             return True  # another skin's: said once a message, as of whole scans
         if not self._whole.due(frame.scan, frame.parts):
             return False
-        values = None if self._moved else self._values(frame, estimator)
-        if values is not None and self._changes(values):
+        values = self._values(frame, estimator)
+        if values is not None and not self._moved and self._changes(values):
             self._moved = True  # a touch that began or ended within these values is seen in the next whole scan
             return False
-        if frame.device_us - float(frame.age_us.max()) < self._grown_us and self._waited < MOST_WAITED:
-            self._waited += 1  # the oldest of these values felt a touch that still grew
+        if self._waited < MOST_WAITED and self._grows(frame, values):
+            self._waited += 1
             self._whole.last = frame.scan - frame.parts + 1
             return False
         new = frame.new.astype(bool)
@@ -93,6 +95,15 @@ class RollingScans:
         stamps["sample"] = self._sample_ns = max(mean, min(self._sample_ns, sample))
         self._handed_on = frame.scan
         return True
+
+    def _grows(self, frame: RawFrame, values: tuple[Array, Array, Array] | None) -> bool:
+        """Whether the oldest of these values felt a touch that began, and still grew."""
+        if self._began_us is None:
+            return False
+        grew = frame.device_us - float(frame.age_us.max()) < self._grown_us
+        if grew or values is None or self._filter is None or self._began is None:
+            return grew
+        return not self._filter.settled(values[0], values[1], self._began)
 
     def _follows(self, frame: RawFrame, values: tuple[Array, Array, Array] | None) -> bool:
         """Whether the whole scan's touch is followed: then all its values are brought to the newest one's instant."""
@@ -112,7 +123,7 @@ class RollingScans:
         self._sound = known and out.valid and not out.electrodes.any() and not {"gain", "gap"} & set(out.reasons)
         self._moved = self._ended = False
         self._grown_us, self._waited = 0.0, 0
-        touched, self._began_us, self._held = self._held is not None, None, None
+        touched, self._began_us, self._began, self._held = self._held is not None, None, None, None
         if not self._sound:
             self._rest, self._rests = None, 0
         elif out.touched:
@@ -177,7 +188,8 @@ class RollingScans:
         share = np.where(on, onset.course, 1.0)
         out.difference = np.where(on, d / share, 0.0).astype(np.float32)
         out.sigma = np.where(on, noise / share, np.inf).astype(np.float32)
-        if not image.fit(out.difference, out.sigma).fits:
+        self._began = image.fit(out.difference, out.sigma)
+        if not self._began.fits:
             return []
         out.touched, out.score, out.threshold = True, onset.sigmas, SIGMAS
         out.reconstructed = frame.scan
@@ -248,6 +260,7 @@ class RollingScans:
             "began_us": self._began_us,
             "grown": [self._grown_us, self._waited],
             "image": self._image_scan,
+            "began": None if self._began is None else asdict(self._began),
             "filter": None if self._filter is None else self._filter.state(),
         }
 
@@ -262,6 +275,8 @@ class RollingScans:
         self._grown_us, self._waited = float(state["grown"][0]), int(state["grown"][1])
         self._began_us, self._rests = state["began_us"], int(state["rests"])
         self._image_scan = int(state.get("image", 0))
+        if (began := state.get("began")) is not None:
+            self._began = PartTouch(**{**began, "sigma": tuple(began["sigma"])})
         if state.get("filter"):
             self._ready()
             assert self._filter is not None

@@ -13,13 +13,14 @@ even by a touch that suddenly moves or presses otherwise, nothing is said until 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from services.estimation.part_image import WIDER, PartImage
+from services.estimation.part_image import WIDER, PartImage, PartTouch
 from services.estimation.rolling import parts_of
 from services.estimation.saved import shaped
 
@@ -40,6 +41,7 @@ SPREAD = 6.0  # standard deviations of chi-square that the noise of a part may c
 LIKELY, EXPLAINED = 2.7, 4.0  # chi-square per value up to which a part is, without and with a sudden change
 SLOW_SIGMAS = 2.0  # standard deviations of its velocity, below which a touch may not move at all
 AS_WELL = 1.05  # times what a whole scan leaves of a touch that moves: one that holds still does as well
+SETTLED = 1.0  # chi-square per value of a whole scan, up to which its touch did not change: 0.1 to 0.7 where it did not
 FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
 LONGEST_US = 2e5  # without a part: nothing is known of what happened meanwhile
 REMEMBERED = 8  # whole scans of a touch that is held, whose mean it is compared with
@@ -172,15 +174,19 @@ class PartFilter:
         for k in np.unique(nearest):
             rows = np.flatnonzero(nearest == k)
             change[rows] = now[rows] - self._model(self._past[k][1], rows, 1e-6 * (measured[rows] - then[k]))[0]
-        still, moving = self._misfit(d, noise), self._misfit(d + change, noise)
+        still, moving = self._misfit(d, noise, self.touches), self._misfit(d + change, noise, self.touches)
         self._as_still = 0 if still > moving else self._as_still + 1
         if moving > FITS or self._as_still > 1 or (self._slow() and still <= AS_WELL * moving):
             self.forget()
         return change if self.moves and not self._as_still else np.zeros(len(age))
 
-    def _misfit(self, d: Array, noise: Array) -> float:
-        """Chi-square per value of a whole scan that touches of about the present places leave, if they hold still."""
-        touches, tau = self.touches.copy(), np.zeros(len(d))
+    def settled(self, d: Array, noise: Array, seen: PartTouch) -> bool:
+        """Whether a touch that did not change explains a whole scan. seen: it, as the newest parts have it."""
+        return self._misfit(d, noise, _touches([seen])) <= SETTLED
+
+    def _misfit(self, d: Array, noise: Array, around: Array) -> float:
+        """Chi-square per value of a whole scan that touches of about these places leave, if they hold still."""
+        touches, tau = around.copy(), np.zeros(len(d))
         variance = noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean())
         for _ in range(2):
             expected, slope = self._model(touches, self._all, tau)
@@ -208,13 +214,9 @@ class PartFilter:
     def _begin(self, d: Array, noise: Array) -> None:
         """Fit the touches to a whole scan."""
         before, one = self.touches, self._image.fit(d, noise)
-        self.touches, self._placed = np.zeros((1, 6)), np.zeros((1, 2, 2))
-        self.touches[0, :MODEL] = one.x, one.y, np.log(one.radius), np.log(one.drop)
-        long, short, angle = one.sigma
-        axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        self._placed[0] = axes @ np.diag([long**2, short**2]) @ axes.T / WIDER**2
-        if not one.fits or self._misfit(d, noise) > FITS:
-            self.touches, self._placed = np.zeros((0, 6)), np.zeros((0, 2, 2))
+        self.touches, self._placed = _touches([one]), _covariances([one])
+        if not one.fits or self._misfit(d, noise, self.touches) > FITS:
+            self.touches, self._placed = _touches([]), _covariances([])
         if len(before) != len(self.touches) or (np.hypot(*(self.touches - before).T[:2]) > NEAR).any():
             self.number += 1
 
@@ -330,3 +332,17 @@ class PartFilter:
             self._reference, self._noise = shaped(d, self._all.shape), shaped(noise, self._all.shape)
             self._there, self._scans = shaped(there, (count, 6)), int(scans)
             self._refer()
+
+
+def _touches(found: Sequence[PartTouch]) -> Array:
+    """(N, 6) of touches that do not move."""
+    return np.array([[t.x, t.y, np.log(t.radius), np.log(t.drop), 0.0, 0.0] for t in found]).reshape(-1, 6)
+
+
+def _covariances(found: Sequence[PartTouch]) -> Array:
+    """(N, 2, 2) of their places."""
+    made = np.zeros((len(found), 2, 2))
+    for k, (long, short, angle) in enumerate(touch.sigma for touch in found):
+        axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        made[k] = axes @ np.diag([long**2, short**2]) @ axes.T / WIDER**2
+    return made
