@@ -31,10 +31,14 @@ class Symmetry:
 
 def symmetries(skin: SkinGeometry) -> list[Symmetry]:
     """Those of the square's eight that map the skin's electrodes (place, width) onto themselves and the
-    pattern onto itself.
+    pattern onto itself; the first is the identity.
+
+    A pattern may read the same |Z| twice, with the current turned round or with drive and sense exchanged. Each
+    measurement is then mapped to the one that reads it in the same way: on a real skin the two differ.
     """
     points = skin.point(skin.electrodes)
-    row = {_key(m): k for k, m in enumerate(skin.pattern)}
+    same_way = {_signed(m): k for k, m in enumerate(skin.pattern)}
+    any_way = {_key(m): k for k, m in enumerate(skin.pattern)}
     found = []
     for turn in TURNS:
         moved = turn.points(points)
@@ -42,10 +46,16 @@ def symmetries(skin: SkinGeometry) -> list[Symmetry]:
         source = distance.argmin(axis=1)  # electrode e stands where `source[e]` has been moved to
         if distance.min(axis=1).max() > 1e-6 or not np.allclose(skin.widths, skin.widths[source]):
             continue
-        keys = [_key(source[m]) for m in skin.pattern]
-        if all(k in row for k in keys):
-            found.append(Symmetry(np.array([row[k] for k in keys]), turn))
+        moved_to = [same_way.get(_signed(source[m]), any_way.get(_key(source[m]))) for m in skin.pattern]
+        if None not in moved_to:
+            found.append(Symmetry(np.array(moved_to), turn))
     return found
+
+
+def _signed(measurement: npt.NDArray[np.integer]) -> tuple[int, ...]:
+    """The same for the two orders that read the same Z: both pairs turned round leave its sign."""
+    a, b, c, d = (int(e) for e in measurement)
+    return min((a, b, c, d), (b, a, d, c))
 
 
 def _key(measurement: npt.NDArray[np.integer]) -> tuple[tuple[int, ...], ...]:

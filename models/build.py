@@ -6,7 +6,8 @@
     python -m models.build --skin square16 --no-network    matrices only: the services show the one-step image
     python -m models.build --skin square16 --package       trains nothing: ships the checkpoints in models/work/SKIN
     python -m models.build --skin square16 --response      adds what a fit of touches needs to the bundle there is
-    python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin
+    python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin,
+                                                           kept where its images are better than those without
 
 Samples and checkpoints stay in models/work/SKIN; a second call uses what is there and makes what is missing.
 """
@@ -222,7 +223,11 @@ def main(argv: list[str] | None = None) -> None:
             for variant, found in calibrate.uncertainty(skin, pre, made, count, cache).items():
                 said[variant]["uncertainty"] = found
     if "full" in said:
-        said["full"]["verdict"] = _verdict(args.skin, pre, held_out, said["full"], own).to_dict()
+        judged = _verdict(args.skin, pre, held_out, said["full"], own)
+        said["full"]["verdict"] = judged.to_dict()
+        if registered is not None and judged.grade == "too little":
+            print(f"verdict: {judged.text}\n{registered.path} is left as it was, the checkpoint is in {work}")
+            return
     if registered is None or model is None:
         tables = response_tables(ForwardModel(skin)) if matrices.normalisation == "model" else None
         about = manifest.describe(skin.name, skin, matrices, network=said or None)
@@ -251,7 +256,7 @@ def _verdict(
     if own is not None:
         return verdict.judge_registered(said["held_out"], training["batches"], training["minutes"], without)
     floor = verdict.position_floor(skin, held_out)
-    return verdict.judge(said["held_out"], training["batches"], training["minutes"], without, floor)
+    return verdict.judge(said["held_out"], training["batches"], training["minutes"], without["contact IoU"], floor)
 
 
 def make_scenes(skin: str, work: Path, scenes: int, valid: int, args: argparse.Namespace) -> None:

@@ -62,7 +62,14 @@ class FieldModes:
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """contact (E,), shift (E,), field (M,), anisotropy (2,), log_gain: see above."""
+    """E electrodes, M modes of the field; see above.
+
+    log_gain           logarithm of the common factor of all |Z|
+    contact (E,)       logarithm of each contact impedance over the file's
+    shift (E,)         model units along the outline, in the direction in which it is drawn
+    field (M,)         coefficients of FieldModes, in units of their prior
+    anisotropy (2,)    (xx - yy) / 2 and xy of the tensor's logarithm
+    """
 
     log_gain: float
     contact: Array
@@ -108,18 +115,21 @@ class Mounting:
 
 
 def most_shift(skin: SkinGeometry) -> Array:
-    """(E,) how far an electrode may be thought off its place: MOST_SHIFT, and less where its neighbours are near."""
+    """(E,) model units: how far each electrode may be thought off its place, MOST_SHIFT, and less where a neighbour is
+    near: two that come together leave a fifth of their gap.
+    """
     order = np.argsort(np.mod(skin.electrodes, skin.perimeter))
-    gap = np.empty(len(order))
-    for a, b in zip(order, np.roll(order, -1), strict=True):
-        between = np.mod(skin.electrodes[b] - skin.electrodes[a], skin.perimeter)
-        gap[a] = between - (skin.widths[a] + skin.widths[b]) / 2
-    before = gap[order][np.argsort(np.argsort(np.mod(skin.electrodes, skin.perimeter))) - 1]
-    return np.asarray(np.minimum(MOST_SHIFT, 0.4 * np.minimum(gap, before)))
+    place, width = skin.electrodes[order], skin.widths[order]
+    after = np.mod(np.roll(place, -1) - place, skin.perimeter) - (width + np.roll(width, -1)) / 2  # to the next one
+    most = np.empty(len(order))
+    most[order] = np.minimum(MOST_SHIFT, 0.4 * np.minimum(after, np.roll(after, 1)))
+    return most
 
 
 class Predicted:
-    """|Z| (K,) of a mounted skin and the derivative (K, P) of its logarithm to `Mounting.vector`."""
+    """|Z| of a mounted skin (K measurements), and the derivative (K, P) of its logarithm to the P numbers of
+    `Mounting.vector`.
+    """
 
     def __init__(self, nominal: SkinGeometry, mounting: Mounting, modes: FieldModes, mesh: str) -> None:
         self.mounting = mounting

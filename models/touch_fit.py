@@ -17,14 +17,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
+from scipy.special import erf
 
 from models.shapes import CLASSES, KINDS, Array, Shape
 from models.touch_response import TouchGrid, TouchResponse, effective_drop
 
 FREE = {"circle": 4, "hertz": 4, "triangle": 5, "rectangle": 6, "square": 5, "L": 5}  # parameters of each kind
 PERIOD = {"triangle": 2 * np.pi / 3, "rectangle": np.pi, "square": np.pi / 2, "L": 2 * np.pi}
-STARTS = {"triangle": 4, "rectangle": 6, "square": 3, "L": 8}  # rotations tried in one period
-TRIED = {"triangle": 2, "rectangle": 2, "square": 2, "L": 4}  # of them, the likeliest, are fitted to the end
+STARTS = {"triangle": 4, "rectangle": 6, "square": 4, "L": 8}  # rotations looked at in one period
+TRIED = {"triangle": 2, "rectangle": 3, "square": 2, "L": 4}  # of them, evenly apart, are fitted to the end
 ROUNDER = {"circle": 1.0, "hertz": 1.1, "triangle": 1.55, "rectangle": 1.3, "square": 1.25, "L": 1.4}
 """Circumscribed radius of each kind over that of the circle of its area."""
 
@@ -35,9 +36,9 @@ LOW = np.array([-1.0, -1.0, np.log(0.05), -5.0, -np.inf, 0.0])
 HIGH = np.array([1.0, 1.0, np.log(0.95), 3.5, np.inf, np.log(4.0)])
 MOST = np.array([0.2, 0.2, 0.4, 0.8, 0.5, 0.4])  # of one step
 STEP = np.array([0.02, 0.02, 0.03, 0.0, 0.05, 0.04])  # for derivatives of coverage; place: of the radius
-DONE = 0.05  # a step that raises the posterior by less, in nats times two, is the last
+DONE = 0.05  # where a step promises less, in nats times two, it is not taken
 STEPS = 12
-FLOOR = 3e-5  # of |Z|: no forward model is better
+FLOOR = 5e-6  # of |Z|: two meshes differ by as much where a touch does least
 MISFIT = 3.5e-3  # of |d|: what the response is wrong by, over the directions that touches make
 MISFIT_ODDS = 0.55  # and it grows with the drop's odds: a drop of a half has all of it, one of a tenth a third
 MISFIT_EACH = 0.2  # of that: in each measurement by itself
@@ -56,6 +57,9 @@ MOST_FOLLOWED = np.array([0.3, 0.3, 0.25, 0.6, 0.2, 0.3])  # of one step along a
 UNFOLLOWED = 0.01  # of a change's energy: what one step may leave of it
 CURVED = 0.15  # of one step: standard deviation of what it is off by
 UNLIKELY = 12.0  # nats behind the likeliest kind: not fitted further
+NO_MORE = 1.0  # where a step promised less and kept nothing, the cells' own error is what is left
+NEAR = 0.04  # in every parameter: the same optimum
+SAME_TURN = 0.08  # of a kind's period: rotations no further apart are of one optimum
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,7 @@ class TouchPosterior:
     drop: tuple[float, float]  # peak, S: mean and standard deviation
     integral: tuple[float, float]  # S times square model units
     area: tuple[float, float]  # square model units
+    between_kinds: tuple[float, float]  # how far the kinds differ in drop and in area: relative standard deviations
     measurements: int
 
     @property
@@ -184,14 +189,19 @@ class TouchFit:
             frame = _Whitened(self.response, d, FrameErrors(errors.noise, CORNERED[kind] ** 2 * errors.model))
             best = max((fit.evidence for fit in found), default=-np.inf)
             starts = [before[kind]] if before else self._starts(frame, kind, start, radius)
-            tried = [frame.fit(kind, theta, radius, best) for theta in starts]
-            found += sorted((fit for fit in tried if fit), key=lambda fit: -fit.evidence)[:1]
+            optima: list[KindFit] = []
+            for theta in starts:
+                fit = frame.fit(kind, theta, radius, best, [other.theta for other in optima])
+                optima += [fit] if fit else []
+            found += over_rotations(optima)
         found.sort(key=lambda fit: -fit.evidence)
         weight = np.exp([fit.evidence - found[0].evidence for fit in found])
         return _posterior(tuple(found), weight / weight.sum(), len(d))
 
     def _starts(self, frame: _Whitened, kind: str, start: Shape, radius: float | None) -> list[Array]:
-        """The likeliest rotations, place and area being the start's."""
+        """The likeliest rotation, place and area being the start's, and those that divide the period with it: its
+        neighbours lead to the same optimum, and the right one may look unlikely until size and drop fit it.
+        """
         size = radius or float(np.sqrt(start.area / np.pi)) * ROUNDER[kind]
         drop = float(np.clip(start.drop * (1.2 if kind == "hertz" else 1.0), 0.03, 0.9))
         x, y = start.centroid
@@ -203,8 +213,45 @@ class TouchFit:
             theta = theta.copy()
             theta[4] = rotation
             theta[:2] += (x, y) - shape_of(kind, theta).centroid  # an L's centroid is not its circle's centre
-            turned.append((frame.misfit(kind, theta), theta))
-        return [theta for _, theta in sorted(turned, key=lambda pair: pair[0])[: TRIED[kind]]]
+            turned.append(theta)
+        best = int(np.argmin([frame.misfit(kind, theta) for theta in turned]))
+        return [turned[(best + k * STARTS[kind] // TRIED[kind]) % STARTS[kind]] for k in range(TRIED[kind])]
+
+
+def over_rotations(optima: list[KindFit]) -> list[KindFit]:
+    """The likeliest of one kind's optima, with the evidence of all rotations: each optimum's Gaussian, as far as the
+    next optimum. A Gaussian alone would count rotations that are not there, more than a period of them where a small
+    touch says nothing of its rotation, and a square would be likelier than the circle that explains as much.
+    """
+    optima = sorted(optima, key=lambda fit: -fit.evidence)
+    if not optima or optima[0].kind not in PERIOD:
+        return optima[:1]
+    evidence, period = [], PERIOD[optima[0].kind]
+    distinct: list[KindFit] = []
+    for fit in optima:
+        if all(abs(_turn(fit.kind, fit.theta, other.theta)) > SAME_TURN * period for other in distinct):
+            distinct.append(fit)
+    for fit in distinct:
+        turns = [_turn(fit.kind, fit.theta, other.theta) for other in distinct if other is not fit]
+        ahead = min((turn % period for turn in turns), default=period) / 2
+        behind = min((-turn % period for turn in turns), default=period) / 2
+        wide = float(np.sqrt(2 * fit.covariance[4, 4]))
+        evidence.append(fit.evidence + float(np.log(0.5 * (erf(ahead / wide) + erf(behind / wide)))))
+    return [replace(distinct[0], evidence=float(np.logaddexp.reduce(evidence)))]
+
+
+def _apart(kind: str, theta: Array, other: Array) -> float:
+    """The largest difference of two parameters."""
+    off = np.abs(theta - other)
+    if kind in PERIOD:
+        off[4] = abs(_turn(kind, theta, other))
+    return float(off.max())
+
+
+def _turn(kind: str, theta: Array, other: Array) -> float:
+    """The rotation from one touch of a kind to another: within half a period of none."""
+    period = PERIOD[kind]
+    return float((other[4] - theta[4] + period / 2) % period - period / 2)
 
 
 def frame_errors(
@@ -276,9 +323,11 @@ class _Whitened:
         d, by_cell = self._response(grid, now, moved)
         return self._seen - self._white(d), self._white(by_cell @ slope[moved])
 
-    def fit(self, kind: str, theta: Array, radius: float | None, best: float) -> KindFit | None:
+    def fit(
+        self, kind: str, theta: Array, radius: float | None, best: float, known: Sequence[Array] = ()
+    ) -> KindFit | None:
         """The likeliest touch of a kind near theta; None where it is so far behind the evidence `best` that it need
-        not be known.
+        not be known, or where it comes to one of the optima that are `known`.
         """
         count = len(theta)
         mean, sd = MEAN[:count].copy(), SD[:count].copy()
@@ -292,37 +341,37 @@ class _Whitened:
         occam = float(np.log(sd[~held]).sum())
         left, slope = self._linear(kind, theta)
 
-        def penalty(left: Array, theta: Array) -> float:
-            return float(left @ left + (information * (theta - mean) ** 2).sum())
+        def penalty(theta: Array) -> float:
+            return float((information * (theta - mean) ** 2).sum())
 
-        cost, damping = penalty(left, theta), 1e-3
+        cost, damping = float(left @ left) + penalty(theta), 1e-3
         for step_number in range(STEPS):
-            if step_number == 3 and -0.5 * cost - self._volume < best - 4 * UNLIKELY:
+            hessian, uphill = slope.T @ slope + np.diag(information), slope.T @ left - information * (theta - mean)
+            promised = float(uphill @ np.linalg.solve(hessian, uphill))  # by a whole step, if the response were linear
+            if promised < DONE:
+                break
+            if step_number >= 3 and -0.5 * (cost - promised) - self._volume < best - 4 * UNLIKELY:
                 return None
-            hessian = slope.T @ slope + np.diag(information)
-            step = np.linalg.solve(
-                hessian + damping * np.diag(np.diag(hessian)), slope.T @ left - information * (theta - mean)
-            )
+            if any(_apart(kind, theta, other) < NEAR for other in known):
+                return None
+            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), uphill)
             step *= min(1.0, float((MOST[:count] / np.maximum(np.abs(step), 1e-9)).min()))
             there = np.clip(theta + step, LOW[:count], HIGH[:count])
-            left_there, slope_there = self._linear(kind, there)
-            cost_there = penalty(left_there, there)
-            if cost_there < cost:
-                done = cost - cost_there < DONE
-                theta, left, slope, cost, damping = there, left_there, slope_there, cost_there, damping * 0.3
-                if done:
-                    break
+            if self.misfit(kind, there) + penalty(there) < cost:
+                theta, damping = there, damping * 0.3
+                left, slope = self._linear(kind, theta)
+                cost = float(left @ left) + penalty(theta)
+            elif damping > 1e2 or promised < NO_MORE:
+                break
             else:
                 damping *= 8
-                if damping > 1e2:
-                    break
         hessian = slope.T @ slope + np.diag(information)
         free = hessian[np.ix_(~held, ~held)]
         evidence = -0.5 * cost - 0.5 * float(np.linalg.slogdet(free)[1]) - occam - self._volume
         covariance, misfit = np.linalg.inv(hessian), float(left @ left)
-        gain = covariance @ solve_triangular(self._root.T, slope, lower=False, check_finite=False).T
-        covariance += (self._wrong(misfit) - 1) * gain @ self._model @ gain.T
-        return KindFit(kind, theta, covariance, misfit, evidence, self._root @ slope, gain, self._noise)
+        follow = covariance @ solve_triangular(self._root.T, slope, lower=False, check_finite=False).T
+        covariance += (self._wrong(misfit) - 1) * follow @ self._model @ follow.T
+        return KindFit(kind, theta, covariance, misfit, evidence, self._root @ slope, follow, self._noise)
 
     def _wrong(self, misfit: float) -> float:
         """Variance of the model's error over what was assumed: as large as what is left of the frame, as far as noise
@@ -365,6 +414,11 @@ def _posterior(fits: tuple[KindFit, ...], probability: Array, measurements: int)
         wider = np.array([WIDER_INTEGRAL if k == 3 else WIDER[fit.kind] for fit in fits])
         return mean, float(np.sqrt(probability @ (wider**2 * variances + (values - mean) ** 2)))
 
+    def apart(k: int) -> float:
+        values = np.array([row[k][0] for row in rows])
+        mean = float(probability @ values)
+        return float(np.sqrt(probability @ (values - mean) ** 2)) / mean
+
     kinds: NDArray[np.str_] = np.array([fit.kind for fit in fits])
     return TouchPosterior(
         fits,
@@ -374,5 +428,6 @@ def _posterior(fits: tuple[KindFit, ...], probability: Array, measurements: int)
         mixed(2),
         mixed(3),
         mixed(4),
+        (apart(2), apart(4)),
         measurements,
     )

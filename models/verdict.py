@@ -28,6 +28,7 @@ WORTH = 0.05  # of contact IoU: what ten times the batches must bring to be wort
 NEAR_FLOOR = 1.6  # times the floor: a position that is as good as it gets
 FAR_FROM_FLOOR = 3.0
 BETTER = 0.05  # of contact IoU, than the one-step image: less is not worth a network
+FARTHER = 1.25  # times the one-step image's distance from where a touch is: such an image misleads
 FLOORS = 24  # held-out touches that floors are computed for
 MEAN_OF_RMS = float(np.sqrt(np.pi) / 2)  # mean distance of a two-dimensional normal error, of its root mean square
 
@@ -44,8 +45,10 @@ class TrainingVerdict:
         return {"grade": self.grade, "text": self.text, **{k: round(v, 4) for k, v in self.figures.items()}}
 
 
-def one_step(held_out: Samples, pre: PreReconstructor, own: OwnSkin | None = None) -> float:
-    """Contact IoU of the best one-step image of the stack, without noise: what there is without a network."""
+def one_step(held_out: Samples, pre: PreReconstructor, own: OwnSkin | None = None) -> dict[str, float]:
+    """Figures (models.evaluation) of the stack's one-step image with the best contact IoU, without noise: what there is
+    without a network.
+    """
 
     def image(rung: int) -> Predict:
         def predict(stack: Array, context: Array) -> tuple[Array, Array, Array]:
@@ -58,7 +61,8 @@ def one_step(held_out: Samples, pre: PreReconstructor, own: OwnSkin | None = Non
 
     rungs = range(len(pre.m.ladder))
     level = LEVELS["noise-free"]
-    return max(evaluate(image(rung), held_out, pre, level, limit=128, own=own)["contact IoU"] for rung in rungs)
+    found = [evaluate(image(rung), held_out, pre, level, limit=128, own=own) for rung in rungs]
+    return max(found, key=lambda figures: figures["contact IoU"])
 
 
 def position_floor(skin: str, held_out: Samples, decibel: float = 70.0) -> float:
@@ -109,26 +113,31 @@ def judge(
 
 
 def judge_registered(
-    held_out: Mapping[str, Mapping[str, float]], batches: int, minutes: float, single_step: float
+    held_out: Mapping[str, Mapping[str, float]], batches: int, minutes: float, single_step: Mapping[str, float]
 ) -> TrainingVerdict:
-    """Of a registered skin: what its presses leave unexplained is in the held-out scenes, and no floor is known."""
+    """Of a registered skin: what its presses leave unexplained is in the held-out scenes, and no floor is known.
+
+    held_out: as for `judge`; single_step: see `one_step`. A network that is "too little" is not to be shipped.
+    """
     clean = held_out["noise-free"]
     iou, place = clean["contact IoU"], clean["position % of side"]
+    iou_before, place_before = single_step["contact IoU"], single_step["position % of side"]
     gain = (1 - iou) * (1 - TIMES**-EXPONENT)
-    grade = "too little" if iou < single_step + BETTER else "usable"
-    first = {
-        "usable": "usable: it shows more than the image without a network",
-        "too little": 'too little: the image without a network is about as good or better, and `network = "none"` in '
-        "skin.toml shows that one",
-    }[grade]
+    worse = iou < iou_before + BETTER or place > FARTHER * place_before
+    first = (
+        "too little: the image without a network is about as good or better, and stays"
+        if worse
+        else "usable: it shows more than the image without a network"
+    )
     text = (
         f"{first}. Held-out touches, simulated and warped to this skin, with what its presses leave unexplained: "
-        f"contact IoU {iou:.2f} (the one-step image: {single_step:.2f}), position off by {place:.2f} % of the side. "
-        f"It has seen {batches} batches in {minutes:.0f} minutes; more presses bring more than more time does. "
-        "Positions of contacts remain those of the presses' own likelihood."
+        f"contact IoU {iou:.2f} (the one-step image: {iou_before:.2f}), position off by {place:.2f} % of the side "
+        f"({place_before:.2f} %). It has seen {batches} batches in {minutes:.0f} minutes; more presses bring more than "
+        "more time does. Positions of contacts remain those of the presses' own likelihood."
     )
-    figures = {"contact_iou": iou, "one_step_contact_iou": single_step, "position_percent": place}
-    return TrainingVerdict(grade, text, figures | {"expected_contact_iou": iou + gain, "batches": float(batches)})
+    figures = {"contact_iou": iou, "one_step_contact_iou": iou_before, "position_percent": place}
+    figures |= {"one_step_position_percent": place_before, "expected_contact_iou": iou + gain}
+    return TrainingVerdict("too little" if worse else "usable", text, figures | {"batches": float(batches)})
 
 
 def _round(minutes: float) -> int:

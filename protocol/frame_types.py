@@ -231,6 +231,11 @@ class RefinedTouch:
     rotation: float = wire(Float(unit="rad"), "of the likeliest shape, counter-clockwise", 0.0)
     aspect: float = wire(Float(0), "ratio of a rectangle's sides", 1.0)
     scan: int = wire(_COUNT, "scan that it was fitted to; the touch has changed by little since", 0)
+    between_kinds: list[float] = wire(
+        Vector(2),
+        "how far the kinds that it may be differ in `drop` and in `area_m2`: relative standard deviations",
+        lambda: [0.0, 0.0],
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

@@ -327,6 +327,7 @@ def told(found: TouchPosterior, scan: int, unit: float) -> RefinedTouch:
         rotation=shape.rotation,
         aspect=shape.aspect,
         scan=scan,
+        between_kinds=list(found.between_kinds),
     )
 
 

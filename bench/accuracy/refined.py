@@ -1,15 +1,16 @@
 """Single touches by the network, and refined: the touch's parameters fitted to the same frame.
 
-    skin bench refined [--touches 500] [--levels none 70] [--seed 33] [--quick]
+    skin bench refined [--touches 500] [--levels none 70] [--seed 33] [--quick] [--coverage-touches 150]
 
 Touches are drawn as training draws them (models.scenes.TRAINING: radius 0.12 to 0.45 and, in one of five, 0.08 to 0.5;
 drop 0.1 to 0.5 and 0.05 to 0.9), of all six kinds alike, and solved on the stub's mesh, which neither training nor
 inverse uses. `network`: the image of the network that runs by default, a touch being what exceeds half its peak.
 `found`: models/touch_fit.py with every kind, the kinds weighed by their evidence; its image is the posterior mean.
 `declared`: with the kind that it was. `service`: what a contact says with `indenter = { kind = "any" }`, the fit where
-it explains the frame and the image agrees, else the image; `stated`: of those, the fits alone. Prints means with their
-standard errors, and how often the truth lay within the stated 68 and 90 % intervals; the images of shapes that neither
-knows (bench/accuracy/odd_shapes.py). Writes refined.json.
+it explains the frame and the image agrees, else the image; `stated`: of those, the fits alone; `symmetry`: the image as
+the mean over the square's symmetries. Prints means with their standard errors; at 60, 70 and 80 dB and without noise,
+how often the truth lay within the stated 68 and 90 % intervals of the service; the images of shapes that neither knows
+(bench/accuracy/odd_shapes.py). Writes refined.json.
 """
 
 from __future__ import annotations
@@ -26,8 +27,10 @@ from rich.progress import track
 from rich.table import Table
 
 from bench import REPORTS, WORK
-from bench.accuracy.frames import Level
+from bench.accuracy.frames import NOISE_FREE, Level
+from bench.accuracy.intervals import INTERVALS, by_kinds, counted, coverage, coverage_table, pixels, summary
 from bench.accuracy.odd_shapes import ODD, OddShape, random_odd
+from bench.accuracy.symmetric import ldci, pictures
 from bench.goals import Goal
 from bench.goals import table as goal_table
 from bench.json_file import write_json
@@ -40,15 +43,17 @@ from models.refine import refined_fit, responses_of, start_of
 from models.scenes import TRAINING, random_scene
 from models.shapes import KINDS, Array, Shape, from_rows, to_rows
 from models.touch_fit import TouchPosterior, frame_errors
+from models.turns import TURNS
 from protocol.frames import Contact
 from services.contacts.force import Force
-from services.contacts.refined import agrees, both
+from services.contacts.refined import agrees, both, settled
 from services.refinement import told
 
 SKIN, MESH, N = "square16", "stub", 96
 MOST = 64 * 2**20
 Row = dict[str, tuple[float, float]]
-INTERVALS = {68: (1.0, 2.279), 90: (1.645, 4.605)}  # sd of one figure; squared distance of two, in sd
+COVERAGE_ALSO = ("60", "80")  # noise levels of which intervals alone are looked at
+METHODS = ("network", "found", "declared", "service", "stated", "symmetry")
 
 
 def frames(seed: int, count: int) -> tuple[list[Shape], Array]:
@@ -80,13 +85,19 @@ def odd_frames(seed: int, count: int) -> tuple[list[OddShape], Array]:
     return touches, np.asarray(read_npz(path, MOST)["d"])
 
 
-def counts(posterior: TouchPosterior, image: Array, start: Shape, unit: float) -> bool:
-    """Whether the service would say the fit: the rule of its publisher."""
+def said(posterior: TouchPosterior, image: Array, start: Shape, unit: float) -> tuple[Force, float, float] | None:
+    """Drop, area and its standard uncertainty as the service would say them; None where it would say the image: the
+    rules of its publisher. The force law is 1 N/S.
+    """
     if not posterior.fits_frame:
-        return False
+        return None
     (x, y), area = start.centroid * unit, float((image > 0.5 * image.max()).mean()) * 4 * unit**2
     seen = Contact(id=1, position=[float(x), float(y), 0.0], area_m2=area, force_n=float(image.max()))
-    return agrees(seen, told(posterior, 0, unit), Force(*posterior.drop))
+    touch, force = told(posterior, 0, unit), Force(*posterior.drop)
+    if not agrees(seen, touch, force):
+        return None
+    force, area, sigma = settled(seen, touch, force)
+    return force, area / unit**2, sigma / unit**2
 
 
 def row_of(image: Array, touch: Shape) -> dict[str, float]:
@@ -106,6 +117,7 @@ def fitted(posterior: TouchPosterior, touch: Shape) -> dict[str, float]:
         "position %": 50 * float(np.linalg.norm(off)),
         "force %": 100 * abs(posterior.drop[0] / touch.drop - 1),
         "integral %": 100 * abs(posterior.integral[0] / touch.integral - 1),
+        "area %": 100 * abs(posterior.area[0] / touch.area - 1),
     }
     for percent, (one, two) in INTERVALS.items():
         row[f"force in {percent} %"] = 100.0 * (abs(posterior.drop[0] - touch.drop) < one * posterior.drop[1])
@@ -113,37 +125,58 @@ def fitted(posterior: TouchPosterior, touch: Shape) -> dict[str, float]:
     return row
 
 
-def measured(level: str, touches: list[Shape], clean: Array, seed: int) -> dict[str, list[Any]]:
+def stated(contact: tuple[Force, float, float], touch: Shape) -> dict[str, float]:
+    """Of what a contact says where image and fit are weighed: force and area."""
+    force, area, _ = contact
+    assert force.newton is not None and force.sigma is not None
+    off = abs(force.newton - touch.drop)
+    row = {"force %": 100 * off / touch.drop, "area %": 100 * abs(area / touch.area - 1)}
+    return row | {f"force in {percent} %": 100.0 * (off < one * force.sigma) for percent, (one, _) in INTERVALS.items()}
+
+
+def shipped() -> Path:
+    """The network that runs by default."""
+    path = Bundle.load(SKIN).network_path("int8")
+    assert path is not None
+    return path
+
+
+def measured(
+    level: str, touches: list[Shape], clean: Array, seed: int, methods: tuple[str, ...] = METHODS
+) -> dict[str, list[Any]]:
     """method -> one row a touch."""
     bundle, noise, rng = Bundle.load(SKIN), Level(level), np.random.default_rng([seed, 7])
     pre = bundle.prereconstructor()
-    path = bundle.network_path("int8")
-    assert path is not None
-    network = export.session(path.read_bytes())
+    network = export.session(shipped().read_bytes())
     responses = responses_of(bundle)
     sigma = np.full(pre.measurements, noise.share)
     operator = pre.condition(sigma)
     d = clean + noise.share * np.sqrt(1 + 1 / 64) * rng.standard_normal(clean.shape)
-    found: dict[str, list[Any]] = {"network": [], "found": [], "declared": [], "service": [], "stated": []}
+    found: dict[str, list[Any]] = {method: [] for method in methods}
     for one, touch in zip(track(d, description=noise.title), touches, strict=True):
-        stack, context, scale = operator.stack(one)
-        drop, _, logits = network.run(None, {"stack": stack[None], "context": context[None]})
-        image = drop[0, 0] * scale
-        mask = (image > 0.5 * image.max()).reshape(24, 4, 24, 4).mean(axis=(1, 3))
-        shifted = np.exp(logits[0] - logits[0].max(axis=0))
-        share = (shifted / shifted.sum(axis=0) * mask).sum(axis=(1, 2))
-        found["network"].append(
-            row_of(image, touch)
-            | {
-                "force %": 100 * abs(float(image.max()) / touch.drop - 1),
-                "integral %": 100 * abs(metrics.integrated(image) / touch.integral - 1),
-                "class %": 100.0 * (int(share.argmax()) == touch.shape_class),
-            }
-        )
+        made = operator.stack(one)
+        for method in ("symmetry", "network"):
+            if method not in methods:
+                continue
+            image, spread, classes = pictures(network, made, TURNS if method == "symmetry" else TURNS[:1])
+            mask = (image > 0.5 * image.max()).reshape(24, 4, 24, 4).mean(axis=(1, 3))
+            share = (classes * mask).sum(axis=(1, 2))
+            found[method].append(
+                row_of(image, touch)
+                | {
+                    "force %": 100 * abs(float(image.max()) / touch.drop - 1),
+                    "integral %": 100 * abs(metrics.integrated(image) / touch.integral - 1),
+                    "area %": 100 * abs(4 * float((image > 0.5 * image.max()).mean()) / touch.area - 1),
+                    "class %": 100.0 * (int(share.argmax()) == touch.shape_class),
+                }
+                | pixels(image, spread, touch)
+            )
         start = start_of(image)
         assert start is not None
         errors = frame_errors(pre.m.gram.astype(float), sigma, one, float(image.max()))
         for method, kinds in (("found", KINDS), ("declared", (touch.kind,))):
+            if method not in methods:
+                continue
             began = time.perf_counter()
             posterior = refined_fit(*responses, one, errors, start, kinds)
             took = 1e3 * (time.perf_counter() - began)
@@ -153,13 +186,14 @@ def measured(level: str, touches: list[Shape], clean: Array, seed: int) -> dict[
                 | {"class %": 100.0 * (int(posterior.classes.argmax()) == touch.shape_class), "ms": took}
             )
             if method == "found":
-                fits = counts(posterior, image, start, bundle.metres_per_unit)
-                said = dict(found["found" if fits else "network"][-1])
-                if fits:
+                contact = said(posterior, image, start, bundle.metres_per_unit)
+                row = dict(found["network" if contact is None else "found"][-1])
+                if contact is not None:
                     named = both(posterior.classes.tolist(), (share / share.sum()).tolist())
-                    said["class %"] = 100.0 * (int(np.argmax(named)) == touch.shape_class)
-                found["service"].append(said | {"refined %": 100.0 * fits})
-                found["stated"].append(found["found"][-1] if fits else None)
+                    row["class %"] = 100.0 * (int(np.argmax(named)) == touch.shape_class)
+                    row |= stated(contact, touch)
+                found["service"].append(row | {"refined %": 100.0 * (contact is not None)})
+                found["stated"].append(None if contact is None else row)
     return found
 
 
@@ -167,9 +201,7 @@ def odd(level: str, touches: list[OddShape], clean: Array, seed: int) -> dict[st
     """What network and service say, and how often the fit counts."""
     bundle, noise, rng = Bundle.load(SKIN), Level(level), np.random.default_rng([seed, 8])
     pre, responses = bundle.prereconstructor(), responses_of(bundle)
-    path = bundle.network_path("int8")
-    assert path is not None
-    network, sigma = export.session(path.read_bytes()), np.full(pre.measurements, noise.share)
+    network, sigma = export.session(shipped().read_bytes()), np.full(pre.measurements, noise.share)
     operator = pre.condition(sigma)
     rows: dict[str, list[dict[str, float]]] = {kind: [] for kind in ODD}
     d = clean + noise.share * np.sqrt(1 + 1 / 64) * rng.standard_normal(clean.shape)
@@ -179,17 +211,15 @@ def odd(level: str, touches: list[OddShape], clean: Array, seed: int) -> dict[st
         start = start_of(image)
         assert start is not None
         posterior = refined_fit(*responses, one, frame_errors(pre.m.gram.astype(float), sigma, one, start.drop), start)
-        fits, covered = counts(posterior, image, start, bundle.metres_per_unit), touch.fraction(N)
+        contact, covered = said(posterior, image, start, bundle.metres_per_unit), touch.fraction(N)
         mask = image > 0.5 * image.max()
         axis = -1 + 2 * (np.arange(N) + 0.5) / N
         centroid = np.array([(covered * a).sum() for a in (axis, axis[:, None])]) / covered.sum()
-        row: dict[str, float] = {"refined %": 100.0 * fits}
+        row: dict[str, float] = {"refined %": 100.0 * (contact is not None)}
         for method in ("network", "service"):
-            fitted_now = fits and method == "service"
-            place = posterior.position if fitted_now else start.centroid
-            area = posterior.area[0] if fitted_now else 4 * float(mask.mean())
-            peak = posterior.drop[0] if fitted_now else float(image.max())
-            seen = posterior.image(N) if fitted_now else image
+            place, area, peak, seen = start.centroid, 4 * float(mask.mean()), float(image.max()), image
+            if method == "service" and contact is not None:
+                place, area, peak, seen = posterior.position, contact[1], contact[0].newton or 0.0, posterior.image(N)
             row |= {
                 f"{method}: contact IoU": metrics.iou(seen > 0.5 * seen.max(), covered > 0.5)[1],
                 f"{method}: position, % of the side": 50 * float(np.linalg.norm(place - centroid)),
@@ -198,23 +228,6 @@ def odd(level: str, touches: list[OddShape], clean: Array, seed: int) -> dict[st
             }
         rows[touch.kind].append(row)
     return {kind: summary(found, list(range(len(found)))) for kind, found in rows.items() if found}
-
-
-def summary(rows: list[Any], index: list[int]) -> dict[str, tuple[float, float]]:
-    """Mean and standard error of each figure; of force and integral the median, and the standard error of a median."""
-    out = {}
-    kept = [rows[k] for k in index if rows[k] is not None]
-    for name in [n for n in kept[0] if all(n in row for row in kept)] if kept else []:
-        values = np.array([row[name] for row in kept])
-        error = float(values.std() / np.sqrt(len(values)))
-        if name == "position %":
-            out["position rms %"] = (float(np.sqrt((values**2).mean())), error)
-        elif name in ("force %", "integral %"):
-            low, high = np.quantile(values, (0.5 - 0.5 / np.sqrt(len(values)), 0.5 + 0.5 / np.sqrt(len(values))))
-            out[name] = (float(np.median(values)), float(high - low) / 2)
-        else:
-            out[name] = (float(values.mean()), error)
-    return out
 
 
 def gains(kind: str, network: Row, service: Row) -> list[float]:
@@ -257,18 +270,17 @@ def goals(report: dict[str, Any], quick: bool) -> list[Goal]:
                 gate=-0.02 if quick else 0.0,
             ),
         ]
-        for percent in INTERVALS:
-            for what in ("force", "position"):
-                name = f"{what} in {percent} %"
-                within = by_kind["all"]["found"][name][0]
-                made.append(
-                    Goal(f"{title}: {what} within the stated {percent} %, off by", abs(within - percent), at_most=3)
-                )
         worst = min(gain for kind, row in by_kind.items() for gain in gains(kind, row["network"], row["service"]))
         made.append(Goal(f"{title}: worst row, service less network, standard errors", worst, at_least=-1.0))
         for kind, most in (("circle", 14 if level != "none" else 3), ("hertz", 14 if level != "none" else 3)):
             force = by_kind[kind]["declared"]["force %"][0]
             made.append(Goal(f"{title}: force, {kind} declared, median error, %", force, at_most=most))
+    for level, by_kind in report["coverage"].items():
+        for what in ("position", "force", "pixels"):
+            for percent in INTERVALS:
+                off = abs(by_kind["all"][f"{what} in {percent} %"][0] - percent)
+                made.append(Goal(f"{Level(level).title}: {what} in the stated {percent} %, off by", off, at_most=3))
+    made.append(Goal("noise-free: LDCI, mean over the symmetries", report["ldci"]["symmetry"], at_most=0.012))
     for level, found in report["odd"].items():
         title = f"{Level(level).title}, shapes that neither knows: worst row, service less network, standard errors"
         made.append(Goal(title, worst_odd(found), at_least=-1.0))
@@ -279,6 +291,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench refined", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--touches", type=int, default=None, help="500; 60 with --quick")
     parser.add_argument("--levels", nargs="+", default=["none", "70"])
+    parser.add_argument("--coverage-touches", type=int, default=None, help="at 60 and 80 dB: 150; 12 with --quick")
     parser.add_argument("--seed", type=int, default=33)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--out", type=Path, default=REPORTS)
@@ -288,18 +301,26 @@ def main(argv: list[str] | None = None) -> int:
     console = Console()
     for level in args.levels:
         rows = measured(level, touches, clean, args.seed)
-        report["levels"][level] = by_kind = {}
-        for kind in ("all", *KINDS):
-            index = [k for k, touch in enumerate(touches) if kind in ("all", touch.kind)]
-            by_kind[kind] = {method: summary(found, index) for method, found in rows.items()}
-            names = [n for n in by_kind[kind]["declared"] if kind == "all" or " in " not in n]
-            table = Table(title=f"{Level(level).title}, {kind}: {len(index)} touches")
+        report["levels"][level] = by_kind = by_kinds(rows, touches)
+        for kind, row in by_kind.items():
+            names = [n for n in row["declared"] if " in " not in n]
+            table = Table(title=f"{Level(level).title}, {kind}: {counted(kind, touches)} touches")
             for column in ("", *rows):
                 table.add_column(column, justify="right" if column else "left")
             for name in names:
-                cells = [by_kind[kind][method].get(name) for method in rows]
+                cells = [row[method].get(name) for method in rows]
                 table.add_row(name, *("" if c is None else f"{c[0]:.4g} +- {c[1]:.2g}" for c in cells))
             console.print(table)
+    report["ldci"] = ldci(export.session(shipped().read_bytes()), Bundle.load(SKIN), MESH, np.full(120, NOISE_FREE))
+    console.print(f"LDCI noise-free, drop 0.15, radius 0.2: {report['ldci']}")
+    some = touches[: args.coverage_touches or (12 if args.quick else 150)]
+    levels = dict(report["levels"])
+    for level in COVERAGE_ALSO:
+        if level not in levels:
+            rows = measured(level, some, clean[: len(some)], args.seed, ("network", "found", "service", "stated"))
+            levels[level] = by_kinds(rows, some)
+    report["coverage"] = coverage(levels)
+    console.print(coverage_table(report["coverage"]))
     report["odd"] = {}
     odd_touches, odd_clean = odd_frames(args.seed, len(touches) // 5)
     for level in ("none", "70"):

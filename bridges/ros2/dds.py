@@ -40,6 +40,12 @@ _QOS = {
     "latched": (Policy.Reliability.Reliable(100_000_000), Policy.History.KeepLast(1), Policy.Durability.TransientLocal),
 }
 
+DATAGRAM, FRAGMENT = 65500, 65000
+"""Bytes of the largest UDP datagram, as with Fast DDS, and of a message's part in one. With Cyclone's own (14720, 1344)
+a cloud of 184 kB is 14 datagrams, which overflow the receive buffer of a ROS node that does not read at once (208 kB
+with what the kernel adds to each): half of the clouds were lost. Of these 3 none is.
+"""
+
 
 def domain_id(given: int | None) -> int:
     """The ROS domain: as configured, else as $ROS_DOMAIN_ID says, as for every ROS 2 node."""
@@ -68,6 +74,7 @@ def configure(given: str) -> None:
     theirs = os.environ.get("CYCLONEDDS_URI", "")
     name = "" if theirs else interface(given)
     text = "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
+    text += f"<General><MaxMessageSize>{DATAGRAM}B</MaxMessageSize><FragmentSize>{FRAGMENT}B</FragmentSize></General>"
     if name:
         alone = ' multicast="false"' if name == "lo" else ""  # the loopback has none
         text += f'<General><Interfaces><NetworkInterface name="{name}"{alone}/></Interfaces></General>'

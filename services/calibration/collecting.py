@@ -15,6 +15,7 @@ from protocol.frames import ImageFrame, RawFrame
 from services.calibration.force_fit import CalibrationError
 from services.calibration.force_presses import PATIENCE_S, Reader, Steady
 from services.contacts.force import Look
+from services.polygon import distance, inside
 
 Array = NDArray[np.float64]
 
@@ -109,7 +110,7 @@ def places(outline: Array, n: int, margin: float, seed: int = 0) -> Array:
     rng = np.random.default_rng(seed)
     low, high = outline.min(axis=0), outline.max(axis=0)
     tried = rng.uniform(low, high, (4000, 2))
-    tried = tried[_inside(outline, tried) & (_distance(outline, tried) >= margin)]
+    tried = tried[inside(outline, *tried.T) & (distance(outline, tried) >= margin)]
     if not len(tried):
         raise CalibrationError(f"no place of the skin is {1e3 * margin:g} mm from its outline: press with less radius")
     chosen = [tried[0]]
@@ -118,22 +119,6 @@ def places(outline: Array, n: int, margin: float, seed: int = 0) -> Array:
         chosen.append(tried[int(far.argmax())])
         far = np.minimum(far, np.hypot(*(tried - chosen[-1]).T))
     return np.array(chosen)
-
-
-def _inside(outline: Array, points: Array) -> NDArray[np.bool_]:
-    x, y = points.T
-    odd = np.zeros(len(points), dtype=bool)
-    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        if y0 != y1:
-            odd ^= ((y0 > y) != (y1 > y)) & (x < (x1 - x0) * (y - y0) / (y1 - y0) + x0)
-    return odd
-
-
-def _distance(outline: Array, points: Array) -> Array:
-    steps = np.roll(outline, -1, axis=0) - outline
-    offset = points[:, None] - outline
-    along = np.clip((offset * steps).sum(axis=2) / np.maximum((steps**2).sum(axis=1), 1e-30), 0, 1)
-    return np.asarray(np.linalg.norm(offset - along[..., None] * steps, axis=2).min(axis=1))
 
 
 def write(path: Path, collected: Sequence[Collected], pattern: NDArray[Any]) -> Path | None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.locator_arrays import matern
+from services.calibration.presses import evenly
 
 Array = NDArray[np.float64]
 
@@ -21,17 +22,19 @@ MOST_FOR_SEARCH = 700  # presses from which a kernel machine's constants are fou
 class Machine:
     """A kernel machine's constants and weights, and what it leaves of presses that it was not trained on."""
 
-    length: float
-    offset: Array
-    weights: Array
-    left: Array  # (N, M)
+    length: float  # of the kernel, in the features' unit
+    offset: Array  # (M,) what is said far from all presses
+    weights: Array  # (N, M)
+    left: Array  # (N, M) targets less what is said without them
     error: float  # root mean square of `left`
 
 
 def search(features: Array, targets: Array, offset: Array, size: float) -> Machine:
-    """The kernel machine of the least leave-one-out error."""
+    """The kernel machine of the least leave-one-out error. features (N, F), targets (N, M) and their offset (M,) in any
+    unit; size: how far features are apart, which lengths are shares of.
+    """
     n = len(features)
-    some = np.unique(np.linspace(0, n - 1, min(n, MOST_FOR_SEARCH)).astype(int))
+    some = evenly(n, MOST_FOR_SEARCH)
     best = min(
         (error, length, ridge)
         for length in (size * share for share in LENGTHS)
@@ -57,7 +60,9 @@ def _errors(features: Array, targets: Array, length: float) -> list[tuple[float,
 
 
 def named(name: str, machine: Machine, centres: Array, spread: Array) -> dict[str, Any]:
-    """The arrays of a kernel machine."""
+    """The arrays of a kernel machine, as models/locator_arrays.py has them. centres (N, F): the features that it was
+    trained on; spread (M,): what to expect where it knows nothing.
+    """
     return {
         f"{name}_centres": centres.astype(np.float32),
         f"{name}_weights": machine.weights,

@@ -18,9 +18,9 @@ from models.locator import LEAST_LOUD, NINETY, Likely, Locator, one_more, second
 from models.locator_arrays import FEWEST_LIVE, QUANTITIES, LocatorArrays
 from services.calibration.fields import half_width, sample
 from services.calibration.kernel_machine import Machine, named, nothing_known, search
-from services.calibration.presses import Presses, RegistrationError, folds_of
+from services.calibration.presses import Presses, RegistrationError, evenly, folds_of, radius_of
 from services.calibration.registration import Similarity
-from services.calibration.response import ResponseFit, fit, fit_amplitudes, radius_of
+from services.calibration.response import ResponseFit, fit, fit_amplitudes
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,8 @@ class Crossed:
 def build(presses: Presses, similarity: Similarity, bundle: Bundle) -> tuple[LocatorArrays, ResponseFit, Crossed]:
     """What the bundle ships of these presses, the map itself, and how well presses that were left out are found.
 
-    Raises RegistrationError.
+    In turn: the map, and with it each press found by a map made without it; the correction of what that is off by,
+    kept where it gains; the ellipses of what is still left; depth or force. Raises RegistrationError.
     """
     if presses.measured.sum() < FEWEST_LIVE:
         raise RegistrationError(f"{int(presses.measured.sum())} measurements: at least {FEWEST_LIVE} are needed")
@@ -79,21 +80,10 @@ def build(presses: Presses, similarity: Similarity, bundle: Bundle) -> tuple[Loc
     middle = places.mean(axis=0)
     reach = radius_of(places)
     left = places - stage
-    best: tuple[float, Machine, Array, float] | None = None
-    for directions in DIRECTIONS if len(presses) >= FEWEST_FOR_CORRECTION else DIRECTIONS[:1]:
-        rotation = _rotation(form, directions)
-        shown = (form - form.mean(axis=0)) @ rotation
-        for weight in REACHES:
-            features = np.hstack([shown, (stage - middle) * weight / reach])
-            machine = search(features, left, np.zeros(2), np.sqrt(directions))
-            if best is None or machine.error < best[0]:
-                best = machine.error, machine, rotation, weight / reach
-    assert best is not None
-    _, machine, rotation, per_metre = best
+    machine, rotation, per_metre = _correction(form, stage - middle, reach, left)
     spread = np.sqrt((left**2).mean(axis=0))
     kept = len(presses) >= FEWEST_FOR_CORRECTION and _better(machine.left, left)
-    shown = (form - form.mean(axis=0)) @ rotation
-    near = np.hstack([shown, (stage - middle) * per_metre])
+    near = np.hstack([(form - form.mean(axis=0)) @ rotation, (stage - middle) * per_metre])
     left = machine.left if kept else left
     covariance = np.array([s.covariance for s in seen])
     factor, floor, inside = ellipses(left, covariance)
@@ -182,7 +172,7 @@ def _left_out(presses: Presses, whole: ResponseFit, plain: LocatorArrays) -> tup
     forms = np.zeros((n, int(presses.measured.sum())))
     seconds, thirds = [], []
     middle = plain.corner + 0.5 * float(plain.spacing) * (plain.shape[::-1] - 1)
-    some = set(np.linspace(0, n - 1, min(n, MOST_FOR_SECOND)).astype(int).tolist())
+    some = set(evenly(n, MOST_FOR_SECOND).tolist())
     for one in np.unique(fold):
         rest = fold != one
         if rest.sum() < 3:
@@ -209,6 +199,26 @@ def _left_out(presses: Presses, whole: ResponseFit, plain: LocatorArrays) -> tup
 
 def _with_ones(error: Array, measured: NDArray[np.bool_]) -> Array:
     return np.asarray(np.where(np.outer(measured, measured), error, np.eye(len(error))))
+
+
+def _correction(form: Array, stage: Array, reach: float, left: Array) -> tuple[Machine, Array, float]:
+    """The kernel machine that foretells best what the likelihood is off by, the directions of the forms that it reads
+    (K', F), and the weight of the place beside them [features per m].
+
+    form (N, K'): whitened differences of length 1; stage (N, 2) m: what the likelihood said, from the middle of the
+    presses; reach [m]: their radius; left (N, 2) m: what it was off by.
+    """
+    best: tuple[float, Machine, Array, float] | None = None
+    for directions in DIRECTIONS if len(form) >= FEWEST_FOR_CORRECTION else DIRECTIONS[:1]:
+        rotation = _rotation(form, directions)
+        shown = (form - form.mean(axis=0)) @ rotation
+        for weight in REACHES:
+            features = np.hstack([shown, stage * weight / reach])
+            machine = search(features, left, np.zeros(2), np.sqrt(directions))
+            if best is None or machine.error < best[0]:
+                best = machine.error, machine, rotation, weight / reach
+    assert best is not None
+    return best[1:]
 
 
 def _rotation(form: NDArray[Any], directions: int) -> Array:
@@ -257,7 +267,12 @@ def _squares(left: Array, covariance: Array) -> Array:
 def _tells(
     value: Array, quantity: str, near: Array, amplitude: Array, found: LocatorArrays, size: float
 ) -> tuple[LocatorArrays, Array | None]:
-    """With what says how deep or hard a press is; unchanged where that cannot be told from the measurements."""
+    """`found` with what says how deep [m] or hard [N] a press is, and what it is off by (N,) for presses that were left
+    out; unchanged and None where that cannot be told from the measurements.
+
+    value (N,): what the file says; near (N, F): features of the correction; amplitude (N,): by the likelihood; size:
+    see kernel_machine.search.
+    """
     loud = np.log(np.maximum(amplitude, LEAST_LOUD))[:, None]
     offset = np.array([value.mean()])
     each = [(search(np.hstack([near, w * loud]), value[:, None], offset, size), w) for w in LOUDNESS]

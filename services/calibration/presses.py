@@ -109,7 +109,10 @@ def part(arrays: Mapping[str, NDArray[Any]], rows: Any) -> dict[str, NDArray[Any
 
 
 def usable(difference: Array, xy: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Which presses (N,) and which measurements (K,) can be used: those that are not finite are left out."""
+    """The rows of the presses that can be used, and which measurements (K,): what is not finite is left out.
+
+    difference (n, K), xy (n, 2) as the file has them. Raises RegistrationError where too little is left.
+    """
     finite = np.isfinite(difference)
     rows = np.isfinite(xy).all(axis=1) & (finite.mean(axis=1) >= 0.5)
     changes = np.ptp(np.where(finite, difference, 0.0), axis=0) > 0
@@ -124,6 +127,16 @@ def usable(difference: Array, xy: NDArray[Any]) -> tuple[NDArray[np.intp], NDArr
     return np.flatnonzero(rows), measured
 
 
+def radius_of(xy: Array) -> float:
+    """From the middle of the bounding box of places (N, 2) to the farthest of them, in their unit; above 0."""
+    return max(float(np.linalg.norm(xy - 0.5 * (xy.min(axis=0) + xy.max(axis=0)), axis=1).max()), 1e-9)
+
+
+def evenly(n: int, most: int) -> NDArray[np.intp]:
+    """At most `most` of n rows, evenly among them."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).astype(int))
+
+
 def folds_of(xy: Array, count: int) -> NDArray[np.intp]:
     """(N,) in which of `count` parts each press is left out: presses at one place are left out together."""
     places, at = np.unique(np.round(xy / SAME_PLACE_M), axis=0, return_inverse=True)
@@ -132,6 +145,9 @@ def folds_of(xy: Array, count: int) -> NDArray[np.intp]:
 
 
 def _difference(after: Array, before: Array, bundle: Bundle) -> Array:
+    """(n, K) as the services form it, of |Z| touched and untouched (n, K); NaN where there was no untouched value. The
+    bundle's normalisation "model" divides by its own |Z0|, in the unit that the untouched values have.
+    """
     before = np.where(np.isfinite(before) & (before > 0), before, np.nan)
     if bundle.matrices.normalisation == "measured":
         return np.asarray(after / before - 1)
@@ -140,6 +156,7 @@ def _difference(after: Array, before: Array, bundle: Bundle) -> Array:
 
 
 def _unit(delta: NDArray[Any]) -> float:
+    """What `delta` (n, K) is multiplied by, since nobody says its unit."""
     try:
         return delta_unit(delta)
     except InputError as why:

@@ -15,7 +15,7 @@ from scipy import optimize
 
 from models.bundle import Bundle
 from services.calibration.fields import electrodes, half_width, sample, sensitivities
-from services.calibration.presses import Presses, RegistrationError
+from services.calibration.presses import Presses, RegistrationError, evenly, radius_of
 
 Array = NDArray[np.float64]
 
@@ -53,6 +53,7 @@ class Similarity:
         return np.asarray(self.offset + self.scale * skin @ self.matrix.T)
 
     def to_skin(self, machine: Array) -> Array:
+        """(N, 2) m of the machine's frame -> (N, 2) m of the bundle's."""
         return np.asarray((machine - self.offset) @ self.matrix / self.scale)
 
 
@@ -76,18 +77,28 @@ class Registration:
 
 
 class _Pose:
-    """What each press leaves unexplained, as a function of the pose."""
+    """What each press leaves unexplained, as a function of the pose.
+
+    A pose is a way (numbered as the bundle, or mirrored) and p (4,): angle [rad], logarithm of the scale, offset x and
+    y [m].
+
+        fields (K', h, w)    the bundle's sensitivities, of the K' measurements that were measured
+        y (N, K')            differences, each measurement with a mean square of 1
+        width                half the side of the bundle's image [m]
+        circle               radius of the circle through the electrodes, in the bundle's metres
+        centre (2,), radius  middle of the presses, and how far the farthest lies from it [m of the machine's frame]
+        sizes                least and largest scale that are looked at
+    """
 
     def __init__(self, presses: Presses, bundle: Bundle, told: Told) -> None:
-        some = np.unique(np.linspace(0, len(presses) - 1, min(len(presses), MOST_FOR_POSE)).astype(int))
-        self.presses = presses[some]
+        self.presses = presses[evenly(len(presses), MOST_FOR_POSE)]
         live = presses.measured
         self.fields, self.width = sensitivities(bundle, PRESS_BLUR)[live], half_width(bundle)
         y = self.presses.difference[:, live]
         self.y = y / np.maximum(np.sqrt((y**2).mean(axis=0)), 1e-30)
         xy = presses.xy
         self.centre = 0.5 * (xy.min(axis=0) + xy.max(axis=0))
-        self.radius = float(np.linalg.norm(xy - self.centre, axis=1).max())
+        self.radius = radius_of(xy)
         at = electrodes(bundle)
         self.circle = float(np.linalg.norm(at, axis=1).max())
         first = float(np.arctan2(at[0, 1], at[0, 0]))
@@ -104,12 +115,13 @@ class _Pose:
         self.told_angle = told.first_electrode
 
     def angles(self, mirrored: bool) -> Array:
-        """Where to start."""
+        """Angles [rad] to start at."""
         if self.told_angle is None:
             return np.asarray(np.radians(np.arange(0, 360, 10)), float)
         return np.array([self.told_angle + (self.first if mirrored else -self.first)])
 
     def of(self, p: Array, mirrored: bool) -> Similarity:
+        """The pose p as a similarity."""
         return Similarity(float(p[0]), float(np.exp(p[1])), np.asarray(p[2:]), mirrored)
 
     def left(self, similarity: Similarity, rows: NDArray[np.intp] | slice = slice(None)) -> Array:
@@ -120,7 +132,7 @@ class _Pose:
         return np.asarray(((y - gain * x) ** 2).mean(axis=1))
 
     def cost(self, p: Array, mirrored: bool, rows: NDArray[np.intp] | slice = slice(None)) -> float:
-        """With a wall where the size or the angle cannot be, or presses would lie outside the skin."""
+        """Mean of `left`, with a wall where the size or the angle cannot be, or presses would lie outside the skin."""
         similarity = self.of(p, mirrored)
         low, high = np.log(self.sizes)
         wall = max(0.0, low - p[1]) + max(0.0, p[1] - high)
@@ -132,9 +144,11 @@ class _Pose:
         return float(self.left(similarity, rows).mean() + 10.0 * wall)
 
     def start(self, angle: float) -> Array:
+        """p (4,) at an angle: of middling size, over the middle of the presses."""
         return np.array([angle, np.log(np.sqrt(self.sizes[0] * self.sizes[1])), *self.centre])
 
     def best(self, start: Array, mirrored: bool, steps: int, rows: NDArray[np.intp] | slice = slice(None)) -> Array:
+        """p (4,) of least cost near `start`."""
         reach = 0.06 * self.width * float(np.exp(start[1]))
         simplex = np.vstack([start, start + np.diag([0.1, 0.05, reach, reach])])
         found = optimize.minimize(
@@ -220,7 +234,9 @@ def _better_than_chance(pose: _Pose, starts: list[tuple[float, bool]]) -> None:
 
 
 def _widths(pose: _Pose, p: Array, way: bool) -> dict[str, float]:
-    """Standard uncertainties, by a jackknife over the presses: what the model is wrong by is in it."""
+    """Standard uncertainties of angle [rad], scale (relative) and offset [m], by a jackknife over the presses: what the
+    model is wrong by is in it.
+    """
     n = len(pose.presses)
     parts = np.random.default_rng(6).permutation(n) % min(PARTS, n)
     count = int(parts.max()) + 1

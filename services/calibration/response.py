@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.locator_arrays import matern
 from services.calibration.fields import half_width, sample, sensitivities
-from services.calibration.presses import Presses
+from services.calibration.presses import Presses, evenly, radius_of
 from services.calibration.registration import Similarity
 
 Array = NDArray[np.float64]
@@ -85,7 +85,7 @@ def fit(
     if not field:
         assumed = Smoothness(np.inf, 0.3, 1.0)
     elif assumed is None:
-        some = _some(len(presses))
+        some = evenly(len(presses), MOST_FOR_LENGTH)
         assumed = smoothness(y[some], presses.xy[some], presses.strength[some], f[some], presses.measured)
     alpha, left, _ = _posterior(y, presses.xy, presses.strength, f, assumed)
     return ResponseFit(
@@ -114,6 +114,7 @@ def covariance(left: Array) -> Array:
 
 
 def _drawn(left: Array, share: float) -> Array:
+    """(K, K) covariance of residuals (N, K), `share` of it their variances alone."""
     found = left.T @ left / len(left)
     own = np.maximum(np.diag(found), 1e-6 * float(np.diag(found).mean()) + 1e-30)
     return np.asarray((1 - share) * found + share * np.diag(own))
@@ -139,7 +140,11 @@ def fit_amplitudes(
 
 
 def smoothness(y: Array, xy: Array, strength: Array, f: Array, measured: NDArray[np.bool_]) -> Smoothness:
-    """The greatest marginal likelihood, each measurement with a variance of its own; first for a share of 1."""
+    """The assumptions of the greatest marginal likelihood, each measurement with a variance of its own; length and
+    noise for a share of 1 first, then the share.
+
+    y, f (N, K): differences and sensitivities at the presses, both of unit size; xy (N, 2) m; strength (N,).
+    """
     radius = radius_of(xy)
     y, f = y[:, measured], f[:, measured]
 
@@ -151,16 +156,11 @@ def smoothness(y: Array, xy: Array, strength: Array, f: Array, measured: NDArray
     return Smoothness(length, noise, share)
 
 
-def radius_of(xy: Array) -> float:
-    """From the middle of the presses to the farthest."""
-    return max(float(np.linalg.norm(xy - 0.5 * (xy.min(axis=0) + xy.max(axis=0)), axis=1).max()), 1e-9)
-
-
 def _posterior(y: Array, xy: Array, a: Array, f: Array, assumed: Smoothness) -> tuple[Array, Array, float]:
     """alpha (N, K), leave-one-out residuals (N, K), and the mean logarithm of the marginal likelihood.
 
-    The field's covariance is shared by all measurements; the sensitivities add one direction to each (Sherman and
-    Morrison).
+    y, f (N, K): as for `smoothness`; a (N,): strengths; xy (N, 2) m. The field's covariance is shared by all
+    measurements; the sensitivities add one direction to each (Sherman and Morrison).
     """
     n = len(xy)
     near = matern(xy, xy, assumed.length_m) if np.isfinite(assumed.length_m) else np.zeros((n, n))
@@ -174,8 +174,3 @@ def _posterior(y: Array, xy: Array, a: Array, f: Array, assumed: Smoothness) -> 
     variance = np.maximum((y * alpha).sum(axis=0) / n, 1e-12)
     logs = 0.5 * n * np.log(variance) + np.log(np.diag(lower)).sum() + 0.5 * np.log(s * assumed.share)
     return alpha, alpha / diagonal, -float(logs.mean())
-
-
-def _some(n: int) -> NDArray[np.intp]:
-    """At most MOST_FOR_LENGTH of n presses, evenly among them."""
-    return np.unique(np.linspace(0, n - 1, min(n, MOST_FOR_LENGTH)).astype(int))

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.text import Text
 
+from services.polygon import inside
+
 RAMP = ((16, 18, 32), (56, 24, 96), (150, 30, 90), (230, 90, 40), (255, 200, 60), (255, 255, 220))
 """Colours from no drop to the full one."""
 LETTERS = ".:-=+*#%@"
@@ -28,15 +30,6 @@ def coarse(image: NDArray[np.floating[Any]], cells: int) -> NDArray[np.floating[
     rows = np.array_split(np.arange(image.shape[0]), cells)
     columns = np.array_split(np.arange(image.shape[1]), cells)
     return np.array([[image[np.ix_(r, c)].max(initial=0.0) for c in columns] for r in rows])
-
-
-def inside(outline: Sequence[Sequence[float]], x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which points lie in a polygon (even-odd rule)."""
-    result = np.zeros(np.broadcast(x, y).shape, dtype=bool)
-    for (x1, y1), (x2, y2) in zip(outline, [*outline[1:], outline[0]], strict=True):
-        if y1 != y2:
-            result ^= ((y1 > y) != (y2 > y)) & (x < x1 + (y - y1) / (y2 - y1) * (x2 - x1))
-    return result
 
 
 def top_of_scale(image: NDArray[np.floating[Any]] | None) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from protocol.frames import SHAPES, Contact, ImageFrame, LocatedTouch, RefinedTouch
 from services.contacts.force import ForceLaw, Look
 from services.contacts.motion import Patch, Track
-from services.contacts.refined import agrees, refined
+from services.contacts.refined import agrees, refined, settled
 from services.contacts.registered import registered
 from services.contacts.segmentation import Segment
 from services.contacts.surface import Placed, Placement
@@ -59,8 +59,8 @@ class ContactWriter:
         force = self.law.of_fit(touch)
         if not agrees(contact, touch, force):
             return None
-        at = self.place(*touch.position)
-        return refined(contact, touch, at, force, _wrench(at, force.newton or 0.0), flat=self.place.flat)
+        at, said = self.place(*touch.position), settled(contact, touch, force)
+        return refined(contact, touch, at, said, _wrench(at, said[0].newton or 0.0), flat=self.place.flat)
 
     def ended(self, tracks: list[Track]) -> list[Contact]:
         """The last contacts of touches that ended: their last places, without force."""

@@ -8,10 +8,9 @@ after a start or after a pause, may have been there for long.
 
 The first touch begins at once, if its image is sure. A touch that appears beside others begins when a second sure image
 shows it too: if a touch comes or goes during a scan, that scan's image may show touches that are not there, and so may
-the next one. A faint one takes a third sure image. While an electrode is at fault, it takes four and must not be faint:
-what that contact does to other pairs comes and goes in the image. An image is sure if it explains its measurements, or
-if it is like the image before and explains all but a little: a strong touch at the edge leaves a twentieth for as long
-as it is held, a contact that rose with a touch a tenth and more.
+the next one. A faint one takes three, and so does any while an electrode is at fault. An image is sure if it explains
+its measurements, or if it is like the image before and explains all but a little: a strong touch at the edge leaves a
+twentieth for as long as it is held, a contact that rose with a touch a tenth and more.
 """
 
 from __future__ import annotations
@@ -30,13 +29,10 @@ UNSEEN_S = 0.25  # it ends after so long at the latest, however bad the images
 FORGOTTEN_S = 1.0  # after so long without a frame, nobody knows whether a touch is the same
 NEVER = 1e6  # cost of what is out of reach
 UNCONFIRMED = 0  # id of what was seen once, beside others
-LEAST_CONFIDENCE = 0.95  # with which a touch begins beside others: where the skin is nearly blind, as at an electrode
-# that is out, a strong touch elsewhere leaves patches of less
-FAINT_CONFIDENCE = 0.92  # the same, where FAINT_FRAMES sure images show it: a newton at the middle of the skin
-SURE_FRAMES, FAINT_FRAMES = 2, 3
-DOUBTED_FRAMES = (
-    4  # instead of SURE_FRAMES where an electrode is at fault: what its contact does to other pairs flickers
-)
+BELIEVED = ((2, 0.92), (3, 0.85))  # sure frames and confidence, of either, with which a touch begins beside others
+# The same while an electrode is at fault: what its contact does to other pairs comes and goes in the image, and where
+# the skin is nearly blind a strong touch elsewhere leaves patches of less.
+BELIEVED_DOUBTED = ((3, 0.95),)
 
 
 class Tracker:
@@ -236,9 +232,8 @@ class Tracker:
 
 def _believed(track: Track, well: bool) -> bool:
     """Whether what appears beside others is a touch. well: no electrode is at fault."""
-    if track.confidence >= LEAST_CONFIDENCE:
-        return track.sure_frames >= (SURE_FRAMES if well else DOUBTED_FRAMES)
-    return well and track.sure_frames >= FAINT_FRAMES and track.confidence >= FAINT_CONFIDENCE
+    enough = BELIEVED if well else BELIEVED_DOUBTED
+    return any(track.sure_frames >= frames and track.confidence >= least for frames, least in enough)
 
 
 def _new(number: int, seen: Patch, sample_ns: int, begins: bool = True, sure: bool = True) -> Track:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bench.accuracy.intervals import pixels, summary
 from bench.accuracy.odd_shapes import FLAT, HOLE, ODD, OddShape, random_odd
-from bench.accuracy.refined import gains, summary
+from bench.accuracy.refined import gains
 from models.forward import shared
+from models.shapes import Shape
 
 
 @pytest.mark.parametrize("kind, share", [("ellipse", FLAT), ("ring", 1 - HOLE**2), ("crescent", None)])
@@ -45,3 +47,12 @@ def test_touches_without_a_row_do_not_count() -> None:
     rows = [{"force %": 1.0, "force in 68 %": 100.0}, None, {"force %": 3.0, "force in 68 %": 0.0}]
     assert summary(rows, [0, 1, 2])["force in 68 %"][0] == 50.0
     assert summary([None], [0]) == {}
+
+
+def test_pixels_count_where_the_truth_is_within_what_the_image_states() -> None:
+    touch = Shape("circle", 0.0, 0.0, 0.4, 0.3)
+    truth, sigma = 0.3 * touch.fraction(96), np.full((96, 96), 0.01)
+    assert pixels(truth + 0.005, sigma, touch) == {"pixels in 68 %": 100.0, "pixels in 90 %": 100.0}
+    assert pixels(truth + 0.012, sigma, touch) == {"pixels in 68 %": 0.0, "pixels in 90 %": 100.0}
+    noisy = truth + 0.01 * np.random.default_rng(0).standard_normal(truth.shape)
+    assert pixels(noisy, sigma, touch)["pixels in 68 %"] == pytest.approx(68, abs=6)

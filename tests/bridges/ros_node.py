@@ -1,7 +1,8 @@
 """A genuine ROS 2 node (rclpy), run by the Python of a virtual environment that has ROS 2's packages: subscribes to all
-topics of a skin and prints a line of JSON for each message. A line `tare` on its input calls the service.
+topics of a skin, or to those that are named, and prints a line of JSON for each message. A line `tare` on its input
+calls the service.
 
-python ros_node.py /eitskin/palm
+python ros_node.py /eitskin/palm [wrench pressure ...]
 """
 
 import json
@@ -60,7 +61,7 @@ def say(**what):
 
 
 def main():
-    base = sys.argv[1]
+    base, named = sys.argv[1], sys.argv[2:]
     rclpy.init()
     node = rclpy.create_node("eitskin_listener")
     topics = {
@@ -73,16 +74,18 @@ def main():
         f"{base}/valid": (Bool, lambda m: m.data, 10),
         "/diagnostics": (DiagnosticArray, diagnostics, 10),
     }
+    if named:
+        topics = {f"{base}/{name}": topics[f"{base}/{name}"] for name in named}
 
     def subscribe(topic, kind, read, qos):
         def on_message(message):
-            now = time.time()
+            now, monotonic = time.time(), time.monotonic_ns()
             header = getattr(message, "header", None)
             if header is None and getattr(message, "markers", None):
                 header = message.markers[0].header
             stamp = None if header is None else header.stamp.sec + header.stamp.nanosec * 1e-9
             frame = None if header is None else header.frame_id
-            say(topic=topic, at=now, stamp=stamp, frame=frame, value=read(message))
+            say(topic=topic, at=now, monotonic_ns=monotonic, stamp=stamp, frame=frame, value=read(message))
 
         node.create_subscription(kind, topic, on_message, qos)
 

@@ -8,9 +8,10 @@ import numpy as np
 
 from protocol.frames import Contact, ContactFrame, InfoFrame, RawFrame, StatusFrame, TrueTouch, TruthFrame
 from protocol.runtime import host_id
-from services.cli.heatmap import LETTERS, coarse, draw, inside
+from services.cli.heatmap import LETTERS, coarse, draw
 from services.cli.monitor import Monitor, percentile
 from services.cli.truth import pairs
+from services.polygon import inside
 
 
 def raw(scan: int, age_s: float) -> RawFrame:

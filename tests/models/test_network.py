@@ -54,6 +54,15 @@ def test_a_disc_has_only_the_symmetries_its_electrodes_have():
     assert len(symmetries(skin.moved(np.r_[0.05, np.zeros(15)]))) == 1
 
 
+@pytest.mark.parametrize("skin", ["square16", "disc16"])
+def test_a_symmetry_maps_measurements_one_to_one_also_where_a_pattern_reads_each_twice(skin):
+    """The disc's pattern drives each pair of electrodes in both directions: a real skin's two readings differ."""
+    found = [symmetry.measurements for symmetry in symmetries(geometry.load(skin))]
+    np.testing.assert_array_equal(found[0], np.arange(len(found[0])))
+    for measurements in found:
+        np.testing.assert_array_equal(np.sort(measurements), np.arange(len(measurements)))
+
+
 def test_training_lowers_the_loss(trainer):
     first = np.mean([total_of(trainer.step(0.2)) for _ in range(3)])
     for _ in range(30):

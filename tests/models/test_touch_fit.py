@@ -60,6 +60,26 @@ def test_it_finds_the_touch_and_its_kind(response: TouchResponse, gram: Array, t
     assert (seen & truth).sum() / (seen | truth).sum() > 0.8
 
 
+def test_a_touch_too_small_to_tell_is_no_square(response: TouchResponse, gram: Array) -> None:
+    """Its rotation is as unknown as its kind: the kinds' evidence counts no rotation twice."""
+    touch, shares = Shape("circle", 0.1, 0.2, 0.1, 0.25), []
+    for seed in range(4):
+        d = frame(response, touch, seed)
+        found = TouchFit(response)(d, frame_errors(gram, SIGMA, d, 0.25), near(touch))
+        shares.append(found.classes)
+        assert found.between_kinds[1] > 0.1
+    assert np.mean(shares, axis=0) == pytest.approx([2 / 6, 1 / 6, 1 / 6, 1 / 6, 1 / 6], abs=0.15)
+
+
+def test_a_start_that_looks_unlikely_may_be_the_right_one(response: TouchResponse, gram: Array) -> None:
+    """What a rotation explains says little before size and drop fit it."""
+    touch = Shape("triangle", -0.128, -0.589, 0.356, 0.466, 0.8)
+    d, sigma = response.of(touch), np.full(120, 1e-6)
+    seen = Shape("circle", -0.142, -0.584, 0.249, 0.43)
+    found = TouchFit(response)(d, frame_errors(gram, sigma, d, seen.drop), seen)
+    assert found.fits[0].kind == "triangle" and found.fits_frame
+
+
 def test_a_known_radius_stays_and_makes_the_drop_sure(response: TouchResponse, gram: Array) -> None:
     touch = Shape("circle", -0.2, 0.3, 0.2, 0.3)
     d = frame(response, touch)

@@ -96,6 +96,22 @@ def test_the_verdict(iou, position, grade, says):
     assert found.to_dict()["grade"] == grade
 
 
+@pytest.mark.parametrize(
+    ("iou", "position", "grade"),
+    [
+        (0.60, 1.0, "usable"),
+        (0.60, 1.2, "usable"),
+        (0.51, 1.0, "too little"),  # its touches are hardly better outlined
+        (0.60, 2.5, "too little"),  # and farther from where they are
+    ],
+)
+def test_the_network_of_a_registered_skin_must_be_better_than_no_network(iou, position, grade):
+    without = {"contact IoU": 0.48, "position % of side": 1.19}
+    found = verdict.judge_registered(held_out(iou, position), batches=1000, minutes=9.0, single_step=without)
+    assert found.grade == grade and found.text.startswith(grade)
+    assert "the one-step image: 0.48" in found.text and "(1.19 %)" in found.text
+
+
 @pytest.fixture(scope="module")
 def scenes(drawn):
     return drawn(48, seed=0, n=1)
@@ -104,7 +120,7 @@ def scenes(drawn):
 def test_what_there_is_without_a_network(scenes):
     """README's table has 0.594 of NOSER's contact IoU, on frames of another mesh."""
     found = verdict.one_step(scenes, Bundle.load("square16").prereconstructor())
-    assert 0.45 < found < 0.8
+    assert 0.45 < found["contact IoU"] < 0.8 and 0.2 < found["position % of side"] < 2.0
 
 
 def test_the_floor_of_position_falls_with_the_noise(scenes):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models import build, data, manifest, warped
+from models import build, data, manifest, verdict, warped
 from models.bundle import Bundle, write
 from models.forward import ForwardModel
 from models.geometry import GeometryError, load
@@ -21,7 +22,7 @@ from protocol.frames import DeltaFrame, ImageFrame
 from services.calibration.register_command import register_presses
 from services.calibration.registration import Similarity
 from services.inference import Inference
-from services.networks import Network
+from services.networks import Network, OneStep
 from services.runtime.config import Skin
 from tests.cli.test_registration import presses_of
 
@@ -136,22 +137,30 @@ def test_shapes_are_stated_only_where_they_were_told_apart(
 
 
 @pytest.mark.slow
-def test_a_registered_bundle_gets_a_network(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("grade", ["usable", "too little"])
+def test_a_registered_bundle_gets_a_network_where_that_is_better_than_none(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], grade: str
+) -> None:
     """By the command, in its shortest form; the services then run it, and the locator says where, as before."""
     monkeypatch.setattr(build, "VALID", 16)
     monkeypatch.setattr(build.Plan, "of", staticmethod(lambda minutes: build.Plan(16, 0.7 * minutes, 0.0)))
     monkeypatch.setattr(build, "make_scenes", _few)
+    monkeypatch.setattr(verdict, "BETTER", -1.0 if grade == "usable" else 1.0)
+    monkeypatch.setattr(verdict, "FARTHER", 1e9)
     out, before = tmp_path / "trained", Bundle.load(folder)
-    build.main(
-        ["--skin", str(folder), "--out", str(out), "--work", str(tmp_path / "work"), "--minutes", "0.02", "--jobs", "1"]
-    )
+    shutil.copytree(folder, out)
+    build.main(["--skin", str(out), "--work", str(tmp_path / "work"), "--minutes", "0.02", "--jobs", "1"])
     made = Bundle.load(out)
-    assert made.network_path("full") is not None and made.locator is not None
+    assert f"verdict: {grade}" in capsys.readouterr().out and made.locator is not None
+    stage = Inference("own", Skin(port="stub", bundle=str(out)), made)
+    assert stage._locator is not None
+    if grade == "too little":
+        assert made.hash == before.hash and isinstance(stage._network, OneStep)
+        return
+    assert made.network_path("full") is not None and isinstance(stage._network, Network)
     assert made.hash != before.hash and made.manifest["trained"]["from"] == before.hash
     assert made.manifest["registration"] == before.manifest["registration"] and "warped" in made.manifest
-    assert made.manifest["network"]["full"]["verdict"]["grade"] in ("usable", "too little")
-    stage = Inference("own", Skin(port="stub", bundle=str(out)), made)
-    assert isinstance(stage._network, Network) and stage._locator is not None
+    assert made.manifest["network"]["full"]["verdict"]["grade"] == grade
 
 
 def _few(skin: str, work: Path, *_: object) -> None:

@@ -17,7 +17,7 @@ from models.shapes import Shape
 from models.touch_response import TouchResponse
 from protocol.frames import Contact, RefinedTouch
 from services.contacts.force import Force
-from services.contacts.refined import agrees, both, refined_outline
+from services.contacts.refined import agrees, both, refined_outline, settled
 from services.describe import refinement
 from services.pipeline import Result
 from services.refinement import RefineHere, RefineProcess
@@ -266,8 +266,20 @@ def test_a_fit_counts_where_it_and_the_image_mean_the_same_touch(
     assert agrees(CONTACT, touch, Force(newton, 0.1)) == same
 
 
+def test_where_the_kinds_differ_the_image_has_a_say() -> None:
+    agreed = settled(CONTACT, TOUCH, Force(3.2, 0.1))
+    assert agreed == (Force(3.2, 0.1), TOUCH.area_m2, TOUCH.area_sigma_m2)
+    force, area, sigma = settled(CONTACT, replace(TOUCH, between_kinds=[0.2, 0.2]), Force(3.2, 0.1))
+    assert force.newton == pytest.approx((3.0 * 3.2) ** 0.5) and area == CONTACT.area_m2
+    assert sigma == pytest.approx(np.hypot(1e-5, 1e-5))
+    without = settled(replace(CONTACT, force_n=None), replace(TOUCH, between_kinds=[0.2, 0.0]), Force(None, None))
+    assert without[0] == Force(None, None)
+
+
 def test_the_shape_is_what_fit_and_network_say_together() -> None:
-    assert both([0.5, 0.5, 0.0, 0.0, 0.0], [0.1, 0.9, 0.0, 0.0, 0.0]) == pytest.approx([0.25, 0.75, 0.0, 0.0, 0.0])
+    first = 1 / (1 + 9**0.25)  # the network has a quarter
+    said = both([0.5, 0.5, 0.0, 0.0, 0.0], [0.1, 0.9, 0.0, 0.0, 0.0])
+    assert said == pytest.approx([first, 1 - first, 0.0, 0.0, 0.0])
     assert both([0.5, 0.5, 0.0, 0.0, 0.0], []) == [0.5, 0.5, 0.0, 0.0, 0.0]
     assert both([1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]) == [1.0, 0.0, 0.0, 0.0, 0.0]
 
