@@ -43,6 +43,7 @@ SLOW_SIGMAS = 2.0  # standard deviations of its velocity, below which a touch ma
 AS_WELL = 1.05  # times what a whole scan leaves of a touch that moves: one that holds still does as well
 SETTLED = 1.0  # chi-square per value of a whole scan, up to which its touch did not change: 0.1 to 0.7 where it did not
 FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
+MOST = 4  # touches that are followed
 LONGEST_US = 2e5  # without a part: nothing is known of what happened meanwhile
 REMEMBERED = 8  # whole scans of a touch that is held, whose mean it is compared with
 KEPT = 12  # parts whose states are kept: those of a whole scan
@@ -174,7 +175,7 @@ class PartFilter:
         for k in np.unique(nearest):
             rows = np.flatnonzero(nearest == k)
             change[rows] = now[rows] - self._model(self._past[k][1], rows, 1e-6 * (measured[rows] - then[k]))[0]
-        still, moving = self._misfit(d, noise, self.touches), self._misfit(d + change, noise, self.touches)
+        still, moving = (self._fitted(each, noise, self.touches)[1] for each in (d, d + change))
         self._as_still = 0 if still > moving else self._as_still + 1
         if moving > FITS or self._as_still > 1 or (self._slow() and still <= AS_WELL * moving):
             self.forget()
@@ -182,23 +183,25 @@ class PartFilter:
 
     def settled(self, d: Array, noise: Array, seen: PartTouch) -> bool:
         """Whether a touch that did not change explains a whole scan. seen: it, as the newest parts have it."""
-        return self._misfit(d, noise, _touches([seen])) <= SETTLED
+        return self._fitted(d, noise, _touches([seen]))[1] <= SETTLED
 
-    def _misfit(self, d: Array, noise: Array, around: Array) -> float:
-        """Chi-square per value of a whole scan that touches of about these places leave, if they hold still."""
+    def _fitted(self, d: Array, noise: Array, around: Array, steps: int = 2) -> tuple[Array, float]:
+        """The touches of about these places that explain a whole scan best, if they hold still, and the chi-square per
+        value that they leave.
+        """
         touches, tau = around.copy(), np.zeros(len(d))
-        variance = noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean())
-        for _ in range(2):
+        touches[:, MODEL:] = 0.0
+        width = np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean()))
+        columns = [6 * k + n for k in range(len(touches)) for n in range(MODEL)]
+        damping = np.diag(np.tile((5 * KNOWN[:MODEL]) ** -2.0, len(touches)))
+        for _ in range(steps):
             expected, slope = self._model(touches, self._all, tau)
-            slope = (
-                slope[:, [6 * k + n for k in range(len(touches)) for n in range(MODEL)]] / np.sqrt(variance)[:, None]
-            )
-            damped = slope.T @ slope + np.diag(np.tile(KNOWN[:MODEL] ** -2 / 25, len(touches)))
-            step = np.linalg.solve(damped, slope.T @ ((d - expected) / np.sqrt(variance)))
+            slope = slope[:, columns] / width[:, None]
+            step = np.linalg.solve(slope.T @ slope + damping, slope.T @ ((d - expected) / width))
             touches[:, :MODEL] += step.reshape(-1, MODEL)
             touches = self._possible(touches.ravel()).reshape(-1, 6)
-        left = d - self._model(touches, self._all, tau)[0]
-        return float((left**2 / variance).mean())
+        left = (d - self._model(touches, self._all, tau)[0]) / width
+        return touches, float((left**2).mean())
 
     def states(self) -> list[FollowedState]:
         """The touches, as the newest part has them."""
@@ -213,10 +216,15 @@ class PartFilter:
 
     def _begin(self, d: Array, noise: Array) -> None:
         """Fit the touches to a whole scan."""
-        before, one = self.touches, self._image.fit(d, noise)
-        self.touches, self._placed = _touches([one]), _covariances([one])
-        if not one.fits or self._misfit(d, noise, self.touches) > FITS:
-            self.touches, self._placed = _touches([]), _covariances([])
+        before, found = self.touches, [self._image.fit(d, noise)]
+        touches, misfit = self._fitted(d, noise, _touches(found))
+        while misfit > FITS and len(found) < MOST:  # another one, where what is left of d is largest
+            left = d - self._model(touches, self._all, np.zeros(len(d)))[0]
+            found.append(self._image.fit(left, noise))
+            touches, misfit = self._fitted(d, noise, np.concatenate([touches, _touches(found[-1:])]), steps=8)
+        if misfit > FITS or not _apart(touches):
+            touches, found = _touches([]), []
+        self.touches, self._placed = touches, _covariances(found)
         if len(before) != len(self.touches) or (np.hypot(*(self.touches - before).T[:2]) > NEAR).any():
             self.number += 1
 
@@ -332,6 +340,13 @@ class PartFilter:
             self._reference, self._noise = shaped(d, self._all.shape), shaped(noise, self._all.shape)
             self._there, self._scans = shaped(there, (count, 6)), int(scans)
             self._refer()
+
+
+def _apart(touches: Array) -> bool:
+    """Whether no touch lies within another: two that grow into each other are not told apart."""
+    away = np.hypot(*(touches[:, None, :RADIUS] - touches[None, :, :RADIUS]).transpose(2, 0, 1))
+    reach = np.exp(touches[:, RADIUS])
+    return bool((away + 1e9 * np.eye(len(touches)) > np.maximum(reach[:, None], reach)).all())
 
 
 def _touches(found: Sequence[PartTouch]) -> Array:

@@ -125,6 +125,29 @@ def test_another_touch_is_not_explained_and_nothing_is_said_until_a_whole_scan(b
     assert follower.knows
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_several_touches_are_followed_while_one_of_them_slides(bundle, count):
+    places = [(-0.5, -0.4), (0.5, 0.5), (-0.3, 0.6)][:count]
+
+    def first(t):
+        return places[0][0] + 2.0 * np.clip(t - 0.111, 0, None), places[0][1], 0.2, 0.25
+
+    skins = [Skin(bundle, first)] + [Skin(bundle, lambda t, at=at: (*at, 0.2, 0.25), seed=1) for at in places[1:]]
+    follower, errors, others = PartFilter(bundle), [], []
+    for k in range(75):
+        made = [skin.values(1 + k % 10) for skin in skins]
+        d, (_, age, now) = sum(each[0] for each in made), made[0]
+        assert k == 0 or follower.part(d, 2 * NOISE, age, now)
+        if k % 10 == 0:
+            follower.whole(d + follower.at_once(d, 2 * NOISE, age), 2 * NOISE, now, shown=not follower.knows)
+        assert len(follower.states()) == count
+        t = 1e-6 * (now - PART_US / 2)
+        apart = [min(np.hypot(s.x - x, s.y - y) for s in follower.states()) for x, y in (first(t)[:2], *places[1:])]
+        errors, others = errors + [apart[0]], others + apart[1:]
+    assert np.median(errors) < 0.02 and max(errors) < 0.08
+    assert max(others) < 0.06
+
+
 def test_its_state_goes_with_a_recording(bundle):
     def at(t):
         return -0.3 + 2.0 * np.clip(t - 0.08, 0, None), 0.2, 0.2, 0.2
