@@ -104,6 +104,14 @@ class TouchResponse:
         """Cells for touches of about this place and circumscribed radius."""
         return TouchGrid(self.tables, self._free, x, y, MARGIN * radius, self.cells)
 
+    def room(self, shape: Shape) -> float:
+        """From the shape's circle to the skin's outline, to about a pixel of `inside`; 0 where it reaches it."""
+        n = self.tables.inside.shape[0]
+        off = np.argwhere(~np.pad(self.tables.inside, 1))
+        y, x = (-1 + 2 * (off - 0.5) / n).T
+        nearest = float(np.hypot(x - shape.x, y - shape.y).min())
+        return float(max(0.0, nearest - 1 / n - shape.radius))
+
     def __call__(
         self, grid: TouchGrid, drop: Array, slope_at: npt.NDArray[np.integer] | None = None
     ) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,11 @@ from models.forward import shared
 from models.shapes import Array, Shape
 from models.turns import TURNS, Turn
 
+ONE = TURNS[:1]  # as it is
 RADIUS, DROP = 0.2, 0.15  # of the paper's touch for the LDCI
 
 
-def pictures(network: Any, made: tuple[Any, Any, float], turns: Sequence[Turn] = TURNS[:1]) -> list[Array]:
+def pictures(network: Any, made: tuple[Any, Any, float], turns: Sequence[Turn] = ONE) -> list[Array]:
     """Drop and its standard deviation (n, n), class probabilities (5, h, w). made: what `Operator.stack` gives."""
     stack, context, scale = made
     each = []
@@ -31,14 +32,22 @@ def pictures(network: Any, made: tuple[Any, Any, float], turns: Sequence[Turn] =
     return [np.mean(parts, axis=0) for parts in zip(*each, strict=True)]
 
 
-def ldci(network: Any, bundle: Bundle, mesh: str, sigma: Array) -> dict[str, float]:
-    """Noise-free: of the image, and of the mean over the symmetries. Every one of the 49 places is solved."""
+def ldci(
+    network: Any, bundle: Bundle, mesh: str, sigma: Array, refined: dict[str, Callable[[Array, Array], float]]
+) -> dict[str, float]:
+    """Noise-free: of the image, of the mean over the symmetries, and of the drop that each of `refined` makes of
+    difference and image. Every one of the 49 places is solved.
+    """
     model, operator = shared(bundle.name, mesh), bundle.prereconstructor().condition(sigma)
     z0 = np.abs(model.solve().impedances())
-    peaks: dict[str, list[float]] = {"network": [], "symmetry": []}
+    peaks: dict[str, list[float]] = {name: [] for name in ("network", "symmetry", *refined)}
     for x, y in metrics.ldci_positions():
         touched = model.touched([Shape("circle", float(x), float(y), RADIUS, DROP)])
-        made = operator.stack(np.abs(model.solve(touched).impedances()) / z0 - 1)
-        for name, turns in (("network", TURNS[:1]), ("symmetry", TURNS)):
-            peaks[name].append(float(pictures(network, made, turns)[0].max()))
+        d = np.abs(model.solve(touched).impedances()) / z0 - 1
+        made = operator.stack(d)
+        images = {name: pictures(network, made, turns)[0] for name, turns in (("network", ONE), ("symmetry", TURNS))}
+        for name, image in images.items():
+            peaks[name].append(float(image.max()))
+        for name, fitted in refined.items():
+            peaks[name].append(fitted(d, images["network"]))
     return {name: metrics.ldci(found) for name, found in peaks.items()}

@@ -3,9 +3,10 @@
     skin bench skip [--seconds 20] [--live 15]
 
 Part one runs the stages in one process, every frame packed and unpacked between them as on the wire, on three scenes
-of the stub in simulated time; variants take turns; a touch held still is met again and again. Part two brings up the
-real processes and reads their CPU time while the skin is untouched, touched and still, touched and moving. Prints
-tables, writes skip.json.
+of the stub in simulated time; variants take turns; a touch held still is met again and again; a moving touch's frames
+go through the stages with and without refinement and symmetry in turn, at a board's pace. Part two brings up the real
+processes and reads their CPU time while the skin is untouched, touched and still, touched and moving. Prints tables,
+writes skip.json.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from bench.machine import machine, provenance
 from bench.speed.service import BEGIN, Outside, end_on_sigterm, running
 from bench.speed.skip_averaging import SNR_DB, averaging
 from bench.speed.skip_batching import TOGETHER, batch_table, batched
+from bench.speed.skip_beside import beside, ratios, table_of
 from bench.tracking.scene import Recorded, record
 from models.bundle import Bundle
 from models.refine import RefineJob
@@ -221,15 +223,27 @@ def main(argv: list[str] | None = None) -> int:
     end_on_sigterm()
     bundle, recorded = Bundle.load("square16"), scenes(args.seconds)
     variants, held = stages_alone(args.seconds), averaging(recorded["still"], bundle)
+    switches = beside(recorded["moving"], bundle, QUIET_S)
     batches, processes = batched(recorded["moving"], bundle), live(args.live)
     console = Console(width=140)
-    for table in (_variants_table(variants), _held_table(held), batch_table(batches), _live_table(processes)):
+    for table in (
+        _variants_table(variants),
+        _held_table(held),
+        table_of(switches),
+        batch_table(batches),
+        _live_table(processes),
+    ):
         console.print(table)
     wanted = goals(variants, held, batches, processes)
+    wanted += [
+        Goal(f"moving: p99 of the newest frame, {name}, of neither", ratio, at_most=1.05, gate=3.0)
+        for name, ratio in ratios(switches).items()
+    ]
     console.print(_goals.table(wanted))
     report = {**provenance("skip", argv), "targets": [goal.to_dict() for goal in wanted]}
     write_json(
-        args.out / "skip.json", report | {"stages": variants, "held": held, "batched": batches, "live": processes}
+        args.out / "skip.json",
+        report | {"stages": variants, "held": held, "switches": switches, "batched": batches, "live": processes},
     )
     print(f"wrote {args.out / 'skip.json'}")
     return 0

@@ -8,7 +8,7 @@ after a start or after a pause, may have been there for long.
 
 The first touch begins at once, if its image is sure. A touch that appears beside others begins when a second sure image
 shows it too: if a touch comes or goes during a scan, that scan's image may show touches that are not there, and so may
-the next one. A faint one takes three, and so does any while an electrode is at fault. An image is sure if it explains
+the next one. A faint one takes three, and none begins while an electrode is at fault. An image is sure if it explains
 its measurements, or if it is like the image before and explains all but a little: a strong touch at the edge leaves a
 twentieth for as long as it is held, a contact that rose with a touch a tenth and more.
 """
@@ -30,9 +30,8 @@ FORGOTTEN_S = 1.0  # after so long without a frame, nobody knows whether a touch
 NEVER = 1e6  # cost of what is out of reach
 UNCONFIRMED = 0  # id of what was seen once, beside others
 BELIEVED = ((2, 0.92), (3, 0.85))  # sure frames and confidence, of either, with which a touch begins beside others
-# The same while an electrode is at fault: what its contact does to other pairs comes and goes in the image, and where
-# the skin is nearly blind a strong touch elsewhere leaves patches of less.
-BELIEVED_DOUBTED = ((3, 0.95),)
+# The same while an electrode is at fault: a strong touch leaves faint patches where the skin is then nearly blind.
+BELIEVED_DOUBTED = ((2, 0.95),)
 
 
 class Tracker:

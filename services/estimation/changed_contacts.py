@@ -18,6 +18,7 @@ Array = NDArray[np.floating]
 
 LOOK_BACK = 3  # frames over which a contact that rises under a touch is told from it
 LOOK_FAR_BACK = 24  # the same, where it rises slowly
+ALIKE = 0.3  # of what is felt: two frames that differ by less say the same
 
 
 class ChangedContacts:
@@ -34,6 +35,7 @@ class ChangedContacts:
 
     def reset(self) -> None:
         self.felt: dict[int, Array] = {}  # by changed contact: (K,) relative, on pairs of other electrodes
+        self._proposed: dict[int, Array] = {}  # the same, as the evidence of the last frame that was asked has it
         self._before: dict[int, Array] = {}  # by contact that rose under a touch: |Z| (K,) from before
         self._past: deque[Array] = deque(maxlen=LOOK_FAR_BACK)  # |Z| (K,) of the frames before, the newest last
         self._second = PastFrames(self._k)
@@ -97,10 +99,19 @@ class ChangedContacts:
         """Returns |Z| (K,) of the touch under which the contact of electrode k rose."""
         return self._before.get(k)
 
+    def propose(self, k: int, felt: Array) -> None:
+        """Takes what the evidence of one frame says that electrode k's contact does to other pairs (K,): at once where
+        nothing is known, else when two frames in a row say so. In a frame in which a touch begins it says anything.
+        """
+        last, self._proposed[k] = self._proposed.get(k), felt
+        again = last is not None and np.linalg.norm(felt - last) <= ALIKE * np.linalg.norm(felt)
+        if again or k not in self.felt:
+            self.felt[k] = felt
+
     def forget(self, k: int) -> None:
         """Drops what is kept of electrode k: its contact is what it was."""
-        self.felt.pop(k, None)
-        self._before.pop(k, None)
+        for kept in (self.felt, self._proposed, self._before):
+            kept.pop(k, None)
 
     def keep(self, drifting: Sequence[int], like: Callable[[int, Array], bool] = lambda k, past: True) -> None:
         """Forgets all others. like: whether the measurements of electrode k are what they were in a past |Z| (K,)."""
@@ -108,6 +119,7 @@ class ChangedContacts:
             if k not in self._before and len(self._past) >= LOOK_BACK and not like(k, self._past[-LOOK_BACK]):
                 self._before[k] = self._past[-LOOK_BACK]  # a contact that drifts slowly was not well then either
         self.felt = {k: felt for k, felt in self.felt.items() if k in drifting}
+        self._proposed = {k: felt for k, felt in self._proposed.items() if k in drifting}
         self._before = {k: before for k, before in self._before.items() if k in drifting}
 
     def shift(self, drifting: Sequence[int], amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Array:
@@ -126,14 +138,16 @@ class ChangedContacts:
         return np.asarray(untouched.normaliser * np.sum([*self.felt.values(), np.zeros(self._k)], axis=0))
 
     def state(self) -> dict[str, Any]:
-        felt, before = ([[k, list(row)] for k, row in rows.items()] for rows in (self.felt, self._before))
-        return {"felt": felt, "before": before, "past": np.array(self._past), "second": self._second.state()}
+        kept = {"felt": self.felt, "proposed": self._proposed, "before": self._before}
+        rows = {name: [[k, list(row)] for k, row in of.items()] for name, of in kept.items()}
+        return {**rows, "past": np.array(self._past), "second": self._second.state()}
 
     def load(self, state: dict[str, Any]) -> None:
         """Older recordings lack some. Raises ValueError where it does not fit."""
         self.reset()
         shape = (self._k,)
         self.felt = {int(k): shaped(row, shape) for k, row in state.get("felt", [])}
+        self._proposed = {int(k): shaped(row, shape) for k, row in state.get("proposed", [])}
         self._before = {int(k): shaped(row, shape, finite=False) for k, row in state.get("before", [])}
         self._past.extend(shaped(row, shape, finite=False) for row in state.get("past", []))
         if "second" in state:

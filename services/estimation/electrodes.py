@@ -221,7 +221,7 @@ class ElectrodeHealth:
         if opinion is not None and opinion.changed():
             self._states[k], self._well[k] = DRIFTING, 0
             self._doubts.asked(k)
-            self._contacts.felt[k] = opinion.felt
+            self._contacts.propose(k, opinion.felt)
 
     def _look_again(self, k: int, seen: FrameFindings, untouched: Reference | None) -> None:
         """Looks at an electrode at fault whose fault this frame does not show by itself."""
@@ -237,7 +237,7 @@ class ElectrodeHealth:
             drifts = self._doubts.known_to_drift(k)
             if self._states[k] == DRIFTING and (opinion.changed() or (drifts and opinion.elsewhere)):
                 self._doubts.sure(k)
-                self._contacts.felt[k] = opinion.felt
+                self._contacts.propose(k, opinion.felt)
         if self._well[k] >= WELL_FRAMES and not self._doubts.moves(k, self._now_s):
             self._states[k] = OK
             self._doubts.well(k)

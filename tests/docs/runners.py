@@ -64,6 +64,7 @@ COMMANDS = (
         says="^[0-9]+ [0-9]+ /tmp/",
         instead="{line} && echo $EITSKIN_UID $EITSKIN_GID $EITSKIN_RUNTIME",
     ),
+    Row("make ros-venv", "ends", says="rclpy", instead="make -n -B ros-venv"),
     Row(r"make venv EXTRAS=(ros2|foxglove)", "ci", says="make venv EXTRAS=ros2,foxglove"),
     Row(r"docker compose --profile (ros2|foxglove) up", "ci", says=r"--profile ros2 --profile foxglove up"),
     Row(

@@ -33,7 +33,7 @@ SHORTER = {
     "make train SKIN=my-registered MINUTES=10": "",
 }
 TRAINED = {
-    "make train SKIN=my-skin QUICK=1": ".venv/bin/python -m models.build --skin my-skin --minutes 3",
+    "make train SKIN=my-skin QUICK=1": ".venv/bin/python -m models.build --skin my-skin --minutes 4",
     "make train SKIN=my-registered MINUTES=10": ".venv/bin/python -m models.build --skin my-registered --minutes 1",
 }
 

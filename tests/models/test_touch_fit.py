@@ -100,6 +100,23 @@ def test_the_stated_uncertainty_is_that_of_the_errors(response: TouchResponse, g
     assert 0.5 < np.mean(ratios) < 1.8  # six standard errors about 1 would be -0.5 to 2.5
 
 
+def test_without_noise_a_place_is_surer_in_the_middle_than_by_the_edge(
+    response: TouchResponse, gram: Array, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As far as the response's error is what is left: that is larger by the edge."""
+
+    def spread(x: float) -> float:
+        touch, sigma = Shape("circle", x, 0.1, 0.25, 0.3), np.full(120, 1e-6)
+        d = response.of(touch)
+        found = TouchFit(response)(d, frame_errors(gram, sigma, d, 0.3), near(touch), ("circle",))
+        return float(np.sqrt(np.trace(found.position_covariance)))
+
+    surer = [spread(x) for x in (0.1, 0.74)]
+    monkeypatch.setattr("models.touch_fit.PLACE_SURER", 1.0)
+    middle, edge = (found / spread(x) for found, x in zip(surer, (0.1, 0.74), strict=True))
+    assert middle < 0.85 < edge <= 1.0
+
+
 def test_what_no_touch_explains_is_said(response: TouchResponse, gram: Array) -> None:
     d = frame(response, Shape("circle", 0.4, 0.4, 0.2, 0.4)) + frame(response, Shape("circle", -0.5, -0.4, 0.2, 0.4))
     found = TouchFit(response)(d, frame_errors(gram, SIGMA, d, 0.3), Shape("circle", 0.4, 0.4, 0.25, 0.4), ("circle",))

@@ -61,6 +61,11 @@ def test_far_squares_are_points() -> None:
     assert _infinite_sheet(n)[:, :, int(y) * n + int(x), 0] == pytest.approx(point, rel=2e-3, abs=1e-6)
 
 
+def test_the_room_beside_a_touch_is_to_the_outline(response: TouchResponse) -> None:
+    assert response.room(Shape("circle", 0.2, -0.1, 0.3, 0.3)) == pytest.approx(0.5, abs=0.07)
+    assert response.room(Shape("circle", 0.7, 0.0, 0.3, 0.3)) == pytest.approx(0.0, abs=0.07)
+
+
 def test_the_derivative_is_that_of_the_response(response: TouchResponse) -> None:
     touch = TOUCHES[0]
     grid = response.grid(touch.x, touch.y, touch.radius)

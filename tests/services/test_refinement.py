@@ -22,7 +22,7 @@ from services.describe import refinement
 from services.pipeline import Result
 from services.refinement import RefineHere, RefineProcess
 from services.runtime.config import ConfigError, Indenter, Skin, parse
-from tests.services.stub_skin import StubSkin
+from tests.services.stub_skin import StubSkin, transfer
 
 UNIT = 0.05  # metres
 FORCE, SHAPE = frozenset({"contact", "force", "shape"}), ("contact", "force", "shape")
@@ -134,6 +134,53 @@ def test_a_moving_touch_takes_its_answer_along_as_far_as_it_explains_the_frames(
     assert not the_contact(found).refined and not fits.jobs[-1].before
 
 
+class SlowFits(RefineHere):
+    """A fit takes five frames' time, and one that begins at an earlier one takes one. The newest job waits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._runs: tuple[RefineJob, int] | None = None
+        self._waits: RefineJob | None = None
+
+    def offer(self, job: RefineJob) -> None:
+        self.skipped["palm"] = self.skipped.get("palm", 0) + (self._waits is not None)
+        self._waits = job
+        self._next()
+
+    def _next(self) -> None:
+        if self._runs is None and self._waits is not None:
+            self._runs, self._waits = (self._waits, 1 if self._waits.before else 5), None
+
+    def a_frame_later(self) -> None:
+        if self._runs is None:
+            return
+        job, left = self._runs
+        self._runs = job, left - 1
+        if left == 1:
+            super().offer(job)
+            self._runs = None
+            self._next()
+
+
+def test_a_slide_is_refined_as_far_as_there_is_time_and_what_is_skipped_is_counted() -> None:
+    """At 20 mm/s a touch is elsewhere when a fit from nothing is done: the next one begins where that ended."""
+    stub, fits = StubSkin(80.0, skin=configured()), SlowFits()
+    stub.pipeline.inference.fit_by(fits)
+    refined, off, step = 0, [], 0.020 / 22 / UNIT
+    for k in range(24):
+        there = replace(CIRCLE, x=0.5 - k * step)
+        start, end = (transfer((replace(there, x=there.x + half * step),)) for half in (0.5, -0.5))
+        found = stub.see(start, end)
+        fits.a_frame_later()
+        contact = the_contact(found)
+        if contact.refined:
+            refined += 1
+            off.append(np.hypot(*(np.array(contact.position[:2]) - UNIT * there.centroid)))
+    assert refined >= 10 and np.median(off) < 5e-4
+    counters = stub.pipeline.inference.health().counters
+    assert counters["refine_skipped"] > 0 and counters["refine_fits"] > 8
+
+
 def test_an_answer_of_a_touch_that_is_gone_is_dropped() -> None:
     stub, fits = StubSkin(80.0, skin=configured()), LateFits()
     stub.pipeline.inference.fit_by(fits)
@@ -187,6 +234,14 @@ def test_the_process_fits_the_newest_of_each_skin_and_counts_the_others(process:
     assert found.number == 4 and found.problem == "" and found.posterior is not None
     assert found.posterior.position == pytest.approx(CIRCLE.centroid, abs=0.01) and not found.live[7]
     assert answered(process, "sole").number == 5
+
+
+def test_a_job_that_knows_the_answer_goes_before_one_that_did_not(process: RefineProcess, bundle: Bundle) -> None:
+    process.offer(job(bundle, 1))
+    process.offer(job(bundle, 2))  # made while the first is fitted
+    assert answered(process).number == 1
+    process.offer(job(bundle, 3))
+    assert answered(process).number == 3 and process.skipped == {"palm": 1}
 
 
 def test_a_process_that_dies_is_started_again_and_said(

@@ -159,7 +159,7 @@ def test_frames_that_show_the_same_do_not_count_as_lost_ones() -> None:
 
 @pytest.mark.parametrize(
     ("confidence", "well", "begins"),
-    [(0.93, True, 2), (0.9, True, 3), (0.8, True, 0), (0.98, False, 3), (0.93, False, 0)],
+    [(0.93, True, 2), (0.9, True, 3), (0.8, True, 0), (0.98, False, 2), (0.93, False, 0)],
 )
 def test_what_appears_beside_others_begins_later_if_faint(confidence: float, well: bool, begins: int) -> None:
     tracker = Tracker()

@@ -1,0 +1,49 @@
+"""What a changed contact does to other pairs, as it is kept from frame to frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from models.bundle import Bundle
+from models.shapes import Shape
+from services.estimation.changed_contacts import ChangedContacts
+from services.estimation.contact_doubts import ASK_EVERY
+from tests.services.stub_skin import StubSkin, transfer
+
+
+def test_one_frame_alone_does_not_change_what_is_known(bundle: Bundle) -> None:
+    members = np.zeros((16, 120), dtype=bool)
+    contacts, known, other = ChangedContacts(bundle, members), np.full(120, 2e-3), np.full(120, 2e-2)
+    contacts.propose(9, known)
+    assert (contacts.felt[9] == known).all()  # nothing was known
+    contacts.propose(9, other)  # a touch begins in this frame
+    assert (contacts.felt[9] == known).all()
+    contacts.propose(9, known)
+    contacts.propose(9, 1.1 * known)  # it drifts on
+    assert (contacts.felt[9] == 1.1 * known).all()
+    contacts.load(contacts.state())
+    contacts.propose(9, known)
+    assert (contacts.felt[9] == known).all()
+
+
+@pytest.mark.parametrize("waited", range(20, 20 + ASK_EVERY))
+def test_two_touches_that_begin_beside_a_changed_contact_are_two(waited: int) -> None:
+    """Their first frames, in which they rise within the scan, say nothing of the contact."""
+    stub, changed = StubSkin(80.0), ((9, 1.38),)
+    touches = (Shape("circle", -0.72, 0.72, 0.2, 0.333), Shape("circle", -0.08, -0.78, 0.2, 0.236))
+    assert stub.rest(3).contact.valid
+    for _ in range(waited):
+        named = stub.feel((), changed)
+    assert named.contact.valid and named.delta.electrodes[9] and not named.delta.touched
+    rising = transfer((), changed)
+    for k in (1, 2, 3):  # hundredths of the whole: each scan ends with more
+        grown = transfer(tuple(Shape(t.kind, t.x, t.y, t.radius, t.drop * k / 3) for t in touches), changed)
+        stub.see(rising, grown)
+        rising = grown
+    felt = stub.pipeline.pre.electrodes._contacts.felt[9]
+    assert np.linalg.norm(felt) < 4e-3
+    for _ in range(8):
+        found = stub.see(rising)
+        assert len(found.contact.contacts) <= 2
+    assert len(found.contact.contacts) == 2 and found.contact.valid
