@@ -26,6 +26,7 @@ COARSE = 0.05  # of the side: a standard deviation beyond it is coarse
 STEPS = 8
 MOST_MISFIT = 6.0  # squares left per value, beyond which it is no touch of this kind; below, they widen what is stated
 MOST = np.array([0.1, 0.1, 0.3, 0.5])  # of one step
+TINY = 1e-9
 AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
 
 
@@ -72,7 +73,10 @@ class PartImage:
         for _ in range(STEPS):
             hessian = slope.T @ slope + information
             pull = slope.T @ left - np.array([0.0, 0.0, *(SD**-2 * (theta[2:] - MEAN))])
-            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), pull)
+            damped = (
+                hessian + damping * np.diag(np.diag(hessian)) + TINY * np.eye(4)
+            )  # off the skin nothing depends on it
+            step = np.linalg.solve(damped, pull)
             step *= min(1.0, float((MOST / np.maximum(np.abs(step), 1e-9)).min()))
             there = theta + step
             there[:2] = np.clip(there[:2], -self._half, self._half)
@@ -85,7 +89,7 @@ class PartImage:
                     break
             else:
                 damping *= 10
-        covariance = np.linalg.inv(slope.T @ slope + information + 1e-9 * np.eye(4))
+        covariance = np.linalg.inv(slope.T @ slope + information + TINY * np.eye(4))
         chi2 = float(left @ left)
         misfit = max(1.0, chi2 / len(rows))
         covariance *= misfit
