@@ -42,6 +42,7 @@ LIKELY, EXPLAINED = 2.7, 4.0  # chi-square per value up to which a part is, with
 SLOW_SIGMAS = 2.0  # standard deviations of its velocity, below which a touch may not move at all
 AS_WELL = 1.05  # times what a whole scan leaves of a touch that moves: one that holds still does as well
 SETTLED = 1.0  # chi-square per value of a whole scan, up to which its touch did not change: 0.1 to 0.7 where it did not
+TINY = 1e-12  # keeps solvable what no value tells
 FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
 MOST = 4  # touches that are followed
 LONGEST_US = 2e5  # without a part: nothing is known of what happened meanwhile
@@ -247,8 +248,9 @@ class PartFilter:
         slope = self._slope / wide[:, None]
         for parts in WINDOWS if len(self.touches) else ():
             rows = by_age[: parts * self._count]
-            along = slope[rows].T @ off[rows]
-            if float(along @ np.linalg.lstsq(slope[rows].T @ slope[rows], along, rcond=1e-9)[0]) > STILL:
+            part, along = slope[rows], slope[rows].T @ off[rows]
+            size = part.T @ part
+            if float(along @ np.linalg.solve(size + TINY * np.trace(size) * np.eye(len(size)), along)) > STILL:
                 return len(rows)
         return 0
 
