@@ -35,6 +35,7 @@ class ContactOpinion(NamedTuple):
     elsewhere: bool  # whether touches, if any, are far enough from the electrode for `odds` to name it
     felt: Array  # (K,) d that the change makes at pairs of other electrodes
     rise: float  # of the contact impedance, relative: the likeliest, if it changed
+    fits: bool  # whether a changed contact and touches are all that there is: a fault is not explained by them
 
     def changed(self, tuning: Tuning = TUNING) -> bool:
         return self.elsewhere and self.odds > tuning.contact_nats
@@ -76,4 +77,5 @@ class ContactEvidence:
             alone or min(apart, default=np.inf) > self.tuning.contact_apart,
             felt,
             float(common + changed.drift[-2]),
+            changed.fits,
         )

@@ -237,7 +237,8 @@ class ElectrodeHealth:
             drifts = self._doubts.known_to_drift(k)
             if self._states[k] == DRIFTING and (opinion.changed() or (drifts and opinion.elsewhere)):
                 self._doubts.sure(k)
-                self._contacts.propose(k, opinion.felt)
+                if opinion.fits:
+                    self._contacts.propose(k, opinion.felt)
         if self._well[k] >= WELL_FRAMES and not self._doubts.moves(k, self._now_s):
             self._states[k] = OK
             self._doubts.well(k)

@@ -47,3 +47,19 @@ def test_two_touches_that_begin_beside_a_changed_contact_are_two(waited: int) ->
         found = stub.see(rising)
         assert len(found.contact.contacts) <= 2
     assert len(found.contact.contacts) == 2 and found.contact.valid
+
+
+def test_scans_out_of_order_say_nothing_of_a_changed_contact() -> None:
+    """They are alike, one after the other, and no contact and no touch explains them."""
+    stub, changed = StubSkin(80.0), ((1, 6.9),)
+    for _ in range(20):
+        stub.feel((), changed)
+    before = stub.pipeline.pre.electrodes._contacts.felt[1].copy()
+    touch = (Shape("circle", 0.06, -0.22, 0.2, 0.285),)
+    for _ in range(4):
+        stub.feel(touch, changed)
+    stub.faults.inject("fifo_misaligned", {"silent": True}, 0.0, 1.0)
+    for _ in range(4 * ASK_EVERY):
+        assert not stub.feel(touch, changed).contact.valid
+    felt = stub.pipeline.pre.electrodes._contacts.felt[1]
+    assert np.linalg.norm(felt - before) < 0.2 * np.linalg.norm(before)
