@@ -110,6 +110,19 @@ class Frame(Heard):
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
+class FollowedTouch:
+    """One touch as the newest part of a scan has it: how it moved and how its strength changed since the last image. By
+    itself it is less exact than the image: what readers use is by how much it changed.
+    """
+
+    number: int = wire(_COUNT, "counts up when others are followed: only places of one number belong together", 0)
+    position: list[float] = wire(Vector(2, "m"), "x, y in the skin's frame")
+    velocity: list[float] = wire(Vector(2, "m/s"), "of `position`", lambda: [0.0, 0.0])
+    sigma: list[float] = wire(Vector(3), "as a contact's `position_sigma`")
+    integral: float = wire(Float(0, unit="S/m m^2"), "drop integrated over the touch")
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
 class RawFrame(Frame):
     """One scan of the board, in the pattern's order. Of a scan in parts: the newest value of each measurement, after
     each part; `sample` is the middle of the newest one.
@@ -176,6 +189,10 @@ class DeltaFrame(Frame):
     calibration: str = wire(
         Text(64, form="(?:[0-9a-f]{64})?"), "hash of the bundle as it was calibrated to this skin; empty: as it is", ""
     )
+    followed: list[FollowedTouch] = wire(
+        ListOf(Record(FollowedTouch), 16), "of a scan in parts: where the touches are by now; empty: nobody knows", list
+    )
+    whole: bool = wire(Bool(), "false: of a part of a scan, which says nothing new but `followed`", True)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -257,6 +274,10 @@ class ImageFrame(Frame):
     refined: RefinedTouch | None = wire(
         Maybe(Record(RefinedTouch)), "the touch refined by a fit, also in held frames; nil: there is none yet", None
     )
+    followed: list[FollowedTouch] = wire(
+        ListOf(Record(FollowedTouch), 16), "of a scan in parts: where the touches are by now; empty: nobody knows", list
+    )
+    whole: bool = wire(Bool(), "false: of a part of a scan, which says nothing new but `followed`", True)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -266,7 +287,8 @@ class Contact:
     id: int = wire(_COUNT, "stays the same while the touch lasts; unique in a session")
     state: str = wire(
         Text(choices=("begin", "hold", "end")),
-        "first frame of the touch; in between, or not known to be the first; last one",
+        "first frame of the touch; in between, or not known to be the first; last one. Of a scan in parts `begin` and "
+        "`end` stay for 50 ms",
         "hold",
     )
     position: list[float] = wire(Vector(3, "m"), "centroid of the contact patch, in the frame `frame_id`")

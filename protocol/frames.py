@@ -31,6 +31,7 @@ from .frame_types import (
     Contact,
     ContactFrame,
     DeltaFrame,
+    FollowedTouch,
     ForceFrame,
     Frame,
     ImageFrame,
@@ -49,9 +50,9 @@ from .topics import TOPIC_OF, TOPICS
 __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "KINDS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
-    "Contact", "ContactFrame", "DeltaFrame", "ForceFrame", "Frame", "FrameError", "ImageFrame", "InfoFrame",
-    "LocatedTouch", "RawFrame", "RefinedTouch", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent",
-    "pack", "read_map", "unpack",
+    "Contact", "ContactFrame", "DeltaFrame", "FollowedTouch", "ForceFrame", "Frame", "FrameError", "ImageFrame",
+    "InfoFrame", "LocatedTouch", "RawFrame", "RefinedTouch", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame",
+    "as_sent", "pack", "read_map", "unpack",
 ]  # fmt: skip
 
 MAX_MESSAGE = 4 * 1024 * 1024

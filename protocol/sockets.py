@@ -23,7 +23,10 @@ from .reconnecting import Connections
 from .topics import TOPIC_OF, TOPICS, wire_topic
 from .transport import Context, Socket
 
-__all__ = ["AllReader", "ControlClient", "ControlError", "ControlServer", "NewestReader", "Publisher", "clock_offset"]
+__all__ = [
+    "AllReader", "ControlClient", "ControlError", "ControlServer", "NewestReader", "PartsReader", "Publisher",
+    "clock_offset",
+]  # fmt: skip
 
 ALL_QUEUE = 10_000
 """Messages held in a reader of all."""
@@ -121,6 +124,55 @@ class NewestReader(_Reader):
             self.skipped += frame.seq - self._last[1] - 1
         self._last = (frame.session, frame.seq)
         return got
+
+
+PARTS_QUEUE = 200
+"""Messages held in a reader of parts: about a second of them."""
+
+
+class PartsReader(_Reader):
+    """The newest frame of one topic of one skin whose scans come in parts, and before it the newest one that says more
+    than where touches are by now (`whole`): what follows it cannot do without. Older ones are skipped.
+    """
+
+    def __init__(self, topic: str, skin: str, endpoint: str | None = None, context: Context | None = None) -> None:
+        address = endpoint or transport.current().data_address(TOPICS[topic].producers[0])
+        addresses = {TOPICS[topic].producers[0]: address}
+        socket = transport.connect(context or zmq.Context.instance(), zmq.SUB, addresses, {zmq.RCVHWM: PARTS_QUEUE})
+        super().__init__(address, socket, addresses)
+        self.skipped = 0
+        """Frames that were overtaken by newer ones before we read them (or lost on the way)."""
+        self._last: tuple[str, int] | None = None
+        self._part: Frame | None = None
+        self.socket.subscribe(wire_topic(topic, skin) + b"\0")
+
+    @property
+    def more(self) -> bool:
+        """Whether another frame is here already, whatever the socket says."""
+        return self._part is not None
+
+    def recv(self, timeout_s: float = 0.0) -> Frame | None:
+        """The next frame, waiting up to `timeout_s` for one; None when there is none. Never raises on bad input."""
+        part, self._part = self._part, None
+        if part is not None:
+            return part
+        whole: Frame | None = None
+        got = self._receive(timeout_s)
+        while got is not None:
+            frame = got[0]
+            if self._last is not None and self._last[0] == frame.session and frame.seq > self._last[1]:
+                self.skipped += frame.seq - self._last[1] - 1
+            self._last = (frame.session, frame.seq)
+            if getattr(frame, "whole", True):
+                self.skipped += (whole is not None) + (self._part is not None)
+                whole, self._part = frame, None
+            else:
+                self.skipped += self._part is not None
+                self._part = frame
+            got = self._receive(0.0)
+        if whole is None:
+            whole, self._part = self._part, None
+        return whole
 
 
 class AllReader(_Reader):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.locator import Located, Locator
-from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
+from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch, RefinedTouch
 from services.describe import ON, refinement
 from services.estimation.part_image import PartImage
 from services.estimation.quality import SURE, Residual
@@ -76,6 +76,7 @@ class Inference(Stage):
         self._last: ImageFrame | None = None  # of the touch that is being held
         self._refused = False  # whether it explains its frame too badly to be that of a touch
         self._last_scan = 0  # of the frame that it was reconstructed from
+        self._refined: RefinedTouch | None = None  # of the last whole scan
         self._again = True  # whether a subscriber may not have it: the next held frame brings it
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
         self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
@@ -102,7 +103,7 @@ class Inference(Stage):
             self._counters["unwanted"] += 1
             self._unseen = frame if frame.stack.size else self._unseen
             return []
-        out = ImageFrame(**inherited(frame), touched=frame.touched)
+        out = ImageFrame(**inherited(frame), touched=frame.touched, followed=frame.followed, whole=frame.whole)
         if frame.calibration != self.linearisation.name and not self._follow(frame.calibration):
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
@@ -112,6 +113,8 @@ class Inference(Stage):
             self._run(frame, out)
         elif frame.held and self._unseen is not None and self._unseen.scan == frame.reconstructed:
             self._run(self._unseen, out)
+        elif not frame.whole:
+            self._part(frame, out)
         elif frame.held:
             self._hold(frame, out)
         elif frame.touched and "coarse" in frame.reasons:
@@ -122,8 +125,9 @@ class Inference(Stage):
             if self._symmetry is not None:
                 self._symmetry.forget()
             self._rest(frame.sigma)
-        if self._refinement is not None:
+        if self._refinement is not None and frame.whole:
             self._refine(frame, out)
+            self._refined = out.refined
         return [out]
 
     def fit_by(self, fits: RefineProcess | RefineHere) -> None:
@@ -292,6 +296,19 @@ class Inference(Stage):
             out.valid = False
             out.reasons.append("gap")
             self._counters["missed"] += 1
+
+    def _part(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        """Hold the last image, whatever scan it is of: where its touch is by now goes with it."""
+        last = self._last
+        if last is None:
+            out.valid = False
+            add_reason(out.reasons, "gap")
+            return
+        out.noise, out.residual, out.refined = last.noise, last.residual, self._refined
+        if "changing" in last.reasons or 0 < self._changing_scan == frame.reconstructed:
+            add_reason(out.reasons, "changing")
+        self._shows_again(last, out)
+        self._judge(out)
 
     def _shows_surer(self, frame: DeltaFrame, last: ImageFrame, out: ImageFrame) -> None:
         """A better image of the scan that is held takes its place: it is a new one to readers."""

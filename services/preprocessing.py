@@ -47,7 +47,7 @@ class Preprocessing(EstimatorStage):
         if not self.rolling_scans.due(frame, out.stamps, self.baseline_estimator):
             return [*self.rolling_scans.part(out, frame, self.baseline_estimator)]
         made = self._scan(out, frame)
-        self.rolling_scans.judged(made, frame)
+        self.rolling_scans.judged(made, frame, self.baseline_estimator)
         return [made]
 
     def _scan(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
@@ -116,6 +116,8 @@ class Preprocessing(EstimatorStage):
         now_ns = out.stamps.get("sample", 0)
         still = separate or self.always_reconstruct  # a row of a file: whoever measured it waited
         d, found_now = self.touch_estimator(amplitude, live, now_ns, still)
+        if self.touch_estimator.touched and self.rolling_scans.change is not None:
+            d = d + self.rolling_scans.change
         if self.touch_estimator.waits:
             out.valid = False
             add_reason(out.reasons, "stale_baseline")

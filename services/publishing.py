@@ -23,7 +23,9 @@ from protocol.frames import (
 )
 from protocol.held import ANY, HeldImage
 from services.contacts.contact_writer import ContactWriter, class_probabilities, confidence
+from services.contacts.following import Following
 from services.contacts.force import ForceLaw
+from services.contacts.lasting import LastingStates
 from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
 from services.contacts.placing import placement
@@ -59,6 +61,7 @@ class Publishing(Stage):
         self._writer = ContactWriter(self.law, place, self._tells_force)
         self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
         self.tracker = Tracker()
+        self.following, self.lasting = Following(), LastingStates()
         self.each_alone = False  # offline: frames that do not follow each other
         self.reset()
 
@@ -78,6 +81,8 @@ class Publishing(Stage):
     def _forget(self) -> None:
         """Nothing is known of what touches."""
         self._known = self._touched = False
+        self.following.forget()
+        self.lasting.forget()
         self._changing = 0  # frames in a row that said so
         self._seen_in = (ANY, -1)  # session and scan of the image that the contacts were seen in
         self._contacts: list[Contact] = []  # of the frame made last, strongest first; those that ended come last
@@ -107,8 +112,12 @@ class Publishing(Stage):
             self._miss(out, "non_finite")
         else:
             self._see(frame)
+            if frame.whole:
+                self.following.anchor(self._contacts, frame.followed)
         fitted = self._fitted(frame.refined if out.valid else None)
         out.contacts = list(self._contacts) if fitted is None else [fitted[0], *self._contacts[1:]]
+        if frame.followed and out.valid:
+            self._follow(frame, out)
         if any((c.force_n or 0.0) > self.law.most_n for c in out.contacts):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
@@ -119,16 +128,19 @@ class Publishing(Stage):
         since = bool(frame.part and frame.touches)  # made only of what was measured since the touch began
         if out.valid and frame.touched and changed and not (frame.held or since or self._alone(frame)):
             add_reason(out.reasons, "changing")
-        self._changing = self._changing + 1 if "changing" in out.reasons else 0
+        if frame.whole:
+            self._changing = self._changing + 1 if "changing" in out.reasons else 0
         self._touched = frame.touched
         explained = out.quality is not None and out.quality >= EXPLAINED
         if any(self.law.impossible(*each) for each in self._drops()) and not explained:
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
+        if frame.part and out.valid:
+            out.contacts = self.lasting(out.contacts, frame.stamps.get("sample", 0))
         frames: list[Frame] = [out]
         if "force" in wanted:
             frames.append(self._force(out))
-        if "shape" in wanted:
+        if "shape" in wanted and frame.whole:
             frames.append(self._shape(out, None if fitted is None else fitted[1]))
         return frames
 
@@ -177,6 +189,16 @@ class Publishing(Stage):
         contact = self._writer.fitted(self._contacts[0], touch)
         self._counters["disagreed" if contact is None else "refined"] += 1
         return None if contact is None else (contact, touch)
+
+    def _follow(self, frame: ImageFrame, out: ContactFrame) -> None:
+        """Bring the contacts to where they are by now."""
+        motion = self.following.motion(frame.followed)
+        out.contacts = self.following.moved(out.contacts, frame.followed, self._writer.place)
+        self.tracker.carry(motion, frame.stamps.get("sample", 0))
+        moves = any(any(touch.velocity) for touch in frame.followed)
+        out.held = out.held and not moves
+        if moves and any(c.id not in motion for c in out.contacts if c.state != "end"):
+            add_reason(out.reasons, "changing")
 
     def _alone(self, frame: ImageFrame) -> bool:
         """Whether this frame follows no other."""
@@ -247,6 +269,8 @@ class Publishing(Stage):
     def state(self) -> dict[str, Any]:
         return {
             "tracker": self.tracker.state(),
+            "following": self.following.state(),
+            "lasting": self.lasting.state(),
             "known": self._known,
             "touched": self._touched,
             "changing": self._changing,
@@ -260,6 +284,8 @@ class Publishing(Stage):
 
     def load(self, state: dict[str, Any]) -> None:
         self.tracker.load(state["tracker"])
+        self.following.load(state.get("following", []))  # older recordings have none
+        self.lasting.load(state.get("lasting", {}))
         self._known, self._touched = bool(state["known"]), bool(state.get("touched", False))
         self._changing = int(state.get("changing", 0))
         self._seen_in = (ANY, int(state.get("reconstructed", -1)))  # older recordings have none

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import DeltaFrame, RawFrame, as_sent
+from protocol.frames import DeltaFrame, FollowedTouch, RawFrame, as_sent
 from services.estimation.baseline import BaselineEstimator
 from services.estimation.part_evidence import SIGMAS, PartEvidence
-from services.estimation.part_image import PartImage
+from services.estimation.part_filter import PartFilter
+from services.estimation.part_image import PartImage, PartTouch
 from services.estimation.rolling import WholeScans, parts_of
 from services.runtime.stage import add_reason
 
@@ -20,7 +22,7 @@ Array = NDArray[np.float64]
 SUSPECTED = 5.0  # sigmas of the newest part, below which it is not looked at further
 WIDER = 1.05  # noise is estimated from a few dozen scans
 DRIFT = 3e-5  # relative, since the untouched scans that parts are compared with
-MOST_WAITED = 8  # messages
+MOST_WAITED = 10  # messages
 REMEMBERED = 8  # untouched whole scans whose mean that is
 
 
@@ -30,13 +32,15 @@ class RollingScans:
 
     The other messages say only, and only where the last whole scan was sound, that a touch began, with the values
     measured since (services/estimation/part_evidence.py); or that the touch ended. Then the next whole scan is the
-    first of values that are all newer than that.
+    first of values that are all newer than that. In between they say where a touch that was there is by now
+    (services/estimation/part_filter.py), where that explains them.
     """
 
     def __init__(self, bundle: Bundle) -> None:
         self._bundle, self._parts = bundle, parts_of(bundle)
         self._whole = WholeScans()
         self._models: tuple[PartEvidence, PartImage] | None = None
+        self._filter: PartFilter | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -56,6 +60,11 @@ class RollingScans:
         self._grown_us = 0.0  # when it was all there, likewise
         self._waited = 0  # messages by which the whole scan was put off for that
         self._began_us: float | None = None  # when a touch began, by the board's clock less the length of a part
+        self._began: PartTouch | None = None  # as the newest parts have it
+        self._image_scan = 0  # of the last image of the touch
+        self.change: Array | None = None  # to the whole scan's difference, for its values to be of one instant
+        if self._filter is not None:
+            self._filter.forget()
 
     def warm_up(self) -> None:
         self._ready()
@@ -71,22 +80,42 @@ class RollingScans:
             return True  # another skin's: said once a message, as of whole scans
         if not self._whole.due(frame.scan, frame.parts):
             return False
-        values = None if self._moved else self._values(frame, estimator)
-        if values is not None and self._changes(values):
+        values = self._values(frame, estimator)
+        if values is not None and not self._moved and self._changes(values):
             self._moved = True  # a touch that began or ended within these values is seen in the next whole scan
             return False
-        if frame.device_us - float(frame.age_us.max()) < self._grown_us and self._waited < MOST_WAITED:
-            self._waited += 1  # the oldest of these values felt a touch that still grew
+        if self._waited < MOST_WAITED and self._grows(frame, values):
+            self._waited += 1
             self._whole.last = frame.scan - frame.parts + 1
             return False
         new = frame.new.astype(bool)
-        sample = stamps.get("sample", 0)
-        mean = sample - round(1e3 * float(frame.age_us.mean() - frame.age_us[new].mean()))
+        sample = mean = stamps.get("sample", 0)
+        if not self._follows(frame, values):
+            mean -= round(1e3 * float(frame.age_us.mean() - frame.age_us[new].mean()))
         stamps["sample"] = self._sample_ns = max(mean, min(self._sample_ns, sample))
         self._handed_on = frame.scan
         return True
 
-    def judged(self, out: DeltaFrame, frame: RawFrame) -> None:
+    def _grows(self, frame: RawFrame, values: tuple[Array, Array, Array] | None) -> bool:
+        """Whether the oldest of these values felt a touch that began, and still grew."""
+        if self._began_us is None:
+            return False
+        grew = frame.device_us - float(frame.age_us.max()) < self._grown_us
+        if grew or values is None or self._filter is None or self._began is None:
+            return grew
+        return not self._filter.settled(values[0], values[1], self._began)
+
+    def _follows(self, frame: RawFrame, values: tuple[Array, Array, Array] | None) -> bool:
+        """Whether the whole scan's touch is followed: then all its values are brought to the newest one's instant."""
+        self.change = None
+        if self._held is None or values is None or self._filter is None:
+            return False
+        follows = self._filter.part(*values, frame.device_us)
+        if follows and self._filter.moves:
+            self.change = self._filter.at_once(*values)
+        return follows
+
+    def judged(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> None:
         """Take what preprocessing said of a whole scan."""
         if frame.parts == 1:
             return
@@ -94,24 +123,55 @@ class RollingScans:
         self._sound = known and out.valid and not out.electrodes.any() and not {"gain", "gap"} & set(out.reasons)
         self._moved = self._ended = False
         self._grown_us, self._waited = 0.0, 0
-        touched, self._began_us, self._held = self._held is not None, None, None
+        touched, self._began_us, self._began, self._held = self._held is not None, None, None, None
         if not self._sound:
             self._rest, self._rests = None, 0
         elif out.touched:
             self._held = out.difference.astype(float)
+            self._image_scan = out.reconstructed
+            self._take(out, frame, estimator)
         else:
             drifted = touched or self._rest is None
             self._rests = 1 if drifted else min(self._rests + 1, REMEMBERED)
             before = 0.0 if self._rest is None else self._rest
             self._rest = before + (out.difference.astype(float) - before) / self._rests
 
+    def _take(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> None:
+        """Begin to follow the touch of a whole scan, or go on."""
+        self._ready()
+        assert self._filter is not None
+        if (values := self._values(frame, estimator)) is None:
+            self._filter.forget()
+            return
+        d = values[0] if self.change is None else values[0] + self.change
+        self._filter.whole(d, values[1], frame.device_us, shown=not out.held)
+        out.followed = self._followed()
+
+    def _followed(self) -> list[FollowedTouch]:
+        assert self._filter is not None
+        metres = self._filter.metres_per_unit
+        return [
+            FollowedTouch(
+                number=self._filter.number,
+                position=[metres * each.x, metres * each.y],
+                velocity=[metres * each.vx, metres * each.vy],
+                sigma=[metres * each.sigma[0], metres * each.sigma[1], each.sigma[2]],
+                integral=metres**2 * each.integral,
+            )
+            for each in self._filter.states()
+        ]
+
     def part(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> list[DeltaFrame]:
         """The delta frame of a message that is no whole scan, where there is something to say."""
         evidence, image = self._ready()
-        if (values := self._values(frame, estimator)) is None or not self._changes(values):
+        if (values := self._values(frame, estimator)) is None:
             return []
+        if not self._changes(values):
+            return self._goes_on(out, frame, values)
         d, noise, age = values
         if self._held is not None:
+            assert self._filter is not None
+            self._filter.forget()
             self._ended = True
             self._put_off(frame.scan)
             out.difference, out.sigma = np.zeros(len(d), np.float32), noise.astype(np.float32)
@@ -128,11 +188,22 @@ class RollingScans:
         share = np.where(on, onset.course, 1.0)
         out.difference = np.where(on, d / share, 0.0).astype(np.float32)
         out.sigma = np.where(on, noise / share, np.inf).astype(np.float32)
-        if not image.fit(out.difference, out.sigma).fits:
+        self._began = image.fit(out.difference, out.sigma)
+        if not self._began.fits:
             return []
         out.touched, out.score, out.threshold = True, onset.sigmas, SIGMAS
         out.reconstructed = frame.scan
         add_reason(out.reasons, "coarse")
+        return self._said(out)
+
+    def _goes_on(self, out: DeltaFrame, frame: RawFrame, values: tuple[Array, Array, Array]) -> list[DeltaFrame]:
+        """Where a touch that goes on is by now, where that is known."""
+        if self._held is None or self._ended or self._filter is None or not self._filter.knows:
+            return []
+        if not self._filter.part(*values, frame.device_us):
+            return []
+        out.touched, out.held, out.whole, out.reconstructed = True, True, False, self._image_scan
+        out.followed = self._followed()
         return self._said(out)
 
     def _values(self, frame: RawFrame, estimator: BaselineEstimator) -> tuple[Array, Array, Array] | None:
@@ -171,6 +242,7 @@ class RollingScans:
     def _ready(self) -> tuple[PartEvidence, PartImage]:
         if self._models is None:
             self._models = PartEvidence(self._bundle, self._parts), PartImage(self._bundle)
+            self._filter = PartFilter(self._bundle)
         return self._models
 
     def _fits(self, frame: RawFrame) -> bool:
@@ -187,6 +259,9 @@ class RollingScans:
             "held": self._held,
             "began_us": self._began_us,
             "grown": [self._grown_us, self._waited],
+            "image": self._image_scan,
+            "began": None if self._began is None else asdict(self._began),
+            "filter": None if self._filter is None else self._filter.state(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -199,3 +274,10 @@ class RollingScans:
         self._rest, self._held = (None if state[n] is None else np.array(state[n], float) for n in ("rest", "held"))
         self._grown_us, self._waited = float(state["grown"][0]), int(state["grown"][1])
         self._began_us, self._rests = state["began_us"], int(state["rests"])
+        self._image_scan = int(state.get("image", 0))
+        if (began := state.get("began")) is not None:
+            self._began = PartTouch(**{**began, "sigma": tuple(began["sigma"])})
+        if state.get("filter"):
+            self._ready()
+            assert self._filter is not None
+            self._filter.load(state["filter"])

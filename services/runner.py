@@ -71,7 +71,10 @@ class Runner:
 
     def add(self, stage: Stage, feed: Feed | None = None) -> None:
         """Drive this stage; without a feed, from the topic that it reads."""
-        channel = Channel(self.process, stage, Newest(stage.reads, stage.skin) if feed is None else feed)
+        if feed is None:  # a raw frame has the newest value of every measurement, whichever part it comes with
+            parts = self.config.skins[stage.skin].scan == "rolling" and stage.reads != "raw"
+            feed = Newest(stage.reads, stage.skin, parts)
+        channel = Channel(self.process, stage, feed)
         self.channels[stage.skin] = channel
         self._by_socket[channel.feed.socket] = channel
         for command in stage.commands:
@@ -138,7 +141,7 @@ class Runner:
         frames: list[Frame] = []
         while len(frames) < AT_ONCE and (frame := channel.feed.recv()) is not None:
             frames.append(frame)
-            if isinstance(channel.feed, Newest):
+            if isinstance(channel.feed, Newest) and not channel.feed.more:
                 return frames
         news = self._lateness.news(frames, stood)
         channel.heartbeat.drops["late"] += len(frames) - len(news)

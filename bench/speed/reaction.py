@@ -146,6 +146,9 @@ def rows(mode: str, found: list[tuple[TouchEvent, Reaction]]) -> list[dict[str, 
             errors = np.array([e for r in of for e in r.errors_m])
             row |= {"frames": len(errors), "error_at_recv_mm": 1e3 * _quantile(errors, 50)}
             row |= {"velocity_error": _quantile(np.array([v for r in of for v in r.slip]), 50)}
+        elif not kind.ramp_s:
+            off, force = (np.array([e for r in of for e in getattr(r, name)]) for name in ("held_m", "held_force"))
+            row |= {"held_frames": len(off), "held_error_mm": 1e3 * _rms(off), "held_force_error": _rms(force)}
         for what in ("contact", "any", "gone"):
             ms = 1e3 * np.array([getattr(r, f"{what}_s") for r in of])
             # A touch that was never seen counts as one seen after every other.
@@ -161,38 +164,70 @@ def _quantile(values: NDArray[np.float64], q: float) -> float:
     return float(np.percentile(values, q, method="higher")) if len(values) else float("nan")
 
 
+def _rms(of: NDArray[np.float64]) -> float:
+    return float(np.sqrt((of**2).mean())) if len(of) else float("nan")
+
+
 def goals(table: list[dict[str, Any]], late: dict[str, int]) -> list[Goal]:
     """Gates are counts: of poses that were not solved, of touches that were not seen."""
     found = []
     for row in table:
         name = f"{row['mode']}: {row['kind']}"
-        if row["kind"] in TARGETS_MS:
-            low, at_low, high, at_high = TARGETS_MS[row["kind"]]
-            found.append(Goal(f"{name}: to a valid contact, median, ms", row[f"contact_p{low}_ms"], at_most=at_low))
-            found.append(Goal(f"{name}: the same, p{high}, ms", row[f"contact_p{high}_ms"], at_most=at_high))
         if row["kind"] == STEP:
-            found.append(Goal(f"{name}: release, median, ms", row["gone_p50_ms"], at_most=GONE_MS[0]))
-            found.append(Goal(f"{name}: release, p99, ms", row["gone_p99_ms"], at_most=GONE_MS[1]))
             share = row["contact_seen"] / row["touches"]
             found.append(Goal(f"{name}: share seen in place", share, at_least=1.0, gate=0.8))
-        if row["kind"] in SLIDING:
-            found.append(Goal(f"{name}: velocity error, median", row["velocity_error"], at_most=SLIP))
+        if row["mode"] == "rolling":  # the others are what it is compared with
+            found += _rolling_goals(name, row)
         found.append(Goal(f"{name}: frames before it, off by over 3 sigma", row["wrong"], at_most=0))
+    found += _beside_full(table)
     for mode, count in late.items():
         found.append(Goal(f"{mode}: poses that the stub had not solved", count, at_most=0, gate=0))
+    return found
+
+
+def _rolling_goals(name: str, row: dict[str, Any]) -> list[Goal]:
+    found = []
+    if row["kind"] in TARGETS_MS:
+        low, at_low, high, at_high = TARGETS_MS[row["kind"]]
+        found.append(Goal(f"{name}: to a valid contact, median, ms", row[f"contact_p{low}_ms"], at_most=at_low))
+        found.append(Goal(f"{name}: the same, p{high}, ms", row[f"contact_p{high}_ms"], at_most=at_high))
+    if row["kind"] == STEP:
+        found.append(Goal(f"{name}: release, median, ms", row["gone_p50_ms"], at_most=GONE_MS[0]))
+        found.append(Goal(f"{name}: release, p99, ms", row["gone_p99_ms"], at_most=GONE_MS[1]))
+    if row["kind"] in SLIDING:
+        found.append(Goal(f"{name}: velocity error, median", row["velocity_error"], at_most=SLIP))
+    return found
+
+
+def _beside_full(table: list[dict[str, Any]]) -> list[Goal]:
+    """Rolling scans against full scans of the same touches."""
+    by = {(row["mode"], row["kind"]): row for row in table}
+    found = []
+    for kind in (kind.name for kind in KINDS):
+        full, rolling = by.get(("full", kind)), by.get(("rolling", kind))
+        if full is None or rolling is None:
+            continue
+        for key, name, most in (
+            ("error_at_recv_mm", "position at recv, error as a share of full scans'", 1 / 3),
+            ("held_error_mm", "held, position error as a share of full scans'", 1.0),
+            ("held_force_error", "held, force error as a share of full scans'", 1.0),
+        ):
+            if key in full and key in rolling:
+                found.append(Goal(f"rolling: {kind}: {name}", rolling[key] / max(full[key], 1e-9), at_most=most))
     return found
 
 
 def table(of: list[dict[str, Any]]) -> Table:
     made = Table(title=f"force leaves zero (or is back) to a controller's recv, ms, {machine()}", title_justify="left")
     headings: tuple[str, ...] = ("scan", "touch", "n", "in place", "p50", "p90", "p99", "any p50", "release p50", "p99")
-    headings += ("off > 3 sigma", "off > 3 %, no sigma", "mm at recv", "velocity")
+    headings += ("off > 3 sigma", "off > 3 %, no sigma", "mm at recv", "velocity", "held mm", "held force")
     for heading in headings:
         made.add_column(heading, justify="left" if heading in ("scan", "touch") else "right")
     for row in of:
         cells = [row[key] for key in ("contact_p50_ms", "contact_p90_ms", "contact_p99_ms", "any_p50_ms")]
         cells += [row["gone_p50_ms"], row["gone_p99_ms"]]
         slides = [f"{row['error_at_recv_mm']:.2f}", f"{row['velocity_error']:.2f}"] if "frames" in row else ["", ""]
+        held = [f"{row['held_error_mm']:.2f}", f"{row['held_force_error']:.2f}"] if "held_frames" in row else ["", ""]
         seen = f"{row['contact_seen']}/{row['touches']}"
         numbers = [f"{v:.1f}" if np.isfinite(v) else "-" for v in cells]
         made.add_row(
@@ -204,6 +239,7 @@ def table(of: list[dict[str, Any]]) -> Table:
             str(row["wrong"]),
             str(row["unstated"]),
             *slides,
+            *held,
         )
     return made
 
@@ -243,7 +279,7 @@ def main(argv: list[str] | None = None) -> int:
     share = (QUICK if args.quick else args.steps) / STEPS
     wanted = {STEP: STEPS, LIGHT: STEPS // 5, FAST_RAMP: RAMPS, SLOW_RAMP: RAMPS, **dict.fromkeys(SLIDING, SLIDES)}
     found, late = {}, {}
-    for mode in args.modes:
+    for mode in args.modes:  # each on the same touches
         few = 1 if args.quick else OF_FEWER[mode]
         counts = {name: max(2, round(n * share / few)) for name, n in wanted.items()}
         found[mode], late[mode] = (simulated if args.simulated else measured)(mode, counts, args.seed)
@@ -252,7 +288,7 @@ def main(argv: list[str] | None = None) -> int:
     listed = goals(result, late)
     Console(width=150).print(_goals.table(listed))
     report = {**provenance("reaction", argv), "targets": [goal.to_dict() for goal in listed], "rows": result}
-    report |= {"late_poses": late, "side_m": SIDE_M}
+    report |= {"late_poses": late, "side_m": SIDE_M, "simulated": args.simulated}
     report |= {
         "contact_ms": {m: [1e3 * r.contact_s for e, r in each if e.kind.name == STEP] for m, each in found.items()}
     }

@@ -37,6 +37,7 @@ KINDS = (
     Kind("sliding at 0.3 m/s", 2.0, (0.2, 0.2), speed=0.3),
 )
 SLIDE_M = 0.05
+HELD_S = 0.15  # from its onset on, after which a step is held
 SETTLED_S = 0.2  # a sliding touch stays still for so long before it moves
 
 
@@ -124,6 +125,8 @@ class Reaction:
     unstated: int = 0  # valid ones before it, neither changing nor coarse, off by more than 3 % and without a sigma
     errors_m: list[float] = field(default_factory=list)  # of valid frames in place, while moving: against recv
     slip: list[float] = field(default_factory=list)  # relative error of their velocity
+    held_m: list[float] = field(default_factory=list)  # while the touch holds still: how far off valid contacts are
+    held_force: list[float] = field(default_factory=list)  # relative error of their force
 
 
 @dataclass(frozen=True)
@@ -179,6 +182,10 @@ def react(event: TouchEvent, until: float, frames: Sequence[SeenFrame]) -> React
             found.errors_m.append(float(np.hypot(*np.subtract(contact.on_sheet, event.at(seen.received)))))
             wrong = np.hypot(*np.subtract(contact.velocity[:2], event.velocity))
             found.slip.append(float(wrong) / event.kind.speed)
+        elif seen.received > event.onset + HELD_S and not event.kind.ramp_s and len(seen.present) == 1:
+            (contact,) = seen.present
+            found.held_m.append(seen.off(contact, event))
+            found.held_force.append(abs((contact.force_n or 0.0) / event.kind.force - 1.0))
     return found
 
 

@@ -29,6 +29,15 @@ class Patch(NamedTuple):
     confidence: float = 1.0  # probability that its peak is no noise
 
 
+class Motion(NamedTuple):
+    """Where a touch is on the sheet [m], and its velocity [m/s]."""
+
+    x: float
+    y: float
+    vx: float
+    vy: float
+
+
 @dataclass
 class Track:
     """One touch that lasts. `inside`: the touches that have grown into its patch, itself included; else empty."""

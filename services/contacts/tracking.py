@@ -15,12 +15,12 @@ twentieth for as long as it is held, a contact that rose with a touch a tenth an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 from services.contacts.merging import absorb, follow, give_up, host_of, is_part, others, part
-from services.contacts.motion import Patch, Track, cost, is_left_over, is_same
+from services.contacts.motion import Motion, Patch, Track, cost, is_left_over, is_same
 
 REACH_M = 0.015  # a touch that jumps further between two frames is another touch
 STAYS_M = 0.006  # what begins is near where it was seen first; what an image of a changing touch shows is not
@@ -122,6 +122,12 @@ class Tracker:
             for one in track.inside:
                 one.seen_ns = sample_ns  # it did not go on
         return ended + self._lose([], sample_ns)
+
+    def carry(self, motion: Mapping[int, Motion], sample_ns: int) -> None:
+        """Touches that are followed go on from where they are by now."""
+        for track in self.tracks:
+            if (now := motion.get(track.id)) is not None and (now.vx or now.vy):
+                track.x, track.y, track.vx, track.vy, track.seen_ns = *now, sample_ns
 
     @property
     def waits(self) -> bool:

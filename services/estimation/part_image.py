@@ -26,6 +26,7 @@ COARSE = 0.05  # of the side: a standard deviation beyond it is coarse
 STEPS = 8
 MOST_MISFIT = 6.0  # squares left per value, beyond which it is no touch of this kind; below, they widen what is stated
 MOST = np.array([0.1, 0.1, 0.3, 0.5])  # of one step
+TINY = 1e-9
 AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
 
 
@@ -72,7 +73,10 @@ class PartImage:
         for _ in range(STEPS):
             hessian = slope.T @ slope + information
             pull = slope.T @ left - np.array([0.0, 0.0, *(SD**-2 * (theta[2:] - MEAN))])
-            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), pull)
+            damped = (
+                hessian + damping * np.diag(np.diag(hessian)) + TINY * np.eye(4)
+            )  # off the skin nothing depends on it
+            step = np.linalg.solve(damped, pull)
             step *= min(1.0, float((MOST / np.maximum(np.abs(step), 1e-9)).min()))
             there = theta + step
             there[:2] = np.clip(there[:2], -self._half, self._half)
@@ -85,7 +89,7 @@ class PartImage:
                     break
             else:
                 damping *= 10
-        covariance = np.linalg.inv(slope.T @ slope + information + 1e-9 * np.eye(4))
+        covariance = np.linalg.inv(slope.T @ slope + information + TINY * np.eye(4))
         chi2 = float(left @ left)
         misfit = max(1.0, chi2 / len(rows))
         covariance *= misfit
@@ -120,8 +124,7 @@ class PartImage:
         around = [theta[:3]] + [
             theta[:3] + sign * a * e for a, e in zip(AHEAD, np.eye(3), strict=True) for sign in (1, -1)
         ]
-        shares = np.concatenate([self._share(x, y, float(np.exp(log_r))) for x, y, log_r in around])
-        responses = drop * (shares @ jacobian.T) / noise
+        responses = drop * (self.shares(np.array(around)) @ jacobian.T) / noise
         ahead, behind = responses[1::2], responses[2::2]
         slope = np.column_stack([*((ahead - behind) / (2 * AHEAD[:, None])), responses[0]])
         left = d / noise - responses[0]
@@ -129,8 +132,19 @@ class PartImage:
         return penalty, left, slope
 
     def _share(self, x: float, y: float, radius: float) -> Array:
-        """(1, P) share of each pixel under a circle, of the circle's area in all where it lies on the skin."""
-        share = np.clip((radius - np.hypot(self._x - x, self._y - y)) / self._pixel + 0.5, 0.0, 1.0)
-        area = float(share.sum())
-        scale = np.pi * radius**2 / self._pixel**2 / max(area, 1e-9)
-        return np.asarray(share * self._inside * scale).reshape(1, -1)
+        return self.shares(np.array([[x, y, np.log(radius)]]))
+
+    def shares(self, circles: Array) -> Array:
+        """(M, P) share of each pixel under circles (M, 3) of x, y, log radius: of a circle's area in all where it lies
+        on the skin.
+        """
+        x, y, log_r = circles.T[:, :, None]
+        radius = np.exp(log_r)
+        away = np.hypot(self._x.ravel() - x, self._y.ravel() - y)
+        share = np.clip((radius - away) / self._pixel + 0.5, 0.0, 1.0)
+        scale = np.pi * radius**2 / self._pixel**2 / np.maximum(share.sum(axis=1, keepdims=True), 1e-9)
+        return np.asarray(share * self._inside.ravel() * scale)
+
+    def responses(self, circles: Array, rows: NDArray[np.intp]) -> Array:
+        """(M, n) d of these measurements per S/m of circles (M, 3) of x, y, log radius."""
+        return np.asarray(self.shares(circles) @ self._jacobian[rows].T)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from protocol.frames import Frame
-from protocol.sockets import NewestReader
+from protocol.sockets import NewestReader, PartsReader
 from protocol.topics import wire_topic
 from services.runtime.heartbeat import Heartbeat
 from services.runtime.stage import Stage
@@ -38,10 +38,12 @@ class Channel:
 
 
 class Newest:
-    """A stage's input from a socket: the newest frame."""
+    """A stage's input from a socket: the newest frame; where frames are made of parts of scans, also the newest one of
+    a whole scan.
+    """
 
-    def __init__(self, topic: str, skin: str) -> None:
-        self.reader = NewestReader(topic, skin)
+    def __init__(self, topic: str, skin: str, parts: bool = False) -> None:
+        self.reader: NewestReader | PartsReader = (PartsReader if parts else NewestReader)(topic, skin)
         self.socket = self.reader.socket
         self._name = f"{topic}/{skin}\0".encode()
 
@@ -52,6 +54,11 @@ class Newest:
     @property
     def skipped(self) -> int:
         return self.reader.skipped
+
+    @property
+    def more(self) -> bool:
+        """Whether another frame waits that the socket says nothing of."""
+        return isinstance(self.reader, PartsReader) and self.reader.more
 
     def recv(self) -> Frame | None:
         return self.reader.recv()

@@ -71,3 +71,20 @@ def test_a_slide_is_scored_against_the_truth_at_recv_and_at_the_sample():
     assert found.errors_m == pytest.approx([0.015])
     assert found.slip == pytest.approx([0.1])
     assert found.contact_s == pytest.approx(0.3), "where it was when it was measured"
+
+
+def test_a_held_touch_is_scored_where_it_is_still_and_beside_full_scans():
+    from bench.speed.reaction import goals, rows
+
+    def of(mode, off):
+        frames = [seen(STILL.onset + t, (0.01 + off, 0.0)) for t in (0.05, 0.16, 0.2, 0.25)]
+        for each in frames:
+            each.frame.contacts[0].force_n = 2.1
+        reaction = react(STILL, STILL.end + 0.3, frames)
+        assert reaction.held_m == pytest.approx([off] * 3)
+        assert reaction.held_force == pytest.approx([0.05] * 3)
+        return rows(mode, [(STILL, reaction)])
+
+    listed = {goal.figure: goal for goal in goals(of("full", 4e-4) + of("rolling", 3e-4), {})}
+    goal = listed[f"rolling: {KINDS[0].name}: held, position error as a share of full scans'"]
+    assert goal.value == pytest.approx(0.75) and goal.at_most == 1.0

@@ -1,15 +1,19 @@
 """What the example controllers make of frames, known beforehand: no service needed."""
 
 import math
+import re
+import time
 
 import pytest
 
+from bench.speed.sentinel_host import AdaptiveHost
 from examples.follow_the_finger import DAMPING, FASTEST, answer, follow, push
 from examples.guarded_move import guarded_move
 from examples.robot import Robot
 from examples.stop_on_contact import stop_on_contact
 from protocol.client import NotValid, Stale
 from protocol.frames import Contact, ContactFrame
+from protocol.runtime import host_id
 
 
 class Skin:
@@ -71,6 +75,43 @@ def test_guarded_move_stops_at_its_force_and_not_before():
     skin = Skin(frame(), frame(contact(0.01, 0.0, 1.9)), frame(contact(0.01, 0, 9.0, "end")), frame(contact(0, 0, 2.1)))
     assert guarded_move(robot, skin, 2.0, 0.1) == 0
     assert [v[2] < 0 for v in robot.told] == [True, True, True, False] and robot.told[-1] == STILL
+
+
+def test_guarded_move_says_how_long_ago_it_was_measured_what_it_stopped_for(capsys):
+    reached = frame(contact(0.01, 0.0, 3.0))
+    reached.host, reached.stamps = host_id(), {"sample": time.monotonic_ns() - 9_000_000}
+    assert guarded_move(Drive(), Skin(frame(), reached), 2.0, 0.1) == 0
+    said = re.search(r"force reached, stopped (\d+) ms after it was measured: \(\+10.0", capsys.readouterr().out)
+    assert said and 9 <= int(said[1]) < 1000
+    reached.host = "another"
+    assert guarded_move(Drive(), Skin(reached), 2.0, 0.1) == 0
+    assert "force reached: (" in capsys.readouterr().out
+
+
+def test_with_rolling_scans_guarded_move_stops_within_20_ms_of_contact():
+    """In simulated time: board, stages and 2 ms for sockets and scheduling."""
+    host = AdaptiveHost("rolling", snr_db=80.0, seed=3)
+    host.until(5.0)
+    for x, y, status in ((0.005, 0.01, 0), (-0.012, 0.008, 0), (0.03, -0.02, 2)):
+        pressed, first = host.now, len(host.contacts) - 3
+        host.press(x=x, y=y, force=2.0, radius=0.008, seconds=0.2)
+        host.until(pressed + 0.1)
+        given = []
+
+        class Later(Skin):
+            def next_frame(self, max_age, *, valid, given=given, seen=host.contacts[first:]):
+                if len(given) == len(seen):
+                    raise Stale("silence", 1.0)
+                given.append(seen[len(given)])
+                return given[-1][1]
+
+        robot = Drive()
+        assert guarded_move(robot, Later(), 1.0, 0.1) in (status, 1)
+        stop = robot.told.index(STILL)
+        assert stop > 2, "it moved before"
+        assert 0 < given[stop][0] - pressed < 0.020
+        host.until(host.now + 0.6)
+    host.rig.close()
 
 
 @pytest.mark.parametrize("touch", [contact(0.04, 0.0, 0.2), contact(0.0, 0.0, None)])

@@ -17,7 +17,7 @@ import zmq
 from protocol.frames import ContactFrame, ForceFrame, ImageFrame, InfoFrame, StatusFrame
 from protocol.reconnecting import GRACE_S
 from protocol.runtime import endpoint
-from protocol.sockets import AllReader, NewestReader, Publisher
+from protocol.sockets import AllReader, NewestReader, PartsReader, Publisher
 from protocol.transport import MAX_MESSAGE
 
 ROOT = Path(__file__).parents[2]
@@ -48,6 +48,29 @@ def run(code):
 @pytest.fixture
 def publisher(runtime, context):
     return Publisher("publisher", context)
+
+
+@pytest.fixture
+def publisher_of_images(runtime, context):
+    return Publisher("inference", context)
+
+
+def test_of_parts_the_newest_comes_and_before_it_the_newest_of_a_whole_scan(publisher_of_images, context):
+    reader = PartsReader("image", "palm", context=context)
+    subscribed(publisher_of_images, "image")
+    for whole in (True, False, False, True, False, False):
+        publisher_of_images.send(ImageFrame(skin="palm", valid=True, whole=whole))
+    time.sleep(0.2)
+    frame = reader.recv(1.0)
+    assert (frame.seq, frame.whole, reader.more) == (3, True, True)
+    frame = reader.recv()
+    assert (frame.seq, frame.whole, reader.more) == (5, False, False)
+    assert reader.recv() is None and reader.skipped == 4
+    for whole in (False, False, True):
+        publisher_of_images.send(ImageFrame(skin="palm", valid=True, whole=whole))
+    time.sleep(0.2)
+    assert (reader.recv(1.0).seq, reader.more, reader.skipped) == (8, False, 6)
+    reader.close()
 
 
 def test_the_newest_frame_comes_and_older_ones_are_skipped(publisher, context):

@@ -79,6 +79,19 @@ def test_what_touched_only_some_of_the_newest_values_is_not_taken_for_all(bundle
         assert not plain[min(fresh, felt) : max(fresh, felt)].any()
 
 
+def test_a_circle_that_leaves_the_skin_while_it_is_fitted_is_no_error(bundle, image):
+    """What is left of a difference beside its first touch may be like no touch at all."""
+    theta = np.array([1.0, 1.0, np.log(0.04), np.log(0.005)])
+    assert np.abs(image._linear(theta, image._jacobian, np.zeros(120), np.ones(120))[2][:, :2]).max() < 1e-6
+    image_start = image._start
+    try:
+        image._start = lambda *_: theta
+        found = image.fit(-touch(bundle, image, 0.3, -0.4), np.full(120, SIGMA))
+    finally:
+        image._start = image_start
+    assert not found.fits and np.isfinite([found.x, found.y, found.drop, *found.sigma]).all()
+
+
 @pytest.mark.parametrize("electrodes", [(5,), (0, 1), (3, 11)])
 def test_a_change_of_one_or_two_electrodes_is_no_touch(bundle, evidence, electrodes):
     rng = np.random.default_rng(1)

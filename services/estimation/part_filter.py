@@ -1,0 +1,365 @@
+"""A touch that is held or slides, followed from part to part of a scan.
+
+State of each touch: x, y [model units], log radius, log drop, and the velocity of its place [model units/s]. A part's
+values, each at its own instant, are the measurement of an extended Kalman filter: circles on the bundle's linear model,
+whose error is part of their noise.
+
+A whole scan begins it: the state is fitted to its difference, and that difference itself is the reference. While the
+parts differ from the reference by no more than noise, the touch is where it was, and the filter need not run. What the
+model gets wrong of the reference is taken along for as long as the touch is near. Where a part is not explained, not
+even by a touch that suddenly moves or presses otherwise, nothing is said until the next whole scan.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bundle import Bundle
+from services.estimation.part_image import WIDER, PartImage, PartTouch
+from services.estimation.rolling import parts_of
+from services.estimation.saved import shaped
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+RADIUS, DROP = 2, 3  # of a touch's state: x, y, log radius, log drop, vx, vy
+MODEL = 4  # of them, that d depends on
+WANDERS = np.array([0.005, 0.005, 0.1, 2.0, 3.0, 3.0])  # by how much the state does, per square root of a second
+KNOWN = np.array([0.01, 0.01, 0.1, 0.2, 2.0, 2.0])  # standard deviation of a touch that begins to change
+SUDDEN = np.array([0.03, 0.03, 0.1, 0.5, 6.0, 6.0])  # the same of one that changes at once
+AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
+LINEAR = 0.05  # of d: by so much the linear picture of a circle is wrong; by half of it of the rms of d
+NEAR = 0.15  # model units from the reference, within which the model is wrong by what it is there
+WINDOWS = (1, 3, 6, 10)  # newest parts among which a change is looked for
+STILL = 24.0  # chi-square of a touch's place and strength, up to which it did not change: one in 10^4 parts exceeds it
+SPREAD = 6.0  # standard deviations of chi-square that the noise of a part may come to
+LIKELY, EXPLAINED = 2.7, 4.0  # chi-square per value up to which a part is, without and with a sudden change
+SLOW_SIGMAS = 2.0  # standard deviations of its velocity, below which a touch may not move at all
+AS_WELL = 1.05  # times what a whole scan leaves of a touch that moves: one that holds still does as well
+SETTLED = 1.0  # chi-square per value of a whole scan, up to which its touch did not change: 0.1 to 0.7 where it did not
+TINY = 1e-12  # keeps solvable what no value tells
+FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
+MOST = 4  # touches that are followed
+LONGEST_US = 2e5  # without a part: nothing is known of what happened meanwhile
+REMEMBERED = 8  # whole scans of a touch that is held, whose mean it is compared with
+KEPT = 12  # parts whose states are kept: those of a whole scan
+LOW, HIGH = np.log([0.04, 0.005]), np.log([0.9, 0.97])  # of log radius, log drop
+LEAST = 0.01  # model units of uncertainty that are stated at least
+
+
+class FollowedState(NamedTuple):
+    """One touch as the newest part has it; lengths in model units. sigma: along the longest and the shortest axis,
+    angle of the longest [rad]; integral: of the drop over the touch.
+    """
+
+    x: float
+    y: float
+    vx: float
+    vy: float
+    integral: float
+    sigma: tuple[float, float, float]
+
+
+class PartFilter:
+    """For one bundle. Times are in us of the board's clock, of the newest part."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._image = PartImage(bundle)
+        self._half = bundle.half_width
+        self._all: Rows = np.arange(len(bundle.pattern))
+        self._count = len(bundle.pattern) // parts_of(bundle)  # values in a part
+        self.metres_per_unit = self._image.metres_per_unit
+        self.number = 0  # counts up when other touches are followed
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing is followed."""
+        self.touches: Array = np.zeros((0, 6))
+        self._covariance: Array = np.zeros((0, 0))
+        self._placed: Array = np.zeros((0, 2, 2))  # covariance of each place, as the whole scan has it
+        self._still = False
+        self._as_still = 0  # whole scans in a row that a touch which holds still explains better
+        self._at_us = 0.0
+        self._past: deque[tuple[float, Array]] = deque(maxlen=KEPT)  # (when, touches)
+        self._scans = 0  # whole scans whose mean the reference is
+        self._reference: Array | None = None  # (K,) difference where the touches were last held
+
+    @property
+    def moves(self) -> bool:
+        """Whether what is followed changes."""
+        return len(self.touches) > 0 and not self._still
+
+    @property
+    def knows(self) -> bool:
+        """Whether the last part was explained."""
+        return self._reference is not None
+
+    def whole(self, d: Array, noise: Array, at_us: float, shown: bool) -> None:
+        """Take a whole scan of a touch that was there all the time: d (K,) as it was at at_us (see `at_once`), noise
+        (K,). shown: an image is made of it; else it is the same as before.
+        """
+        if self.moves:
+            return
+        held = self._still and self._reference is not None
+        if shown or self._reference is None:
+            self._begin(d, noise)
+        self.touches[:, MODEL:] = 0.0
+        self._scans = min(self._scans + 1, REMEMBERED) if held else 1
+        before = d if self._reference is None or not held else self._reference
+        self._reference, self._there = before + (d - before) / self._scans, self.touches.copy()
+        self._noise = noise / np.sqrt(self._scans)
+        self._still, self._at_us = True, at_us
+        self._refer()
+        self._past.clear()
+        self._past.append((at_us, self.touches.copy()))
+
+    def _refer(self) -> None:
+        """What the model makes of the reference."""
+        assert self._reference is not None
+        expected, slope = self._model(self._there, self._all, np.zeros(len(self._all)))
+        self._left = self._reference - expected
+        self._slope = slope[:, [6 * k + n for k in range(len(self._there)) for n in (0, 1, DROP)]]
+
+    def part(self, d: Array, noise: Array, age: Array, at_us: float) -> bool:
+        """Take what is newer than what was taken last, of d, noise and age [us] (K,); False where it is not explained:
+        then nothing is followed.
+        """
+        elapsed = at_us - self._at_us
+        if self._reference is None or not 0 < elapsed < LONGEST_US:
+            self.forget()
+            return False
+        by_age: Rows = np.argsort(age)
+        fresh = self._count * max(1, int((age < elapsed).sum()) // self._count)  # values measured since
+        if self._still and (changed := self._changed(d, noise, by_age, fresh)):
+            self._still = False
+            self._covariance = np.diag(np.tile(KNOWN**2, len(self.touches)))
+            for k, placed in enumerate(self._placed):
+                self._covariance[6 * k : 6 * k + 2, 6 * k : 6 * k + 2] = placed
+            fresh = max(fresh, changed)  # what was taken for noise is looked at again
+            elapsed *= fresh / max(1, int((age < elapsed).sum()))
+        if not self._still and not (len(self.touches) and self._taken(d, noise, age, by_age[:fresh], elapsed)):
+            self.forget()
+            return False
+        self._at_us = at_us
+        self._past.append((at_us, self.touches.copy()))
+        return True
+
+    def _taken(self, d: Array, noise: Array, age: Array, newest: Rows, elapsed: float) -> bool:
+        """Take values (n,), which were measured within `elapsed` us, part after part; False where one is not
+        explained.
+        """
+        parts = newest.reshape(-1, self._count)[::-1]
+        for rows in parts:
+            tau = 1e-6 * (float(age[rows].mean()) - age[rows])
+            if not self._follow(d[rows], noise[rows], tau, rows, 1e-6 * elapsed / len(parts)):
+                return False
+        return True
+
+    def at_once(self, d: Array, noise: Array, age: Array) -> Array:
+        """(K,) what to add to a whole scan's d, of which each value has its age [us], so that all are as if they had
+        been measured when the newest part was. Zero where nothing moves, or a touch that holds still explains the
+        scan better; twice in a row, or where it is slow, it is held from here on.
+        """
+        change = np.zeros(len(age))
+        if not self.moves:
+            return change
+        middle = float(np.sort(age)[: self._count].mean())
+        now = self._model(self.touches, self._all, change)[0]
+        then = np.array([at for at, _ in self._past])
+        measured = self._at_us + middle - age
+        nearest = np.abs(then[:, None] - measured).argmin(axis=0)
+        for k in np.unique(nearest):
+            rows = np.flatnonzero(nearest == k)
+            change[rows] = now[rows] - self._model(self._past[k][1], rows, 1e-6 * (measured[rows] - then[k]))[0]
+        still, moving = (self._fitted(each, noise, self.touches)[1] for each in (d, d + change))
+        self._as_still = 0 if still > moving else self._as_still + 1
+        if moving > FITS or self._as_still > 1 or (self._slow() and still <= AS_WELL * moving):
+            self.forget()
+        return change if self.moves and not self._as_still else np.zeros(len(age))
+
+    def settled(self, d: Array, noise: Array, seen: PartTouch) -> bool:
+        """Whether a touch that did not change explains a whole scan. seen: it, as the newest parts have it."""
+        return self._fitted(d, noise, _touches([seen]))[1] <= SETTLED
+
+    def _fitted(self, d: Array, noise: Array, around: Array, steps: int = 2) -> tuple[Array, float]:
+        """The touches of about these places that explain a whole scan best, if they hold still, and the chi-square per
+        value that they leave.
+        """
+        touches, tau = around.copy(), np.zeros(len(d))
+        touches[:, MODEL:] = 0.0
+        width = np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean()))
+        columns = [6 * k + n for k in range(len(touches)) for n in range(MODEL)]
+        damping = np.diag(np.tile((5 * KNOWN[:MODEL]) ** -2.0, len(touches)))
+        for _ in range(steps):
+            expected, slope = self._model(touches, self._all, tau)
+            slope = slope[:, columns] / width[:, None]
+            step = np.linalg.solve(slope.T @ slope + damping, slope.T @ ((d - expected) / width))
+            touches[:, :MODEL] += step.reshape(-1, MODEL)
+            touches = self._possible(touches.ravel()).reshape(-1, 6)
+        left = (d - self._model(touches, self._all, tau)[0]) / width
+        return touches, float((left**2).mean())
+
+    def states(self) -> list[FollowedState]:
+        """The touches, as the newest part has them."""
+        found = []
+        for k, (x, y, log_r, log_drop, vx, vy) in enumerate(self.touches.tolist()):
+            place = self._placed[k] if self._still else self._covariance[6 * k : 6 * k + 2, 6 * k : 6 * k + 2]
+            values, vectors = np.linalg.eigh(place)
+            short, long = np.maximum(WIDER * np.sqrt(np.maximum(values, 0.0)), LEAST)
+            sigma = float(long), float(short), float(np.arctan2(vectors[1, 1], vectors[0, 1]))
+            found.append(FollowedState(x, y, vx, vy, float(np.pi * np.exp(2 * log_r + log_drop)), sigma))
+        return found
+
+    def _begin(self, d: Array, noise: Array) -> None:
+        """Fit the touches to a whole scan."""
+        before, found = self.touches, [self._image.fit(d, noise)]
+        touches, misfit = self._fitted(d, noise, _touches(found))
+        while misfit > FITS and len(found) < MOST:  # another one, where what is left of d is largest
+            left = d - self._model(touches, self._all, np.zeros(len(d)))[0]
+            found.append(self._image.fit(left, noise))
+            touches, misfit = self._fitted(d, noise, np.concatenate([touches, _touches(found[-1:])]), steps=8)
+        if misfit > FITS or not _apart(touches):
+            touches, found = _touches([]), []
+        self.touches, self._placed = touches, _covariances(found)
+        if len(before) != len(self.touches) or (np.hypot(*(self.touches - before).T[:2]) > NEAR).any():
+            self.number += 1
+
+    def _slow(self) -> bool:
+        """Whether no touch moves for sure."""
+        speed = np.hypot(*self.touches.T[MODEL:])
+        variance = np.diag(self._covariance).reshape(-1, 6)[:, MODEL:].sum(axis=1)
+        return bool((speed < SLOW_SIGMAS * np.sqrt(variance)).all())
+
+    def _changed(self, d: Array, noise: Array, by_age: Rows, fresh: int) -> int:
+        """Among how many of the newest values a change shows against the reference; 0: all is noise. fresh: values that
+        were not looked at yet.
+        """
+        assert self._reference is not None
+        wide = np.hypot(noise, self._noise)
+        off = (d - self._reference) / wide
+        new = off[by_age[:fresh]]
+        if float(new @ new) > fresh + SPREAD * np.sqrt(2 * fresh):
+            return fresh
+        slope = self._slope / wide[:, None]
+        for parts in WINDOWS if len(self.touches) else ():
+            rows = by_age[: parts * self._count]
+            part, along = slope[rows], slope[rows].T @ off[rows]
+            size = part.T @ part
+            if float(along @ np.linalg.solve(size + TINY * np.trace(size) * np.eye(len(size)), along)) > STILL:
+                return len(rows)
+        return 0
+
+    def _follow(self, d: Array, noise: Array, tau: Array, rows: Rows, elapsed: float) -> bool:
+        """One step of the filter; False where it does not explain the values."""
+        advance = np.eye(self.touches.size)
+        for k in range(len(self.touches)):
+            advance[6 * k : 6 * k + 2, 6 * k + MODEL : 6 * k + 6] = elapsed * np.eye(2)
+        wandered = np.diag(np.tile(WANDERS**2 * elapsed, len(self.touches)))
+        before = advance @ self.touches.ravel()
+        for sudden, most in ((0.0, LIKELY), (1.0, EXPLAINED)):
+            start = self._covariance + sudden * np.diag(np.tile(SUDDEN**2, len(self.touches)))
+            state, covariance, chi = self._updated(before, advance @ start @ advance.T + wandered, d, noise, tau, rows)
+            if chi <= most:
+                self.touches, self._covariance = state.reshape(-1, 6), covariance
+                return True
+        return False
+
+    def _updated(
+        self, before: Array, covariance: Array, d: Array, noise: Array, tau: Array, rows: Rows
+    ) -> tuple[Array, Array, float]:
+        """State (6 N,), covariance and chi-square per value: of values d (n,), measured tau [s] after the state."""
+        assert self._reference is not None
+        state, chi = before, np.inf
+        for _ in range(2):
+            touches = state.reshape(-1, 6)
+            away = np.hypot(*(touches - self._there).T[:2]).max()
+            near = float(np.exp(-((away / NEAR) ** 2)))
+            expected, slope = self._model(touches, rows, tau)
+            new = d - near * self._reference[rows]
+            variance = noise**2 + (LINEAR * new) ** 2 + (LINEAR / 2) ** 2 * float((new**2).mean())
+            off = d - expected - near * self._left[rows] - slope @ (before - state)
+            spread = slope @ covariance @ slope.T + np.diag(variance)
+            gain = np.linalg.solve(spread, slope @ covariance).T
+            if chi == np.inf:
+                chi = float(off @ np.linalg.solve(spread, off)) / len(d)
+            state = self._possible(before + gain @ off)
+        after = covariance - gain @ slope @ covariance
+        return state, np.asarray((after + after.T) / 2), chi
+
+    def _possible(self, state: Array) -> Array:
+        touches = state.reshape(-1, 6).copy()
+        touches[:, :RADIUS] = np.clip(touches[:, :RADIUS], -self._half, self._half)
+        touches[:, RADIUS:MODEL] = np.clip(touches[:, RADIUS:MODEL], LOW, HIGH)
+        return touches.ravel()
+
+    def _model(self, touches: Array, rows: Rows, tau: Array) -> tuple[Array, Array]:
+        """(n,) d of these measurements, each tau (n,) s after the state, and (n, 6 N) its derivative."""
+        steps = np.concatenate([np.zeros((1, 3)), *(np.outer([1, -1], step) for step in np.diag(AHEAD))])
+        circles = (touches[:, None, :DROP] + steps).reshape(-1, 3)
+        drop = np.exp(touches[:, DROP])
+        each = self._image.responses(circles, rows).reshape(len(touches), 7, len(rows)) * drop[:, None, None]
+        slope = np.empty((len(rows), len(touches), 6))
+        slope[:, :, :DROP] = ((each[:, 1::2] - each[:, 2::2]) / (2 * AHEAD[:, None])).transpose(2, 0, 1)
+        slope[:, :, DROP] = each[:, 0].T
+        slope[:, :, MODEL:] = slope[:, :, :2] * tau[:, None, None]
+        expected = each[:, 0].sum(axis=0) + (slope[:, :, MODEL:] * touches[:, MODEL:]).sum(axis=(1, 2))
+        return expected, slope.reshape(len(rows), -1)
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "number": self.number,
+            "touches": self.touches.copy(),
+            "covariance": self._covariance.copy(),
+            "still": [self._still, self._as_still],
+            "at_us": self._at_us,
+            "past": [[at, touches.copy()] for at, touches in self._past],
+            "reference": None
+            if self._reference is None
+            else [self._reference.copy(), self._noise.copy(), self._there.copy(), self._scans],
+            "placed": self._placed.copy(),
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Older recordings have none. Raises KeyError, TypeError or ValueError where it does not fit."""
+        self.forget()
+        if not state:
+            return
+        count = len(state["touches"])
+        self.number, self._at_us = int(state["number"]), float(state["at_us"])
+        self._still, self._as_still = bool(state["still"][0]), int(state["still"][1])
+        self.touches = shaped(state["touches"], (count, 6))
+        if not self._still and state["reference"] is not None:
+            self._covariance = shaped(state["covariance"], (6 * count, 6 * count))
+        self._placed = shaped(state["placed"], (count, 2, 2))
+        self._past.extend((float(at), shaped(touches, (count, 6))) for at, touches in state["past"])
+        if state["reference"] is not None:
+            d, noise, there, scans = state["reference"]
+            self._reference, self._noise = shaped(d, self._all.shape), shaped(noise, self._all.shape)
+            self._there, self._scans = shaped(there, (count, 6)), int(scans)
+            self._refer()
+
+
+def _apart(touches: Array) -> bool:
+    """Whether no touch lies within another: two that grow into each other are not told apart."""
+    away = np.hypot(*(touches[:, None, :RADIUS] - touches[None, :, :RADIUS]).transpose(2, 0, 1))
+    reach = np.exp(touches[:, RADIUS])
+    return bool((away + 1e9 * np.eye(len(touches)) > np.maximum(reach[:, None], reach)).all())
+
+
+def _touches(found: Sequence[PartTouch]) -> Array:
+    """(N, 6) of touches that do not move."""
+    return np.array([[t.x, t.y, np.log(t.radius), np.log(t.drop), 0.0, 0.0] for t in found]).reshape(-1, 6)
+
+
+def _covariances(found: Sequence[PartTouch]) -> Array:
+    """(N, 2, 2) of their places."""
+    made = np.zeros((len(found), 2, 2))
+    for k, (long, short, angle) in enumerate(touch.sigma for touch in found):
+        axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        made[k] = axes @ np.diag([long**2, short**2]) @ axes.T / WIDER**2
+    return made
