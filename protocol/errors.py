@@ -48,5 +48,6 @@ class EitskinError(Exception):
         ├── ReplayRefused                     the page does not record or replay now
         ├── Malformed (ValueError)            bytes that are no RTPS message, or not one that the bridge reads
         ├── CliError                          ends a command with one line and an exit code
-        └── Broken                            bench: a promise was broken under changed bytes
+        ├── Broken                            bench: a promise was broken under changed bytes
+        └── RosMissing (RuntimeError)         bench: there is no ROS 2 to listen with
     """

@@ -41,6 +41,7 @@ from bench.speed.bridges import NEAR_NS, P99_MS, SETTLE_S, SKINS, quantiles
 from bench.speed.service import Service, end_on_sigterm, running
 from bridges import views
 from protocol.control import ControlClient, ControlError
+from protocol.errors import EitskinError
 from protocol.frames import ContactFrame, ImageFrame, StatusFrame
 from protocol.sockets import AllReader
 
@@ -52,7 +53,7 @@ EVERY_S, HELD_S = 8.0, 3.0  # a press, and how long it is held
 Row = dict[str, float]
 
 
-class RosMissing(RuntimeError):
+class RosMissing(EitskinError, RuntimeError):
     """There is no ROS 2 to listen with. The text says what to do."""
 
 

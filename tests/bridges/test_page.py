@@ -20,6 +20,7 @@ import pytest
 
 from bridges.page import fetch_three
 from bridges.page.advice import ADVICE
+from bridges.page.commands import OwnRecorder
 from bridges.page.replays import Replay, ReplayRefused, listed
 from bridges.page.server import PageServer
 from bridges.page.settings import PageSettings
@@ -202,6 +203,13 @@ def test_the_services_recorder_is_told(runtime: Path, tmp_path: Path) -> None:
         recorder.close()
 
     run(test)
+
+
+def test_a_recorder_that_is_slow_to_answer_is_there(runtime: Path, tmp_path: Path) -> None:
+    assert not OwnRecorder._answers(0.1)
+    server = ControlServer("recorder", {"status": lambda: {}})  # and nobody serves it
+    assert OwnRecorder._answers(0.1)
+    server.close()
 
 
 def test_where_no_recorder_runs_the_page_has_one_while_it_runs(runtime: Path, tmp_path: Path) -> None:
