@@ -127,7 +127,7 @@ def target(axis: Axes, at: float | None, text: str, across: bool = True, style: 
 SHORT = (
     ("shipped, ", "eitskin "), (" (published)", ""), ("lambda 0.15", "as published"), (", best lambda", ""),
     ("the same without attention", "without attention"), ("MM-CNN as published", "MM-CNN published"),
-    ("pyEIT 1.2.4", "pyEIT"),
+    ("pyEIT 1.2.4", "pyEIT"), (", training time not recorded", ""),
     (", 3 steps", ""), (" (0.01)", ""),
 )  # fmt: skip
 ACCURACY = (  # level, figure, its target, title
