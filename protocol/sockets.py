@@ -86,7 +86,33 @@ class _Reader:
         self.socket.close(0)
 
 
-class NewestReader(_Reader):
+class _TopicReader(_Reader):
+    """One topic of one skin, from its one producer; frames that were not read are counted."""
+
+    def __init__(
+        self, topic: str, skin: str, endpoint: str | None, context: Context | None, options: dict[int, int]
+    ) -> None:
+        producers = TOPICS[topic].producers
+        if endpoint is None and len(producers) > 1:
+            raise ValueError(f"{topic} has several producers: name an endpoint, or read it with AllReader")
+        address = endpoint or transport.current().data_address(producers[0])
+        addresses = {producers[0]: address}
+        socket = transport.connect(context or zmq.Context.instance(), zmq.SUB, addresses, options)
+        super().__init__(address, socket, addresses)
+        self.topic, self.skin = topic, skin
+        self.skipped = 0
+        """Frames that were overtaken by newer ones before we read them (or lost on the way)."""
+        self._last: tuple[str, int] | None = None
+        self.socket.subscribe(wire_topic(topic, skin) + b"\0")
+
+    def _count(self, frame: Frame) -> None:
+        """Count what is missing between the last frame and this one."""
+        if self._last is not None and self._last[0] == frame.session and frame.seq > self._last[1]:
+            self.skipped += frame.seq - self._last[1] - 1
+        self._last = (frame.session, frame.seq)
+
+
+class NewestReader(_TopicReader):
     """The newest frame of one topic of one skin; older ones are skipped.
 
     CONFLATE, because a high-water mark bounds neither the age of what is queued nor the kernel's buffers; one topic
@@ -94,18 +120,7 @@ class NewestReader(_Reader):
     """
 
     def __init__(self, topic: str, skin: str, endpoint: str | None = None, context: Context | None = None) -> None:
-        producers = TOPICS[topic].producers
-        if endpoint is None and len(producers) > 1:
-            raise ValueError(f"{topic} has several producers: name an endpoint, or read it with AllReader")
-        address = endpoint or transport.current().data_address(producers[0])
-        addresses = {producers[0]: address}
-        socket = transport.connect(context or zmq.Context.instance(), zmq.SUB, addresses, {zmq.CONFLATE: 1})
-        super().__init__(address, socket, addresses)
-        self.topic, self.skin = topic, skin
-        self.skipped = 0
-        """Frames that were overtaken by newer ones before we read them (or lost on the way)."""
-        self._last: tuple[str, int] | None = None
-        self.socket.subscribe(wire_topic(topic, skin) + b"\0")
+        super().__init__(topic, skin, endpoint, context, {zmq.CONFLATE: 1})
 
     def recv(self, timeout_s: float = 0.0) -> Frame | None:
         """The newest frame not yet read, waiting up to `timeout_s` for one; None when there is none. Never raises on
@@ -117,12 +132,8 @@ class NewestReader(_Reader):
     def recv_message(self, timeout_s: float = 0.0) -> tuple[Frame, bytes] | None:
         """The newest frame not yet read together with its message, for who forwards it."""
         got = self._receive(timeout_s)
-        if got is None:
-            return None
-        frame = got[0]
-        if self._last is not None and self._last[0] == frame.session and frame.seq > self._last[1]:
-            self.skipped += frame.seq - self._last[1] - 1
-        self._last = (frame.session, frame.seq)
+        if got is not None:
+            self._count(got[0])
         return got
 
 
@@ -130,21 +141,14 @@ PARTS_QUEUE = 200
 """Messages held in a reader of parts: about a second of them."""
 
 
-class PartsReader(_Reader):
+class PartsReader(_TopicReader):
     """The newest frame of one topic of one skin whose scans come in parts, and before it the newest one that says more
     than where touches are by now (`whole`): what follows it cannot do without. Older ones are skipped.
     """
 
     def __init__(self, topic: str, skin: str, endpoint: str | None = None, context: Context | None = None) -> None:
-        address = endpoint or transport.current().data_address(TOPICS[topic].producers[0])
-        addresses = {TOPICS[topic].producers[0]: address}
-        socket = transport.connect(context or zmq.Context.instance(), zmq.SUB, addresses, {zmq.RCVHWM: PARTS_QUEUE})
-        super().__init__(address, socket, addresses)
-        self.skipped = 0
-        """Frames that were overtaken by newer ones before we read them (or lost on the way)."""
-        self._last: tuple[str, int] | None = None
+        super().__init__(topic, skin, endpoint, context, {zmq.RCVHWM: PARTS_QUEUE})
         self._part: Frame | None = None
-        self.socket.subscribe(wire_topic(topic, skin) + b"\0")
 
     @property
     def more(self) -> bool:
@@ -160,9 +164,7 @@ class PartsReader(_Reader):
         got = self._receive(timeout_s)
         while got is not None:
             frame = got[0]
-            if self._last is not None and self._last[0] == frame.session and frame.seq > self._last[1]:
-                self.skipped += frame.seq - self._last[1] - 1
-            self._last = (frame.session, frame.seq)
+            self._count(frame)
             if getattr(frame, "whole", True):
                 self.skipped += (whole is not None) + (self._part is not None)
                 whole, self._part = frame, None

@@ -26,7 +26,7 @@ COARSE = 0.05  # of the side: a standard deviation beyond it is coarse
 STEPS = 8
 MOST_MISFIT = 6.0  # squares left per value, beyond which it is no touch of this kind; below, they widen what is stated
 MOST = np.array([0.1, 0.1, 0.3, 0.5])  # of one step
-TINY = 1e-9
+TINY = 1e-9  # keeps solvable what nothing depends on, as of a circle off the skin
 AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
 
 
@@ -73,9 +73,7 @@ class PartImage:
         for _ in range(STEPS):
             hessian = slope.T @ slope + information
             pull = slope.T @ left - np.array([0.0, 0.0, *(SD**-2 * (theta[2:] - MEAN))])
-            damped = (
-                hessian + damping * np.diag(np.diag(hessian)) + TINY * np.eye(4)
-            )  # off the skin nothing depends on it
+            damped = hessian + damping * np.diag(np.diag(hessian)) + TINY * np.eye(4)
             step = np.linalg.solve(damped, pull)
             step *= min(1.0, float((MOST / np.maximum(np.abs(step), 1e-9)).min()))
             there = theta + step

@@ -7,15 +7,14 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from bench.speed.sentinel_host import AdaptiveHost
 from models.bundle import Bundle
-from protocol.frames import pack, unpack
 from services.estimation.part_filter import PartFilter
 from services.estimation.part_image import PartImage
 from services.estimation.rolling import measured_at
 from services.pipeline import Pipeline
 from services.runtime.config import Skin
 from services.runtime.persistence import arrays, plain
+from tests.services.rolling_host import rolling_host
 
 ROLLING = Skin(port="stub", bundle="square16", scan="rolling")
 SIGMA = 1e-4
@@ -170,19 +169,8 @@ def test_its_state_goes_with_a_recording(bundle):
 
 @pytest.fixture(scope="module")
 def host():
-    host = AdaptiveHost("rolling", snr_db=80.0, seed=8)
-    host.raws = []
-    hand_on = host.source.handed_on
-
-    def kept(*args):
-        frame = hand_on(*args)
-        host.raws += [pack(frame)] if frame else []
-        return frame
-
-    host.source.handed_on = kept
-    host.until(5.0)
-    yield host
-    host.rig.close()
+    with rolling_host(seed=8) as host:
+        yield host
 
 
 def test_contacts_of_a_held_and_then_sliding_touch_come_at_the_part_rate(host):
@@ -249,7 +237,7 @@ def test_a_recording_that_begins_while_a_touch_slides_plays_as_it_was(host):
     again = Pipeline(ROLLING, "palm")
     for stage, state in zip((again.pre, again.inference, again.publishing), states, strict=True):
         stage.load(arrays(state))
-    made = [found.contact for message in host.raws[raw:] if (found := again.step(unpack(message))) is not None]
+    made = [found.contact for frame in host.raws[raw:] if (found := again.step(frame)) is not None]
     assert len(made) == len(host.contacts) - first > 40
     for one, (_, other) in zip(made, host.contacts[first:], strict=True):
         assert (one.scan, one.valid, one.reasons) == (other.scan, other.valid, other.reasons)

@@ -17,6 +17,7 @@ from services.pipeline import Pipeline
 from services.rolling_scans import RollingScans
 from services.runtime.config import Skin
 from services.runtime.stage import Health
+from tests.services.rolling_host import rolling_host
 
 ROLLING = Skin(port="stub", bundle="square16", scan="rolling")
 
@@ -28,19 +29,8 @@ def bundle():
 
 @pytest.fixture(scope="module")
 def host():
-    host = AdaptiveHost("rolling", snr_db=80.0, seed=2)
-    host.raws = []
-    hand_on = host.source.handed_on
-
-    def kept(*args):
-        frame = hand_on(*args)
-        host.raws += [frame] if frame else []
-        return frame
-
-    host.source.handed_on = kept
-    host.until(5.0)
-    yield host
-    host.rig.close()
+    with rolling_host(seed=2) as host:
+        yield host
 
 
 def part(seq, of=5, n=2, value=1.0, config=1):
