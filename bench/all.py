@@ -1,4 +1,4 @@
-"""Every benchmark, one page: latency, skip rules, many skins, adaptive scan, peers, tracking, faults, drift, stability,
+"""Every benchmark, one page: latency, skip rules, many skins, reaction, peers, tracking, faults, drift, stability,
 accuracy.
 
     skin bench all                      the page of README: about an hour on two idle cores
@@ -75,7 +75,6 @@ BENCHMARKS = (
         ("reaction",),
         "Full scans are there to compare with: theirs take 45 ms. A light touch and a force that grows are told later.",
     ),
-    Benchmark("sentinel", "Adaptive scan", ("--quick",)),
     Benchmark(
         "peers",
         "Peers",

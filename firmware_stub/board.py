@@ -21,7 +21,7 @@ CLOCK_HZ = 16e6  # the AD5940's system clock
 SETTLE_S = 20e-6  # multiplexers and filters, before each DFT
 KEPT_CONFIGS = 8
 POINTS = [2**k for k in range(2, 15)]
-CAPABILITIES = link.Capability.SENTINEL | link.Capability.SELF_TEST | link.Capability.VARIABLE_DFT
+CAPABILITIES = link.Capability.SWITCHES | link.Capability.SELF_TEST | link.Capability.VARIABLE_DFT
 EVENT_PAUSE_S = 1.0  # the same event is reported at most that often
 
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from models.geometry import SkinGeometry
 from models.prereconstruction import Array, Drift, Operator, PreReconstructor
-from models.touch_fit import misfit_factor
+from models.response_error import misfit_factor
 from models.turns import TURNS, Turn
 
 # What two meshes or two solvers differ by, of |d|. It is no noise: it looks like the signal of a touch that is not

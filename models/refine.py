@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
+from models.response_error import FrameErrors, frame_errors
 from models.shapes import KINDS, Array, Shape
-from models.touch_fit import FrameErrors, TouchFit, TouchPosterior, frame_errors
+from models.touch_fit import TouchFit
+from models.touch_posterior import TouchPosterior
 from models.touch_response import TouchResponse
 from protocol.errors import EitskinError
 
@@ -85,7 +87,7 @@ def refined_fit(
     before: Mapping[str, Array] | None = None,
 ) -> TouchPosterior:
     """As TouchFit, in two steps. Raises ValueError where a covariance is none."""
-    before = before or likely(TouchFit(coarse)(d, errors, start, kinds, radius))
+    before = before or likely(TouchFit(coarse, scales=(1.0,))(d, errors, start, kinds, radius))
     return TouchFit(fine)(d, errors, start, kinds, radius, before)
 
 

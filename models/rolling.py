@@ -1,7 +1,7 @@
 """The order of a scan in parts: each part sees the whole skin (numpy only).
 
 By turns each part takes the measurement that lowers the mean variance of a touch's position most, given what the part
-has (A-optimal, as models/sentinel.py's list, whose grid of touches and prior it uses). Every electrode is in every
+has (A-optimal, Bayesian: Chaloner & Verdinelli, Statistical Science 10, 1995). Every electrode is in every
 part, so that a fault of one shows in each.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from models.prereconstruction import Matrices
-from models.sentinel import PRIOR, RADIUS, SNR_DB, Array, Rows, slopes, touches
+from models.touch_grid import PRIOR, RADIUS, SNR_DB, Array, Rows, slopes, touches
 from protocol.link import PARTS
 
 

@@ -25,7 +25,7 @@ __version__ = "0.2.0"
 __all__ = [
     "AsyncContactSubscriber", "Contact", "ContactFrame", "ContactListener", "ContactSubscriber", "ControlError",
     "DeltaFrame", "EitskinError", "ForceFrame", "Frame", "FrameError", "ImageFrame", "InfoFrame", "NotValid",
-    "RawFrame", "ShapeFrame", "Stale", "StatusFrame", "TransportError", "TruthFrame", "__version__",
+    "PartFrame", "RawFrame", "ShapeFrame", "Stale", "StatusFrame", "TransportError", "TruthFrame", "__version__",
 ]  # fmt: skip
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
         FrameError,
         ImageFrame,
         InfoFrame,
+        PartFrame,
         RawFrame,
         ShapeFrame,
         StatusFrame,

@@ -39,7 +39,7 @@ REASONS = {
     "gap": "scans are missing just before this one",
     "low_snr": "the measurements are too noisy for the stated uncertainty",
     "out_of_distribution": "the measurements look like nothing the model was trained on",
-    "coarse": "from the short sentinel scan: that something touches, roughly where",
+    "coarse": "from the first part of a scan since the touch began: that something touches, roughly where",
     "changing": "the touch came, went or changed while it was scanned: that something touches, but only roughly where",
     "extrapolated": "a force beyond the calibrated range",
     "late": "measured longer ago than it may be acted on: what brought it was held up",
@@ -138,7 +138,8 @@ class RawFrame(Frame):
     config: int = wire(Int(0, 65535), "board's configuration that was scanned", 0)
     kind: str = wire(
         Text(choices=("full", "sentinel", "reference")),
-        "whole pattern; short list while idle; or, from imported files only, a scan known to be untouched",
+        "whole pattern; a short list (in old recordings only); or, from imported files only, a scan known to be "
+        "untouched",
         "full",
     )
     board: str = wire(Text(64), "unique id of the board", "")
@@ -190,9 +191,18 @@ class DeltaFrame(Frame):
         Text(64, form="(?:[0-9a-f]{64})?"), "hash of the bundle as it was calibrated to this skin; empty: as it is", ""
     )
     followed: list[FollowedTouch] = wire(
-        ListOf(Record(FollowedTouch), 16), "of a scan in parts: where the touches are by now; empty: nobody knows", list
+        ListOf(Record(FollowedTouch), 16),
+        "of a scan in parts: where the touches are at `sample`; empty: nobody follows them",
+        list,
     )
-    whole: bool = wire(Bool(), "false: of a part of a scan, which says nothing new but `followed`", True)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class PartFrame(Frame):
+    """Where the touches of a scan in parts are by its newest part: between two delta frames, which say all else."""
+
+    after: int = wire(_COUNT, "scan of the delta frame before it: the image of that scan shows these touches", 0)
+    followed: list[FollowedTouch] = wire(ListOf(Record(FollowedTouch), 16), "the touches", list)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -275,9 +285,10 @@ class ImageFrame(Frame):
         Maybe(Record(RefinedTouch)), "the touch refined by a fit, also in held frames; nil: there is none yet", None
     )
     followed: list[FollowedTouch] = wire(
-        ListOf(Record(FollowedTouch), 16), "of a scan in parts: where the touches are by now; empty: nobody knows", list
+        ListOf(Record(FollowedTouch), 16),
+        "of a scan in parts: where the touches are at `sample`; empty: nobody follows them",
+        list,
     )
-    whole: bool = wire(Bool(), "false: of a part of a scan, which says nothing new but `followed`", True)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -336,7 +347,9 @@ class Contact:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class ContactFrame(Frame):
-    """All touches: published at the board's full-scan rate also when there is none, so that silence means fault."""
+    """All touches: published at the board's full-scan rate also when there is none, so that silence means fault. Of a
+    scan in parts more often while something touches; `rate_hz` in info says how often.
+    """
 
     held: bool = wire(Bool(), "the contacts are those of an earlier frame: nothing changed since", False)
     frame_id: str = wire(Text(128), "name of the coordinate frame of positions and wrenches", "")
@@ -407,6 +420,9 @@ INFO_KEYS = {
     "pose": "x, y, z [m], qx, qy, qz, qw: the skin's frame in its parent",
     "surface": "map: kind (cylinder), radius_m, axis_degrees: what the sheet is wrapped round; or nil: it lies flat",
     "units": "map: name of a field -> its unit",
+    "rate_hz": "map: least, the rate at which contact and force frames come also while nothing touches: fewer are a "
+    'fault; touched, the rate that they reach while a touch is followed (`scan = "rolling"`: with every part); or nil: '
+    "not yet known",
     "force_law": "map: kind and parameters of the force law, or nil",
     "refinement": "whether touches are refined by a fit of their shape (`indenter` in skin.toml): on, or why not",
     "mounting": "map: what the calibration to this very skin found (contacts, shifts, field, anisotropy, remarks); "

@@ -37,6 +37,7 @@ from .frame_types import (
     ImageFrame,
     InfoFrame,
     LocatedTouch,
+    PartFrame,
     RawFrame,
     RefinedTouch,
     ShapeFrame,
@@ -51,8 +52,8 @@ __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "KINDS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
     "Contact", "ContactFrame", "DeltaFrame", "FollowedTouch", "ForceFrame", "Frame", "FrameError", "ImageFrame",
-    "InfoFrame", "LocatedTouch", "RawFrame", "RefinedTouch", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame",
-    "as_sent", "pack", "read_map", "unpack",
+    "InfoFrame", "LocatedTouch", "PartFrame", "RawFrame", "RefinedTouch", "ShapeFrame", "StatusFrame",
+    "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
 ]  # fmt: skip
 
 MAX_MESSAGE = 4 * 1024 * 1024

@@ -37,7 +37,7 @@ class LinkError(EitskinError, ValueError):
 class Capability(IntFlag):
     """Bits of Ident.capabilities."""
 
-    SENTINEL = 1
+    SWITCHES = 1
     SELF_TEST = 2
     VARIABLE_DFT = 4
     TIME = 8

@@ -16,7 +16,7 @@ import zmq
 
 from . import transport
 from .control import ControlClient, ControlError, ControlServer, clock_offset
-from .frames import Frame, FrameError, unpack
+from .frames import Frame, FrameError, PartFrame, unpack
 from .logs import foreign
 from .publishing import Publisher
 from .reconnecting import Connections
@@ -138,43 +138,67 @@ class NewestReader(_TopicReader):
 
 
 PARTS_QUEUE = 200
-"""Messages held in a reader of parts: about a second of them."""
+"""Messages held in a reader of images and parts, from each of the two producers: about a second of parts."""
 
 
-class PartsReader(_TopicReader):
-    """The newest frame of one topic of one skin whose scans come in parts, and before it the newest one that says more
-    than where touches are by now (`whole`): what follows it cannot do without. Older ones are skipped.
+class PartsReader(_Reader):
+    """The newest image frame of one skin whose scans come in parts, and the newest part after it; older ones are
+    skipped. A part comes after the image of the scan that it names, whichever of the two arrives first.
     """
 
-    def __init__(self, topic: str, skin: str, endpoint: str | None = None, context: Context | None = None) -> None:
-        super().__init__(topic, skin, endpoint, context, {zmq.RCVHWM: PARTS_QUEUE})
-        self._part: Frame | None = None
+    def __init__(self, skin: str, context: Context | None = None) -> None:
+        producers = {TOPICS[topic].producers[0] for topic in ("image", "part")}
+        addresses = {name: transport.current().data_address(name) for name in sorted(producers)}
+        own = context or zmq.Context.instance()
+        socket = transport.connect(own, zmq.SUB, addresses, {zmq.RCVHWM: PARTS_QUEUE})
+        super().__init__(", ".join(addresses.values()), socket, addresses)
+        self.skipped = 0
+        """Frames that were overtaken by newer ones before we read them (or lost on the way)."""
+        self._names = [wire_topic(topic, skin) + b"\0" for topic in ("image", "part")]
+        self._last: dict[type[Frame], tuple[str, int]] = {}
+        self._part: PartFrame | None = None
+        self._after = -1  # scan of the image frame that was read last
+        self.listen(True)
+
+    def listen(self, on: bool) -> None:
+        """Subscribe, or no longer."""
+        for name in self._names:
+            (self.socket.subscribe if on else self.socket.unsubscribe)(name)
 
     @property
     def more(self) -> bool:
         """Whether another frame is here already, whatever the socket says."""
-        return self._part is not None
+        return self._part is not None and self._part.after == self._after
 
     def recv(self, timeout_s: float = 0.0) -> Frame | None:
         """The next frame, waiting up to `timeout_s` for one; None when there is none. Never raises on bad input."""
-        part, self._part = self._part, None
-        if part is not None:
-            return part
-        whole: Frame | None = None
-        got = self._receive(timeout_s)
+        image: Frame | None = None
+        got = self._receive(0.0 if self.more else timeout_s)
         while got is not None:
             frame = got[0]
             self._count(frame)
-            if getattr(frame, "whole", True):
-                self.skipped += (whole is not None) + (self._part is not None)
-                whole, self._part = frame, None
-            else:
+            if isinstance(frame, PartFrame):
                 self.skipped += self._part is not None
                 self._part = frame
+            else:
+                self.skipped += image is not None
+                image = frame
             got = self._receive(0.0)
-        if whole is None:
-            whole, self._part = self._part, None
-        return whole
+        if image is not None:
+            self._after = image.scan
+            if self._part is not None and self._part.after < image.scan:
+                self._part, self.skipped = None, self.skipped + 1  # of before that image
+            return image
+        if not self.more:
+            return None
+        part, self._part = self._part, None
+        return part
+
+    def _count(self, frame: Frame) -> None:
+        last = self._last.get(type(frame))
+        if last is not None and last[0] == frame.session and frame.seq > last[1]:
+            self.skipped += frame.seq - last[1] - 1
+        self._last[type(frame)] = frame.session, frame.seq
 
 
 class AllReader(_Reader):

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import hashlib
+from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from models.bundle import Bundle
 from models.prereconstruction import ONE_STEP_LAMBDA
+from protocol.frames import RawFrame
 from services.contacts.force import ForceLaw
 from services.estimation.tare import Baseline
 from services.runtime.config import Skin
+from services.runtime.stage import SEPARATE
 
 ON = "on"
 CORNERS = 64  # of the polygon that stands for a disc
 MOVED = 2e-4  # relative: as two frames of 80 dB differ; a baseline that drifted by more is told again
 EVERY_S = 5.0  # but that at most so often
+RATE_FRAMES = 16  # of which the median time between two scans is taken
+RATE_CHANGED = 0.1  # relative: a rate that changed by more is told again
 
 UNITS = {"z": "ohm", "image": "S/m", "position": "m", "velocity": "m/s", "area_m2": "m^2", "force_n": "N"}
 
@@ -34,10 +39,15 @@ def force(skin: Skin, bundle: Bundle) -> dict[str, Any]:
 
 
 def describe(
-    skin: Skin, bundle: Bundle, force: dict[str, Any], baseline: Baseline | None, revision: int = 0
+    skin: Skin,
+    bundle: Bundle,
+    force: dict[str, Any],
+    baseline: Baseline | None,
+    revision: int = 0,
+    rate_hz: dict[str, float] | None = None,
 ) -> dict[str, Any]:
-    """The map of an InfoFrame: bundle (the one in use), geometry, pose, units, what `force` said and, once there is
-    one, the baseline.
+    """The map of an InfoFrame: bundle (the one in use), geometry, pose, units, the rate of frames, what `force` said
+    and, once there is one, the baseline.
     """
     found: dict[str, Any] = {
         "bundle": bundle.name,
@@ -50,6 +60,7 @@ def describe(
         "pose": [*skin.pose.position_m, *skin.pose.quaternion_xyzw],
         "surface": None if skin.surface is None else skin.surface.model_dump(),
         "units": UNITS,
+        "rate_hz": rate_hz,
         **force,
     }
     if baseline is not None:
@@ -85,6 +96,37 @@ def refinement(skin: Skin, bundle: Bundle, calibrated: bool = False) -> str:
     return ON
 
 
+class FrameRate:
+    """How often contact frames come: `found` maps `least` to the rate of whole scans, which holds whatever happens, and
+    `touched` to that of the parts, which they reach while a touch is followed from part to part. None: not yet known.
+    """
+
+    def __init__(self) -> None:
+        self.found: dict[str, float] | None = None
+        self._before = (0, 0, 0)  # parts, scan, `sample` of the frame before; no parts: there is none
+        self._steps_ns: deque[float] = deque(maxlen=RATE_FRAMES)
+
+    def __call__(self, frame: RawFrame) -> None:
+        """Take the next raw frame. Scans lost in between count; those that follow no other do not."""
+        if frame.kind != "full" or SEPARATE in frame.reasons:
+            return
+        (parts, scan, sample_ns), now_ns = self._before, frame.stamps.get("sample", 0)
+        self._before = frame.parts, frame.scan, now_ns
+        if parts != frame.parts or frame.scan <= scan:
+            self._steps_ns.clear()
+            return
+        self._steps_ns.append((now_ns - sample_ns) / (frame.scan - scan))
+        if len(self._steps_ns) < RATE_FRAMES:
+            return
+        step_ns = float(np.median(self._steps_ns))
+        self._steps_ns.clear()
+        if step_ns > 0:
+            touched = 1e9 / step_ns
+            told = 0.0 if self.found is None else self.found["touched"]
+            if abs(touched - told) > RATE_CHANGED * touched:
+                self.found = {"least": round(touched / frame.parts, 2), "touched": round(touched, 2)}
+
+
 class _Told(NamedTuple):
     baseline: Baseline | None
     origin: tuple[Any, ...]
@@ -99,10 +141,13 @@ class BaselineNews:
     def __init__(self) -> None:
         self._told: _Told | None = None
 
-    def __call__(self, baseline: Baseline | None, now_ns: int) -> bool:
-        """True: the caller tells it now. now_ns: stamp `sample` of the newest frame."""
+    def __call__(self, baseline: Baseline | None, now_ns: int, rate_hz: dict[str, float] | None = None) -> bool:
+        """True: the caller tells it now. now_ns: stamp `sample` of the newest frame. rate_hz: told anew as it is
+        another.
+        """
         told = self._told
-        found = _Told(baseline, () if baseline is None else _origin(baseline), now_ns)
+        rate = tuple((rate_hz or {}).values())
+        found = _Told(baseline, (rate, *(() if baseline is None else _origin(baseline))), now_ns)
         if told is not None and told.origin == found.origin:
             if told.baseline is None or baseline is None or abs(now_ns - told.at_ns) < EVERY_S * 1e9:
                 return False

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from models.bundle import Bundle
-from services.describe import BaselineNews, describe, force, refinement
+from services.describe import BaselineNews, FrameRate, describe, force, refinement
 from services.estimation import checks
 from services.estimation.drift import DriftRates
 from services.estimation.electrodes import ElectrodeHealth
@@ -23,7 +23,6 @@ from services.linearisation import Linearisation
 from services.rolling_scans import RollingScans
 from services.runtime.config import Skin
 from services.runtime.stage import Health, Refused, Stage
-from services.sentinel_scans import SentinelScans
 
 
 class EstimatorStage(Stage):
@@ -40,9 +39,9 @@ class EstimatorStage(Stage):
         self.gain = GainSteps(len(bundle.pattern))
         self.frame_averager = FrameAverager()
         self._news = BaselineNews()
+        self.frame_rate = FrameRate()
         self._unchecked = checks.sentence(bundle)
         self._force = force(skin, bundle)
-        self.sentinel_scans = SentinelScans(skin, bundle)
         self.rolling_scans = RollingScans(bundle)
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
         self.reset()
@@ -71,7 +70,6 @@ class EstimatorStage(Stage):
         self._news = BaselineNews()
 
     def reset(self) -> None:
-        self.sentinel_scans.scan = 0
         self.rolling_scans.reset()
         self._impossible_ns = 0  # since when every frame is of no touch
         self.gain.reset()
@@ -117,7 +115,6 @@ class EstimatorStage(Stage):
         return {
             "touched": self.touch_estimator.touched,
             "waits": self.touch_estimator.state(),
-            "coarse": self.sentinel_scans.scan,
             "rolling": self.rolling_scans.state(),
             "impossible_ns": self._impossible_ns,
             "gain": self.gain.state(),
@@ -143,7 +140,6 @@ class EstimatorStage(Stage):
         self.baseline_estimator.load(state)
         self.touch_estimator.touched = bool(state["touched"])
         self.touch_estimator.load(state.get("waits", {"last": None}))
-        self.sentinel_scans.scan = int(state.get("coarse", 0))
         self.rolling_scans.load(state.get("rolling", {}))
         self._impossible_ns = int(state.get("impossible_ns", 0))
         self.frame_averager.load(state["hold"], len(self.bundle.pattern))
@@ -169,8 +165,6 @@ class EstimatorStage(Stage):
 
     def warm_up(self) -> None:
         _ = self.baseline_estimator.evidence
-        if self.config.scan == "adaptive":
-            self.sentinel_scans.warm_up()
         if self.config.scan == "rolling":
             self.rolling_scans.warm_up()
         if self.baseline_estimator.baseline is not None:
@@ -181,10 +175,10 @@ class EstimatorStage(Stage):
             decision(nothing, False)
 
     def info(self) -> dict[str, Any] | None:
-        if not self._news(self.baseline_estimator.baseline, self.baseline_estimator.last_sample_ns):
+        estimator, rate_hz = self.baseline_estimator, self.frame_rate.found
+        if not self._news(estimator.baseline, estimator.last_sample_ns, rate_hz):
             return None
-        estimator = self.baseline_estimator
-        said = describe(self.config, self.bundle, self._force, estimator.baseline, estimator.revision)
+        said = describe(self.config, self.bundle, self._force, estimator.baseline, estimator.revision, rate_hz)
         said["refinement"] = refinement(self.config, self.bundle, bool(self.linearisation.name))
         return said | {"mounting": self.linearisation.found} if self.linearisation.found else said
 

@@ -14,20 +14,19 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.locator import Located, Locator
-from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch, RefinedTouch
+from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
 from services.describe import ON, refinement
 from services.estimation.part_image import PartImage
-from services.estimation.quality import SURE, Residual
-from services.estimation.sentinel import CoarseImage
-from services.estimation.within_scan import CHANGING_FRAMES, ChangingTouch
+from services.image_check import ImageCheck
 from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
-from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
+from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
 from services.symmetry import SymmetryMean, symmetries
 
 if TYPE_CHECKING:
-    from services.refinement import RefineHere, Refinement, RefineProcess
+    from services.refine_process import RefineHere, RefineProcess
+    from services.refinement import Refinement
 
 TELLS = 0.6  # share of held-out touches whose class a registered skin's network must get right for it to be stated
 SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
@@ -49,11 +48,10 @@ class Inference(Stage):
             self._network.check(bundle)
         # Only a network's image is meant to explain a frame: a one-step image shows where, not how much. Nor is that of
         # a registered skin: its presses leave too much open, and its locator says how well each touch is explained.
-        self._refuses = isinstance(self._network, Network) and bundle.locator is None
+        refuses = isinstance(self._network, Network) and bundle.locator is None
+        self.image_check = ImageCheck(bundle, refuses)
         self.linearisation = Linearisation(name, bundle)
-        self._residual = Residual(bundle, to_scale=self._refuses)
         self._tells_shapes = tells_shapes(bundle)
-        self._changing_touch = ChangingTouch(bundle)  # the bundle's: how a skin is mounted changes 3 % of d by little
         self.each_alone = False  # offline: frames that do not follow each other; each waits for its fit
         n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
@@ -62,28 +60,24 @@ class Inference(Stage):
         self._symmetry: SymmetryMean | None = None
         if skin.touch.symmetry and isinstance(self._network, Network) and bundle.locator is None:
             self._symmetry = SymmetryMean(self._network, symmetries(bundle.skin))  # one registered is like itself alone
-        self._coarse = CoarseImage(bundle) if skin.scan == "adaptive" else None
         self._parts = PartImage(bundle) if skin.scan == "rolling" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
 
     def reset(self) -> None:
+        self.image_check.forget()
         if self._refinement is not None:
             self._refinement.forget()
         if self._symmetry is not None:
             self._symmetry.forget()
         self._surer: Pictures | None = None  # the mean over the symmetries of the image that is held
         self._last: ImageFrame | None = None  # of the touch that is being held
-        self._refused = False  # whether it explains its frame too badly to be that of a touch
         self._last_scan = 0  # of the frame that it was reconstructed from
-        self._refined: RefinedTouch | None = None  # of the last whole scan
         self._again = True  # whether a subscriber may not have it: the next held frame brings it
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
         self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
         self._quiet: NDArray[np.float32] | None = None  # standard deviation that untouched frames state
         self._stated = 0  # how many have stated it, one after the other
-        self._changing = 0  # frames in a row whose touch changed during the scan
-        self._changing_scan = 0  # of the last of them whose image shows nothing
         names = (
             "networks_run",
             "held",
@@ -103,7 +97,7 @@ class Inference(Stage):
             self._counters["unwanted"] += 1
             self._unseen = frame if frame.stack.size else self._unseen
             return []
-        out = ImageFrame(**inherited(frame), touched=frame.touched, followed=frame.followed, whole=frame.whole)
+        out = ImageFrame(**inherited(frame), touched=frame.touched, followed=frame.followed)
         if frame.calibration != self.linearisation.name and not self._follow(frame.calibration):
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
@@ -113,21 +107,19 @@ class Inference(Stage):
             self._run(frame, out)
         elif frame.held and self._unseen is not None and self._unseen.scan == frame.reconstructed:
             self._run(self._unseen, out)
-        elif not frame.whole:
-            self._part(frame, out)
         elif frame.held:
             self._hold(frame, out)
         elif frame.touched and "coarse" in frame.reasons:
-            self._roughly(frame, out)
+            self._of_parts(frame, out)
         else:
             self._counters["untouched"] += 1
-            self._last, self._changing, self._changing_scan = None, 0, 0
+            self._last = None
+            self.image_check.forget()
             if self._symmetry is not None:
                 self._symmetry.forget()
             self._rest(frame.sigma)
-        if self._refinement is not None and frame.whole:
+        if self._refinement is not None:
             self._refine(frame, out)
-            self._refined = out.refined
         return [out]
 
     def fit_by(self, fits: RefineProcess | RefineHere) -> None:
@@ -152,7 +144,7 @@ class Inference(Stage):
 
     def _build(self) -> None:
         """What stands on the matrices in use."""
-        self._residual = Residual(self.linearisation.bundle, to_scale=self._refuses)
+        self.image_check.follow(self.linearisation.bundle)
         if isinstance(self._network, OneStep):
             self._network = OneStep(self.linearisation.bundle)
         self._last, self._quiet, self._stated = None, None, 0
@@ -175,7 +167,7 @@ class Inference(Stage):
                     stage._ahead = frame, pictures
 
     def _rest(self, sigma: NDArray[np.float32]) -> None:
-        """Learn the noise from an untouched frame. Sentinel scans do not state it."""
+        """Learn the noise from an untouched frame. One that stands for no scan does not state it."""
         if self._quiet is not None and np.array_equal(sigma, self._quiet):
             self._stated += 1
         elif np.isfinite(sigma).any():
@@ -190,7 +182,7 @@ class Inference(Stage):
         if self._symmetry is not None and self._symmetry.busy:
             self._surer = self._symmetry.step()
             return True
-        return self._quiet is not None and self._stated >= SETTLED and self._residual.prepare(self._quiet)
+        return self._quiet is not None and self._stated >= SETTLED and self.image_check.prepare(self._quiet)
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
         ahead, self._ahead = self._ahead, None
@@ -198,39 +190,21 @@ class Inference(Stage):
         if not self._tells_shapes:
             out.classes = ImageFrame(skin=self.skin).classes
         out.noise = _rms(frame.sigma)
-        out.residual = self._residual(frame.difference, frame.sigma, out.image)
         if self._locator is not None and frame.touched:
             quantity = self._locator.quantity
             out.touches = [_touch(each, quantity) for each in self._locator.locate(frame.difference, frame.sigma)]
-        self._refused = self._refuses and frame.touched and out.residual is not None and self._residual.refused
         self._counters["networks_run"] += 1
-        doubted = frame.touched and out.residual is not None and out.residual > SURE
-        if not doubted or self.each_alone or SEPARATE in frame.reasons:  # what stands by itself was still
-            self._changing = 0
-        elif self._refused and self._changes(frame, out):
-            return
-        elif not self._changing_touch.steady(frame.difference, frame.sigma, frame.part):
-            self._changing += 1
-            if not self._refused:
-                add_reason(out.reasons, "changing")
+        if not self.image_check.examine(frame, out, self.each_alone):
+            return self._changed(frame, out)
         self._judge(out)
         self._shows(frame, out)
-        if self._symmetry is not None and frame.touched and not self._refused:
+        if self._symmetry is not None and frame.touched and not self.image_check.refused:
             self._symmetry.begin(frame, (out.image, out.sigma, out.classes))
 
-    def _changes(self, frame: DeltaFrame, out: ImageFrame) -> bool:
-        """Whether a touch that changed during the scan explains a frame that its image does not. Then the frame is
-        valid and says `changing`, also where the touch ended: it pressed in a part of the scan. Its image shows nothing
-        new: that of before is held, and where there was none it is empty.
+    def _changed(self, frame: DeltaFrame, out: ImageFrame) -> None:
+        """Show nothing new of a touch that changed during the scan: the image of before is held, and where there was
+        none it is empty.
         """
-        known = self._changing >= CHANGING_FRAMES
-        found = None if known else self._changing_touch(frame.difference, frame.sigma, frame.part)
-        if found is None:
-            return False
-        add_reason(out.reasons, "changing")
-        out.residual, self._refused = found.left, False
-        self._changing = CHANGING_FRAMES if found.ended else self._changing + 1  # what ended does not end again
-        self._changing_scan = frame.scan
         self._counters["changing"] += 1
         if (last := self._last) is None:
             out.image, out.sigma = np.zeros_like(out.image), np.zeros_like(out.sigma)
@@ -239,28 +213,18 @@ class Inference(Stage):
             blank = ImageFrame(skin=self.skin)
             out.image, out.sigma, out.classes = blank.image, blank.sigma, blank.classes
             self._shows_again(last, out)
-        return True
-
-    def _roughly(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        """The image of a few measurements, which no network was trained on."""
-        if frame.part:
-            self._of_parts(frame, out)
-            return
-        self._coarse = self._coarse or CoarseImage(self.bundle)
-        out.image, out.sigma, out.classes = self._coarse.run(frame)
-        self._shows(frame, out)
 
     def _of_parts(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """The image of one touch, from the parts since it began: `coarse` where its place is not sure."""
         self._parts = self._parts or PartImage(self.bundle)
         found = self._parts.fit(frame.difference, frame.sigma)
         out.image, out.sigma = self._parts.image(found)
-        metres = self._parts.metres_per_unit
-        at, axes = [metres * found.x, metres * found.y], [metres * found.sigma[0], metres * found.sigma[1]]
-        out.residual = found.unexplained
-        size = found.drop * np.pi * (metres * found.radius) ** 2
-        out.touches = [LocatedTouch(position=at, sigma=[*axes, found.sigma[2]], amplitude=size)]
-        if found.sure:
+        out.residual, out.followed = found.unexplained, []
+        out.touches = [
+            LocatedTouch(position=touch.position, sigma=touch.sigma, amplitude=touch.integral)
+            for touch in frame.followed
+        ]
+        if self._parts.sure(*(touch.sigma[0] for touch in frame.followed)):
             out.reasons.remove("coarse")
         self._shows(frame, out)
 
@@ -272,7 +236,7 @@ class Inference(Stage):
 
     def _judge(self, out: ImageFrame) -> None:
         """Judge whether the image explains the measurements: else it is not that of a touch."""
-        if self._refused:
+        if self.image_check.refused:
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
             self._counters["refused"] += 1
@@ -286,29 +250,17 @@ class Inference(Stage):
             self._shows_surer(frame, last, out)
         elif last is not None and self._last_scan == frame.reconstructed:
             out.noise, out.residual = last.noise, last.residual
+            self.image_check.held()
             self._shows_again(last, out)
             self._judge(out)
             self._counters["held"] += 1
-        elif 0 < self._changing_scan == frame.reconstructed:
-            self._refused = True  # what stays as it is did not change during the scan
+        elif self.image_check.of_changing(frame.reconstructed):
+            self.image_check.held_changing()
             self._judge(out)
         else:  # skipped, or before we started: not valid until the next reconstruction, at most 16 frames on
             out.valid = False
             out.reasons.append("gap")
             self._counters["missed"] += 1
-
-    def _part(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        """Hold the last image, whatever scan it is of: where its touch is by now goes with it."""
-        last = self._last
-        if last is None:
-            out.valid = False
-            add_reason(out.reasons, "gap")
-            return
-        out.noise, out.residual, out.refined = last.noise, last.residual, self._refined
-        if "changing" in last.reasons or 0 < self._changing_scan == frame.reconstructed:
-            add_reason(out.reasons, "changing")
-        self._shows_again(last, out)
-        self._judge(out)
 
     def _shows_surer(self, frame: DeltaFrame, last: ImageFrame, out: ImageFrame) -> None:
         """A better image of the scan that is held takes its place: it is a new one to readers."""
@@ -328,11 +280,11 @@ class Inference(Stage):
             self._again = False
 
     def state(self) -> dict[str, Any]:
-        last, rest = self._last, {"changing": [self._changing, self._changing_scan], **self.linearisation.state()}
+        last, rest = self._last, {"image_check": self.image_check.state(), **self.linearisation.state()}
         if last is None:
             return {"last": None, **rest}
         kept: dict[str, Any] = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
-        kept |= {"residual": last.residual, "refused": self._refused, "touches": [asdict(t) for t in last.touches]}
+        kept |= {"residual": last.residual, "touches": [asdict(t) for t in last.touches]}
         return {"last": {"scan": self._last_scan, **kept}, **rest}
 
     def load(self, state: dict[str, Any]) -> None:
@@ -340,7 +292,8 @@ class Inference(Stage):
         if self.linearisation.load(state):
             self._build()
         last = state.get("last")
-        self._changing, self._changing_scan = (int(n) for n in state.get("changing", (0, 0)))
+        before = {"changing": state.get("changing", (0, 0)), "refused": (last or {}).get("refused", False)}
+        self.image_check.load(state.get("image_check", before))  # recordings have states of earlier versions
         if last is None:
             return
         try:
@@ -348,7 +301,7 @@ class Inference(Stage):
             self._last = ImageFrame(skin=self.skin, image=image, sigma=sigma, classes=classes)
             self._last.noise, self._last_scan = last.get("noise"), int(last["scan"])
             self._last.touches = [LocatedTouch(**each) for each in last.get("touches", [])]
-            self._last.residual, self._refused = last.get("residual"), bool(last.get("refused", False))
+            self._last.residual = last.get("residual")
         except (KeyError, TypeError, ValueError) as wrong:
             raise Refused(f"no image in the saved state ({wrong})") from None
 

@@ -6,13 +6,14 @@ import time
 from typing import NamedTuple
 
 from models.bundle import Bundle
-from protocol.frames import ContactFrame, DeltaFrame, ImageFrame, RawFrame
+from protocol.frames import ContactFrame, DeltaFrame, Frame, ImageFrame, RawFrame
 from services.inference import Inference
 from services.preprocessing import Preprocessing
 from services.publishing import Publishing
 from services.runtime.config import Skin
+from services.runtime.stage import Stage
 
-ALL = frozenset({"delta", "image", "contact"})
+ALL = frozenset({"delta", "part", "image", "contact"})
 
 
 class Result(NamedTuple):
@@ -39,28 +40,40 @@ class Pipeline:
         if isinstance(skin, str):
             skin = Skin(port="stub", bundle=skin, frame_id=name)
         self.name = name
+        self.delta: DeltaFrame | None = None  # the newest one; parts of scans come between two of them
         self.pre, self.inference, self.publishing = build_stages(name, skin, bundle)
         self.pre.always_reconstruct = self.inference.each_alone = self.publishing.each_alone = always_reconstruct
 
     def run(self, raw: RawFrame) -> Result:
         """What the processes would publish for one raw frame, which is a whole scan; stamps are filled in."""
-        result = self.step(raw)
-        assert result is not None, "a part of a scan: only `step` takes those"
-        return result
-
-    def step(self, raw: RawFrame) -> Result | None:
-        """The same; None for a part of a scan that only preprocessing takes note of."""
-        made = self.pre.process(raw, ALL)
-        if not made:
-            return None
+        made = self._passed(self.pre, raw)
+        assert made, "a part of a scan: only `step` takes those"
+        image = self._passed(self.inference, made[0])[0]
+        contact = self._passed(self.publishing, image)[0]
         delta = made[0]
-        delta.stamps[self.pre.stamp] = time.monotonic_ns()
-        image = self.inference.process(delta, ALL)[0]
-        image.stamps[self.inference.stamp] = time.monotonic_ns()
-        contact = self.publishing.process(image, ALL)[0]
-        contact.stamps[self.publishing.stamp] = time.monotonic_ns()
         assert isinstance(delta, DeltaFrame) and isinstance(image, ImageFrame) and isinstance(contact, ContactFrame)
         return Result(delta, image, contact)
+
+    def step(self, raw: RawFrame) -> ContactFrame | None:
+        """The contacts alone; None for a part of a scan that only preprocessing takes note of."""
+        made = self._passed(self.pre, raw)
+        if not made:
+            return None
+        said = made[0]
+        if isinstance(said, DeltaFrame):
+            self.delta = said
+            said = self._passed(self.inference, said)[0]
+        contact = self._passed(self.publishing, said)[0]
+        assert isinstance(contact, ContactFrame)
+        return contact
+
+    @staticmethod
+    def _passed(stage: Stage, frame: Frame) -> list[Frame]:
+        """What a stage makes of a frame, stamped."""
+        made = stage.process(frame, ALL)
+        for out in made:
+            out.stamps[stage.stamp] = time.monotonic_ns()
+        return made
 
     def prepare(self) -> None:
         """Do the work that the processes do while no frame waits."""

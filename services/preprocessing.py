@@ -31,16 +31,17 @@ LASTING_S = 2.0  # a change that no touch can make, and that lasts so long, is t
 
 
 class Preprocessing(EstimatorStage):
-    """raw -> delta. K measurements in the bundle's pattern order."""
+    """raw -> delta; of scans in parts also part. K measurements in the bundle's pattern order."""
 
     reads = "raw"
-    writes = ("delta",)
+    writes = ("delta", "part")
     stamp = "preprocess"
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         assert isinstance(frame, RawFrame)
         out = DeltaFrame(**inherited(frame), calibration=self.linearisation.name)
         self._counters["frames"] += 1
+        self.frame_rate(frame)
         out.valid, out.reasons = as_sent(frame)  # measurements that failed are left out below
         for reason in reasons_of(frame.status):
             add_reason(out.reasons, reason)
@@ -52,9 +53,8 @@ class Preprocessing(EstimatorStage):
 
     def _scan(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
         """What one scan says."""
-        if frame.kind == "sentinel":
-            return self._sentinel(out, frame)
-        self.sentinel_scans.scan = 0
+        if frame.kind == "sentinel":  # of a recording made by an earlier version: no contacts are made of it
+            return _unusable(out, "coarse", len(self.bundle.pattern))
         if len(frame.z) != len(self.bundle.pattern):
             return self._no_scan(out, frame)
         self._foreign = ""
@@ -168,13 +168,6 @@ class Preprocessing(EstimatorStage):
         found, expected = len(frame.z), len(self.bundle.pattern)
         self._foreign = f"frames of {found} measurements, the bundle {self.bundle.name} has {expected}"
         return _unusable(out, "out_of_distribution", len(self.bundle.pattern))
-
-    def _sentinel(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
-        valid = out.valid
-        _unusable(out, "coarse", len(self.bundle.pattern))
-        touched, reconstructed = self.touch_estimator.touched, self.frame_averager.scan
-        self.sentinel_scans(out, frame, valid, self.baseline_estimator, touched, reconstructed)
-        return out
 
 
 def _unusable(out: DeltaFrame, reason: str, measurements: int) -> DeltaFrame:

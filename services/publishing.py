@@ -18,6 +18,7 @@ from protocol.frames import (
     Frame,
     ImageFrame,
     LocatedTouch,
+    PartFrame,
     RefinedTouch,
     ShapeFrame,
 )
@@ -25,6 +26,7 @@ from protocol.held import ANY, HeldImage
 from services.contacts.contact_writer import ContactWriter, class_probabilities, confidence
 from services.contacts.following import Following
 from services.contacts.force import ForceLaw
+from services.contacts.last_image import LastImage
 from services.contacts.lasting import LastingStates
 from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
@@ -40,11 +42,14 @@ from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
+HARMLESS = {"replay", "uncalibrated_force"}  # reasons that make no frame invalid
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 
 class Publishing(Stage):
-    """image -> contact, and force and shape where somebody wants them."""
+    """image -> contact, and force and shape where somebody wants them. Of scans in parts, contact and force also of the
+    part frames between two images.
+    """
 
     reads = "image"
     writes = ("contact", "force", "shape")
@@ -61,13 +66,14 @@ class Publishing(Stage):
         self._writer = ContactWriter(self.law, place, self._tells_force)
         self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
         self.tracker = Tracker()
-        self.following, self.lasting = Following(), LastingStates()
+        self.following, self.lasting, self.last_image = Following(), LastingStates(), LastImage(name)
         self.each_alone = False  # offline: frames that do not follow each other
         self.reset()
 
     def reset(self) -> None:
         self.tracker.reset()
         self.held = HeldImage()
+        self.last_image.forget()
         self._forget()
         self._counters = {"frames": 0, "contacts": 0, "unknown": 0, "refined": 0, "disagreed": 0}
 
@@ -76,6 +82,7 @@ class Publishing(Stage):
 
     def wake(self) -> None:
         self.tracker.forget()
+        self.last_image.forget()
         self._forget()
 
     def _forget(self) -> None:
@@ -91,19 +98,27 @@ class Publishing(Stage):
         self._geometry = (0.0, [0.0, 0.0])  # metres per pixel, origin of the segments' image
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        if isinstance(frame, PartFrame):
+            return self._say(self.last_image.held_by(frame), wanted, whole=False)
         assert isinstance(frame, ImageFrame)
+        found = self._say(frame, wanted)
+        self.last_image.take(frame)
+        return found
+
+    def _say(self, frame: ImageFrame, wanted: frozenset[str], whole: bool = True) -> list[Frame]:
+        """The frames that follow from an image. whole: it is of a whole scan, or of the parts since a touch began."""
         self._counters["frames"] += 1
         out = ContactFrame(**inherited(frame), frame_id=self.frame_id, force_calibrated=self._calibrated)
         if not self._tells_force:
             add_reason(out.reasons, "uncalibrated_force")
-        self.lacks = not self.held.complete(frame)
+        self.lacks = whole and not self.held.complete(frame)
         had = bool(self._segments)
         if not frame.valid and "out_of_distribution" in frame.reasons:
             self._miss(out, "out_of_distribution")
         elif self.lacks:
             add_reason(out.reasons, "gap")
             self._miss(out, "gap")
-        elif frame.held and (self._knows(frame) or self._changes(frame)):
+        elif frame.held and (self._knows(frame, whole) or self._changes(frame)):
             self._keep(frame)
             out.held = True
         elif not frame.image.size and (frame.touched or not frame.valid):
@@ -112,8 +127,7 @@ class Publishing(Stage):
             self._miss(out, "non_finite")
         else:
             self._see(frame)
-            if frame.whole:
-                self.following.anchor(self._contacts, frame.followed)
+            self.following.anchor(self._contacts, frame.followed)
         fitted = self._fitted(frame.refined if out.valid else None)
         out.contacts = list(self._contacts) if fitted is None else [fitted[0], *self._contacts[1:]]
         if frame.followed and out.valid:
@@ -128,7 +142,7 @@ class Publishing(Stage):
         since = bool(frame.part and frame.touches)  # made only of what was measured since the touch began
         if out.valid and frame.touched and changed and not (frame.held or since or self._alone(frame)):
             add_reason(out.reasons, "changing")
-        if frame.whole:
+        if whole:
             self._changing = self._changing + 1 if "changing" in out.reasons else 0
         self._touched = frame.touched
         explained = out.quality is not None and out.quality >= EXPLAINED
@@ -140,7 +154,7 @@ class Publishing(Stage):
         frames: list[Frame] = [out]
         if "force" in wanted:
             frames.append(self._force(out))
-        if "shape" in wanted and frame.whole:
+        if "shape" in wanted and whole:
             frames.append(self._shape(out, None if fitted is None else fitted[1]))
         return frames
 
@@ -204,14 +218,14 @@ class Publishing(Stage):
         """Whether this frame follows no other."""
         return self.each_alone or SEPARATE in frame.reasons
 
-    def _knows(self, frame: ImageFrame) -> bool:
+    def _knows(self, frame: ImageFrame, whole: bool) -> bool:
         """Whether our contacts are those of this held image. They are not if frames in between were missed, or if a
-        touch waits for its second frame.
+        touch waits for its second frame, which a part is not: it shows no touch that the image before did not.
         """
         recent = not self.tracker.forgotten(frame.stamps.get("sample", 0))
         session, scan = self._seen_in
         theirs = session in (ANY, frame.session) and scan == frame.reconstructed > 0  # 0: nobody says
-        return self._known and recent and not self.tracker.waits and theirs
+        return self._known and recent and theirs and not (whole and self.tracker.waits)
 
     def _changes(self, frame: ImageFrame) -> bool:
         """Whether this frame shows nothing new because its touch changed meanwhile: our contacts are all there is."""
@@ -228,7 +242,7 @@ class Publishing(Stage):
     def _miss(self, out: ContactFrame, reason: str) -> None:
         """Make a frame that says nothing about touches, not even that a contact ended."""
         out.valid = False
-        if not out.reasons:
+        if set(out.reasons) <= HARMLESS:
             add_reason(out.reasons, reason)
         self._forget()
         self._counters["unknown"] += 1
@@ -271,6 +285,7 @@ class Publishing(Stage):
             "tracker": self.tracker.state(),
             "following": self.following.state(),
             "lasting": self.lasting.state(),
+            "last_image": self.last_image.state(),
             "known": self._known,
             "touched": self._touched,
             "changing": self._changing,
@@ -286,6 +301,7 @@ class Publishing(Stage):
         self.tracker.load(state["tracker"])
         self.following.load(state.get("following", []))  # older recordings have none
         self.lasting.load(state.get("lasting", {}))
+        self.last_image.load(state.get("last_image"))
         self._known, self._touched = bool(state["known"]), bool(state.get("touched", False))
         self._changing = int(state.get("changing", 0))
         self._seen_in = (ANY, int(state.get("reconstructed", -1)))  # older recordings have none

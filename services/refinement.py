@@ -1,7 +1,7 @@
 """A touch refined by physics: its place, size, drop and kind fitted to the measurements (models/touch_fit.py), where
 skin.toml names the `indenter`.
 
-    delta, image --> job --> python -m models.refine   (a process of its own, niced; tens of milliseconds)
+    delta, image --> job --> services/refine_process.py   (tens of milliseconds)
                        |<----------- answer
     image frames carry it as `refined` from the next frame on
 
@@ -16,159 +16,22 @@ from __future__ import annotations
 
 import logging
 import math
-import os
-import subprocess
-import sys
-import time
-from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from models.refine import RefineAnswer, RefineJob, Refiner, likely, start_of
+from models.refine import RefineJob, likely, start_of
 from models.shapes import KINDS, Shape
-from models.touch_fit import TouchPosterior
+from models.touch_posterior import TouchPosterior
 from protocol.frames import DeltaFrame, ImageFrame, RefinedTouch
-from services.runtime.config import ROOT, Skin
+from services.refine_process import RefineHere, RefineProcess, shared
+from services.runtime.config import Skin
 
 log = logging.getLogger(__name__)
 
-STUCK_S = 30.0  # a fit that takes longer on however busy a machine has failed
-WAIT_S = (1.0, 60.0)  # before a fit's process that ended is started again: at first, and at most
 QUIET_DRIFT = 1e-6  # rms: less is none
-
-
-class RefineProcess:
-    """The process that fits, for all skins of this one. `offer` and `poll` never wait."""
-
-    def __init__(self, command: tuple[str, ...] = (sys.executable, "-m", "models.refine")) -> None:
-        self._command = command
-        self._process: subprocess.Popen[bytes] | None = None
-        self._to: Connection | None = None
-        self._from: Connection | None = None
-        self._waiting: dict[str, RefineJob] = {}  # the newest of each skin
-        self._begun: RefineJob | None = None
-        self._begun_s = self._not_before_s = 0.0
-        self._pause_s = WAIT_S[0]
-        self._answers: dict[str, RefineAnswer] = {}
-        self.skipped: dict[str, int] = {}  # jobs that a newer one of their skin replaced, or that were lost
-        self.problem = ""
-
-    def start(self) -> None:
-        """Before the first job; where it cannot be started, the first job says so."""
-        try:
-            if self._process is None:
-                self._start()
-        except OSError as why:
-            log.warning("the process that refines touches cannot be started (%s)", why)
-
-    def offer(self, job: RefineJob) -> None:
-        if job.skin in self._waiting:
-            self._skip(job.skin)
-        self._waiting[job.skin] = job
-        self._next()
-
-    def poll(self, skin: str) -> RefineAnswer | None:
-        """The newest answer for a skin, once. The next job waits for what the skin offers now that it knows the answer:
-        a fit that begins there takes a fraction of the time.
-        """
-        if self._begun is not None:
-            self._receive()
-        answer = self._answers.pop(skin, None)
-        if answer is None:
-            self._next()
-        return answer
-
-    def close(self) -> None:
-        for end in (self._to, self._from):
-            if end is not None:
-                end.close()
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-        self._process = self._to = self._from = self._begun = None
-
-    def _receive(self) -> None:
-        assert self._from is not None and self._begun is not None
-        try:
-            if self._from.poll():
-                answer: RefineAnswer = self._from.recv()
-                self._answers[answer.skin] = answer
-                self._begun, self._pause_s, self.problem = None, WAIT_S[0], ""
-                return
-        except (EOFError, OSError):
-            return self._lost("ended")
-        if time.monotonic() > self._begun_s + STUCK_S:
-            self._lost(f"gave no answer within {STUCK_S:.0f} s")
-
-    def _lost(self, why: str) -> None:
-        assert self._begun is not None
-        self._skip(self._begun.skin)
-        self.close()
-        self.problem = f"the process that refines touches {why}; it is started again"
-        log.warning("%s", self.problem)
-        self._not_before_s, self._pause_s = time.monotonic() + self._pause_s, min(2 * self._pause_s, WAIT_S[1])
-
-    def _next(self) -> None:
-        """Hand over one job: so little waits in the pipe that writing never does."""
-        if self._begun is not None or not self._waiting or time.monotonic() < self._not_before_s:
-            return
-        skin = next(iter(self._waiting))
-        self._begun, self._begun_s = self._waiting.pop(skin), time.monotonic()
-        try:
-            if self._process is None:
-                self._start()
-            assert self._to is not None
-            self._to.send(self._begun)
-        except OSError as why:
-            self._lost(f"cannot be used ({why})")
-
-    def _start(self) -> None:
-        self._process = subprocess.Popen(
-            self._command,
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-        )
-        assert self._process.stdin is not None and self._process.stdout is not None
-        with self._process.stdin as stdin, self._process.stdout as stdout:
-            self._to = Connection(os.dup(stdin.fileno()), readable=False)
-            self._from = Connection(os.dup(stdout.fileno()), writable=False)
-
-    def _skip(self, skin: str) -> None:
-        self.skipped[skin] = self.skipped.get(skin, 0) + 1
-
-
-class RefineHere:
-    """The same at once: for frames from a file, and to measure."""
-
-    def __init__(self) -> None:
-        self._refiner = Refiner()
-        self._answers: dict[str, RefineAnswer] = {}
-        self.skipped: dict[str, int] = {}
-        self.problem = ""
-
-    def start(self) -> None:
-        """There is nothing to start."""
-
-    def offer(self, job: RefineJob) -> None:
-        self._answers[job.skin] = self._refiner(job)
-
-    def poll(self, skin: str) -> RefineAnswer | None:
-        return self._answers.pop(skin, None)
-
-
-_shared: RefineProcess | None = None
-
-
-def shared() -> RefineProcess:
-    """One process for all skins of this one."""
-    global _shared
-    _shared = _shared or RefineProcess()
-    return _shared
 
 
 class _Asked(NamedTuple):

@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import DeltaFrame, FollowedTouch, RawFrame, as_sent
+from protocol.frames import DeltaFrame, FollowedTouch, Frame, PartFrame, RawFrame, as_sent
 from services.estimation.baseline import BaselineEstimator
+from services.estimation.part_course import PartPlaces
 from services.estimation.part_evidence import SIGMAS, PartEvidence
 from services.estimation.part_filter import PartFilter
 from services.estimation.part_image import PartImage, PartTouch
 from services.estimation.rolling import WholeScans, parts_of
-from services.runtime.stage import add_reason
+from services.runtime.stage import add_reason, inherited
 
 Array = NDArray[np.float64]
 
 SUSPECTED = 5.0  # sigmas of the newest part, below which it is not looked at further
 WIDER = 1.05  # noise is estimated from a few dozen scans
 DRIFT = 3e-5  # relative, since the untouched scans that parts are compared with
-MOST_WAITED = 10  # messages
+MOST_WAITED = 20  # messages
+KNOWN = 0.05  # model units of uncertainty, from which on a touch that began is not looked for elsewhere
+ANYWHERE = 0.12  # model units of uncertainty, beyond which a place is not said
 REMEMBERED = 8  # untouched whole scans whose mean that is
+
+
+class PartModels(NamedTuple):
+    """What tells a touch from the parts of a scan: made when it is first needed."""
+
+    evidence: PartEvidence
+    places: PartPlaces
+    filter: PartFilter
 
 
 class RollingScans:
@@ -39,13 +50,13 @@ class RollingScans:
     def __init__(self, bundle: Bundle) -> None:
         self._bundle, self._parts = bundle, parts_of(bundle)
         self._whole = WholeScans()
-        self._models: tuple[PartEvidence, PartImage] | None = None
-        self._filter: PartFilter | None = None
+        self._made: PartModels | None = None
         self.reset()
 
     def reset(self) -> None:
         self._whole.last = -1
         self._seen = self._handed_on = -1  # scans of messages
+        self._delta_scan = 0  # of the last message that a delta frame was made of
         self._sample_ns = 0  # of the last delta frame
         self.begin_anew()
 
@@ -57,17 +68,22 @@ class RollingScans:
         self._sound = False  # the last whole scan
         self._moved = False  # the next whole scan was put off since the last one
         self._ended = False  # the touch of the last whole scan has
-        self._grown_us = 0.0  # when it was all there, likewise
         self._waited = 0  # messages by which the whole scan was put off for that
         self._began_us: float | None = None  # when a touch began, by the board's clock less the length of a part
         self._began: PartTouch | None = None  # as the newest parts have it
-        self._image_scan = 0  # of the last image of the touch
         self.change: Array | None = None  # to the whole scan's difference, for its values to be of one instant
-        if self._filter is not None:
-            self._filter.forget()
+        if self._made is not None:
+            self._made.filter.forget()
 
     def warm_up(self) -> None:
-        self._ready()
+        _ = self._models
+
+    @property
+    def _models(self) -> PartModels:
+        if self._made is None:
+            evidence, places = PartEvidence(self._bundle, self._parts), PartPlaces(PartImage(self._bundle))
+            self._made = PartModels(evidence, places, PartFilter(self._bundle))
+        return self._made
 
     def due(self, frame: RawFrame, stamps: dict[str, int], estimator: BaselineEstimator) -> bool:
         """Whether the message is to be taken for a whole scan; then `sample` in stamps is set to the mean time of its
@@ -84,7 +100,7 @@ class RollingScans:
         if values is not None and not self._moved and self._changes(values):
             self._moved = True  # a touch that began or ended within these values is seen in the next whole scan
             return False
-        if self._waited < MOST_WAITED and self._grows(frame, values):
+        if self._waited < MOST_WAITED and self._grows(values):
             self._waited += 1
             self._whole.last = frame.scan - frame.parts + 1
             return False
@@ -93,26 +109,24 @@ class RollingScans:
         if not self._follows(frame, values):
             mean -= round(1e3 * float(frame.age_us.mean() - frame.age_us[new].mean()))
         stamps["sample"] = self._sample_ns = max(mean, min(self._sample_ns, sample))
-        self._handed_on = frame.scan
+        self._handed_on = self._delta_scan = frame.scan
         return True
 
-    def _grows(self, frame: RawFrame, values: tuple[Array, Array, Array] | None) -> bool:
+    def _grows(self, values: tuple[Array, Array, Array] | None) -> bool:
         """Whether the oldest of these values felt a touch that began, and still grew."""
-        if self._began_us is None:
+        if self._began is None or values is None:
             return False
-        grew = frame.device_us - float(frame.age_us.max()) < self._grown_us
-        if grew or values is None or self._filter is None or self._began is None:
-            return grew
-        return not self._filter.settled(values[0], values[1], self._began)
+        return float(self._models.places.course(*values, self._began).min()) < 1.0
 
     def _follows(self, frame: RawFrame, values: tuple[Array, Array, Array] | None) -> bool:
         """Whether the whole scan's touch is followed: then all its values are brought to the newest one's instant."""
         self.change = None
-        if self._held is None or values is None or self._filter is None:
+        if self._held is None or values is None:
             return False
-        follows = self._filter.part(*values, frame.device_us)
-        if follows and self._filter.moves:
-            self.change = self._filter.at_once(*values)
+        followed = self._models.filter
+        follows = followed.part(*values, frame.device_us)
+        if follows and followed.moves:
+            self.change = followed.at_once(*values)
         return follows
 
     def judged(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> None:
@@ -122,13 +136,14 @@ class RollingScans:
         known = len(out.difference) == len(frame.z) and bool(np.isfinite(out.sigma).all())
         self._sound = known and out.valid and not out.electrodes.any() and not {"gain", "gap"} & set(out.reasons)
         self._moved = self._ended = False
-        self._grown_us, self._waited = 0.0, 0
+        self._waited = 0
         touched, self._began_us, self._began, self._held = self._held is not None, None, None, None
+        if not touched or not self._sound or not out.touched:
+            self._models.filter.forget()  # what it followed is over
         if not self._sound:
             self._rest, self._rests = None, 0
         elif out.touched:
             self._held = out.difference.astype(float)
-            self._image_scan = out.reconstructed
             self._take(out, frame, estimator)
         else:
             drifted = touched or self._rest is None
@@ -138,73 +153,70 @@ class RollingScans:
 
     def _take(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> None:
         """Begin to follow the touch of a whole scan, or go on."""
-        self._ready()
-        assert self._filter is not None
         if (values := self._values(frame, estimator)) is None:
-            self._filter.forget()
+            self._models.filter.forget()
             return
         d = values[0] if self.change is None else values[0] + self.change
-        self._filter.whole(d, values[1], frame.device_us, shown=not out.held)
+        self._models.filter.whole(d, values[1], frame.device_us, shown=not out.held)
         out.followed = self._followed()
 
     def _followed(self) -> list[FollowedTouch]:
-        assert self._filter is not None
-        metres = self._filter.metres_per_unit
-        return [
-            FollowedTouch(
-                number=self._filter.number,
-                position=[metres * each.x, metres * each.y],
-                velocity=[metres * each.vx, metres * each.vy],
-                sigma=[metres * each.sigma[0], metres * each.sigma[1], each.sigma[2]],
-                integral=metres**2 * each.integral,
-            )
-            for each in self._filter.states()
-        ]
+        followed = self._models.filter
+        states = [(each.x, each.y, each.vx, each.vy, each.sigma, each.integral) for each in followed.states()]
+        return [_told(followed.metres_per_unit, *state, number=followed.number) for state in states]
 
-    def part(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> list[DeltaFrame]:
-        """The delta frame of a message that is no whole scan, where there is something to say."""
-        evidence, image = self._ready()
+    def _placed(self, touch: PartTouch) -> list[FollowedTouch]:
+        """The touch that began."""
+        integral = float(np.pi * touch.radius**2 * touch.drop)
+        return [_told(self._models.filter.metres_per_unit, *touch.at, 0.0, 0.0, touch.sigma, integral)]
+
+    def part(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> list[Frame]:
+        """What is said of a message that is no whole scan, if anything: a delta frame where a touch began or ended, a
+        part frame of one that goes on.
+        """
+        evidence, places, followed = self._models
         if (values := self._values(frame, estimator)) is None:
             return []
         if not self._changes(values):
             return self._goes_on(out, frame, values)
         d, noise, age = values
         if self._held is not None:
-            assert self._filter is not None
-            self._filter.forget()
+            followed.forget()
             self._ended = True
             self._put_off(frame.scan)
             out.difference, out.sigma = np.zeros(len(d), np.float32), noise.astype(np.float32)
             return self._said(out)
-        since = None if self._began_us is None else frame.device_us - self._began_us
-        onset = evidence.began(d, noise, age, since)
-        if onset is None:
+        if self._began is not None and self._began.fits and self._began.sigma[0] <= KNOWN:
+            place = places.again(d, noise, age, self._began)
+            sigmas = evidence.goes_on(d, noise, place.course, places.response(place.touch))
+        else:
+            since = None if self._began_us is None else frame.device_us - self._began_us
+            if (onset := evidence.began(d, noise, age, since)) is None:
+                return []
+            place, sigmas = places(d, noise, age, onset.starts), onset.sigmas
+        if sigmas is None:
+            self._began = None
             return []
         self._put_off(frame.scan)
-        self._grown_us = frame.device_us - onset.grown
-        if self._began_us is None:
-            self._began_us = frame.device_us - onset.since
-        on = onset.course > 0
-        share = np.where(on, onset.course, 1.0)
+        on = place.course > 0
+        self._began_us, self._began = frame.device_us - float(age[on].max()), place.touch
+        if not self._began.fits or self._began.sigma[0] > ANYWHERE:
+            return []
+        share = np.where(on, place.course, 1.0)
         out.difference = np.where(on, d / share, 0.0).astype(np.float32)
         out.sigma = np.where(on, noise / share, np.inf).astype(np.float32)
-        self._began = image.fit(out.difference, out.sigma)
-        if not self._began.fits:
-            return []
-        out.touched, out.score, out.threshold = True, onset.sigmas, SIGMAS
+        out.followed = self._placed(self._began)
+        out.touched, out.score, out.threshold = True, sigmas, SIGMAS
         out.reconstructed = frame.scan
         add_reason(out.reasons, "coarse")
         return self._said(out)
 
-    def _goes_on(self, out: DeltaFrame, frame: RawFrame, values: tuple[Array, Array, Array]) -> list[DeltaFrame]:
+    def _goes_on(self, out: DeltaFrame, frame: RawFrame, values: tuple[Array, Array, Array]) -> list[Frame]:
         """Where a touch that goes on is by now, where that is known."""
-        if self._held is None or self._ended or self._filter is None or not self._filter.knows:
+        followed = self._models.filter
+        if self._held is None or self._ended or not followed.knows or not followed.part(*values, frame.device_us):
             return []
-        if not self._filter.part(*values, frame.device_us):
-            return []
-        out.touched, out.held, out.whole, out.reconstructed = True, True, False, self._image_scan
-        out.followed = self._followed()
-        return self._said(out)
+        return self._said(PartFrame(**inherited(out), after=self._delta_scan, followed=self._followed()))
 
     def _values(self, frame: RawFrame, estimator: BaselineEstimator) -> tuple[Array, Array, Array] | None:
         """(K,) each: difference to the untouched skin lately, its standard deviation, age [us]; None where the last
@@ -212,7 +224,7 @@ class RollingScans:
         """
         baseline = estimator.baseline
         sound = self._sound and as_sent(frame)[0] and not frame.status.any() and set(frame.reasons) <= {"replay"}
-        if not (sound and self._ready()[0].knows) or baseline is None or baseline.doubt or self._rest is None:
+        if not (sound and self._models.evidence.knows) or baseline is None or baseline.doubt or self._rest is None:
             return None
         d = (np.abs(frame.z.astype(np.complex128)) - baseline.z0) / estimator.normaliser - self._rest
         noise = WIDER * np.hypot(estimator.sigma * np.sqrt(1 + 1 / self._rests), DRIFT)
@@ -220,13 +232,17 @@ class RollingScans:
 
     def _changes(self, values: tuple[Array, Array, Array]) -> bool:
         """Whether a touch began, by all that a quick look tells, or the one that there was has ended."""
-        evidence, (d, noise, age) = self._ready()[0], values
+        evidence, (d, noise, age) = self._models.evidence, values
         if self._held is None or self._rest is None:
             return self._began_us is not None or evidence.sigmas(d, noise, age) >= SUSPECTED
-        return not self._ended and evidence.ended(d, self._held - self._rest, noise, age)
+        followed = self._models.filter
+        held = followed.strongest() if followed.moves else self._held - self._rest
+        return not self._ended and evidence.ended(d, held, noise, age)
 
-    def _said(self, out: DeltaFrame) -> list[DeltaFrame]:
+    def _said(self, out: Frame) -> list[Frame]:
         self._handed_on = out.scan
+        if isinstance(out, DeltaFrame):
+            self._delta_scan = out.scan
         self._sample_ns = out.stamps.get("sample", 0)
         return [out]
 
@@ -238,12 +254,6 @@ class RollingScans:
     def handed_on(self, scan: int) -> dict[str, bool]:
         """Whether the message `scan` was seen, and whether a delta frame was made of it: a replay asks."""
         return {"seen": self._seen == scan, "handed_on": self._handed_on == scan}
-
-    def _ready(self) -> tuple[PartEvidence, PartImage]:
-        if self._models is None:
-            self._models = PartEvidence(self._bundle, self._parts), PartImage(self._bundle)
-            self._filter = PartFilter(self._bundle)
-        return self._models
 
     def _fits(self, frame: RawFrame) -> bool:
         count = len(frame.z)
@@ -258,10 +268,10 @@ class RollingScans:
             "rests": self._rests,
             "held": self._held,
             "began_us": self._began_us,
-            "grown": [self._grown_us, self._waited],
-            "image": self._image_scan,
+            "waited": self._waited,
+            "delta": self._delta_scan,
             "began": None if self._began is None else asdict(self._began),
-            "filter": None if self._filter is None else self._filter.state(),
+            "filter": None if self._made is None else self._made.filter.state(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -272,12 +282,23 @@ class RollingScans:
         self._whole.last, self._sample_ns = int(state["whole"]), int(state["sample_ns"])
         self._sound, self._moved, self._ended = (bool(each) for each in state["flags"])
         self._rest, self._held = (None if state[n] is None else np.array(state[n], float) for n in ("rest", "held"))
-        self._grown_us, self._waited = float(state["grown"][0]), int(state["grown"][1])
+        self._waited = int(state["waited"])
         self._began_us, self._rests = state["began_us"], int(state["rests"])
-        self._image_scan = int(state.get("image", 0))
+        self._delta_scan = int(state.get("delta", 0))
         if (began := state.get("began")) is not None:
-            self._began = PartTouch(**{**began, "sigma": tuple(began["sigma"])})
+            self._began = PartTouch(**{**began, "at": tuple(began["at"]), "sigma": tuple(began["sigma"])})
         if state.get("filter"):
-            self._ready()
-            assert self._filter is not None
-            self._filter.load(state["filter"])
+            self._models.filter.load(state["filter"])
+
+
+def _told(
+    metres: float, x: float, y: float, vx: float, vy: float, sigma: tuple[float, ...], integral: float, number: int = 0
+) -> FollowedTouch:
+    """Of lengths in model units, each so many metres."""
+    return FollowedTouch(
+        number=number,
+        position=[metres * x, metres * y],
+        velocity=[metres * vx, metres * vy],
+        sigma=[metres * sigma[0], metres * sigma[1], sigma[2]],
+        integral=metres**2 * integral,
+    )

@@ -71,8 +71,8 @@ class Runner:
 
     def add(self, stage: Stage, feed: Feed | None = None) -> None:
         """Drive this stage; without a feed, from the topic that it reads."""
-        if feed is None:  # a raw frame has the newest value of every measurement, whichever part it comes with
-            parts = self.config.skins[stage.skin].scan == "rolling" and stage.reads != "raw"
+        if feed is None:
+            parts = self.config.skins[stage.skin].scan == "rolling" and stage.reads == "image"
             feed = Newest(stage.reads, stage.skin, parts)
         channel = Channel(self.process, stage, feed)
         self.channels[stage.skin] = channel

@@ -45,8 +45,8 @@ SERVICES_USE_OF_MODELS = {
     "models.refine",
     "models.turns",
     "models.shapes",
-    "models.touch_fit",
-    "models.sentinel",
+    "models.touch_grid",
+    "models.touch_posterior",
     "models.uncertainty",
 }
 

@@ -10,6 +10,7 @@ from rich.table import Table
 from models.shapes import KINDS, Array, Shape
 
 INTERVALS = {68: (1.0, 2.279), 90: (1.645, 4.605)}  # sd of one figure; squared distance of two, in sd
+BINS = 10  # of the probability
 Row = dict[str, tuple[float, float]]
 
 
@@ -36,6 +37,13 @@ def summary(rows: list[Any], index: list[int]) -> dict[str, tuple[float, float]]
         else:
             out[name] = (float(values.mean()), error)
     return out
+
+
+def class_error(rows: list[dict[str, float]]) -> float:
+    """Expected calibration error of the shapes that contacts state. Of 500 touches, one that is none shows as 0.03."""
+    sure, right = (np.array([row[name] / 100 for row in rows]) for name in ("class stated %", "class %"))
+    place = np.minimum((sure * BINS).astype(int), BINS - 1)
+    return float(np.abs(np.bincount(place, right - sure, minlength=BINS)).sum() / len(rows))
 
 
 def counted(kind: str, touches: list[Shape]) -> int:

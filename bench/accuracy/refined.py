@@ -1,6 +1,6 @@
 """Single touches by the network, and refined: the touch's parameters fitted to the same frame.
 
-    skin bench refined [--touches 500] [--levels none 70] [--seed 33] [--quick] [--coverage-touches 150]
+    skin bench refined [--touches 500] [--levels none 70] [--seed 33] [--quick] [--coverage-touches 300]
 
 Touches are drawn as training draws them (models.scenes.TRAINING: radius 0.12 to 0.45 and, in one of five, 0.08 to 0.5;
 drop 0.1 to 0.5 and 0.05 to 0.9), of all six kinds alike, and solved on the stub's mesh, which neither training nor
@@ -9,7 +9,8 @@ inverse uses. `network`: the image of the network that runs by default, a touch 
 `declared`: with the kind that it was. `service`: what a contact says with `indenter = { kind = "any" }`, the fit where
 it explains the frame and the image agrees, else the image; `stated`: of those, the fits alone; `symmetry`: the image as
 the mean over the square's symmetries. Prints means with their standard errors; at 60, 70 and 80 dB and without noise,
-how often the truth lay within the stated 68 and 90 % intervals of the service; the images of shapes that neither knows
+how often the truth lay within the stated 68 and 90 % intervals of the service; how far the stated probability of a
+shape is from how often it is right (expected calibration error); the images of shapes that neither knows
 (bench/accuracy/odd_shapes.py). Writes refined.json.
 """
 
@@ -30,7 +31,16 @@ from rich.table import Table
 
 from bench import REPORTS, WORK
 from bench.accuracy.frames import NOISE_FREE, Level
-from bench.accuracy.intervals import INTERVALS, by_kinds, counted, coverage, coverage_table, pixels, summary
+from bench.accuracy.intervals import (
+    INTERVALS,
+    by_kinds,
+    class_error,
+    counted,
+    coverage,
+    coverage_table,
+    pixels,
+    summary,
+)
 from bench.accuracy.odd_shapes import ODD, OddShape, random_odd
 from bench.accuracy.symmetric import ldci, pictures
 from bench.goals import Goal
@@ -42,9 +52,10 @@ from models.bundle import Bundle
 from models.forward import ForwardModel
 from models.npz import read_npz
 from models.refine import refined_fit, responses_of, start_of
+from models.response_error import frame_errors
 from models.scenes import TRAINING, random_scene
 from models.shapes import KINDS, Array, Shape, from_rows, to_rows
-from models.touch_fit import TouchPosterior, frame_errors
+from models.touch_posterior import TouchPosterior
 from models.turns import TURNS
 from protocol.frames import Contact
 from services.contacts.force import Force
@@ -190,10 +201,12 @@ def measured(
             if method == "found":
                 contact = said(posterior, image, start, bundle.metres_per_unit)
                 row = dict(found["network" if contact is None else "found"][-1])
+                named = (share / share.sum()).tolist()
                 if contact is not None:
-                    named = both(posterior.classes.tolist(), (share / share.sum()).tolist())
+                    named = both(posterior.classes.tolist(), named)
                     row["class %"] = 100.0 * (int(np.argmax(named)) == touch.shape_class)
                     row |= stated(contact, touch)
+                row["class stated %"] = 100 * max(named)
                 found["service"].append(row | {"refined %": 100.0 * (contact is not None)})
                 found["stated"].append(None if contact is None else row)
     return found
@@ -293,6 +306,8 @@ def goals(report: dict[str, Any], quick: bool) -> list[Goal]:
         for kind, most in (("circle", 14 if level != "none" else 3), ("hertz", 14 if level != "none" else 3)):
             force = by_kind[kind]["declared"]["force %"][0]
             made.append(Goal(f"{title}: force, {kind} declared, median error, %", force, at_most=most))
+        error = report["class_calibration_error"][level]
+        made.append(Goal(f"{title}: expected calibration error of the shape class", error, at_most=0.05))
     for level, by_kind in report["coverage"].items():
         for what in ("position", "force", "pixels"):
             for percent in INTERVALS:
@@ -312,17 +327,19 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench refined", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--touches", type=int, default=None, help="500; 60 with --quick")
     parser.add_argument("--levels", nargs="+", default=["none", "70"])
-    parser.add_argument("--coverage-touches", type=int, default=None, help="at 60 and 80 dB: 150; 12 with --quick")
+    parser.add_argument("--coverage-touches", type=int, default=None, help="at 60 and 80 dB: 300; 12 with --quick")
     parser.add_argument("--seed", type=int, default=33)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     touches, clean = frames(args.seed, args.touches or (60 if args.quick else 500))
-    report: dict[str, Any] = {"levels": {}, "touches": len(touches), **provenance("refined", argv)}
+    report: dict[str, Any] = {"levels": {}, "class_calibration_error": {}, "touches": len(touches)}
+    report |= provenance("refined", argv)
     console = Console()
     for level in args.levels:
         rows = measured(level, touches, clean, args.seed)
         report["levels"][level] = by_kind = by_kinds(rows, touches)
+        report["class_calibration_error"][level] = class_error(rows["service"])
         for kind, row in by_kind.items():
             names = [n for n in row["declared"] if " in " not in n]
             table = Table(title=f"{Level(level).title}, {kind}: {counted(kind, touches)} touches")
@@ -335,7 +352,7 @@ def main(argv: list[str] | None = None) -> int:
     report["ldci"] = consistency()
     said_of = ", ".join(f"{name} {value:.4f}" for name, value in report["ldci"].items())
     console.print(f"LDCI noise-free, drop 0.15, radius 0.2: {said_of}")
-    some = touches[: args.coverage_touches or (12 if args.quick else 150)]
+    some = touches[: args.coverage_touches or (12 if args.quick else 300)]
     levels = dict(report["levels"])
     for level in COVERAGE_ALSO:
         if level not in levels:

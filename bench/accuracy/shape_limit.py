@@ -31,7 +31,7 @@ from models.bundle import Bundle
 from models.prereconstruction import TARE_FRAMES
 from models.scenes import TARGETS, random_shape
 from models.shapes import CLASSES, Shape
-from models.touch_fit import PERIOD
+from models.touch_parameters import PERIOD
 
 Array = NDArray[np.float64]
 

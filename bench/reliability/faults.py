@@ -5,6 +5,7 @@
     skin bench faults --only gain hang    some rows of the matrix, nothing else
     skin bench faults --frames 1000000    that many frames of random faults and presses, nothing else
     skin bench faults --frames 100000 --more    so many more, added to those of the last report
+    skin bench faults --scan rolling      any of these with scans in parts (faults-rolling.json, soak-rolling.json)
 
 The stub board's bytes go through line, link, clock regression and the stages that the services run. Prints figures
 beside targets and writes faults.json (--frames: soak.json). Exit status 1 where what held when the gate was set, a
@@ -18,13 +19,14 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bench import REPORTS
 from bench.reliability import availability, faults_report, matrix, report, soak, workers
 from bench.reliability.matrix import ROWS, SITUATIONS, FaultScore
 from bench.speed.service import end_on_sigterm
 from firmware_stub.world import Touch
+from services.pipeline import Pipeline
 
 PLACES, QUICK_PLACES = 20, 2
 SESSIONS, QUICK_SESSIONS = 8, 1  # of each state of availability, soak.CHUNK frames each
@@ -32,10 +34,20 @@ QUICK_FRAMES = 20_000  # of random faults and presses
 Cells = dict[tuple[str, str], FaultScore]  # (row's title, situation)
 
 
-def run_place(task: tuple[Touch, int, tuple[str, ...], str]) -> Cells:
-    """All rows and situations at one place: (touch, seed, titles, bundle)."""
-    touch, seed, titles, bundle = task
-    sheet, pipeline = workers.sheet(), workers.pipeline(bundle)
+class SkinUnderTest(NamedTuple):
+    """What a run is of."""
+
+    bundle: str
+    scan: str
+
+    def pipeline(self) -> Pipeline:
+        return workers.pipeline(self.bundle, scan=self.scan)
+
+
+def run_place(task: tuple[Touch, int, tuple[str, ...], SkinUnderTest]) -> Cells:
+    """All rows and situations at one place: (touch, seed, titles, skin)."""
+    touch, seed, titles, skin = task
+    sheet, pipeline = workers.sheet(), skin.pipeline()
     return {
         (row.title, situation): matrix.run_case(sheet, pipeline, row, situation, touch, seed)
         for row in ROWS
@@ -44,25 +56,25 @@ def run_place(task: tuple[Touch, int, tuple[str, ...], str]) -> Cells:
     }
 
 
-def run_matrix(places: int, seed: int, titles: tuple[str, ...], bundle: str, cores: int) -> Cells:
+def run_matrix(places: int, seed: int, titles: tuple[str, ...], skin: SkinUnderTest, cores: int) -> Cells:
     found: Cells = {}
-    tasks = [(touch, seed + k, titles, bundle) for k, touch in enumerate(matrix.places(places, seed))]
+    tasks = [(touch, seed + k, titles, skin) for k, touch in enumerate(matrix.places(places, seed))]
     for cells in workers.spread(run_place, tasks, cores, "places of the matrix"):
         for key, score in cells.items():
             found.setdefault(key, FaultScore()).add(score)
     return found
 
 
-def run_chunk(task: tuple[int, int, str]) -> soak.SoakTally:
-    """One start and the frames after it: (frames, seed, bundle)."""
-    frames, seed, bundle = task
-    return soak.chunk(workers.sheet(), workers.pipeline(bundle), frames, seed)
+def run_chunk(task: tuple[int, int, SkinUnderTest]) -> soak.SoakTally:
+    """One start and the scans after it: (scans, seed, skin)."""
+    scans, seed, skin = task
+    return soak.chunk(workers.sheet(), skin.pipeline(), scans, seed)
 
 
-def run_soak(frames: int, seed: int, bundle: str, cores: int, so_far: soak.SoakTally) -> soak.SoakTally:
+def run_soak(frames: int, seed: int, skin: SkinUnderTest, cores: int, so_far: soak.SoakTally) -> soak.SoakTally:
     """Adds so many frames, from starts that `so_far` does not have."""
     counts = [soak.CHUNK] * (frames // soak.CHUNK) + [frames % soak.CHUNK] * (frames % soak.CHUNK > 0)
-    tasks = [(count, 1000 * seed + so_far.chunks + k, bundle) for k, count in enumerate(counts)]
+    tasks = [(count, 1000 * seed + so_far.chunks + k, skin) for k, count in enumerate(counts)]
     for tally in workers.spread(run_chunk, tasks, cores, "random faults and presses"):
         so_far.add(tally)
     return so_far
@@ -84,16 +96,18 @@ def reported(path: Path, seed: int, bundle: str) -> tuple[soak.SoakTally, list[d
     return tally, runs
 
 
-def run_session(task: tuple[str, int, str]) -> tuple[str, availability.AvailabilityScore]:
-    """One session: (state, seed, bundle)."""
-    state, seed, bundle = task
-    sheet, pipeline = workers.sheet(), workers.pipeline(bundle)
+def run_session(task: tuple[str, int, SkinUnderTest]) -> tuple[str, availability.AvailabilityScore]:
+    """One session: (state, seed, skin)."""
+    state, seed, skin = task
+    sheet, pipeline = workers.sheet(), skin.pipeline()
     return state, availability.session(sheet, pipeline, state, availability.FRAMES, seed)
 
 
-def run_availability(sessions: int, seed: int, bundle: str, cores: int) -> dict[str, availability.AvailabilityScore]:
+def run_availability(
+    sessions: int, seed: int, skin: SkinUnderTest, cores: int
+) -> dict[str, availability.AvailabilityScore]:
     found = {state: availability.AvailabilityScore() for state in availability.STATES}
-    tasks = [(state, 1000 * seed + k, bundle) for k in range(sessions) for state in availability.STATES]
+    tasks = [(state, 1000 * seed + k, skin) for k in range(sessions) for state in availability.STATES]
     for state, score in workers.spread(run_session, tasks, cores, "availability"):
         found[state].add(score)
     return found
@@ -107,6 +121,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, help="random faults and presses instead of the matrix")
     parser.add_argument("--more", action="store_true", help="with --frames: add to what the last report counted")
     parser.add_argument("--bundle", default="square16")
+    parser.add_argument("--scan", choices=("full", "rolling"), default="full", help="whole scans, or scans in parts")
     parser.add_argument("--seed", type=int, default=5, help="of places, arguments and noise")
     parser.add_argument("--cores", type=int, default=workers.cores())
     parser.add_argument("--out", type=Path, default=REPORTS)
@@ -116,10 +131,11 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f"--only {' '.join(args.only)}: expected the beginning of {', '.join(r.title for r in ROWS)}")
     if args.frames is not None and not soak.LEAST <= args.frames <= soak.MOST:
         parser.error(f"--frames {args.frames}: expected {soak.LEAST} to {soak.MOST}")
+    skin, of_parts = SkinUnderTest(args.bundle, args.scan), "-rolling" * (args.scan == "rolling")
     so_far, runs = soak.SoakTally(), list[dict[str, Any]]()
     if args.more:
         try:
-            so_far, runs = reported(args.out / "soak.json", args.seed, args.bundle)
+            so_far, runs = reported(args.out / f"soak{of_parts}.json", args.seed, args.bundle)
         except ValueError as why:
             parser.error(str(why))
     end_on_sigterm()
@@ -127,14 +143,14 @@ def main(argv: list[str] | None = None) -> int:
     found: dict[str, Any] = {}
     if args.frames is None:
         places = args.places or (QUICK_PLACES if args.quick else PLACES)
-        found["matrix"] = faults_report.matrix_rows(run_matrix(places, args.seed, titles, args.bundle, args.cores))
+        found["matrix"] = faults_report.matrix_rows(run_matrix(places, args.seed, titles, skin, args.cores))
     if args.frames is None and args.only is None:
         sessions = QUICK_SESSIONS if args.quick else SESSIONS
-        scores = run_availability(sessions, args.seed, args.bundle, args.cores)
+        scores = run_availability(sessions, args.seed, skin, args.cores)
         found["availability"] = {state: score.row() for state, score in scores.items()}
     head = report.head("faults", argv, args, 0.0)
     if args.frames or (args.quick and args.only is None):
-        tally = run_soak(args.frames or QUICK_FRAMES, args.seed, args.bundle, args.cores, so_far)
+        tally = run_soak(args.frames or QUICK_FRAMES, args.seed, skin, args.cores, so_far)
         found["soak"] = tally.row()
         found["runs"] = [*runs, {"commit": head["commit"], "frames": tally.frames - sum(r["frames"] for r in runs)}]
     goals = faults_report.goals(found, args.quick)
@@ -142,7 +158,7 @@ def main(argv: list[str] | None = None) -> int:
     faults_report.show(found)
     report.show(head, goals)
     if args.only is None:
-        report.write(args.out / ("soak.json" if args.frames else "faults.json"), head, found, goals)
+        report.write(args.out / f"{'soak' if args.frames else 'faults'}{of_parts}.json", head, found, goals)
     return report.status(goals, sys.stderr)
 
 

@@ -31,7 +31,9 @@ class PointForce:
 
 @dataclass(frozen=True)
 class Moment:
-    """One contact frame. truth: the touches that were there when the scan began or at its middle."""
+    """One contact frame. truth: the touches that were there when its oldest value was measured, or at the middle of its
+    scan (or newest part).
+    """
 
     read_s: float
     middle_s: float
@@ -104,8 +106,9 @@ class Session:
             if self.host.problem != (self.problems[-1][1] if self.problems else ""):
                 self.problems.append((self.host.now, self.host.problem))
             for raw, felt in frames:
-                result = self.pipeline.run(raw)
-                yield moment(self.host.now, felt.middle, felt, result.delta, result.contact)
+                contact, delta = self.pipeline.step(raw), self.pipeline.delta
+                if contact is not None and delta is not None:
+                    yield moment(self.host.now, felt.middle, felt, delta, contact)
 
     def close(self) -> None:
         self.rig.close()

@@ -1,8 +1,9 @@
 """Many frames of random faults and presses; counts the errors that no frame may have. Counted are frames that are valid
 and do not say `changing`; touches press with 1 N or more, radius 0.1 or more.
 
-A phantom: a contact further than FAR_M from every touch, while every touch has one near it or nothing touches. Off: the
-same while a touch has none near it. Unseen: a touch without a contact near it in more than UNSEEN such frames in a row.
+A phantom: a contact further than FAR_M from every touch, while every touch has one near it or nothing touches. Off:
+the same while a touch has none near it. Unseen: a touch without a contact near it in such frames in a row, for UNSEEN
+scans.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from bench.reliability.session import Moment, Session
 from services.pipeline import Pipeline
 
 FAR_M = 0.020
-UNSEEN = 2  # frames
+UNSEEN = 2.5  # scans: the third frame in a row, of whole scans
 NEWTON = 1.0  # a touch presses from here on
 CHUNK = 2500  # frames from one start to the next
 LEAST, MOST = 200, 10**8  # frames of a run
@@ -79,15 +80,17 @@ def chunk(sheet: SolvedSheet, pipeline: Pipeline, frames: int, seed: int) -> Soa
 
 def tallied(moments: Iterable[Moment], scene: RandomScene, seed: int) -> SoakTally:
     tally = SoakTally(chunks=1, touches=len(scene.presses), faults=len(scene.faults))
-    run: list[int] = []  # frames in a row in which the n-th touch had no contact
+    run: list[float] = []  # scans in a row in which the n-th touch had no contact
+    before = 0.0
     for m in moments:
         tally.frames += 1
+        scans, before = min(1.0, (m.read_s - before) / SCAN_S), m.read_s  # a frame of a part adds a tenth
         if m.middle_s < TARE_S:
             continue
         tally.invalid += not m.valid
         pressed = tuple(t for t in m.pressed if (t.newtons or 0.0) >= 0.999 * NEWTON)
         if len(pressed) != len(run):
-            run = [0] * len(pressed)
+            run = [0.0] * len(pressed)
         if not m.valid or m.changing:
             continue
         tally.counted += 1
@@ -101,8 +104,9 @@ def tallied(moments: Iterable[Moment], scene: RandomScene, seed: int) -> SoakTal
                 ("off" if off else "phantom") + f" at ({strangers[0].x * 1e3:+.0f}, {strangers[0].y * 1e3:+.0f}) mm"
             )
         for n, touch in enumerate(pressed):
-            run[n] = run[n] + 1 if touch in unseen else 0
-            if run[n] == UNSEEN + 1:
+            longer = run[n] + scans if touch in unseen else 0.0
+            late, run[n] = run[n] <= UNSEEN < longer, longer
+            if late:
                 tally.unseen += 1
                 wrong.append(f"unseen {touch.newtons:.1f} N at ({touch.x * 1e3:+.0f}, {touch.y * 1e3:+.0f}) mm")
         if wrong:

@@ -1,11 +1,11 @@
 """Latency: from the last byte of a scan that the board writes to a controller's recv, hop by hop, beside the floor.
 
-    skin bench latency [--seconds 20] [--controllers 1 4 16]
+    skin bench latency [--seconds 20] [--controllers 1 4 16] [--parts-only]
 
 Real processes, the stub's board behind its serial device, a plain pyzmq controller; then the same with a real-time
 priority, where this machine grants one. The floor is the same stages on the same frames in one process without
-sockets, each frame as it arrives: equally cold, and under the same load of the machine. Prints a table, writes
-latency.json and draws latency.png.
+sockets, each frame as it arrives: equally cold, and under the same load of the machine. Scans in parts are measured
+too, with the CPU that they cost (latency_parts.py). Prints tables, writes latency.json and draws latency.png.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from bench import goals as _goals
 from bench.goals import Goal
 from bench.json_file import write_json
 from bench.machine import machine, provenance
+from bench.speed import latency_parts
 from bench.speed.service import BEGIN, Outside, Service, end_on_sigterm, running
 from protocol.frames import RawFrame, TruthFrame
 from protocol.sockets import AllReader
@@ -229,19 +230,25 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench latency", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--seconds", type=float, default=20.0, help="of each condition")
     parser.add_argument("--controllers", type=int, nargs="+", default=[1, 4, 16])
+    parser.add_argument("--parts-only", action="store_true", help="scans in parts alone; writes no report")
     parser.add_argument("--usual-priority", action="store_true", help="without the rows of a real-time priority")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()
+    parts = latency_parts.measured(args.seconds)
+    Console(width=150).print(latency_parts.table(parts))
+    if args.parts_only:
+        Console(width=150).print(_goals.table(latency_parts.goals(parts)))
+        return 0
     samples, left_out = run(args.seconds, sorted(args.controllers), not args.usual_priority)
     rows = {name: figures(sample) for name, sample in samples.items()}
     Console(width=150).print(table(rows))
-    wanted = goals(rows)
+    wanted = [*goals(rows), *latency_parts.goals(parts)]
     Console(width=150).print(_goals.table(wanted))
     for line in left_out:
         print(line)
     report = {**provenance("latency", argv), "targets": [goal.to_dict() for goal in wanted], "rows": rows}
-    report["left_out"] = left_out
+    report |= {"left_out": left_out, "parts": parts}
     write_json(args.out / "latency.json", report)
     from bench import plots  # matplotlib takes a while
 

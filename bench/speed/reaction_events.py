@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,6 +37,7 @@ KINDS = (
     Kind("sliding at 0.3 m/s", 2.0, (0.2, 0.2), speed=0.3),
 )
 SLIDE_M = 0.05
+ONSET_S = 0.02
 HELD_S = 0.15  # from its onset on, after which a step is held
 SETTLED_S = 0.2  # a sliding touch stays still for so long before it moves
 
@@ -59,6 +60,11 @@ class TouchEvent:
     def at(self, t: float) -> tuple[float, float]:
         since = max(0.0, min(t, self.end) - self.moves)
         return self.x + since * self.velocity[0], self.y + since * self.velocity[1]
+
+    def force(self, t: float) -> float:
+        """At t s of the scene."""
+        times, forces = [key[0] for key in self.keys], [key[3] for key in self.keys]
+        return float(np.interp(t, times, forces, left=0.0, right=0.0))
 
     @property
     def released(self) -> float:
@@ -114,6 +120,24 @@ def scene(of: Sequence[TouchEvent]) -> str:
     return "\n".join(parts) + "\n"
 
 
+PHASES: dict[str, Callable[[TouchEvent, float], bool]] = {
+    "onset, 20 ms": lambda event, t: t < event.onset + ONSET_S,
+    "held": lambda event, t: event.onset + HELD_S + event.kind.ramp_s < t < min(event.moves, event.released),
+    "sliding": lambda event, t: event.moves < t < event.released,
+}
+
+
+@dataclass(frozen=True)
+class StatedError:
+    """Of one valid contact that is not `changing`: squared distance from the truth and error of force, in standard
+    deviations that it states.
+    """
+
+    phase: str
+    place: float
+    force: float
+
+
 @dataclass
 class Reaction:
     """What a controller saw of one event; times in s after force left zero, or came back to it. NaN: never."""
@@ -127,6 +151,7 @@ class Reaction:
     slip: list[float] = field(default_factory=list)  # relative error of their velocity
     held_m: list[float] = field(default_factory=list)  # while the touch holds still: how far off valid contacts are
     held_force: list[float] = field(default_factory=list)  # relative error of their force
+    stated: list[StatedError] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -172,10 +197,10 @@ def react(event: TouchEvent, until: float, frames: Sequence[SeenFrame]) -> React
                 found.wrong += off > SIGMAS * max(contact.position_sigma[:2])
             elif not seen.doubtful:
                 found.unstated += off > NEAR * SIDE_M
-    after = [seen for seen in frames if event.end <= seen.received < until]
+    after = [seen for seen in frames if event.released <= seen.received < until]
     free = _last_run([seen.frame.valid and not seen.present for seen in after])
     if free < len(after):
-        found.gone_s = after[free].received - event.end
+        found.gone_s = max(0.0, after[free].received - event.end)  # of a force that fades, the end may show before
     for seen in during:
         if seen.received > event.moves and len(seen.present) == 1:
             (contact,) = seen.present
@@ -186,7 +211,23 @@ def react(event: TouchEvent, until: float, frames: Sequence[SeenFrame]) -> React
             (contact,) = seen.present
             found.held_m.append(seen.off(contact, event))
             found.held_force.append(abs((contact.force_n or 0.0) / event.kind.force - 1.0))
+    found.stated = [error for seen in during if (error := _stated(seen, event)) is not None]
     return found
+
+
+def _stated(seen: SeenFrame, event: TouchEvent) -> StatedError | None:
+    """The errors of a contact that states both of its uncertainties; None in other phases."""
+    if len(seen.present) != 1 or "changing" in seen.frame.reasons:
+        return None
+    (contact,), at = seen.present, max(seen.sampled, event.onset)
+    phase = next((name for name, during in PHASES.items() if during(event, seen.received)), None)
+    if phase is None or not contact.position_sigma or not contact.force_sigma_n or contact.force_n is None:
+        return None
+    long, short, angle = contact.position_sigma
+    dx, dy = np.subtract(contact.on_sheet, event.at(at))
+    along, across = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
+    place = float((along / long) ** 2 + (across / short) ** 2)
+    return StatedError(phase, place, (contact.force_n - event.force(at)) / contact.force_sigma_n)
 
 
 def _last_run(good: Sequence[bool]) -> int:

@@ -40,12 +40,13 @@ from models.bundle import Bundle
 from models.refine import RefineJob
 from protocol.frames import ContactFrame, Frame, RawFrame, pack, unpack
 from services.pipeline import build_stages
-from services.refinement import RefineHere
+from services.refine_process import RefineHere
 from services.runtime.config import Indenter, Skin, TouchConfig
 from services.runtime.stage import PROCESSES, Stage
 
 QUIET_S = 5.0  # of each scene, before it begins: the tare
 ROUNDS = 3
+LEAST_S, LEAST_LIVE_S = 2.0, 1.0  # of a scene, to count frames of
 TARGETS = {"untouched": 0.25, "still": 0.5}  # of a moving touch's CPU
 GATES = {"untouched": 0.45, "still": 0.7}  # of a short run, stages alone
 REFINED_GATES = {"still": 1.6, "moving": 2.5}  # a slide is refined too: nearly each of its frames is handed to a fit
@@ -221,6 +222,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--live", type=float, default=15.0, help="seconds of each scene with the real processes")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
+    for name, given, least in (("seconds", args.seconds, LEAST_S), ("live", args.live, LEAST_LIVE_S)):
+        if not given >= least:
+            parser.error(f"--{name} {given:g}: expected {least:g} or more")
     end_on_sigterm()
     bundle, recorded = Bundle.load("square16"), scenes(args.seconds)
     variants, held = stages_alone(args.seconds), averaging(recorded["still"], bundle)

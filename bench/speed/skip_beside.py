@@ -13,7 +13,7 @@ from bench.tracking.scene import Recorded
 from models.bundle import Bundle
 from protocol.frames import RawFrame, pack, unpack
 from services.pipeline import build_stages
-from services.refinement import RefineProcess
+from services.refine_process import RefineProcess
 from services.runtime.config import Indenter, Skin, TouchConfig
 from services.runtime.stage import Stage
 

@@ -6,8 +6,9 @@ that is pulled out is found again after REOPEN_S, with a new link, as in service
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,11 +27,13 @@ IN_FLIGHT = 256  # scans that were measured and have not arrived
 
 @dataclass(frozen=True)
 class Felt:
-    """What one scan measured. Seconds of simulated time; faults: in force when it began, name -> arguments."""
+    """What one scan measured, or the newest part of one. Seconds of simulated time; faults: in force when it began,
+    name -> arguments.
+    """
 
     start: float
     middle: float
-    first: World  # when it began
+    first: World  # when the oldest value of its frame was measured
     world: World  # at its middle
     faults: dict[str, dict[str, Any]]
 
@@ -44,6 +47,7 @@ class Host:
         self.source = BoardSource("palm", skin, bundle)
         self._rng = np.random.default_rng([seed, 7])
         self._felt: dict[int, Felt] = {}
+        self._lately: deque[Felt] = deque(maxlen=self.source.scanning.parts)
         self._reopened_s: float | None = None  # when a cable that was out can be opened again
         self._connect()
 
@@ -72,9 +76,11 @@ class Host:
             return
         read_ns = round(self.now * 1e9)
         for scan_frame in self.link.received(data, self.now):
-            frame = self.source.raw_frame(scan_frame, self.link, read_ns)
-            yield frame, self._felt.pop(frame.scan)
+            self._lately.append(self._felt.pop(scan_frame.seq))
+            frame = self.source.handed_on(scan_frame, self.link, read_ns, self._newest)
+            if frame is not None:
+                yield frame, replace(self._lately[-1], first=self._lately[0].first)
 
     def _connect(self) -> None:
-        self.link = BoardLink(self.source.scanning, self.now)
+        self.link, self._newest = BoardLink(self.source.scanning, self.now), self.source.newest()
         self._reopened_s = None

@@ -18,7 +18,6 @@ from services.board.time_questions import TimeQuestions
 
 HELLO_EVERY_S = 0.2
 ANSWER_S = 0.5  # a command that is not answered in this time is sent again
-SWITCH_S = 0.1  # a running board that does not answer to a START in this time is told again
 TRIES = 3  # then everything starts from HELLO
 SILENT_S = 1.0  # a running board that sends nothing for so long is asked again
 EXPLAIN_AFTER_S = 1.5  # of unanswered HELLOs
@@ -33,15 +32,11 @@ class BoardLink:
     where its firmware knows no parts.
 
     `clock` maps the board's time to this host's. It begins anew only where START and its answer say so.
-    idle: a second configuration that a running board may be switched to (`switch`), where its firmware can.
     """
 
-    def __init__(self, scanning: Scanning, now_s: float, idle: Scanning | None = None) -> None:
-        self.scanning, self._idle = scanning, idle
+    def __init__(self, scanning: Scanning, now_s: float) -> None:
+        self.scanning = scanning
         self.knows_no_parts = False  # and so scans whole, although parts were wanted
-        self._pending: list[Scanning] = []  # configurations to send before START
-        self._started = scanning  # what the board was last told to scan
-        self._wanted = scanning
         self.decoder = link.Decoder()
         self.clock = DeviceClock()
         self._check = ScanCheck(self.clock)
@@ -71,20 +66,6 @@ class BoardLink:
     def frozen(self) -> bool:
         """Whether the board sends the same scan again and again."""
         return self._check.frozen
-
-    @property
-    def switches(self) -> bool:
-        """Whether this board can be switched to the idle configuration while it runs."""
-        return self._idle is not None and bool(self.ident and self.ident.capabilities & link.Capability.SENTINEL)
-
-    @property
-    def confirmed(self) -> Scanning | None:
-        """The list that the running board has said that it scans, after the scan under way; None while it has not."""
-        return self._started if self.state == "running" and not self._tries else None
-
-    def switch(self, to: Scanning) -> None:
-        """Makes the running board scan this one of the configurations; `to_send` tells it."""
-        self._wanted = to
 
     def received(self, data: bytes, now_s: float) -> list[link.ScanFrame]:
         """Returns the scans that `data` completes, in order; all other messages are dealt with here."""
@@ -122,7 +103,7 @@ class BoardLink:
         """Returns the bytes that are due now."""
         if self.state == "running":
             if now_s - self._heard_s <= SILENT_S:
-                return self._switching(now_s) + self._asking(now_s)
+                return self._asking(now_s)
             self._restart(now_s, f"the board went silent for {SILENT_S:g} s: asking it again")
         if self.state == "refused" and now_s - self._since >= REFUSED_AGAIN_S:
             self._to(now_s, "hello")
@@ -139,7 +120,7 @@ class BoardLink:
                 self._restart(now_s, f"the board does not answer {self.state.upper()}: asking it again")
                 return b""
             self._due_s = now_s + ANSWER_S
-            s = self._pending[0] if self._pending else self.scanning
+            s = self.scanning
             if self.state == "config":
                 return link.encode(
                     link.Config(
@@ -179,19 +160,9 @@ class BoardLink:
         self._check.doubt()
         self._restart(now_s, "the board's clock jumped, or runs wrong by more than 1 ms/s: asking it again")
 
-    def _switching(self, now_s: float) -> bytes:
-        """Returns a START of another configuration, again and again until it is answered."""
-        answered = not self._tries
-        if self._wanted is self._started and (answered or now_s < self._due_s):
-            return b""
-        self._started, self._due_s, self._tries = self._wanted, now_s + SWITCH_S, 1
-        return link.encode(link.Start(config=self._wanted.config))
-
     def _to(self, now_s: float, state: str) -> None:
         self.state, self._since, self._due_s, self._tries = state, now_s, now_s, 0
         self._heard_s, self._start_s = now_s, None
-        if state == "start":
-            self._started = self._wanted = self.scanning
         if state == "hello":
             self._asked_since = now_s
 
@@ -209,27 +180,20 @@ class BoardLink:
         if wrong := unfit(ident, self.scanning):
             self._refuse(wrong, now_s)
         elif self.state in ("hello", "refused"):
-            self._pending = [self.scanning, *([self._idle] if self._idle and self.switches else [])]
             self._to(now_s, "config")
 
     def _acknowledged(self, ack: link.Ack, now_s: float) -> None:
         if self.state == "config" and ack.of == link.Config.number:
-            if self._pending and ack.value != self._pending[0].config:
-                return  # a late answer to the one before
-            self._pending = self._pending[1:]
-            self._to(now_s, "config" if self._pending else "start")
-        elif ack.of == link.Start.number and ack.value not in (0, self._started.config):  # 0: the board does not say
+            if ack.value == self.scanning.config:  # else a late answer to the one before
+                self._to(now_s, "start")
+        elif ack.of == link.Start.number and ack.value not in (0, self.scanning.config):  # 0: the board does not say
             return  # a late answer to another one
         elif self.state == "start" and ack.of == link.Start.number:
             self.problem = ""
-            self._started = self._wanted = self.scanning
             self._begin(ack, self._start_s, now_s)
             self._to(now_s, "running")
         elif self.state == "running" and ack.of == link.Start.number:
-            if self._tries:  # of a switch: scans go on being counted
-                self._tries = 0
-            else:
-                self._check.started(ack.device_us)  # a START sent twice: scans count from 0 again
+            self._check.started(ack.device_us)  # a START sent twice: scans count from 0 again
 
     def _begin(self, ack: link.Ack, asked_s: float | None, now_s: float) -> None:
         """START was carried out: what comes now is from after it, and its answer says what the board's clock shows."""
@@ -270,15 +234,11 @@ class BoardLink:
 
     def _is_ours(self, scan: link.ScanFrame, first_byte_s: float, now_s: float) -> bool:
         """Returns whether this is to be believed as the board's next scan; counts what it is otherwise."""
-        known = (self.scanning, self._idle) if self.switches else (self.scanning,)
-        ours = any(s is not None and s.sent(scan) for s in known)
-        if self.state != "running" or not ours:
+        if self.state != "running" or not self.scanning.sent(scan):
             self.counts["foreign"] += 1
             return False
         # The first byte leaves as the scan ends; the last one as much later as the line is slow.
-        what = self._check(
-            scan, _ns(first_byte_s), fit=scan.config == self.scanning.config and scan.part == scan.parts - 1
-        )
+        what = self._check(scan, _ns(first_byte_s), fit=scan.part == scan.parts - 1)
         self.counts[what] += 1
         if self._check.jumped:
             self._clock_jumped(now_s)

@@ -15,10 +15,8 @@ from dataclasses import replace
 
 from models.bundle import Bundle
 from protocol import link
-from protocol.frames import DeltaFrame, RawFrame
-from protocol.sockets import NewestReader
+from protocol.frames import RawFrame
 from services.board import port as ports
-from services.board.adaptive import AdaptiveScan, Passed
 from services.board.boardlink import BoardLink
 from services.board.clock import UNSETTLED_NS
 from services.board.host_time import STOOD_STILL_S, HostTime, Suspensions
@@ -26,7 +24,6 @@ from services.board.newest_values import NewestValues
 from services.board.remarks import Remarks
 from services.board.scanning import Scanning
 from services.estimation.rolling import parts_of, rolling_order
-from services.estimation.sentinel import sentinel_of
 from services.runtime.config import Skin
 from services.runtime.stage import Health, add_reason, valid_for_s
 
@@ -82,16 +79,11 @@ class BoardSource(Source):
         self.remarks = Remarks()
         self._logged: dict[str, float] = {}  # what was logged lately, and when
         self.scanning = Scanning(bundle.pattern, skin.dft_points, skin.rtia_ohm)
-        self.idling: Scanning | None = None
-        self._verdicts: NewestReader | None = None  # what preprocessing makes of the frames
-        if skin.scan == "adaptive":
-            self.idling = Scanning(bundle.pattern[sentinel_of(bundle).rows], skin.dft_points, skin.rtia_ohm)
         if skin.scan == "rolling":
             self.scanning = replace(self.scanning, parts=parts_of(bundle), order=rolling_order(bundle))
         self._port: ports.Port | None = None
         self._board = ""  # unique id of the board that we know
         self._usb_serial: str | None = None
-        self._full_s = 0.0  # duration of the last full scan
 
     def frames(self) -> Iterator[RawFrame | None]:
         while True:
@@ -122,9 +114,6 @@ class BoardSource(Source):
         return self.remarks.added_to(super().health())
 
     def close(self) -> None:
-        if self._verdicts is not None:
-            self._verdicts.close()
-            self._verdicts = None
         if self._port is not None:
             self._port.close()
             self._port = None
@@ -134,27 +123,19 @@ class BoardSource(Source):
         `must_be` (returns True).
         """
         opened = last = self._now()
-        board, suspensions = BoardLink(self.scanning, opened, self.idling), Suspensions(self.host)
-        adaptive, newest = self.adaptive(), self.newest()
+        board, suspensions = BoardLink(self.scanning, opened), Suspensions(self.host)
+        newest = self.newest()
         seen: Counter[str] = Counter()
         counted = 0.0
         try:
             while True:
                 now = self._now()
                 wait_s = POLL_S if board.state == "running" else 0.02
-                if adaptive is not None:
-                    self._listen(adaptive, now)
-                    if board.state != "running" or not board.switches:
-                        adaptive.interrupted()
-                    else:
-                        self.steer(board, adaptive, now)
-                        wait_s = min(wait_s, adaptive.due_s(now))
                 # After a standstill what waits is read first: the board was not silent, and not asked either.
                 due = board.to_send(now) if now - last < STOOD_STILL_S else b""
                 if due:
                     port.write(due)
-                if adaptive is None:  # its lists differ in length, and it cannot wait
-                    self.host.sleep(board.pause_s(self._now()))
+                self.host.sleep(board.pause_s(self._now()))
                 data = port.read(wait_s)
                 stood_s = self._now() - last
                 if stood_s > STOOD_STILL_S:
@@ -170,19 +151,19 @@ class BoardSource(Source):
                     self._board, self._usb_serial = board.board, ports.usb_serial_number(port.url)
                 if board.problem != self.problem:
                     self._trouble(board.problem)
-                passed = [p for scan in scans for p in (adaptive.scanned(scan, last) if adaptive else [(scan, "full")])]
+                came = bool(scans)
                 if stood_s > STOOD_STILL_S:
-                    passed = self._newest(passed, board, stood_s, last)
-                frames = [self.handed_on(scan, board, read_ns, newest, kind) for scan, kind in passed]
-                if last - counted > COUNT_EVERY_S or not scans:
+                    scans = self._newest(scans, board, stood_s, last)
+                frames = [self.handed_on(scan, board, read_ns, newest) for scan in scans]
+                if last - counted > COUNT_EVERY_S or not came:
                     counted = last
-                    self._count(board, seen, adaptive)
+                    self._count(board, seen)
                     self.remarks.look(board, last)
                 yield from (frame for frame in frames if frame is not None)
-                if not scans:
+                if not came:
                     yield None
         finally:
-            self._count(board, seen, adaptive)
+            self._count(board, seen)
 
     def _now(self) -> float:
         return self.host.now_ns() * 1e-9
@@ -194,51 +175,34 @@ class BoardSource(Source):
             data += more
         return data
 
-    def _newest(self, passed: list[Passed], board: BoardLink, stood_s: float, now_s: float) -> list[Passed]:
+    def _newest(
+        self, scans: list[link.ScanFrame], board: BoardLink, stood_s: float, now_s: float
+    ) -> list[link.ScanFrame]:
         """Returns the newest of the scans that waited while this process stood still: it alone goes on."""
-        skipped = max(0, len(passed) - 1)
+        skipped = max(0, len(scans) - 1)
         if skipped:
-            board.reasons[passed[-1][0].seq] = sorted({"gap", *board.reasons.get(passed[-1][0].seq, ())})
+            board.reasons[scans[-1].seq] = sorted({"gap", *board.reasons.get(scans[-1].seq, ())})
         self.counts["standstills"] += 1
         self.counts["skipped"] += skipped
         self.remarks.stood_still(stood_s, skipped, now_s)
-        return passed[-1:]
-
-    def adaptive(self) -> AdaptiveScan | None:
-        """Returns what decides which list a new connection's board scans, where skin.toml wants that."""
-        return AdaptiveScan(sentinel_of(self.bundle), self.idling.config) if self.idling else None
-
-    def steer(self, board: BoardLink, adaptive: AdaptiveScan, now_s: float) -> None:
-        """Makes the board scan what `adaptive` wants."""
-        assert self.idling is not None
-        confirmed = "full" if board.confirmed is self.scanning else "sentinel"
-        board.switch(self.scanning if adaptive.wants(now_s, confirmed) == "full" else self.idling)
-
-    def _listen(self, adaptive: AdaptiveScan, now_s: float) -> None:
-        """Hears preprocessing's newest verdict, in the thread that the socket belongs to."""
-        if self._verdicts is None:
-            self._verdicts = NewestReader("delta", self.name)
-        while (delta := self._verdicts.recv()) is not None:
-            if isinstance(delta, DeltaFrame):
-                adaptive.heard(delta, now_s)
+        return scans[-1:]
 
     def newest(self) -> NewestValues | None:
         """Returns what collects a new connection's values, where they come in parts."""
         return None if self.scanning.order is None else NewestValues(self.scanning.order)
 
     def handed_on(
-        self, scan: link.ScanFrame, board: BoardLink, read_ns: int, newest: NewestValues | None, kind: str = "full"
+        self, scan: link.ScanFrame, board: BoardLink, read_ns: int, newest: NewestValues | None
     ) -> RawFrame | None:
         """Returns what goes on to preprocessing; None while values are missing."""
         if newest is not None and not newest.take(scan):
             return None
-        frame = self.raw_frame(scan, board, read_ns, kind)
+        frame = self.raw_frame(scan, board, read_ns)
         return frame if newest is None else newest.frame(frame, scan)
 
-    def raw_frame(self, scan: link.ScanFrame, board: BoardLink, read_ns: int, kind: str = "full") -> RawFrame:
+    def raw_frame(self, scan: link.ScanFrame, board: BoardLink, read_ns: int) -> RawFrame:
         """Returns the raw frame of a board's scan, with this host's stamps; `read_ns`: when its last byte was read."""
-        if kind == "full":
-            self._full_s = scan.duration_us * scan.parts * 1e-6
+        scan_s = scan.duration_us * scan.parts * 1e-6
         middle_us = scan.device_us + scan.duration_us // 2
         unknown, sigma_ns = board.clock.unknown(middle_us), board.clock.sigma_ns(middle_us)
         reasons = list(board.reasons.get(scan.seq, ()))
@@ -254,9 +218,8 @@ class BoardSource(Source):
             source="stub" if "stub" in board.ident.firmware.lower() else "board",
             valid=valid,
             reasons=reasons,
-            valid_for_s=valid_for_s(self._full_s),
+            valid_for_s=valid_for_s(scan_s),
             z=scan.z,
-            kind=kind,
             status=scan.status,
             device_us=scan.device_us,
             config=scan.config,
@@ -277,11 +240,9 @@ class BoardSource(Source):
         else:
             log.info("%s: the board is running", self.name)
 
-    def _count(self, board: BoardLink, seen: Counter[str], adaptive: AdaptiveScan | None) -> None:
+    def _count(self, board: BoardLink, seen: Counter[str]) -> None:
         """Adds what is new in the connection's counts to ours."""
         now = board.counts + Counter({f"line_{what}": n for what, n in board.decoder.counts.items() if what != "good"})
-        if adaptive is not None:
-            now += adaptive.counts
         if now != seen:
             self.counts += now - seen
             seen.clear()

@@ -1,7 +1,9 @@
 """Contacts between two images: moved as the touches were that preprocessing follows from part to part of a scan.
 
 What an image says of a touch stays: identity, shape, area. Its place and its force change by as much as those of the
-followed touch that was nearest to it when the image was made.
+followed touch that was nearest to it when the image was made. The errors of both places, the image's and the followed
+touch's, have little to do with each other: where they agree, the contact is in the middle. Where they do not, the touch
+is no circle, or the image is of a touch that changed: then the place is the image's, and its uncertainty says so.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from protocol.frames import Contact, FollowedTouch
 from services.contacts.motion import Motion
 from services.contacts.surface import Placement
 
+AGREE = 3.0  # standard deviations of the followed touch's place within which an image's is of the same circle
 REACH_M = 0.008  # between a contact and the followed touch that it is
 
 
@@ -29,6 +32,7 @@ class Anchor:
     dx: float  # m
     dy: float
     integral: float
+    apart: float | None = 0.0  # m, of image and followed touch where they do not agree; None: it is in the middle
 
 
 class Following:
@@ -49,7 +53,13 @@ class Following:
             if near and min(near) < REACH_M:
                 k = near.index(min(near))
                 t = followed[k]
-                self._anchors[contact.id] = Anchor(t.number, k, x - t.position[0], y - t.position[1], t.integral)
+                dx, dy = x - t.position[0], y - t.position[1]
+                apart: float | None = 0.0
+                part = 1.0  # what was measured by itself is where it is
+                if contact.position_sigma is None:
+                    agree = math.hypot(dx, dy) <= AGREE * t.sigma[0]
+                    apart, part = (None, 0.5) if agree else (math.hypot(dx, dy), 1.0)
+                self._anchors[contact.id] = Anchor(t.number, k, part * dx, part * dy, t.integral, apart)
 
     def motion(self, followed: Sequence[FollowedTouch]) -> dict[int, Motion]:
         """By now, of the contacts that are followed, by their ids."""
@@ -68,7 +78,7 @@ class Following:
                 anchor = self._anchors[contact.id]
                 touch = followed[anchor.place]
                 grown = touch.integral / max(anchor.integral, 1e-30)
-                contact = _moved(contact, motion[contact.id], grown, list(touch.sigma), place)
+                contact = _moved(contact, motion[contact.id], grown, _sigma(anchor, touch), place)
             found.append(contact)
         return found
 
@@ -77,6 +87,15 @@ class Following:
 
     def load(self, state: Sequence[Any]) -> None:
         self._anchors = {int(number): Anchor(int(n), int(k), *rest) for number, n, k, *rest in state}
+
+
+def _sigma(anchor: Anchor, touch: FollowedTouch) -> list[float]:
+    """Of the contact's place: in the middle of two that are about as sure it is surer than either, while it is held."""
+    long, short, angle = touch.sigma
+    if anchor.apart is None:
+        better = 1.0 if any(touch.velocity) else math.sqrt(0.5)
+        return [better * long, better * short, angle]
+    return [math.hypot(long, anchor.apart), math.hypot(short, anchor.apart), angle]
 
 
 def _of(anchor: Anchor, followed: Sequence[FollowedTouch]) -> FollowedTouch | None:

@@ -16,6 +16,7 @@ SIZE_SIGMA = 0.4  # of the logarithm of an integrated drop, from frame to frame
 SIZE_SHARE = 0.3  # of what is seen, in the running mean of the size
 LEFT_OVER, LEFT_OVER_M = 0.3, 0.008  # share of its size, and distance, that no touch changes by at once as it goes on
 SAME_M, SAME_SIZE = 0.0015, 0.15  # a steady touch from image to image: place, logarithm of an integrated drop
+REMEMBERED = 3  # images
 MOST_FOR_SIZE = 9.0  # a touch may grow quickly: its size alone makes it no other touch
 
 
@@ -56,7 +57,7 @@ class Track:
     missing: int = 0  # frames since it was seen
     age: int = 1  # frames in which it was seen
     sure_frames: int = 0  # of those, with an image that explained its frame, or that was like the one before
-    confidence: float = 1.0  # of the last image's patch
+    confidences: list[float] = field(default_factory=list)  # of its patches in the last images, newest last
     last: list[float] = field(default_factory=list)  # place [m] and size in the last image
     begins: bool = True  # whether it was looked for, and not there, just before
     sure: list[float] = field(default_factory=list)  # m, where the last image that explained its frame showed it
@@ -76,7 +77,8 @@ class Track:
         """Update with where an image shows it. sure: the image explains its frame; else it shows roughly where."""
         if sure:
             self.sure, self.sure_frames = [seen.x, seen.y], self.sure_frames + 1
-        self.last, self.confidence = [seen.x, seen.y, seen.size], seen.confidence
+        self.last = [seen.x, seen.y, seen.size]
+        self.confidences = [*self.confidences, seen.confidence][-REMEMBERED:]
         real = max(0.0, (sample_ns - self.seen_ns) * 1e-9)
         if real > 1e-6:
             self._filter(seen, real)

@@ -29,7 +29,7 @@ UNSEEN_S = 0.25  # it ends after so long at the latest, however bad the images
 FORGOTTEN_S = 1.0  # after so long without a frame, nobody knows whether a touch is the same
 NEVER = 1e6  # cost of what is out of reach
 UNCONFIRMED = 0  # id of what was seen once, beside others
-BELIEVED = ((2, 0.92), (3, 0.85))  # sure frames and confidence, of either, with which a touch begins beside others
+BELIEVED = ((2, 0.92), (3, 0.85))  # images and confidence in each, of either, with which a touch begins beside others
 # The same while an electrode is at fault: a strong touch leaves faint patches where the skin is then nearly blind.
 BELIEVED_DOUBTED = ((2, 0.95),)
 
@@ -232,16 +232,18 @@ class Tracker:
 def _believed(track: Track, well: bool) -> bool:
     """Whether what appears beside others is a touch. well: no electrode is at fault."""
     enough = BELIEVED if well else BELIEVED_DOUBTED
-    return any(track.sure_frames >= frames and track.confidence >= least for frames, least in enough)
+    return any(track.sure_frames >= n and min(track.confidences[-n:], default=0.0) >= least for n, least in enough)
 
 
 def _new(number: int, seen: Patch, sample_ns: int, begins: bool = True, sure: bool = True) -> Track:
     track = Track(number, seen.x, seen.y, sample_ns, seen.size, seen.reach, begins=begins)
-    track.last, track.confidence = [seen.x, seen.y, seen.size], seen.confidence
+    track.last, track.confidences = [seen.x, seen.y, seen.size], [seen.confidence]
     if sure:
         track.sure, track.sure_frames = [seen.x, seen.y], 1
     return track
 
 
 def _track(values: dict[str, Any]) -> Track:
-    return Track(**{**values, "inside": [Track(**one) for one in values["inside"]]})
+    if "confidence" in values:  # of an earlier version
+        values = {name: value for name, value in values.items() if name != "confidence"}
+    return Track(**{**values, "inside": [_track(one) for one in values["inside"]]})

@@ -19,6 +19,7 @@ Array = NDArray[np.floating]
 LOOK_BACK = 3  # frames over which a contact that rises under a touch is told from it
 LOOK_FAR_BACK = 24  # the same, where it rises slowly
 ALIKE = 0.3  # of what is felt: two frames that differ by less say the same
+JUMP = 3.0  # times the change of the frames before, from which one comes at once
 
 
 class ChangedContacts:
@@ -76,7 +77,23 @@ class ChangedContacts:
             if found is not None:
                 self._before.setdefault(found.electrode, past)
                 return found
-        return self._changed_under_motion(amplitude, untouched, live)
+        found = self._changed_under_motion(amplitude, untouched, live)
+        if found is not None:
+            return found
+        return self._jumped(amplitude, untouched, live)
+
+    def _jumped(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
+        """Returns the electrode whose contact may have jumped while something else moved: a touch that moves onto an
+        electrode changes each frame by as much as the one before. Two frames back, since it may jump within a scan.
+        """
+        if len(self._past) < 4:
+            return None
+        last, before = self._past[-2], self._past[-4]
+        live = live & np.isfinite(last) & np.isfinite(before)
+        d, usual = _difference(amplitude, last, untouched, live), _difference(last, before, untouched, live)
+        if float(d[live] @ d[live]) < JUMP**2 * float(usual[live] @ usual[live]):
+            return None
+        return self._drift.resembles(d, np.sqrt(2.0) * untouched.sigma, live)
 
     def _changed_under_motion(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
         """Returns the same under a touch that moves steadily: the frames before say which change is its own."""

@@ -15,6 +15,7 @@ States = NDArray[np.uint8]
 
 SUSPECTED = 3  # frames in a row after which a change that may be a touch on the electrode is the contact's
 STILL_S = 10.0  # for which a contact that drifted must have been well
+ASK_AGAIN = 8  # frames in which a contact that was suspected is asked about while nothing explains them
 ASK_EVERY = 4  # frames from one question about a contact under a touch to the next: each takes 20 ms
 
 
@@ -28,6 +29,7 @@ class ContactDoubts:
     def reset(self) -> None:
         self.unsure = np.zeros(self._electrodes, dtype=bool)  # drifting, unless somebody presses right on it
         self.suspected = np.zeros(self._electrodes, dtype=np.int64)  # frames in a row
+        self._open = np.zeros(self._electrodes, dtype=np.int64)  # frames for which a question may stay without answer
         self._asked = np.zeros(self._electrodes, dtype=np.int64)  # frames until the evidence is asked again
         self._off_s = np.full(self._electrodes, np.nan)  # when a contact that drifts was last seen off; NaN: none does
 
@@ -40,9 +42,22 @@ class ContactDoubts:
         self.unsure &= (states == DRIFTING) & ~faulty
 
     def passed(self, electrode: int | None, states: States) -> NDArray[np.intp]:
-        """Electrodes that were suspected until now, and that this frame, which suspects `electrode`, does not show."""
+        """Electrodes that were suspected until now, or whose question has no answer yet, and that this frame, which
+        suspects `electrode`, does not show.
+        """
         again = np.arange(self._electrodes) == electrode
-        return np.flatnonzero((self.suspected > 0) & ~again & (states == OK))
+        self._open[self.suspected > 0] = ASK_AGAIN
+        passed = (self._open > 0) & ~again & (states == OK)
+        self._open[passed] -= 1
+        return np.flatnonzero(passed)
+
+    @property
+    def asks(self) -> bool:
+        """Whether an electrode is suspected, or its question has no answer yet."""
+        return bool(self.suspected.any() or self._open.any())
+
+    def answered(self, k: int) -> None:
+        self._open[k] = 0
 
     def suspect(self, electrode: int | None, states: States) -> Mask:
         """A frame suspects this electrode, or none. (E,) which have been suspected for so long that they count as
@@ -93,6 +108,7 @@ class ContactDoubts:
             "unsure": self.unsure.astype(np.uint8),
             "suspected": self.suspected.copy(),
             "asked": self._asked.copy(),
+            "open": self._open.copy(),
             "off_s": self._off_s.copy(),
         }
 
@@ -105,4 +121,5 @@ class ContactDoubts:
         self.unsure = shaped(state["unsure"], shape) > 0
         self.suspected = shaped(state["suspected"], shape).astype(np.int64)
         self._asked = shaped(state.get("asked", self._asked), shape).astype(np.int64)
+        self._open = shaped(state.get("open", self._open), shape).astype(np.int64)
         self._off_s = shaped(state.get("off_s", self._off_s), shape, finite=False)

@@ -39,6 +39,7 @@ UNTOUCHED = 0.03  # of |d|, what a changed contact leaves of it where nothing el
 LEAST_RISE = 0.03  # of the nominal contact impedance
 RISES_WITHIN = 0.5  # the same, where it rises within a scan
 STEEPEST = 1.2  # of a: it rises from nothing within a scan, at most
+RESEMBLES = 0.2  # of |d|, what it leaves where a touch goes on meanwhile
 FALL = 0.004  # relative: a pair that fell by more, and by 6 sigma
 SIGMAS = 6.0
 MOST_OF = 0.6  # share of the electrode's pairs that fell (a touch may have raised the others)
@@ -124,6 +125,19 @@ class ContactDrift:
             return Changed(k, sure)
         within = sure and aside is None and self._rises_within(k, d, live, expected)
         return Changed(k, True) if within else None
+
+    def resembles(self, d: Array, sigma: Array, live: NDArray[np.bool_]) -> Changed | None:
+        """Returns the electrode whose contact may have risen while something else changed a little too: where d (K,)
+        has most of its energy in the form of that rise.
+        """
+        if not self._tells(live):
+            return None
+        strength = self.members @ np.where(live, d, 0.0)
+        k = int(strength.argmax())
+        energy = float(d[live] @ d[live])
+        if energy < SUSPECT**2 * float(np.mean(sigma[live] ** 2)) or strength[k] < 2 * np.partition(strength, -2)[-2]:
+            return None
+        return Changed(k, False) if self._left_by_rise(k, d, live, None) <= RESEMBLES**2 * energy else None
 
     def _left_by_rise(self, k: int, d: Array, live: NDArray[np.bool_], aside: Array | None) -> float:
         """Returns the energy that a rise of electrode k's contact leaves of d; infinite where it is no rise."""

@@ -27,6 +27,7 @@ from services.estimation.tuning import TUNING, Tuning
 
 Array = NDArray[np.float64]
 
+JUMPED_NATS = 8.0  # by which a contact that seemed to jump must be likelier changed than not
 WELL_WITHIN = 0.05  # relative: a contact that is farther off its old impedance is not well, however likely drift is
 
 
@@ -39,6 +40,11 @@ class ContactOpinion(NamedTuple):
 
     def changed(self, tuning: Tuning = TUNING) -> bool:
         return self.elsewhere and self.odds > tuning.contact_nats
+
+    @property
+    def jumped(self) -> bool:
+        """The same of a contact that seemed to jump a moment ago, which is evidence too."""
+        return self.elsewhere and self.fits and self.odds > JUMPED_NATS and self.rise > WELL_WITHIN
 
     @property
     def well(self) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from models.sentinel import touches
+from models.touch_grid import touches
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]

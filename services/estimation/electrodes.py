@@ -154,9 +154,7 @@ class ElectrodeHealth:
         """Returns whether nothing is wrong, as in most touched frames: what follows would find the same at twice the
         work.
         """
-        wrong = (
-            seen.states.any() or status.any() or seen.failed.any() or self._states.any() or self._doubts.suspected.any()
-        )
+        wrong = seen.states.any() or status.any() or seen.failed.any() or self._states.any() or self._doubts.asks
         quiet = seen.suspect is None and not wrong
         return quiet and not self._contacts.felt and bool(np.isfinite(untouched.sigma).all())
 
@@ -214,11 +212,13 @@ class ElectrodeHealth:
             self._look_again(int(k), seen, untouched)
 
     def _no_longer_suspected(self, k: int, seen: FrameFindings, untouched: Reference | None) -> None:
-        """Asks once whether the contact of electrode k changed at once and stays so: then no frame differs from the
-        few before by it any more.
+        """Asks whether the contact of electrode k changed at once and stays so: then no frame differs from the few
+        before by it any more. Once, where contact and touches explain the frame: they do not while a touch comes.
         """
         opinion = None if untouched is None else self._ask(k, seen, untouched)
-        if opinion is not None and opinion.changed():
+        if opinion is None or opinion.fits:
+            self._doubts.answered(k)
+        if opinion is not None and (opinion.changed() or opinion.jumped):
             self._states[k], self._well[k] = DRIFTING, 0
             self._doubts.asked(k)
             self._contacts.propose(k, opinion.felt)

@@ -62,17 +62,32 @@ class GainSteps:
             self._gross_ns, self._taken, self._past = 0, gross, self._past[-1:]
             return GainStep(gross, lasted=True)
         self._gross_ns = 0
-        total = float(past[-1].sum())
-        if abs(float(amplitude.sum()) - total) < TUNING.gain_least * total:
-            return None
-        factor = _common(past[-1], amplitude, baseline)
-        for earlier in past[-2::-1] if factor is None else ():  # the steadier a touch moves, the further back tells
-            factor = factor or _common(past[-1], amplitude, baseline, earlier)
+        factor = self._stepped(past, amplitude, baseline)
         if factor is None:
             return None
         if self._undoes(factor):
             return self._back(factor)
-        return self._step(factor) if abs(factor - 1) <= GROSS else None
+        if abs(factor - 1) <= GROSS:
+            return self._step(factor)
+        # Under a touch, where the baseline tells nothing: said, and not taken over. The frames before had another gain.
+        self._gross_ns, self._past = now_ns, self._past[-1:]
+        return None
+
+    def _stepped(self, past: list[Array], amplitude: Array, baseline: Baseline) -> float | None:
+        """The factor between two frames: this one and the one before, or the one before that where the step came in
+        the midst of a scan.
+        """
+        for skipped in (0, 1):
+            known = past[: len(past) - skipped]
+            if not known or not _differs(known[-1], amplitude):
+                continue
+            factor = _common(known[-1], amplitude, baseline)
+            for earlier in known[-2::-1] if factor is None else ():  # a steady motion: the further, the surer
+                factor = factor or _common(known[-1], amplitude, baseline, earlier)
+            if factor is not None:
+                self._past = [*known, amplitude.copy()]  # the scan of the step is of neither gain
+                return factor
+        return None
 
     def _undoes(self, factor: float) -> bool:
         """Whether a gross gain that the baseline took over ends: nothing needs to last for that."""
@@ -108,6 +123,11 @@ class GainSteps:
             state = {**state, "past": [] if state["before"] is None else [state["before"]]}
         self._past = [shaped(row, (self._k,), finite=False) for row in state["past"]]
         self._gross_ns, self._taken = int(state["gross_ns"]), float(state.get("taken", 0.0))
+
+
+def _differs(before: Array, now: Array) -> bool:
+    total = float(before.sum())
+    return len(before) == len(now) and not abs(float(now.sum()) - total) < TUNING.gain_least * total
 
 
 def _common(before: Array, now: Array, baseline: Baseline, earlier: Array | None = None) -> float | None:

@@ -1,6 +1,6 @@
 """What the newest parts of a scan say before a whole scan can: that a touch began, when, or that it ended.
 
-A touch m of a grid (models/sentinel.py) that began at an instant changes value k, measured at t_k, by d_k = drop R_mk
+A touch m of a grid (models/touch_grid.py) that began at an instant changes value k, measured at t_k, by d_k = drop R_mk
 f(t_k), with f a step at that instant or a ramp from it. Over all touches, instants and both forms the likelihood ratio
 to an untouched skin is exp(z^2 / 2), z the matched filter's value. A begin counts only where
 
@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from models.sentinel import touches
+from models.touch_grid import touches
+from services.estimation.part_course import FAINT, TouchStart
 
 Array = NDArray[np.floating]
 
@@ -30,25 +31,26 @@ OUTSIDE_SIGMAS = 4.0  # without any two electrodes
 GAIN_MARGIN = 10.0  # nats times two, by which a touch is likelier than a change of gain
 LINEAR = 0.1  # of d: by so much the linear picture of a touch on a grid position may be wrong
 ELSEWHERE = 0.25  # model units: a touch so far from another is in another place
-UNLIKELY = 8.0  # nats by which other places must be less likely
+UNLIKELY = 15.0  # nats by which other places must be less likely, for them not to be tried
+STARTS = 4  # that are tried
 MISFIT = 0.3  # of what one touch explains: so much may be left
 NEWEST = 3  # parts within which a touch may have begun that nothing is known of yet
 RAMP_PARTS = 5  # the same of one that grows
 RAMPS = (2.5, 4.5, 7.0, 11.0)  # parts that a force may take to grow, once its beginning is known
 NEAR = 0.5  # parts by which a known beginning may be off
-FAINT = 0.2  # of a ramp's newest value, below which a value tells too little
-HELD_SIGMAS = 12.0  # that a held touch must have in one part for its absence to be seen there
+TINY = 1e-12  # keeps solvable what no value tells
+HELD_SIGMAS = 12.0  # that a held touch must have in the newest parts for its absence to be seen there
+ENDS_WITHIN = 5  # parts
 GONE_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
 class PartOnset:
-    """A touch that began. course (K,): f at each value's instant, 1 at the newest, 0 before the touch began."""
+    """A touch that began. since: age of the oldest value that felt it; starts: what it may be, the likeliest first."""
 
     sigmas: float
-    since: float  # age of the oldest value that felt it
-    grown: float  # of the oldest value that felt all of it
-    course: NDArray[np.float64]
+    since: float
+    starts: list[TouchStart]
 
 
 class PartEvidence:
@@ -59,15 +61,15 @@ class PartEvidence:
         self.knows = m.normalisation == "model" and parts > 1
         grid = touches(m, bundle.half_width)
         self._response = np.asarray(grid.response, dtype=np.float64)  # (M, K)
-        self._position = np.asarray(grid.position, dtype=np.float64)
+        self._position, self._radius = np.asarray(grid.position, dtype=np.float64), grid.radius
         self._count = len(bundle.pattern) // parts  # values in a part
         electrodes = int(bundle.pattern.max()) + 1
         uses = np.array([np.isin(np.arange(electrodes), row) for row in bundle.pattern])
         self._outside = np.array([~(uses[:, a] | uses[:, b]) for a, b in combinations(range(electrodes), 2)])
 
-    def sigmas(self, d: Array, noise: Array, age: Array) -> float:
-        """The largest matched filter of the newest part alone. d, noise, age: (K,) each."""
-        rows = np.argsort(age)[: self._count]
+    def sigmas(self, d: Array, noise: Array, age: Array, parts: int = 1) -> float:
+        """The largest matched filter of so many of the newest parts. d, noise, age: (K,) each."""
+        rows = np.argsort(age)[: parts * self._count]
         return float(_filters(self._response[:, rows], d[rows], noise[rows], np.ones((1, len(rows)))).max())
 
     def began(self, d: Array, noise: Array, age: Array, since: float | None = None) -> PartOnset | None:
@@ -85,26 +87,44 @@ class PartEvidence:
         z = _filters(self._response[:, rows], d[rows], noise[rows], courses)
         touch, best = np.unravel_index(int(z.argmax()), z.shape)
         f, found = courses[best], float(z[touch, best])
-        if found < SIGMAS or not self._in_one_place(d[rows], noise[rows], courses, rows):
+        if found < SIGMAS or not self._is_touch(d[rows[f > 0]], noise[rows[f > 0]], f[f > 0], rows[f > 0]):
             return None
-        on = f > 0
-        rows, f = rows[on], f[on]
-        if not self._is_touch(d[rows], noise[rows], f, rows):
-            return None
-        course = np.zeros(len(d))
-        course[rows] = f
-        return PartOnset(found, float(age[rows].max()), float(age[rows][f >= 1.0].max()), course)
+        starts = []
+        for m, h in self._likely(d[rows], noise[rows], courses, rows):
+            course = np.zeros(len(d))
+            course[rows] = courses[h]
+            unit = self._response[m] * course / noise
+            drop = float(np.clip(unit @ (d / noise) / (unit @ unit + TINY), 0.01, 0.9))
+            starts.append(TouchStart(course, np.array([*self._position[m], np.log(self._radius[m]), np.log(drop)])))
+        return PartOnset(found, float(age[rows[f > 0]].max()), starts)
 
-    def _in_one_place(self, d: Array, noise: Array, courses: Array, rows: NDArray[np.intp]) -> bool:
-        """Whether no touch elsewhere, of whatever course, is nearly as likely as the likeliest: a few values may fit
-        two places.
+    def goes_on(self, d: Array, noise: Array, course: Array, response: Array) -> float | None:
+        """Sigmas of a touch that began, response (K,) per S/m; None where it could be no touch by now."""
+        rows = np.flatnonzero(course)
+        d, noise, f, one = d[rows], noise[rows], course[rows], response[None, rows]
+        found = float(_filters(one, d, noise, f[None]).max())
+        return found if found >= SIGMAS and self._is_touch(d, noise, f, rows, one) else None
+
+    def _likely(self, d: Array, noise: Array, courses: Array, rows: NDArray[np.intp]) -> list[tuple[int, int]]:
+        """(touch, course) of the likeliest and of those that are nearly as likely, each of another form, or elsewhere:
+        a few values may fit two.
         """
-        z = _filters(self._response[:, rows], d, _with_misfit(d, noise), courses).max(axis=1).clip(0.0)
-        far = np.hypot(*(self._position - self._position[int(z.argmax())]).T) > ELSEWHERE
-        return bool(z.max() ** 2 - z[far].max() ** 2 > 2 * UNLIKELY)
+        z = _filters(self._response[:, rows], d, _with_misfit(d, noise), courses).clip(0.0) ** 2
+        ramp = np.asarray(((courses > 0) & (courses < 1.0)).any(axis=1))
+        found: list[tuple[int, int]] = []
+        likely = float(z.max()) - 2 * UNLIKELY
+        while len(found) < STARTS and float(z.max()) >= max(likely, TINY):
+            m, h = (int(n) for n in np.unravel_index(int(z.argmax()), z.shape))
+            found.append((m, h))
+            near = np.hypot(*(self._position - self._position[m]).T) <= ELSEWHERE
+            z[np.ix_(near, ramp == ramp[h])] = 0.0
+        return found
 
-    def _is_touch(self, d: Array, noise: Array, f: Array, rows: NDArray[np.intp]) -> bool:
-        response, one = self._response[:, rows], f[None]
+    def _is_touch(
+        self, d: Array, noise: Array, f: Array, rows: NDArray[np.intp], response: Array | None = None
+    ) -> bool:
+        """response (M, n): of the touches that it may be; None: all of the grid."""
+        response, one = self._response[:, rows] if response is None else response, f[None]
         wide = _with_misfit(d, noise)
         explained = float(_filters(response, d, wide, one).max()) ** 2
         left = float(((d / wide) ** 2).sum()) - explained
@@ -117,15 +137,17 @@ class PartEvidence:
         return bool(_filters(response, d, noise, outside).max(axis=0).min() > OUTSIDE_SIGMAS)
 
     def ended(self, d: Array, held: Array, noise: Array, age: Array) -> bool:
-        """Whether nothing touched while the newest part was measured, although `held` (K,), the difference of the
-        touch until then, would be plain in it.
+        """Whether nothing touched while the newest parts were measured, although `held` (K,), the difference of the
+        touch until then, would be plain in them.
         """
-        rows = np.argsort(age)[: self._count]
-        count = len(rows)
-        expected = float(((held[rows] / noise[rows]) ** 2).sum())
-        left = float(((d[rows] / noise[rows]) ** 2).sum())
-        silent = left < count + 3 * np.sqrt(2 * count) and self.sigmas(d, noise, age) < GONE_SIGMAS + 1.0
-        return expected > HELD_SIGMAS**2 + count and silent
+        order = np.argsort(age)
+        expected, left = (np.cumsum((each[order] / noise[order]) ** 2) for each in (held, d))
+        for parts in range(1, ENDS_WITHIN + 1):
+            count = parts * self._count
+            if expected[count - 1] > HELD_SIGMAS**2 + count:
+                silent = left[count - 1] < count + 3 * np.sqrt(2 * count)
+                return bool(silent and self.sigmas(d, noise, age, parts) < GONE_SIGMAS + 1.0)
+        return False
 
 
 def _with_misfit(d: Array, noise: Array) -> Array:
@@ -149,12 +171,12 @@ def _courses(age: Array, count: int, least: int = 2) -> Array:
     """
     most = NEWEST * count if least == 2 else len(age)
     steps = [np.arange(len(age)) < n for n in range(least, min(most, len(age)) + 1)]
-    ramps = []
+    ramps, apart = [], float(np.median(np.diff(age)))
     for n in range(max(count, least), len(age) + 1, max(1, count // (2 if least == 2 else 4))):
         since = float(age[n - 1])
         lasts = [since - float(age[0])]
         if least > 2:
-            lasts += [took for each in RAMPS if (took := each * count * float(np.median(np.diff(age)))) < lasts[0]]
+            lasts += [took for each in RAMPS if (took := each * count * apart) < lasts[0]]
         for took in lasts:
             f = np.clip((since - age) / max(took, 1e-9), 0.0, 1.0)
             ramps.append(np.where(f > FAINT, f, 0.0))

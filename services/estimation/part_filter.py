@@ -13,27 +13,22 @@ even by a touch that suddenly moves or presses otherwise, nothing is said until 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from services.estimation.part_image import WIDER, PartImage, PartTouch
+from services.estimation.circles import DROP, FITS, LINEAR, MODEL, RADIUS, Circles
 from services.estimation.rolling import parts_of
 from services.estimation.saved import shaped
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
-RADIUS, DROP = 2, 3  # of a touch's state: x, y, log radius, log drop, vx, vy
-MODEL = 4  # of them, that d depends on
 WANDERS = np.array([0.005, 0.005, 0.1, 2.0, 3.0, 3.0])  # by how much the state does, per square root of a second
 KNOWN = np.array([0.01, 0.01, 0.1, 0.2, 2.0, 2.0])  # standard deviation of a touch that begins to change
 SUDDEN = np.array([0.03, 0.03, 0.1, 0.5, 6.0, 6.0])  # the same of one that changes at once
-AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
-LINEAR = 0.05  # of d: by so much the linear picture of a circle is wrong; by half of it of the rms of d
 NEAR = 0.15  # model units from the reference, within which the model is wrong by what it is there
 WINDOWS = (1, 3, 6, 10)  # newest parts among which a change is looked for
 STILL = 24.0  # chi-square of a touch's place and strength, up to which it did not change: one in 10^4 parts exceeds it
@@ -41,15 +36,10 @@ SPREAD = 6.0  # standard deviations of chi-square that the noise of a part may c
 LIKELY, EXPLAINED = 2.7, 4.0  # chi-square per value up to which a part is, without and with a sudden change
 SLOW_SIGMAS = 2.0  # standard deviations of its velocity, below which a touch may not move at all
 AS_WELL = 1.05  # times what a whole scan leaves of a touch that moves: one that holds still does as well
-SETTLED = 1.0  # chi-square per value of a whole scan, up to which its touch did not change: 0.1 to 0.7 where it did not
 TINY = 1e-12  # keeps solvable what no value tells
-FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
-MOST = 4  # touches that are followed
 LONGEST_US = 2e5  # without a part: nothing is known of what happened meanwhile
 REMEMBERED = 8  # whole scans of a touch that is held, whose mean it is compared with
 KEPT = 12  # parts whose states are kept: those of a whole scan
-LOW, HIGH = np.log([0.04, 0.005]), np.log([0.9, 0.97])  # of log radius, log drop
-LEAST = 0.01  # model units of uncertainty that are stated at least
 
 
 class FollowedState(NamedTuple):
@@ -69,11 +59,9 @@ class PartFilter:
     """For one bundle. Times are in us of the board's clock, of the newest part."""
 
     def __init__(self, bundle: Bundle) -> None:
-        self._image = PartImage(bundle)
-        self._half = bundle.half_width
-        self._all: Rows = np.arange(len(bundle.pattern))
+        self._circles = Circles(bundle)
         self._count = len(bundle.pattern) // parts_of(bundle)  # values in a part
-        self.metres_per_unit = self._image.metres_per_unit
+        self.metres_per_unit = self._circles.metres_per_unit
         self.number = 0  # counts up when other touches are followed
         self.forget()
 
@@ -81,7 +69,7 @@ class PartFilter:
         """Nothing is followed."""
         self.touches: Array = np.zeros((0, 6))
         self._covariance: Array = np.zeros((0, 0))
-        self._placed: Array = np.zeros((0, 2, 2))  # covariance of each place, as the whole scan has it
+        self._fitted: Array = np.zeros((0, 0))  # covariance (4 N, 4 N) of the touches, as the whole scan has it
         self._still = False
         self._as_still = 0  # whole scans in a row that a touch which holds still explains better
         self._at_us = 0.0
@@ -105,14 +93,14 @@ class PartFilter:
         """
         if self.moves:
             return
-        held = self._still and self._reference is not None
-        if shown or self._reference is None:
-            self._begin(d, noise)
-        self.touches[:, MODEL:] = 0.0
-        self._scans = min(self._scans + 1, REMEMBERED) if held else 1
-        before = d if self._reference is None or not held else self._reference
-        self._reference, self._there = before + (d - before) / self._scans, self.touches.copy()
+        before = self._reference if self._still else None
+        self._scans = 1 if before is None else min(self._scans + 1, REMEMBERED)
+        self._reference = d if before is None else before + (d - before) / self._scans
         self._noise = noise / np.sqrt(self._scans)
+        if shown or before is None:
+            self._begin(self._reference, self._noise)
+        self.touches[:, MODEL:] = 0.0
+        self._there = self.touches.copy()
         self._still, self._at_us = True, at_us
         self._refer()
         self._past.clear()
@@ -121,7 +109,8 @@ class PartFilter:
     def _refer(self) -> None:
         """What the model makes of the reference."""
         assert self._reference is not None
-        expected, slope = self._model(self._there, self._all, np.zeros(len(self._all)))
+        rows = self._circles.all
+        expected, slope = self._circles.expected(self._there, rows, np.zeros(len(rows)))
         self._left = self._reference - expected
         self._slope = slope[:, [6 * k + n for k in range(len(self._there)) for n in (0, 1, DROP)]]
 
@@ -138,8 +127,9 @@ class PartFilter:
         if self._still and (changed := self._changed(d, noise, by_age, fresh)):
             self._still = False
             self._covariance = np.diag(np.tile(KNOWN**2, len(self.touches)))
-            for k, placed in enumerate(self._placed):
-                self._covariance[6 * k : 6 * k + 2, 6 * k : 6 * k + 2] = placed
+            for k in range(len(self.touches)):
+                own = self._fitted[MODEL * k : MODEL * k + 2, MODEL * k : MODEL * k + 2]
+                self._covariance[6 * k : 6 * k + 2, 6 * k : 6 * k + 2] = own
             fresh = max(fresh, changed)  # what was taken for noise is looked at again
             elapsed *= fresh / max(1, int((age < elapsed).sum()))
         if not self._still and not (len(self.touches) and self._taken(d, noise, age, by_age[:fresh], elapsed)):
@@ -169,63 +159,41 @@ class PartFilter:
         if not self.moves:
             return change
         middle = float(np.sort(age)[: self._count].mean())
-        now = self._model(self.touches, self._all, change)[0]
+        now = self._circles.expected(self.touches, self._circles.all, change)[0]
         then = np.array([at for at, _ in self._past])
         measured = self._at_us + middle - age
         nearest = np.abs(then[:, None] - measured).argmin(axis=0)
         for k in np.unique(nearest):
             rows = np.flatnonzero(nearest == k)
-            change[rows] = now[rows] - self._model(self._past[k][1], rows, 1e-6 * (measured[rows] - then[k]))[0]
-        still, moving = (self._fitted(each, noise, self.touches)[1] for each in (d, d + change))
+            tau = 1e-6 * (measured[rows] - then[k])
+            change[rows] = now[rows] - self._circles.expected(self._past[k][1], rows, tau)[0]
+        still, moving = (self._circles.fitted(each, noise, self.touches).misfit for each in (d, d + change))
         self._as_still = 0 if still > moving else self._as_still + 1
         if moving > FITS or self._as_still > 1 or (self._slow() and still <= AS_WELL * moving):
             self.forget()
         return change if self.moves and not self._as_still else np.zeros(len(age))
 
-    def settled(self, d: Array, noise: Array, seen: PartTouch) -> bool:
-        """Whether a touch that did not change explains a whole scan. seen: it, as the newest parts have it."""
-        return self._fitted(d, noise, _touches([seen]))[1] <= SETTLED
-
-    def _fitted(self, d: Array, noise: Array, around: Array, steps: int = 2) -> tuple[Array, float]:
-        """The touches of about these places that explain a whole scan best, if they hold still, and the chi-square per
-        value that they leave.
-        """
-        touches, tau = around.copy(), np.zeros(len(d))
-        touches[:, MODEL:] = 0.0
-        width = np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean()))
-        columns = [6 * k + n for k in range(len(touches)) for n in range(MODEL)]
-        damping = np.diag(np.tile((5 * KNOWN[:MODEL]) ** -2.0, len(touches)))
-        for _ in range(steps):
-            expected, slope = self._model(touches, self._all, tau)
-            slope = slope[:, columns] / width[:, None]
-            step = np.linalg.solve(slope.T @ slope + damping, slope.T @ ((d - expected) / width))
-            touches[:, :MODEL] += step.reshape(-1, MODEL)
-            touches = self._possible(touches.ravel()).reshape(-1, 6)
-        left = (d - self._model(touches, self._all, tau)[0]) / width
-        return touches, float((left**2).mean())
+    def strongest(self) -> Array:
+        """(K,) d of the touches as they were when they were strongest, of the last parts."""
+        return self._circles.still(max((touches for _, touches in self._past), key=_strength))
 
     def states(self) -> list[FollowedState]:
         """The touches, as the newest part has them."""
-        found = []
-        for k, (x, y, log_r, log_drop, vx, vy) in enumerate(self.touches.tolist()):
-            place = self._placed[k] if self._still else self._covariance[6 * k : 6 * k + 2, 6 * k : 6 * k + 2]
-            values, vectors = np.linalg.eigh(place)
-            short, long = np.maximum(WIDER * np.sqrt(np.maximum(values, 0.0)), LEAST)
-            sigma = float(long), float(short), float(np.arctan2(vectors[1, 1], vectors[0, 1]))
-            found.append(FollowedState(x, y, vx, vy, float(np.pi * np.exp(2 * log_r + log_drop)), sigma))
-        return found
+        modelled = [6 * k + n for k in range(len(self.touches)) for n in range(MODEL)]
+        covariance = self._fitted
+        if not self._still:  # it moved since, and where it was is known no better
+            covariance = covariance + self._covariance[np.ix_(modelled, modelled)]
+        return [
+            FollowedState(x, y, vx, vy, float(np.pi * np.exp(2 * log_r + log_drop)), sigma)
+            for (x, y, sigma), (_, _, log_r, log_drop, vx, vy) in zip(
+                self._circles.places(self.touches, covariance), self.touches.tolist(), strict=True
+            )
+        ]
 
     def _begin(self, d: Array, noise: Array) -> None:
-        """Fit the touches to a whole scan."""
-        before, found = self.touches, [self._image.fit(d, noise)]
-        touches, misfit = self._fitted(d, noise, _touches(found))
-        while misfit > FITS and len(found) < MOST:  # another one, where what is left of d is largest
-            left = d - self._model(touches, self._all, np.zeros(len(d)))[0]
-            found.append(self._image.fit(left, noise))
-            touches, misfit = self._fitted(d, noise, np.concatenate([touches, _touches(found[-1:])]), steps=8)
-        if misfit > FITS or not _apart(touches):
-            touches, found = _touches([]), []
-        self.touches, self._placed = touches, _covariances(found)
+        """Fit the touches to a whole scan, or to the mean of several."""
+        before, fit = self.touches, self._circles.found(d, noise)
+        self.touches, self._fitted = fit.touches, fit.covariance
         if len(before) != len(self.touches) or (np.hypot(*(self.touches - before).T[:2]) > NEAR).any():
             self.number += 1
 
@@ -279,7 +247,7 @@ class PartFilter:
             touches = state.reshape(-1, 6)
             away = np.hypot(*(touches - self._there).T[:2]).max()
             near = float(np.exp(-((away / NEAR) ** 2)))
-            expected, slope = self._model(touches, rows, tau)
+            expected, slope = self._circles.expected(touches, rows, tau)
             new = d - near * self._reference[rows]
             variance = noise**2 + (LINEAR * new) ** 2 + (LINEAR / 2) ** 2 * float((new**2).mean())
             off = d - expected - near * self._left[rows] - slope @ (before - state)
@@ -287,28 +255,9 @@ class PartFilter:
             gain = np.linalg.solve(spread, slope @ covariance).T
             if chi == np.inf:
                 chi = float(off @ np.linalg.solve(spread, off)) / len(d)
-            state = self._possible(before + gain @ off)
+            state = self._circles.possible((before + gain @ off).reshape(-1, 6)).ravel()
         after = covariance - gain @ slope @ covariance
         return state, np.asarray((after + after.T) / 2), chi
-
-    def _possible(self, state: Array) -> Array:
-        touches = state.reshape(-1, 6).copy()
-        touches[:, :RADIUS] = np.clip(touches[:, :RADIUS], -self._half, self._half)
-        touches[:, RADIUS:MODEL] = np.clip(touches[:, RADIUS:MODEL], LOW, HIGH)
-        return touches.ravel()
-
-    def _model(self, touches: Array, rows: Rows, tau: Array) -> tuple[Array, Array]:
-        """(n,) d of these measurements, each tau (n,) s after the state, and (n, 6 N) its derivative."""
-        steps = np.concatenate([np.zeros((1, 3)), *(np.outer([1, -1], step) for step in np.diag(AHEAD))])
-        circles = (touches[:, None, :DROP] + steps).reshape(-1, 3)
-        drop = np.exp(touches[:, DROP])
-        each = self._image.responses(circles, rows).reshape(len(touches), 7, len(rows)) * drop[:, None, None]
-        slope = np.empty((len(rows), len(touches), 6))
-        slope[:, :, :DROP] = ((each[:, 1::2] - each[:, 2::2]) / (2 * AHEAD[:, None])).transpose(2, 0, 1)
-        slope[:, :, DROP] = each[:, 0].T
-        slope[:, :, MODEL:] = slope[:, :, :2] * tau[:, None, None]
-        expected = each[:, 0].sum(axis=0) + (slope[:, :, MODEL:] * touches[:, MODEL:]).sum(axis=(1, 2))
-        return expected, slope.reshape(len(rows), -1)
 
     def state(self) -> dict[str, Any]:
         return {
@@ -321,7 +270,7 @@ class PartFilter:
             "reference": None
             if self._reference is None
             else [self._reference.copy(), self._noise.copy(), self._there.copy(), self._scans],
-            "placed": self._placed.copy(),
+            "fitted": self._fitted.copy(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -335,31 +284,15 @@ class PartFilter:
         self.touches = shaped(state["touches"], (count, 6))
         if not self._still and state["reference"] is not None:
             self._covariance = shaped(state["covariance"], (6 * count, 6 * count))
-        self._placed = shaped(state["placed"], (count, 2, 2))
+        self._fitted = shaped(state["fitted"], (MODEL * count, MODEL * count))
         self._past.extend((float(at), shaped(touches, (count, 6))) for at, touches in state["past"])
         if state["reference"] is not None:
             d, noise, there, scans = state["reference"]
-            self._reference, self._noise = shaped(d, self._all.shape), shaped(noise, self._all.shape)
+            self._reference, self._noise = shaped(d, self._circles.all.shape), shaped(noise, self._circles.all.shape)
             self._there, self._scans = shaped(there, (count, 6)), int(scans)
             self._refer()
 
 
-def _apart(touches: Array) -> bool:
-    """Whether no touch lies within another: two that grow into each other are not told apart."""
-    away = np.hypot(*(touches[:, None, :RADIUS] - touches[None, :, :RADIUS]).transpose(2, 0, 1))
-    reach = np.exp(touches[:, RADIUS])
-    return bool((away + 1e9 * np.eye(len(touches)) > np.maximum(reach[:, None], reach)).all())
-
-
-def _touches(found: Sequence[PartTouch]) -> Array:
-    """(N, 6) of touches that do not move."""
-    return np.array([[t.x, t.y, np.log(t.radius), np.log(t.drop), 0.0, 0.0] for t in found]).reshape(-1, 6)
-
-
-def _covariances(found: Sequence[PartTouch]) -> Array:
-    """(N, 2, 2) of their places."""
-    made = np.zeros((len(found), 2, 2))
-    for k, (long, short, angle) in enumerate(touch.sigma for touch in found):
-        axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        made[k] = axes @ np.diag([long**2, short**2]) @ axes.T / WIDER**2
-    return made
+def _strength(touches: Array) -> float:
+    """Drop times area of all touches."""
+    return float(np.exp(2 * touches[:, RADIUS] + touches[:, DROP]).sum())

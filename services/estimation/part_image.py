@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from models.sentinel import touches
+from models.touch_grid import touches
 
 Array = NDArray[np.floating]
 
 LINEAR = 0.05  # of d: by so much the linear response of a circle is wrong, once it is in its place
-WIDER = 1.5  # times the posterior's standard deviation: what is stated
-LEAST = 0.01  # model units that are stated at least
+WIDER = 1.15  # times the posterior's standard deviation: what is stated
+BELIEVED = 12  # values that the noise they were taken to have counts for
+LEAST = 0.004  # model units that are stated at least
 MEAN = np.log([0.2, 0.2])  # prior of log radius [model units], log drop [S/m]
 SD = np.array([0.5, 0.9])
 COARSE = 0.05  # of the side: a standard deviation beyond it is coarse
@@ -32,16 +33,18 @@ AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
 
 @dataclass(frozen=True)
 class PartTouch:
-    """Lengths in model units. sigma: along the longest and the shortest axis, angle of the longest [rad]."""
+    """A circle; lengths in model units. at: the centre of its part that lies on the skin; sigma of that: along the
+    longest and the shortest axis, angle of the longest [rad].
+    """
 
     x: float
     y: float
     radius: float
     drop: float
     drop_sigma: float
+    at: tuple[float, float]
     sigma: tuple[float, float, float]
     fits: bool  # whether it explains the values
-    sure: bool  # whether its place is known to within COARSE
     unexplained: float  # share of what was measured
 
 
@@ -52,21 +55,23 @@ class PartImage:
         m = bundle.matrices
         self._jacobian = np.asarray(m.jacobian, dtype=np.float64)
         self._inside = np.asarray(m.inside, dtype=np.float64)
-        self._half = bundle.half_width
-        self._grid = touches(m, self._half)
+        self.half_width, self.measurements = bundle.half_width, len(bundle.pattern)
+        self._grid = touches(m, self.half_width)
         h, w = m.inside.shape
-        self._pixel = 2 * self._half / w
-        x, y = ((np.arange(n) + 0.5) * self._pixel - self._half for n in (w, h))
+        self._pixel = 2 * self.half_width / w
+        x, y = ((np.arange(n) + 0.5) * self._pixel - self.half_width for n in (w, h))
         self._x, self._y = np.meshgrid(x, y)
         self._fine = bundle.image_size // h
-        self.metres_per_unit = bundle.metres_per_pixel * bundle.image_size / (2 * self._half)
+        self.metres_per_unit = bundle.metres_per_pixel * bundle.image_size / (2 * self.half_width)
 
-    def fit(self, d: Array, sigma: Array) -> PartTouch:
-        """d (K,) with standard deviation sigma (K,), infinite where nothing was measured since the touch began."""
+    def fit(self, d: Array, sigma: Array, start: Array | None = None) -> PartTouch:
+        """d (K,) with standard deviation sigma (K,), infinite where nothing was measured since the touch began. start:
+        theta, where the likeliest of the grid is not to be looked for.
+        """
         rows = np.flatnonzero(np.isfinite(sigma))
         seen, jacobian = d[rows].astype(float), self._jacobian[rows]
         noise = np.sqrt(sigma[rows].astype(float) ** 2 + (LINEAR * seen) ** 2 + (LINEAR / 2) ** 2 * (seen**2).mean())
-        theta = self._start(rows, seen, noise)
+        theta = self._start(rows, seen, noise) if start is None else start
         cost, left, slope = self._linear(theta, jacobian, seen, noise)
         information = np.diag([0.0, 0.0, *SD**-2])
         damping = 1e-3
@@ -77,7 +82,7 @@ class PartImage:
             step = np.linalg.solve(damped, pull)
             step *= min(1.0, float((MOST / np.maximum(np.abs(step), 1e-9)).min()))
             there = theta + step
-            there[:2] = np.clip(there[:2], -self._half, self._half)
+            there[:2] = np.clip(there[:2], -self.half_width, self.half_width)
             there[2:] = np.clip(there[2:], np.log([0.04, 0.005]), np.log([0.9, 0.97]))
             found = self._linear(there, jacobian, seen, noise)
             if found[0] < cost:
@@ -90,16 +95,27 @@ class PartImage:
         covariance = np.linalg.inv(slope.T @ slope + information + TINY * np.eye(4))
         chi2 = float(left @ left)
         misfit = max(1.0, chi2 / len(rows))
-        covariance *= misfit
-        values, vectors = np.linalg.eigh(covariance[:2, :2])
-        short, long = np.maximum(WIDER * np.sqrt(np.maximum(values, 0.0)), LEAST)
-        angle = float(np.arctan2(vectors[1, 1], vectors[0, 1]))
+        covariance *= spread_of(chi2, len(rows) - 4)
+        place, spread = self.place(theta[:3], covariance[:3, :3])
+        axes = ellipse(spread, WIDER, LEAST)
         x, y, radius, drop = float(theta[0]), float(theta[1]), float(np.exp(theta[2])), float(np.exp(theta[3]))
         drop_sigma = WIDER * drop * float(np.sqrt(covariance[3, 3]))
         unexplained = max(0.0, chi2 - len(rows)) / float(((seen / noise) ** 2).sum())
-        sure = long <= COARSE * 2 * self._half
-        axes = float(long), float(short), angle
-        return PartTouch(x, y, radius, drop, drop_sigma, axes, misfit < MOST_MISFIT, bool(sure), unexplained)
+        at = float(place[0]), float(place[1])
+        return PartTouch(x, y, radius, drop, drop_sigma, at, axes, misfit < MOST_MISFIT, unexplained)
+
+    def sure(self, *sigma: float) -> bool:
+        """Whether places with these uncertainties [m] are known to within COARSE."""
+        return max(sigma) <= COARSE * 2 * self.half_width * self.metres_per_unit
+
+    def place(self, circle: Array, covariance: Array) -> tuple[Array, Array]:
+        """(2,) centre of the part of a circle (x, y, log radius) that lies on the skin, and its covariance (2, 2)."""
+        steps = [sign * step for step in np.diag(AHEAD) for sign in (1, -1)]
+        shares = self.shares(circle + np.array([np.zeros(3), *steps]))
+        weight = np.maximum(shares.sum(axis=1), TINY)
+        at = np.stack([shares @ self._x.ravel(), shares @ self._y.ravel()], axis=1) / weight[:, None]
+        slope = (at[1::2] - at[2::2]).T / (2 * AHEAD)
+        return at[0], slope @ covariance @ slope.T
 
     def image(self, touch: PartTouch) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(H, W) drop [S/m] and its standard deviation."""
@@ -146,3 +162,17 @@ class PartImage:
     def responses(self, circles: Array, rows: NDArray[np.intp]) -> Array:
         """(M, n) d of these measurements per S/m of circles (M, 3) of x, y, log radius."""
         return np.asarray(self.shares(circles) @ self._jacobian[rows].T)
+
+
+def spread_of(chi2: float, free: int) -> float:
+    """By how much the noise of values is larger than it was taken to be, as what is left of them has it."""
+    return (chi2 + BELIEVED) / (max(free, 0) + BELIEVED)
+
+
+def ellipse(covariance: Array, wider: float, least: float) -> tuple[float, float, float]:
+    """Longest and shortest axis, and the longest one's angle, of a place's covariance (2, 2), times `wider` and at
+    least `least`.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    short, long = np.maximum(wider * np.sqrt(np.maximum(values, 0.0)), least)
+    return float(long), float(short), float(np.arctan2(vectors[1, 1], vectors[0, 1]))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import Matrices
-from models.sentinel import touches
+from models.touch_grid import touches
 from services.estimation.tuning import TUNING, Tuning
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from models.bundle import Bundle
-from models.sentinel import touches
+from models.touch_grid import touches
 from services.estimation.rolling import measured_at
 from services.estimation.tuning import TUNING
 

@@ -142,8 +142,8 @@ def _lines(source: Iterator[Step], pipelines: dict[str, Pipeline]) -> Iterator[d
             _load(pipeline, step.states, STAGES if step.skin not in begun else STAGES[:1])
         else:
             mark(step.raw)
-            if (result := pipeline.step(step.raw)) is not None:
-                yield _line(result.contact, (step.at_ns - first_ns) * 1e-9)
+            if (contact := pipeline.step(step.raw)) is not None:
+                yield _line(contact, (step.at_ns - first_ns) * 1e-9)
             pipeline.prepare()
         begun.add(step.skin)
 

@@ -269,7 +269,7 @@ class Replayer:
 
 
 def _primer(skin: str) -> RawFrame:
-    """A frame that no stage takes for a measurement: one value, of a sentinel scan, invalid."""
+    """A frame that no stage takes for a measurement: one value, of a kind that is no more, invalid."""
     import numpy as np
 
     return RawFrame(

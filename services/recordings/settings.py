@@ -28,6 +28,7 @@ from services.runtime.config import (
     ConfigFile,
     Indenter,
     Pose,
+    ScanMode,
     Skin,
     TareConfig,
     TouchConfig,
@@ -56,11 +57,17 @@ class RecordedSkin(Section):
     network: Literal["full", "fast", "int8", "none"] = "int8"
     indenter: Indenter | None = None
     dft_points: Literal[128, 256, 512] = 128
-    scan: Literal["full", "adaptive", "rolling"] = "full"
+    scan: ScanMode = "full"
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0
     tare: TareConfig = TareConfig()
     touch: TouchConfig = TouchConfig()
     calibration: dict[str, Any] | None = None  # the content of its file, which calibration.load checks
+
+    @field_validator("scan", mode="before")
+    @classmethod
+    def scan_of_then(cls, scan: object) -> object:
+        """Earlier versions knew an adaptive scan, of which the whole scans still count."""
+        return "full" if scan == "adaptive" else scan
 
 
 class Settings(Section):

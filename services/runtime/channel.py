@@ -38,12 +38,10 @@ class Channel:
 
 
 class Newest:
-    """A stage's input from a socket: the newest frame; where frames are made of parts of scans, also the newest one of
-    a whole scan.
-    """
+    """A stage's input from a socket: the newest frame. parts: images, and the parts of scans between them."""
 
     def __init__(self, topic: str, skin: str, parts: bool = False) -> None:
-        self.reader: NewestReader | PartsReader = (PartsReader if parts else NewestReader)(topic, skin)
+        self.reader: NewestReader | PartsReader = PartsReader(skin) if parts else NewestReader(topic, skin)
         self.socket = self.reader.socket
         self._name = f"{topic}/{skin}\0".encode()
 
@@ -64,7 +62,10 @@ class Newest:
         return self.reader.recv()
 
     def listen(self, on: bool) -> None:
-        (self.socket.subscribe if on else self.socket.unsubscribe)(self._name)
+        if isinstance(self.reader, PartsReader):
+            self.reader.listen(on)
+        else:
+            (self.socket.subscribe if on else self.socket.unsubscribe)(self._name)
 
     def mind(self) -> None:
         """Connect anew where ZeroMQ has given up; no arriving frame would make us notice."""

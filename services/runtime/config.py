@@ -119,7 +119,7 @@ class Indenter(Section):
 
 
 NetworkFile = Literal["full", "fast", "int8", "none"]
-ScanMode = Literal["full", "adaptive", "rolling"]
+ScanMode = Literal["full", "rolling"]
 
 
 class Skin(Section):
@@ -136,7 +136,7 @@ class Skin(Section):
     indenter: Indenter | None = None
     network: NetworkFile = "int8"
     dft_points: Literal[128, 256, 512] = 128
-    scan: ScanMode = "full"  # adaptive: a short list while nothing touches; rolling: scans in parts
+    scan: ScanMode = "full"  # rolling: scans in parts
     rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
     tare: TareConfig = TareConfig()
     touch: TouchConfig = TouchConfig()
@@ -150,6 +150,13 @@ class Skin(Section):
             '"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000), a recording (*.mcap) or a file '
             "of measurements (*.npz)"
         )
+
+    @field_validator("scan", mode="before")
+    @classmethod
+    def scan_of_today(cls, scan: object) -> object:
+        if scan == "adaptive":
+            raise ValueError('"full" or "rolling": the adaptive scan is no more, write "rolling", which is quicker')
+        return scan
 
     @model_validator(mode="after")
     def mismatch_of_a_stub(self) -> Skin:

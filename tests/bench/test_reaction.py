@@ -74,7 +74,7 @@ def test_a_slide_is_scored_against_the_truth_at_recv_and_at_the_sample():
 
 
 def test_a_held_touch_is_scored_where_it_is_still_and_beside_full_scans():
-    from bench.speed.reaction import goals, rows
+    from bench.speed.reaction_report import goals, rows
 
     def of(mode, off):
         frames = [seen(STILL.onset + t, (0.01 + off, 0.0)) for t in (0.05, 0.16, 0.2, 0.25)]
@@ -88,3 +88,40 @@ def test_a_held_touch_is_scored_where_it_is_still_and_beside_full_scans():
     listed = {goal.figure: goal for goal in goals(of("full", 4e-4) + of("rolling", 3e-4), {})}
     goal = listed[f"rolling: {KINDS[0].name}: held, position error as a share of full scans'"]
     assert goal.value == pytest.approx(0.75) and goal.at_most == 1.0
+
+
+def test_a_release_that_shows_while_the_force_still_fades_is_no_later_than_its_end():
+    ramp = TouchEvent(KINDS[3], 1.0, 1.4, 0.01, 0.0, 0.01, np.inf)
+    frames = [seen(1.2, (0.01, 0.0)), seen(1.37, (0.01, 0.0)), seen(1.395), seen(1.44)]
+    assert react(ramp, 2.0, frames).gone_s == 0.0
+    assert react(STILL, 2.0, [seen(1.29, (0.01, 0.0)), seen(1.34)]).gone_s == pytest.approx(0.04)
+
+
+def test_truths_are_counted_within_the_ellipse_and_the_force_that_a_contact_states():
+    from bench.speed.reaction_report import stated
+
+    frames = []
+    for t, dx, dy, force in (
+        (1.01, 2e-3, 0.0, 2.0),
+        (1.16, 2e-3, 0.0, 2.15),
+        (1.2, 0.0, 2e-3, 2.05),
+        (1.25, 0, 0, 1.7),
+    ):
+        frame = seen(t, (0.01 + dx, dy), sigma=[0.002, 0.0005, 0.0])
+        frame.frame.contacts[0].force_n, frame.frame.contacts[0].force_sigma_n = force, 0.1
+        frames.append(frame)
+    found = {row["phase"]: row for row in stated("rolling", [(STILL, react(STILL, 2.0, frames))])}
+    assert found["onset, 20 ms"]["position_68"] == 100 and found["onset, 20 ms"]["frames"] == 1
+    held = found["held"]
+    assert (held["frames"], held["touches"]) == (3, 1)
+    assert held["position_68"] == held["position_90"] == pytest.approx(200 / 3), "2 mm along the short axis is 4 sigma"
+    assert (held["force_68"], held["force_90"]) == pytest.approx((100 / 3, 200 / 3))
+
+
+def test_the_floor_of_a_light_touch_is_higher_and_so_is_that_of_a_noisy_skin():
+    from bench.speed.reaction_floor import held_floor
+
+    light = TouchEvent(KINDS[1], 1.0, 1.3, 0.01, 0.0, 0.005, np.inf)
+    strong = TouchEvent(KINDS[0], 1.0, 1.3, 0.01, 0.0, 0.0075, np.inf)
+    assert held_floor([light], 80.0)[0] > 1.5 * held_floor([strong], 80.0)[0] > 0
+    assert held_floor([strong], 60.0)[0] > 2 * held_floor([strong], 80.0)[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.accuracy.intervals import pixels, summary
+from bench.accuracy.intervals import class_error, pixels, summary
 from bench.accuracy.odd_shapes import FLAT, HOLE, ODD, OddShape, random_odd
 from bench.accuracy.refined import gains
 from models.forward import shared
@@ -41,6 +41,12 @@ def test_a_row_is_worse_by_the_networks_standard_errors() -> None:
     assert gains("circle", network, service) == pytest.approx([1.0] * 5)
     assert min(gains("circle", network, service | {"force %": (1.2, 0.1)})) == pytest.approx(-2.0)
     assert min(gains("hertz", network, service | {"mean IoU": (0.5, 0.1)})) > 0
+
+
+def test_the_class_is_as_sure_as_it_is_right() -> None:
+    fair = [{"class stated %": 75.0, "class %": 100.0 * (k % 4 > 0)} for k in range(40)]
+    assert class_error(fair) == pytest.approx(0.0)
+    assert class_error([{**row, "class stated %": 95.0} for row in fair]) == pytest.approx(0.2)
 
 
 def test_touches_without_a_row_do_not_count() -> None:

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from bench.speed.sentinel_host import AdaptiveHost
+from bench.speed.simulated_host import SimulatedHost
 from examples.follow_the_finger import DAMPING, FASTEST, answer, follow, push
 from examples.guarded_move import guarded_move
 from examples.robot import Robot
@@ -90,7 +90,7 @@ def test_guarded_move_says_how_long_ago_it_was_measured_what_it_stopped_for(caps
 
 def test_with_rolling_scans_guarded_move_stops_within_20_ms_of_contact():
     """In simulated time: board, stages and 2 ms for sockets and scheduling."""
-    host = AdaptiveHost("rolling", snr_db=80.0, seed=3)
+    host = SimulatedHost("rolling", snr_db=80.0, seed=3)
     host.until(5.0)
     for x, y, status in ((0.005, 0.01, 0), (-0.012, 0.008, 0), (0.03, -0.02, 2)):
         pressed, first = host.now, len(host.contacts) - 3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from models import rolling, sentinel
+from models import rolling, touch_grid
 
 
 @pytest.mark.parametrize("parts", [10, 5, 4, 2, 1])
@@ -16,14 +16,14 @@ def test_every_electrode_is_in_every_part(bundle, parts):
 
 def test_each_part_alone_tells_where_a_touch_is_better_than_the_patterns_own_order(bundle):
     """The mean Bayesian standard deviation of position over the grid of touches, of the part that knows least."""
-    grid = sentinel.touches(bundle.matrices)
-    judged = grid.radius == sentinel.RADIUS
-    slopes = sentinel.slopes(grid, judged, 1e-4)
+    grid = touch_grid.touches(bundle.matrices)
+    judged = grid.radius == touch_grid.RADIUS
+    slopes = touch_grid.slopes(grid, judged, 1e-4)
 
     def worst(order):
         found = []
         for part in order.reshape(10, -1):
-            information = np.diag(sentinel.PRIOR**-2) + np.einsum("mka,mkb->mab", slopes[:, part], slopes[:, part])
+            information = np.diag(touch_grid.PRIOR**-2) + np.einsum("mka,mkb->mab", slopes[:, part], slopes[:, part])
             covariance = np.linalg.inv(information)
             found.append(float(np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]).mean()))
         return max(found)

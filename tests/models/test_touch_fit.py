@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from models.forward import shared
+from models.response_error import FrameErrors, frame_errors
 from models.response_tables import response_tables
 from models.shapes import Array, Shape
-from models.touch_fit import FrameErrors, TouchFit, frame_errors
+from models.touch_fit import TouchFit
 from models.touch_response import TouchResponse
 
 SIGMA = np.full(120, 10 ** (-70 / 20))
@@ -100,21 +101,31 @@ def test_the_stated_uncertainty_is_that_of_the_errors(response: TouchResponse, g
     assert 0.5 < np.mean(ratios) < 1.8  # six standard errors about 1 would be -0.5 to 2.5
 
 
-def test_without_noise_a_place_is_surer_in_the_middle_than_by_the_edge(
-    response: TouchResponse, gram: Array, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_noise_a_place_is_surer_in_the_middle_than_by_the_edge(response: TouchResponse, gram: Array) -> None:
     """As far as the response's error is what is left: that is larger by the edge."""
 
     def spread(x: float) -> float:
-        touch, sigma = Shape("circle", x, 0.1, 0.25, 0.3), np.full(120, 1e-6)
+        touch, sigma = Shape("circle", x, 0.1, 0.35, 0.5), np.full(120, 1e-6)
         d = response.of(touch)
-        found = TouchFit(response)(d, frame_errors(gram, sigma, d, 0.3), near(touch), ("circle",))
+        found = TouchFit(response)(d, frame_errors(gram, sigma, d, 0.5), near(touch), ("circle",))
         return float(np.sqrt(np.trace(found.position_covariance)))
 
-    surer = [spread(x) for x in (0.1, 0.74)]
-    monkeypatch.setattr("models.touch_fit.PLACE_SURER", 1.0)
-    middle, edge = (found / spread(x) for found, x in zip(surer, (0.1, 0.74), strict=True))
-    assert middle < 0.85 < edge <= 1.0
+    assert spread(0.1) < 0.02 * spread(0.64)
+
+
+def test_of_a_large_touch_the_responses_error_leaves_drop_and_size_less_sure(
+    response: TouchResponse, gram: Array
+) -> None:
+    """All of a large touch's edge is put off by the same amount: that does not average out."""
+
+    def spread(radius: float, known: bool = False) -> float:
+        touch, sigma = Shape("circle", 0.1, 0.1, radius, 0.3), np.full(120, 1e-6)
+        d = response.of(touch)
+        errors = frame_errors(gram, sigma, d, 0.3)
+        found = TouchFit(response)(d, errors, near(touch), ("circle",), radius if known else None)
+        return found.drop[1] / found.drop[0]
+
+    assert spread(0.45) > 0.004 > spread(0.45, known=True)
 
 
 def test_what_no_touch_explains_is_said(response: TouchResponse, gram: Array) -> None:

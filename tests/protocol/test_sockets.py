@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zmq
 
-from protocol.frames import ContactFrame, ForceFrame, ImageFrame, InfoFrame, StatusFrame
+from protocol.frames import ContactFrame, ForceFrame, ImageFrame, InfoFrame, PartFrame, StatusFrame
 from protocol.reconnecting import GRACE_S
 from protocol.runtime import endpoint
 from protocol.sockets import AllReader, NewestReader, PartsReader, Publisher
@@ -55,22 +55,49 @@ def publisher_of_images(runtime, context):
     return Publisher("inference", context)
 
 
-def test_of_parts_the_newest_comes_and_before_it_the_newest_of_a_whole_scan(publisher_of_images, context):
-    reader = PartsReader("image", "palm", context=context)
+def test_a_part_comes_after_the_image_that_it_names_whichever_arrives_first(publisher_of_images, context):
+    parts, reader = Publisher("preprocessing", context), PartsReader("palm", context)
     subscribed(publisher_of_images, "image")
-    for whole in (True, False, False, True, False, False):
-        publisher_of_images.send(ImageFrame(skin="palm", valid=True, whole=whole))
-    time.sleep(0.2)
-    frame = reader.recv(1.0)
-    assert (frame.seq, frame.whole, reader.more) == (3, True, True)
-    frame = reader.recv()
-    assert (frame.seq, frame.whole, reader.more) == (5, False, False)
-    assert reader.recv() is None and reader.skipped == 4
-    for whole in (False, False, True):
-        publisher_of_images.send(ImageFrame(skin="palm", valid=True, whole=whole))
-    time.sleep(0.2)
-    assert (reader.recv(1.0).seq, reader.more, reader.skipped) == (8, False, 6)
+    subscribed(parts, "part")
+
+    def image(scan):
+        publisher_of_images.send(ImageFrame(skin="palm", valid=True, scan=scan))
+
+    def part(scan, after):
+        parts.send(PartFrame(skin="palm", valid=True, scan=scan, after=after))
+
+    def told():
+        time.sleep(0.2)
+        found = []
+        while (frame := reader.recv()) is not None:
+            found.append((type(frame).__name__, frame.scan))
+            if not reader.more:
+                break
+        return found
+
+    part(11, after=10)
+    part(12, after=10)
+    assert told() == [], "of an image that is still to come"
+    image(10)
+    assert told() == [("ImageFrame", 10), ("PartFrame", 12)] and reader.skipped == 1
+    part(13, after=10)
+    assert told() == [("PartFrame", 13)]
+    part(14, after=10)
+    image(20)
+    assert told() == [("ImageFrame", 20)] and reader.skipped == 2, "older than the image that came with it"
+    part(21, after=20)
+    part(31, after=30)
+    image(25)
+    image(30)
+    assert told() == [("ImageFrame", 30), ("PartFrame", 31)] and reader.skipped == 4
+    reader.listen(False)
+    deadline = time.monotonic() + 10
+    while parts.subscribers("part", "palm") and time.monotonic() < deadline:
+        parts.poll()
+        time.sleep(0.01)
+    assert not parts.subscribers("part", "palm")
     reader.close()
+    parts.close()
 
 
 def test_the_newest_frame_comes_and_older_ones_are_skipped(publisher, context):

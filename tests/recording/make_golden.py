@@ -2,7 +2,7 @@
 
 Rarely needed: what the stages make of the recordings is accepted anew with `make golden`. A recording begins with the
 untouched skin, so that it holds its own baseline and fits whatever bundle is installed. The float network runs, since
-the int8 one is rounded otherwise by processors without VNNI.
+the int8 one is rounded otherwise by processors without VNNI. adaptive.mcap is of an earlier version: it stays as it is.
 """
 
 from __future__ import annotations
@@ -17,8 +17,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from bench.speed.simulated_host import SimulatedHost
 from protocol.control import ControlClient
+from protocol.frames import RawFrame, pack
 from protocol.sockets import NewestReader
+from services.recordings import settings
+from services.recordings.recording import RecordingWriter
+from services.runtime.config import Skin
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -82,6 +89,42 @@ def record(name: str, steps: list[Step], wait: Callable[[float], None] = time.sl
             service.wait(20)
 
 
+def record_parts(target: Path) -> None:
+    """Scans in parts, in simulated time: a press, a slide, two touches, and in between messages that were lost."""
+    host, rng = SimulatedHost("rolling", snr_db=80.0, seed=21), np.random.default_rng(21)
+    hand_on, raws = host.source.handed_on, list[tuple[float, RawFrame]]()
+
+    def kept(*args: Any) -> RawFrame | None:
+        frame = hand_on(*args)
+        raws.extend([(host.now, frame)] if frame is not None else [])
+        return frame
+
+    host.source.handed_on = kept  # type: ignore[method-assign]
+    host.until(3.7)
+    start = host.now
+    host.press(x=0.02, y=-0.01, force=2.0, radius=0.01, seconds=0.25, finger="one")
+    host.until(start + 0.4)
+    host.press(x=-0.02, y=0.015, force=3.0, radius=0.01, seconds=60.0, finger="two")
+    host.until(start + 0.6)
+    host.press(x=-0.02, y=0.015, force=3.0, radius=0.01, seconds=0.3, to_x=0.02, to_y=0.015, finger="two")
+    host.until(start + 1.1)
+    host.press(x=0.025, y=0.025, force=3.0, radius=0.01, seconds=60.0, finger="three")
+    host.until(start + 1.2)
+    host.press(x=-0.025, y=-0.02, force=2.0, radius=0.01, seconds=60.0, finger="four")
+    host.until(start + 1.5)
+    host.release()
+    host.until(start + 1.7)
+    host.rig.close()
+    lost = {k for k in range(len(raws)) if raws[k][0] > start and rng.random() < 0.1}
+    lost |= {k for k in range(len(raws)) if 0.85 < raws[k][0] - start < 0.92}  # more than one scan, under a slide
+    skin = Skin(port="stub", bundle="square16", network="full", scan="rolling")
+    with RecordingWriter(target, {settings.KEY: settings.text_of({"palm": skin})}, overwrite=True) as writer:
+        for k, (at, frame) in enumerate(raws):
+            if k not in lost:
+                writer.write("raw/palm", pack(frame).partition(b"\0")[2], round(1e9 * at))
+
+
 if __name__ == "__main__":
+    record_parts(HERE / "golden" / "rolling.mcap")
     for session, what in SESSIONS.items():
         record(session, what)

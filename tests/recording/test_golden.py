@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from protocol.frames import RawFrame, unpack
 from services.pipeline import Pipeline
 from services.recordings import golden
 from services.recordings.recording import RecordingError, RecordingReader
@@ -21,7 +22,7 @@ MOST_BYTES = 2_000_000
 Skin = Callable[..., Ran]
 
 
-@pytest.mark.parametrize("name", ["contacts", "faults"])
+@pytest.mark.parametrize("name", ["contacts", "faults", "adaptive", "rolling"])
 def test_recordings_give_the_contacts_that_were_accepted(name: str) -> None:
     file = HERE / f"{name}.mcap"
     found = golden.compare(golden.accepted(file), golden.run(file))
@@ -36,6 +37,25 @@ def test_the_recordings_are_small_and_hold_what_they_are_for() -> None:
     assert len(contacts) >= 5 and max(len(line["contacts"]) for line in lines["contacts"]) == 2
     reasons = {reason for line in lines["faults"] for reason in line["reasons"]}
     assert {"electrode_open", "gap", "saturated"} <= reasons
+
+
+def test_an_old_recording_with_an_adaptive_scan_still_gives_the_contacts_of_its_whole_scans() -> None:
+    file = HERE / "adaptive.mcap"
+    kinds = {}
+    for message in RecordingReader(file).messages({"raw"}):
+        raw = unpack(message.wire)
+        assert isinstance(raw, RawFrame)
+        kinds[raw.scan] = raw.kind
+    assert set(kinds.values()) == {"full", "sentinel"}
+    lines = {line["scan"]: line for line in golden.accepted(file)}
+    assert lines.keys() == kinds.keys()
+    short = [lines[scan] for scan, kind in kinds.items() if kind == "sentinel"]
+    assert all(not line["valid"] and line["reasons"] == ["coarse"] and not line["contacts"] for line in short)
+    touched = [line for line in lines.values() if line["valid"] and any(c["state"] == "hold" for c in line["contacts"])]
+    assert len(touched) > 15
+    for line in touched[4:-1]:
+        (contact,) = line["contacts"]
+        assert abs(contact["x_mm"] - 20) < 1 and abs(contact["y_mm"] + 10) < 1
 
 
 def changed(**fields: object) -> list[dict[str, object]]:

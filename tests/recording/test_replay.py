@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -20,6 +22,7 @@ from services.recordings.recording import RecordingReader, RecordingWriter
 from services.recordings.replay import ReplayError, steps
 from services.recordings.replay_session import replay_file
 from services.runtime import persistence
+from services.runtime.config import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +75,44 @@ def test_two_replays_give_identical_contacts(runtime: Path, recording: Path, tmp
     assert [s for s in states[88:] if s] == [["end"]], "it ends once, and is not there any more"
     x = [f["contacts"][0]["position"][0] for f in first[72:88]]  # type: ignore[index]
     assert np.corrcoef(x, 0.05 * 0.03 * np.arange(8, 24))[0, 1] > 0.99 and abs(x[0] - 0.012) < 0.004
+
+
+ONE_PROCESS = """
+import sys
+from pathlib import Path
+from services.pipeline import Pipeline  # first: it has numpy round as the processes do, with one thread
+from protocol.frames import pack
+from services.recordings.recording import RecordingReader, RecordingWriter
+from services.recordings.replay import mark, steps
+from services.runtime.config import Skin
+pipeline = Pipeline(Skin(port="stub", bundle="square16", frame_id="palm", network="full", scan="rolling"), "palm")
+with RecordingWriter(Path(sys.argv[2])) as writer:
+    for step in steps(RecordingReader(Path(sys.argv[1]))):
+        mark(step.raw)
+        if (contact := pipeline.step(step.raw)) is not None:
+            writer.write("contact/palm", pack(contact).partition(b"\\0")[2], step.at_ns)
+"""
+
+
+def test_scans_in_parts_of_which_some_were_lost_give_the_contacts_of_one_process(runtime: Path, tmp_path: Path) -> None:
+    """Which image meets which part is decided by their numbers: images and parts come to publisher from two processes,
+    and whichever is first, the contacts are bit by bit those of the stages called one after the other.
+    """
+    recording = Path(__file__).with_name("golden") / "rolling.mcap"
+    raws = [step.raw for step in steps(RecordingReader(recording)) if step.raw is not None]
+    lost = np.diff([raw.scan for raw in raws])
+    assert {raw.parts for raw in raws} == {10} and max(lost) > 10 and sum(lost > 1) > 20
+    subprocess.run(
+        [sys.executable, "-c", ONE_PROCESS, recording, tmp_path / "one.mcap"], check=True, cwd=ROOT, timeout=120
+    )
+    replay_file(recording, None, out=tmp_path / "two.mcap")
+    one, two = contacts(tmp_path / "one.mcap"), contacts(tmp_path / "two.mcap")
+    for frame in (*one, *two):
+        del frame["seq"], frame["host"]
+    assert len(one) == len(two) and {frame["part"] for frame in one} >= set(range(1, 11))
+    assert len({c["id"] for frame in one for c in frame["contacts"]}) >= 3  # type: ignore[attr-defined]
+    for a, b in zip(one, two, strict=True):
+        assert msgpack.packb(a) == msgpack.packb(b), a["scan"]
 
 
 def test_a_socket_file_deleted_during_a_replay_is_there_again_and_no_frame_is_lost(

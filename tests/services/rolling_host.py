@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from bench.speed.sentinel_host import AdaptiveHost
+from bench.speed.simulated_host import SimulatedHost
 from protocol.frames import pack, unpack
 
 
 @contextmanager
-def rolling_host(seed: int) -> Iterator[AdaptiveHost]:
+def rolling_host(seed: int) -> Iterator[SimulatedHost]:
     """After five seconds untouched. `raws`: the raw frames that were handed on, as they were then."""
-    host = AdaptiveHost("rolling", snr_db=80.0, seed=seed)
+    host = SimulatedHost("rolling", snr_db=80.0, seed=seed)
     host.raws = []
     hand_on = host.source.handed_on
 

@@ -48,6 +48,10 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         ({"skins": {"palm": PALM | {"pose": {"quaternion_xyzw": [0, 0, NAN, 1]}}}}, "found nan; allowed: a finite"),
         ({"skins": {"palm": PALM | {"touch": {"false_alarms": NAN}}}}, "false_alarms: found nan; allowed: a finite"),
         ({"skins": {"palm": PALM | {"touch": {"hold": "yes"}}}}, "touch.hold: found 'yes'; allowed: a valid boolean"),
+        (
+            {"skins": {"palm": PALM | {"scan": "adaptive"}}},
+            """scan: found 'adaptive'; allowed: "full" or "rolling": the adaptive scan is no more, write "rolling\"""",
+        ),
         ({"skins": {"palm": PALM | {"rtia_ohm": 16**9000}}}, "rtia_ohm: found a int too long to show"),
         (
             {"skins": {"palm": PALM}, "security": {"insecure": "yes"}},

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from models.sentinel import touches
+from models.touch_grid import touches
 from services.estimation.coverage import RADIUS, Coverage
 
 K = 120

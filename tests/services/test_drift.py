@@ -12,7 +12,7 @@ from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
 from models.bundle import Bundle
 from models.prereconstruction import PreReconstructor
-from models.sentinel import touches
+from models.touch_grid import touches
 from protocol.frames import DeltaFrame, RawFrame
 from services.estimation.creep import Creep
 from services.estimation.drift import DriftRates

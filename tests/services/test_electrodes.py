@@ -132,9 +132,45 @@ def test_a_contact_that_rises_and_falls_under_a_touch_that_moves(skin: StubSkin,
     assert all(r.contact.valid and present(r) == 1 for r in risen[8:])
     assert all(not r.contact.valid or present(r) == 1 for r in risen)
     well = [skin.feel(moving(55 + step)) for step in range(25)]
-    assert all(r.contact.valid and present(r) == 1 for r in well)
+    # Until it is known to be well, what it did to the others is taken off their pairs, and too much is unexplained.
+    assert all(not r.contact.valid or present(r) == 1 for r in well)
+    assert all(r.contact.valid for r in well[3 * BACK_WITHIN :])
     assert states(well[-1]) == {}
     skin.rest(BACK_WITHIN + 3)
+
+
+def test_a_contact_that_jumps_a_little_under_a_fast_slide_makes_no_second_one() -> None:
+    skin = StubSkin(80.0)
+
+    def sliding(step: int) -> tuple[Shape, ...]:
+        """1.6 mm from frame to frame."""
+        return (Shape("circle", -0.36 + 0.005 * step, -0.6 + 0.032 * step, 0.2, 0.16),)
+
+    before = [skin.feel(sliding(step)) for step in range(15)]
+    assert before[-1].contact.valid and present(before[-1]) == 1
+    risen = [skin.feel(sliding(15 + step), ((3, 1.44),)) for step in range(20)]
+    assert all(not r.contact.valid or present(r) == 1 for r in risen)
+    assert all(r.contact.valid and states(r) == {"drifting": [3]} for r in risen[6:])
+
+
+@pytest.mark.parametrize("speed", [0.003, 0.0055, 0.011])
+def test_a_touch_that_slides_onto_an_electrode_is_no_contact_that_rises(speed: float) -> None:
+    skin = StubSkin(80.0)
+    for step in range(int(0.62 / speed)):
+        contact = skin.feel((Shape("circle", 0.1 + speed * step, -0.26, 0.28, 0.45),)).contact
+        assert contact.valid and not {"electrode_drift", "gain"} & set(contact.reasons)
+
+
+def test_a_contact_that_jumps_as_two_touches_come_makes_no_third_one() -> None:
+    skin = StubSkin(80.0)
+
+    def two(drop: float) -> tuple[Shape, ...]:
+        return Shape("circle", -0.52, 0.4, 0.2, 0.475 * drop), Shape("circle", -0.2, -0.7, 0.2, 0.353 * drop)
+
+    rising = [skin.feel(two(drop), ((2, 5.95),)) for drop in (0.02, 0.5, 0.9)]
+    held = [skin.feel(two(1.0), ((2, 5.95),)) for _ in range(16)]
+    assert all(not r.contact.valid or present(r) <= 2 for r in (*rising, *held))
+    assert all(r.contact.valid and present(r) == 2 and states(r) == {"drifting": [2]} for r in held[6:])
 
 
 def test_a_touch_that_came_while_a_contact_was_up_does_not_hide_that_it_is_well_again(skin: StubSkin) -> None:

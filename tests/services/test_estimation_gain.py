@@ -7,7 +7,7 @@ import pytest
 
 from models.shapes import Shape
 from services.estimation.gain import common_factor
-from tests.services.stub_skin import StubSkin
+from tests.services.stub_skin import StubSkin, transfer
 
 NOISE = 1e-4
 K = 120
@@ -109,3 +109,43 @@ def test_a_gross_gain_that_was_taken_over_ends_at_once_and_names_no_electrode() 
     seen += [skin.rest(1) for _ in range(40)]
     assert all(r.contact.valid and not r.contact.contacts for r in seen[40:])
     assert not any(r.delta.electrodes.any() for r in seen)
+
+
+@pytest.mark.parametrize("situation", ["untouched", "held", "sliding"])
+@pytest.mark.parametrize("gain", [-0.04, -0.003, 0.003, 0.04])
+def test_a_gain_step_in_the_midst_of_a_scan_is_taken_over_by_the_next(gain: float, situation: str) -> None:
+    skin = StubSkin(80.0)
+
+    def touching(step: int) -> tuple[Shape, ...]:
+        return () if situation == "untouched" else sliding(skin, step if situation == "sliding" else 0)
+
+    for step in range(20):
+        skin.feel(touching(step))
+    z, status = skin.analog.measure((transfer(touching(20)),) * 2, skin.pattern, 128, 40_000.0, 0.0)
+    z[50:] *= 1 + gain
+    between = skin.run(z, status).contact
+    assert not (between.valid and situation == "untouched" and between.contacts)
+    skin.faults.inject("gain", {"factor": 1 + gain}, 0.0, 1e9)
+    after = skin.feel(touching(21)).contact
+    assert "gain" in after.reasons
+    for step in range(22, 30):
+        contact = skin.feel(touching(step)).contact
+        assert contact.valid and "gain" not in contact.reasons and len(contact.contacts) == (situation != "untouched")
+
+
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("gain", [-0.18, 0.19])
+def test_a_gross_gain_under_a_touch_is_named_and_wrong_nowhere(gain: float, moves: bool) -> None:
+    skin = StubSkin(80.0)
+    steps = [sliding(skin, step if moves else 0) for step in range(120)]
+    before = [skin.feel(touch) for touch in steps[:20]][-1].contact
+    skin.faults.inject("gain", {"factor": 1 + gain}, 0.0, 1e9)
+    during = [skin.feel(touch).contact for touch in steps[20:70]]
+    assert "gain" in during[0].reasons
+    skin.faults.clear("gain")
+    after = [skin.feel(touch).contact for touch in steps[70:]]
+    for contact in (*during, *after):
+        present = [c for c in contact.contacts if c.state != "end"]
+        assert not contact.valid or len(present) == 1
+        assert all(c.force_n == pytest.approx(before.contacts[0].force_n, rel=0.25) for c in present)
+    assert all(c.valid for c in after[5:])

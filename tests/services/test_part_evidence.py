@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.speed.sentinel_host import AdaptiveHost
+from bench.speed.simulated_host import SimulatedHost
 from models.bundle import Bundle
+from models.forward import shared
+from models.shapes import Shape
+from services.estimation.part_course import PartPlaces
 from services.estimation.part_evidence import PartEvidence
 from services.estimation.part_image import PartImage
 from services.estimation.rolling import measured_at, parts_of
@@ -30,6 +33,11 @@ def image(bundle):
     return PartImage(bundle)
 
 
+@pytest.fixture(scope="module")
+def places(image):
+    return PartPlaces(image)
+
+
 def frame(bundle, change, fresh, newest=3, seed=0, ramp=False):
     """d, noise and age where `change` (K,) is felt by the `fresh` newest values."""
     rng = np.random.default_rng(seed)
@@ -44,7 +52,7 @@ def touch(bundle, image, x, y, radius=0.2, drop=0.2):
 
 
 @pytest.mark.parametrize("ramp", [False, True])
-def test_a_touch_is_seen_from_two_parts_and_lies_where_its_uncertainty_says(bundle, evidence, image, ramp):
+def test_a_touch_is_seen_from_two_parts_and_lies_where_its_uncertainty_says(bundle, evidence, image, places, ramp):
     rng = np.random.default_rng(3)
     off, stated = [], []
     for seed in range(12):
@@ -55,18 +63,16 @@ def test_a_touch_is_seen_from_two_parts_and_lies_where_its_uncertainty_says(bund
         onset = evidence.began(d, noise, age)
         if onset is None:
             continue
-        on = onset.course > 0
-        share = np.where(on, onset.course, 1.0)
-        found = image.fit(np.where(on, d / share, 0.0), np.where(on, noise / share, np.inf))
+        found = places(d, noise, age, onset.starts).touch
         if found.fits:
-            off.append(np.hypot(found.x - x, found.y - y) / found.sigma[0])
+            off.append(np.hypot(found.at[0] - x, found.at[1] - y) / found.sigma[0])
             stated.append(found.sigma[0] / 2)
     assert len(off) >= (4 if ramp else 11)
     assert max(off) < 3 and np.median(off) < 1
     assert np.median(stated) < 0.05
 
 
-def test_what_touched_only_some_of_the_newest_values_is_not_taken_for_all(bundle, evidence, image):
+def test_what_touched_only_some_of_the_newest_values_is_not_taken_for_all(bundle, evidence, image, places):
     """A part half touched, read as a whole one, would be wrong by a third of the side."""
     change = touch(bundle, image, 0.3, -0.4)
     for fresh in (17, 20, 29):
@@ -74,9 +80,59 @@ def test_what_touched_only_some_of_the_newest_values_is_not_taken_for_all(bundle
         onset = evidence.began(d, noise, age)
         assert onset is not None
         rank = np.argsort(np.argsort(age))
-        felt = rank[onset.course > 0].max() + 1
+        felt = rank[places(d, noise, age, onset.starts).course > 0].max() + 1
         plain = np.abs(change[np.argsort(age)]) > 6 * SIGMA  # values that tell whether they felt it
         assert not plain[min(fresh, felt) : max(fresh, felt)].any()
+
+
+def test_a_first_part_that_fits_a_step_here_and_a_ramp_there_says_so(bundle, evidence, places):
+    """A strong touch, exactly solved: the likeliest course and place of a grid were up to 6.5 sigmas wrong."""
+    x, y, model = 0.65, -0.506, shared("square16", "inverse")
+    touched = model.solve(model.touched([Shape("circle", x, y, 0.166, 0.2)])).impedances(bundle.pattern)
+    change, seen = np.abs(touched) / np.abs(model.solve().impedances(bundle.pattern)) - 1, 0
+    for newest in range(1, 11):
+        for fresh in range(8, 15):
+            d, noise, age = frame(bundle, change, fresh, newest=newest, seed=fresh)
+            if (onset := evidence.began(d, noise, age)) is not None:
+                found, seen = places(d, noise, age, onset.starts).touch, seen + 1
+                assert not found.fits or np.hypot(found.at[0] - x, found.at[1] - y) < 3 * found.sigma[0]
+    assert seen > 50
+
+
+@pytest.mark.parametrize("parts", [3, 6, 9])
+def test_a_force_that_grew_and_stays_is_told_from_one_that_grows(bundle, image, places, parts):
+    """Its course is that of all values, those older than the growth's end and older than the message included."""
+    at, change = measured_at(bundle, 3), touch(bundle, image, 0.2, -0.3)
+    seen = image.fit(change, np.full(120, SIGMA))
+    age = (1 - at) * AGE_US
+    for began in (0.6, 1.3):
+        if began * 10 <= parts:
+            continue
+        true = np.clip((began * AGE_US - age) / (began * AGE_US - parts / 10 * AGE_US), 0, 1)
+        d = true * change + SIGMA * np.random.default_rng(parts).standard_normal(120)
+        course = places.course(d, np.full(120, SIGMA), age, seen)
+        plain = np.abs(change) > 30 * SIGMA
+        assert np.abs(course - true)[plain].max() < 0.12
+    d = change + SIGMA * np.random.default_rng(1).standard_normal(120)
+    assert places.course(d, np.full(120, SIGMA), age, seen).min() == 1.0, "it was there all the time"
+
+
+def test_a_touch_that_goes_on_is_followed_from_where_it_was_and_a_fault_in_its_place_is_not(
+    bundle, evidence, image, places
+):
+    change = touch(bundle, image, 0.3, -0.2, radius=0.15)
+    d, noise, age = frame(bundle, change, 24, newest=2)
+    place = places(d, noise, age, evidence.began(d, noise, age).starts)
+    d, noise, age = frame(bundle, change, 36, newest=3, seed=1)
+    again = places.again(d, noise, age, place.touch)
+    assert evidence.goes_on(d, noise, again.course, places.response(again.touch)) > 50
+    assert np.hypot(again.touch.at[0] - 0.3, again.touch.at[1] + 0.2) < 3 * again.touch.sigma[0]
+    assert again.touch.sigma[0] < 1.1 * place.touch.sigma[0]
+    contact = np.where(np.isin(bundle.pattern[:, :2], (3,)).any(axis=1), -0.02, 0.0)
+    for wrong in (contact, np.full(120, 0.01), np.zeros(120)):
+        d, noise, age = frame(bundle, wrong, 36, newest=3, seed=2)
+        again = places.again(d, noise, age, place.touch)
+        assert evidence.goes_on(d, noise, again.course, places.response(again.touch)) is None
 
 
 def test_a_circle_that_leaves_the_skin_while_it_is_fitted_is_no_error(bundle, image):
@@ -129,9 +185,37 @@ def test_an_end_is_seen_where_the_touch_would_be_plain_and_only_there(bundle, ev
     assert not evidence.ended(d, strong, noise, age), "it is elsewhere now"
 
 
+def test_the_end_of_a_light_touch_is_seen_as_soon_as_its_absence_would_be_plain(bundle, evidence, image):
+    light = touch(bundle, image, 0.05, 0.1, radius=0.1, drop=0.08)
+    assert (light / SIGMA)[np.argsort(measured_at(bundle, 3))[-12:]] @ (light / SIGMA)[
+        np.argsort(measured_at(bundle, 3))[-12:]
+    ] < 12**2, "one part does not tell"
+    silent = [evidence.ended(*_ended_since(bundle, light, fresh, 0.0)) for fresh in (12, 60)]
+    assert silent == [False, True]
+    assert not any(evidence.ended(*_ended_since(bundle, light, fresh, 0.5)) for fresh in (12, 24, 36, 60))
+
+
+def _ended_since(bundle, held, fresh, left):
+    """What `ended` takes, where the `fresh` newest values felt `left` times the touch that was held."""
+    d, noise, age = frame(bundle, (left - 1) * held, fresh)
+    return d + held, held, noise, age
+
+
+@pytest.mark.parametrize("x, y", [(0.98, 0.97), (0.0, 1.0), (-0.9, 0.9), (0.3, 0.2)])
+def test_a_touch_is_where_its_part_that_lies_on_the_skin_is(image, x, y):
+    at, spread = image.place(np.array([x, y, np.log(0.2)]), np.diag([0.1, 0.1, 0.1]) ** 2)
+    rng = np.random.default_rng(0)
+    points = np.array([x, y]) + rng.uniform(-0.2, 0.2, (20_000, 2))
+    on = points[(np.hypot(*(points - [x, y]).T) < 0.2) & (np.abs(points) < 1).all(axis=1)]
+    assert at == pytest.approx(on.mean(axis=0), abs=0.02)
+    over = np.abs([x, y]) > 0.8
+    assert np.sqrt(np.diag(spread))[~over] == pytest.approx(0.1, abs=0.03)
+    assert (np.sqrt(np.diag(spread))[over] < 0.08).all(), "what leaves the skin moves it less"
+
+
 @pytest.fixture(scope="module")
 def host():
-    host = AdaptiveHost("rolling", snr_db=80.0, seed=7)
+    host = SimulatedHost("rolling", snr_db=80.0, seed=7)
     host.until(6.0)
     yield host
     host.rig.close()
@@ -188,7 +272,7 @@ def test_a_tare_makes_no_contact_and_is_followed_by_touches_again(host):
 
 @pytest.mark.parametrize("fault", [{"name": "electrode_open", "args": {"electrode": 4}}, {"name": "gain", "args": {}}])
 def test_a_fault_of_the_board_makes_no_contact(fault):
-    host = AdaptiveHost("rolling", snr_db=80.0, seed=11)
+    host = SimulatedHost("rolling", snr_db=80.0, seed=11)
     host.until(5.0)
     first = len(host.contacts)
     host.rig.fault(fault["name"], fault["args"], host.now, seconds=1.0)

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
+from protocol.frames import DeltaFrame
 from services.estimation.part_filter import PartFilter
 from services.estimation.part_image import PartImage
 from services.estimation.rolling import measured_at
 from services.pipeline import Pipeline
+from services.rolling_scans import RollingScans
 from services.runtime.config import Skin
 from services.runtime.persistence import arrays, plain
 from tests.services.rolling_host import rolling_host
@@ -72,6 +74,25 @@ def test_a_held_touch_stays_where_the_whole_scan_shows_it(bundle):
         assert all((s.vx, s.vy) == (0, 0) for _, _, s, _ in seen)
         assert len({(s.x, s.y) for _, _, s, _ in seen}) == 1
         assert off(seen, lambda t: (0.3, -0.2)).max() < 0.02
+
+
+def test_a_held_touch_is_known_better_with_every_image_of_more_scans(bundle):
+    off, stated = [], []
+    for seed in range(6):
+        skin, follower = Skin(bundle, lambda t: (0.1, 0.05, 0.1, 0.1), seed), PartFilter(bundle)
+        for k in range(81):
+            d, age, now = skin.values(1 + k % 10)
+            assert k == 0 or follower.part(d, NOISE, age, now)
+            if k % 10 == 0:
+                follower.whole(d, NOISE, now, shown=k in (0, 10, 40, 80))
+                if k in (0, 80):
+                    (state,) = follower.states()
+                    off.append(np.hypot(state.x - 0.1, state.y - 0.05))
+                    stated.append(state.sigma[0])
+    one, nine = np.array(off).reshape(-1, 2).T
+    assert np.sqrt((nine**2).mean()) < 0.7 * np.sqrt((one**2).mean())
+    assert np.mean(stated[1::2]) < 0.6 * np.mean(stated[::2])
+    assert (nine < 3 * np.array(stated[1::2])).all()
 
 
 @pytest.mark.parametrize("speed", [2.0, 6.0])
@@ -237,8 +258,24 @@ def test_a_recording_that_begins_while_a_touch_slides_plays_as_it_was(host):
     again = Pipeline(ROLLING, "palm")
     for stage, state in zip((again.pre, again.inference, again.publishing), states, strict=True):
         stage.load(arrays(state))
-    made = [found.contact for frame in host.raws[raw:] if (found := again.step(frame)) is not None]
+    made = [found for frame in host.raws[raw:] if (found := again.step(frame)) is not None]
     assert len(made) == len(host.contacts) - first > 40
     for one, (_, other) in zip(made, host.contacts[first:], strict=True):
         assert (one.scan, one.valid, one.reasons) == (other.scan, other.valid, other.reasons)
         assert [asdict(c) for c in one.contacts] == [asdict(c) for c in other.contacts]
+
+
+def test_a_touch_that_a_whole_scan_does_not_see_any_more_is_not_followed_into_the_next(host):
+    host.until(host.now + 0.5)
+    host.press(x=-0.02, y=-0.01, force=2.0, radius=0.01, seconds=60.0, finger="one")
+    host.until(host.now + 0.2)
+    host.press(x=-0.02, y=-0.01, force=2.0, radius=0.01, seconds=0.3, to_x=0.02, to_y=0.01, finger="one")
+    host.until(host.now + 0.1)
+    rolling = host.pipeline.pre.rolling_scans
+    state, estimator, raw = rolling.state(), host.pipeline.pre.baseline_estimator, host.raws[-1]
+    after = RollingScans(host.pipeline.pre.bundle)
+    after.load(state)
+    assert after._models.filter.moves
+    sigma = estimator.sigma.astype(np.float32)
+    after.judged(DeltaFrame(skin="palm", difference=np.zeros(120, np.float32), sigma=sigma), raw, estimator)
+    assert not after._models.filter.moves and not after._models.filter.knows

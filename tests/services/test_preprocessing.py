@@ -11,10 +11,8 @@ import pytest
 
 from models.bundle import Bundle
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA, DeltaFrame, RawFrame, pack, unpack
-from services.board.scanning import Scanning
 from services.describe import EVERY_S, MOVED
 from services.estimation import checks
-from services.estimation.sentinel import sentinel_of
 from services.estimation.tare import Baseline, NoBaseline, disagreement, take
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
@@ -564,13 +562,14 @@ def test_what_a_bundle_cannot_tell_follows_from_its_pattern(bundle: Bundle) -> N
     ]
 
 
-def test_a_short_scan_that_the_board_doubts_is_not_valid(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
+def test_a_short_scan_of_an_old_recording_makes_no_contact_and_disturbs_nothing(
+    stage: Preprocessing, board: Board, bundle: Bundle
+) -> None:
     tared(stage, board)
-    rows = sentinel_of(bundle).rows
-    short = Scanning(bundle.pattern[rows], stage.config.dft_points, stage.config.rtia_ohm).config
-    for bit, reasons in ((0, ["coarse"]), (STATUS_FIFO, ["fifo", "coarse"])):
-        frame = board.frame()
-        frame.z, frame.status = frame.z[rows], np.zeros(len(rows), np.uint8)
-        frame.status[0], frame.kind, frame.config = bit, "sentinel", short
-        out = run(stage, frame)
-        assert out.valid == (not bit) and out.reasons == reasons
+    before = stage.state()
+    frame = board.frame()
+    frame.z, frame.status, frame.kind = frame.z[:12], np.zeros(12, np.uint8), "sentinel"
+    out = run(stage, frame)
+    assert not out.valid and out.reasons == ["coarse"] and not out.touched and np.isinf(out.sigma).all()
+    assert str(stage.state()) == str(before)
+    assert run(stage, board.frame()).valid

@@ -20,7 +20,7 @@ from services.contacts.force import Force
 from services.contacts.refined import agrees, both, refined_outline, settled
 from services.describe import refinement
 from services.pipeline import Result
-from services.refinement import RefineHere, RefineProcess
+from services.refine_process import RefineHere, RefineProcess
 from services.runtime.config import ConfigError, Indenter, Skin, parse
 from tests.services.stub_skin import StubSkin, transfer
 
@@ -247,7 +247,7 @@ def test_a_job_that_knows_the_answer_goes_before_one_that_did_not(process: Refin
 def test_a_process_that_dies_is_started_again_and_said(
     process: RefineProcess, bundle: Bundle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.refinement.WAIT_S", (0.0, 0.0))
+    monkeypatch.setattr("services.refine_process.WAIT_S", (0.0, 0.0))
     process._pause_s = 0.0
     process.offer(job(bundle))
     assert process._process is not None
@@ -268,7 +268,7 @@ def test_a_process_that_cannot_be_started_stops_nothing(bundle: Bundle) -> None:
 
 
 def test_a_fit_that_never_ends_is_given_up(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.refinement.STUCK_S", 0.0)
+    monkeypatch.setattr("services.refine_process.STUCK_S", 0.0)
     process = RefineProcess((sys.executable, "-c", "import time; time.sleep(60)"))
     process.offer(job(bundle))
     time.sleep(0.01)
@@ -326,6 +326,7 @@ def test_where_the_kinds_differ_the_image_has_a_say() -> None:
     assert agreed == (Force(3.2, 0.1), TOUCH.area_m2, TOUCH.area_sigma_m2)
     force, area, sigma = settled(CONTACT, replace(TOUCH, between_kinds=[0.2, 0.2]), Force(3.2, 0.1))
     assert force.newton == pytest.approx((3.0 * 3.2) ** 0.5) and area == CONTACT.area_m2
+    assert force.sigma == pytest.approx(np.hypot(0.1, force.newton - 3.2))
     assert sigma == pytest.approx(np.hypot(1e-5, 1e-5))
     without = settled(replace(CONTACT, force_n=None), replace(TOUCH, between_kinds=[0.2, 0.0]), Force(None, None))
     assert without[0] == Force(None, None)

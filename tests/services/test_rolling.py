@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.speed.sentinel_host import AdaptiveHost
+from bench.speed.simulated_host import SimulatedHost
 from models.bundle import Bundle
 from protocol import link
 from protocol.frames import RawFrame, pack, unpack
@@ -97,7 +97,7 @@ def test_a_touch_is_where_it_is_and_a_released_one_is_gone(host):
 
 
 def test_an_open_electrode_is_named_in_parts_too():
-    host = AdaptiveHost("rolling", snr_db=80.0, seed=5)
+    host = SimulatedHost("rolling", snr_db=80.0, seed=5)
     host.until(5.0)
     host.rig.fault("electrode_open", {"electrode": 5}, host.now, seconds=100)
     since = len(host.contacts)
@@ -109,7 +109,7 @@ def test_an_open_electrode_is_named_in_parts_too():
 
 
 def test_a_board_that_knows_no_parts_scans_whole_and_status_says_so(bundle):
-    host = AdaptiveHost("rolling", snr_db=80.0, seed=3)
+    host = SimulatedHost("rolling", snr_db=80.0, seed=3)
     host.rig.board.knows_parts = False
     host.until(4.0)
     assert host.link.scanning.parts == 1 and host.link.knows_no_parts
@@ -122,7 +122,7 @@ def test_a_board_that_knows_no_parts_scans_whole_and_status_says_so(bundle):
 
 
 def test_frames_of_another_cut_are_foreign(bundle):
-    host = AdaptiveHost("rolling", seed=4)
+    host = SimulatedHost("rolling", seed=4)
     scanning = host.source.scanning
     board = BoardLink(scanning, 0.0)
     assert scanning.sent(part(0, of=10, n=12, config=scanning.config))

@@ -171,6 +171,26 @@ def test_what_appears_beside_others_begins_later_if_faint(confidence: float, wel
     assert shown == [None] * (begins - 1) + [2] * (9 - begins) if begins else shown == [None] * 8
 
 
+def test_a_patch_that_has_long_been_faint_is_no_touch_because_one_image_shows_it_clearly() -> None:
+    tracker = Tracker()
+    for n, confidence in enumerate([0.8] * 10 + [0.93, 0.8], 1):
+        faint = touch(0.03)._replace(confidence=confidence)
+        found, _ = tracker.update([touch(0.0, size=2 * SIZE), faint], n * FRAME_NS)
+        assert [t and t.id for t in found] == [1, None]
+
+
+def test_the_state_of_an_earlier_version_is_taken() -> None:
+    tracker = Tracker()
+    tracker.update([touch(0.0, size=2 * SIZE), touch(0.03)], FRAME_NS)
+    state = tracker.state()
+    for track in state["tracks"]:
+        track["confidence"] = track.pop("confidences")[-1]
+    later = Tracker()
+    later.load(state)
+    again = [touch(0.0, size=2 * SIZE), touch(0.03)]
+    assert [t and t.id for t in later.update(again, 2 * FRAME_NS)[0]] == [1, 2]
+
+
 def test_what_appears_beside_others_or_in_a_bad_image_has_to_appear_twice() -> None:
     tracker = Tracker()
     first, _ = tracker.update([touch(0.0), touch(0.03, size=2 * SIZE)], FRAME_NS)

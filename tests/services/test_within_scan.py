@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from models.sentinel import touches
 from models.shapes import Shape
+from models.touch_grid import touches
 from services.estimation.within_scan import ChangingTouch
 from services.pipeline import Result
 from tests.services.stub_skin import TRANSFER, StubSkin, transfer

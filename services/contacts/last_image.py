@@ -1,0 +1,67 @@
+"""What the newest image frame said of its touches, for the parts of scans between it and the next one."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from protocol.frames import ImageFrame, PartFrame, RefinedTouch
+from protocol.held import ANY
+from services.runtime.stage import add_reason, inherited
+
+
+class LastImage:
+    """Of one skin. A part that does not follow it, by the scan that it names, is of another image."""
+
+    def __init__(self, skin: str) -> None:
+        self._skin = skin
+        self._last: ImageFrame | None = None
+
+    def forget(self) -> None:
+        self._last = None
+
+    def take(self, frame: ImageFrame) -> None:
+        """Take note of an image frame, without its arrays."""
+        self._last = ImageFrame(
+            skin=frame.skin,
+            session=frame.session,
+            scan=frame.scan,
+            valid="out_of_distribution" not in frame.reasons,
+            reasons=[reason for reason in frame.reasons if reason in ("changing", "out_of_distribution")],
+            touched=frame.touched,
+            reconstructed=frame.reconstructed,
+            residual=frame.residual,
+            noise=frame.noise,
+            refined=frame.refined,
+        )
+
+    def held_by(self, part: PartFrame) -> ImageFrame:
+        """The image frame of a part: it holds the last image, whose touches are by now where the part says. Where that
+        image is not known it holds none.
+        """
+        last = self._last
+        out = ImageFrame(**inherited(part), touched=True, held=True)
+        if last is None or last.scan != part.after or not last.touched:
+            return out
+        out.session, out.reconstructed = last.session, last.reconstructed
+        out.residual, out.noise, out.refined = last.residual, last.noise, last.refined
+        out.followed = part.followed
+        out.valid = out.valid and last.valid
+        for reason in last.reasons:
+            add_reason(out.reasons, reason)
+        return out
+
+    def state(self) -> dict[str, Any] | None:
+        last = self._last
+        if last is None:
+            return None
+        names = ("scan", "valid", "reasons", "touched", "reconstructed", "residual", "noise")
+        refined = None if last.refined is None else asdict(last.refined)
+        return {**{name: getattr(last, name) for name in names}, "refined": refined}
+
+    def load(self, state: dict[str, Any] | None) -> None:
+        """Older recordings have none."""
+        self._last = None
+        if state is not None:
+            refined = None if state["refined"] is None else RefinedTouch(**state["refined"])
+            self._last = ImageFrame(skin=self._skin, session=ANY, **{**state, "refined": refined})

@@ -1,0 +1,139 @@
+"""Where a touch is that began within the newest parts of a scan, and how its force grew: by all of their values.
+
+Its force is f(t): 0 before it began, 1 now, a line between, or a step. Likely beginnings are tried one after the other:
+each gives a touch (part_image.py), and for that touch all courses are compared anew, on every value of the message. As
+long as several are about as likely, the touch may be in the places of all of them, and its uncertainty says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.estimation.part_image import LEAST, LINEAR, PartImage, PartTouch, ellipse
+
+Array = NDArray[np.float64]
+
+FAINT = 0.2  # of the newest value, below which one tells too little of the touch
+LESS_LIKELY = 3.0  # nats by which a force that grew must be likelier than one that was there at once
+CAUTIOUS = 2.0  # times its noise that a value is taken to have: what the model is wrong by is not independent
+BEGINS, GROWS = 4, 6  # values of a scan from one beginning that is tried to the next, from one end of the growth
+BEFORE = 10  # beginnings that are tried within a scan's time before the oldest value
+TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class TouchStart:
+    """A touch that may have begun. course (K,): f of each value; theta: x, y, log radius, log drop."""
+
+    course: Array
+    theta: Array
+
+
+@dataclass(frozen=True)
+class PartPlace:
+    """The touch; course (K,): f of each value; the uncertainty of its place is that of all likely courses."""
+
+    touch: PartTouch
+    course: Array
+
+
+def courses(age: Array) -> tuple[Array, int]:
+    """(H, K) of values of these ages, and how many of them are steps: those come first. Values are measured one after
+    the other, as long as the one before took.
+    """
+    return _courses(np.argsort(age).tobytes())
+
+
+@lru_cache(maxsize=32)
+def _courses(ordered: bytes) -> tuple[Array, int]:
+    order = np.frombuffer(ordered, dtype=np.intp)
+    age = np.empty(len(order))
+    age[order] = np.arange(1.0, len(order) + 1)
+    steps = np.zeros((len(age), len(age)))
+    steps[:, order] = np.tri(len(age))
+    whole = float(age[order[-1]]) * np.arange(1, BEFORE + 1) / BEFORE
+    old = np.concatenate([age[order], age[order[-1]] + whole])
+    begins = [*range(GROWS, len(age), BEGINS), *range(len(age), len(old))]
+    tried = [(b, e) for b in begins for e in range(0, min(b - BEGINS, len(age)), GROWS)]
+    begin, end = old[np.array(tried).T][:, :, None]
+    return np.concatenate([steps, ((begin - age) / (begin - end)).clip(0.0, 1.0)]), len(steps)
+
+
+class PartPlaces:
+    """For one bundle."""
+
+    def __init__(self, image: PartImage) -> None:
+        self._image, self._all = image, np.arange(image.measurements)
+
+    def __call__(self, d: Array, noise: Array, age: Array, starts: Sequence[TouchStart]) -> PartPlace:
+        """d (K,) with standard deviation noise (K,), measured at these ages."""
+        tried, found = courses(age), []
+        for start in starts:
+            found.append(self._fitted(d, noise, start.course, start.theta))
+            touch = found[-1][1].touch
+            course = self._course(d, noise, touch, *tried)
+            if np.abs(course - start.course).max() > 0.0:
+                found.append(self._fitted(d, noise, course, _theta(touch)))
+        cost = np.array([cost for cost, _ in found])
+        best = found[int(cost.argmin())][1]
+        weight = np.exp((cost.min() - cost) / 2 / CAUTIOUS**2)
+        weight /= weight.sum()
+        at = np.array([place.touch.at for _, place in found])
+        middle = weight @ at
+        spread = np.einsum("n,na,nb->ab", weight, at - middle, at - middle)
+        own = np.einsum("n,nab->ab", weight, [_covariance(place.touch.sigma) for _, place in found])
+        sigma = ellipse(own + spread, 1.0, LEAST)
+        touch = replace(best.touch, at=(float(middle[0]), float(middle[1])), sigma=sigma)
+        return PartPlace(touch, best.course)
+
+    def again(self, d: Array, noise: Array, age: Array, touch: PartTouch) -> PartPlace:
+        """The same of a touch whose place is known, which goes on."""
+        return self(d, noise, age, [TouchStart(self.course(d, noise, age, touch), _theta(touch))])
+
+    def response(self, touch: PartTouch) -> Array:
+        """(K,) d per S/m of this circle."""
+        circle = np.array([[touch.x, touch.y, np.log(touch.radius)]])
+        return np.asarray(self._image.responses(circle, self._all)[0])
+
+    def course(self, d: Array, noise: Array, age: Array, touch: PartTouch) -> Array:
+        """(K,) the likeliest course of this touch's force."""
+        return self._course(d, noise, touch, *courses(age))
+
+    def _course(self, d: Array, noise: Array, touch: PartTouch, f: Array, steps: int) -> Array:
+        """That of f (H, K); so many of them are steps."""
+        response = self.response(touch)
+        along, size = f @ (response * d / (width := _width(d, noise)) ** 2), f**2 @ (response / width) ** 2
+        gain = np.maximum(along, 0.0) ** 2 / (size + TINY)
+        gain[steps:] -= 2 * LESS_LIKELY
+        return np.asarray(f[int(gain.argmax())])
+
+    def _fitted(self, d: Array, noise: Array, course: Array, theta: Array) -> tuple[float, PartPlace]:
+        """The touch of this course, and minus twice the logarithm of its likelihood."""
+        on = course > FAINT
+        share = np.where(on, course, 1.0)
+        touch = self._image.fit(np.where(on, d / share, 0.0), np.where(on, noise / share, np.inf), theta)
+        expected = course * touch.drop * self.response(touch)
+        cost = float((((d - expected) / _width(d, noise)) ** 2).sum())
+        cost += 2 * LESS_LIKELY * bool(((course > 0) & (course < 1)).any())
+        return cost, PartPlace(touch, np.where(on, course, 0.0))
+
+
+def _theta(touch: PartTouch) -> Array:
+    return np.array([touch.x, touch.y, np.log(touch.radius), np.log(touch.drop)])
+
+
+def _width(d: Array, noise: Array) -> Array:
+    """(K,) standard deviation of d against the linear picture of a circle."""
+    felt = np.sort(d**2)[-len(d) // 2 :]
+    return np.asarray(np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float(felt.mean())))
+
+
+def _covariance(sigma: tuple[float, float, float]) -> Array:
+    long, short, angle = sigma
+    axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.asarray(axes @ np.diag([long**2, short**2]) @ axes.T)
