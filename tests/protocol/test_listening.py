@@ -1,6 +1,7 @@
 """Sockets that are robbed, deleted or flooded: it is said, it is mended within 2 s, and nobody else suffers."""
 
 import contextlib
+import ctypes
 import os
 import shutil
 import stat
@@ -46,6 +47,9 @@ def another(*command):
 
 
 def resident_mb():
+    """What is held, without what malloc keeps of freed memory: up to 100 MB after a flood, by chance."""
+    with contextlib.suppress(OSError, AttributeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
