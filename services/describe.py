@@ -127,7 +127,7 @@ class FrameRate:
                 self.found = {"least": round(touched / frame.parts, 2), "touched": round(touched, 2)}
 
 
-class _Told(NamedTuple):
+class _Announced(NamedTuple):
     baseline: Baseline | None
     origin: tuple[Any, ...]
     at_ns: int
@@ -139,7 +139,7 @@ class BaselineNews:
     """
 
     def __init__(self) -> None:
-        self._told: _Told | None = None
+        self._told: _Announced | None = None
 
     def __call__(self, baseline: Baseline | None, now_ns: int, rate_hz: dict[str, float] | None = None) -> bool:
         """True: the caller tells it now. now_ns: stamp `sample` of the newest frame. rate_hz: told anew as it is
@@ -147,7 +147,7 @@ class BaselineNews:
         """
         told = self._told
         rate = tuple((rate_hz or {}).values())
-        found = _Told(baseline, (rate, *(() if baseline is None else _origin(baseline))), now_ns)
+        found = _Announced(baseline, (rate, *(() if baseline is None else _origin(baseline))), now_ns)
         if told is not None and told.origin == found.origin:
             if told.baseline is None or baseline is None or abs(now_ns - told.at_ns) < EVERY_S * 1e9:
                 return False

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from services.calibration.locating import build
 from services.calibration.presses import Presses, RegistrationError, part, read_presses
-from services.calibration.registration import FEWEST, Registration, Similarity, Told, register
+from services.calibration.registration import FEWEST, KnownPose, Registration, Similarity, register
 from services.calibration.sensitivity import write_corrected
 from services.recordings.reconstruction import find_skin
 
 
 def register_presses(
-    arrays: Mapping[str, NDArray[Any]], skin: str, count: int | None, out: Path, told: Told | None = None
+    arrays: Mapping[str, NDArray[Any]], skin: str, count: int | None, out: Path, told: KnownPose | None = None
 ) -> dict[str, Any]:
     """Fits the first `count` presses (None: all), writes the bundle folder `out` and a skin.toml in it; returns the
     report.

@@ -58,7 +58,7 @@ class Similarity:
 
 
 @dataclass(frozen=True)
-class Told:
+class KnownPose:
     """What somebody knows of the skin; None: nobody does."""
 
     diameter_m: float | None = None  # of the circle through the electrodes
@@ -90,7 +90,7 @@ class _Pose:
         sizes                least and largest scale that are looked at
     """
 
-    def __init__(self, presses: Presses, bundle: Bundle, told: Told) -> None:
+    def __init__(self, presses: Presses, bundle: Bundle, told: KnownPose) -> None:
         self.presses = presses[evenly(len(presses), MOST_FOR_POSE)]
         live = presses.measured
         self.fields, self.width = sensitivities(bundle, PRESS_BLUR)[live], half_width(bundle)
@@ -157,13 +157,13 @@ class _Pose:
         return np.asarray(found.x)
 
 
-def register(presses: Presses, bundle: Bundle, told: Told | None = None) -> Registration:
+def register(presses: Presses, bundle: Bundle, told: KnownPose | None = None) -> Registration:
     """The pose that explains most. Raises RegistrationError where the presses cannot tell it."""
     if len(presses) < FEWEST:
         without = f" ({presses.left_out} others of the file cannot be used)" if presses.left_out else ""
         raise RegistrationError(f"{len(presses)} presses{without}: at least {FEWEST}, spread over the skin, are needed")
-    pose = _Pose(presses, bundle, told or Told())
-    _fits(pose, told or Told())
+    pose = _Pose(presses, bundle, told or KnownPose())
+    _fits(pose, told or KnownPose())
     starts = [
         (pose.cost(pose.start(angle), way), angle, way) for way in pose.ways for angle in pose.angles(way).tolist()
     ]
@@ -181,7 +181,7 @@ def register(presses: Presses, bundle: Bundle, told: Told | None = None) -> Regi
     similarity = pose.of(p, way)
     explained = 1 - float(pose.left(similarity).mean())
     sigma = _widths(pose, p, way)
-    doubts = _doubts(pose, p, sigma, told or Told())
+    doubts = _doubts(pose, p, sigma, told or KnownPose())
     if len(found) == 2:
         other = pose.left(pose.of(found[not way][1], not way)) - pose.left(similarity)
         error = float(other.std(ddof=1)) / np.sqrt(len(other))
@@ -198,7 +198,7 @@ def register(presses: Presses, bundle: Bundle, told: Told | None = None) -> Regi
     return Registration(Similarity(angle, similarity.scale, similarity.offset, way), explained, sigma, doubts)
 
 
-def _fits(pose: _Pose, told: Told) -> None:
+def _fits(pose: _Pose, told: KnownPose) -> None:
     """Presses of a size that a skin has, and inside the one that was told."""
     if pose.radius < 1e-4:
         raise RegistrationError(
@@ -245,7 +245,7 @@ def _widths(pose: _Pose, p: Array, way: bool) -> dict[str, float]:
     return {"angle": float(spread[0]), "scale": float(spread[1]), "offset": float(np.hypot(spread[2], spread[3]))}
 
 
-def _doubts(pose: _Pose, p: Array, sigma: dict[str, float], told: Told) -> list[str]:
+def _doubts(pose: _Pose, p: Array, sigma: dict[str, float], told: KnownPose) -> list[str]:
     found = []
     low, high = np.log(pose.sizes)
     if told.diameter_m is None and (p[1] < low + 0.01 or p[1] > high - 0.01):

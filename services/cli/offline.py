@@ -118,11 +118,11 @@ def register_frame(
     import math
 
     from services.calibration.register_command import register_presses
-    from services.calibration.registration import Told
+    from services.calibration.registration import KnownPose
 
     if numbering not in (None, "clockwise", "counter-clockwise"):
         fail(f"found --numbering {numbering}, expected clockwise or counter-clockwise", USAGE)
-    told = Told(
+    told = KnownPose(
         diameter,
         None if first_electrode is None else math.radians(first_electrode),
         None if numbering is None else numbering == "clockwise",

@@ -15,7 +15,7 @@ from services.calibration.fields import half_width, sample, sensitivities
 from services.calibration.locating import build, true_places
 from services.calibration.presses import Presses, RegistrationError, part, read_presses
 from services.calibration.register_command import register_presses
-from services.calibration.registration import Similarity, Told, register
+from services.calibration.registration import KnownPose, Similarity, register
 from services.recordings.npz_file import load_npz, read_scans
 from services.runtime.config import Skin
 
@@ -161,13 +161,13 @@ def test_few_presses_say_that_they_know_little(bundle: Bundle, reference: Path) 
 def test_what_is_told_of_a_skin_is_kept(bundle: Bundle) -> None:
     true = Similarity(0.4, 1.1, np.array([0.0, 0.0]), True)
     presses = read_presses(presses_of(bundle, true, n=12), bundle)
-    told = register(presses, bundle, Told(0.16 * 1.1, 0.4, True))
+    told = register(presses, bundle, KnownPose(0.16 * 1.1, 0.4, True))
     found = told.similarity
     assert found.mirrored and abs(found.scale / 1.1 - 1) < 0.025 and abs(found.angle - 0.4) < np.radians(6)
     with pytest.raises(RegistrationError, match="--numbering"):  # told wrongly: no pose explains these presses
-        register(presses, bundle, Told(clockwise=False))
+        register(presses, bundle, KnownPose(clockwise=False))
     with pytest.raises(RegistrationError, match="presses lie inside the skin"):
-        register(presses, bundle, Told(diameter_m=0.05))
+        register(presses, bundle, KnownPose(diameter_m=0.05))
 
 
 def test_a_skin_is_no_larger_than_physics_allows(bundle: Bundle) -> None:
@@ -179,7 +179,7 @@ def test_a_skin_is_no_larger_than_physics_allows(bundle: Bundle) -> None:
     radius = np.linalg.norm(xy - 0.5 * (xy.min(axis=0) + xy.max(axis=0)), axis=1).max()
     assert 0.99 * radius < made.similarity.scale * half_width(bundle) < 1.61 * radius
     assert any("--diameter" in doubt for doubt in made.doubts)
-    told = register(read_presses(arrays, bundle), bundle, Told(diameter_m=0.16))
+    told = register(read_presses(arrays, bundle), bundle, KnownPose(diameter_m=0.16))
     assert abs(told.similarity.scale - 1.0) < 0.025 and told.explained > made.explained
 
 
