@@ -74,7 +74,9 @@ def _live(monitor: Monitor) -> None:
 
 
 def echo(
-    topic: Annotated[str, typer.Argument(help="raw, delta, image, contact, force, shape, status, info or truth.")],
+    topic: Annotated[
+        str, typer.Argument(help="raw, delta, part, image, contact, force, shape, status, info or truth.")
+    ],
     skin: SkinOption = "",
     count: Annotated[int, typer.Option("--count", "-n", help="Leave after so many frames; 0: never.")] = 0,
     timeout: Annotated[float, typer.Option(help="Give up after so many seconds without a frame; 0: never.")] = 10.0,
