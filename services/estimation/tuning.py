@@ -1,4 +1,6 @@
-"""Every number of the estimation, with its unit, its meaning and where it comes from.
+"""The numbers that the hypotheses share, each with its unit, its meaning and where it comes from.
+
+What one check alone uses (how many frames in a row, how far off a line) stands at the top of that check's file.
 
 `origin` is "sheet": data of the board or the foam; "prior": what is expected of touches; "measured": found on frames; a
 program in bench/: it chose the number, on the scenes it names. Lengths are model units (half a side of the square
