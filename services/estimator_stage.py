@@ -101,7 +101,9 @@ class EstimatorStage(Stage):
         if name != "tare":
             return super().command(name, args)
         try:
-            baseline = self.baseline_estimator.tare(self.touch_estimator.touched, force=bool(args.get("force", False)))
+            # A baseline with which frames are of no touch is wrong, and so is its word that something touches.
+            force = bool(args.get("force", False)) or self._impossible_ns > 0
+            baseline = self.baseline_estimator.tare(self.touch_estimator.touched, force)
         except NoBaseline as why:
             raise Refused(str(why)) from None
         self._begin_anew()

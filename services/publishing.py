@@ -26,6 +26,7 @@ from protocol.held import ANY, HeldImage
 from services.contacts.contact_writer import ContactWriter, class_probabilities, confidence
 from services.contacts.following import Following
 from services.contacts.force import ForceLaw
+from services.contacts.invalid_spell import InvalidSpell
 from services.contacts.last_image import LastImage
 from services.contacts.lasting import LastingStates
 from services.contacts.motion import Patch, Track
@@ -76,6 +77,7 @@ class Publishing(Stage):
         self.last_image.forget()
         self._forget()
         self._counters = {"frames": 0, "contacts": 0, "unknown": 0, "refined": 0, "disagreed": 0}
+        self._invalid = InvalidSpell()
 
     def new_session(self) -> None:
         self.tracker = Tracker()
@@ -149,6 +151,7 @@ class Publishing(Stage):
         if any(self.law.impossible(*each) for each in self._drops()) and not explained:
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
+        self._invalid(out.valid, [r for r in out.reasons if r not in HARMLESS], frame.stamps.get("sample", 0))
         if frame.part and out.valid:
             out.contacts = self.lasting(out.contacts, frame.stamps.get("sample", 0))
         frames: list[Frame] = [out]
@@ -314,7 +317,8 @@ class Publishing(Stage):
         self._geometry = (metres_per_pixel, origin)
 
     def health(self) -> Health:
-        return Health("OK", [], dict(self._counters))
+        problem = self._invalid.problem
+        return Health("WARN" if problem else "OK", [problem] if problem else [], dict(self._counters))
 
 
 def _sound(frame: ImageFrame) -> bool:

@@ -49,14 +49,19 @@ ROWS: tuple[Column, ...] = (
 HISTORY = tuple(column for column in ROWS if column[1] not in ("floor_%", "of_floor", "known_force_%"))
 AS_WITHOUT, AS_FORCE = 2.0, 1.3  # "as without drift": percentage points of touches found, ratio of force errors
 
-# What held in the quick form on 22 November 2026, by the goal's key: to be tightened as the figures get better. Goals
-# that are not here have no gate yet.
+# What held in the quick form on 23 November 2026, by the goal's key: to be tightened as the figures get better. Shares
+# of invalid frames have no target, and so no gate.
 GATES = {
     **{f"{state} {what}": 0 for state in ("cold", "lost", "aged") for what in ("wrong", "late")},
     "gains untouched false": 0,
     "gains untouched late": 0,
     "gains held false": 0,
     "gains held late": 0,
+    "rows found": 98,
+    "rows force": 15,
+    "rows floor": 1.3,
+    "rows known": 8,
+    "rows false": 0,
     "history found": AS_WITHOUT,
     "history force": AS_FORCE,
     "history false": 0,

@@ -59,7 +59,7 @@ def goals(found: dict[str, Any]) -> list[Goal]:
     fade = found["fade_%"]
     return [
         Goal("position error, median, % of the side", row["position_%"], at_most=1.5, gate=1.5),
-        Goal("force error, median, %", row["force_%"], at_most=8.0, gate=16.0),
+        Goal("force error, median, %", row["force_%"], at_most=7.0, gate=16.0),
         Goal("id switches per 100 touches", per_100, at_most=1.0, gate=10.0),
         Goal("false touches", row["false_touches"], at_most=0, gate=5),
         Goal(f"electrode faults not named within {NAMED_WITHIN} frames, of {len(faults)}", late, at_most=0),

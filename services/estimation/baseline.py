@@ -192,8 +192,17 @@ class BaselineEstimator:
         self._use(baseline)
 
     def tare(self, touched: bool, force: bool) -> Baseline:
-        """A new baseline from the last frames. Raises NoBaseline if they disagree, or while touched (unless forced)."""
+        """A new baseline from the last frames. Raises NoBaseline if they disagree, or while touched (unless forced).
+
+        At the start the bundle's word that something touches counts, too: a baseline of a touched skin would hide that
+        touch in valid frames.
+        """
         needed = self.window.frames
+        if self.touched_at_start and not force:
+            raise NoBaseline(
+                "the skin is touched, and has been since the start: free it, and it is valid without a command (or "
+                "--force, if nothing touches it)"
+            )
         sure = self.baseline is not None and not self.baseline.doubt  # else its word against a touch counts for nothing
         if sure and not force and len(self.window) == needed:
             if touched:

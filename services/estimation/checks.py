@@ -23,6 +23,9 @@ def skipped(bundle: Bundle) -> dict[str, str]:
         found["contacts that change"] = nothing_predicted if measured else "not all pairs sense where they drive"
     if measured or own.sum() < len(own) / 2:
         found["changes that no touch can make"] = nothing_predicted if measured else "few pairs sense where they drive"
+    if measured:
+        for check in ("touches at the first start", "drift under a touch", "touches that change during a scan"):
+            found[check] = nothing_predicted
     return found
 
 

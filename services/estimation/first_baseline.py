@@ -16,7 +16,7 @@ UNSURE = (
     "this skin differs from its bundle by as much as a touch may make: see that nothing touches it and run `skin tare` "
     "once"
 )
-PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare`"
+PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare --force`"
 
 
 class FirstBaseline(NamedTuple):

@@ -99,7 +99,7 @@ COMMANDS = (
     ),
     Row("skin fault", "ends", says="electrode_open"),
     Row("skin release", "ends", says="nothing touches"),
-    Row("skin tare", "ends", says="new baseline from 64 frames"),
+    Row(r"skin tare( --force)?", "ends", says="new baseline from 64 frames"),
     Row("(./)?skin doctor", "ends", says="OK +configuration"),
     Row(
         "python -m firmware_stub",

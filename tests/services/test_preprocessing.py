@@ -76,14 +76,23 @@ def test_a_touch_at_the_start_is_named_and_ends_without_a_command(stage: Preproc
     assert outs[-1].valid and not outs[-1].touched and stage.health().level == "OK"
 
 
-def test_a_tare_on_command_is_believed_whatever_the_start_says(stage: Preprocessing, board: Board) -> None:
+def test_a_tare_under_a_touch_that_the_start_found_is_refused_and_ends_by_another(
+    stage: Preprocessing, board: Board
+) -> None:
+    """Its frames would be valid and hide the touch. Who forces it is believed, and needs no force to be rid of it."""
     touch = 3 * board.disc(0.5, -0.3, 0.3, 0.5)
     for _ in range(80):
         run(stage, board.frame(touch))
-    stage.command("tare", {})
+    with pytest.raises(Refused, match="free it"):
+        stage.command("tare", {})
+    assert run(stage, board.frame(touch)).reasons == ["touched_at_start"]
+    stage.command("tare", {"force": True})
     assert run(stage, board.frame(touch)).valid
-    out = [run(stage, board.frame()) for _ in range(3)][-1]  # no touch lowers an impedance
-    assert not out.valid and "out_of_distribution" in out.reasons
+    outs = [run(stage, board.frame()) for _ in range(80)]  # no touch lowers an impedance
+    assert all(not out.valid and "out_of_distribution" in out.reasons for out in outs)
+    stage.command("tare", {})
+    out = run(stage, board.frame())
+    assert out.valid and not out.touched
 
 
 def test_a_skin_unlike_its_bundle_is_not_valid_until_one_tare(stage: Preprocessing, board: Board) -> None:
@@ -559,6 +568,9 @@ def test_what_a_bundle_cannot_tell_follows_from_its_pattern(bundle: Bundle) -> N
         "exchanged wires and stuck multiplexers",
         "contacts that change",
         "changes that no touch can make",
+        "touches at the first start",
+        "drift under a touch",
+        "touches that change during a scan",
     ]
 
 

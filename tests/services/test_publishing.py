@@ -296,3 +296,15 @@ def test_a_doubtful_shape_is_named_with_its_probability(stage: Publishing) -> No
 def _shoelace(polygon: list[list[float]]) -> float:
     x, y = np.array(polygon).T
     return float(0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+
+
+def test_frames_that_stay_invalid_are_a_warning(stage: Publishing) -> None:
+    """For `skin status` and `skin doctor`: each process may be well, and still nobody learns of a touch."""
+    for scan in range(1, 130):
+        frame = image_frame(NOTHING, scan)
+        frame.valid, frame.reasons = False, ["out_of_distribution"]
+        contacts(stage, frame)
+    health = stage.health()
+    assert health.level == "WARN" and "out_of_distribution" in health.messages[0]
+    contacts(stage, image_frame(NOTHING, 130))
+    assert stage.health().level == "OK"
