@@ -27,7 +27,7 @@ STAMPS = ("sample", "read", "preprocess", "infer", "publish")
 SOURCES = ("board", "stub", "replay")
 REASONS = {
     "stale_baseline": "the baseline is too old or does not fit: tare",
-    "touched_at_start": "something touches the skin since the service began: free it; `tare --force` if nothing does",
+    "touched_at_start": "something has touched the skin since the service began: free it, or tare if nothing touches",
     "saturated": "a measurement was beyond what the board measures: converter clipped, or RTIA overrange",
     "fifo": "the board lost or mixed up measurements: FIFO error or missed interrupt",
     "electrode_open": "an electrode has no contact with the skin",

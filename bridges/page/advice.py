@@ -2,7 +2,7 @@
 
 ADVICE = {
     "stale_baseline": "Take everything off the skin and press Tare.",
-    "touched_at_start": "Take everything off the skin. If nothing touches it, run `skin tare --force`.",
+    "touched_at_start": "Take everything off the skin. If nothing touches it, press Tare.",
     "saturated": "Look for a short or a loose wire at the board; a lighter touch may do, too.",
     "fifo": "Wait: the next scans should be whole. If it goes on, power-cycle the board.",
     "electrode_open": "Look at the wire of the electrode marked open, and press it on.",

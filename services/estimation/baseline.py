@@ -15,7 +15,7 @@ from services.estimation.drift import DriftRates
 from services.estimation.drift_filter import DriftFilter
 from services.estimation.drift_in_touch import drifted, explain
 from services.estimation.evidence import Explanation, TouchEvidence, evidence_of
-from services.estimation.first_baseline import PRESSED, first_baseline
+from services.estimation.first_baseline import first_baseline
 from services.estimation.references import References
 from services.estimation.tare import Baseline, NoBaseline, noisy, plausible_noise, saved_noise
 from services.estimation.tare_window import TareWindow
@@ -57,7 +57,7 @@ class BaselineEstimator:
         self.undated_s = 0.0  # age of a baseline that an earlier process took, until the first frame
         self.news = False  # whether there is another baseline, or much drift was followed, since somebody kept it
         self.problem = ""  # what stands in the way of valid frames, for a person
-        self.touched_at_start = False
+        self.touched_at_start = self._surely_touched = False
         self.trusted: Baseline | None = None  # the last one without doubt: it judges the start, if it is of this board
         self._use(None)
 
@@ -109,9 +109,9 @@ class BaselineEstimator:
         """Use the first baseline, unless something touches: whether there is one now."""
         trusted = self.trusted if self.trusted is not None and self.trusted.board == found.board else None
         first = first_baseline(found, trusted, self.evidence)
-        self.touched_at_start = first.touched
+        self.touched_at_start, self._surely_touched = first.touched, first.surely
         if first.baseline is None:
-            self.problem = PRESSED
+            self.problem = first.problem
             return False
         self.set_baseline(first.baseline, self.last_sample_ns)
         if first.drift is not None:
@@ -194,11 +194,11 @@ class BaselineEstimator:
     def tare(self, touched: bool, force: bool) -> Baseline:
         """A new baseline from the last frames. Raises NoBaseline if they disagree, or while touched (unless forced).
 
-        At the start the bundle's word that something touches counts, too: a baseline of a touched skin would hide that
+        Where a touch explains the skin at the start, that counts, too: a baseline of a touched skin would hide the
         touch in valid frames.
         """
         needed = self.window.frames
-        if self.touched_at_start and not force:
+        if self._surely_touched and not force:
             raise NoBaseline(
                 "the skin is touched, and has been since the start: free it, and it is valid without a command (or "
                 "--force, if nothing touches it)"
@@ -237,7 +237,7 @@ class BaselineEstimator:
             self.sigma = self.baseline.sigma / self.normaliser
             self.news = True
             self.problem = baseline.doubt
-            self.touched_at_start = False
+            self.touched_at_start = self._surely_touched = False
             if not baseline.doubt:
                 self.trusted = self.baseline
 

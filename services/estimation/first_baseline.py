@@ -16,13 +16,15 @@ UNSURE = (
     "this skin differs from its bundle by as much as a touch may make: see that nothing touches it and run `skin tare` "
     "once"
 )
-PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare --force`"
+PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare{}`"
 
 
 class FirstBaseline(NamedTuple):
     touched: bool
     baseline: Baseline | None  # None: something touches, and hides the untouched skin
     drift: NDArray[np.float64] | None = None  # of a trusted baseline since it was taken: it is to be moved by it
+    problem: str = ""  # where there is no baseline: why, and what to do
+    surely: bool = False  # whether the touch explains the skin: a tare's word does not count against it
 
 
 def first_baseline(found: Baseline, trusted: Baseline | None, evidence: TouchEvidence) -> FirstBaseline:
@@ -33,5 +35,5 @@ def first_baseline(found: Baseline, trusted: Baseline | None, evidence: TouchEvi
         unsure = start.verdict is StartVerdict.UNKNOWN and not found.doubt
         return FirstBaseline(False, dataclasses.replace(found, doubt=UNSURE) if unsure else found)
     if trusted is None or start.explanation is None or not start.explanation.fits:
-        return FirstBaseline(True, None)
+        return FirstBaseline(True, None, problem=PRESSED.format(" --force" * start.sure), surely=start.sure)
     return FirstBaseline(True, dataclasses.replace(trusted, sigma=found.sigma), start.explanation.drift)

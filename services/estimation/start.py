@@ -23,6 +23,11 @@ from services.estimation.tuning import TUNING, Tuning
 Array = NDArray[np.float64]
 
 LADDER = 2.0 ** np.arange(9)  # of the mismatch: up to 256 times the least
+SURE_MISMATCH, SURE_LEFT = 16.0, 3.0
+"""A touch surely explains the skin where it needs no more mismatch beside it, and leaves no more times what is expected
+(tests/services/test_estimation_evidence.py). Touches like those of the training need 16 and leave 2.9 at most. Skins
+that nothing touches and that are not as in their file need 64 or leave 3.4, at least.
+"""
 
 
 class StartVerdict(Enum):
@@ -34,6 +39,7 @@ class StartVerdict(Enum):
 class StartJudgement(NamedTuple):
     verdict: StartVerdict
     odds: float  # nats: log evidence of touched against untouched
+    sure: bool  # whether a touch explains the skin, and not only better than mismatch alone does
     mismatch: float  # times the least one: the likeliest, of an untouched skin
     explanation: Explanation | None  # under the likeliest mismatch of a touched skin; drift is relative to `expected`
     expected: Array | None  # (K,) ohm: |Z0| that the frames were held against
@@ -54,12 +60,12 @@ def judge_start(
     """
     physics = evidence.physics
     if trusted is None and not physics.signed:
-        return StartJudgement(StartVerdict.UNKNOWN, 0.0, float("inf"), None, None, None)
+        return StartJudgement(StartVerdict.UNKNOWN, 0.0, False, float("inf"), None, None, None)
     live = np.isfinite(z0) & (z0 > 0) & np.isfinite(sigma)
     if trusted is not None:
         live &= np.isfinite(trusted) & (trusted > 0)
     if live.sum() < len(z0) / 2:
-        return StartJudgement(StartVerdict.UNKNOWN, 0.0, float("inf"), None, None, None)
+        return StartJudgement(StartVerdict.UNKNOWN, 0.0, False, float("inf"), None, None, None)
     expected = physics.z0 if trusted is None else trusted
     gain = float(np.median(z0[live] / expected[live]))
     # Scale and contacts are what a gain of 1 leaves; a trusted skin's own gain is part of its drift.
@@ -87,7 +93,10 @@ def judge_start(
         verdict = StartVerdict.TOUCHED
     elif odds < 0 and mismatch <= tuning.mismatch_most:
         verdict = StartVerdict.UNTOUCHED
-    return StartJudgement(verdict, odds, mismatch, found[int(touched.argmax())], expected, prior)
+    best = int(touched.argmax())
+    sure = bool(rungs[best] <= SURE_MISMATCH) and found[best].left < SURE_LEFT * found[best].measurements
+    sure &= verdict is StartVerdict.TOUCHED
+    return StartJudgement(verdict, odds, sure, mismatch, found[best], expected, prior)
 
 
 def _rungs(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.forward import shared
+from models.mismatch import MismatchedSheet, named
 from models.prereconstruction import Drift
 from models.shapes import Shape
 from services.estimation.evidence import TouchEvidence
@@ -186,3 +187,34 @@ def test_a_measured_bundle_has_no_prediction_to_start_from() -> None:
     evidence = TouchEvidence(SkinPhysics.of(bundle.matrices))
     z = np.asarray(bundle.z0, dtype=float)
     assert judge_start(z, 1e-4 * z, evidence).verdict is StartVerdict.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    "touches",
+    [
+        (Shape("circle", 0.4, -0.2, 0.1, 0.2),),
+        (Shape("circle", 0.85, 0.1, 0.1, 0.3),),
+        (Shape("L", 0.1, 0.5, 0.4, 0.5, 0.7),),
+        (Shape("circle", -0.4, -0.4, 0.2, 0.4), Shape("circle", 0.5, 0.5, 0.2, 0.3)),
+    ],
+    ids=lambda touches: "-".join(shape.kind for shape in touches),
+)
+def test_a_touch_surely_explains_a_start_under_it(
+    evidence: TouchEvidence, solved: Callable[..., Array], touches: tuple[Shape, ...]
+) -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(2):
+        z = solved(*touches, contact=np.exp(0.3 * rng.standard_normal(16)))
+        found = judge_start(noisy(z, rng, FRAMES), z * NOISE / np.sqrt(FRAMES), evidence)
+        assert found.verdict is StartVerdict.TOUCHED and found.sure
+
+
+@pytest.mark.parametrize("name", ["mild", "field5", "field10", "shift1", "shift3", "anisotropy15", "contacts"])
+@pytest.mark.parametrize("seed", [1, 3])
+def test_no_touch_surely_explains_a_skin_that_is_not_as_in_its_file(
+    evidence: TouchEvidence, name: str, seed: int
+) -> None:
+    """So that its first tare, which fits how it is mounted, is taken without force."""
+    z = np.abs(MismatchedSheet("square16", named(name).seeded(seed), "stub").solve().impedances())
+    found = judge_start(noisy(z, np.random.default_rng(seed), FRAMES), z * NOISE / np.sqrt(FRAMES), evidence)
+    assert found.verdict is not StartVerdict.UNTOUCHED and not found.sure
