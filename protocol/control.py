@@ -33,6 +33,9 @@ QUEUE = 8
 BUSY = 100
 """Requests a second from which on status speaks of a flood. They are answered one at a time, frames come first."""
 
+OFTEN = ("part",)
+"""Commands that a replay gives after each part of a scan. Where the peer may give them they are no flood."""
+
 SPOKEN_OF_S = 5.0
 
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
@@ -112,8 +115,8 @@ class ControlServer:
         except zmq.Again:
             return False
         peer = peer_of(frames[-1], self._listening.secured)
-        self._count(peer)
         if len(frames) < 3 or frames[-2].bytes != b"":
+            self._count(peer)
             self.malformed += 1
             return True
         try:
@@ -158,15 +161,18 @@ class ControlServer:
             if not isinstance(command, str) or not isinstance(args, dict):
                 raise FrameError("control", "command, args", f"{brief(command)}, {type(args).__name__}", "text, map")
         except FrameError as bad:
+            self._count(peer)
             self.malformed += 1
             return _refusal("bad_request", str(bad))
-        handler = self.handlers.get(command)
+        handler, forbidden = self.handlers.get(command), self._forbidden(command, peer)
+        if handler is None or forbidden or command not in OFTEN:
+            self._count(peer)
         if handler is None:
             return _refusal(
                 "unknown_command",
                 f"{self.process} has no command {command[:64]!r}; it has: {', '.join(sorted(self.handlers))}",
             )
-        if forbidden := self._forbidden(command, peer):
+        if forbidden:
             return _refusal("forbidden", forbidden)
         try:
             return _packed({"ok": True, "result": handler(args) or {}})

@@ -1,12 +1,13 @@
 """Reaction: from the instant a touch begins, or ends, to the contact frame that says so, live on the stub's board.
 
     skin bench reaction [--steps 500] [--modes full rolling] [--simulated] [--quick]
+    skin bench reaction --steps 100 --more    so many other touches, added to those of the last report
 
 Real processes and a plain controller. The stub plays a scene that it has solved beforehand and says when it began, so
 every onset is known on this host's clock. A touch is seen with the first valid frame, neither `changing` nor `coarse`,
 from which every frame until the release is within 3 % of the side. --simulated: board and stages in one process and in
 simulated time, 2 ms after the board's last byte, whatever else the machine does. Prints the tables, writes
-reaction.json and reaction.png.
+reaction.json and reaction.png, or reaction_simulated.json and reaction_simulated.png.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from bench import goals as _goals
 from bench.json_file import write_json
 from bench.machine import provenance
 from bench.speed.reaction_events import SIDE_M, Reaction, SeenFrame, TouchEvent, events, react, scene
+from bench.speed.reaction_pieces import Piece, joined, keep, kept, piece_seed
 from bench.speed.reaction_report import (
     FAST_RAMP,
     LIGHT,
@@ -43,6 +45,7 @@ from bench.speed.reaction_report import (
 )
 from bench.speed.service import Service, end_on_sigterm, running
 from bench.speed.simulated_host import SimulatedHost
+from models import manifest
 from protocol.frames import ContactFrame, unpack
 from protocol.sockets import ControlClient
 from protocol.transport import Context
@@ -145,17 +148,21 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES))
     parser.add_argument("--simulated", action="store_true", help="in simulated time, without processes")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--more", action="store_true", help="add so many other touches to those of the last report")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} steps and a few of the others")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()
-    share = (QUICK if args.quick else args.steps) / STEPS
-    wanted = {STEP: STEPS, LIGHT: STEPS // 5, FAST_RAMP: RAMPS, SLOW_RAMP: RAMPS, **dict.fromkeys(SLIDING, SLIDES)}
-    found, late, load = {}, {}, [os.getloadavg()[0]]
-    for mode in args.modes:  # each on the same touches
-        counts = {name: max(2, round(n * share)) for name, n in wanted.items()}
-        found[mode], late[mode] = (simulated if args.simulated else measured)(mode, counts, args.seed)
-        load.append(os.getloadavg()[0])
+    name, before = "reaction_simulated" if args.simulated else "reaction", list[Piece]()
+    if args.more:
+        try:
+            before = kept(name, args.seed, args.modes)
+        except ValueError as why:
+            parser.error(str(why))
+    pieces = [*before, _piece(args, len(before))]
+    if not args.quick:
+        keep(pieces, name)
+    found, late = joined(pieces)
     result = [row for mode, each in found.items() for row in rows(mode, each)]
     Console(width=190).print(table(result))
     honest = [row for mode, each in found.items() for row in stated(mode, each)]
@@ -163,18 +170,33 @@ def main(argv: list[str] | None = None) -> int:
     listed = goals(result, late)
     Console(width=150).print(_goals.table(listed))
     report = {**provenance("reaction", argv), "targets": [goal.to_dict() for goal in listed], "rows": result}
-    report |= {"stated": honest}
-    report |= {"steps": counts[STEP], "seed": args.seed, "load": load}
-    report |= {"late_poses": late, "side_m": SIDE_M, "simulated": args.simulated}
+    report |= {"stated": honest, "runs": [piece.row() for piece in pieces]}
+    report |= {"side_m": SIDE_M, "simulated": args.simulated}
     report |= {
         "contact_ms": {m: [1e3 * r.contact_s for e, r in each if e.kind.name == STEP] for m, each in found.items()}
     }
-    write_json(args.out / "reaction.json", report)
-    draw(found, args.out / "reaction.png")
-    busy = " to ".join(f"{each:.1f}" for each in (min(load), max(load)))
-    print(f"{counts[STEP]} steps a scan, {sum(late.values())} late poses; load of the machine {busy}")
-    print(f"wrote {args.out / 'reaction.json'} and reaction.png")
+    write_json(args.out / f"{name}.json", report)
+    draw(found, args.out / f"{name}.png")
+    for said in report["runs"]:
+        print(
+            f"{said['steps']} steps a scan, {sum(said['late_poses'].values())} late poses; "
+            f"load of the machine {said['load'][0]:.1f} to {said['load'][1]:.1f}"
+        )
+    print(f"wrote {args.out / name}.json and {name}.png")
     return 0
+
+
+def _piece(args: argparse.Namespace, number: int) -> Piece:
+    """One run."""
+    steps = QUICK if args.quick else args.steps
+    wanted = {STEP: STEPS, LIGHT: STEPS // 5, FAST_RAMP: RAMPS, SLOW_RAMP: RAMPS, **dict.fromkeys(SLIDING, SLIDES)}
+    counts = {name: max(2, round(n * steps / STEPS)) for name, n in wanted.items()}
+    piece = Piece(piece_seed(args.seed, number), counts[STEP], load=[os.getloadavg()[0]], commit=manifest.commit())
+    for mode in args.modes:  # each on the same touches
+        run = simulated if args.simulated else measured
+        piece.found[mode], piece.late[mode] = run(mode, counts, piece.seed)
+        piece.load.append(os.getloadavg()[0])
+    return piece
 
 
 if __name__ == "__main__":

@@ -14,6 +14,8 @@ import argparse
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +32,7 @@ from bench.json_file import write_json
 from bench.machine import machine, provenance
 from bench.speed.service import Outside, Service, end_on_sigterm, running
 from bench.speed.skip import scenes
-from bench.tracking.scene import Recorded
-from protocol.frames import pack
+from protocol.frames import RawFrame, pack
 from protocol.transport import Context
 from services.recordings.recording import RecordingWriter
 from services.runtime.stage import PROCESSES
@@ -46,29 +47,82 @@ STATUS_S = 1.5  # for the last status frames to tell what was dropped
 def recordings(folder: Path, n: int, touched: float, seconds: float) -> tuple[Path, int, float]:
     """n recordings and the skin.toml that plays them: its path, how many are touched, their frames a second."""
     of = scenes(seconds, START_S)
+    frames = {name: [recorded.frame(k) for k in range(len(recorded))] for name, recorded in of.items()}
+    path, moving = written(folder, n, touched, frames, 1 / RATE_HZ, "")
+    return path, moving, 1 / float(np.median(np.diff(of["untouched"].seconds)))
+
+
+def written(
+    folder: Path, n: int, touched: float, frames: Mapping[str, Sequence[RawFrame]], period_s: float, settings: str
+) -> tuple[Path, int]:
+    """The skin.toml that plays recordings of `frames["moving"]` and `frames["untouched"]`, each at a phase of its own
+    within period_s, and how many of the n are touched. settings: further lines of TOML of each skin.
+    """
     lines, moving = [], [(k + 0.5) * touched % 1 < touched and touched > 0 for k in range(n)]
     for k in range(n):
-        recorded = of["moving" if moving[k] else "untouched"]
         name = f"s{k:02d}"
-        _write(folder / f"{name}.mcap", name, recorded, phase_s=(k * 0.618) % 1 / RATE_HZ)
-        lines.append(f'[skins.{name}]\nport = "{folder / name}.mcap"\nbundle = "square16"\n')
+        _write(
+            folder / f"{name}.mcap", name, frames["moving" if moving[k] else "untouched"], (k * 0.618) % 1 * period_s
+        )
+        lines.append(f'[skins.{name}]\nport = "{folder / name}.mcap"\nbundle = "square16"\n{settings}')
     path = folder / "skin.toml"
     path.write_text("\n".join(lines))
-    return path, sum(moving), 1 / float(np.median(np.diff(of["untouched"].seconds)))
+    return path, sum(moving)
 
 
-def _write(path: Path, skin: str, recorded: Recorded, phase_s: float) -> None:
+def _write(path: Path, skin: str, frames: Sequence[RawFrame], phase_s: float) -> None:
     with RecordingWriter(path) as writer:
-        for k in range(len(recorded)):
-            frame = recorded.frame(k)
-            frame.skin = skin
-            frame.stamps["sample"] += round(phase_s * 1e9) * (k > 0)
-            topic, _, body = pack(frame).partition(b"\0")
-            writer.write(topic.decode(), body, frame.stamps["sample"])
+        for k, frame in enumerate(frames):
+            later = {**frame.stamps, "sample": frame.stamps["sample"] + round(phase_s * 1e9) * (k > 0)}
+            topic, _, body = pack(replace(frame, skin=skin, stamps=later)).partition(b"\0")
+            writer.write(topic.decode(), body, later["sample"])
 
 
-def measure(service: Service, n: int, seconds: float, rate_hz: float) -> dict[str, Any]:
-    """What one controller that takes everything sees of n skins."""
+@dataclass(frozen=True)
+class Said:
+    """What a process said of a skin: in the last status before the measurement, and in the newest one."""
+
+    first: dict[str, Any]
+    last: dict[str, Any]
+
+    @property
+    def seconds(self) -> float:
+        """Between the two."""
+        return (self.last["stamps"]["publish"] - self.first["stamps"]["publish"]) * 1e-9
+
+    @property
+    def dropped(self) -> int:
+        return int(sum(self.last["drops"].values()) - sum(self.first["drops"].values()))
+
+    def counted(self, name: str) -> int:
+        return int(self.last.get("counters", {}).get(name, 0) - self.first.get("counters", {}).get(name, 0))
+
+
+@dataclass
+class Traffic:
+    """What one controller that takes everything saw within the seconds measured."""
+
+    latency_ms: list[float]
+    seen: Counter[str]  # contact frames, by skin
+    missing: int  # between those seen, by their numbers
+    said: dict[tuple[str, str], Said]  # by process and skin
+    cores: dict[str, float]
+    memory_mb: dict[str, float]
+
+    def row(self) -> dict[str, Any]:
+        """What is reported of any traffic."""
+        return {
+            "skins_seen": len(self.seen),
+            "frames": self.seen.total(),
+            "p50_ms": float(np.percentile(self.latency_ms or [np.inf], 50)),
+            "p99_ms": float(np.percentile(self.latency_ms or [np.inf], 99)),
+            "cores": sum(self.cores.values()),
+            "cores_by_process": self.cores,
+            "memory_mb": self.memory_mb,
+        }
+
+
+def listen(service: Service, seconds: float) -> Traffic:
     socket = Context.instance().socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, 100_000)
     for process in PROCESSES:
@@ -76,8 +130,9 @@ def measure(service: Service, n: int, seconds: float, rate_hz: float) -> dict[st
     for topic in (b"contact/", b"status/"):
         socket.subscribe(topic)
     latency: list[float] = []
-    seen = Counter[str]()
-    dropped: dict[tuple[str, str], list[int]] = {}  # said by status frames: the last before we count, those after
+    seen, numbers, missing = Counter[str](), dict[str, int](), 0
+    first: dict[tuple[str, str], dict[str, Any]] = {}
+    last: dict[tuple[str, str], dict[str, Any]] = {}
     cpu: dict[str, float] = {}
     began = time.monotonic() + STATUS_S
     while (now := time.monotonic()) < began + seconds + STATUS_S:
@@ -91,31 +146,35 @@ def measure(service: Service, n: int, seconds: float, rate_hz: float) -> dict[st
         frame = msgpack.unpackb(body)
         if name.startswith(b"status/"):
             key = frame["process"], frame["skin"]
-            counts = dropped.setdefault(key, [])
-            if now < began:
-                counts.clear()
-            counts.append(sum(frame["drops"].values()))
-        elif began <= now < began + seconds:
-            seen[frame["skin"]] += 1
-            latency.append((at - frame["stamps"]["read"]) * 1e-6)
+            last[key] = frame
+            if now < began or key not in first:
+                first[key] = frame
+        else:
+            missing += frame["seq"] - numbers.get(frame["skin"], frame["seq"] - 1) - 1
+            numbers[frame["skin"]] = frame["seq"]
+            if began <= now < began + seconds:
+                seen[frame["skin"]] += 1
+                latency.append((at - frame["stamps"]["read"]) * 1e-6)
     took = time.monotonic() - began
-    used = {name: seconds_used - cpu[name] for name, seconds_used in service.cpu_s().items()}
+    cores = {name: (used - cpu[name]) / took for name, used in service.cpu_s().items()}
     socket.close(0)
-    frames = seen.total()
+    said = {key: Said(first[key], last[key]) for key in first}
+    memory_mb = {name: used / 1e6 for name, used in service.memory_bytes().items()}
+    return Traffic(latency, seen, missing, said, cores, memory_mb)
+
+
+def measure(service: Service, n: int, seconds: float, rate_hz: float) -> dict[str, Any]:
+    """What one controller that takes everything sees of n skins."""
+    traffic = listen(service, seconds)
+    frames = traffic.seen.total()
     expected = max(frames, n * (int(rate_hz * seconds) - 1))  # one may lie on the window's edge
-    reported = sum(counts[-1] - counts[0] for counts in dropped.values())
+    reported = sum(said.dropped for said in traffic.said.values())
     return {
         "skins": n,
-        "skins_seen": len(seen),
-        "frames": frames,
+        **traffic.row(),
         "lost": (expected - frames) / max(expected, 1),
         "reported_dropped": reported,
         "unreported": max(0, expected - frames - reported) / max(expected, 1),
-        "p50_ms": float(np.percentile(latency or [np.inf], 50)),
-        "p99_ms": float(np.percentile(latency or [np.inf], 99)),
-        "cores": sum(used.values()) / took,
-        "cores_by_process": {k: v / took for k, v in used.items()},
-        "memory_mb": {k: v / 1e6 for k, v in service.memory_bytes().items()},
     }
 
 
@@ -123,11 +182,11 @@ def scaled(n: int, touched: float, seconds: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="eitskin-scale") as folder:
         path, moving, rate_hz = recordings(Path(folder), n, touched, seconds + 2 * STATUS_S + MARGIN_S)
         with running("--config", str(path), skin="s00") as service:
-            _wait_for_touch(service, touched)
+            wait_for_touch(service, touched)
             return {"touched": moving / n, **measure(service, n, seconds, rate_hz)}
 
 
-def _wait_for_touch(service: Service, touched: float) -> None:
+def wait_for_touch(service: Service, touched: float) -> None:
     """Wait until the recordings' quiet beginning is over: the first skin is a touched one, if any is."""
     contacts = Outside("contact", "s00", service.folder)
     end = time.monotonic() + START_S + MARGIN_S

@@ -98,6 +98,17 @@ VARIANTS = {
 @lru_cache(maxsize=4)
 def scenes(seconds: float, quiet_s: float = QUIET_S) -> dict[str, Recorded]:
     """The three scenes in simulated time; nothing touches for quiet_s."""
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, script in scripts(seconds, quiet_s).items():
+            path = Path(folder, f"{name}.toml")
+            path.write_text(script)
+            found[name] = record(str(path), 80.0, 3, quiet_s + seconds)[0]
+    return found
+
+
+def scripts(seconds: float, quiet_s: float = QUIET_S) -> dict[str, str]:
+    """The TOML of the three scenes."""
     end = quiet_s + seconds
     keys = {
         "untouched": [],
@@ -107,13 +118,7 @@ def scenes(seconds: float, quiet_s: float = QUIET_S) -> dict[str, Recorded]:
             for s in np.arange(0, seconds - ENDS_S + 1e-9, 0.25)
         ],
     }
-    found = {}
-    with tempfile.TemporaryDirectory() as folder:
-        for name, points in keys.items():
-            path = Path(folder, f"{name}.toml")
-            path.write_text(_toml(points, end))
-            found[name] = record(str(path), 80.0, 3, end)[0]
-    return found
+    return {name: _toml(points, end) for name, points in keys.items()}
 
 
 def _toml(points: list[dict[str, Any]], end: float) -> str:

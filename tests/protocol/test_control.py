@@ -7,6 +7,7 @@ import msgpack
 import pytest
 import zmq
 
+from protocol.control import BUSY
 from protocol.runtime import control_endpoint
 from protocol.sockets import ControlClient, ControlError, ControlServer, clock_offset
 
@@ -117,6 +118,26 @@ def test_any_req_socket_can_ask_and_nonsense_is_refused(server, context):
     dealer.send(b"no delimiter")
     assert not dealer.poll(100)
     assert server.malformed == 6
+
+
+def test_what_a_replay_asks_after_each_part_is_no_flood(runtime, context):
+    parts = {command: lambda args: {"seen": True} for command in ("part", "status")}
+    control = ControlServer("preprocessing", parts, context=context)
+    socket = context.socket(zmq.REQ)
+    socket.connect(control_endpoint("preprocessing"))
+
+    def ask(command):
+        for _ in range(2 * BUSY + 1):  # of which BUSY are in one second, unless they take more than two
+            socket.send(msgpack.packb({"command": command}))
+            assert control.serve_once(1.0)
+            assert socket.poll(1000) and msgpack.unpackb(socket.recv())["ok"]
+
+    ask("part")
+    assert control.problems == []
+    ask("status")
+    assert "control requests a second" in control.problems[0]
+    socket.close(0)
+    control.close()
 
 
 def test_the_clock_of_another_process(server, context):
