@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from services.estimation.part_image import LEAST, SD, WIDER, PartImage, PartTouch, ellipse, spread_of
+from services.estimation.part_image import AHEAD, LEAST, SD, STENCIL, WIDER, PartImage, PartTouch, ellipse, spread_of
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 RADIUS, DROP = 2, 3  # of a touch: x, y, log radius, log drop, vx, vy
 MODEL = 4  # of them, that d depends on
-AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
 LINEAR = 0.05  # of d: by so much the linear picture of a circle is wrong; by half of it of the rms of d
 STEP = np.array([0.05, 0.05, 0.5, 1.0])  # that one step of a fit does not much exceed
 FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
@@ -49,10 +48,10 @@ class Circles:
 
     def expected(self, touches: Array, rows: Rows, tau: Array) -> tuple[Array, Array]:
         """(n,) d of these measurements, each tau (n,) s after the state, and (n, 6 N) its derivative."""
-        steps = np.concatenate([np.zeros((1, 3)), *(np.outer([1, -1], step) for step in np.diag(AHEAD))])
-        circles = (touches[:, None, :DROP] + steps).reshape(-1, 3)
         drop = np.exp(touches[:, DROP])
-        each = self._image.responses(circles, rows).reshape(len(touches), 7, len(rows)) * drop[:, None, None]
+        each = np.empty((len(touches), len(STENCIL), len(rows)))
+        for k, touch in enumerate(touches):
+            each[k] = self._image.responses(touch[:DROP] + STENCIL, rows) * drop[k]
         slope = np.empty((len(rows), len(touches), 6))
         slope[:, :, :DROP] = ((each[:, 1::2] - each[:, 2::2]) / (2 * AHEAD[:, None])).transpose(2, 0, 1)
         slope[:, :, DROP] = each[:, 0].T

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,27 @@ class PartOnset:
     starts: list[TouchStart]
 
 
+class Responses(NamedTuple):
+    """What each of M touches changes n measurements by, per S/m: (n, M), and its square."""
+
+    change: Array
+    squared: Array
+
+    @classmethod
+    def of(cls, response: Array) -> Responses:
+        """response (M, n)."""
+        change = np.ascontiguousarray(response.T)
+        return cls(change, change**2)
+
+    def at(self, rows: NDArray[np.intp]) -> Responses:
+        """Those of these measurements."""
+        return Responses(self.change[rows], self.squared[rows])
+
+    def only(self, touch: int) -> Responses:
+        """That of one touch."""
+        return Responses(self.change[:, touch : touch + 1], self.squared[:, touch : touch + 1])
+
+
 class PartEvidence:
     """For one bundle. `knows` is false where its differences have no sign: then parts say nothing."""
 
@@ -60,7 +82,7 @@ class PartEvidence:
         m = bundle.matrices
         self.knows = m.normalisation == "model" and parts > 1
         grid = touches(m, bundle.half_width)
-        self._response = np.asarray(grid.response, dtype=np.float64)  # (M, K)
+        self._touches = Responses.of(np.asarray(grid.response, dtype=np.float64))
         self._position, self._radius = np.asarray(grid.position, dtype=np.float64), grid.radius
         self._count = len(bundle.pattern) // parts  # values in a part
         electrodes = int(bundle.pattern.max()) + 1
@@ -70,7 +92,7 @@ class PartEvidence:
     def sigmas(self, d: Array, noise: Array, age: Array, parts: int = 1) -> float:
         """The largest matched filter of so many of the newest parts. d, noise, age: (K,) each."""
         rows = np.argsort(age)[: parts * self._count]
-        return float(_filters(self._response[:, rows], d[rows], noise[rows], np.ones((1, len(rows)))).max())
+        return float(_filters(self._touches.at(rows), d[rows], noise[rows], np.ones((1, len(rows)))).max())
 
     def began(self, d: Array, noise: Array, age: Array, since: float | None = None) -> PartOnset | None:
         """The touch that began within the newest parts, or so long ago as is known; None where that is not sure. since:
@@ -84,7 +106,7 @@ class PartEvidence:
             near = NEAR * float(age[order[self._count]] - age[order[0]])
             rows = order[age[order] < since + near]
             courses = _courses(age[rows], self._count, max(2, int((age[rows] < since - near).sum())))
-        z = _filters(self._response[:, rows], d[rows], noise[rows], courses)
+        z = _filters(self._touches.at(rows), d[rows], noise[rows], courses)
         touch, best = np.unravel_index(int(z.argmax()), z.shape)
         f, found = courses[best], float(z[touch, best])
         if found < SIGMAS or not self._is_touch(d[rows[f > 0]], noise[rows[f > 0]], f[f > 0], rows[f > 0]):
@@ -93,7 +115,7 @@ class PartEvidence:
         for m, h in self._likely(d[rows], noise[rows], courses, rows):
             course = np.zeros(len(d))
             course[rows] = courses[h]
-            unit = self._response[m] * course / noise
+            unit = self._touches.change[:, m] * course / noise
             drop = float(np.clip(unit @ (d / noise) / (unit @ unit + TINY), 0.01, 0.9))
             starts.append(TouchStart(course, np.array([*self._position[m], np.log(self._radius[m]), np.log(drop)])))
         return PartOnset(found, float(age[rows[f > 0]].max()), starts)
@@ -101,7 +123,7 @@ class PartEvidence:
     def goes_on(self, d: Array, noise: Array, course: Array, response: Array) -> float | None:
         """Sigmas of a touch that began, response (K,) per S/m; None where it could be no touch by now."""
         rows = np.flatnonzero(course)
-        d, noise, f, one = d[rows], noise[rows], course[rows], response[None, rows]
+        d, noise, f, one = d[rows], noise[rows], course[rows], Responses.of(response[None, rows])
         found = float(_filters(one, d, noise, f[None]).max())
         return found if found >= SIGMAS and self._is_touch(d, noise, f, rows, one) else None
 
@@ -109,7 +131,7 @@ class PartEvidence:
         """(touch, course) of the likeliest and of those that are nearly as likely, each of another form, or elsewhere:
         a few values may fit two.
         """
-        z = _filters(self._response[:, rows], d, _with_misfit(d, noise), courses).clip(0.0) ** 2
+        z = _filters(self._touches.at(rows), d, _with_misfit(d, noise), courses).clip(0.0) ** 2
         ramp = np.asarray(((courses > 0) & (courses < 1.0)).any(axis=1))
         found: list[tuple[int, int]] = []
         likely = float(z.max()) - 2 * UNLIKELY
@@ -121,12 +143,13 @@ class PartEvidence:
         return found
 
     def _is_touch(
-        self, d: Array, noise: Array, f: Array, rows: NDArray[np.intp], response: Array | None = None
+        self, d: Array, noise: Array, f: Array, rows: NDArray[np.intp], response: Responses | None = None
     ) -> bool:
-        """response (M, n): of the touches that it may be; None: all of the grid."""
-        response, one = self._response[:, rows] if response is None else response, f[None]
+        """response: of the touches that it may be; None: all of the grid."""
+        response, one = self._touches.at(rows) if response is None else response, f[None]
         wide = _with_misfit(d, noise)
-        explained = float(_filters(response, d, wide, one).max()) ** 2
+        z = _filters(response, d, wide, one)[:, 0]
+        explained = float(z.max()) ** 2
         left = float(((d / wide) ** 2).sum()) - explained
         if left > len(d) + 3 * np.sqrt(2 * len(d)) + MISFIT * explained:
             return False
@@ -134,6 +157,8 @@ class PartEvidence:
         if float(_filters(response, d, noise, one).max()) ** 2 < gain + GAIN_MARGIN:
             return False
         outside = self._outside[:, rows] * f
+        if _filters(response.only(int(z.argmax())), d, noise, outside).min() > OUTSIDE_SIGMAS:
+            return True  # this touch alone shows it
         return bool(_filters(response, d, noise, outside).max(axis=0).min() > OUTSIDE_SIGMAS)
 
     def ended(self, d: Array, held: Array, noise: Array, age: Array) -> bool:
@@ -157,12 +182,12 @@ def _with_misfit(d: Array, noise: Array) -> Array:
     return np.asarray(np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * size))
 
 
-def _filters(response: Array, d: Array, noise: Array, courses: Array) -> Array:
-    """(M, H) matched filters of touches (M, n) that took one of the courses (H, n)."""
-    whitened = response / noise
-    along = (whitened * (d / noise)) @ courses.T
-    size = (whitened**2) @ (courses**2).T
-    return np.asarray(along / np.sqrt(np.maximum(size, 1e-12)))
+def _filters(response: Responses, d: Array, noise: Array, courses: Array) -> Array:
+    """(M, H) matched filters of touches that took one of the courses (H, n)."""
+    weight = noise**-2.0
+    along = (courses * (d * weight)) @ response.change
+    size = (courses**2 * weight) @ response.squared
+    return np.asarray(along / np.sqrt(np.maximum(size, 1e-12))).T
 
 
 def _courses(age: Array, count: int, least: int = 2) -> Array:

@@ -29,6 +29,7 @@ MOST_MISFIT = 6.0  # squares left per value, beyond which it is no touch of this
 MOST = np.array([0.1, 0.1, 0.3, 0.5])  # of one step
 TINY = 1e-9  # keeps solvable what nothing depends on, as of a circle off the skin
 AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
+STENCIL = np.array([np.zeros(3), *(sign * step for step in np.diag(AHEAD) for sign in (1, -1))])
 
 
 @dataclass(frozen=True)
@@ -53,14 +54,16 @@ class PartImage:
 
     def __init__(self, bundle: Bundle) -> None:
         m = bundle.matrices
-        self._jacobian = np.asarray(m.jacobian, dtype=np.float64)
         self._inside = np.asarray(m.inside, dtype=np.float64)
+        h, w = m.inside.shape
+        jacobian = np.asarray(m.jacobian, dtype=np.float64)  # (K, P)
+        self._by_pixel = np.ascontiguousarray(jacobian.T).reshape(h, w, -1)  # (H, W, K)
         self.half_width, self.measurements = bundle.half_width, len(bundle.pattern)
         self._grid = touches(m, self.half_width)
-        h, w = m.inside.shape
+        self._of_grid = np.asarray(self._grid.response, dtype=np.float64)  # (M, K)
+        self._of_grid_squared = self._of_grid**2
         self._pixel = 2 * self.half_width / w
-        x, y = ((np.arange(n) + 0.5) * self._pixel - self.half_width for n in (w, h))
-        self._x, self._y = np.meshgrid(x, y)
+        self._x, self._y = ((np.arange(n) + 0.5) * self._pixel - self.half_width for n in (w, h))
         self._fine = bundle.image_size // h
         self.metres_per_unit = bundle.metres_per_pixel * bundle.image_size / (2 * self.half_width)
 
@@ -69,22 +72,24 @@ class PartImage:
         theta, where the likeliest of the grid is not to be looked for.
         """
         rows = np.flatnonzero(np.isfinite(sigma))
-        seen, jacobian = d[rows].astype(float), self._jacobian[rows]
+        seen = d[rows].astype(float)
         noise = np.sqrt(sigma[rows].astype(float) ** 2 + (LINEAR * seen) ** 2 + (LINEAR / 2) ** 2 * (seen**2).mean())
         theta = self._start(rows, seen, noise) if start is None else start
-        cost, left, slope = self._linear(theta, jacobian, seen, noise)
+        cost, left, slope = self._linear(theta, rows, seen, noise)
         information = np.diag([0.0, 0.0, *SD**-2])
         damping = 1e-3
         for _ in range(STEPS):
             hessian = slope.T @ slope + information
             pull = slope.T @ left - np.array([0.0, 0.0, *(SD**-2 * (theta[2:] - MEAN))])
-            damped = hessian + damping * np.diag(np.diag(hessian)) + TINY * np.eye(4)
+            damped = hessian.copy()
+            damped.flat[::5] *= 1 + damping
+            damped.flat[::5] += TINY
             step = np.linalg.solve(damped, pull)
             step *= min(1.0, float((MOST / np.maximum(np.abs(step), 1e-9)).min()))
             there = theta + step
             there[:2] = np.clip(there[:2], -self.half_width, self.half_width)
             there[2:] = np.clip(there[2:], np.log([0.04, 0.005]), np.log([0.9, 0.97]))
-            found = self._linear(there, jacobian, seen, noise)
+            found = self._linear(there, rows, seen, noise)
             if found[0] < cost:
                 theta, damping, done = there, damping * 0.3, cost - found[0] < 0.01
                 cost, left, slope = found
@@ -110,58 +115,66 @@ class PartImage:
 
     def place(self, circle: Array, covariance: Array) -> tuple[Array, Array]:
         """(2,) centre of the part of a circle (x, y, log radius) that lies on the skin, and its covariance (2, 2)."""
-        steps = [sign * step for step in np.diag(AHEAD) for sign in (1, -1)]
-        shares = self.shares(circle + np.array([np.zeros(3), *steps]))
-        weight = np.maximum(shares.sum(axis=1), TINY)
-        at = np.stack([shares @ self._x.ravel(), shares @ self._y.ravel()], axis=1) / weight[:, None]
+        shares, (rows, columns) = self._near(circle + STENCIL)
+        weight = np.maximum(shares.sum(axis=(1, 2)), TINY)
+        x, y = shares.sum(axis=1) @ self._x[columns], shares.sum(axis=2) @ self._y[rows]
+        at = np.stack([x, y], axis=1) / weight[:, None]
         slope = (at[1::2] - at[2::2]).T / (2 * AHEAD)
         return at[0], slope @ covariance @ slope.T
 
     def image(self, touch: PartTouch) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(H, W) drop [S/m] and its standard deviation."""
-        share = self._share(touch.x, touch.y, touch.radius)[0].reshape(self._x.shape)
+        share = np.zeros(self._inside.shape)
+        near, at = self._near(np.array([[touch.x, touch.y, np.log(touch.radius)]]))
+        share[at] = near[0]
         ones = np.ones((self._fine, self._fine))
         drop, sigma = (np.kron(share * value, ones).astype(np.float32) for value in (touch.drop, touch.drop_sigma))
         return drop, sigma
 
     def _start(self, rows: NDArray[np.intp], d: Array, noise: Array) -> Array:
-        whitened = self._grid.response[:, rows] / noise
-        size = np.maximum(np.linalg.norm(whitened, axis=1), 1e-12)
-        z = whitened @ (d / noise) / size
+        weight, pull = np.zeros(self.measurements), np.zeros(self.measurements)
+        weight[rows], pull[rows] = noise**-2.0, d / noise**2
+        size = np.maximum(np.sqrt(self._of_grid_squared @ weight), 1e-12)
+        z = self._of_grid @ pull / size
         best = int(z.argmax())
         drop = float(np.clip(z[best] / size[best], 0.01, 0.9))
         return np.array([*self._grid.position[best], np.log(self._grid.radius[best]), np.log(drop)])
 
-    def _linear(self, theta: Array, jacobian: Array, d: Array, noise: Array) -> tuple[float, Array, Array]:
+    def _linear(self, theta: Array, rows: NDArray[np.intp], d: Array, noise: Array) -> tuple[float, Array, Array]:
         """Penalty, what is left of d, and the derivative of the response; whitened."""
-        drop = float(np.exp(theta[3]))
-        around = [theta[:3]] + [
-            theta[:3] + sign * a * e for a, e in zip(AHEAD, np.eye(3), strict=True) for sign in (1, -1)
-        ]
-        responses = drop * (self.shares(np.array(around)) @ jacobian.T) / noise
+        responses = float(np.exp(theta[3])) * self.responses(theta[:3] + STENCIL, rows) / noise
         ahead, behind = responses[1::2], responses[2::2]
         slope = np.column_stack([*((ahead - behind) / (2 * AHEAD[:, None])), responses[0]])
         left = d / noise - responses[0]
         penalty = float(left @ left) + float((((theta[2:] - MEAN) / SD) ** 2).sum())
         return penalty, left, slope
 
-    def _share(self, x: float, y: float, radius: float) -> Array:
-        return self.shares(np.array([[x, y, np.log(radius)]]))
-
-    def shares(self, circles: Array) -> Array:
-        """(M, P) share of each pixel under circles (M, 3) of x, y, log radius: of a circle's area in all where it lies
-        on the skin.
+    def _near(self, circles: Array) -> tuple[Array, tuple[slice, slice]]:
+        """(M, h, w) share of each pixel under circles (M, 3) of x, y, log radius, of a circle's area in all where it
+        lies on the skin; and which pixels those are: none other is under one of them.
         """
         x, y, log_r = circles.T[:, :, None]
         radius = np.exp(log_r)
-        away = np.hypot(self._x.ravel() - x, self._y.ravel() - y)
-        share = np.clip((radius - away) / self._pixel + 0.5, 0.0, 1.0)
-        scale = np.pi * radius**2 / self._pixel**2 / np.maximum(share.sum(axis=1, keepdims=True), 1e-9)
-        return np.asarray(share * self._inside.ravel() * scale)
+        reach = max(radius.ravel().tolist()) + self._pixel
+        columns, rows = self._range(x, reach), self._range(y, reach)
+        across, down = self._x[columns] - x, self._y[rows] - y
+        away = np.sqrt((down**2)[:, :, None] + (across**2)[:, None, :])
+        share = np.clip((radius[:, :, None] - away) / self._pixel + 0.5, 0.0, 1.0)
+        scale = np.pi * radius[:, :, None] ** 2 / self._pixel**2
+        scale = scale / np.maximum(share.sum(axis=(1, 2), keepdims=True), 1e-9)
+        return np.asarray(share * self._inside[rows, columns] * scale), (rows, columns)
+
+    def _range(self, at: Array, reach: float) -> slice:
+        """The pixels of a line, of which one or another is within reach."""
+        each = at.ravel().tolist()
+        low, high = ((edge + self.half_width) / self._pixel for edge in (min(each) - reach, max(each) + reach))
+        return slice(max(0, int(low)), max(0, int(high) + 1))
 
     def responses(self, circles: Array, rows: NDArray[np.intp]) -> Array:
-        """(M, n) d of these measurements per S/m of circles (M, 3) of x, y, log radius."""
-        return np.asarray(self.shares(circles) @ self._jacobian[rows].T)
+        """(M, n) d of these measurements per S/m of circles (M, 3) of x, y, log radius, which are near each other."""
+        shares, at = self._near(circles)
+        count = len(circles)
+        return np.asarray(shares.reshape(count, -1) @ self._by_pixel[at].reshape(-1, self.measurements))[:, rows]
 
 
 def spread_of(chi2: float, free: int) -> float:
