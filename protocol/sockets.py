@@ -16,7 +16,7 @@ import zmq
 
 from . import transport
 from .control import ControlClient, ControlError, ControlServer, clock_offset
-from .frames import Frame, FrameError, PartFrame, unpack
+from .frames import DeltaFrame, Frame, FrameError, ImageFrame, PartFrame, unpack
 from .logs import foreign
 from .publishing import Publisher
 from .reconnecting import Connections
@@ -138,24 +138,27 @@ class NewestReader(_TopicReader):
 
 
 PARTS_QUEUE = 200
-"""Messages held in a reader of images and parts, from each of the two producers: about a second of parts."""
+"""Messages held in a reader of parts and what lies between them, from each producer: about a second of parts."""
 
 
 class PartsReader(_Reader):
-    """The newest image frame of one skin whose scans come in parts, and the newest part after it; older ones are
-    skipped. A part comes after the image of the scan that it names, whichever of the two arrives first.
+    """The newest delta or image frame of one skin whose scans come in parts; beside images the newest part after it.
+    Older ones are skipped, but not the one whose stack or image a newer one holds: that comes first. A part comes after
+    the image of the scan that it names, whichever of the two arrives first.
     """
 
-    def __init__(self, skin: str, context: Context | None = None) -> None:
-        producers = {TOPICS[topic].producers[0] for topic in ("image", "part")}
+    def __init__(self, skin: str, topic: str = "image", context: Context | None = None) -> None:
+        topics = ("image", "part") if topic == "image" else (topic,)
+        producers = {TOPICS[each].producers[0] for each in topics}
         addresses = {name: transport.current().data_address(name) for name in sorted(producers)}
         own = context or zmq.Context.instance()
         socket = transport.connect(own, zmq.SUB, addresses, {zmq.RCVHWM: PARTS_QUEUE})
         super().__init__(", ".join(addresses.values()), socket, addresses)
         self.skipped = 0
         """Frames that were overtaken by newer ones before we read them (or lost on the way)."""
-        self._names = [wire_topic(topic, skin) + b"\0" for topic in ("image", "part")]
+        self._names = [wire_topic(each, skin) + b"\0" for each in topics]
         self._last: dict[type[Frame], tuple[str, int]] = {}
+        self._whole: list[DeltaFrame | ImageFrame] = []  # that wait: the newest, and before it the one that it holds
         self._part: PartFrame | None = None
         self._after = -1  # scan of the image frame that was read last
         self.listen(True)
@@ -168,11 +171,10 @@ class PartsReader(_Reader):
     @property
     def more(self) -> bool:
         """Whether another frame is here already, whatever the socket says."""
-        return self._part is not None and self._part.after == self._after
+        return bool(self._whole) or (self._part is not None and self._part.after == self._after)
 
     def recv(self, timeout_s: float = 0.0) -> Frame | None:
         """The next frame, waiting up to `timeout_s` for one; None when there is none. Never raises on bad input."""
-        image: Frame | None = None
         got = self._receive(0.0 if self.more else timeout_s)
         while got is not None:
             frame = got[0]
@@ -180,15 +182,17 @@ class PartsReader(_Reader):
             if isinstance(frame, PartFrame):
                 self.skipped += self._part is not None
                 self._part = frame
-            else:
-                self.skipped += image is not None
-                image = frame
+            elif isinstance(frame, DeltaFrame | ImageFrame):
+                kept = [each for each in self._whole[:1] if _holds(frame, each)]
+                self.skipped += len(self._whole) - len(kept)
+                self._whole = [*kept, frame]
             got = self._receive(0.0)
-        if image is not None:
-            self._after = image.scan
-            if self._part is not None and self._part.after < image.scan:
+        if self._whole:
+            frame = self._whole.pop(0)
+            self._after = frame.scan
+            if self._part is not None and self._part.after < frame.scan:
                 self._part, self.skipped = None, self.skipped + 1  # of before that image
-            return image
+            return frame
         if not self.more:
             return None
         part, self._part = self._part, None
@@ -199,6 +203,12 @@ class PartsReader(_Reader):
         if last is not None and last[0] == frame.session and frame.seq > last[1]:
             self.skipped += frame.seq - last[1] - 1
         self._last[type(frame)] = frame.session, frame.seq
+
+
+def _holds(frame: DeltaFrame | ImageFrame, older: DeltaFrame | ImageFrame) -> bool:
+    """Whether a frame says no more than that all is as in an older one, of which its reader needs the arrays."""
+    own, theirs = (each.stack if isinstance(each, DeltaFrame) else each.image for each in (frame, older))
+    return frame.held and frame.reconstructed == older.reconstructed and theirs.size > 0 and not own.size
 
 
 class AllReader(_Reader):

@@ -86,6 +86,10 @@ class ImageCheck:
         """The next scan is like one of a touch that changed: what stays as it is did not change during the scan."""
         self.refused = True
 
+    def warm_up(self, parts: int) -> None:
+        """Do once what is slow the first time, of scans in so many parts: the order of parts takes half a second."""
+        self._changing_touch.warm_up(parts)
+
     def prepare(self, sigma: NDArray[np.float32]) -> bool:
         return self.residual.prepare(sigma)
 

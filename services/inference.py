@@ -17,6 +17,7 @@ from models.locator import Located, Locator
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
 from services.describe import ON, refinement
 from services.estimation.part_image import PartImage
+from services.estimation.rolling import parts_of
 from services.image_check import ImageCheck
 from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
@@ -174,6 +175,7 @@ class Inference(Stage):
             self._quiet, self._stated = sigma, 1
 
     def warm_up(self) -> None:
+        self.image_check.warm_up(parts_of(self.bundle) if self.config.scan == "rolling" else 1)
         if self._refinement is not None:
             self._refinement.warm_up()
 

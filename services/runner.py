@@ -72,7 +72,7 @@ class Runner:
     def add(self, stage: Stage, feed: Feed | None = None) -> None:
         """Drive this stage; without a feed, from the topic that it reads."""
         if feed is None:
-            parts = self.config.skins[stage.skin].scan == "rolling" and stage.reads == "image"
+            parts = self.config.skins[stage.skin].scan == "rolling" and stage.reads in ("delta", "image")
             feed = Newest(stage.reads, stage.skin, parts)
         channel = Channel(self.process, stage, feed)
         self.channels[stage.skin] = channel

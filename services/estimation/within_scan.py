@@ -47,6 +47,11 @@ class ChangingTouch:
         self._bundle = bundle
         self._courses: dict[int, tuple[Array, Array]] = {}  # by the part measured last
 
+    def warm_up(self, parts: int) -> None:
+        """Do once what is slow the first time, of scans in so many parts."""
+        for part in range(parts + 1) if parts > 1 else (0,):
+            self._course(part)
+
     def _course(self, part: int) -> tuple[Array, Array]:
         """(KNOTS, K) by how much each moment counts in each measurement, and (K, pairs) their products."""
         if part not in self._courses:

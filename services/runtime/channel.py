@@ -38,10 +38,12 @@ class Channel:
 
 
 class Newest:
-    """A stage's input from a socket: the newest frame. parts: images, and the parts of scans between them."""
+    """A stage's input from a socket: the newest frame. parts: of scans in parts; before it the one that it holds, and
+    beside images the parts between them.
+    """
 
     def __init__(self, topic: str, skin: str, parts: bool = False) -> None:
-        self.reader: NewestReader | PartsReader = PartsReader(skin) if parts else NewestReader(topic, skin)
+        self.reader: NewestReader | PartsReader = PartsReader(skin, topic) if parts else NewestReader(topic, skin)
         self.socket = self.reader.socket
         self._name = f"{topic}/{skin}\0".encode()
 

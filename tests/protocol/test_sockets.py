@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zmq
 
-from protocol.frames import ContactFrame, ForceFrame, ImageFrame, InfoFrame, PartFrame, StatusFrame
+from protocol.frames import ContactFrame, DeltaFrame, ForceFrame, ImageFrame, InfoFrame, PartFrame, StatusFrame
 from protocol.reconnecting import GRACE_S
 from protocol.runtime import endpoint
 from protocol.sockets import AllReader, NewestReader, PartsReader, Publisher
@@ -55,8 +55,48 @@ def publisher_of_images(runtime, context):
     return Publisher("inference", context)
 
 
+def told_by(reader):
+    time.sleep(0.2)
+    found = []
+    while (frame := reader.recv()) is not None:
+        found.append(frame.scan)
+        if not reader.more:
+            break
+    return found
+
+
+@pytest.mark.parametrize("topic", ["delta", "image"])
+def test_a_slow_reader_has_what_the_newest_frame_holds(runtime, context, topic):
+    """Without it, nothing could be said of a touch until it changes."""
+    producer = Publisher("preprocessing" if topic == "delta" else "inference", context)
+    reader = PartsReader("palm", topic, context)
+    subscribed(producer, topic)
+
+    def send(scan, held_from=None):
+        kind, array = (DeltaFrame, "stack") if topic == "delta" else (ImageFrame, "image")
+        frame = kind(skin="palm", valid=True, scan=scan, touched=True, held=held_from is not None)
+        frame.reconstructed = scan if held_from is None else held_from
+        if held_from is None:
+            setattr(frame, array, np.ones((1, 2, 2) if topic == "delta" else (2, 2), np.float32))
+        producer.send(frame)
+
+    send(10)
+    send(20, held_from=10)
+    send(30, held_from=10)
+    assert told_by(reader) == [10, 30] and reader.skipped == 1
+    send(40, held_from=10)
+    send(50, held_from=10)
+    assert told_by(reader) == [50] and reader.skipped == 2, "it has the array of 10"
+    send(60)
+    send(70, held_from=60)
+    send(80)
+    assert told_by(reader) == [80] and reader.skipped == 4, "nothing stands on 60 any more"
+    reader.close()
+    producer.close()
+
+
 def test_a_part_comes_after_the_image_that_it_names_whichever_arrives_first(publisher_of_images, context):
-    parts, reader = Publisher("preprocessing", context), PartsReader("palm", context)
+    parts, reader = Publisher("preprocessing", context), PartsReader("palm", context=context)
     subscribed(publisher_of_images, "image")
     subscribed(parts, "part")
 

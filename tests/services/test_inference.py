@@ -11,6 +11,7 @@ from onnx import TensorProto, helper
 
 from models.bundle import Bundle, write
 from protocol.frames import DeltaFrame, ImageFrame, pack
+from services.estimation import rolling
 from services.estimation.quality import KEPT
 from services.estimation.touch_decision import MEANS
 from services.inference import SETTLED, Inference
@@ -313,3 +314,14 @@ def test_what_other_touches_displaced_is_prepared_again(skin: Skin, networked: B
     for k in range(KEPT):
         stage.image_check.residual.prepare(np.full(120, 1e-5 * (k + 1), np.float32))
     assert stage.prepare()
+
+
+def test_no_frame_waits_for_the_order_of_the_parts(skin: Skin, bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes half a second, in which a press is over."""
+    monkeypatch.setattr(rolling, "_orders", {})
+    stage = Inference("palm", skin.model_copy(update={"scan": "rolling", "network": "none"}), bundle)
+    stage.warm_up()
+    monkeypatch.setattr(rolling.rolling, "order", None)
+    d = np.linspace(-0.1, 0.2, len(bundle.pattern), dtype=np.float32)
+    frame = DeltaFrame(skin="palm", valid=True, touched=True, scan=7, part=3, difference=d, sigma=np.full_like(d, 1e-4))
+    assert stage.image_check._changing_touch(frame.difference, frame.sigma, frame.part) is None
