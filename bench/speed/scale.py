@@ -88,7 +88,7 @@ class Said:
     @property
     def seconds(self) -> float:
         """Between the two."""
-        return (self.last["stamps"]["publish"] - self.first["stamps"]["publish"]) * 1e-9
+        return float(self.last["stamps"]["publish"] - self.first["stamps"]["publish"]) * 1e-9
 
     @property
     def dropped(self) -> int:

@@ -14,7 +14,7 @@ import tempfile
 from collections import Counter
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -33,7 +33,7 @@ from firmware_stub.rig import Rig
 from protocol.frames import RawFrame
 from services.runtime.config import Skin
 
-DFT_POINTS = 256
+DFT_POINTS: Literal[256] = 256
 SETTINGS = f'scan = "rolling"\ndft_points = {DFT_POINTS}\n'
 SNR_DB = 80.0
 TARGET_MS = 20.0
