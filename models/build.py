@@ -5,6 +5,7 @@
     python -m models.build --skin square16 --minutes 3     for CI: proves the path, not the accuracy
     python -m models.build --skin square16 --no-network    matrices only: the services show the one-step image
     python -m models.build --skin square16 --package       trains nothing: ships the checkpoints in models/work/SKIN
+    python -m models.build --skin square16 --package --only fast   that checkpoint alone, into the bundle there is
     python -m models.build --skin square16 --response      adds what a fit of touches needs to the bundle there is
     python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin,
                                                            kept where its images are better than those without
@@ -95,15 +96,17 @@ def networks(
     held_out: samples.Samples,
     presses: calibrate.SolvedPresses | None,
     own: OwnSkin | None = None,
+    only: str | None = None,
 ) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Exports the checkpoints in a folder: ONNX of each variant, and what the manifest says about them. presses: what
-    the temperature of the class probabilities is fitted to; a registered skin has none of known shapes.
+    """Exports the checkpoints in a folder, or `only` one variant's: ONNX of each, and what the manifest says about
+    them. presses: what the temperature of the class probabilities is fitted to; a registered skin has none of known
+    shapes.
     """
     made: dict[str, bytes] = {}
     said: dict[str, Any] = {}
     stack, context = calibration(pre, held_out, own=own)
     for variant in train.CONFIGS:
-        if not (folder / f"{variant}.pt").is_file():
+        if not (folder / f"{variant}.pt").is_file() or variant != (only or variant):
             continue
         model, state = restore(folder / f"{variant}.pt")
         shape_class = None
@@ -142,6 +145,26 @@ def networks(
     return made, said
 
 
+def replace_one(variant: str, skin: geometry.SkinGeometry, shipped: bundle.Bundle, work: Path) -> bundle.Bundle:
+    """The bundle there is with the checkpoint of one variant; the other files stay as they are. Run times of all of its
+    networks are measured anew, since those of two days cannot be compared.
+    """
+    pre, cache = shipped.prereconstructor(), work / "presses.npz"
+    held_out = samples.load(work, "valid", pre)
+    made, said = networks(work, pre, held_out, calibrate.solve(skin, cache=cache), only=variant)
+    found = calibrate.uncertainty(skin, pre, made, cache=cache)
+    said[variant] |= {"uncertainty": found[variant], "built": manifest.built()}
+    if (curve := work / f"{variant}.png").is_file():
+        shutil.copy(curve, shipped.path / f"training_{variant}.png")
+    entries = {**shipped.manifest["network"], variant: said[variant]}
+    replaced = bundle.replace_network(shipped, variant, made[variant], entries)
+    stack, context = calibration(pre, held_out)
+    for name, entry in entries.items():
+        if (path := replaced.network_path(name)) is not None:
+            entry["run_time_ms"] = export.run_time_ms(path.read_bytes(), stack, context)
+    return bundle.replace_manifest(replaced.path, {**replaced.manifest, "network": entries})
+
+
 def restore(checkpoint: Path) -> tuple[MMCNN, dict[str, Any]]:
     """The network a checkpoint ships (averaged weights, best on held-out scenes), and all of its state."""
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
@@ -176,6 +199,9 @@ def main(argv: list[str] | None = None) -> None:
     budget.add_argument("--no-network", action="store_true", help="matrices only")
     budget.add_argument("--package", action="store_true", help="export the checkpoints there are, train nothing")
     budget.add_argument("--response", action="store_true", help="response.npz alone, into the bundle there is")
+    parser.add_argument(
+        "--only", choices=sorted(train.CONFIGS), help="with --package: one network of the bundle there is"
+    )
     parser.add_argument("--matrices", type=Path, help="with --package: the bundle the checkpoints were trained with")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)
@@ -190,6 +216,10 @@ def main(argv: list[str] | None = None) -> None:
     if args.response:
         added = bundle.add_response(bundle.Bundle.load(out), response_tables(ForwardModel(skin)))
         print(f"{added.path}: response.npz added, {added.hash[:12]}, after {time.perf_counter() - began:.0f} s")
+        return
+    if args.package and args.only:
+        replaced = replace_one(args.only, skin, bundle.Bundle.load(out), work)
+        print(f"{replaced.path}: another {args.only} network, {replaced.hash[:12]}")
         return
     plan = QUICK if args.quick else Plan.of(args.minutes) if args.minutes else FULL
     if not (args.package or args.no_network):

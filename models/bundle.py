@@ -224,6 +224,14 @@ def add_response(bundle: Bundle, response: ResponseTables) -> Bundle:
     return added
 
 
+def replace_network(bundle: Bundle, variant: str, content: bytes, said: Mapping[str, Any]) -> Bundle:
+    """The bundle there is with another network of this variant. said: the manifest's `network`, of all variants."""
+    name = NETWORKS[variant]
+    (bundle.path / name).write_bytes(content)
+    files = {**bundle.manifest["files"], name: sha256(bundle.path / name)}
+    return replace_manifest(bundle.path, {**bundle.manifest, "network": said, "files": files})
+
+
 def replace_manifest(path: Path, full: Mapping[str, Any]) -> Bundle:
     """Another manifest for the files that are there, at once, and loads the bundle back."""
     _replace(path / "manifest.json", json.dumps(full, indent=2, allow_nan=False) + "\n")

@@ -34,12 +34,16 @@ WEIGHTS = {
     "integral": 0.3,
     "class": 0.8,
     "sigma": 0.02,
+    # Where a larger network teaches (distillation.py).
+    "taught mask": 1.0,
+    "taught amplitude": 0.5,
+    "taught class": 0.8,
 }
 
 
 def losses(parts: tuple[Tensor, Tensor, Tensor, Tensor], target: Target) -> dict[str, Tensor]:
-    """Each of WEIGHTS' terms as a batch mean; all are relative to the touch, so a light touch counts as much as a
-    heavy one.
+    """WEIGHTS' terms that need no teacher, as batch means; all are relative to the touch, so a light touch counts as
+    much as a heavy one.
     """
     logits, amplitude, sigma, classes = parts
     drop, log_sigma = compose(logits, amplitude, sigma)

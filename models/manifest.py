@@ -39,7 +39,7 @@ def describe(name: str, skin: SkinGeometry, matrices: Matrices, **more: Any) -> 
             "model_error": matrices.model_error,
         },
         "one_step": {"lambda": ONE_STEP_LAMBDA, "t": THRESHOLD_T},
-        "built": {"utc": datetime.now(UTC).isoformat(timespec="seconds"), "commit": commit(), "versions": versions()},
+        "built": built(),
         "network": None,
         **more,
     }
@@ -48,8 +48,12 @@ def describe(name: str, skin: SkinGeometry, matrices: Matrices, **more: Any) -> 
 def of_registered(registered: Bundle, **more: Any) -> dict[str, Any]:
     """That of a registered bundle with the networks that were trained for it; `more` is added as given."""
     kept = {key: value for key, value in registered.manifest.items() if key not in ("files", "schema")}
-    built = {"utc": datetime.now(UTC).isoformat(timespec="seconds"), "commit": commit(), "versions": versions()}
-    return {**kept, "trained": {**built, "from": registered.hash}, **more}
+    return {**kept, "trained": {**built(), "from": registered.hash}, **more}
+
+
+def built() -> dict[str, Any]:
+    """When, of which commit and with which packages."""
+    return {"utc": datetime.now(UTC).isoformat(timespec="seconds"), "commit": commit(), "versions": versions()}
 
 
 def commit() -> str:

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 CONTEXT = 4
 TOLD = 32  # features of the context
 CLASSES = 5
+ATTENTION = 4  # channels of each hidden unit of the attention
 UPSCALE = 4
 
 Model = TypeVar("Model", bound=nn.Module)
@@ -52,7 +53,7 @@ FAST = NetworkConfig(channels=(8, 24, 48), blocks=(1, 1, 1), lean=True)
 class CBAM(nn.Module):
     """Convolutional block attention (Woo et al. 2018): channels first, then places."""
 
-    def __init__(self, channels: int, reduction: int = 4) -> None:
+    def __init__(self, channels: int, reduction: int = ATTENTION) -> None:
         super().__init__()
         self.squeeze = nn.Conv2d(channels, channels // reduction, 1)
         self.excite = nn.Conv2d(channels // reduction, channels, 1)

@@ -3,6 +3,8 @@
     python -m models.train --skin square16 --minutes 80            writes models/work/square16/full.pt and full.png
     python -m models.train --skin square16 --minutes 80 --resume   goes on from the checkpoint
     python -m models.train --skin square16 --minutes 80 --from square16   starts from a bundle's network, at low rates
+    python -m models.train --skin square16 --minutes 60 --variant fast --teacher square16   a part of a bundle's full
+                                                                    network, which it learns from (distillation.py)
 
 The budget sets the schedule: the learning rate rises over the first percent and falls to zero at the last minute,
 whatever the machine's speed. What is kept is the running average of the weights; the best on held-out scenes is kept
@@ -26,12 +28,14 @@ from torch import Tensor, nn
 from models import data, geometry, manifest, samples
 from models.augmentation import OwnSkin
 from models.bundle import Bundle
+from models.distillation import Teacher, taught
 from models.evaluation import LEVELS, evaluate, predict
 from models.losses import losses, total
 from models.network import FAST, FULL, MMCNN, NetworkConfig, laid_out
 from models.optim import Muon
 from models.pace import Pace, TrainingBar, plot
 from models.prereconstruction import PreReconstructor
+from models.pruning import part, worth
 from models.warm_start import BATCHES, NoSuchNetwork, normalised, restored
 
 NUMBERS = ("elapsed", "steps", "curve", "best_score", "best_at", "rates", "start")  # of a checkpoint, and all plain
@@ -40,6 +44,7 @@ MUON_RATE, ADAM_RATE = 0.02, 2e-3
 AVERAGE = 0.999
 CPU_BATCH, GPU_BATCH = (64, 4), (1024, 16)  # scenes of a batch, and noise conditions among them
 FINE = 0.04  # of the learning rates, where training starts from a trained network: more, and it is lost first
+PART = 0.5  # the same for a part of a trained network: what was cut has to be made up for
 OTHER_SKIN = 0.3  # the same for a registered skin, which the network has not seen: there is much to learn
 
 
@@ -71,6 +76,7 @@ class Trainer:
         self.rates = [MUON_RATE, ADAM_RATE]
         self.elapsed, self.steps = 0.0, 0  # seconds, batches
         self.start: dict[str, Any] = {}  # what the manifest says of where it started
+        self.teacher: Teacher | None = None
         self.curve: list[dict[str, Any]] = []
         self.best: dict[str, Any] | None = None
         self.best_score, self.best_at = -math.inf, 0.0
@@ -93,6 +99,10 @@ class Trainer:
             parts = self._parts(batch.stack, batch.context)
         mask, amplitude, sigma, classes = (p.float() for p in parts)
         terms = losses((mask, amplitude, sigma, classes), batch.target)
+        if self.teacher is not None:
+            turn = self.batches.symmetries[self.steps % len(self.batches.symmetries)].turn
+            said = self.teacher.parts(batch.stack, batch.context, turn)
+            terms |= taught((mask, amplitude, sigma, classes), said, batch.target)
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
         total(terms).backward()
@@ -209,6 +219,23 @@ class Trainer:
         self.rates = [share * rate for rate in self.rates]
         self.start = {"from": {"bundle": bundle.hash, "network": bundle.manifest["files"][path.name]}}
 
+    def start_as_part(self, teacher: Teacher) -> None:
+        """The teacher's most valuable channels and blocks as the start; finding them counts as training. Raises
+        NoPart.
+        """
+        began = time.perf_counter()
+        self.learn_from(teacher)
+        whole = copy.deepcopy(teacher.model)
+        model = part(whole, self.config, worth(whole, self.batches))
+        for mine in (self.model, self.average):
+            mine.load_state_dict(model.state_dict())
+        self.rates = [PART * rate for rate in self.rates]
+        self.start = {"part_of": teacher.said}
+        self.elapsed = time.perf_counter() - began
+
+    def learn_from(self, teacher: Teacher) -> None:
+        self.teacher = Teacher(laid_out(teacher.model.to(self.device).eval(), torch.channels_last), teacher.said)
+
     def resume(self, path: Path) -> None:
         state = torch.load(path, map_location=self.device, weights_only=True)
         self.model.load_state_dict(state["model"])
@@ -218,6 +245,16 @@ class Trainer:
             optimizer.load_state_dict(saved)
         for name, value in state["numbers"].items():
             setattr(self, name, value)
+
+
+def full_network(bundle: Bundle, batches: samples.Batches) -> Teacher:
+    """A bundle's full network as a teacher. Raises NoSuchNetwork."""
+    path = bundle.network_path("full")
+    if path is None:
+        raise NoSuchNetwork(f"the bundle {bundle.name} has no network 'full' to learn from")
+    model = restored(path.read_bytes(), FULL)
+    normalised(model, [(b.stack, b.context) for b in (batches.draw() for _ in range(BATCHES))])
+    return Teacher(model, {"bundle": bundle.hash, "network": bundle.manifest["files"][path.name]})
 
 
 def train(
@@ -234,17 +271,24 @@ def train(
     folder: Path | None = None,
     start: Bundle | None = None,
     own: OwnSkin | None = None,
+    teacher: Bundle | None = None,
 ) -> Trainer:
     """Trains a variant of CONFIGS; leaves the checkpoint and its curves (PNG) behind. folder: see Trainer.run.
     start: a bundle whose network is the start, instead of random weights. own: what was measured of this very skin.
+    teacher: a bundle whose full network is larger; a part of it is the start, and training learns from its answers.
     """
     torch.set_num_threads(threads)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     size, groups = GPU_BATCH if device.type == "cuda" else CPU_BATCH
     batches = samples.Batches(scenes, pre, skin, seed, size, groups, device=device, own=own)
     trainer = Trainer(CONFIGS[variant], batches, held_out, seed)
+    larger = None if teacher is None else full_network(teacher, batches)
     if resume:
         trainer.resume(checkpoint)
+        if larger is not None:
+            trainer.learn_from(larger)
+    elif larger is not None:
+        trainer.start_as_part(larger)
     elif start is not None:
         trainer.start_from(start, variant, FINE if own is None else OTHER_SKIN)
     weights = sum(p.numel() for p in trainer.model.parameters()) / 1e6
@@ -269,6 +313,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--from", dest="start", help="the bundle whose network to start from, at a lower rate")
+    parser.add_argument("--teacher", help="the bundle whose full network to start as a part of, and to learn from")
     args = parser.parse_args(argv)
     skin = geometry.load(args.skin)
     folder = args.data or data.WORK / skin.name
@@ -290,6 +335,7 @@ def main(argv: list[str] | None = None) -> None:
         args.resume,
         more,
         start,
+        teacher=Bundle.load(args.teacher) if args.teacher else None,
     )
 
 

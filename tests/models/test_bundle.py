@@ -38,6 +38,15 @@ def test_hash_covers_every_file(made):
     assert again.network_path("fast") is None and not (made.path / "network_fast.onnx").exists()
 
 
+def test_one_network_is_replaced_and_the_others_stay(made):
+    said = {"full": {"parameters": 3}, "fast": {"parameters": 2}}
+    again = bundle.replace_network(made, "fast", b"faster", said)
+    found = [again.network_path(variant).read_bytes() for variant in ("fast", "full")]
+    assert found == [b"faster", b"network"]
+    assert again.manifest["files"]["network.onnx"] == made.manifest["files"]["network.onnx"]
+    assert again.manifest["network"] == said and again.hash != made.hash
+
+
 def test_a_changed_byte_is_refused(made):
     (made.path / "network.onnx").write_bytes(b"Network")
     with pytest.raises(BundleError, match=r"network.onnx: sha256 .* changed or damaged"):

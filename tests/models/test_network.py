@@ -175,8 +175,10 @@ def test_the_published_network_has_the_published_layers(attention):
 
 
 @pytest.mark.skipif(not REFERENCE.is_file(), reason="reference frames not here")
-@pytest.mark.parametrize("decibel, bound", [(None, 0.90), (70, 0.84)])
-def test_the_shipped_network_on_another_solvers_frames(pre, decibel, bound):
+@pytest.mark.parametrize(
+    "variant, decibel, bound", [("full", None, 0.90), ("full", 70, 0.84), ("fast", None, 0.88), ("fast", 70, 0.80)]
+)
+def test_the_shipped_network_on_another_solvers_frames(pre, variant, decibel, bound):
     """EIDORS's single touches. Bounds below the benchmark's figures: they catch a broken bundle, not a bad day."""
     z = np.load(REFERENCE)
     rng = np.random.default_rng(0)
@@ -184,7 +186,7 @@ def test_the_shipped_network_on_another_solvers_frames(pre, decibel, bound):
     single = np.flatnonzero(np.isfinite(z["shapes"][:, 0, 0]) & np.isnan(z["shapes"][:, 1, 0]))
     sigma = 10 ** (-(decibel or 130) / 20)
     operator = pre.condition(np.full(120, sigma))
-    session = export.session(Bundle.load("square16").network_path("full"))
+    session = export.session(Bundle.load("square16").network_path(variant))
     scores = []
     for scene in np.repeat(single, 4):
         z0 = (impedance[0] * (1 + sigma * rng.standard_normal((64, 120)))).mean(axis=0)
