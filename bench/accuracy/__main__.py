@@ -1,6 +1,6 @@
 """Every method on the same frames in one run: run time per frame against each error.
 
-    skin bench accuracy [--quick] [--levels none 50 60 70 80 70f] [--out bench/reports]
+    skin bench accuracy [--quick] [--levels none 50 60 70 80 70f] [--mesh stub] [--only NAMES] [--out bench/reports]
 
 Frames are solved on the reference mesh, which no training and no inverse uses, and read from bench/work where they are
 there (bench/accuracy/frames.py says what they are). Noise: |Z| 10^(-dB/20) on each measurement, and on the 64 untouched
@@ -129,7 +129,10 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--bundle", default="square16", help="the bundle that stands for what is shipped")
     parser.add_argument("--seed", type=int, default=5, help="of the frames and the noise")
-    parser.add_argument("--only", nargs="*", default=None, help="methods whose name contains one of these")
+    parser.add_argument(
+        "--only", nargs="*", default=None, help="methods whose name contains one of these; no name: what is shipped"
+    )
+    parser.add_argument("--mesh", choices=("reference", "stub"), help="stub: the full form's frames in minutes")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     bundle = Bundle.load(args.bundle)
@@ -137,6 +140,7 @@ def main(argv: list[str] | None = None) -> int:
     methods = _methods.classical() + _methods.peers() + _methods.published(bundle) + _methods.shipped(bundle)
     levels = args.levels or (("none", "70") if args.quick else LEVELS)
     mesh, n, singles = ("stub", 6, None) if args.quick else ("reference", 20, SINGLES)
+    mesh = args.mesh or mesh
     frames = _frames.load(args.seed, n, mesh, singles=singles)
     tuning = _frames.load(args.seed + 1000, 4, "stub", ("shapes", "hertz"))
     wanted = [m for m in methods if args.only is None or any(o in m.name for o in args.only)]
