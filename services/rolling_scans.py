@@ -200,7 +200,8 @@ class RollingScans:
         self._put_off(frame.scan)
         on = place.course > 0
         self._began_us, self._began = frame.device_us - float(age[on].max()), place.touch
-        if not self._began.fits or self._began.sigma[0] > ANYWHERE:
+        shown = self._began.fits and self._began.sigma[0] <= ANYWHERE
+        if not shown or not evidence.no_contact(d, noise, age, place):
             return []
         share = np.where(on, place.course, 1.0)
         out.difference = np.where(on, d / share, 0.0).astype(np.float32)

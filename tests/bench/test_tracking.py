@@ -32,6 +32,10 @@ def recorded_of(rows, n=N, faults=None):
         read_ns=np.zeros(n, int),
         device_us=np.zeros(n, int),
         gap=np.zeros(n, bool),
+        part=np.zeros(n, int),
+        parts=np.ones(n, int),
+        age_us=none.astype(np.float32),
+        new=none.astype(np.uint8),
         touches=touches,
         faults=np.array([json.dumps(f) for f in faults or [{}] * n]),
         sections=np.array(["one"] * n),
@@ -201,7 +205,7 @@ def test_the_simulated_truth_is_the_scenes(short):
 
 
 def test_a_few_seconds_of_the_real_thing(short):
-    found = tracking.score(short, tracking.follow(short, Skin(port="stub", bundle="square16")))
+    found = tracking.score(*tracking.follow(short, Skin(port="stub", bundle="square16")))
     row, press = found["all"], found["sections"]["press"]
     assert row["touches"] == 2 and row["unseen"] == 0 and row["false_touches"] == 0
     assert press["seen_%"] > 95 and press["position_%"] <= 1.5 and press["switches"] == 0
