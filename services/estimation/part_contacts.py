@@ -27,8 +27,10 @@ MOST_RISE = 10.0  # relative, of a contact impedance
 LEAST_REST = 1 / OTHER_BEFORE / (1 + MOST_RISE / SHORT_WAY)  # of a change of the rest of a contact: see contact_drift.py
 LASTS = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 35.0, 60.0, 120.0)  # values within which a contact changes
 BEFORE = 3  # values before the touch's beginning that are looked at too: a contact may change sooner
-BEGINS = 24  # beginnings that are tried of every contact, at most
+BEYOND = 1.5  # times as many: what rises slowly may be faint in the oldest of them
+BEGINS = 32  # beginnings that are tried of every contact, at most
 LOOKED_AT = 3  # contacts of which all are tried
+BENDS = (0.0, 0.5, 1.5)  # of a contact's rest while it rises slowly: a / SHORT_WAY (contact_drift.py)
 NEAR, LONGER = np.linspace(-1.0, 1.0, 9), 1.13 ** np.arange(-6, 7)  # values apart, times as long: last of all
 TINY = 1e-12  # keeps solvable what no value tells
 
@@ -67,19 +69,23 @@ class PartContacts:
         gain = 0.0
         for k in np.argsort(every)[-LOOKED_AT:]:
             one = own[[k]], rest[[k]], seen
-            begin, lasts = _courses(len(rows), len(rows))
-            best = int(_explained(*one, begin, lasts).argmax())
-            gain = max(gain, float(_explained(*one, *_each(begin[best] + NEAR, lasts[best] * LONGER)).max()))
+            begin, lasts = _courses(len(rows))
+            for bend in BENDS:
+                best = int(_explained(*one, begin, lasts, bend).argmax())
+                near = _each(begin[best] + NEAR, lasts[best] * LONGER)
+                gain = max(gain, float(_explained(*one, *near, bend).max()))
         return float(seen @ seen) - gain + 2 * float(np.log(width).sum())
 
 
-def _explained(own: Array, rest: Array, seen: Array, begin: Array, lasts: Array) -> Array:
+def _explained(own: Array, rest: Array, seen: Array, begin: Array, lasts: Array, bend: float = 0.0) -> Array:
     """(H, E) of |seen|^2 that a change of each contact explains, over the courses (H,): a line from 0 to 1 that begins
-    so many values ago and lasts so many. own, rest (E, n), seen (n,): the newest value first.
+    so many values ago and lasts so many. own, rest (E, n), seen (n,): the newest value first. bend: how far the rest
+    dies out on the way, as far as it goes.
     """
     f = ((begin[:, None] - np.arange(len(seen))) / lasts[:, None]).clip(0.0, 1.0)
-    by_own, by_rest = f @ (own * seen).T, f @ (rest * seen).T
-    of_own, both, of_rest = (f**2 @ each.T for each in (own**2, own * rest, rest**2))
+    g = f * (1 + bend) / (1 + bend * f)
+    by_own, by_rest = f @ (own * seen).T, g @ (rest * seen).T
+    of_own, both, of_rest = f**2 @ (own**2).T, (f * g) @ (own * rest).T, g**2 @ (rest**2).T
     free = of_own * of_rest - both**2 + TINY
     a, b = (of_rest * by_own - both * by_rest) / free, (of_own * by_rest - both * by_own) / free
     gain = np.zeros_like(a)
@@ -90,9 +96,10 @@ def _explained(own: Array, rest: Array, seen: Array, begin: Array, lasts: Array)
 
 
 @lru_cache(maxsize=128)
-def _courses(count: int, begins: int) -> tuple[Array, Array]:
-    """Beginnings and durations of the courses that are tried over so many values."""
-    begin, lasts = _each(np.linspace(1.0, count, min(count, begins)), np.array(LASTS))
+def _courses(count: int, most: int = 1000) -> tuple[Array, Array]:
+    """Beginnings, at most so many, and durations of the courses that are tried over `count` values."""
+    every = np.arange(1.0, BEYOND * count + 1)
+    begin, lasts = _each(every[:: -(-len(every) // most)], np.array(LASTS))
     possible = lasts < 2 * begin
     return begin[possible], lasts[possible]
 
