@@ -83,7 +83,8 @@ def head(args: argparse.Namespace, bundle: Bundle, recorded: Recorded, simulated
 
 def show(head: dict[str, Any], found: dict[str, Any], notes: bool) -> None:
     console = Console(width=220) if not sys.stdout.isatty() else Console()
-    title = f"{head['scene']}, {head['scan']} scans, {head['frames']} frames, {head['snr_db']:g} dB, {head['bundle']['name']}"
+    title = f"{head['scene']}, {head['scan']} scans, {head['frames']} frames, {head['snr_db']:g} dB"
+    title += f", {head['bundle']['name']}"
     rows = [*found["sections"].items(), ("all", found["all"])]
     console.print(_table(title, "section", COLUMNS, rows))
     named = [(f"{f['fault']} {_brief(f['args'])} at {f['at_s']:.0f} s", f) for f in found["faults"]]

@@ -32,7 +32,10 @@ from services.runtime.config import ScanMode, Skin
 MADE_BY = (
     *(f"firmware_stub/{n}.py" for n in ("analog", "board", "faults", "field", "rig", "scene", "sheet", "timeline")),
     *(f"models/{n}.py" for n in ("elements", "forward", "geometry", "meshing", "patterns", "shapes")),
-    *(f"services/board/{n}.py" for n in ("boardlink", "clock", "newest_values", "scan_check", "scan_order", "scanning", "source")),
+    *(
+        f"services/board/{n}.py"
+        for n in ("boardlink", "clock", "newest_values", "scan_check", "scan_order", "scanning", "source")
+    ),
 )
 LAYOUT = 2  # of what is kept: raised when Recorded or what fills it changes
 KEPT = 6  # recorded scenes

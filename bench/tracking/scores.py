@@ -29,8 +29,8 @@ METRES_PER_UNIT = 0.05  # of the skin, for models.metrics
 
 @dataclass(frozen=True)
 class StageOutput:
-    """What the stages said of one frame. contacts: those that last, each id, x, y [m], force, sigma [N]; scans: how many
-    were measured since the frame before, of a part a tenth.
+    """What the stages said of one frame. contacts: those that last, each id, x, y [m], force, sigma [N]; scans: how
+    many were measured since the frame before, of a part a tenth.
     """
 
     valid: bool

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 LIKELIER = 10.0  # nats by which a touch must be likelier than a changed contact
 ERROR = 0.005  # of d: what the change of a contact may be off its form
 MOST_RISE = 10.0  # relative, of a contact impedance
-LEAST_REST = 1 / OTHER_BEFORE / (1 + MOST_RISE / SHORT_WAY)  # of a change of the rest of a contact: see contact_drift.py
+LEAST_REST = 1 / OTHER_BEFORE / (1 + MOST_RISE / SHORT_WAY)  # of a change of its rest: b / a in contact_drift.py
 LASTS = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 35.0, 60.0, 120.0)  # values within which a contact changes
 BEFORE = 3  # values before the touch's beginning that are looked at too: a contact may change sooner
 BEYOND = 1.5  # times as many: what rises slowly may be faint in the oldest of them
@@ -36,8 +36,8 @@ TINY = 1e-12  # keeps solvable what no value tells
 
 
 class PartContacts:
-    """For one bundle. members (E, K): measurement uses electrode. Where nothing is known of contacts (see ContactDrift),
-    every touch is likelier.
+    """For one bundle. members (E, K): measurement uses electrode. Where nothing is known of contacts (ContactDrift says
+    so) every touch is likelier.
     """
 
     def __init__(self, bundle: Bundle, members: NDArray[np.bool_]) -> None:

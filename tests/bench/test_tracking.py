@@ -214,6 +214,21 @@ def test_a_few_seconds_of_the_real_thing(short):
     assert press["valid_%"] > 90  # frames in which it begins or ends may be refused
 
 
+def test_scans_in_parts_are_scored_by_scans(tmp_path):
+    path = tmp_path / "short.toml"
+    path.write_text(SCENE.partition("fault =")[0])
+    recorded = simulate(str(path), 80.0, seed=1, seconds=8.8, scan="rolling")
+    assert set(recorded.parts) == {10} and len(recorded) == pytest.approx(8.7 * 229, rel=0.03)
+    followed, seen = tracking.follow(recorded, Skin(port="stub", bundle="square16", scan="rolling"))
+    assert min(s.scans for s in seen) == pytest.approx(0.1) and max(s.scans for s in seen) == 1.0
+    touched = np.array([bool(s.contacts) for s in seen])
+    assert np.diff(followed.seconds[touched]).min() < 0.006 < np.diff(followed.seconds[~touched][:20]).min()
+    found = tracking.score(followed, seen)
+    row, press = found["all"], found["sections"]["press"]
+    assert row["touches"] == 1 and row["unseen"] == row["switches"] == row["false_touches"] == 0
+    assert press["seen_%"] > 95 and press["position_%"] <= 1.5 and press["begin_most"] <= 1
+
+
 def test_the_command_prints_tables_and_writes_strict_json(short, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(tracking, "record", lambda *_: (short, 1.0))
     assert tracking.main(["--seconds", "3", "--notes", "--out", str(tmp_path)]) == 0

@@ -1,5 +1,5 @@
-"""A contact that rises between whole scans is no touch, and a touch beside an electrode is: on the stub's sheet, which the
-inverse does not use.
+"""A contact that rises between whole scans is no touch, and a touch beside an electrode is: on the stub's sheet, which
+the inverse does not use.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def change(bundle, touches=(), contacts=()):
 
 
 def shown(bundle, evidence, places, change, fresh, newest, seed, lasts=1):
-    """Whether `change` (K,), which the `fresh` newest values felt, within so many of them, is taken for a touch: without
-    a look at contacts, and with it.
+    """Whether `change` (K,), which the `fresh` newest values felt and which came within so many of them, is taken for a
+    touch: without a look at contacts, and with it.
     """
     rng, at = np.random.default_rng(seed), measured_at(bundle, newest)
     course = np.clip((fresh - np.argsort(np.argsort(-at))) / lasts, 0, 1)
