@@ -30,6 +30,7 @@ BEFORE = 3  # values before the touch's beginning that are looked at too: a cont
 BEYOND = 1.5  # times as many: what rises slowly may be faint in the oldest of them
 BEGINS = 32  # beginnings that are tried of every contact, at most
 LOOKED_AT = 3  # contacts of which all are tried
+SLOW, KNOT = 48, 12  # values from which on a contact may have any course, values between two knots of it
 BENDS = (0.0, 0.5, 1.5)  # of a contact's rest while it rises slowly: a / SHORT_WAY (contact_drift.py)
 NEAR, LONGER = np.linspace(-1.0, 1.0, 9), 1.13 ** np.arange(-6, 7)  # values apart, times as long: last of all
 TINY = 1e-12  # keeps solvable what no value tells
@@ -74,6 +75,8 @@ class PartContacts:
                 best = int(_explained(*one, begin, lasts, bend).argmax())
                 near = _each(begin[best] + NEAR, lasts[best] * LONGER)
                 gain = max(gain, float(_explained(*one, *near, bend).max()))
+            if len(rows) >= SLOW:
+                gain = max(gain, _explained_anyhow(own[k], rest[k], seen))
         return float(seen @ seen) - gain + 2 * float(np.log(width).sum())
 
 
@@ -93,6 +96,14 @@ def _explained(own: Array, rest: Array, seen: Array, begin: Array, lasts: Array,
         pull, size = by_own + share * by_rest, of_own + 2 * share * both + share**2 * of_rest
         gain = np.maximum(gain, np.maximum(pull, 0.0) ** 2 / (size + TINY))
     return np.asarray(gain)
+
+
+def _explained_anyhow(own: Array, rest: Array, seen: Array) -> float:
+    """The same of one contact, own, rest (n,), that changes along lines between knots, as it likes."""
+    at = np.arange(len(seen)) / KNOT
+    hats = np.maximum(0.0, 1.0 - np.abs(at - np.arange(int(at[-1]) + 2)[:, None]))
+    found, *_ = np.linalg.lstsq(columns := np.concatenate([hats * own, hats * rest]).T, seen, rcond=None)
+    return float(seen @ seen - ((seen - columns @ found) ** 2).sum())
 
 
 @lru_cache(maxsize=128)
