@@ -24,6 +24,7 @@ MODEL = 4  # of them, that d depends on
 LINEAR = 0.05  # of d: by so much the linear picture of a circle is wrong; by half of it of the rms of d
 STEP = np.array([0.05, 0.05, 0.5, 1.0])  # that one step of a fit does not much exceed
 FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
+ELSEWHERE = 0.4  # model units from a touch: another one is told from its change
 MOST = 4  # touches that are told apart
 LOW, HIGH = np.log([0.04, 0.005]), np.log([0.9, 0.97])  # of log radius, log drop
 TINY = 1e-9  # keeps solvable what no value tells
@@ -58,6 +59,14 @@ class Circles:
         slope[:, :, MODEL:] = slope[:, :, :2] * tau[:, None, None]
         expected = each[:, 0].sum(axis=0) + (slope[:, :, MODEL:] * touches[:, MODEL:]).sum(axis=(1, 2))
         return expected, slope.reshape(len(rows), -1)
+
+    def another(self, off: Array, width: Array, rows: Rows, touches: Array) -> float:
+        """How much of |off / width|^2, of these measurements (n,), a touch explains that begins elsewhere."""
+        grid = self._image.grid
+        away = np.hypot(*(grid.position[:, None] - touches[None, :, :RADIUS]).transpose(2, 0, 1)).min(axis=1)
+        whitened = grid.response[np.ix_(away > ELSEWHERE, rows)] / width
+        gain = np.maximum(whitened @ (off / width), 0.0) ** 2 / ((whitened**2).sum(axis=1) + TINY)
+        return float(gain.max(initial=0.0))
 
     def still(self, touches: Array) -> Array:
         """(K,) d of touches that do not move."""

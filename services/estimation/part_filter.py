@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from services.estimation.circles import DROP, FITS, LINEAR, MODEL, RADIUS, Circles
+from services.estimation.part_course import width_of
 from services.estimation.rolling import parts_of
 from services.estimation.saved import shaped
 
@@ -34,6 +35,8 @@ WINDOWS = (1, 3, 6, 10)  # newest parts among which a change is looked for
 STILL = 24.0  # chi-square of a touch's place and strength, up to which it did not change: one in 10^4 parts exceeds it
 SPREAD = 6.0  # standard deviations of chi-square that the noise of a part may come to
 LIKELY, EXPLAINED = 2.7, 4.0  # chi-square per value up to which a part is, without and with a sudden change
+SURPRISE = 24.0  # chi-square that a step explains, from which on another touch may have begun
+CLEARLY = 10.0  # by which the step must explain more than that
 SLOW_SIGMAS = 2.0  # standard deviations of its velocity, below which a touch may not move at all
 AS_WELL = 1.05  # times what a whole scan leaves of a touch that moves: one that holds still does as well
 TINY = 1e-12  # keeps solvable what no value tells
@@ -233,24 +236,42 @@ class PartFilter:
             start = self._covariance + sudden * np.diag(np.tile(SUDDEN**2, len(self.touches)))
             state, covariance, chi = self._updated(before, advance @ start @ advance.T + wandered, d, noise, tau, rows)
             if chi <= most:
+                if self._another(before, state, d, noise, tau, rows):
+                    return False
                 self.touches, self._covariance = state.reshape(-1, 6), covariance
                 return True
         return False
+
+    def _another(self, before: Array, after: Array, d: Array, noise: Array, tau: Array, rows: Rows) -> bool:
+        """Whether a touch that begins elsewhere explains about as well as the step from one state (6 N,) to the next
+        what is new in the values: a touch that is followed must not go where another one begins.
+        """
+        off, left = (self._beside(state, d, tau, rows)[0] for state in (before, after))
+        width = width_of(off, noise, LINEAR)
+        gained = float(((off / width) ** 2).sum() - ((left / width) ** 2).sum())
+        if gained < SURPRISE:
+            return False
+        return self._circles.another(off, width, rows, before.reshape(-1, 6)) > gained - CLEARLY
+
+    def _beside(self, state: Array, d: Array, tau: Array, rows: Rows) -> tuple[Array, Array, Array]:
+        """What a state (6 N,) leaves of values (n,), measured tau [s] after it; its derivative (n, 6 N); what is new in
+        the values, beside the reference, as far as the touches are near it.
+        """
+        assert self._reference is not None
+        touches = state.reshape(-1, 6)
+        near = float(np.exp(-((np.hypot(*(touches - self._there).T[:2]).max() / NEAR) ** 2)))
+        expected, slope = self._circles.expected(touches, rows, tau)
+        return d - expected - near * self._left[rows], slope, d - near * self._reference[rows]
 
     def _updated(
         self, before: Array, covariance: Array, d: Array, noise: Array, tau: Array, rows: Rows
     ) -> tuple[Array, Array, float]:
         """State (6 N,), covariance and chi-square per value: of values d (n,), measured tau [s] after the state."""
-        assert self._reference is not None
         state, chi = before, np.inf
         for _ in range(2):
-            touches = state.reshape(-1, 6)
-            away = np.hypot(*(touches - self._there).T[:2]).max()
-            near = float(np.exp(-((away / NEAR) ** 2)))
-            expected, slope = self._circles.expected(touches, rows, tau)
-            new = d - near * self._reference[rows]
+            off, slope, new = self._beside(state, d, tau, rows)
             variance = noise**2 + (LINEAR * new) ** 2 + (LINEAR / 2) ** 2 * float((new**2).mean())
-            off = d - expected - near * self._left[rows] - slope @ (before - state)
+            off = off - slope @ (before - state)
             spread = slope @ covariance @ slope.T + np.diag(variance)
             gain = np.linalg.solve(spread, slope @ covariance).T
             if chi == np.inf:
