@@ -134,6 +134,7 @@ class PartEvidence:
         """Whether the touch explains what was measured since it began better than any contact that changed. d, noise,
         age: (K,) each.
         """
+        d, noise, age = (np.asarray(each, dtype=np.float64) for each in (d, noise, age))
         return self._contacts.beaten(d, noise, age, place.expected, float(age[place.expected > 0].max()))
 
     def _likely(self, d: Array, noise: Array, courses: Array, rows: NDArray[np.intp]) -> list[tuple[int, int]]:
