@@ -144,6 +144,8 @@ class Publishing(Stage):
         since = bool(frame.part and frame.touches)  # made only of what was measured since the touch began
         if out.valid and frame.touched and changed and not (frame.held or since or self._alone(frame)):
             add_reason(out.reasons, "changing")
+        if out.valid and not whole and self._leaves_something(frame):
+            add_reason(out.reasons, "changing")
         if whole:
             self._changing = self._changing + 1 if "changing" in out.reasons else 0
         self._touched = frame.touched
@@ -216,6 +218,12 @@ class Publishing(Stage):
         out.held = out.held and not moves
         if moves and any(c.id not in motion for c in out.contacts if c.state != "end"):
             add_reason(out.reasons, "changing")
+
+    def _leaves_something(self, part: ImageFrame) -> bool:
+        """Whether the image that a part holds is not all that there was: one of a touch that changed, of which a good
+        deal is unexplained, or beside whose touches another one waits for a second image.
+        """
+        return self._changing > 0 or self.tracker.waits or (part.residual or 0.0) > NEARLY
 
     def _alone(self, frame: ImageFrame) -> bool:
         """Whether this frame follows no other."""

@@ -14,7 +14,7 @@ from services.estimation.baseline import BaselineEstimator
 from services.estimation.part_course import PartPlaces
 from services.estimation.part_evidence import SIGMAS, PartEvidence
 from services.estimation.part_filter import PartFilter
-from services.estimation.part_image import PartImage, PartTouch
+from services.estimation.part_image import COARSE, PartImage, PartTouch
 from services.estimation.rolling import WholeScans, parts_of
 from services.runtime.stage import add_reason, inherited
 
@@ -49,6 +49,7 @@ class RollingScans:
 
     def __init__(self, bundle: Bundle) -> None:
         self._bundle, self._parts = bundle, parts_of(bundle)
+        self._coarse = 2 * COARSE * bundle.half_width  # model units of uncertainty, beyond which a part says nothing
         self._whole = WholeScans()
         self._made: PartModels | None = None
         self.reset()
@@ -71,6 +72,7 @@ class RollingScans:
         self._waited = 0  # messages by which the whole scan was put off for that
         self._began_us: float | None = None  # when a touch began, by the board's clock less the length of a part
         self._began: PartTouch | None = None  # as the newest parts have it
+        self._doubted = False  # a contact that changed may be all that it is: a whole scan tells
         self.change: Array | None = None  # to the whole scan's difference, for its values to be of one instant
         if self._made is not None:
             self._made.filter.forget()
@@ -100,7 +102,7 @@ class RollingScans:
         if values is not None and not self._moved and self._changes(values):
             self._moved = True  # a touch that began or ended within these values is seen in the next whole scan
             return False
-        if self._waited < MOST_WAITED and self._grows(values):
+        if self._waited < MOST_WAITED and not self._doubted and self._grows(values):
             self._waited += 1
             self._whole.last = frame.scan - frame.parts + 1
             return False
@@ -135,7 +137,7 @@ class RollingScans:
             return
         known = len(out.difference) == len(frame.z) and bool(np.isfinite(out.sigma).all())
         self._sound = known and out.valid and not out.electrodes.any() and not {"gain", "gap"} & set(out.reasons)
-        self._moved = self._ended = False
+        self._moved = self._ended = self._doubted = False
         self._waited = 0
         touched, self._began_us, self._began, self._held = self._held is not None, None, None, None
         if not touched or not self._sound or not out.touched:
@@ -202,6 +204,9 @@ class RollingScans:
         self._began_us, self._began = frame.device_us - float(age[on].max()), place.touch
         if not self._began.fits or self._began.sigma[0] > ANYWHERE:
             return []
+        self._doubted = not evidence.no_contact(d, noise, age, place)
+        if self._doubted:
+            return []
         share = np.where(on, place.course, 1.0)
         out.difference = np.where(on, d / share, 0.0).astype(np.float32)
         out.sigma = np.where(on, noise / share, np.inf).astype(np.float32)
@@ -215,6 +220,8 @@ class RollingScans:
         """Where a touch that goes on is by now, where that is known."""
         followed = self._models.filter
         if self._held is None or self._ended or not followed.knows or not followed.part(*values, frame.device_us):
+            return []
+        if max((state.sigma[0] for state in followed.states()), default=0.0) > self._coarse:
             return []
         return self._said(PartFrame(**inherited(out), after=self._delta_scan, followed=self._followed()))
 
@@ -269,6 +276,7 @@ class RollingScans:
             "held": self._held,
             "began_us": self._began_us,
             "waited": self._waited,
+            "doubted": self._doubted,
             "delta": self._delta_scan,
             "began": None if self._began is None else asdict(self._began),
             "filter": None if self._made is None else self._made.filter.state(),
@@ -282,7 +290,7 @@ class RollingScans:
         self._whole.last, self._sample_ns = int(state["whole"]), int(state["sample_ns"])
         self._sound, self._moved, self._ended = (bool(each) for each in state["flags"])
         self._rest, self._held = (None if state[n] is None else np.array(state[n], float) for n in ("rest", "held"))
-        self._waited = int(state["waited"])
+        self._waited, self._doubted = int(state["waited"]), bool(state.get("doubted", False))
         self._began_us, self._rests = state["began_us"], int(state["rests"])
         self._delta_scan = int(state.get("delta", 0))
         if (began := state.get("began")) is not None:

@@ -1,6 +1,7 @@
 """Numerical stability: everything that goes in made worse, step by step, until the answer or the promise breaks.
 
     skin bench stability [--quick] [--only PART ...] [--out bench/reports]
+    skin bench stability --scan rolling    what concerns scans, with scans in parts (stability-rolling.json)
 
 For each case: error against truth where there is one, and whether the promise was kept: no exception, no NaN or
 infinity out, never `valid` on garbage, no contact that jumps by more than 2 mm for a change within noise (or by four
@@ -64,16 +65,18 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="fewer cases and frames: under a minute on one core")
     parser.add_argument("--only", nargs="*", default=(), metavar="PART", help="parts whose name contains one of these")
     parser.add_argument("--bundle", default=SKIN, help=f"a bundle of the skin {SKIN}")
+    parser.add_argument("--scan", choices=("full", "rolling"), default="full", help="whole scans, or scans in parts")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     began, cpu = time.perf_counter(), time.process_time()
-    setting = Setting(Bundle.load(args.bundle), args.quick, args.seed)
-    found = run(setting, args.only)
+    setting, rolling = Setting(Bundle.load(args.bundle), args.quick, args.seed, args.scan), args.scan == "rolling"
+    found = run(setting, args.only or (tuple(late_bytes.PARTS) if rolling else ()))
     report.show(found)
     top = report.head(setting, time.perf_counter() - began, time.process_time() - cpu)
-    report.write(args.out, top, found)
-    print(f"{top['seconds']:.0f} s ({top['cpu_seconds']:.0f} s of CPU); wrote {args.out}/stability.json")
+    path = args.out / f"stability{'-rolling' * rolling}.json"
+    report.write(path, top, found)
+    print(f"{top['seconds']:.0f} s ({top['cpu_seconds']:.0f} s of CPU); wrote {path}")
     return 1 if report.broken(found) else 0
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware_stub.rig import Rig
 from firmware_stub.sheet import Sheet
@@ -19,7 +20,7 @@ from protocol import link
 from protocol.frames import RawFrame
 from services.board.host_time import HostTime
 from services.board.source import BoardSource
-from services.runtime.config import Skin
+from services.runtime.config import ScanMode, Skin
 
 BOOTED_NS = 1_000_000_000_000  # what the host's clock shows as the simulation begins
 READ_LATE_S = 0.002  # a scheduler's doing
@@ -35,7 +36,7 @@ class ReceivedFrame:
 
     at_s: float  # true time
     frame: RawFrame
-    true_age_s: float  # since the middle of the scan that its values were measured in first
+    true_age_s: float  # since the middle of the scan, or of the newest part, that its values were measured in first
     stated_age_s: float  # by its stamp
 
     @property
@@ -53,8 +54,15 @@ class DelayedLine(HostTime):
     url = "socket://simulated:1"
 
     def __init__(
-        self, seed: int, *, to_host: Delay | None = None, to_board: Delay | None = None, answers_time: bool = True
+        self,
+        seed: int,
+        *,
+        to_host: Delay | None = None,
+        to_board: Delay | None = None,
+        answers_time: bool = True,
+        scan: ScanMode = "full",
     ) -> None:
+        self.scan = scan
         self.rig = Rig(_sheet(), seed=seed, answers_time=answers_time)
         self.rig.field.play(Timeline(Script("nothing"), 0.0, (), self.rig.sheet.electrodes), 0.0)
         self.true_s = 0.0
@@ -149,7 +157,7 @@ class DelayedLine(HostTime):
             self._middles[scan.seq] = middle
         for message in self._decoder.feed(data):
             if isinstance(message, link.ScanFrame):
-                self._measured.setdefault(message.z.tobytes(), self._middles[message.seq])
+                self._measured.setdefault(_values(message.z), self._middles[message.seq])
                 self.captured.append(link.encode(message))
         if data:
             self._hold_up(self._to_host, self._delays[0], data)
@@ -162,7 +170,7 @@ class DelayedLine(HostTime):
         return ReceivedFrame(
             self.true_s,
             frame,
-            self.true_s - self._measured[frame.z.tobytes()],
+            self.true_s - self._measured[_values(frame.z[frame.new > 0] if frame.parts > 1 else frame.z)],
             (self.now_ns() - frame.stamps["sample"]) * 1e-9,
         )
 
@@ -171,7 +179,7 @@ class _Source(BoardSource):
     """Acquisition's source at the end of such a line."""
 
     def __init__(self, line: DelayedLine) -> None:
-        super().__init__("palm", Skin(port=line.url, bundle="square16"), _bundle(), line)
+        super().__init__("palm", Skin(port=line.url, bundle="square16", scan=line.scan), _bundle(), line)
         self.line = line
 
     def open_port(self, url: str) -> DelayedLine:  # type: ignore[override]
@@ -190,6 +198,11 @@ def _frames(source: _Source, seconds: float) -> Iterator[ReceivedFrame]:
             return
         if frame is not None:
             yield source.line.seen(frame)
+
+
+def _values(z: NDArray[np.complex64]) -> bytes:
+    """What tells these values from others: a part's are sent in another order than the pattern's."""
+    return np.sort(z).tobytes()
 
 
 @cache

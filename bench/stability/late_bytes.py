@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 from bench.stability.delayed_line import Delay, DelayedLine, Happening, ReceivedFrame, listen
 from bench.stability.run import Row, Setting
+from services.runtime.config import ScanMode
 
 SLACK_S = 0.1
 BEGIN_S = 4.0  # all is well until then
@@ -34,8 +35,10 @@ class TimingCase:
     well: bool = True
     quick: bool = True
 
-    def line(self, seed: int) -> DelayedLine:
-        made = DelayedLine(seed, to_host=self.to_host, to_board=self.to_board, answers_time=self.answers_time)
+    def line(self, seed: int, scan: ScanMode = "full") -> DelayedLine:
+        made = DelayedLine(
+            seed, to_host=self.to_host, to_board=self.to_board, answers_time=self.answers_time, scan=scan
+        )
         for seconds, happening in self.at:
             made.at(seconds, happening)
         return made
@@ -127,16 +130,16 @@ def played(cases: list[TimingCase]) -> Callable[[Setting], Iterator[Row]]:
     def part(setting: Setting) -> Iterator[Row]:
         for case in cases:
             if case.quick or not setting.quick:
-                yield judged(case, setting.seed)
+                yield judged(case, setting.seed, setting.scan)
 
     return part
 
 
-def judged(case: TimingCase, seed: int) -> Row:
+def judged(case: TimingCase, seed: int, scan: ScanMode = "full") -> Row:
     log = logging.getLogger("services.board")
     level, log.level = log.level, logging.CRITICAL  # what acquisition says of the board is no news here
     try:
-        seen, source = listen(case.line(seed), case.seconds)
+        seen, source = listen(case.line(seed, scan), case.seconds)
     finally:
         log.level = level
     usable = [s for s in seen if s.usable]

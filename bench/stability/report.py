@@ -93,6 +93,7 @@ def head(setting: Setting, seconds: float, cpu_seconds: float) -> dict[str, Any]
     return {
         **provenance("stability", None),
         "bundle": {"name": setting.bundle.name, "hash": setting.bundle.hash},
+        "scan": setting.scan,
         "seed": setting.seed,
         "quick": setting.quick,
         "seconds": round(seconds, 1),
@@ -107,11 +108,12 @@ def goals(found: Found) -> list[Goal]:
     ]
 
 
-def write(folder: Path, top: Mapping[str, Any], found: Found) -> None:
-    """stability.json in `folder`, and stability.png where there are curves to draw."""
+def write(path: Path, top: Mapping[str, Any], found: Found) -> None:
+    """The report; of whole scans also stability.png beside it. Scans in parts have no curves."""
     targets = [goal.to_dict() for goal in goals(found)]
     content = {**top, "targets": targets, "broken": broken(found), "parts": dict(found)}
-    write_json(folder / "stability.json", content)
-    from bench import plots  # matplotlib takes a while
+    write_json(path, content)
+    if top["scan"] == "full":
+        from bench import plots  # matplotlib takes a while
 
-    plots.draw(folder / "stability.json")
+        plots.draw(path)

@@ -21,7 +21,7 @@ from models.shapes import Array, Shape
 from protocol.frames import Contact, FrameError, RawFrame, pack, unpack
 from services.estimation.tare import Baseline, take
 from services.pipeline import Pipeline, Result
-from services.runtime.config import Skin
+from services.runtime.config import ScanMode, Skin
 
 Row = dict[str, Any]
 
@@ -75,6 +75,7 @@ class Setting:
     bundle: Bundle
     quick: bool
     seed: int
+    scan: ScanMode = "full"  # of a board at the end of a line; stages are given whole scans
 
     def model(self, mesh: str = "stub") -> ForwardModel:
         """ "stub": as far from the mesh of training and inverse as a real skin is allowed to be."""

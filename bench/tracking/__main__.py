@@ -1,6 +1,7 @@
 """Ten scripted minutes in simulated time, scored against the stub's truth.
 
     skin bench tracking [--scene ten_minutes] [--seconds 60] [--bundle square16] [--out bench/reports]
+    skin bench tracking --scan rolling    the same with scans in parts (tracking-rolling.json)
 
 The stub board plays the scene; its bytes go through link, clock regression and the stages that the services run; every
 contact frame is matched with the true touches (bench/tracking/scores.py says how). The frames are simulated once and
@@ -29,16 +30,19 @@ HOLD = "hold"  # the section whose touch must not fade
 FADE_S = 5.0  # mean of the force over so long, at both ends
 
 
-def follow(recorded: Recorded, skin: Skin, bundle: Bundle | None = None) -> list[StageOutput]:
-    """What the stages say of every frame."""
+def follow(recorded: Recorded, skin: Skin, bundle: Bundle | None = None) -> tuple[Recorded, list[StageOutput]]:
+    """What the stages say, and the frames that were measured when it holds: of whole scans all."""
     pipeline = Pipeline(skin, name="palm", bundle=bundle)
-    seen = []
+    seen, measured, before = list[StageOutput](), list[int](), -1
     for k in range(len(recorded)):
-        result = pipeline.run(recorded.frame(k))
-        seen.append(StageOutput.of(result.delta, result.contact))
+        contact = pipeline.step(recorded.frame(k))
+        if contact is not None and pipeline.delta is not None:
+            scans, before = min(1.0, (k - before) / int(recorded.parts[k])), k
+            seen.append(StageOutput.of(pipeline.delta, contact, scans))
+            measured.append(recorded.measured_at(k, contact.stamps["sample"]))
         if k % 1000 == 999:
             print(f"followed {recorded.seconds[k]:.0f} of {recorded.seconds[-1]:.0f} s", file=sys.stderr)
-    return seen
+    return recorded.only(measured), seen
 
 
 def score(recorded: Recorded, seen: list[StageOutput]) -> dict[str, Any]:
@@ -81,21 +85,21 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=None, help="only the scene's beginning")
     parser.add_argument("--snr", type=float, default=80.0, help="the stub's signal over noise, dB")
     parser.add_argument("--bundle", default="square16")
+    parser.add_argument("--scan", choices=("full", "rolling"), default="full", help="whole scans, or scans in parts")
     parser.add_argument("--network", choices=("full", "fast", "int8", "none"), help="default: the services'")
     parser.add_argument("--seed", type=int, default=4, help="of the noise")
     parser.add_argument("--notes", action="store_true", help="also say what went wrong when")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
-    recorded, simulated_s = record(args.scene, args.snr, args.seed, args.seconds)
+    recorded, simulated_s = record(args.scene, args.snr, args.seed, args.seconds, args.scan)
     began = time.perf_counter()
     bundle = Bundle.load(args.bundle)
-    seen = follow(
-        recorded, Skin(port="stub", bundle=args.bundle, **({"network": args.network} if args.network else {})), bundle
-    )
-    found = score(recorded, seen)
-    head = report.head(args, bundle, recorded, simulated_s, time.perf_counter() - began)
+    skin = Skin(port="stub", bundle=args.bundle, scan=args.scan)
+    followed, seen = follow(recorded, skin.model_copy(update={"network": args.network or skin.network}), bundle)
+    found = score(followed, seen)
+    head = report.head(args, bundle, followed, simulated_s, time.perf_counter() - began)
     report.show(head, found, args.notes)
-    report.write(args.out, head, found)
+    report.write(args.out / f"tracking{'-rolling' * (args.scan == 'rolling')}.json", head, found)
     return 0
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +21,7 @@ STATES = {
     "mux_disabled": "open",
     "contact_drifts": "drifting",
 }
-RECOVERY = 22  # frames after a fault in which its electrodes may still be named
+RECOVERY = 22  # scans after a fault in which its electrodes may still be named
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def events(recorded: Recorded) -> list[FaultEvent]:
 
 
 def rows(recorded: Recorded, seen: Sequence[StageOutput]) -> list[dict[str, Any]]:
-    """One row an event: frames until named and marked (1: the first frame measured with it), and until all is well
+    """One row an event: scans until named and marked (1: the first one measured with it), and until all is well
     again.
     """
     found, all_events = [], events(recorded)
@@ -86,10 +87,10 @@ def rows(recorded: Recorded, seen: Sequence[StageOutput]) -> list[dict[str, Any]
                 "args": event.args,
                 "at_s": float(recorded.seconds[event.first]),
                 "frames": len(during),
-                "named": _first(event.named(s) for s in during),
+                "named": _first(during, event.named),
                 "named_%": 100 * sum(event.named(s) for s in during) / len(during),
-                "marked": _first(event.marked(s) for s in during),
-                "well_again": _first(s.valid and not any(s.electrodes) for s in after),
+                "marked": _first(during, event.marked),
+                "well_again": _first(after, lambda s: s.valid and not any(s.electrodes)),
                 "others_named_frames": sum(any(s.electrodes[e] != OK for e in others) for s in during),
                 "valid_%": 100 * sum(s.valid for s in during) / len(during),
                 "electrodes_said": _said(during),
@@ -100,15 +101,21 @@ def rows(recorded: Recorded, seen: Sequence[StageOutput]) -> list[dict[str, Any]
 
 def false_alarms(recorded: Recorded, seen: Sequence[StageOutput]) -> int:
     """Frames that name an electrode while no fault is in force, nor was lately."""
-    quiet, count = RECOVERY + 1, 0
+    quiet, count = RECOVERY + 1.0, 0
     for k, s in enumerate(seen):
-        quiet = 0 if recorded.faults[k] != "{}" else quiet + 1
+        quiet = 0 if recorded.faults[k] != "{}" else quiet + s.scans
         count += quiet > RECOVERY and any(e != OK for e in s.electrodes)
     return count
 
 
-def _first(flags: Any) -> int | None:
-    return next((n for n, flag in enumerate(flags, 1) if flag), None)
+def _first(seen: Sequence[StageOutput], says: Callable[[StageOutput], bool]) -> int | None:
+    """Scans up to the first frame that says so."""
+    passed = 0.0
+    for s in seen:
+        passed += s.scans
+        if says(s):
+            return math.ceil(round(passed, 3))
+    return None
 
 
 def _said(during: Sequence[StageOutput]) -> dict[str, int]:

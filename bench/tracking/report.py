@@ -33,10 +33,10 @@ COLUMNS = (  # heading, key, format
     ("false", "false_touches", "{:.0f}"),
     ("unseen", "unseen", "{:.0f}"),
     ("wrong %", "wrong_%", "{:.2f}"),
-    ("begin", "begin_frames", "{:.0f}"),
-    ("most", "begin_most", "{:.0f}"),
-    ("end", "end_frames", "{:.0f}"),
-    ("most", "end_most", "{:.0f}"),
+    ("begin", "begin_frames", "{:.1f}"),
+    ("most", "begin_most", "{:.1f}"),
+    ("end", "end_frames", "{:.1f}"),
+    ("most", "end_most", "{:.1f}"),
 )
 FAULTS = (
     ("frames", "frames", "{:.0f}"),
@@ -72,6 +72,7 @@ def head(args: argparse.Namespace, bundle: Bundle, recorded: Recorded, simulated
         **provenance("tracking", None),
         "bundle": {"name": bundle.name, "hash": bundle.hash, "network": args.network},
         "scene": args.scene,
+        "scan": args.scan,
         "seed": args.seed,
         "snr_db": args.snr,
         "frames": len(recorded),
@@ -82,7 +83,8 @@ def head(args: argparse.Namespace, bundle: Bundle, recorded: Recorded, simulated
 
 def show(head: dict[str, Any], found: dict[str, Any], notes: bool) -> None:
     console = Console(width=220) if not sys.stdout.isatty() else Console()
-    title = f"{head['scene']}, {head['frames']} frames, {head['snr_db']:g} dB, {head['bundle']['name']}"
+    title = f"{head['scene']}, {head['scan']} scans, {head['frames']} frames, {head['snr_db']:g} dB"
+    title += f", {head['bundle']['name']}"
     rows = [*found["sections"].items(), ("all", found["all"])]
     console.print(_table(title, "section", COLUMNS, rows))
     named = [(f"{f['fault']} {_brief(f['args'])} at {f['at_s']:.0f} s", f) for f in found["faults"]]
@@ -97,16 +99,15 @@ def show(head: dict[str, Any], found: dict[str, Any], notes: bool) -> None:
         print(f"{seconds:7.2f} s  {section}: {text}")
 
 
-def write(folder: Path, head: dict[str, Any], found: dict[str, Any]) -> None:
-    """tracking.json in `folder`."""
+def write(path: Path, head: dict[str, Any], found: dict[str, Any]) -> None:
     content = {
         **head,
         "targets": [goal.to_dict() for goal in goals(found)],
         **found,
         "notes": found["notes"][:KEPT_NOTES],
     }
-    write_json(folder / "tracking.json", content)
-    print(f"wrote {folder / 'tracking.json'}")
+    write_json(path, content)
+    print(f"wrote {path}")
 
 
 def _table(title: str, first: str, columns: Any, rows: Any) -> Table:

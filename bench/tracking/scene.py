@@ -11,7 +11,7 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -27,13 +27,17 @@ from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import Script
 from firmware_stub.world import NEWTON, World
 from protocol.frames import RawFrame
+from services.runtime.config import ScanMode, Skin
 
 MADE_BY = (
     *(f"firmware_stub/{n}.py" for n in ("analog", "board", "faults", "field", "rig", "scene", "sheet", "timeline")),
     *(f"models/{n}.py" for n in ("elements", "forward", "geometry", "meshing", "patterns", "shapes")),
-    *(f"services/board/{n}.py" for n in ("boardlink", "clock", "scan_check", "scan_order", "scanning", "source")),
+    *(
+        f"services/board/{n}.py"
+        for n in ("boardlink", "clock", "newest_values", "scan_check", "scan_order", "scanning", "source")
+    ),
 )
-LAYOUT = 1  # of what is kept: raised when Recorded or what fills it changes
+LAYOUT = 2  # of what is kept: raised when Recorded or what fills it changes
 KEPT = 6  # recorded scenes
 CONTACT_CHANGED = 0.05  # of its impedance within a second: a contact that drifts, not one that ages
 ELECTRODE_FAULTS = ("electrode_open", "electrodes_shorted", "electrodes_swapped", "mux_stuck", "mux_disabled")
@@ -42,7 +46,7 @@ TOUCHES = ("track", "x", "y", "force", "radius", "area")  # of one true touch; x
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """N scans that reached the host."""
+    """N scans that reached the host, or N parts of scans: then each with the newest value of every measurement."""
 
     z: NDArray[np.complex64]  # (N, K) ohm
     status: NDArray[np.uint8]  # (N, K)
@@ -53,6 +57,10 @@ class Recorded:
     read_ns: NDArray[np.int64]
     device_us: NDArray[np.int64]
     gap: NDArray[np.bool_]  # scans are missing just before
+    part: NDArray[np.int64]  # (N,) the one measured last, from 1 on; 0: whole scans
+    parts: NDArray[np.int64]  # (N,) of a scan
+    age_us: NDArray[np.float32]  # (N, K), (N, 0) of whole scans: of each value, when the newest part ended
+    new: NDArray[np.uint8]  # (N, K), (N, 0) of whole scans: 1: measured in the newest part
     touches: NDArray[np.float64]  # (M, 1 + len(TOUCHES)): index of the frame, then TOUCHES
     faults: NDArray[np.str_]  # (N,) JSON: electrode faults in force, name -> arguments
     sections: NDArray[np.str_]  # (N,) name of the scene's section
@@ -74,7 +82,22 @@ class Recorded:
             status=self.status[k],
             device_us=int(self.device_us[k]),
             board=board,
+            part=int(self.part[k]),
+            parts=int(self.parts[k]),
+            age_us=self.age_us[k],
+            new=self.new[k],
         )
+
+    def measured_at(self, k: int, sample_ns: int) -> int:
+        """The one of the scan's parts, frame k the last of them, that was measured nearest to a time."""
+        first = max(0, k - int(self.parts[k]) + 1)
+        return first + int(np.abs(self.sample_ns[first : k + 1] - sample_ns).argmin())
+
+    def only(self, frames: Sequence[int]) -> Recorded:
+        """These frames."""
+        touches = [[n, *row[1:]] for n, k in enumerate(frames) for row in self._of(k)]
+        kept = {f.name: getattr(self, f.name)[list(frames)] for f in fields(self) if f.name != "touches"}
+        return Recorded(**kept, touches=np.array(touches).reshape(-1, 1 + len(TOUCHES)))
 
     def beginning(self, seconds: float) -> Recorded:
         n = int(np.searchsorted(self.seconds, seconds))
@@ -91,17 +114,19 @@ class Recorded:
         return self.touches[low:high]
 
 
-def record(name: str, snr_db: float, seed: int, seconds: float | None = None) -> tuple[Recorded, float]:
+def record(
+    name: str, snr_db: float, seed: int, seconds: float | None = None, scan: ScanMode = "full"
+) -> tuple[Recorded, float]:
     """The scene's frames, or those of its beginning, from bench/work where they are there; and the seconds that
     simulating them took.
     """
-    path = WORK / f"tracking-{_key(name, snr_db, seed)}.npz"
+    path = WORK / f"tracking-{_key(name, snr_db, seed, scan)}.npz"
     if path.is_file():
         with np.load(path) as kept:
             found = Recorded(**{f.name: kept[f.name] for f in fields(Recorded)})
         return (found if seconds is None else found.beginning(seconds)), 0.0
     began = time.perf_counter()
-    found = simulate(name, snr_db, seed, seconds)
+    found = simulate(name, snr_db, seed, seconds, scan=scan)
     if seconds is None:
         WORK.mkdir(parents=True, exist_ok=True)
         for old in sorted(WORK.glob("tracking-*.npz"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
@@ -110,11 +135,18 @@ def record(name: str, snr_db: float, seed: int, seconds: float | None = None) ->
     return found, time.perf_counter() - began
 
 
-def simulate(name: str, snr_db: float, seed: int, seconds: float | None = None, sheet: Sheet | None = None) -> Recorded:
+def simulate(
+    name: str,
+    snr_db: float,
+    seed: int,
+    seconds: float | None = None,
+    sheet: Sheet | None = None,
+    scan: ScanMode = "full",
+) -> Recorded:
     """Play a scene (name or path) to its end, or for so many seconds."""
     rig = Rig(sheet or "square16", scene=name, snr_db=snr_db, seed=seed)
     script = rig.field.timeline.script
-    recorder = _Recorder(rig, seed)
+    recorder = _Recorder(rig, seed, scan)
     end = min(seconds or script.duration, script.duration)
     said = 0.0
     while (now := recorder.host.now) < end:
@@ -129,8 +161,8 @@ def simulate(name: str, snr_db: float, seed: int, seconds: float | None = None, 
 class _Recorder:
     """What came of a host's steps."""
 
-    def __init__(self, rig: Rig, seed: int) -> None:
-        self.rig, self.host = rig, Host(rig, seed)
+    def __init__(self, rig: Rig, seed: int, scan: ScanMode) -> None:
+        self.rig, self.host = rig, Host(rig, seed, Skin(port="stub", bundle="square16", scan=scan))
         self._felt: list[Felt] = []
         self._frames: list[RawFrame] = []
 
@@ -162,6 +194,10 @@ class _Recorder:
             read_ns=column(lambda f: f.stamps["read"]),
             device_us=column(lambda f: f.device_us),
             gap=column(lambda f: "gap" in f.reasons),
+            part=column(lambda f: f.part),
+            parts=column(lambda f: f.parts),
+            age_us=column(lambda f: f.age_us),
+            new=column(lambda f: f.new),
             touches=np.array(rows).reshape(-1, 1 + len(TOUCHES)),
             faults=np.array([json.dumps(f, sort_keys=True) for f in faults]),
             sections=np.array(names),
@@ -193,8 +229,8 @@ def _drifting(script: Script, starts: list[float]) -> list[dict[str, object]]:
     return found
 
 
-def _key(name: str, snr_db: float, seed: int) -> str:
-    digest = hashlib.sha256(f"{LAYOUT} {snr_db} {seed}".encode())
+def _key(name: str, snr_db: float, seed: int, scan: ScanMode) -> str:
+    digest = hashlib.sha256(f"{LAYOUT} {snr_db} {seed} {scan}".encode())
     path = Path(name) if name.endswith(".toml") else scenes.FOLDER / f"{name}.toml"
     for file in (path, *(ROOT / name for name in MADE_BY)):
         digest.update(file.read_bytes())

@@ -19,27 +19,31 @@ from protocol.frames import ContactFrame, DeltaFrame
 
 GATE_M = 0.010  # a contact further away matches no true touch
 LIGHT_N = 0.5  # a lighter touch may be seen or not
-GRACE = 2  # frames a contact may outlast its touch before it counts as false
-STEADY = 0.01  # relative change of the force from frame to frame
-SETTLED = 3  # frames a touch is there before what is said of it counts as steady, or its absence as wrong
+GRACE = 2  # scans a contact may outlast its touch before it counts as false
+STEADY = 0.01  # relative change of the force from scan to scan
+SETTLED = 3  # scans a touch is there before what is said of it counts as steady, or its absence as wrong
 WRONG_M = 0.005  # a valid position that is off by more must not be
+TINY = 1e-6  # by which sums of tenths are off
 METRES_PER_UNIT = 0.05  # of the skin, for models.metrics
 
 
 @dataclass(frozen=True)
 class StageOutput:
-    """What the stages said of one frame. contacts: those that last, each id, x, y [m], force, sigma [N]."""
+    """What the stages said of one frame. contacts: those that last, each id, x, y [m], force, sigma [N]; scans: how
+    many were measured since the frame before, of a part a tenth.
+    """
 
     valid: bool
     reasons: tuple[str, ...]
     electrodes: tuple[int, ...]
     contacts: tuple[tuple[int, float, float, float | None, float | None], ...] = ()
+    scans: float = 1.0
 
     @classmethod
-    def of(cls, delta: DeltaFrame, contact: ContactFrame) -> StageOutput:
+    def of(cls, delta: DeltaFrame, contact: ContactFrame, scans: float = 1.0) -> StageOutput:
         lasting = [c for c in contact.contacts if c.state != "end"]
         rows = tuple((c.id, c.position[0], c.position[1], c.force_n, c.force_sigma_n) for c in lasting)
-        return cls(contact.valid, tuple(contact.reasons), tuple(delta.electrodes.tolist()), rows)
+        return cls(contact.valid, tuple(contact.reasons), tuple(delta.electrodes.tolist()), rows, scans)
 
 
 @dataclass
@@ -62,8 +66,8 @@ class Tally:
     force: list[float] = field(default_factory=list)  # relative errors
     steady: list[float] = field(default_factory=list)  # those of settled, unchanging forces
     sigmas: list[float] = field(default_factory=list)  # steady errors in standard uncertainties
-    begin: list[int] = field(default_factory=list)  # valid frames from LIGHT_N until matched
-    end: list[int] = field(default_factory=list)  # frames a contact outlasts its touch
+    begin: list[float] = field(default_factory=list)  # scans of valid frames from LIGHT_N until matched
+    end: list[float] = field(default_factory=list)  # scans a contact outlasts its touch
 
     def row(self) -> dict[str, Any]:
         """Figures for table and report. None: nothing to count."""
@@ -111,13 +115,13 @@ class _Touch:
 
     section: str
     first: int  # frame
-    loaded: int | None = None  # frame from which it weighs LIGHT_N
+    loaded: float | None = None  # scans until it weighed LIGHT_N
     last: int = 0  # frame in which it was there
     force: float = 0.0
     id: int | None = None  # contact it was last matched with
     matched: bool = False  # ever
-    waited: int = 0  # valid frames with LIGHT_N until then
-    missing: int = 0  # valid frames in a row
+    waited: float = 0.0  # scans of valid frames with LIGHT_N until then
+    missing: float = 0.0  # scans of valid frames in a row
 
 
 class Scorer:
@@ -129,14 +133,16 @@ class Scorer:
         self.notes: list[tuple[int, str, str]] = []
         self._touches: dict[int, _Touch] = {}
         self._pairs: dict[int, int] = {}  # track -> contact id, in the last valid frame
-        self._alone: dict[int, int] = {}  # contact id -> frames in a row without a touch
+        self._alone: dict[int, float] = {}  # contact id -> scans in a row without a touch
+        self._scans = 0.0  # so far
         self._real: dict[int, int] = {}  # contact id -> track it last belonged to
 
     def add(self, k: int, seen: StageOutput) -> None:
         section = str(self.recorded.sections[k])
         tally = self.tallies[section]
         truth = {int(t["track"]): t for t in self.recorded.truth(k)}
-        steady = self._begin(k, section, truth)
+        self._scans += seen.scans
+        steady = self._begin(k, section, truth, seen.scans)
         loaded = [n for n, t in truth.items() if t["force"] >= LIGHT_N]
         tally.frames += 1
         tally.present += len(loaded)
@@ -151,11 +157,12 @@ class Scorer:
         wrong = [self._pair(k, tally, truth[n], seen.contacts[i], n in steady) for n, i in pairs.items()]
         for n in loaded:
             touch = self._touches[n]
-            touch.missing = 0 if n in pairs else touch.missing + 1
-            touch.waited += not touch.matched
+            touch.missing = 0.0 if n in pairs else touch.missing + seen.scans
+            touch.waited += seen.scans * (not touch.matched)
             tally.missed += n not in pairs
             wrong.append(touch.missing > SETTLED)
-        wrong += [self._extra(k, section, tally, c) for i, c in enumerate(seen.contacts) if i not in pairs.values()]
+        strangers = [c for i, c in enumerate(seen.contacts) if i not in pairs.values()]
+        wrong += [self._extra(k, section, tally, c, seen.scans) for c in strangers]
         there = {c[0] for c in seen.contacts}
         self._alone = {n: count for n, count in self._alone.items() if n in there}
         tally.wrong += any(wrong)
@@ -168,7 +175,7 @@ class Scorer:
                 self.tallies[touch.section].unseen += 1
                 self.notes.append((touch.first, touch.section, "touch never seen"))
 
-    def _begin(self, k: int, section: str, truth: dict[int, dict[str, float]]) -> set[int]:
+    def _begin(self, k: int, section: str, truth: dict[int, dict[str, float]], scans: float) -> set[int]:
         """Keep the book of true touches; those that are settled and press steadily."""
         steady = set()
         for n, t in truth.items():
@@ -177,9 +184,9 @@ class Scorer:
                 self.tallies[section].touches += 1
             touch = self._touches[n]
             if touch.loaded is None and t["force"] >= LIGHT_N:
-                touch.loaded = k
-            changed = abs(t["force"] - touch.force) > STEADY * t["force"]
-            if touch.loaded is not None and k - touch.loaded >= SETTLED and not changed:
+                touch.loaded = self._scans
+            changed = abs(t["force"] - touch.force) > STEADY * scans * t["force"]
+            if touch.loaded is not None and self._scans - touch.loaded >= SETTLED - TINY and not changed:
                 steady.add(n)
             touch.last, touch.force = k, t["force"]
         return steady
@@ -210,16 +217,17 @@ class Scorer:
                     tally.sigmas.append((force - t["force"]) / sigma)
         return steady and off > WRONG_M
 
-    def _extra(self, k: int, section: str, tally: Tally, contact: Any) -> bool:
+    def _extra(self, k: int, section: str, tally: Tally, contact: Any, scans: float) -> bool:
         """A contact where nothing touches; whether that is wrong by now."""
         contact_id = contact[0]
         tally.extra += 1
-        count = self._alone[contact_id] = self._alone.get(contact_id, 0) + 1
+        before = self._alone.get(contact_id, 0.0)
+        count = self._alone[contact_id] = before + scans
         track = self._real.get(contact_id)
         if track is not None and k > self._touches[track].last:
             tally.end.append(count)
-        limit = 1 if track is None else GRACE + 1  # one that never was a touch's is false at once
-        if count == limit:
+        limit = TINY if track is None else GRACE + 1 - TINY  # one that never was a touch's is false at once
+        if before < limit <= count:
             tally.false_touches += 1
             force = "no force" if contact[3] is None else f"{contact[3]:.2f} N"
             where = f"({contact[1] * 1e3:+.1f}, {contact[2] * 1e3:+.1f}) mm, {force}"

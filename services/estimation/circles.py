@@ -24,6 +24,8 @@ MODEL = 4  # of them, that d depends on
 LINEAR = 0.05  # of d: by so much the linear picture of a circle is wrong; by half of it of the rms of d
 STEP = np.array([0.05, 0.05, 0.5, 1.0])  # that one step of a fit does not much exceed
 FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
+STEADY = 0.8  # the same beside noise of touches that hold still: those whose force grows leave more
+ELSEWHERE = 0.4  # model units from a touch: another one is told from its change
 MOST = 4  # touches that are told apart
 LOW, HIGH = np.log([0.04, 0.005]), np.log([0.9, 0.97])  # of log radius, log drop
 TINY = 1e-9  # keeps solvable what no value tells
@@ -59,6 +61,14 @@ class Circles:
         expected = each[:, 0].sum(axis=0) + (slope[:, :, MODEL:] * touches[:, MODEL:]).sum(axis=(1, 2))
         return expected, slope.reshape(len(rows), -1)
 
+    def another(self, off: Array, width: Array, rows: Rows, touches: Array) -> float:
+        """How much of |off / width|^2, of these measurements (n,), a touch explains that begins elsewhere."""
+        grid = self._image.grid
+        away = np.hypot(*(grid.position[:, None] - touches[None, :, :RADIUS]).transpose(2, 0, 1)).min(axis=1)
+        whitened = grid.response[np.ix_(away > ELSEWHERE, rows)] / width
+        gain = np.maximum(whitened @ (off / width), 0.0) ** 2 / ((whitened**2).sum(axis=1) + TINY)
+        return float(gain.max(initial=0.0))
+
     def still(self, touches: Array) -> Array:
         """(K,) d of touches that do not move."""
         held = touches.copy()
@@ -87,7 +97,7 @@ class Circles:
         """The touches of about these places that explain a whole scan best, if they hold still."""
         touches, tau = around.copy(), np.zeros(len(d))
         touches[:, MODEL:] = 0.0
-        width = np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean()))
+        width = _width(d, noise)
         columns = [6 * k + n for k in range(len(touches)) for n in range(MODEL)]
         damping = np.diag(np.tile(STEP**-2.0, len(touches)))
         for _ in range(steps):
@@ -104,13 +114,16 @@ class Circles:
         return Fit(touches, np.asarray(covariance, dtype=np.float64), chi2 / len(d))
 
     def found(self, d: Array, noise: Array) -> Fit:
-        """The touches that explain a whole scan; none where they are no circles that are apart."""
+        """The touches that explain a whole scan; none where they are no circles that are apart, or where they changed
+        during the scan.
+        """
         seen = [self._image.fit(d, noise)]
         fit = self.fitted(d, noise, as_touches(seen))
         while fit.misfit > FITS and len(seen) < MOST:  # another one, where what is left of d is largest
             seen.append(self._image.fit(d - self.still(fit.touches), noise))
             fit = self.fitted(d, noise, np.concatenate([fit.touches, as_touches(seen[-1:])]), steps=8)
-        if fit.misfit > FITS or not _apart(fit.touches):
+        noisy = float((noise**2 / _width(d, noise) ** 2).mean())
+        if fit.misfit > min(FITS, STEADY + noisy) or not _apart(fit.touches):
             return Fit(as_touches([]), np.zeros((0, 0)), fit.misfit)
         return fit
 
@@ -118,6 +131,11 @@ class Circles:
 def as_touches(seen: Sequence[PartTouch]) -> Array:
     """(N, 6) of touches that do not move."""
     return np.array([[t.x, t.y, np.log(t.radius), np.log(t.drop), 0.0, 0.0] for t in seen]).reshape(-1, 6)
+
+
+def _width(d: Array, noise: Array) -> Array:
+    """(K,) standard deviation of d against circles."""
+    return np.asarray(np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean())))
 
 
 def _apart(touches: Array) -> bool:

@@ -36,10 +36,13 @@ class TouchStart:
 
 @dataclass(frozen=True)
 class PartPlace:
-    """The touch; course (K,): f of each value; the uncertainty of its place is that of all likely courses."""
+    """The touch; course (K,): f of each value that tells; the uncertainty of its place is that of all likely courses.
+    expected (K,): what the touch makes of d, where it tells too little too.
+    """
 
     touch: PartTouch
     course: Array
+    expected: Array
 
 
 def courses(age: Array) -> tuple[Array, int]:
@@ -89,7 +92,7 @@ class PartPlaces:
         own = np.einsum("n,nab->ab", weight, [_covariance(place.touch.sigma) for _, place in found])
         sigma = ellipse(own + spread, 1.0, LEAST)
         touch = replace(best.touch, at=(float(middle[0]), float(middle[1])), sigma=sigma)
-        return PartPlace(touch, best.course)
+        return PartPlace(touch, best.course, best.expected)
 
     def again(self, d: Array, noise: Array, age: Array, touch: PartTouch) -> PartPlace:
         """The same of a touch whose place is known, which goes on."""
@@ -107,7 +110,7 @@ class PartPlaces:
     def _course(self, d: Array, noise: Array, touch: PartTouch, f: Array, steps: int) -> Array:
         """That of f (H, K); so many of them are steps."""
         response = self.response(touch)
-        along, size = f @ (response * d / (width := _width(d, noise)) ** 2), f**2 @ (response / width) ** 2
+        along, size = f @ (response * d / (width := width_of(d, noise, LINEAR)) ** 2), f**2 @ (response / width) ** 2
         gain = np.maximum(along, 0.0) ** 2 / (size + TINY)
         gain[steps:] -= 2 * LESS_LIKELY
         return np.asarray(f[int(gain.argmax())])
@@ -118,19 +121,19 @@ class PartPlaces:
         share = np.where(on, course, 1.0)
         touch = self._image.fit(np.where(on, d / share, 0.0), np.where(on, noise / share, np.inf), theta)
         expected = course * touch.drop * self.response(touch)
-        cost = float((((d - expected) / _width(d, noise)) ** 2).sum())
+        cost = float((((d - expected) / width_of(d, noise, LINEAR)) ** 2).sum())
         cost += 2 * LESS_LIKELY * bool(((course > 0) & (course < 1)).any())
-        return cost, PartPlace(touch, np.where(on, course, 0.0))
+        return cost, PartPlace(touch, np.where(on, course, 0.0), expected)
 
 
 def _theta(touch: PartTouch) -> Array:
     return np.array([touch.x, touch.y, np.log(touch.radius), np.log(touch.drop)])
 
 
-def _width(d: Array, noise: Array) -> Array:
-    """(K,) standard deviation of d against the linear picture of a circle."""
+def width_of(d: Array, noise: Array, error: float) -> Array:
+    """(n,) standard deviation of d against a picture of it that is wrong by this share."""
     felt = np.sort(d**2)[-len(d) // 2 :]
-    return np.asarray(np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float(felt.mean())))
+    return np.asarray(np.sqrt(noise**2 + (error * d) ** 2 + (error / 2) ** 2 * float(felt.mean())))
 
 
 def _covariance(sigma: tuple[float, float, float]) -> Array:

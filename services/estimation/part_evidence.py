@@ -7,7 +7,8 @@ to an untouched skin is exp(z^2 / 2), z the matched filter's value. A begin coun
 - z exceeds SIGMAS, which noise does less than once in a month of parts,
 - one touch explains what changed, within what the linear model of it may be wrong by,
 - it explains more than a change of gain would,
-- it is seen also without all measurements of any two electrodes: a contact, an open or a short is not.
+- it is seen also without all measurements of any two electrodes: an open or a short is not,
+- it explains more than a change of any one contact would, whatever its course (part_contacts.py).
 
 Otherwise the next part decides, or the next whole scan.
 """
@@ -23,7 +24,8 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.touch_grid import touches
-from services.estimation.part_course import FAINT, TouchStart
+from services.estimation.part_contacts import PartContacts
+from services.estimation.part_course import FAINT, PartPlace, TouchStart
 
 Array = NDArray[np.floating]
 
@@ -88,6 +90,7 @@ class PartEvidence:
         electrodes = int(bundle.pattern.max()) + 1
         uses = np.array([np.isin(np.arange(electrodes), row) for row in bundle.pattern])
         self._outside = np.array([~(uses[:, a] | uses[:, b]) for a, b in combinations(range(electrodes), 2)])
+        self._contacts = PartContacts(bundle, uses.T)
 
     def sigmas(self, d: Array, noise: Array, age: Array, parts: int = 1) -> float:
         """The largest matched filter of so many of the newest parts. d, noise, age: (K,) each."""
@@ -126,6 +129,13 @@ class PartEvidence:
         d, noise, f, one = d[rows], noise[rows], course[rows], Responses.of(response[None, rows])
         found = float(_filters(one, d, noise, f[None]).max())
         return found if found >= SIGMAS and self._is_touch(d, noise, f, rows, one) else None
+
+    def no_contact(self, d: Array, noise: Array, age: Array, place: PartPlace) -> bool:
+        """Whether the touch explains what was measured since it began better than any contact that changed. d, noise,
+        age: (K,) each.
+        """
+        d, noise, age = (np.asarray(each, dtype=np.float64) for each in (d, noise, age))
+        return self._contacts.beaten(d, noise, age, place.expected, float(age[place.expected > 0].max()))
 
     def _likely(self, d: Array, noise: Array, courses: Array, rows: NDArray[np.intp]) -> list[tuple[int, int]]:
         """(touch, course) of the likeliest and of those that are nearly as likely, each of another form, or elsewhere:

@@ -34,6 +34,8 @@ WINDOWS = (1, 3, 6, 10)  # newest parts among which a change is looked for
 STILL = 24.0  # chi-square of a touch's place and strength, up to which it did not change: one in 10^4 parts exceeds it
 SPREAD = 6.0  # standard deviations of chi-square that the noise of a part may come to
 LIKELY, EXPLAINED = 2.7, 4.0  # chi-square per value up to which a part is, without and with a sudden change
+SURPRISE = 24.0  # chi-square beyond noise, from which on another touch may have begun
+OTHER_NATS = 7.0  # that it costs to be anywhere: the logarithm of the grid's touches
 SLOW_SIGMAS = 2.0  # standard deviations of its velocity, below which a touch may not move at all
 AS_WELL = 1.05  # times what a whole scan leaves of a touch that moves: one that holds still does as well
 TINY = 1e-12  # keeps solvable what no value tells
@@ -231,33 +233,56 @@ class PartFilter:
         before = advance @ self.touches.ravel()
         for sudden, most in ((0.0, LIKELY), (1.0, EXPLAINED)):
             start = self._covariance + sudden * np.diag(np.tile(SUDDEN**2, len(self.touches)))
-            state, covariance, chi = self._updated(before, advance @ start @ advance.T + wandered, d, noise, tau, rows)
+            ahead = advance @ start @ advance.T + wandered
+            state, covariance, chi, another = self._updated(before, ahead, d, noise, tau, rows)
             if chi <= most:
+                if another:
+                    return False
                 self.touches, self._covariance = state.reshape(-1, 6), covariance
                 return True
         return False
 
+    def _another(self, off: Array, variance: Array, spread: Array, rows: Rows, touches: Array) -> bool:
+        """Whether what touches (N, 6), which go on as before, leave of values (n,) is likelier of another touch that
+        begins elsewhere than of their own change: one that is followed must not go where another one begins. variance
+        (n,): of what is no change, spread (n, n): with their change.
+        """
+        alone = float((off**2 / variance).sum())
+        if alone < SURPRISE + len(off):
+            return False
+        changed = float(off @ np.linalg.solve(spread, off)) + float(np.linalg.slogdet(spread)[1])
+        other = alone - self._circles.another(off, np.sqrt(variance), rows, touches) + float(np.log(variance).sum())
+        return other + 2 * OTHER_NATS < changed
+
+    def _beside(self, state: Array, d: Array, tau: Array, rows: Rows) -> tuple[Array, Array, Array]:
+        """What a state (6 N,) leaves of values (n,), measured tau [s] after it; its derivative (n, 6 N); what is new in
+        the values, beside the reference, as far as the touches are near it.
+        """
+        assert self._reference is not None
+        touches = state.reshape(-1, 6)
+        near = float(np.exp(-((np.hypot(*(touches - self._there).T[:2]).max() / NEAR) ** 2)))
+        expected, slope = self._circles.expected(touches, rows, tau)
+        return d - expected - near * self._left[rows], slope, d - near * self._reference[rows]
+
     def _updated(
         self, before: Array, covariance: Array, d: Array, noise: Array, tau: Array, rows: Rows
-    ) -> tuple[Array, Array, float]:
-        """State (6 N,), covariance and chi-square per value: of values d (n,), measured tau [s] after the state."""
-        assert self._reference is not None
-        state, chi = before, np.inf
+    ) -> tuple[Array, Array, float, bool]:
+        """State (6 N,), covariance and chi-square per value: of values d (n,), measured tau [s] after the state; and
+        whether another touch is likelier.
+        """
+        state, chi, another = before, np.inf, False
         for _ in range(2):
-            touches = state.reshape(-1, 6)
-            away = np.hypot(*(touches - self._there).T[:2]).max()
-            near = float(np.exp(-((away / NEAR) ** 2)))
-            expected, slope = self._circles.expected(touches, rows, tau)
-            new = d - near * self._reference[rows]
+            off, slope, new = self._beside(state, d, tau, rows)
             variance = noise**2 + (LINEAR * new) ** 2 + (LINEAR / 2) ** 2 * float((new**2).mean())
-            off = d - expected - near * self._left[rows] - slope @ (before - state)
+            off = off - slope @ (before - state)
             spread = slope @ covariance @ slope.T + np.diag(variance)
             gain = np.linalg.solve(spread, slope @ covariance).T
             if chi == np.inf:
                 chi = float(off @ np.linalg.solve(spread, off)) / len(d)
+                another = self._another(off, variance, spread, rows, before.reshape(-1, 6))
             state = self._circles.possible((before + gain @ off).reshape(-1, 6)).ravel()
         after = covariance - gain @ slope @ covariance
-        return state, np.asarray((after + after.T) / 2), chi
+        return state, np.asarray((after + after.T) / 2), chi, another
 
     def state(self) -> dict[str, Any]:
         return {

@@ -25,7 +25,7 @@ MEAN = np.log([0.2, 0.2])  # prior of log radius [model units], log drop [S/m]
 SD = np.array([0.5, 0.9])
 COARSE = 0.05  # of the side: a standard deviation beyond it is coarse
 STEPS = 8
-MOST_MISFIT = 6.0  # squares left per value, beyond which it is no touch of this kind; below, they widen what is stated
+MOST_MISFIT = 2.5  # squares left per value, beyond which it is no circle: one between two touches leaves 3
 MOST = np.array([0.1, 0.1, 0.3, 0.5])  # of one step
 TINY = 1e-9  # keeps solvable what nothing depends on, as of a circle off the skin
 AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
@@ -59,8 +59,8 @@ class PartImage:
         jacobian = np.asarray(m.jacobian, dtype=np.float64)  # (K, P)
         self._by_pixel = np.ascontiguousarray(jacobian.T).reshape(h, w, -1)  # (H, W, K)
         self.half_width, self.measurements = bundle.half_width, len(bundle.pattern)
-        self._grid = touches(m, self.half_width)
-        self._of_grid = np.asarray(self._grid.response, dtype=np.float64)  # (M, K)
+        self.grid = touches(m, self.half_width)
+        self._of_grid = np.asarray(self.grid.response, dtype=np.float64)  # (M, K)
         self._of_grid_squared = self._of_grid**2
         self._pixel = 2 * self.half_width / w
         self._x, self._y = ((np.arange(n) + 0.5) * self._pixel - self.half_width for n in (w, h))
@@ -138,7 +138,7 @@ class PartImage:
         z = self._of_grid @ pull / size
         best = int(z.argmax())
         drop = float(np.clip(z[best] / size[best], 0.01, 0.9))
-        return np.array([*self._grid.position[best], np.log(self._grid.radius[best]), np.log(drop)])
+        return np.array([*self.grid.position[best], np.log(self.grid.radius[best]), np.log(drop)])
 
     def _linear(self, theta: Array, rows: NDArray[np.intp], d: Array, noise: Array) -> tuple[float, Array, Array]:
         """Penalty, what is left of d, and the derivative of the response; whitened."""

@@ -32,6 +32,10 @@ def recorded_of(rows, n=N, faults=None):
         read_ns=np.zeros(n, int),
         device_us=np.zeros(n, int),
         gap=np.zeros(n, bool),
+        part=np.zeros(n, int),
+        parts=np.ones(n, int),
+        age_us=none.astype(np.float32),
+        new=none.astype(np.uint8),
         touches=touches,
         faults=np.array([json.dumps(f) for f in faults or [{}] * n]),
         sections=np.array(["one"] * n),
@@ -201,13 +205,28 @@ def test_the_simulated_truth_is_the_scenes(short):
 
 
 def test_a_few_seconds_of_the_real_thing(short):
-    found = tracking.score(short, tracking.follow(short, Skin(port="stub", bundle="square16")))
+    found = tracking.score(*tracking.follow(short, Skin(port="stub", bundle="square16")))
     row, press = found["all"], found["sections"]["press"]
     assert row["touches"] == 2 and row["unseen"] == 0 and row["false_touches"] == 0
     assert press["seen_%"] > 95 and press["position_%"] <= 1.5 and press["switches"] == 0
     assert row["position_%"] <= 1.5 and row["force_%"] < 20
     assert found["faults"][0]["named"] <= report.NAMED_WITHIN
     assert press["valid_%"] > 90  # frames in which it begins or ends may be refused
+
+
+def test_scans_in_parts_are_scored_by_scans(tmp_path):
+    path = tmp_path / "short.toml"
+    path.write_text(SCENE.partition("fault =")[0])
+    recorded = simulate(str(path), 80.0, seed=1, seconds=8.8, scan="rolling")
+    assert set(recorded.parts) == {10} and len(recorded) == pytest.approx(8.7 * 229, rel=0.03)
+    followed, seen = tracking.follow(recorded, Skin(port="stub", bundle="square16", scan="rolling"))
+    assert min(s.scans for s in seen) == pytest.approx(0.1) and max(s.scans for s in seen) == 1.0
+    touched = np.array([bool(s.contacts) for s in seen])
+    assert np.diff(followed.seconds[touched]).min() < 0.006 < np.diff(followed.seconds[~touched][:20]).min()
+    found = tracking.score(followed, seen)
+    row, press = found["all"], found["sections"]["press"]
+    assert row["touches"] == 1 and row["unseen"] == row["switches"] == row["false_touches"] == 0
+    assert press["seen_%"] > 95 and press["position_%"] <= 1.5 and press["begin_most"] <= 1
 
 
 def test_the_command_prints_tables_and_writes_strict_json(short, monkeypatch, tmp_path, capsys):

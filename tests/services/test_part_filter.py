@@ -145,6 +145,22 @@ def test_another_touch_is_not_explained_and_nothing_is_said_until_a_whole_scan(b
     assert follower.knows
 
 
+def test_a_held_touch_stays_where_it_is_while_another_begins_slowly_elsewhere(bundle):
+    """A filter of one touch went 10 mm towards the other one and stated 1 mm."""
+    held = Skin(bundle, lambda t: (0.37, -0.17, 0.2, 0.45))
+    other = Skin(bundle, lambda t: (0.55, 0.41, 0.2, 2.0 * np.clip(t - 0.1, 1e-9, None)), seed=1)
+    follower, explained = PartFilter(bundle), 0
+    for k in range(30):
+        (d, age, now), more = held.values(1 + k % 10), other.values(1 + k % 10)[0]
+        if k == 0:
+            follower.whole(d, NOISE, now, shown=True)
+        elif follower.part(d + more, 1.5 * NOISE, age, now):
+            (state,) = follower.states()
+            assert np.hypot(state.x - 0.37, state.y + 0.17) < 0.06, "3 % of the side"
+            explained += 1
+    assert explained >= 10 and not follower.knows
+
+
 @pytest.mark.parametrize("count", [2, 3])
 def test_several_touches_are_followed_while_one_of_them_slides(bundle, count):
     places = [(-0.5, -0.4), (0.5, 0.5), (-0.3, 0.6)][:count]

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import ContactFrame, ForceFrame, Frame, ImageFrame, ShapeFrame, pack, unpack
+from protocol.frames import ContactFrame, ForceFrame, Frame, ImageFrame, PartFrame, ShapeFrame, pack, unpack
 from services.contacts.outline import outline
 from services.contacts.tracking import LOST_FRAMES
 from services.publishing import Publishing
@@ -222,6 +222,27 @@ def test_a_held_image_that_was_never_seen_is_looked_at(stage: Publishing) -> Non
     assert c.position[0] == pytest.approx(0.02, abs=1e-3)
     moved = settled(stage, image_frame(discs((-0.02, 0.0, 0.01, 0.3)), 12, held=True)).contacts
     assert [c.position[0] for c in moved if c.state != "end"] == [pytest.approx(-0.02, abs=1e-3)]
+
+
+def test_a_part_after_an_image_that_left_something_says_that_it_changes(stage: Publishing) -> None:
+    """A touch that waits for its second image, or is not explained, is not shown: a part shows it no more."""
+
+    def part(after: int) -> ContactFrame:
+        stamps = {"sample": after * 45_000_000 + 4_000_000}
+        return contacts(stage, PartFrame(skin="palm", scan=after, part=2, valid=True, stamps=stamps, after=after))
+
+    one, two = discs((0.02, 0.01, 0.01, 0.2)), discs((0.02, 0.01, 0.01, 0.2), (-0.02, -0.02, 0.01, 0.2))
+    seen = [
+        (image_frame(one, 1, residual=0.0, reconstructed=1), True),
+        (image_frame(one, 2, residual=0.0, reconstructed=2), False),
+        (image_frame(two, 3, residual=0.0, reconstructed=3), True),
+        (image_frame(two, 4, residual=0.0, reconstructed=4), False),
+        (image_frame(two, 5, residual=0.3, reconstructed=5), True),
+    ]
+    for frame, changing in seen:
+        contacts(stage, frame)
+        after = part(frame.scan)
+        assert after.valid and ("changing" in after.reasons) == changing, frame.scan
 
 
 def test_an_id_never_holds_and_ends_in_one_frame(stage: Publishing) -> None:
