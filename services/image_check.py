@@ -61,8 +61,6 @@ class ImageCheck:
             self._changing += 1
             if not self.refused:
                 add_reason(out.reasons, "changing")
-        if frame.part and doubtful and not self.refused and not alone:
-            add_reason(out.reasons, "changing")  # each part sees the whole skin: a force that grows is spread over it
         return True
 
     def _changes(self, frame: DeltaFrame, out: ImageFrame) -> bool:

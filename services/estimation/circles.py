@@ -24,7 +24,6 @@ MODEL = 4  # of them, that d depends on
 LINEAR = 0.05  # of d: by so much the linear picture of a circle is wrong; by half of it of the rms of d
 STEP = np.array([0.05, 0.05, 0.5, 1.0])  # that one step of a fit does not much exceed
 FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
-STEADY = 0.8  # the same beside noise of touches that hold still: those whose force grows leave more
 ELSEWHERE = 0.4  # model units from a touch: another one is told from its change
 MOST = 4  # touches that are told apart
 LOW, HIGH = np.log([0.04, 0.005]), np.log([0.9, 0.97])  # of log radius, log drop
@@ -97,7 +96,7 @@ class Circles:
         """The touches of about these places that explain a whole scan best, if they hold still."""
         touches, tau = around.copy(), np.zeros(len(d))
         touches[:, MODEL:] = 0.0
-        width = _width(d, noise)
+        width = np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean()))
         columns = [6 * k + n for k in range(len(touches)) for n in range(MODEL)]
         damping = np.diag(np.tile(STEP**-2.0, len(touches)))
         for _ in range(steps):
@@ -114,16 +113,13 @@ class Circles:
         return Fit(touches, np.asarray(covariance, dtype=np.float64), chi2 / len(d))
 
     def found(self, d: Array, noise: Array) -> Fit:
-        """The touches that explain a whole scan; none where they are no circles that are apart, or where they changed
-        during the scan.
-        """
+        """The touches that explain a whole scan; none where they are no circles that are apart."""
         seen = [self._image.fit(d, noise)]
         fit = self.fitted(d, noise, as_touches(seen))
         while fit.misfit > FITS and len(seen) < MOST:  # another one, where what is left of d is largest
             seen.append(self._image.fit(d - self.still(fit.touches), noise))
             fit = self.fitted(d, noise, np.concatenate([fit.touches, as_touches(seen[-1:])]), steps=8)
-        noisy = float((noise**2 / _width(d, noise) ** 2).mean())
-        if fit.misfit > min(FITS, STEADY + noisy) or not _apart(fit.touches):
+        if fit.misfit > FITS or not _apart(fit.touches):
             return Fit(as_touches([]), np.zeros((0, 0)), fit.misfit)
         return fit
 
@@ -131,11 +127,6 @@ class Circles:
 def as_touches(seen: Sequence[PartTouch]) -> Array:
     """(N, 6) of touches that do not move."""
     return np.array([[t.x, t.y, np.log(t.radius), np.log(t.drop), 0.0, 0.0] for t in seen]).reshape(-1, 6)
-
-
-def _width(d: Array, noise: Array) -> Array:
-    """(K,) standard deviation of d against circles."""
-    return np.asarray(np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean())))
 
 
 def _apart(touches: Array) -> bool:
