@@ -29,6 +29,7 @@ class EitskinError(Exception):
         ├── CalibrationFileError              what a calibration found cannot be read, kept or used
         ├── OtherScenes (ValueError)          training scenes of another skin, or of this one as it was
         ├── NoSuchNetwork (ValueError)        a file without the network that training is to start from
+        ├── NoPart (ValueError)               a network that is not made of another's channels and blocks
         ├── NotRegistered (ValueError)        a folder to train for holds a bundle of no registered skin
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
