@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import zmq
 
@@ -86,33 +86,39 @@ class _Reader:
         self.socket.close(0)
 
 
-class _TopicReader(_Reader):
-    """One topic of one skin, from its one producer; frames that were not read are counted."""
+class _SkippingReader(_Reader):
+    """Topics of one skin, each from its one producer; frames that were not read are counted."""
 
     def __init__(
-        self, topic: str, skin: str, endpoint: str | None, context: Context | None, options: dict[int, int]
+        self,
+        topics: Sequence[str],
+        skin: str,
+        addresses: Mapping[str, str],
+        context: Context | None,
+        options: dict[int, int],
     ) -> None:
-        producers = TOPICS[topic].producers
-        if endpoint is None and len(producers) > 1:
-            raise ValueError(f"{topic} has several producers: name an endpoint, or read it with AllReader")
-        address = endpoint or transport.current().data_address(producers[0])
-        addresses = {producers[0]: address}
         socket = transport.connect(context or zmq.Context.instance(), zmq.SUB, addresses, options)
-        super().__init__(address, socket, addresses)
-        self.topic, self.skin = topic, skin
+        super().__init__(", ".join(addresses.values()), socket, addresses)
         self.skipped = 0
         """Frames that were overtaken by newer ones before we read them (or lost on the way)."""
-        self._last: tuple[str, int] | None = None
-        self.socket.subscribe(wire_topic(topic, skin) + b"\0")
+        self._names = [wire_topic(topic, skin) + b"\0" for topic in topics]
+        self._last: dict[type[Frame], tuple[str, int]] = {}
+        self.listen(True)
+
+    def listen(self, on: bool) -> None:
+        """Subscribe, or no longer."""
+        for name in self._names:
+            (self.socket.subscribe if on else self.socket.unsubscribe)(name)
 
     def _count(self, frame: Frame) -> None:
-        """Count what is missing between the last frame and this one."""
-        if self._last is not None and self._last[0] == frame.session and frame.seq > self._last[1]:
-            self.skipped += frame.seq - self._last[1] - 1
-        self._last = (frame.session, frame.seq)
+        """Count what is missing between the last frame of its topic and this one."""
+        last = self._last.get(type(frame))
+        if last is not None and last[0] == frame.session and frame.seq > last[1]:
+            self.skipped += frame.seq - last[1] - 1
+        self._last[type(frame)] = frame.session, frame.seq
 
 
-class NewestReader(_TopicReader):
+class NewestReader(_SkippingReader):
     """The newest frame of one topic of one skin; older ones are skipped.
 
     CONFLATE, because a high-water mark bounds neither the age of what is queued nor the kernel's buffers; one topic
@@ -120,7 +126,12 @@ class NewestReader(_TopicReader):
     """
 
     def __init__(self, topic: str, skin: str, endpoint: str | None = None, context: Context | None = None) -> None:
-        super().__init__(topic, skin, endpoint, context, {zmq.CONFLATE: 1})
+        producers = TOPICS[topic].producers
+        if endpoint is None and len(producers) > 1:
+            raise ValueError(f"{topic} has several producers: name an endpoint, or read it with AllReader")
+        addresses = {producers[0]: endpoint or transport.current().data_address(producers[0])}
+        self.topic, self.skin = topic, skin
+        super().__init__([topic], skin, addresses, context, {zmq.CONFLATE: 1})
 
     def recv(self, timeout_s: float = 0.0) -> Frame | None:
         """The newest frame not yet read, waiting up to `timeout_s` for one; None when there is none. Never raises on
@@ -141,7 +152,7 @@ PARTS_QUEUE = 200
 """Messages held in a reader of parts and what lies between them, from each producer: about a second of parts."""
 
 
-class PartsReader(_Reader):
+class PartsReader(_SkippingReader):
     """The newest delta or image frame of one skin whose scans come in parts; beside images the newest part after it.
     Older ones are skipped, but not the one whose stack or image a newer one holds: that comes first. A part comes after
     the image of the scan that it names, whichever of the two arrives first.
@@ -151,22 +162,10 @@ class PartsReader(_Reader):
         topics = ("image", "part") if topic == "image" else (topic,)
         producers = {TOPICS[each].producers[0] for each in topics}
         addresses = {name: transport.current().data_address(name) for name in sorted(producers)}
-        own = context or zmq.Context.instance()
-        socket = transport.connect(own, zmq.SUB, addresses, {zmq.RCVHWM: PARTS_QUEUE})
-        super().__init__(", ".join(addresses.values()), socket, addresses)
-        self.skipped = 0
-        """Frames that were overtaken by newer ones before we read them (or lost on the way)."""
-        self._names = [wire_topic(each, skin) + b"\0" for each in topics]
-        self._last: dict[type[Frame], tuple[str, int]] = {}
+        super().__init__(topics, skin, addresses, context, {zmq.RCVHWM: PARTS_QUEUE})
         self._whole: list[DeltaFrame | ImageFrame] = []  # that wait: the newest, and before it the one that it holds
         self._part: PartFrame | None = None
         self._after = -1  # scan of the image frame that was read last
-        self.listen(True)
-
-    def listen(self, on: bool) -> None:
-        """Subscribe, or no longer."""
-        for name in self._names:
-            (self.socket.subscribe if on else self.socket.unsubscribe)(name)
 
     @property
     def more(self) -> bool:
@@ -197,12 +196,6 @@ class PartsReader(_Reader):
             return None
         part, self._part = self._part, None
         return part
-
-    def _count(self, frame: Frame) -> None:
-        last = self._last.get(type(frame))
-        if last is not None and last[0] == frame.session and frame.seq > last[1]:
-            self.skipped += frame.seq - last[1] - 1
-        self._last[type(frame)] = frame.session, frame.seq
 
 
 def _holds(frame: DeltaFrame | ImageFrame, older: DeltaFrame | ImageFrame) -> bool:

@@ -15,7 +15,7 @@ from services.estimation.drift import DriftRates
 from services.estimation.drift_filter import DriftFilter
 from services.estimation.drift_in_touch import drifted, explain
 from services.estimation.evidence import Explanation, TouchEvidence, evidence_of
-from services.estimation.first_baseline import first_baseline
+from services.estimation.first_baseline import PRESSED, first_baseline
 from services.estimation.references import References
 from services.estimation.tare import Baseline, NoBaseline, noisy, plausible_noise, saved_noise
 from services.estimation.tare_window import TareWindow
@@ -199,10 +199,7 @@ class BaselineEstimator:
         """
         needed = self.window.frames
         if self._surely_touched and not force:
-            raise NoBaseline(
-                "the skin is touched, and has been since the start: free it, and it is valid without a command (or "
-                "--force, if nothing touches it)"
-            )
+            raise NoBaseline(PRESSED.format(" --force"))
         sure = self.baseline is not None and not self.baseline.doubt  # else its word against a touch counts for nothing
         if sure and not force and len(self.window) == needed:
             if touched:

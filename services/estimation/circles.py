@@ -14,19 +14,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from services.estimation.part_image import AHEAD, LEAST, SD, STENCIL, WIDER, PartImage, PartTouch, ellipse, spread_of
+from services.estimation.part_image import (
+    AHEAD,
+    HIGH,
+    LEAST,
+    LOW,
+    SD,
+    STENCIL,
+    WIDER,
+    PartImage,
+    PartTouch,
+    ellipse,
+    spread_of,
+    variance_of,
+)
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 RADIUS, DROP = 2, 3  # of a touch: x, y, log radius, log drop, vx, vy
 MODEL = 4  # of them, that d depends on
-LINEAR = 0.05  # of d: by so much the linear picture of a circle is wrong; by half of it of the rms of d
 STEP = np.array([0.05, 0.05, 0.5, 1.0])  # that one step of a fit does not much exceed
 FITS = 2.0  # chi-square per value of a whole scan, beyond which its touches are no circles
 ELSEWHERE = 0.4  # model units from a touch: another one is told from its change
 MOST = 4  # touches that are told apart
-LOW, HIGH = np.log([0.04, 0.005]), np.log([0.9, 0.97])  # of log radius, log drop
 TINY = 1e-9  # keeps solvable what no value tells
 
 
@@ -96,7 +107,7 @@ class Circles:
         """The touches of about these places that explain a whole scan best, if they hold still."""
         touches, tau = around.copy(), np.zeros(len(d))
         touches[:, MODEL:] = 0.0
-        width = np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * float((d**2).mean()))
+        width = np.sqrt(variance_of(d, noise, float((d**2).mean())))
         columns = [6 * k + n for k in range(len(touches)) for n in range(MODEL)]
         damping = np.diag(np.tile(STEP**-2.0, len(touches)))
         for _ in range(steps):

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from services.estimation.part_image import LEAST, LINEAR, PartImage, PartTouch, ellipse
+from services.estimation.part_image import LEAST, LINEAR, PartImage, PartTouch, ellipse, variance_of
 
 Array = NDArray[np.float64]
 
@@ -133,7 +133,7 @@ def _theta(touch: PartTouch) -> Array:
 def width_of(d: Array, noise: Array, error: float) -> Array:
     """(n,) standard deviation of d against a picture of it that is wrong by this share."""
     felt = np.sort(d**2)[-len(d) // 2 :]
-    return np.asarray(np.sqrt(noise**2 + (error * d) ** 2 + (error / 2) ** 2 * float(felt.mean())))
+    return np.asarray(np.sqrt(variance_of(d, noise, float(felt.mean()), error)))
 
 
 def _covariance(sigma: tuple[float, float, float]) -> Array:

@@ -26,6 +26,7 @@ from models.bundle import Bundle
 from models.touch_grid import touches
 from services.estimation.part_contacts import PartContacts
 from services.estimation.part_course import FAINT, PartPlace, TouchStart
+from services.estimation.part_image import variance_of
 
 Array = NDArray[np.floating]
 
@@ -189,7 +190,7 @@ def _with_misfit(d: Array, noise: Array) -> Array:
     """Standard deviation of d (n,) against the linear picture of a touch on a grid position."""
     felt = d**2 > (3 * noise) ** 2
     size = float((d[felt] ** 2).mean()) if felt.any() else 0.0
-    return np.asarray(np.sqrt(noise**2 + (LINEAR * d) ** 2 + (LINEAR / 2) ** 2 * size))
+    return np.asarray(np.sqrt(variance_of(d, noise, size, LINEAR)))
 
 
 def _filters(response: Responses, d: Array, noise: Array, courses: Array) -> Array:

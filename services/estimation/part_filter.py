@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from services.estimation.circles import DROP, FITS, LINEAR, MODEL, RADIUS, Circles
+from services.estimation.circles import DROP, FITS, MODEL, RADIUS, Circles
+from services.estimation.part_image import variance_of
 from services.estimation.rolling import parts_of
 from services.estimation.saved import shaped
 
@@ -273,7 +274,7 @@ class PartFilter:
         state, chi, another = before, np.inf, False
         for _ in range(2):
             off, slope, new = self._beside(state, d, tau, rows)
-            variance = noise**2 + (LINEAR * new) ** 2 + (LINEAR / 2) ** 2 * float((new**2).mean())
+            variance = variance_of(new, noise, float((new**2).mean()))
             off = off - slope @ (before - state)
             spread = slope @ covariance @ slope.T + np.diag(variance)
             gain = np.linalg.solve(spread, slope @ covariance).T

@@ -17,7 +17,8 @@ from models.touch_grid import touches
 
 Array = NDArray[np.floating]
 
-LINEAR = 0.05  # of d: by so much the linear response of a circle is wrong, once it is in its place
+LINEAR = 0.05  # of d: by so much the linear response of a circle is wrong, once it is in its place; and by half of it
+# of the rms of d
 WIDER = 1.15  # times the posterior's standard deviation: what is stated
 BELIEVED = 12  # values that the noise they were taken to have counts for
 LEAST = 0.004  # model units that are stated at least
@@ -27,6 +28,7 @@ COARSE = 0.05  # of the side: a standard deviation beyond it is coarse
 STEPS = 8
 MOST_MISFIT = 2.5  # squares left per value, beyond which it is no circle: one between two touches leaves 3
 MOST = np.array([0.1, 0.1, 0.3, 0.5])  # of one step
+LOW, HIGH = np.log([0.04, 0.005]), np.log([0.9, 0.97])  # of log radius, log drop
 TINY = 1e-9  # keeps solvable what nothing depends on, as of a circle off the skin
 AHEAD = np.array([0.02, 0.02, 0.05])  # of the derivatives
 STENCIL = np.array([np.zeros(3), *(sign * step for step in np.diag(AHEAD) for sign in (1, -1))])
@@ -73,7 +75,7 @@ class PartImage:
         """
         rows = np.flatnonzero(np.isfinite(sigma))
         seen = d[rows].astype(float)
-        noise = np.sqrt(sigma[rows].astype(float) ** 2 + (LINEAR * seen) ** 2 + (LINEAR / 2) ** 2 * (seen**2).mean())
+        noise = np.sqrt(variance_of(seen, sigma[rows].astype(float), float((seen**2).mean())))
         theta = self._start(rows, seen, noise) if start is None else start
         cost, left, slope = self._linear(theta, rows, seen, noise)
         information = np.diag([0.0, 0.0, *SD**-2])
@@ -88,7 +90,7 @@ class PartImage:
             step *= min(1.0, float((MOST / np.maximum(np.abs(step), 1e-9)).min()))
             there = theta + step
             there[:2] = np.clip(there[:2], -self.half_width, self.half_width)
-            there[2:] = np.clip(there[2:], np.log([0.04, 0.005]), np.log([0.9, 0.97]))
+            there[2:] = np.clip(there[2:], LOW, HIGH)
             found = self._linear(there, rows, seen, noise)
             if found[0] < cost:
                 theta, damping, done = there, damping * 0.3, cost - found[0] < 0.01
@@ -175,6 +177,13 @@ class PartImage:
         shares, at = self._near(circles)
         count = len(circles)
         return np.asarray(shares.reshape(count, -1) @ self._by_pixel[at].reshape(-1, self.measurements))[:, rows]
+
+
+def variance_of(d: Array, noise: Array, energy: float, linear: float = LINEAR) -> NDArray[np.float64]:
+    """(n,) variance of values d (n,) about a linear picture of them. noise (n,): standard deviations. energy: mean
+    square of the values that felt the touch; linear: as LINEAR.
+    """
+    return np.asarray(noise**2 + (linear * d) ** 2 + (linear / 2) ** 2 * energy)
 
 
 def spread_of(chi2: float, free: int) -> float:

@@ -45,7 +45,6 @@ class Newest:
     def __init__(self, topic: str, skin: str, parts: bool = False) -> None:
         self.reader: NewestReader | PartsReader = PartsReader(skin, topic) if parts else NewestReader(topic, skin)
         self.socket = self.reader.socket
-        self._name = f"{topic}/{skin}\0".encode()
 
     @property
     def malformed(self) -> int:
@@ -64,10 +63,7 @@ class Newest:
         return self.reader.recv()
 
     def listen(self, on: bool) -> None:
-        if isinstance(self.reader, PartsReader):
-            self.reader.listen(on)
-        else:
-            (self.socket.subscribe if on else self.socket.unsubscribe)(self._name)
+        self.reader.listen(on)
 
     def mind(self) -> None:
         """Connect anew where ZeroMQ has given up; no arriving frame would make us notice."""

@@ -11,31 +11,12 @@ from bench.reliability.matrix import CONTACT_RISES, FAULT_END_S, FAULT_S, ROWS, 
 from bench.reliability.scenes import script
 from bench.reliability.session import Session, new_pipeline
 from bench.reliability.workers import sheet as solved_sheet
-from models.bundle import Bundle
 from models.shapes import Shape
-from services.estimation.part_course import PartPlaces
-from services.estimation.part_evidence import PartEvidence
-from services.estimation.part_image import PartImage
-from services.estimation.rolling import measured_at, parts_of
+from services.estimation.rolling import measured_at
 from tests.services.stub_skin import sheet, transfer
 
 SIGMA = 1e-4
 AGE_US = 43_600.0
-
-
-@pytest.fixture(scope="module")
-def bundle():
-    return Bundle.load("square16")
-
-
-@pytest.fixture(scope="module")
-def evidence(bundle):
-    return PartEvidence(bundle, parts_of(bundle))
-
-
-@pytest.fixture(scope="module")
-def places(bundle):
-    return PartPlaces(PartImage(bundle))
 
 
 def change(bundle, touches=(), contacts=()):

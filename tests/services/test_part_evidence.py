@@ -6,36 +6,12 @@ import numpy as np
 import pytest
 
 from bench.speed.simulated_host import SimulatedHost
-from models.bundle import Bundle
 from models.forward import shared
 from models.shapes import Shape
-from services.estimation.part_course import PartPlaces
-from services.estimation.part_evidence import PartEvidence
-from services.estimation.part_image import PartImage
-from services.estimation.rolling import measured_at, parts_of
+from services.estimation.rolling import measured_at
 
 SIGMA = 1e-4
 AGE_US = 43_600.0
-
-
-@pytest.fixture(scope="module")
-def bundle():
-    return Bundle.load("square16")
-
-
-@pytest.fixture(scope="module")
-def evidence(bundle):
-    return PartEvidence(bundle, parts_of(bundle))
-
-
-@pytest.fixture(scope="module")
-def image(bundle):
-    return PartImage(bundle)
-
-
-@pytest.fixture(scope="module")
-def places(image):
-    return PartPlaces(image)
 
 
 def frame(bundle, change, fresh, newest=3, seed=0, ramp=False):

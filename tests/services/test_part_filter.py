@@ -7,7 +7,6 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from models.bundle import Bundle
 from protocol.frames import DeltaFrame
 from services.estimation.part_filter import PartFilter
 from services.estimation.part_image import PartImage
@@ -22,11 +21,6 @@ ROLLING = Skin(port="stub", bundle="square16", scan="rolling")
 SIGMA = 1e-4
 PART_US = 4360.0
 NOISE = np.full(120, SIGMA)
-
-
-@pytest.fixture(scope="module")
-def bundle():
-    return Bundle.load("square16")
 
 
 class Skin:
@@ -261,12 +255,17 @@ def test_a_reader_of_30_hz_misses_neither_begin_nor_end(host):
         assert len({contact.id for _, f in seen for contact in f.contacts if contact.state == state}) == 1
 
 
-def test_a_recording_that_begins_while_a_touch_slides_plays_as_it_was(host):
+def until_it_slides(host):
+    """A touch is held, and a third on its way."""
     host.until(host.now + 0.5)
     host.press(x=-0.02, y=-0.01, force=2.0, radius=0.01, seconds=60.0, finger="one")
     host.until(host.now + 0.2)
     host.press(x=-0.02, y=-0.01, force=2.0, radius=0.01, seconds=0.3, to_x=0.02, to_y=0.01, finger="one")
     host.until(host.now + 0.1)
+
+
+def test_a_recording_that_begins_while_a_touch_slides_plays_as_it_was(host):
+    until_it_slides(host)
     stages = (host.pipeline.pre, host.pipeline.inference, host.pipeline.publishing)
     states = [plain(stage.state()) for stage in stages]
     first, raw = len(host.contacts), len(host.raws)
@@ -282,11 +281,7 @@ def test_a_recording_that_begins_while_a_touch_slides_plays_as_it_was(host):
 
 
 def test_a_touch_that_a_whole_scan_does_not_see_any_more_is_not_followed_into_the_next(host):
-    host.until(host.now + 0.5)
-    host.press(x=-0.02, y=-0.01, force=2.0, radius=0.01, seconds=60.0, finger="one")
-    host.until(host.now + 0.2)
-    host.press(x=-0.02, y=-0.01, force=2.0, radius=0.01, seconds=0.3, to_x=0.02, to_y=0.01, finger="one")
-    host.until(host.now + 0.1)
+    until_it_slides(host)
     rolling = host.pipeline.pre.rolling_scans
     state, estimator, raw = rolling.state(), host.pipeline.pre.baseline_estimator, host.raws[-1]
     after = RollingScans(host.pipeline.pre.bundle)
