@@ -219,7 +219,8 @@ class Inference(Stage):
     def _of_parts(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """The image of one touch, from the parts since it began: `coarse` where its place is not sure."""
         self._parts = self._parts or PartImage(self.bundle)
-        found = self._parts.fit(frame.difference, frame.sigma)
+        start = self._parts.about(frame.followed[0]) if frame.followed else None
+        found = self._parts.fit(frame.difference, frame.sigma, start)
         out.image, out.sigma = self._parts.image(found)
         out.residual, out.followed = found.unexplained, []
         out.touches = [

@@ -132,6 +132,8 @@ class Publishing(Stage):
             self.following.anchor(self._contacts, frame.followed)
         fitted = self._fitted(frame.refined if out.valid else None)
         out.contacts = list(self._contacts) if fitted is None else [fitted[0], *self._contacts[1:]]
+        if out.valid and not whole and self._leaves_something(frame):
+            add_reason(out.reasons, "changing")
         if frame.followed and out.valid:
             self._follow(frame, out)
         if any((c.force_n or 0.0) > self.law.most_n for c in out.contacts):
@@ -143,8 +145,6 @@ class Publishing(Stage):
         changed = not self._touched or not (self._segments or (_explained(frame) and not doubtful))
         since = bool(frame.part and frame.touches)  # made only of what was measured since the touch began
         if out.valid and frame.touched and changed and not (frame.held or since or self._alone(frame)):
-            add_reason(out.reasons, "changing")
-        if out.valid and not whole and self._leaves_something(frame):
             add_reason(out.reasons, "changing")
         if whole:
             self._changing = self._changing + 1 if "changing" in out.reasons else 0
@@ -213,11 +213,12 @@ class Publishing(Stage):
         """Bring the contacts to where they are by now."""
         motion = self.following.motion(frame.followed)
         out.contacts = self.following.moved(out.contacts, frame.followed, self._writer.place)
-        self.tracker.carry(motion, frame.stamps.get("sample", 0))
         moves = any(any(touch.velocity) for touch in frame.followed)
         out.held = out.held and not moves
         if moves and any(c.id not in motion for c in out.contacts if c.state != "end"):
             add_reason(out.reasons, "changing")
+        if "changing" not in out.reasons:  # else what is followed may be on its way to another touch
+            self.tracker.carry(motion, frame.stamps.get("sample", 0))
 
     def _leaves_something(self, part: ImageFrame) -> bool:
         """Whether the image that a part holds is not all that there was: one of a touch that changed, of which a good

@@ -26,6 +26,7 @@ DRIFT = 3e-5  # relative, since the untouched scans that parts are compared with
 MOST_WAITED = 20  # messages
 KNOWN = 0.05  # model units of uncertainty, from which on a touch that began is not looked for elsewhere
 ANYWHERE = 0.12  # model units of uncertainty, beyond which a place is not said
+JUMPS = 3.0  # standard deviations of both places, by which no touch that began is elsewhere a few parts later
 REMEMBERED = 8  # untouched whole scans whose mean that is
 
 
@@ -72,6 +73,8 @@ class RollingScans:
         self._waited = 0  # messages by which the whole scan was put off for that
         self._began_us: float | None = None  # when a touch began, by the board's clock less the length of a part
         self._began: PartTouch | None = None  # as the newest parts have it
+        self._shown: PartTouch | None = None  # as it was said last
+        self._one = True  # one touch explains what changed since it began; else a whole scan tells
         self._doubted = False  # a contact that changed may be all that it is: a whole scan tells
         self.change: Array | None = None  # to the whole scan's difference, for its values to be of one instant
         if self._made is not None:
@@ -116,7 +119,7 @@ class RollingScans:
 
     def _grows(self, values: tuple[Array, Array, Array] | None) -> bool:
         """Whether the oldest of these values felt a touch that began, and still grew."""
-        if self._began is None or values is None:
+        if self._began is None or values is None or not self._one:
             return False
         return float(self._models.places.course(*values, self._began).min()) < 1.0
 
@@ -140,6 +143,7 @@ class RollingScans:
         self._moved = self._ended = self._doubted = False
         self._waited = 0
         touched, self._began_us, self._began, self._held = self._held is not None, None, None, None
+        self._shown, self._one = None, True
         if not touched or not self._sound or not out.touched:
             self._models.filter.forget()  # what it followed is over
         if not self._sound:
@@ -202,7 +206,8 @@ class RollingScans:
         self._put_off(frame.scan)
         on = place.course > 0
         self._began_us, self._began = frame.device_us - float(age[on].max()), place.touch
-        if not self._began.fits or self._began.sigma[0] > ANYWHERE:
+        self._one = self._one and self._began.fits and not self._jumped(self._began)
+        if not self._one or self._began.sigma[0] > ANYWHERE:
             return []
         self._doubted = not evidence.no_contact(d, noise, age, place)
         if self._doubted:
@@ -210,11 +215,18 @@ class RollingScans:
         share = np.where(on, place.course, 1.0)
         out.difference = np.where(on, d / share, 0.0).astype(np.float32)
         out.sigma = np.where(on, noise / share, np.inf).astype(np.float32)
-        out.followed = self._placed(self._began)
+        out.followed, self._shown = self._placed(self._began), self._began
         out.touched, out.score, out.threshold = True, sigmas, SIGMAS
         out.reconstructed = frame.scan
         add_reason(out.reasons, "coarse")
         return self._said(out)
+
+    def _jumped(self, touch: PartTouch) -> bool:
+        """Whether it is not where it was said to be: then another one began while this one was being placed."""
+        if self._shown is None:
+            return False
+        away = np.hypot(touch.at[0] - self._shown.at[0], touch.at[1] - self._shown.at[1])
+        return bool(away > JUMPS * np.hypot(touch.sigma[0], self._shown.sigma[0]))
 
     def _goes_on(self, out: DeltaFrame, frame: RawFrame, values: tuple[Array, Array, Array]) -> list[Frame]:
         """Where a touch that goes on is by now, where that is known."""
@@ -279,6 +291,8 @@ class RollingScans:
             "doubted": self._doubted,
             "delta": self._delta_scan,
             "began": None if self._began is None else asdict(self._began),
+            "shown": None if self._shown is None else asdict(self._shown),
+            "one": self._one,
             "filter": None if self._made is None else self._made.filter.state(),
         }
 
@@ -293,10 +307,14 @@ class RollingScans:
         self._waited, self._doubted = int(state["waited"]), bool(state.get("doubted", False))
         self._began_us, self._rests = state["began_us"], int(state["rests"])
         self._delta_scan = int(state.get("delta", 0))
-        if (began := state.get("began")) is not None:
-            self._began = PartTouch(**{**began, "at": tuple(began["at"]), "sigma": tuple(began["sigma"])})
+        self._began, self._shown = _touch(state.get("began")), _touch(state.get("shown"))
+        self._one = bool(state.get("one", True))
         if state.get("filter"):
             self._models.filter.load(state["filter"])
+
+
+def _touch(kept: dict[str, Any] | None) -> PartTouch | None:
+    return None if kept is None else PartTouch(**{**kept, "at": tuple(kept["at"]), "sigma": tuple(kept["sigma"])})
 
 
 def _told(

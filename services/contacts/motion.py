@@ -90,6 +90,11 @@ class Track:
         self.reach, self.missing = seen.reach, 0
         self.age += 1
 
+    def carry(self, now: Motion, sample_ns: int) -> None:
+        """It is followed, and has come there: what images told of its velocity is over."""
+        self.x, self.y, self.vx, self.vy = now
+        self.pp, self.pv, self.vv, self.seen_ns = PLACE_SIGMA_M**2, 0.0, FIRST_SPEED**2, sample_ns
+
     def _filter(self, seen: Patch, seconds: float) -> None:
         noise = ACCELERATION**2 * seconds**2
         pp = self.pp + 2 * seconds * self.pv + seconds**2 * self.vv + noise * seconds**2 / 4

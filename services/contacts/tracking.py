@@ -119,15 +119,17 @@ class Tracker:
         """
         ended = self._begin_frame(sample_ns)
         for track in self.tracks:
+            if not track.missing:
+                track.vx = track.vy = 0.0  # it did not go on
             for one in track.inside:
-                one.seen_ns = sample_ns  # it did not go on
+                one.seen_ns = sample_ns
         return ended + self._lose([], sample_ns)
 
     def carry(self, motion: Mapping[int, Motion], sample_ns: int) -> None:
         """Touches that are followed go on from where they are by now."""
         for track in self.tracks:
             if (now := motion.get(track.id)) is not None and (now.vx or now.vy):
-                track.x, track.y, track.vx, track.vy, track.seen_ns = *now, sample_ns
+                track.carry(now, sample_ns)
 
     @property
     def waits(self) -> bool:

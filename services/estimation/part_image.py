@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.touch_grid import touches
+from protocol.frames import FollowedTouch
 
 Array = NDArray[np.floating]
 
@@ -93,7 +94,7 @@ class PartImage:
             there[2:] = np.clip(there[2:], LOW, HIGH)
             found = self._linear(there, rows, seen, noise)
             if found[0] < cost:
-                theta, damping, done = there, damping * 0.3, cost - found[0] < 0.01
+                theta, damping, done = there, damping * 0.3, cost - found[0] < 0.05
                 cost, left, slope = found
                 if done:
                     break
@@ -110,6 +111,13 @@ class PartImage:
         unexplained = max(0.0, chi2 - len(rows)) / float(((seen / noise) ** 2).sum())
         at = float(place[0]), float(place[1])
         return PartTouch(x, y, radius, drop, drop_sigma, at, axes, misfit < MOST_MISFIT, unexplained)
+
+    def about(self, touch: FollowedTouch) -> Array:
+        """Where to start the fit of a touch that is about there: theta."""
+        x, y = np.array(touch.position) / self.metres_per_unit
+        area = np.pi * np.exp(2 * MEAN[0]) * self.metres_per_unit**2
+        drop = np.clip(np.log(max(touch.integral / area, TINY)), LOW[1], HIGH[1])
+        return np.array([x, y, MEAN[0], drop])
 
     def sure(self, *sigma: float) -> bool:
         """Whether places with these uncertainties [m] are known to within COARSE."""
