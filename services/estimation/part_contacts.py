@@ -34,7 +34,7 @@ HOPELESS = 0.7  # of what a contact must explain: where those beginnings explain
 # contacts that rose (six electrodes, three amounts) they came to 0.99 at least; in touches to 0.5, in the median
 SLOW, KNOT = 48, 12  # values from which on a contact may have any course, values between two knots of it
 BENDS = (0.0, 0.5, 1.5)  # of a contact's rest while it rises slowly: a / SHORT_WAY (contact_drift.py)
-NEAR, LONGER = np.linspace(-1.0, 1.0, 9), np.geomspace(0.48, 2.08, 13)  # of the way to the next beginning, of a duration
+NEAR, LONGER = np.linspace(-1.0, 1.0, 9), np.geomspace(0.48, 2.08, 13)  # of a gap, of a duration
 TINY = 1e-12  # keeps solvable what no value tells
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from services.contacts.merging import MERGED_S
-from services.contacts.motion import Patch, Track
+from services.contacts.motion import Motion, Patch, Track
 from services.contacts.tracking import FORGOTTEN_S, LOST_FRAMES, Tracker
 
 FRAME_NS = 45_000_000
@@ -155,6 +155,22 @@ def test_frames_that_show_the_same_do_not_count_as_lost_ones() -> None:
     play(tracker, [[touch(-0.02), touch(0.02)]] * 3 + [[touch(-0.02)]])
     assert all(tracker.still(n * FRAME_NS) == [] for n in (5, 6, 7))
     assert play(tracker, [[touch(-0.02), touch(0.02)]], 8) == ([[1, 2]], [])
+
+
+def test_a_touch_that_stood_still_is_looked_for_where_it_stood_however_it_came_there() -> None:
+    tracker = Tracker()
+    play(tracker, [[touch(0.0045 * n)] for n in range(5)])
+    for n in (6, 7, 8, 9):
+        tracker.still(n * FRAME_NS)
+    assert play(tracker, [[touch(0.017)]], 10) == ([[1]], [])
+
+
+def test_a_touch_that_was_not_where_it_was_followed_to_is_itself_again_with_the_next_images() -> None:
+    tracker = Tracker()
+    play(tracker, [[touch(0.0)]] * 20)
+    tracker.carry({1: Motion(0.003, -0.002, 0.2, -0.1)}, 20 * FRAME_NS + 4_400_000)
+    assert play(tracker, [[touch(0.0)]] * 4, 21) == ([[1]] * 4, [])
+    assert math.hypot(tracker.tracks[0].vx, tracker.tracks[0].vy) < 0.05
 
 
 @pytest.mark.parametrize(
