@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from protocol.frames import Contact, FollowedTouch
-from services.contacts.following import Following
+from services.contacts.following import MOVES, Following
 from services.contacts.surface import Placed
 
 
@@ -37,7 +37,8 @@ def test_a_contact_is_in_the_middle_of_an_image_and_a_followed_touch_that_agree(
     (later,) = following.moved([contact(0.011, 0.0)], [touch(0.013, 0.001, (0.1, 0.0), integral=2e-5)], Flat())
     assert later.position == pytest.approx([0.0135, 0.001, 0.0]) and later.velocity == pytest.approx([0.1, 0.0, 0.0])
     assert later.position_sigma == pytest.approx([4e-4, 3e-4, 0.2]), "while it moves the image's place gets old"
-    assert (later.force_n, later.force_sigma_n) == pytest.approx((4.0, 0.4))
+    assert (now.force_n, now.force_sigma_n) == pytest.approx((2.0, 0.2))
+    assert (later.force_n, later.force_sigma_n) == pytest.approx((4.0, np.hypot(0.4, MOVES * 4.0))), "it moves"
 
 
 def test_an_image_and_a_followed_touch_that_do_not_agree_say_so():
