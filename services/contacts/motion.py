@@ -17,6 +17,11 @@ SIZE_SHARE = 0.3  # of what is seen, in the running mean of the size
 LEFT_OVER, LEFT_OVER_M = 0.3, 0.008  # share of its size, and distance, that no touch changes by at once as it goes on
 SAME_M, SAME_SIZE = 0.0015, 0.15  # a steady touch from image to image: place, logarithm of an integrated drop
 REMEMBERED = 3  # images
+BACK, BACK_M = (
+    4.0,
+    0.004,
+)  # a touch that doubtful images led away is where it was sure to be: chi-squared that this costs,
+# m by which it may be off
 MOST_FOR_SIZE = 9.0  # a touch may grow quickly: its size alone makes it no other touch
 
 
@@ -132,11 +137,36 @@ def is_left_over(track: Track, seen: Patch) -> bool:
 
 def cost(track: Track, seen: Patch, sample_ns: int) -> tuple[float, float]:
     """(distance [m] from where the track should be, how unlikely it is that this is the track: chi-squared)."""
+    distance, chi2 = _apart(track, seen, sample_ns)
+    back = _apart_from_sure(track, seen)
+    if back is not None and back[1] < chi2:
+        distance, chi2 = back
+    return distance, chi2 + size_cost(track, seen)
+
+
+def comes_back(track: Track, seen: Patch, sample_ns: int) -> bool:
+    """Whether a patch is rather where the last image that explained its frame showed the track than where the images
+    after that led to: while another touch begins, images show touches where none is.
+    """
+    back = _apart_from_sure(track, seen)
+    return back is not None and back[1] < _apart(track, seen, sample_ns)[1]
+
+
+def _apart(track: Track, seen: Patch, sample_ns: int) -> tuple[float, float]:
+    """The same as `cost`, of places alone."""
     x, y = track.ahead(sample_ns)
     distance = math.hypot(seen.x - x, seen.y - y)
     s = track.seconds_to(sample_ns)
     variance = track.pp + 2 * s * track.pv + s * s * track.vv + (ACCELERATION * s * s) ** 2 / 4 + PLACE_SIGMA_M**2
-    return distance, distance**2 / variance + size_cost(track, seen)
+    return distance, distance**2 / variance
+
+
+def _apart_from_sure(track: Track, seen: Patch) -> tuple[float, float] | None:
+    """The same from where the track was sure to be; None where its last image was sure."""
+    if not track.sure or track.last[:2] == track.sure:
+        return None
+    distance = math.hypot(seen.x - track.sure[0], seen.y - track.sure[1])
+    return distance, BACK + (distance / BACK_M) ** 2
 
 
 def size_cost(track: Track, seen: Patch) -> float:

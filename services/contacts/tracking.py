@@ -20,7 +20,7 @@ from dataclasses import asdict
 from typing import Any
 
 from services.contacts.merging import absorb, follow, give_up, host_of, is_part, others, part
-from services.contacts.motion import Motion, Patch, Track, cost, is_left_over, is_same
+from services.contacts.motion import Motion, Patch, Track, comes_back, cost, is_left_over, is_same
 
 REACH_M = 0.015  # a touch that jumps further between two frames is another touch
 STAYS_M = 0.006  # what begins is near where it was seen first; what an image of a changing touch shows is not
@@ -87,6 +87,8 @@ class Tracker:
                 track = _new(UNCONFIRMED, entry, sample_ns, begins, sure)
             else:
                 track.sure_frames += steady and track.sure_frames == 0  # the image before was sure too
+                if comes_back(track, entry, sample_ns):
+                    track.carry(Motion(track.sure[0], track.sure[1], 0.0, 0.0), sample_ns)
                 track.move(entry, sample_ns, sure)
                 if track.inside:
                     follow(track, entry, sample_ns)

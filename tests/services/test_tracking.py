@@ -173,6 +173,18 @@ def test_a_touch_that_was_not_where_it_was_followed_to_is_itself_again_with_the_
     assert math.hypot(tracker.tracks[0].x, tracker.tracks[0].y) < 0.001
 
 
+def test_a_touch_that_doubtful_images_lead_to_another_one_is_itself_again_in_the_first_sure_one() -> (
+    None
+):
+    """In the scene of ten minutes a second touch began 30 mm away; its force grew for 0.3 s."""
+    tracker = Tracker()
+    play(tracker, [[touch(0.035, -0.006)]] * 5)
+    for n, place in enumerate([(0.035, -0.007), (0.030, 0.0), (0.0276, 0.0045)], 6):
+        tracker.update([touch(*place)], n * FRAME_NS, sure=False)
+    assert play(tracker, [[touch(0.0165, 0.0186), touch(0.038, -0.008)]] * 3, 9)[0][-1] == [2, 1]
+    assert tracker.tracks[-1].sure == [0.038, -0.008]
+
+
 @pytest.mark.parametrize(
     ("confidence", "well", "begins"),
     [(0.93, True, 2), (0.9, True, 3), (0.8, True, 0), (0.98, False, 2), (0.93, False, 0)],
