@@ -74,7 +74,7 @@ class RollingScans:
         self._began_us: float | None = None  # when a touch began, by the board's clock less the length of a part
         self._began: PartTouch | None = None  # as the newest parts have it
         self._shown: PartTouch | None = None  # as it was said last
-        self._one = True  # one touch explains what changed since it began; else a whole scan tells
+        self._one = True  # no other one began since; else a whole scan tells
         self._doubted = False  # a contact that changed may be all that it is: a whole scan tells
         self.change: Array | None = None  # to the whole scan's difference, for its values to be of one instant
         if self._made is not None:
@@ -119,7 +119,7 @@ class RollingScans:
 
     def _grows(self, values: tuple[Array, Array, Array] | None) -> bool:
         """Whether the oldest of these values felt a touch that began, and still grew."""
-        if self._began is None or values is None or not self._one:
+        if self._began is None or values is None or not (self._one and self._began.fits):
             return False
         return float(self._models.places.course(*values, self._began).min()) < 1.0
 
@@ -206,8 +206,8 @@ class RollingScans:
         self._put_off(frame.scan)
         on = place.course > 0
         self._began_us, self._began = frame.device_us - float(age[on].max()), place.touch
-        self._one = self._one and self._began.fits and not self._jumped(self._began)
-        if not self._one or self._began.sigma[0] > ANYWHERE:
+        self._one = self._one and not self._jumped(self._began)
+        if not (self._one and self._began.fits) or self._began.sigma[0] > ANYWHERE:
             return []
         self._doubted = not evidence.no_contact(d, noise, age, place)
         if self._doubted:
