@@ -47,7 +47,7 @@ class NetworkConfig:
 
 
 FULL = NetworkConfig()
-FAST = NetworkConfig(channels=(8, 24, 48), blocks=(1, 1, 1), lean=True)
+FAST = NetworkConfig(channels=(16, 48, 96), blocks=(1, 2, 1), lean=True)
 
 
 class CBAM(nn.Module):
