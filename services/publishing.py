@@ -246,7 +246,7 @@ class Publishing(Stage):
 
     def _keep(self, frame: ImageFrame) -> None:
         """The same contacts a frame later."""
-        ended = self.tracker.still(frame.stamps.get("sample", 0))
+        ended = self.tracker.still(frame.stamps.get("sample", 0), "changing" in frame.reasons)
         present = [c for c in self._contacts if c.state != "end"]
         held = [replace(c, state="hold", velocity=[0.0, 0.0, 0.0]) for c in present]
         self._contacts = held + self._writer.ended(ended)

@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 SUSPECTED = 5.0  # sigmas of the newest part, below which it is not looked at further
 WIDER = 1.05  # noise is estimated from a few dozen scans
 DRIFT = 3e-5  # relative, since the untouched scans that parts are compared with
-MOST_WAITED = 60  # messages: a finger takes up to a quarter of a second to press
+LONGEST_PRESS_US = 300_000.0  # after a touch began a whole scan is taken, although its force still grows
+SAID_LATELY = 2  # messages, of which one said where the touch is: else nothing would be said until the whole scan
 KNOWN = 0.05  # model units of uncertainty, from which on a touch that began is not looked for elsewhere
 ANYWHERE = 0.12  # model units of uncertainty, beyond which a place is not said
 JUMPS = 3.0  # standard deviations of both places, by which no touch that began is elsewhere a few parts later
@@ -70,7 +71,6 @@ class RollingScans:
         self._sound = False  # the last whole scan
         self._moved = False  # the next whole scan was put off since the last one
         self._ended = False  # the touch of the last whole scan has
-        self._waited = 0  # messages by which the whole scan was put off for that
         self._began_us: float | None = None  # when a touch began, by the board's clock less the length of a part
         self._began: PartTouch | None = None  # as the newest parts have it
         self._shown: PartTouch | None = None  # as it was said last
@@ -94,6 +94,7 @@ class RollingScans:
         """Whether the message is to be taken for a whole scan; then `sample` in stamps is set to the mean time of its
         values, for which what is made of it stands, and never before what was said last.
         """
+        self.change = None
         if frame.parts == 1:
             return True
         self._seen = frame.scan
@@ -105,8 +106,7 @@ class RollingScans:
         if values is not None and not self._moved and self._changes(values):
             self._moved = True  # a touch that began or ended within these values is seen in the next whole scan
             return False
-        if self._waited < MOST_WAITED and not self._doubted and self._grows(values):
-            self._waited += 1
+        if not self._doubted and self._grows(frame, values):
             self._whole.last = frame.scan - frame.parts + 1
             return False
         new = frame.new.astype(bool)
@@ -117,15 +117,16 @@ class RollingScans:
         self._handed_on = self._delta_scan = frame.scan
         return True
 
-    def _grows(self, values: tuple[Array, Array, Array] | None) -> bool:
-        """Whether the oldest of these values felt a touch that began, and still grew."""
-        if self._began is None or values is None or not (self._one and self._began.fits):
+    def _grows(self, frame: RawFrame, values: tuple[Array, Array, Array] | None) -> bool:
+        """Whether the oldest of these values felt a touch that began, and still grew, and parts say where it is."""
+        if self._began is None or self._began_us is None or values is None or not (self._one and self._began.fits):
+            return False
+        if self._handed_on < frame.scan - SAID_LATELY or frame.device_us - self._began_us > LONGEST_PRESS_US:
             return False
         return float(self._models.places.course(*values, self._began).min()) < 1.0
 
     def _follows(self, frame: RawFrame, values: tuple[Array, Array, Array] | None) -> bool:
         """Whether the whole scan's touch is followed: then all its values are brought to the newest one's instant."""
-        self.change = None
         if self._held is None or values is None:
             return False
         followed = self._models.filter
@@ -141,7 +142,6 @@ class RollingScans:
         known = len(out.difference) == len(frame.z) and bool(np.isfinite(out.sigma).all())
         self._sound = known and out.valid and not out.electrodes.any() and not {"gain", "gap"} & set(out.reasons)
         self._moved = self._ended = self._doubted = False
-        self._waited = 0
         touched, self._began_us, self._began, self._held = self._held is not None, None, None, None
         self._shown, self._one = None, True
         if not touched or not self._sound or not out.touched:
@@ -197,7 +197,9 @@ class RollingScans:
             sigmas = evidence.goes_on(d, noise, place.course, places.response(place.touch))
         else:
             since = None if self._began_us is None else frame.device_us - self._began_us
+            since = None if since is None or since < 0 else since  # another board's clock
             if (onset := evidence.began(d, noise, age, since)) is None:
+                self._began = None
                 return []
             place, sigmas = places(d, noise, age, onset.starts), onset.sigmas
         if sigmas is None:
@@ -287,7 +289,6 @@ class RollingScans:
             "rests": self._rests,
             "held": self._held,
             "began_us": self._began_us,
-            "waited": self._waited,
             "doubted": self._doubted,
             "delta": self._delta_scan,
             "began": None if self._began is None else asdict(self._began),
@@ -304,7 +305,7 @@ class RollingScans:
         self._whole.last, self._sample_ns = int(state["whole"]), int(state["sample_ns"])
         self._sound, self._moved, self._ended = (bool(each) for each in state["flags"])
         self._rest, self._held = (None if state[n] is None else np.array(state[n], float) for n in ("rest", "held"))
-        self._waited, self._doubted = int(state["waited"]), bool(state.get("doubted", False))
+        self._doubted = bool(state.get("doubted", False))
         self._began_us, self._rests = state["began_us"], int(state["rests"])
         self._delta_scan = int(state.get("delta", 0))
         self._began, self._shown = _touch(state.get("began")), _touch(state.get("shown"))

@@ -17,11 +17,8 @@ SIZE_SHARE = 0.3  # of what is seen, in the running mean of the size
 LEFT_OVER, LEFT_OVER_M = 0.3, 0.008  # share of its size, and distance, that no touch changes by at once as it goes on
 SAME_M, SAME_SIZE = 0.0015, 0.15  # a steady touch from image to image: place, logarithm of an integrated drop
 REMEMBERED = 3  # images
-BACK, BACK_M = (
-    4.0,
-    0.004,
-)  # a touch that doubtful images led away is where it was sure to be: chi-squared that this costs,
-# m by which it may be off
+BACK, BACK_M = 4.0, 0.004  # a touch is where it was before doubtful images led it away: chi-squared that it costs, m
+AWAY_M = 0.025  # by which they may have led it
 MOST_FOR_SIZE = 9.0  # a touch may grow quickly: its size alone makes it no other touch
 
 
@@ -66,6 +63,7 @@ class Track:
     last: list[float] = field(default_factory=list)  # place [m] and size in the last image
     begins: bool = True  # whether it was looked for, and not there, just before
     sure: list[float] = field(default_factory=list)  # m, where the last image that explained its frame showed it
+    doubted: bool = False  # whether the image after that one did not
     since_ns: int = 0  # when the last one of `inside` came
     until_ns: int = 0  # how long it is waited for while it is inside another one's patch
     inside: list[Track] = field(default_factory=list)
@@ -82,6 +80,7 @@ class Track:
         """Update with where an image shows it. sure: the image explains its frame; else it shows roughly where."""
         if sure:
             self.sure, self.sure_frames = [seen.x, seen.y], self.sure_frames + 1
+        self.doubted = not sure
         self.last = [seen.x, seen.y, seen.size]
         self.confidences = [*self.confidences, seen.confidence][-REMEMBERED:]
         real = max(0.0, (sample_ns - self.seen_ns) * 1e-9)
@@ -99,6 +98,7 @@ class Track:
         """It is followed, and has come there: what images told of its velocity is over."""
         self.x, self.y, self.vx, self.vy = now
         self.pp, self.pv, self.vv, self.seen_ns = PLACE_SIGMA_M**2, 0.0, FIRST_SPEED**2, sample_ns
+        self.doubted = False
 
     def _filter(self, seen: Patch, seconds: float) -> None:
         noise = ACCELERATION**2 * seconds**2
@@ -138,7 +138,7 @@ def is_left_over(track: Track, seen: Patch) -> bool:
 def cost(track: Track, seen: Patch, sample_ns: int) -> tuple[float, float]:
     """(distance [m] from where the track should be, how unlikely it is that this is the track: chi-squared)."""
     distance, chi2 = _apart(track, seen, sample_ns)
-    back = _apart_from_sure(track, seen)
+    back = _apart_from_sure(track, seen, sample_ns)
     if back is not None and back[1] < chi2:
         distance, chi2 = back
     return distance, chi2 + size_cost(track, seen)
@@ -148,7 +148,7 @@ def comes_back(track: Track, seen: Patch, sample_ns: int) -> bool:
     """Whether a patch is rather where the last image that explained its frame showed the track than where the images
     after that led to: while another touch begins, images show touches where none is.
     """
-    back = _apart_from_sure(track, seen)
+    back = _apart_from_sure(track, seen, sample_ns)
     return back is not None and back[1] < _apart(track, seen, sample_ns)[1]
 
 
@@ -161,9 +161,12 @@ def _apart(track: Track, seen: Patch, sample_ns: int) -> tuple[float, float]:
     return distance, distance**2 / variance
 
 
-def _apart_from_sure(track: Track, seen: Patch) -> tuple[float, float] | None:
-    """The same from where the track was sure to be; None where its last image was sure."""
-    if not track.sure or track.last[:2] == track.sure:
+def _apart_from_sure(track: Track, seen: Patch, sample_ns: int) -> tuple[float, float] | None:
+    """The same from where the track was sure to be; None where its last image was sure, or it went far since."""
+    if not (track.sure and track.doubted):
+        return None
+    x, y = track.ahead(sample_ns)
+    if math.hypot(x - track.sure[0], y - track.sure[1]) > AWAY_M:
         return None
     distance = math.hypot(seen.x - track.sure[0], seen.y - track.sure[1])
     return distance, BACK + (distance / BACK_M) ** 2

@@ -115,13 +115,13 @@ class Tracker:
             track.id, track.age = self._next_id, 1
             self._next_id += 1
 
-    def still(self, sample_ns: int) -> list[Track]:
+    def still(self, sample_ns: int, changing: bool = False) -> list[Track]:
         """Take in a frame that shows the same as the one before; no touch counts as missing for longer. Returns tracks
-        that ended.
+        that ended. changing: touches may have moved all the same.
         """
         ended = self._begin_frame(sample_ns)
         for track in self.tracks:
-            if not track.missing:
+            if not (track.missing or changing):
                 track.vx = track.vy = 0.0  # it did not go on
             for one in track.inside:
                 one.seen_ns = sample_ns

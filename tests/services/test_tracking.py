@@ -173,9 +173,7 @@ def test_a_touch_that_was_not_where_it_was_followed_to_is_itself_again_with_the_
     assert math.hypot(tracker.tracks[0].x, tracker.tracks[0].y) < 0.001
 
 
-def test_a_touch_that_doubtful_images_lead_to_another_one_is_itself_again_in_the_first_sure_one() -> (
-    None
-):
+def test_a_touch_that_doubtful_images_lead_to_another_one_is_itself_again_in_the_first_sure_one() -> None:
     """In the scene of ten minutes a second touch began 30 mm away; its force grew for 0.3 s."""
     tracker = Tracker()
     play(tracker, [[touch(0.035, -0.006)]] * 5)
@@ -183,6 +181,22 @@ def test_a_touch_that_doubtful_images_lead_to_another_one_is_itself_again_in_the
         tracker.update([touch(*place)], n * FRAME_NS, sure=False)
     assert play(tracker, [[touch(0.0165, 0.0186), touch(0.038, -0.008)]] * 3, 9)[0][-1] == [2, 1]
     assert tracker.tracks[-1].sure == [0.038, -0.008]
+
+
+def test_a_touch_that_went_on_while_images_were_doubtful_is_not_looked_for_where_it_was_long_before() -> None:
+    tracker = Tracker()
+    play(tracker, [[touch(0.0)]])
+    for n, x in enumerate((0.01, 0.02, 0.03, 0.038), 2):
+        tracker.update([touch(x)], n * FRAME_NS, sure=False)
+    tracker.update([], 6 * FRAME_NS)
+    assert play(tracker, [[touch(0.001)]], 7)[0] != [[1]]
+
+
+def test_a_touch_that_moved_on_in_a_frame_without_an_image_of_its_own_is_looked_for_further_on() -> None:
+    tracker = Tracker()
+    play(tracker, [[touch(0.0135 * n)] for n in range(5)])
+    tracker.still(6 * FRAME_NS, changing=True)
+    assert play(tracker, [[touch(0.0135 * 6)]], 7) == ([[1]], [])
 
 
 @pytest.mark.parametrize(
