@@ -3,8 +3,8 @@
 A contact that rises is felt by other pairs too, and from a dozen values a touch on its electrode explains that about as
 well. What a contact's change does is known far better than what a touch does (contact_drift.py): so both are asked how
 likely they make the very values since the beginning, each with its own error. A touch is shown only where it is
-likelier than a change of any one contact, whatever its course, by LIKELIER nats. Until then the next part decides, and
-a whole scan at the latest.
+likelier than a change of any one contact by LIKELIER nats. Until then the next part decides, and then a whole scan.
+Every contact is asked with a few courses. Those that come near to explaining it are asked with many.
 """
 
 from __future__ import annotations

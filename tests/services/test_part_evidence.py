@@ -223,6 +223,20 @@ def test_a_touch_reaches_a_controller_within_three_parts_and_so_does_its_end(hos
     assert samples == sorted(samples)
 
 
+def test_a_light_tap_leaves_no_silence_behind():
+    """What was left of it looked like a force that grows, so that the whole scan was put off by 0.3 s."""
+    host, rng = SimulatedHost("rolling", snr_db=80.0, seed=2), np.random.default_rng(5)
+    host.until(6.0)
+    first = len(host.contacts)
+    for _ in range(12):
+        x, y = rng.uniform(-0.03, 0.03, 2).tolist()
+        host.press(x=x, y=y, force=0.45, radius=0.005, seconds=rng.uniform(0.01, 0.025))
+        host.until(host.now + 0.3 + rng.uniform(0.0, 0.05))
+    host.rig.close()
+    assert np.diff([t for t, _ in host.contacts[first:]]).max() < 0.1
+    assert any(f.contacts for _, f in host.contacts[first:])
+
+
 def test_while_nothing_touches_a_part_makes_no_frame(host):
     first = len(host.contacts)
     host.until(host.now + 2.0)
