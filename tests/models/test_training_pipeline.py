@@ -180,7 +180,7 @@ def test_a_network_of_other_sizes_is_refused(bundle):
     content = bundle.network_path("fast").read_bytes()
     with pytest.raises(NoSuchNetwork, match="in a network of"):
         restored(content, NetworkConfig(channels=(8, 24, 32), blocks=(1, 1, 1), lean=True))
-    with pytest.raises(NoSuchNetwork, match="no convolution '/stage2/blocks.1"):
+    with pytest.raises(NoSuchNetwork, match="no convolution '/stage2/blocks.2"):
         restored(content, FULL)
 
 
