@@ -121,7 +121,7 @@ class RollingScans:
         """Whether the oldest of these values felt a touch that began, and still grew, and parts say where it is."""
         if self._began is None or self._began_us is None or values is None or not (self._one and self._began.fits):
             return False
-        if self._handed_on < frame.scan - SAID_LATELY or frame.device_us - self._began_us > LONGEST_PRESS_US:
+        if self._delta_scan < frame.scan - SAID_LATELY or frame.device_us - self._began_us > LONGEST_PRESS_US:
             return False
         return float(self._models.places.course(*values, self._began).min()) < 1.0
 
