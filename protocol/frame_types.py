@@ -39,7 +39,7 @@ REASONS = {
     "gap": "scans are missing just before this one",
     "low_snr": "the measurements are too noisy for the stated uncertainty",
     "out_of_distribution": "the measurements look like nothing the model was trained on",
-    "coarse": "from the first part of a scan since the touch began: that something touches, roughly where",
+    "coarse": "from the first parts of a scan since the touch began: that something touches, roughly where",
     "changing": "the touch came, went or changed while it was scanned: that something touches, but only roughly where",
     "extrapolated": "a force beyond the calibrated range",
     "late": "measured longer ago than it may be acted on: what brought it was held up",
@@ -198,11 +198,28 @@ class DeltaFrame(Frame):
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
+class BegunTouch:
+    """A touch that began since the last whole scan, as a circle, from the values that were measured since."""
+
+    position: list[float] = wire(Vector(2, "m"), "x, y of the centroid, in the skin's frame")
+    sigma: list[float] = wire(Vector(3), "as a contact's `position_sigma`")
+    drop: float = wire(Float(0, unit="S/m"), "largest conductivity drop")
+    drop_sigma: float = wire(Float(0, unit="S/m"), "its standard uncertainty")
+    integral: float = wire(Float(0, unit="S/m m^2"), "drop integrated over the touch")
+    unexplained: float = wire(Float(0), "share of the measured change that it does not explain")
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
 class PartFrame(Frame):
-    """Where the touches of a scan in parts are by its newest part: between two delta frames, which say all else."""
+    """What the newest part of a scan says between two delta frames, which say all else: where the touches of the last
+    one are by now, or that a touch began.
+    """
 
     after: int = wire(_COUNT, "scan of the delta frame before it: the image of that scan shows these touches", 0)
     followed: list[FollowedTouch] = wire(ListOf(Record(FollowedTouch), 16), "the touches", list)
+    began: BegunTouch | None = wire(
+        Maybe(Record(BegunTouch)), "the only touch, of which there is no image yet; nil: none began", None
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

@@ -28,6 +28,7 @@ from .frame_types import (
     STATUS_FIFO,
     STATUS_OPEN,
     STATUS_RTIA,
+    BegunTouch,
     Contact,
     ContactFrame,
     DeltaFrame,
@@ -51,8 +52,8 @@ from .topics import TOPIC_OF, TOPICS
 __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "KINDS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
-    "Contact", "ContactFrame", "DeltaFrame", "FollowedTouch", "ForceFrame", "Frame", "FrameError", "ImageFrame",
-    "InfoFrame", "LocatedTouch", "PartFrame", "RawFrame", "RefinedTouch", "ShapeFrame", "StatusFrame",
+    "BegunTouch", "Contact", "ContactFrame", "DeltaFrame", "FollowedTouch", "ForceFrame", "Frame", "FrameError",
+    "ImageFrame", "InfoFrame", "LocatedTouch", "PartFrame", "RawFrame", "RefinedTouch", "ShapeFrame", "StatusFrame",
     "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
 ]  # fmt: skip
 

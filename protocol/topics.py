@@ -67,7 +67,7 @@ TOPICS: dict[str, Topic] = {
             False,
             False,
             "newest",
-            "where touches are by now, between two images of scans in parts",
+            "where touches are by now, or that one began, between two images of scans in parts",
         ),
         Topic("image", f.ImageFrame, "inference", 22, False, False, "newest", "conductivity-drop image"),
         Topic("contact", f.ContactFrame, "publisher", 22, False, False, "newest", "list of contacts, also when empty"),

@@ -16,7 +16,6 @@ from models.bundle import Bundle
 from models.locator import Located, Locator
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
 from services.describe import ON, refinement
-from services.estimation.part_image import PartImage
 from services.estimation.rolling import parts_of
 from services.image_check import ImageCheck
 from services.linearisation import Linearisation
@@ -61,7 +60,6 @@ class Inference(Stage):
         self._symmetry: SymmetryMean | None = None
         if skin.touch.symmetry and isinstance(self._network, Network) and bundle.locator is None:
             self._symmetry = SymmetryMean(self._network, symmetries(bundle.skin))  # one registered is like itself alone
-        self._parts = PartImage(bundle) if skin.scan == "rolling" else None
         self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
         self.reset()
 
@@ -110,8 +108,6 @@ class Inference(Stage):
             self._run(self._unseen, out)
         elif frame.held:
             self._hold(frame, out)
-        elif frame.touched and "coarse" in frame.reasons:
-            self._of_parts(frame, out)
         else:
             self._counters["untouched"] += 1
             self._last = None
@@ -215,21 +211,6 @@ class Inference(Stage):
             blank = ImageFrame(skin=self.skin)
             out.image, out.sigma, out.classes = blank.image, blank.sigma, blank.classes
             self._shows_again(last, out)
-
-    def _of_parts(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        """The image of one touch, from the parts since it began: `coarse` where its place is not sure."""
-        self._parts = self._parts or PartImage(self.bundle)
-        start = self._parts.about(frame.followed[0]) if frame.followed else None
-        found = self._parts.fit(frame.difference, frame.sigma, start)
-        out.image, out.sigma = self._parts.image(found)
-        out.residual, out.followed = found.unexplained, []
-        out.touches = [
-            LocatedTouch(position=touch.position, sigma=touch.sigma, amplitude=touch.integral)
-            for touch in frame.followed
-        ]
-        if self._parts.sure(*(touch.sigma[0] for touch in frame.followed)):
-            out.reasons.remove("coarse")
-        self._shows(frame, out)
 
     def _shows(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """`out` has the image of `frame`, which later ones may hold."""

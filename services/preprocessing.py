@@ -82,6 +82,8 @@ class Preprocessing(EstimatorStage):
         reference = (
             Reference(known.z0, self.baseline_estimator.normaliser, self.baseline_estimator.sigma) if known else None
         )
+        if (placed := self.rolling_scans.placed) is not None:
+            self.electrodes.touch_began(placed)
         found = self.electrodes(amplitude, frame.status, reference, out.stamps.get("sample", 0) * 1e-9)
         out.electrodes = found.states
         for reason in found.reasons:

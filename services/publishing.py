@@ -12,6 +12,7 @@ import numpy as np
 from models.bundle import Bundle
 from protocol.frames import (
     SHAPES,
+    BegunTouch,
     Contact,
     ContactFrame,
     ForceFrame,
@@ -23,6 +24,7 @@ from protocol.frames import (
     ShapeFrame,
 )
 from protocol.held import ANY, HeldImage
+from services.contacts.begun import begun, possible, without_image
 from services.contacts.contact_writer import ContactWriter, class_probabilities, confidence
 from services.contacts.following import Following
 from services.contacts.force import ForceLaw
@@ -65,6 +67,8 @@ class Publishing(Stage):
         by_registration = measures_force(bundle)
         self._tells_force = self.law.exists or by_registration
         self._writer = ContactWriter(self.law, place, self._tells_force)
+        m, self._image_size = bundle.metres_per_pixel, bundle.image_size
+        self._grid = (m, [-0.5 * self._image_size * m] * 2)
         self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
         self.tracker = Tracker()
         self.following, self.lasting, self.last_image = Following(), LastingStates(), LastImage(name)
@@ -81,6 +85,7 @@ class Publishing(Stage):
 
     def new_session(self) -> None:
         self.tracker = Tracker()
+        self._forget()
 
     def wake(self) -> None:
         self.tracker.forget()
@@ -89,7 +94,7 @@ class Publishing(Stage):
 
     def _forget(self) -> None:
         """Nothing is known of what touches."""
-        self._known = self._touched = False
+        self._known = self._touched = self._from_parts = False  # _from_parts: no image showed the contacts yet
         self.following.forget()
         self.lasting.forget()
         self._changing = 0  # frames in a row that said so
@@ -100,15 +105,21 @@ class Publishing(Stage):
         self._geometry = (0.0, [0.0, 0.0])  # metres per pixel, origin of the segments' image
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
-        if isinstance(frame, PartFrame):
+        if isinstance(frame, PartFrame) and frame.began is None:
             return self._say(self.last_image.held_by(frame), wanted, whole=False)
+        if isinstance(frame, PartFrame):
+            return self._say(without_image(frame, *self._grid), wanted, whole=False, began=frame.began)
         assert isinstance(frame, ImageFrame)
         found = self._say(frame, wanted)
         self.last_image.take(frame)
         return found
 
-    def _say(self, frame: ImageFrame, wanted: frozenset[str], whole: bool = True) -> list[Frame]:
-        """The frames that follow from an image. whole: it is of a whole scan, or of the parts since a touch began."""
+    def _say(
+        self, frame: ImageFrame, wanted: frozenset[str], whole: bool = True, began: BegunTouch | None = None
+    ) -> list[Frame]:
+        """The frames that follow from an image. whole: it is of a whole scan; else of a part, which holds the image
+        before it, or has none yet of a touch that began.
+        """
         self._counters["frames"] += 1
         out = ContactFrame(**inherited(frame), frame_id=self.frame_id, force_calibrated=self._calibrated)
         if not self._tells_force:
@@ -123,16 +134,20 @@ class Publishing(Stage):
         elif frame.held and (self._knows(frame, whole) or self._changes(frame)):
             self._keep(frame)
             out.held = True
-        elif not frame.image.size and (frame.touched or not frame.valid):
+        elif self._from_parts and self._tells_nothing(frame):
+            self._keep(frame)  # parts had told where the touch is
+        elif began is not None and not possible(began, *self._grid, self._image_size):
+            self._miss(out, "non_finite")
+        elif began is None and not frame.image.size and (frame.touched or not frame.valid):
             self._miss(out, "gap")
         elif not _sound(frame):
             self._miss(out, "non_finite")
         else:
-            self._see(frame)
+            self._see(frame, began)
             self.following.anchor(self._contacts, frame.followed)
         fitted = self._fitted(frame.refined if out.valid else None)
         out.contacts = list(self._contacts) if fitted is None else [fitted[0], *self._contacts[1:]]
-        if out.valid and not whole and self._leaves_something(frame):
+        if out.valid and not whole and began is None and self._leaves_something(frame):
             add_reason(out.reasons, "changing")
         if frame.followed and out.valid:
             self._follow(frame, out)
@@ -143,8 +158,8 @@ class Publishing(Stage):
         # It began or went during the scan, or nothing of it is to be believed yet.
         doubtful = (had or self.tracker.waits) and self._changing < CHANGING_FRAMES
         changed = not self._touched or not (self._segments or (_explained(frame) and not doubtful))
-        since = bool(frame.part and frame.touches)  # made only of what was measured since the touch began
-        if out.valid and frame.touched and changed and not (frame.held or since or self._alone(frame)):
+        told = frame.held or (began is not None and bool(self._segments)) or self._alone(frame)
+        if out.valid and frame.touched and changed and not told:
             add_reason(out.reasons, "changing")
         if whole:
             self._changing = self._changing + 1 if "changing" in out.reasons else 0
@@ -163,12 +178,14 @@ class Publishing(Stage):
             frames.append(self._shape(out, None if fitted is None else fitted[1]))
         return frames
 
-    def _see(self, frame: ImageFrame) -> None:
-        """Find the contacts of a new image."""
+    def _see(self, frame: ImageFrame, began: BegunTouch | None) -> None:
+        """Find the contacts of a new image, or of the touch that began."""
         m, (x0, y0), now = frame.metres_per_pixel, frame.origin, frame.stamps.get("sample", 0)
         segments: list[Segment] = []
         located = frame.touches if frame.touched and frame.image.size else []
-        if located:
+        if began is not None:
+            segments, seen, located = begun(began, m, (x0, y0), self._image_size)
+        elif located:
             segments, seen = patches(frame)
         elif frame.touched and frame.image.size:
             places = [] if self._alone(frame) else self.tracker.expected(now)
@@ -195,7 +212,7 @@ class Publishing(Stage):
         if not located:  # those come strongest first
             present.sort(key=lambda each: (-(each[0].force_n or 0.0), -each[1].peak))
         self._segments, self._classes = [s for _, s, _ in present], [classes for _, _, classes in present]
-        self._geometry, self._known = (m, [x0, y0]), True
+        self._geometry, self._known, self._from_parts = (m, [x0, y0]), True, began is not None
         self._seen_in = frame.session, frame.reconstructed
         self._contacts = [contact for contact, _, _ in present] + self._writer.ended(ended)
         self._counters["contacts"] += sum(track is not None and track.age == 1 for track in tracks)
@@ -243,6 +260,11 @@ class Publishing(Stage):
         """Whether this frame shows nothing new because its touch changed meanwhile: our contacts are all there is."""
         forgotten = self.tracker.forgotten(frame.stamps.get("sample", 0))
         return self._known and not forgotten and "changing" in frame.reasons
+
+    def _tells_nothing(self, frame: ImageFrame) -> bool:
+        """Whether this frame's image is empty because its touch changed meanwhile. Not for long: then it is gone."""
+        blank = frame.valid and frame.image.size > 0 and not frame.image.any()
+        return blank and self._changes(frame) and self._changing < CHANGING_FRAMES
 
     def _keep(self, frame: ImageFrame) -> None:
         """The same contacts a frame later."""
@@ -302,6 +324,7 @@ class Publishing(Stage):
             "touched": self._touched,
             "changing": self._changing,
             "reconstructed": self._seen_in[1],
+            "from_parts": self._from_parts,
             "held": None if self.held.last is None else _kept(self.held.last),
             "contacts": [asdict(c) for c in self._contacts],
             "segments": [{**asdict(s), "mask": s.mask.astype(np.uint8)} for s in self._segments],
@@ -315,7 +338,7 @@ class Publishing(Stage):
         self.lasting.load(state.get("lasting", {}))
         self.last_image.load(state.get("last_image"))
         self._known, self._touched = bool(state["known"]), bool(state.get("touched", False))
-        self._changing = int(state.get("changing", 0))
+        self._changing, self._from_parts = int(state.get("changing", 0)), bool(state.get("from_parts", False))
         self._seen_in = (ANY, int(state.get("reconstructed", -1)))  # older recordings have none
         kept = state.get("held")
         self.held.last = None if kept is None else _image_of(self.skin, kept)

@@ -12,7 +12,7 @@ from models.bundle import Bundle
 from protocol.frames import DeltaFrame, FollowedTouch, Frame, PartFrame, RawFrame, as_sent
 from services.estimation.baseline import BaselineEstimator
 from services.estimation.part_course import PartPlaces
-from services.estimation.part_evidence import SIGMAS, PartEvidence
+from services.estimation.part_evidence import PartEvidence
 from services.estimation.part_filter import PartFilter
 from services.estimation.part_image import COARSE, PartImage, PartTouch
 from services.estimation.rolling import WholeScans, parts_of
@@ -35,6 +35,7 @@ class PartModels(NamedTuple):
     """What tells a touch from the parts of a scan: made when it is first needed."""
 
     evidence: PartEvidence
+    image: PartImage
     places: PartPlaces
     filter: PartFilter
 
@@ -43,7 +44,7 @@ class RollingScans:
     """Of one skin. A message has the newest value of every measurement, so each could stand for a whole scan; those
     that share no value with the one before do, so that noise, electrodes and drift are judged as in whole scans.
 
-    The other messages say only, and only where the last whole scan was sound, that a touch began, with the values
+    The other messages say only, and only where the last whole scan was sound, where a touch began, by the values
     measured since (services/estimation/part_evidence.py); or that the touch ended. Then the next whole scan is the
     first of values that are all newer than that. In between they say where a touch that was there is by now
     (services/estimation/part_filter.py), where that explains them.
@@ -60,6 +61,7 @@ class RollingScans:
         self._whole.last = -1
         self._seen = self._handed_on = -1  # scans of messages
         self._delta_scan = 0  # of the last message that a delta frame was made of
+        self._placed_scan = 0  # of the last message that said where a touch is that began
         self._sample_ns = 0  # of the last delta frame
         self.begin_anew()
 
@@ -86,8 +88,8 @@ class RollingScans:
     @property
     def _models(self) -> PartModels:
         if self._made is None:
-            evidence, places = PartEvidence(self._bundle, self._parts), PartPlaces(PartImage(self._bundle))
-            self._made = PartModels(evidence, places, PartFilter(self._bundle))
+            evidence, image = PartEvidence(self._bundle, self._parts), PartImage(self._bundle)
+            self._made = PartModels(evidence, image, PartPlaces(image), PartFilter(self._bundle))
         return self._made
 
     def due(self, frame: RawFrame, stamps: dict[str, int], estimator: BaselineEstimator) -> bool:
@@ -103,8 +105,8 @@ class RollingScans:
         if not self._whole.due(frame.scan, frame.parts):
             return False
         values = self._values(frame, estimator)
-        if values is not None and not self._moved and self._changes(values):
-            self._moved = True  # a touch that began or ended within these values is seen in the next whole scan
+        if values is not None and not self._moved and (self._changes(values) or self._models.filter.jumps(*values)):
+            self._moved = True  # a touch that began, ended or jumped within them is seen in the next whole scan
             return False
         if not self._doubted and self._grows(frame, values):
             self._whole.last = frame.scan - frame.parts + 1
@@ -117,11 +119,23 @@ class RollingScans:
         self._handed_on = self._delta_scan = frame.scan
         return True
 
+    @property
+    def placed(self) -> tuple[float, float] | None:
+        """Where a touch began since the last whole scan [model units] that parts told from any contact's change; None
+        where none did, or where it is gone.
+        """
+        return self._shown.at if self._is_one and self._shown is not None else None
+
+    @property
+    def _is_one(self) -> bool:
+        """Whether what began is one touch, as far as the newest parts tell."""
+        return self._began is not None and self._began.fits and self._one
+
     def _grows(self, frame: RawFrame, values: tuple[Array, Array, Array] | None) -> bool:
         """Whether the oldest of these values felt a touch that began, and still grew, and parts say where it is."""
-        if self._began is None or self._began_us is None or values is None or not (self._one and self._began.fits):
+        if self._began is None or self._began_us is None or values is None or not self._is_one:
             return False
-        if self._delta_scan < frame.scan - SAID_LATELY or frame.device_us - self._began_us > LONGEST_PRESS_US:
+        if self._placed_scan < frame.scan - SAID_LATELY or frame.device_us - self._began_us > LONGEST_PRESS_US:
             return False
         return float(self._models.places.course(*values, self._began).min()) < 1.0
 
@@ -168,19 +182,23 @@ class RollingScans:
 
     def _followed(self) -> list[FollowedTouch]:
         followed = self._models.filter
-        states = [(each.x, each.y, each.vx, each.vy, each.sigma, each.integral) for each in followed.states()]
-        return [_told(followed.metres_per_unit, *state, number=followed.number) for state in states]
-
-    def _placed(self, touch: PartTouch) -> list[FollowedTouch]:
-        """The touch that began."""
-        integral = float(np.pi * touch.radius**2 * touch.drop)
-        return [_told(self._models.filter.metres_per_unit, *touch.at, 0.0, 0.0, touch.sigma, integral)]
+        metres, number = followed.metres_per_unit, followed.number
+        return [
+            FollowedTouch(
+                number=number,
+                position=[metres * each.x, metres * each.y],
+                velocity=[metres * each.vx, metres * each.vy],
+                sigma=[metres * each.sigma[0], metres * each.sigma[1], each.sigma[2]],
+                integral=metres**2 * each.integral,
+            )
+            for each in followed.states()
+        ]
 
     def part(self, out: DeltaFrame, frame: RawFrame, estimator: BaselineEstimator) -> list[Frame]:
-        """What is said of a message that is no whole scan, if anything: a delta frame where a touch began or ended, a
-        part frame of one that goes on.
+        """What is said of a message that is no whole scan, if anything: a delta frame where a touch ended, a part frame
+        of one that began or goes on.
         """
-        evidence, places, followed = self._models
+        followed = self._models.filter
         if (values := self._values(frame, estimator)) is None:
             return []
         if not self._changes(values):
@@ -192,6 +210,12 @@ class RollingScans:
             self._put_off(frame.scan)
             out.difference, out.sigma = np.zeros(len(d), np.float32), noise.astype(np.float32)
             return self._said(out)
+        return self._begins(out, frame, values)
+
+    def _begins(self, out: DeltaFrame, frame: RawFrame, values: tuple[Array, Array, Array]) -> list[Frame]:
+        """Where a touch is that began, where that is known."""
+        models, (d, noise, age) = self._models, values
+        evidence, places = models.evidence, models.places
         if self._began is not None and self._began.fits and self._began.sigma[0] <= KNOWN:
             place = places.again(d, noise, age, self._began)
             sigmas = evidence.goes_on(d, noise, place.course, places.response(place.touch))
@@ -209,19 +233,15 @@ class RollingScans:
         on = place.course > 0
         self._began_us, self._began = frame.device_us - float(age[on].max()), place.touch
         self._one = self._one and not self._jumped(self._began)
-        if not (self._one and self._began.fits) or self._began.sigma[0] > ANYWHERE:
+        if not self._is_one or self._began.sigma[0] > ANYWHERE:
             return []
         self._doubted = not evidence.no_contact(d, noise, age, place)
         if self._doubted:
             return []
-        share = np.where(on, place.course, 1.0)
-        out.difference = np.where(on, d / share, 0.0).astype(np.float32)
-        out.sigma = np.where(on, noise / share, np.inf).astype(np.float32)
-        out.followed, self._shown = self._placed(self._began), self._began
-        out.touched, out.score, out.threshold = True, sigmas, SIGMAS
-        out.reconstructed = frame.scan
-        add_reason(out.reasons, "coarse")
-        return self._said(out)
+        self._shown, self._placed_scan = self._began, frame.scan
+        if self._began.sigma[0] > self._coarse:
+            add_reason(out.reasons, "coarse")
+        return self._said(PartFrame(**inherited(out), after=self._delta_scan, began=models.image.begun(self._began)))
 
     def _jumped(self, touch: PartTouch) -> bool:
         """Whether it is not where it was said to be: then another one began while this one was being placed."""
@@ -273,7 +293,7 @@ class RollingScans:
             self._moved, self._whole.last = True, scan
 
     def handed_on(self, scan: int) -> dict[str, bool]:
-        """Whether the message `scan` was seen, and whether a delta frame was made of it: a replay asks."""
+        """Whether the message `scan` was seen, and whether a frame was made of it: a replay asks."""
         return {"seen": self._seen == scan, "handed_on": self._handed_on == scan}
 
     def _fits(self, frame: RawFrame) -> bool:
@@ -291,6 +311,7 @@ class RollingScans:
             "began_us": self._began_us,
             "doubted": self._doubted,
             "delta": self._delta_scan,
+            "placed": self._placed_scan,
             "began": None if self._began is None else asdict(self._began),
             "shown": None if self._shown is None else asdict(self._shown),
             "one": self._one,
@@ -307,7 +328,7 @@ class RollingScans:
         self._rest, self._held = (None if state[n] is None else np.array(state[n], float) for n in ("rest", "held"))
         self._doubted = bool(state.get("doubted", False))
         self._began_us, self._rests = state["began_us"], int(state["rests"])
-        self._delta_scan = int(state.get("delta", 0))
+        self._delta_scan, self._placed_scan = int(state.get("delta", 0)), int(state.get("placed", 0))
         self._began, self._shown = _touch(state.get("began")), _touch(state.get("shown"))
         self._one = bool(state.get("one", True))
         if state.get("filter"):
@@ -315,17 +336,6 @@ class RollingScans:
 
 
 def _touch(kept: dict[str, Any] | None) -> PartTouch | None:
-    return None if kept is None else PartTouch(**{**kept, "at": tuple(kept["at"]), "sigma": tuple(kept["sigma"])})
-
-
-def _told(
-    metres: float, x: float, y: float, vx: float, vy: float, sigma: tuple[float, ...], integral: float, number: int = 0
-) -> FollowedTouch:
-    """Of lengths in model units, each so many metres."""
-    return FollowedTouch(
-        number=number,
-        position=[metres * x, metres * y],
-        velocity=[metres * vx, metres * vy],
-        sigma=[metres * sigma[0], metres * sigma[1], sigma[2]],
-        integral=metres**2 * integral,
-    )
+    if kept is None:
+        return None
+    return PartTouch(**{"densest": 1.0, **kept, "at": tuple(kept["at"]), "sigma": tuple(kept["sigma"])})

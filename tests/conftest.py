@@ -31,13 +31,15 @@ def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def without_recorder(folder: Path) -> Path:
+def without_recorder(folder: Path, scan: str) -> Path:
     """The shipped configuration without its recorder, which listens to every contact and keeps the publisher awake."""
     lines = (ROOT / "skin.toml").read_text().splitlines(keepends=True)
     begin = next(k for k, line in enumerate(lines) if line.startswith("[recorder]"))
     end = next(k for k, line in enumerate(lines) if k > begin and line.startswith("# ["))
     path = folder / "skin.toml"
-    path.write_text("".join(lines[:begin] + lines[end:]))
+    text = "".join(lines[:begin] + lines[end:])
+    assert text.count("[skins.palm]\n") == 1
+    path.write_text(text.replace("[skins.palm]\n", f'[skins.palm]\nscan = "{scan}"\n'))
     return path
 
 
@@ -70,12 +72,12 @@ def service(runtime: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @contextlib.contextmanager
-def _shared(without: bool) -> Iterator[Path]:
+def _shared(without: bool, scan: str = "full") -> Iterator[Path]:
     folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
     try:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("EITSKIN_RUNTIME", str(folder))
-            with serving(folder, *(("--config", str(without_recorder(folder))) if without else ())):
+            with serving(folder, *(("--config", str(without_recorder(folder, scan))) if without else ())):
                 yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -89,7 +91,7 @@ def shared_service() -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def service_that_nobody_hears() -> Iterator[Path]:
-    """The same without recorder."""
-    with _shared(without=True) as folder:
+def service_that_nobody_hears(request: pytest.FixtureRequest) -> Iterator[Path]:
+    """The same without recorder. Parametrized by how it scans."""
+    with _shared(without=True, scan=request.param) as folder:
         yield folder

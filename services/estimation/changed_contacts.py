@@ -19,6 +19,8 @@ Array = NDArray[np.floating]
 LOOK_BACK = 3  # frames over which a contact that rises under a touch is told from it
 LOOK_FAR_BACK = 24  # the same, where it rises slowly
 ALIKE = 0.3  # of what is felt: two frames that differ by less say the same
+BACK = 2  # frames over which a contact jumps
+NEAR = 0.25  # model units from a touch that began, within which an electrode may seem to have jumped by it
 JUMP = 3.0  # times the change of the frames before, from which one comes at once
 
 
@@ -27,6 +29,7 @@ class ChangedContacts:
 
     def __init__(self, bundle: Bundle, members: NDArray[np.bool_]) -> None:
         self._drift, self._k = ContactDrift(bundle, members), members.shape[1]
+        self._centre = np.asarray(bundle.skin["electrodes"]["centre"], dtype=float)  # (E, 2) model units
         self.reset()
 
     @property
@@ -40,10 +43,19 @@ class ChangedContacts:
         self._before: dict[int, Array] = {}  # by contact that rose under a touch: |Z| (K,) from before
         self._past: deque[Array] = deque(maxlen=LOOK_FAR_BACK)  # |Z| (K,) of the frames before, the newest last
         self._second = PastFrames(self._k)
+        self._onset: tuple[float, float] | None = None  # where a touch began that no contact's change explains
+        self._onset_frames = 0  # to come that are compared with one from before it
+
+    def touch_began(self, at: tuple[float, float] | None) -> None:
+        """The next frame is the first one of a touch at (x, y) [model units] that no contact's change explains: others
+        told so. None: there is none such.
+        """
+        self._onset, self._onset_frames = at, 0 if at is None else BACK
 
     def follow(self, amplitude: Array, now_s: float) -> None:
         """Takes a frame's |Z| (K,), measured at now_s, after it was judged."""
         self._past.append(amplitude.copy())
+        self._onset_frames = max(0, self._onset_frames - 1)
         self._second.follow(amplitude, now_s)
 
     def drifts(self, k: int, amplitude: Array, now_s: float, untouched: Reference, live: NDArray[np.bool_]) -> bool:
@@ -84,16 +96,23 @@ class ChangedContacts:
 
     def _jumped(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
         """Returns the electrode whose contact may have jumped while something else moved: a touch that moves onto an
-        electrode changes each frame by as much as the one before. Two frames back, since it may jump within a scan.
+        electrode changes each frame by as much as the one before. BACK frames, since it may jump within a scan.
         """
-        if len(self._past) < 4:
+        if len(self._past) < 2 * BACK:
             return None
-        last, before = self._past[-2], self._past[-4]
+        last, before = self._past[-BACK], self._past[-2 * BACK]
         live = live & np.isfinite(last) & np.isfinite(before)
         d, usual = _difference(amplitude, last, untouched, live), _difference(last, before, untouched, live)
         if float(d[live] @ d[live]) < JUMP**2 * float(usual[live] @ usual[live]):
             return None
-        return self._drift.resembles(d, np.sqrt(2.0) * untouched.sigma, live)
+        found = self._drift.resembles(d, np.sqrt(2.0) * untouched.sigma, live)
+        return None if found is not None and self._pressed(found.electrode) else found
+
+    def _pressed(self, k: int) -> bool:
+        """Whether what electrode k seems to have jumped by is the touch that just began on it."""
+        if not self._onset_frames or self._onset is None:
+            return False
+        return bool(np.hypot(*(self._centre[k] - self._onset)) < NEAR)
 
     def _changed_under_motion(self, amplitude: Array, untouched: Reference, live: NDArray[np.bool_]) -> Changed | None:
         """Returns the same under a touch that moves steadily: the frames before say which change is its own."""
@@ -157,7 +176,10 @@ class ChangedContacts:
     def state(self) -> dict[str, Any]:
         kept = {"felt": self.felt, "proposed": self._proposed, "before": self._before}
         rows = {name: [[k, list(row)] for k, row in of.items()] for name, of in kept.items()}
-        return {**rows, "past": np.array(self._past), "second": self._second.state()}
+        return {**rows, "past": np.array(self._past), "second": self._second.state(), "onset": self._onset_state()}
+
+    def _onset_state(self) -> dict[str, Any]:
+        return {"at": None if self._onset is None else list(self._onset), "frames": self._onset_frames}
 
     def load(self, state: dict[str, Any]) -> None:
         """Older recordings lack some. Raises ValueError where it does not fit."""
@@ -167,6 +189,9 @@ class ChangedContacts:
         self._proposed = {int(k): shaped(row, shape) for k, row in state.get("proposed", [])}
         self._before = {int(k): shaped(row, shape, finite=False) for k, row in state.get("before", [])}
         self._past.extend(shaped(row, shape, finite=False) for row in state.get("past", []))
+        onset = state.get("onset", {"at": None, "frames": 0})
+        self._onset = None if onset["at"] is None else (float(onset["at"][0]), float(onset["at"][1]))
+        self._onset_frames = int(onset["frames"])
         if "second" in state:
             self._second.load(state["second"])
 

@@ -80,6 +80,13 @@ class ElectrodeHealth:
         self._states[(self._states == DRIFTING) | (self._states == UNKNOWN)] = OK
         self._doubts.reset()
         self._contacts.keep(())
+        self._contacts.touch_began(None)
+
+    def touch_began(self, at: tuple[float, float]) -> None:
+        """The next frame is the first one of a touch at (x, y) [model units] that no contact's change explains, as its
+        parts told.
+        """
+        self._contacts.touch_began(at)
 
     def rescale(self, step: GainStep) -> None:
         """The baseline took this step of the board's gain over."""

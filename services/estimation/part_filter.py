@@ -35,6 +35,7 @@ WINDOWS = (1, 3, 6, 10)  # newest parts among which a change is looked for
 STILL = 24.0  # chi-square of a touch's place and strength, up to which it did not change: one in 10^4 parts exceeds it
 SPREAD = 6.0  # standard deviations of chi-square that the noise of a part may come to
 LIKELY, EXPLAINED = 2.7, 4.0  # chi-square per value up to which a part is, without and with a sudden change
+JUMPS = 12.0  # standard deviations of the newest part's chi-square, beyond which a held touch is suddenly another
 SURPRISE = 24.0  # chi-square beyond noise, from which on another touch may have begun
 OTHER_NATS = 7.0  # that it costs to be anywhere: the logarithm of the grid's touches
 SLOW_SIGMAS = 2.0  # standard deviations of its velocity, below which a touch may not move at all
@@ -175,6 +176,14 @@ class PartFilter:
         if moving > FITS or self._as_still > 1 or (self._slow() and still <= AS_WELL * moving):
             self.forget()
         return change if self.moves and not self._as_still else np.zeros(len(age))
+
+    def jumps(self, d: Array, noise: Array, age: Array) -> bool:
+        """Whether a touch that was held is suddenly another in the newest part of d, noise and age (K,)."""
+        if not self._still or self._reference is None:
+            return False
+        rows = np.argsort(age)[: self._count]
+        off = (d[rows] - self._reference[rows]) / np.hypot(noise[rows], self._noise[rows])
+        return bool(off @ off > len(rows) + JUMPS * np.sqrt(2 * len(rows)))
 
     def strongest(self) -> Array:
         """(K,) d of the touches as they were when they were strongest, of the last parts."""

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.touch_grid import touches
-from protocol.frames import FollowedTouch
+from protocol.frames import BegunTouch
 
 Array = NDArray[np.floating]
+Values = tuple[NDArray[np.intp], Array, Array]  # which measurements, d, standard deviation
 
 LINEAR = 0.05  # of d: by so much the linear response of a circle is wrong, once it is in its place; and by half of it
 # of the rms of d
@@ -26,7 +27,9 @@ LEAST = 0.004  # model units that are stated at least
 MEAN = np.log([0.2, 0.2])  # prior of log radius [model units], log drop [S/m]
 SD = np.array([0.5, 0.9])
 COARSE = 0.05  # of the side: a standard deviation beyond it is coarse
+INFORMATION = np.diag([0.0, 0.0, *SD**-2])
 STEPS = 8
+DONE = 0.2  # of the penalty: a step that gains less is the last one
 MOST_MISFIT = 2.5  # squares left per value, beyond which it is no circle: one between two touches leaves 3
 MOST = np.array([0.1, 0.1, 0.3, 0.5])  # of one step
 LOW, HIGH = np.log([0.04, 0.005]), np.log([0.9, 0.97])  # of log radius, log drop
@@ -46,6 +49,7 @@ class PartTouch:
     radius: float
     drop: float
     drop_sigma: float
+    densest: float  # times the drop: the largest there is. On the skin's edge a part of the circle has all of it
     at: tuple[float, float]
     sigma: tuple[float, float, float]
     fits: bool  # whether it explains the values
@@ -67,22 +71,42 @@ class PartImage:
         self._of_grid_squared = self._of_grid**2
         self._pixel = 2 * self.half_width / w
         self._x, self._y = ((np.arange(n) + 0.5) * self._pixel - self.half_width for n in (w, h))
-        self._fine = bundle.image_size // h
         self.metres_per_unit = bundle.metres_per_pixel * bundle.image_size / (2 * self.half_width)
 
     def fit(self, d: Array, sigma: Array, start: Array | None = None) -> PartTouch:
         """d (K,) with standard deviation sigma (K,), infinite where nothing was measured since the touch began. start:
         theta, where the likeliest of the grid is not to be looked for.
         """
+        values = self._values(d, sigma)
+        rows, seen, noise = values
+        theta, left, slope = self._climbed(self._start(*values) if start is None else start, values, STEPS)
+        covariance = np.linalg.inv(slope.T @ slope + INFORMATION + TINY * np.eye(4))
+        chi2 = float(left @ left)
+        misfit = max(1.0, chi2 / len(rows))
+        covariance *= spread_of(chi2, len(rows) - 4)
+        place, spread, densest = self._place(theta[:3], covariance[:3, :3])
+        axes = ellipse(spread, WIDER, LEAST)
+        x, y, radius, drop = float(theta[0]), float(theta[1]), float(np.exp(theta[2])), float(np.exp(theta[3]))
+        drop_sigma = WIDER * drop * float(np.sqrt(covariance[3, 3]))
+        unexplained = max(0.0, chi2 - len(rows)) / float(((seen / noise) ** 2).sum())
+        at = float(place[0]), float(place[1])
+        return PartTouch(x, y, radius, drop, drop_sigma, densest, at, axes, misfit < MOST_MISFIT, unexplained)
+
+    def towards(self, d: Array, sigma: Array, start: Array, steps: int) -> NDArray[np.float64]:
+        """theta after so many steps of a fit."""
+        return np.asarray(self._climbed(start, self._values(d, sigma), steps)[0], dtype=np.float64)
+
+    def _values(self, d: Array, sigma: Array) -> Values:
         rows = np.flatnonzero(np.isfinite(sigma))
         seen = d[rows].astype(float)
-        noise = np.sqrt(variance_of(seen, sigma[rows].astype(float), float((seen**2).mean())))
-        theta = self._start(rows, seen, noise) if start is None else start
-        cost, left, slope = self._linear(theta, rows, seen, noise)
-        information = np.diag([0.0, 0.0, *SD**-2])
+        return rows, seen, np.sqrt(variance_of(seen, sigma[rows].astype(float), float((seen**2).mean())))
+
+    def _climbed(self, theta: Array, values: Values, steps: int) -> tuple[Array, Array, Array]:
+        """The likeliest theta, what it leaves of the values, and the derivative of the response; whitened."""
+        cost, left, slope = self._linear(theta, *values)
         damping = 1e-3
-        for _ in range(STEPS):
-            hessian = slope.T @ slope + information
+        for _ in range(steps):
+            hessian = slope.T @ slope + INFORMATION
             pull = slope.T @ left - np.array([0.0, 0.0, *(SD**-2 * (theta[2:] - MEAN))])
             damped = hessian.copy()
             damped.flat[::5] *= 1 + damping
@@ -92,54 +116,40 @@ class PartImage:
             there = theta + step
             there[:2] = np.clip(there[:2], -self.half_width, self.half_width)
             there[2:] = np.clip(there[2:], LOW, HIGH)
-            found = self._linear(there, rows, seen, noise)
+            found = self._linear(there, *values)
             if found[0] < cost:
-                theta, damping, done = there, damping * 0.3, cost - found[0] < 0.05
+                theta, damping, done = there, damping * 0.3, cost - found[0] < DONE
                 cost, left, slope = found
                 if done:
                     break
             else:
                 damping *= 10
-        covariance = np.linalg.inv(slope.T @ slope + information + TINY * np.eye(4))
-        chi2 = float(left @ left)
-        misfit = max(1.0, chi2 / len(rows))
-        covariance *= spread_of(chi2, len(rows) - 4)
-        place, spread = self.place(theta[:3], covariance[:3, :3])
-        axes = ellipse(spread, WIDER, LEAST)
-        x, y, radius, drop = float(theta[0]), float(theta[1]), float(np.exp(theta[2])), float(np.exp(theta[3]))
-        drop_sigma = WIDER * drop * float(np.sqrt(covariance[3, 3]))
-        unexplained = max(0.0, chi2 - len(rows)) / float(((seen / noise) ** 2).sum())
-        at = float(place[0]), float(place[1])
-        return PartTouch(x, y, radius, drop, drop_sigma, at, axes, misfit < MOST_MISFIT, unexplained)
-
-    def about(self, touch: FollowedTouch) -> Array:
-        """Where to start the fit of a touch that is about there: theta."""
-        x, y = np.array(touch.position) / self.metres_per_unit
-        area = np.pi * np.exp(2 * MEAN[0]) * self.metres_per_unit**2
-        drop = np.clip(np.log(max(touch.integral / area, TINY)), LOW[1], HIGH[1])
-        return np.array([x, y, MEAN[0], drop])
-
-    def sure(self, *sigma: float) -> bool:
-        """Whether places with these uncertainties [m] are known to within COARSE."""
-        return max(sigma) <= COARSE * 2 * self.half_width * self.metres_per_unit
+        return theta, left, slope
 
     def place(self, circle: Array, covariance: Array) -> tuple[Array, Array]:
         """(2,) centre of the part of a circle (x, y, log radius) that lies on the skin, and its covariance (2, 2)."""
+        return self._place(circle, covariance)[:2]
+
+    def _place(self, circle: Array, covariance: Array) -> tuple[Array, Array, float]:
+        """And the largest share of a pixel."""
         shares, (rows, columns) = self._near(circle + STENCIL)
         weight = np.maximum(shares.sum(axis=(1, 2)), TINY)
         x, y = shares.sum(axis=1) @ self._x[columns], shares.sum(axis=2) @ self._y[rows]
         at = np.stack([x, y], axis=1) / weight[:, None]
         slope = (at[1::2] - at[2::2]).T / (2 * AHEAD)
-        return at[0], slope @ covariance @ slope.T
+        return at[0], slope @ covariance @ slope.T, float(shares[0].max())
 
-    def image(self, touch: PartTouch) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(H, W) drop [S/m] and its standard deviation."""
-        share = np.zeros(self._inside.shape)
-        near, at = self._near(np.array([[touch.x, touch.y, np.log(touch.radius)]]))
-        share[at] = near[0]
-        ones = np.ones((self._fine, self._fine))
-        drop, sigma = (np.kron(share * value, ones).astype(np.float32) for value in (touch.drop, touch.drop_sigma))
-        return drop, sigma
+    def begun(self, touch: PartTouch) -> BegunTouch:
+        """The touch as readers are told of it."""
+        metres, (long, short, angle) = self.metres_per_unit, touch.sigma
+        return BegunTouch(
+            position=[metres * touch.at[0], metres * touch.at[1]],
+            sigma=[metres * long, metres * short, angle],
+            drop=touch.densest * touch.drop,
+            drop_sigma=touch.densest * touch.drop_sigma,
+            integral=float(np.pi * (metres * touch.radius) ** 2 * touch.drop),
+            unexplained=touch.unexplained,
+        )
 
     def _start(self, rows: NDArray[np.intp], d: Array, noise: Array) -> Array:
         weight, pull = np.zeros(self.measurements), np.zeros(self.measurements)

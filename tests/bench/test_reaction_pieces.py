@@ -38,9 +38,16 @@ def test_kept_runs_are_joined_as_if_they_were_one() -> None:
         assert [event for event, _ in found[mode]] == [event for event, _ in before[mode]]
         assert str(rows(mode, found[mode])) == str(rows(mode, before[mode]))
         assert stated(mode, found[mode]) == stated(mode, before[mode]) != []
-    assert again[1].row() == {"commit": "abc", "seed": 1001, "steps": 2, "late_poses": late | {"rolling": 3}} | {
-        "load": [0.1, 0.4]
-    }
+    said = {"commit": "abc", "seed": 1001, "modes": ["full", "rolling"], "steps": 2}
+    assert again[1].row() == {**said, "late_poses": late | {"rolling": 3}, "load": [0.1, 0.4]}
+
+
+def test_touches_may_be_added_to_one_kind_of_scan_alone() -> None:
+    keep([piece(1, False)], "reaction")
+    alone = piece(piece_seed(1, 1), False)
+    del alone.found["full"], alone.late["full"]
+    found, late = joined([*kept("reaction", 1, ["rolling"]), alone])
+    assert len(found["rolling"]) == 2 * len(found["full"]) and late == {"full": 0, "rolling": 6}
 
 
 def test_touches_of_a_further_run_are_others() -> None:
@@ -49,7 +56,7 @@ def test_touches_of_a_further_run_are_others() -> None:
     assert isinstance(first[0], TouchEvent)
 
 
-@pytest.mark.parametrize(("seed", "modes"), [(2, ["full", "rolling"]), (1, ["rolling"])])
+@pytest.mark.parametrize(("seed", "modes"), [(2, ["full", "rolling"]), (1, ["rolling", "other"])])
 def test_another_series_is_refused(seed: int, modes: list[str]) -> None:
     with pytest.raises(ValueError, match="run without --more first"):
         kept("reaction", 1, ["rolling"])

@@ -55,15 +55,16 @@ class FakeService:
         control.close()
 
     def _send(self, publisher: Publisher, inference: Publisher) -> None:
+        valid = self.valid  # the test may change it meanwhile
         self.scan += 1
         now = time.monotonic_ns() - 5_000_000
         head = {
             "skin": "palm",
             "scan": self.scan,
             "source": "stub",
-            "valid": self.valid,
+            "valid": valid,
             "valid_for_s": 0.25,
-            "reasons": [] if self.valid else ["frozen"],
+            "reasons": [] if valid else ["frozen"],
             "stamps": {"sample": now},
         }
         touch = Contact(
@@ -79,7 +80,7 @@ class FakeService:
         image = np.zeros((8, 8), "<f4")
         image[4, 6] = 0.3
         inference.send(ImageFrame(**head, touched=True, image=image, metres_per_pixel=0.01, origin=[-0.04, -0.04]))  # type: ignore[arg-type]
-        self.sent.append((self.scan, now, self.valid))
+        self.sent.append((self.scan, now, valid))
 
     def _tare(self, args: dict[str, object]) -> dict[str, object]:
         self.tares.append(str(args["skin"]))

@@ -1,6 +1,6 @@
 """The examples as they are, against the running service: real processes, the stub board, a press by its control socket.
 
-Python's three controllers and the C++ subscriber share one service.
+Python's three controllers and the C++ subscriber share one service that scans whole, and one that scans in parts.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ ROOT = Path(__file__).resolve().parents[2]
 CPP = ROOT / "examples" / "cpp" / "subscribe.cpp"
 PATIENT_S = "1.5"  # what counts as silence here: a busy machine that runs tests is no fault of the skin
 
-pytestmark = pytest.mark.usefixtures("untouched")
+pytestmark = [
+    pytest.mark.usefixtures("untouched"),
+    pytest.mark.parametrize("service_that_nobody_hears", ["full", "rolling"], indirect=True),
+]
 Start = Callable[..., subprocess.Popen[str]]
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench.speed.simulated_host import SimulatedHost
+from firmware_stub.timeline import PiecewiseLinear, Script, Timeline
 from models.forward import shared
 from models.shapes import Shape
 from services.estimation.rolling import measured_at
@@ -221,6 +222,53 @@ def test_a_touch_reaches_a_controller_within_three_parts_and_so_does_its_end(hos
         host.until(host.now + 0.3)
     samples = [f.stamps["sample"] for _, f in host.contacts]
     assert samples == sorted(samples)
+
+
+@pytest.mark.parametrize("x, y", [(0.037, -0.044), (-0.0137, 0.0436)])
+def test_a_touch_on_an_electrode_is_not_taken_for_its_contact_after_parts_had_told_them_apart(x, y):
+    """The two whole scans after its beginning were of a contact that jumped, by what they show alone."""
+    host = SimulatedHost("rolling", snr_db=80.0, seed=4)
+    host.until(6.0)
+    began, first = host.now, len(host.contacts)
+    host.press(x=x, y=y, force=2.0, radius=0.006, seconds=60.0)
+    host.until(began + 0.4)
+    host.rig.close()
+    frames = [f for _, f in host.contacts[first:]]
+    assert all(f.valid for f in frames)
+    assert [t for t, f in host.contacts[first:] if f.contacts][0] - began < 0.025
+
+
+def test_a_contact_that_jumps_as_a_touch_begins_elsewhere_is_named():
+    """That the touch is none is no reason not to ask of others."""
+    host = SimulatedHost("rolling", snr_db=80.0, seed=11)
+    host.until(6.0)
+    jump = PiecewiseLinear((0.0, 0.106, 0.107), (1.0, 1.0, 4.0))
+    host.rig.field.play(
+        Timeline(Script("jumps", contact=((0, jump),)), host.now, (), host.rig.sheet.electrodes), host.now
+    )
+    host.until(host.now + 0.1)
+    began, first = host.now, len(host.contacts)
+    host.press(x=0.004, y=0.008, force=2.0, radius=0.007, seconds=60.0)
+    host.until(began + 0.3)
+    host.rig.close()
+    named = [t - began for t, f in host.contacts[first:] if any(r.startswith("electrode") for r in f.reasons)]
+    assert named and named[0] < 0.2
+
+
+def test_no_whole_scan_is_made_of_values_from_before_and_after_a_release():
+    """Of a release within the newest values too: such a scan looks like a contact that jumped, asking takes 20 ms."""
+    host = SimulatedHost("rolling", snr_db=80.0, seed=9)
+    host.until(6.0)
+    for k in range(20):
+        host.press(x=0.03, y=-0.028, force=2.0, radius=0.0075, seconds=60.0)
+        host.until(host.now + 0.3 + 0.0022 * k)
+        ended, first = host.now, len(host.contacts)
+        host.release()
+        host.until(ended + 0.25)
+        after = host.contacts[first:]
+        assert all(f.valid and "changing" not in f.reasons for _, f in after), k
+        assert next(t for t, f in after if all(c.state == "end" for c in f.contacts)) - ended < 0.02
+    host.rig.close()
 
 
 def test_a_light_tap_leaves_no_silence_behind():

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import ContactFrame, ForceFrame, Frame, ImageFrame, PartFrame, ShapeFrame, pack, unpack
+from protocol.frames import BegunTouch, ContactFrame, ForceFrame, Frame, ImageFrame, PartFrame, ShapeFrame, pack, unpack
 from services.contacts.outline import outline
 from services.contacts.tracking import LOST_FRAMES
 from services.publishing import Publishing
@@ -243,6 +243,79 @@ def test_a_part_after_an_image_that_left_something_says_that_it_changes(stage: P
         contacts(stage, frame)
         after = part(frame.scan)
         assert after.valid and ("changing" in after.reasons) == changing, frame.scan
+
+
+def begun(scan: int, after: int, drop: float = 0.3) -> PartFrame:
+    began = BegunTouch(
+        position=[0.02, -0.01],
+        sigma=[0.001, 0.0005, 0.25],
+        drop=drop,
+        drop_sigma=0.1 * drop,
+        integral=drop * math.pi * 0.01**2,
+        unexplained=0.01,
+    )
+    return PartFrame(
+        skin="palm", scan=scan, part=3, valid=True, stamps={"sample": scan * 4_500_000}, after=after, began=began
+    )
+
+
+def test_a_touch_that_began_is_a_contact_before_any_image_and_the_image_is_of_the_same(stage: Publishing) -> None:
+    first = image_frame(NOTHING, 1)
+    assert contacts(stage, first).contacts == []
+    made = stage.process(begun(12, after=1), ALL)
+    assert [type(frame) for frame in made] == [ContactFrame, ForceFrame], "a shape needs an image"
+    (c,) = contacts(stage, begun(13, after=1)).contacts
+    assert c.state == "begin" and c.position[:2] == pytest.approx([0.02, -0.01])
+    assert c.position_sigma == [0.001, 0.0005, 0.25]
+    assert c.force_n == pytest.approx(3.0, rel=0.1) and c.area_m2 == pytest.approx(math.pi * 0.01**2, rel=1e-6)
+    grows = image_frame(np.zeros((N, N), np.float32), 2, reconstructed=2)
+    grows.reasons = ["changing"]
+    kept = stage.process(grows, ALL)
+    assert isinstance(kept[0], ContactFrame) and [each.id for each in kept[0].contacts] == [c.id]
+    assert isinstance(kept[2], ShapeFrame) and kept[2].ids == [c.id] and "changing" in kept[0].reasons
+    seen = contacts(stage, image_frame(discs((0.02, -0.01, 0.01, 0.3)), 3, residual=0.0, reconstructed=3))
+    assert [each.id for each in seen.contacts] == [c.id] and "changing" not in seen.reasons
+    gone = image_frame(np.zeros((N, N), np.float32), 4, reconstructed=4, residual=0.0)
+    gone.reasons = ["changing"]
+    assert all(each.state == "end" for each in contacts(stage, gone).contacts), "an image had shown it"
+
+
+def test_a_touch_that_began_and_is_not_believed_is_not_silently_left_out(stage: Publishing) -> None:
+    contacts(stage, image_frame(NOTHING, 1))
+    part = begun(12, after=1)
+    assert part.began is not None
+    part.began.unexplained = 0.9
+    out = contacts(stage, part)
+    assert not out.contacts and "changing" in out.reasons
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"position": [1e30, 0.0]}, {"position": [0.3, 0.0]}, {"drop": 0.0}, {"integral": 1e300, "drop": 1e-300}]
+)
+def test_a_touch_that_began_where_or_as_none_can_is_not_valid(stage: Publishing, wrong: dict[str, Any]) -> None:
+    contacts(stage, image_frame(NOTHING, 1))
+    part = begun(12, after=1)
+    assert part.began is not None
+    part.began = dataclasses.replace(part.began, **wrong)
+    out = contacts(stage, part)
+    assert not out.valid and not out.contacts and "non_finite" in out.reasons
+
+
+def test_a_touch_that_began_is_not_kept_by_empty_images_for_long(stage: Publishing) -> None:
+    contacts(stage, image_frame(NOTHING, 1))
+    contacts(stage, begun(12, after=1))
+
+    def blank(scan: int) -> ImageFrame:
+        frame = image_frame(np.zeros((N, N), np.float32), scan, reconstructed=scan)
+        frame.reasons = ["changing"]
+        return frame
+
+    again = Publishing("palm", stage.config, Bundle.load("square16"))
+    again.load(stage.state())
+    late = contacts(again, blank(100)).contacts
+    assert all(c.state == "end" for c in late) and len({c.id for c in late}) == len(late), "four seconds later"
+    present = [any(c.state != "end" for c in contacts(stage, blank(scan)).contacts) for scan in range(2, 12)]
+    assert present[0] and not any(present[5:])
 
 
 def test_an_id_never_holds_and_ends_in_one_frame(stage: Publishing) -> None:
