@@ -1,7 +1,8 @@
 """Reaction: from the instant a touch begins, or ends, to the contact frame that says so, live on the stub's board.
 
     skin bench reaction [--steps 500] [--modes full rolling] [--simulated] [--quick]
-    skin bench reaction --steps 100 --more    so many other touches, added to those of the last report
+    skin bench reaction --steps 100 --more    so many other touches, added to those of the last report (in parts alone:
+                                              --modes rolling)
 
 Real processes and a plain controller. The stub plays a scene that it has solved beforehand and says when it began, so
 every onset is known on this host's clock. A touch is seen with the first valid frame, neither `changing` nor `coarse`,
@@ -179,7 +180,7 @@ def main(argv: list[str] | None = None) -> int:
     draw(found, args.out / f"{name}.png")
     for said in report["runs"]:
         print(
-            f"{said['steps']} steps a scan, {sum(said['late_poses'].values())} late poses; "
+            f"{said['steps']} steps, {' and '.join(said['modes'])}; {sum(said['late_poses'].values())} late poses; "
             f"load of the machine {said['load'][0]:.1f} to {said['load'][1]:.1f}"
         )
     print(f"wrote {args.out / name}.json and {name}.png")

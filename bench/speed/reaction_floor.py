@@ -1,7 +1,11 @@
-"""What held touches of the reaction benchmark can be known to: Bayesian floors (models/fisher.py) of place and force.
+"""What touches of the reaction benchmark can be known to, by noise alone.
 
-The noise is that of the scans that were made of a touch until the middle of the time in which it is scored, averaged,
-and of what the bundle's model is wrong by, which no average takes away.
+held_floor: Bayesian floors (models/fisher.py) of place and force of touches that are held. The noise is that of the
+scans that were made of a touch until the middle of the time in which it is scored, averaged, and of what the bundle's
+model is wrong by, which no average takes away.
+
+growing_floor: when the place of a touch whose force grows is first known to NEAR of the side, from the parts of scans
+since it began, by the bundle's linear response and its noise, if the course of its force were known.
 """
 
 from __future__ import annotations
@@ -9,14 +13,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bench.speed.reaction_events import HELD_S, UNIT_M, TouchEvent
+from bench.speed.reaction_events import HELD_S, NEAR, SIDE_M, UNIT_M, TouchEvent
 from models.bundle import Bundle
 from models.fisher import MeasurementNoise, SizePrior, floors, mean_floor
 from models.shapes import Shape
 from services.contacts.force import NEWTONS_PER_SIEMENS
+from services.estimation.circles import MODEL, TINY, Circles
+from services.estimation.part_image import INFORMATION
+from services.estimation.rolling import parts_of, rolling_order
 
 SCAN_S = 0.0436
+LONGEST_S = 0.3
 MOST = 40  # touches of a kind: each takes eight solves
 PRIOR = SizePrior(radius=(0.05, 0.45))
 
@@ -38,3 +47,29 @@ def held_floor(of: Sequence[TouchEvent], snr_db: float) -> tuple[float, float]:
         found.append(floors("square16", touch, noise, PRIOR, bundle.pattern)["bayes"])
     floor = mean_floor(found)
     return floor.position * UNIT_M, floor.drop
+
+
+def growing_floor(of: Sequence[TouchEvent], snr_db: float) -> NDArray[np.float64]:
+    """(N * parts,) seconds from the beginning to that part's end, of touches that begin with any part of a scan."""
+    bundle = Bundle.load("square16")
+    circles, order, parts = Circles(bundle), rolling_order(bundle), parts_of(bundle)
+    at_once, count = np.zeros(len(order)), len(order) // parts
+    noise, found = 10 ** (-snr_db / 20), []
+    for event in of:
+        size = np.log([event.radius_m / UNIT_M, event.kind.force / NEWTONS_PER_SIEMENS])
+        touch = np.array([[event.x / UNIT_M, event.y / UNIT_M, *size, 0.0, 0.0]])
+        slope = circles.expected(touch, circles.all, at_once)[1][:, :MODEL] / noise
+        for first in range(parts):
+            information = INFORMATION + TINY * np.eye(MODEL)
+            for n in range(int(LONGEST_S / SCAN_S * parts)):
+                rows = order[(first + n) % parts * count :][:count]
+                at = (n + (np.arange(count) + 0.5) / count) * SCAN_S / parts
+                felt = slope[rows] * np.array([event.force(event.onset + t) / event.kind.force for t in at])[:, None]
+                information = information + felt.T @ felt
+                spread = np.linalg.inv(information)[:2, :2]
+                if np.sqrt(np.trace(spread)) * UNIT_M <= NEAR * SIDE_M:
+                    found.append((n + 1) * SCAN_S / parts)
+                    break
+            else:
+                found.append(np.inf)
+    return np.array(found)

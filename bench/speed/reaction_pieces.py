@@ -17,7 +17,7 @@ Found = list[tuple[TouchEvent, Reaction]]
 
 @dataclass
 class Piece:
-    """One run: the same touches in each mode, and what the machine did meanwhile. load: its least and its most."""
+    """One run: the same touches in each of its modes, and what the machine did. load: its least and its most."""
 
     seed: int
     steps: int
@@ -28,16 +28,21 @@ class Piece:
 
     def row(self) -> dict[str, Any]:
         """What the report says of it."""
-        return {"commit": self.commit, "seed": self.seed, "steps": self.steps, "late_poses": self.late} | {
+        said = {"commit": self.commit, "seed": self.seed, "modes": list(self.found), "steps": self.steps}
+        return {**said, "late_poses": self.late} | {
             "load": [round(each, 2) for each in (min(self.load), max(self.load))]
         }
 
 
 def joined(pieces: Sequence[Piece]) -> tuple[dict[str, Found], dict[str, int]]:
     """By mode: what was seen of every touch, and how often the stub had no pose ready."""
-    modes = list(pieces[-1].found)
-    found = {mode: [each for piece in pieces for each in piece.found[mode]] for mode in modes}
-    return found, {mode: sum(piece.late[mode] for piece in pieces) for mode in modes}
+    found: dict[str, Found] = {}
+    late: dict[str, int] = {}
+    for piece in pieces:
+        for mode, each in piece.found.items():
+            found[mode] = found.get(mode, []) + each
+            late[mode] = late.get(mode, 0) + piece.late[mode]
+    return found, late
 
 
 def piece_seed(seed: int, number: int) -> int:
@@ -62,7 +67,7 @@ def kept(name: str, seed: int, modes: Sequence[str]) -> list[Piece]:
     except (OSError, ValueError, KeyError, TypeError) as why:
         raise ValueError(f"{path} holds no earlier run ({why!r}): run without --more first") from None
     was = content["machine"], pieces[0].seed, list(pieces[0].found)
-    if was != (machine(), seed, list(modes)):
+    if was[:2] != (machine(), seed) or not set(modes) <= set(was[2]):
         raise ValueError(f"{path} is of machine, seed and modes {was}, this run is of {(machine(), seed, list(modes))}")
     return pieces
 

@@ -13,12 +13,13 @@ from bench.accuracy.intervals import INTERVALS
 from bench.goals import Goal
 from bench.machine import machine
 from bench.speed.reaction_events import KINDS, PHASES, Reaction, TouchEvent
-from bench.speed.reaction_floor import held_floor
+from bench.speed.reaction_floor import growing_floor, held_floor
 
 SNR_DB = 80.0
 STEP, LIGHT, FAST_RAMP, SLOW_RAMP, *SLIDING = (kind.name for kind in KINDS)
 TARGETS_MS = {STEP: (50, 12.0, 99, 25.0), LIGHT: (50, 18.0, 90, 35.0)}  # quantile, target, quantile, target
 GONE_MS = (15.0, 30.0)
+BEYOND_MS = {50: 8.0, 99: 15.0}  # of a force that grows: beyond the floor of the same touches
 SLIP = 0.1
 
 
@@ -38,6 +39,9 @@ def rows(mode: str, found: list[tuple[TouchEvent, Reaction]]) -> list[dict[str, 
             row |= {"held_frames": len(off), "held_error_mm": 1e3 * _rms(off), "held_force_error": _rms(force)}
             place, drop = held_floor([event for event, _ in found if event.kind is kind], SNR_DB)
             row |= {"held_floor_mm": 1e3 * place, "held_force_floor": drop}
+        else:
+            floor = 1e3 * growing_floor([event for event, _ in found if event.kind is kind], SNR_DB)
+            row |= {f"floor_p{q}_ms": _quantile(floor, q) for q in (50, 99)}
         for what in ("contact", "any", "gone"):
             ms = 1e3 * np.array([getattr(r, f"{what}_s") for r in of])
             # A touch that was never seen counts as one seen after every other.
@@ -83,6 +87,12 @@ def _rolling_goals(name: str, row: dict[str, Any]) -> list[Goal]:
     if row["kind"] == STEP:
         found.append(Goal(f"{name}: release, median, ms", row["gone_p50_ms"], at_most=GONE_MS[0]))
         found.append(Goal(f"{name}: release, p99, ms", row["gone_p99_ms"], at_most=GONE_MS[1]))
+    for q, most in BEYOND_MS.items():
+        if f"floor_p{q}_ms" in row:
+            beyond = row[f"contact_p{q}_ms"] - row[f"floor_p{q}_ms"]
+            found.append(
+                Goal(f"{name}: beyond the floor ({row[f'floor_p{q}_ms']:.1f}), p{q}, ms", beyond, at_most=most)
+            )
     if "held_frames" in row:
         for what, error, floor in (
             ("position", "held_error_mm", "held_floor_mm"),

@@ -1,10 +1,11 @@
 """False touches: an untouched skin that drifts, scanned in parts, for hours of simulated time.
 
-    skin bench untouched_parts [--hours 3] [--chunk-minutes 10] [--seed 1]
+    skin bench untouched_parts [--hours 3] [--chunk-minutes 10] [--seed 1] [--quick]
 
 Board, link and stages in one process. The sheet's background drifts by 1e-5 a second and two contacts by 1e-4, as
 those of a drying gel do; each chunk begins with a fresh skin and noise of its own. Every contact in a valid frame is a
-false touch. What ran is kept in untouched_parts.json after each chunk, and the same command goes on from there.
+false touch. What ran is kept in untouched_parts.json after each chunk, with its commit, and the same command goes on
+from there; chunks of another commit are forgotten unless --mixed says that they count too.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ BASELINE_S = 7.0
 DRIFT_HZ, CONTACT_HZ = 1e-5, 1e-4  # relative, of the background and of two contacts
 AGING = (3, 13)
 LEAST_S = 10.0  # of a chunk
+QUICK_HOURS = 1 / 6
 
 
 def scene(seconds: float) -> str:
@@ -73,20 +75,29 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--chunk-minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=1, help="of the first chunk; each has the next one")
     parser.add_argument("--anew", action="store_true", help="forget what ran before")
+    parser.add_argument("--mixed", action="store_true", help="what ran at other commits counts too")
+    parser.add_argument("--quick", action="store_true", help="the ten minutes of CI")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()
     path, seconds = args.out / "untouched_parts.json", max(LEAST_S, 60 * args.chunk_minutes)
     kept = {} if args.anew or not path.exists() else json.loads(path.read_text(encoding="utf-8"))
-    done: list[dict[str, Any]] = kept.get("chunks", [])
-    while sum(each["seconds"] for each in done) < 3600 * args.hours:
-        done.append(chunk(seconds, args.seed + len(done)))
-        write_json(path, {**provenance("untouched_parts", argv), "chunks": done, **totals(done)})
+    own, hours = provenance("untouched_parts", argv), QUICK_HOURS if args.quick else args.hours
+    done: list[dict[str, Any]] = [c for c in kept.get("chunks", []) if args.mixed or c.get("commit") == own["commit"]]
+    while sum(each["seconds"] for each in done) < 3600 * hours:
+        done.append({**chunk(seconds, args.seed + len(done)), "commit": own["commit"]})
+        write_json(path, {**own, "targets": [goal(done).to_dict()], "chunks": done, **totals(done)})
         print(f"{totals(done)['hours']:.2f} h, false touches: {totals(done)['false_touches']}", flush=True)
     found = totals(done)
     print(f"{found['hours']:.2f} simulated hours, {found['parts']} parts, {found['cpu_s'] / 60:.0f} minutes of CPU")
-    Console(width=120).print(_goals.table([Goal("frames with a false touch", found["false_touches"], at_most=0)]))
+    Console(width=120).print(_goals.table([goal(done)]))
     return 0
+
+
+def goal(chunks: list[dict[str, Any]]) -> Goal:
+    found = totals(chunks)
+    figure = f"frames with a false touch, of {found['hours']:.2f} h of scans in parts with drift"
+    return Goal(figure, found["false_touches"], at_most=0, gate=0)
 
 
 def totals(chunks: list[dict[str, Any]]) -> dict[str, Any]:
