@@ -24,7 +24,7 @@ from .topics import TOPIC_OF, TOPICS, wire_topic
 from .transport import Context, Socket
 
 __all__ = [
-    "AllReader", "ControlClient", "ControlError", "ControlServer", "NewestReader", "PartsReader", "Publisher",
+    "AllReader", "ControlClient", "ControlError", "ControlServer", "NewestReader", "Publisher", "StageReader",
     "clock_offset",
 ]  # fmt: skip
 
@@ -122,7 +122,9 @@ class NewestReader(_SkippingReader):
     """The newest frame of one topic of one skin; older ones are skipped.
 
     CONFLATE, because a high-water mark bounds neither the age of what is queued nor the kernel's buffers; one topic
-    and skin per socket, because a conflating socket holds one message, whatever its topic.
+    and skin per socket, because a conflating socket holds one message, whatever its topic. About one frame in a million
+    is lost although it is the newest: where it arrives while we look (libzmq 4.3.5, dbuffer_t::write). The next one
+    makes up for it.
     """
 
     def __init__(self, topic: str, skin: str, endpoint: str | None = None, context: Context | None = None) -> None:
@@ -148,22 +150,25 @@ class NewestReader(_SkippingReader):
         return got
 
 
-PARTS_QUEUE = 200
-"""Messages held in a reader of parts and what lies between them, from each producer: about a second of parts."""
+STAGE_QUEUE = 200
+"""Messages held in a stage's reader, from each producer: nine seconds of whole scans, about one of parts."""
 
 
-class PartsReader(_SkippingReader):
-    """The newest delta or image frame of one skin whose scans come in parts; beside images the newest part after it.
+class StageReader(_SkippingReader):
+    """What a stage reads of one skin: the newest raw, delta or image frame; beside images the newest part after it.
     Older ones are skipped, but not the one whose stack or image a newer one holds: that comes first. A part comes after
     the image of the scan that it names, whichever of the two arrives first.
+
+    A queue that is emptied at every call, and not CONFLATE, which loses a frame now and then (see NewestReader):
+    nothing makes up for one of a replay, whose next frame waits for what becomes of it.
     """
 
-    def __init__(self, skin: str, topic: str = "image", context: Context | None = None) -> None:
+    def __init__(self, topic: str, skin: str, context: Context | None = None) -> None:
         topics = ("image", "part") if topic == "image" else (topic,)
         producers = {TOPICS[each].producers[0] for each in topics}
         addresses = {name: transport.current().data_address(name) for name in sorted(producers)}
-        super().__init__(topics, skin, addresses, context, {zmq.RCVHWM: PARTS_QUEUE})
-        self._whole: list[DeltaFrame | ImageFrame] = []  # that wait: the newest, and before it the one that it holds
+        super().__init__(topics, skin, addresses, context, {zmq.RCVHWM: STAGE_QUEUE})
+        self._whole: list[Frame] = []  # that wait: the newest, and before it the one that it holds
         self._part: PartFrame | None = None
         self._after = -1  # scan of the image frame that was read last
 
@@ -174,18 +179,19 @@ class PartsReader(_SkippingReader):
 
     def recv(self, timeout_s: float = 0.0) -> Frame | None:
         """The next frame, waiting up to `timeout_s` for one; None when there is none. Never raises on bad input."""
-        got = self._receive(0.0 if self.more else timeout_s)
-        while got is not None:
+        for n in range(STAGE_QUEUE):  # more come with the next call: a flood of them cannot hold us
+            got = self._receive(0.0 if n or self.more else timeout_s)
+            if got is None:
+                break
             frame = got[0]
             self._count(frame)
             if isinstance(frame, PartFrame):
                 self.skipped += self._part is not None
                 self._part = frame
-            elif isinstance(frame, DeltaFrame | ImageFrame):
+            else:
                 kept = [each for each in self._whole[:1] if _holds(frame, each)]
                 self.skipped += len(self._whole) - len(kept)
                 self._whole = [*kept, frame]
-            got = self._receive(0.0)
         if self._whole:
             frame = self._whole.pop(0)
             self._after = frame.scan
@@ -198,8 +204,10 @@ class PartsReader(_SkippingReader):
         return part
 
 
-def _holds(frame: DeltaFrame | ImageFrame, older: DeltaFrame | ImageFrame) -> bool:
+def _holds(frame: Frame, older: Frame) -> bool:
     """Whether a frame says no more than that all is as in an older one, of which its reader needs the arrays."""
+    if not (isinstance(frame, DeltaFrame | ImageFrame) and isinstance(older, DeltaFrame | ImageFrame)):
+        return False
     own, theirs = (each.stack if isinstance(each, DeltaFrame) else each.image for each in (frame, older))
     return frame.held and frame.reconstructed == older.reconstructed and theirs.size > 0 and not own.size
 

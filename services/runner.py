@@ -71,10 +71,7 @@ class Runner:
 
     def add(self, stage: Stage, feed: Feed | None = None) -> None:
         """Drive this stage; without a feed, from the topic that it reads."""
-        if feed is None:
-            parts = self.config.skins[stage.skin].scan == "rolling" and stage.reads in ("delta", "image")
-            feed = Newest(stage.reads, stage.skin, parts)
-        channel = Channel(self.process, stage, feed)
+        channel = Channel(self.process, stage, Newest(stage.reads, stage.skin) if feed is None else feed)
         self.channels[stage.skin] = channel
         self._by_socket[channel.feed.socket] = channel
         for command in stage.commands:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from protocol.frames import Frame
-from protocol.sockets import NewestReader, PartsReader
+from protocol.sockets import StageReader
 from protocol.topics import wire_topic
 from services.runtime.heartbeat import Heartbeat
 from services.runtime.stage import Stage
@@ -38,12 +38,10 @@ class Channel:
 
 
 class Newest:
-    """A stage's input from a socket: the newest frame. parts: of scans in parts; before it the one that it holds, and
-    beside images the parts between them.
-    """
+    """A stage's input from a socket: the newest frame, and what belongs to it."""
 
-    def __init__(self, topic: str, skin: str, parts: bool = False) -> None:
-        self.reader: NewestReader | PartsReader = PartsReader(skin, topic) if parts else NewestReader(topic, skin)
+    def __init__(self, topic: str, skin: str) -> None:
+        self.reader = StageReader(topic, skin)
         self.socket = self.reader.socket
 
     @property
@@ -57,7 +55,7 @@ class Newest:
     @property
     def more(self) -> bool:
         """Whether another frame waits that the socket says nothing of."""
-        return isinstance(self.reader, PartsReader) and self.reader.more
+        return self.reader.more
 
     def recv(self) -> Frame | None:
         return self.reader.recv()

@@ -30,7 +30,10 @@ def test_a_command_ends_with_tests_that_are_killed(tmp_path: Path, how: signal.S
     assert tests.stdout is not None
     with tests, tests.stdout:
         started = Path("/proc", str(int(tests.stdout.readline())))
-        assert "sleep" in (started / "cmdline").read_text()
+        end = time.monotonic() + 30
+        while not (line := (started / "cmdline").read_text()) and time.monotonic() < end:  # the kernel replaces it
+            time.sleep(0.02)
+        assert "sleep" in line
         tests.send_signal(how)
     end = time.monotonic() + 30
     while (running := "State:\tZ" not in _status(started)) and time.monotonic() < end:

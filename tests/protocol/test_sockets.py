@@ -14,10 +14,19 @@ import numpy as np
 import pytest
 import zmq
 
-from protocol.frames import ContactFrame, DeltaFrame, ForceFrame, ImageFrame, InfoFrame, PartFrame, StatusFrame
+from protocol.frames import (
+    ContactFrame,
+    DeltaFrame,
+    ForceFrame,
+    ImageFrame,
+    InfoFrame,
+    PartFrame,
+    RawFrame,
+    StatusFrame,
+)
 from protocol.reconnecting import GRACE_S
 from protocol.runtime import endpoint
-from protocol.sockets import AllReader, NewestReader, PartsReader, Publisher
+from protocol.sockets import AllReader, NewestReader, Publisher, StageReader
 from protocol.transport import MAX_MESSAGE
 
 ROOT = Path(__file__).parents[2]
@@ -69,7 +78,7 @@ def told_by(reader):
 def test_a_slow_reader_has_what_the_newest_frame_holds(runtime, context, topic):
     """Without it, nothing could be said of a touch until it changes."""
     producer = Publisher("preprocessing" if topic == "delta" else "inference", context)
-    reader = PartsReader("palm", topic, context)
+    reader = StageReader(topic, "palm", context)
     subscribed(producer, topic)
 
     def send(scan, held_from=None):
@@ -95,8 +104,20 @@ def test_a_slow_reader_has_what_the_newest_frame_holds(runtime, context, topic):
     producer.close()
 
 
+def test_a_slow_stage_reads_the_newest_raw_frame(runtime, context):
+    producer, reader = Publisher("acquisition", context), StageReader("raw", "palm", context)
+    subscribed(producer, "raw")
+    for scan in (1, 2, 3):
+        producer.send(RawFrame(skin="palm", valid=True, scan=scan))
+    assert told_by(reader) == [3] and reader.skipped == 2
+    producer.send(RawFrame(skin="palm", valid=True, scan=4))
+    assert told_by(reader) == [4] and reader.skipped == 2
+    reader.close()
+    producer.close()
+
+
 def test_a_part_comes_after_the_image_that_it_names_whichever_arrives_first(publisher_of_images, context):
-    parts, reader = Publisher("preprocessing", context), PartsReader("palm", context=context)
+    parts, reader = Publisher("preprocessing", context), StageReader("image", "palm", context)
     subscribed(publisher_of_images, "image")
     subscribed(parts, "part")
 
