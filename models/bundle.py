@@ -102,6 +102,12 @@ class Bundle:
     def metres_per_pixel(self) -> float:
         return self.metres_per_unit * 2.0 * self.half_width / self.image_size
 
+    @property
+    def image_origin(self) -> tuple[float, float]:
+        """(x, y) [m] of the corner of an image's first pixel."""
+        corner = -self.metres_per_unit * self.half_width
+        return corner, corner
+
     def prereconstructor(self) -> PreReconstructor:
         return PreReconstructor(self.matrices)
 

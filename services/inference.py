@@ -53,14 +53,13 @@ class Inference(Stage):
         self.linearisation = Linearisation(name, bundle)
         self._tells_shapes = tells_shapes(bundle)
         self.each_alone = False  # offline: frames that do not follow each other; each waits for its fit
-        n = bundle.image_size
         self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
         self._refinement = _refinement(name, skin, bundle)
         self._symmetry: SymmetryMean | None = None
         if skin.touch.symmetry and isinstance(self._network, Network) and bundle.locator is None:
             self._symmetry = SymmetryMean(self._network, symmetries(bundle.skin))  # one registered is like itself alone
-        self._origin = [-0.5 * n * bundle.metres_per_pixel] * 2
+        self._origin = list(bundle.image_origin)
         self.reset()
 
     def reset(self) -> None:

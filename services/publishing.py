@@ -67,8 +67,8 @@ class Publishing(Stage):
         by_registration = measures_force(bundle)
         self._tells_force = self.law.exists or by_registration
         self._writer = ContactWriter(self.law, place, self._tells_force)
-        m, self._image_size = bundle.metres_per_pixel, bundle.image_size
-        self._grid = (m, [-0.5 * self._image_size * m] * 2)
+        self._image_size = bundle.image_size
+        self._grid = (bundle.metres_per_pixel, list(bundle.image_origin))
         self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
         self.tracker = Tracker()
         self.following, self.lasting, self.last_image = Following(), LastingStates(), LastImage(name)
