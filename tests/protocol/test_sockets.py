@@ -107,10 +107,16 @@ def test_a_slow_reader_has_what_the_newest_frame_holds(runtime, context, topic):
 def test_a_slow_stage_reads_the_newest_raw_frame(runtime, context):
     producer, reader = Publisher("acquisition", context), StageReader("raw", "palm", context)
     subscribed(producer, "raw")
+
+    def send(scan):
+        producer.send(
+            RawFrame(skin="palm", valid=True, scan=scan, z=np.ones(1, np.complex64), status=np.zeros(1, np.uint8))
+        )
+
     for scan in (1, 2, 3):
-        producer.send(RawFrame(skin="palm", valid=True, scan=scan))
+        send(scan)
     assert told_by(reader) == [3] and reader.skipped == 2
-    producer.send(RawFrame(skin="palm", valid=True, scan=4))
+    send(4)
     assert told_by(reader) == [4] and reader.skipped == 2
     reader.close()
     producer.close()

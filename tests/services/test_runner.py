@@ -352,7 +352,7 @@ def test_who_subscribes_is_told_of_and_what_is_lacking_is_asked_for_by_subscribi
     try:
         runner.add(stage)
         until(lambda: "contact" in stage.told)
-        until(lambda: len(asked) >= 5 and set(asked) == {b"image/palm\0"})
+        until(lambda: len(asked) >= 5 and set(asked) == {b"image/palm\0", b"part/palm\0"})
         contacts.close()
         until(lambda: runner.channels["palm"].asleep)
         asked.clear()
