@@ -5,6 +5,7 @@ Python's three controllers and the C++ subscriber share one service that scans w
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import os
 import re
@@ -24,6 +25,7 @@ from protocol.client import ContactSubscriber, Stale
 from protocol.control import ControlClient
 from protocol.frames import Contact, ContactFrame
 from protocol.sockets import AllReader
+from tests.docs.snippets import snippets
 
 ROOT = Path(__file__).resolve().parents[2]
 CPP = ROOT / "examples" / "cpp" / "subscribe.cpp"
@@ -125,6 +127,16 @@ def test_the_newest_frame_is_there_right_after_connecting() -> None:
         with ContactSubscriber("palm") as skin, contextlib.suppress(Stale):
             good += skin.latest(valid=True).valid
     assert good >= 4
+
+
+def test_the_ten_lines_of_readme_read_a_touch(start: Start) -> None:
+    """Whole scans and parts alike: who has none of our code."""
+    program = next(each.text for each in snippets() if each.kind == "python" and "import msgpack" in each.text)
+    client = start(sys.executable, "-u", "-c", program)
+    assert line_with(client, "True []"), "an untouched frame to act on"
+    press(0.02, -0.01, 3.0)
+    position, newtons = ast.literal_eval(line_with(client, "True [([").partition(" True ")[2])[0]
+    assert position == pytest.approx([0.02, -0.01, 0.0], abs=0.004) and newtons > 0
 
 
 def test_who_comes_late_is_told_of_no_beginning_and_no_end() -> None:
