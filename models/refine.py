@@ -23,13 +23,12 @@ from models.bundle import Bundle
 from models.response_error import FrameErrors, frame_errors
 from models.shapes import KINDS, Array, Shape
 from models.touch_fit import TouchFit
-from models.touch_posterior import TouchPosterior
+from models.touch_posterior import UNLIKELY_NOW, TouchPosterior
 from models.touch_response import TouchResponse
 from protocol.errors import EitskinError
 
 CELLS = (12, 20)
 CONTACT_TO_SCALE = 4.0  # of drift: standard deviations of contact impedances over that of the whole sheet
-UNLIKELY_NOW = 1e-4  # probability below which a kind is no longer followed
 NICE = 10  # frames come first
 REMEMBERED = 8  # bundles
 
@@ -101,12 +100,17 @@ class Refiner:
         began, live = time.perf_counter(), np.isfinite(job.sigma)
         try:
             posterior, problem = self._fitted(job, live), ""
-        except (EitskinError, ValueError, np.linalg.LinAlgError) as why:
-            posterior, problem = None, f"a touch could not be fitted: {why}"
+        except Exception as why:  # the next frame may well be fitted
+            said = str(why) if isinstance(why, EitskinError | ValueError) else f"{type(why).__name__}: {why}"
+            posterior, problem = None, f"a touch could not be fitted: {said}"
         return RefineAnswer(job.skin, job.number, posterior, live, time.perf_counter() - began, problem)
 
     def _fitted(self, job: RefineJob, live: NDArray[np.bool_]) -> TouchPosterior:
         bundle, responses = self._of(job.bundle)
+        if len(job.d) != len(bundle.z0) or len(job.sigma) != len(bundle.z0):
+            raise ValueError(f"a frame of {len(job.d)} measurements, expected {len(bundle.z0)}, as the bundle has")
+        if not np.isfinite(job.d[live]).all():
+            raise ValueError("a frame with measurements that are no numbers, expected sigma to be infinite there")
         m, d = bundle.matrices, job.d[live]
         drift = None
         if job.drift > 0:
@@ -137,7 +141,7 @@ def start_of(image: NDArray[np.floating]) -> Shape | None:
     peak. None where it shows nothing.
     """
     peak = float(image.max(initial=0.0))
-    if not peak > 0:
+    if not 0 < peak < np.inf:
         return None
     mask = image > 0.5 * peak
     axis = -1 + 2 * (np.arange(len(image)) + 0.5) / len(image)

@@ -19,7 +19,7 @@ from scipy.special import erf
 from models.response_error import CORNERED, FrameErrors, seen_error, widening
 from models.shapes import KINDS, Array, Shape
 from models.touch_parameters import FREE, HIGH, LOW, MEAN, PERIOD, SD, shape_of, turn_between
-from models.touch_posterior import KindFit, TouchPosterior, posterior_of
+from models.touch_posterior import UNLIKELY_NOW, KindFit, TouchPosterior, posterior_of
 from models.touch_response import TouchGrid, TouchResponse, effective_drop
 
 STARTS = {"triangle": 4, "rectangle": 6, "square": 4, "L": 8}  # rotations looked at in one period
@@ -38,6 +38,7 @@ ERROR_SCALES = (1.0, 0.5, 0.25)
 """Of the response's error over what is assumed, each as likely before: what it is of a touch is not known, and a kind
 that leaves much less of the frame than was assumed is the likelier for it.
 """
+BEND_STEP, ROOM = 0.12, 1.2  # of the radius: for its second derivatives, and the cells that they take
 SAME_TURN = 0.08  # of a kind's period: rotations no further apart are of one optimum
 
 
@@ -75,7 +76,12 @@ class TouchFit:
             found += over_rotations(optima)
         found.sort(key=lambda fit: -fit.evidence)
         weight = np.exp([fit.evidence - found[0].evidence for fit in found])
-        return posterior_of(tuple(found), weight / weight.sum(), len(d))
+        share = weight / weight.sum()
+        fits = [
+            replace(fit, bend=bend(self.response, fit.kind, fit.theta)) if p > UNLIKELY_NOW else fit
+            for fit, p in zip(found, share, strict=True)
+        ]
+        return posterior_of(tuple(fits), share)
 
     def _starts(self, frame: _Whitened, kind: str, start: Shape, radius: float | None) -> list[Array]:
         """The likeliest rotation, place and area being the start's, and those that divide the period with it: its
@@ -95,6 +101,22 @@ class TouchFit:
             turned.append(theta)
         best = int(np.argmin([frame.misfit(kind, theta) for theta in turned]))
         return [turned[(best + k * STARTS[kind] // TRIED[kind]) % STARTS[kind]] for k in range(TRIED[kind])]
+
+
+def bend(response: TouchResponse, kind: str, theta: Array) -> Array:
+    """(K, 3) half the second derivatives of the response to x x, x y and y y of a touch's place."""
+    shape = shape_of(kind, theta)
+    grid = response.grid(shape.x, shape.y, ROOM * shape.radius)
+    h = BEND_STEP * shape.radius
+
+    def at(x: int, y: int) -> Array:
+        moved = shape_of(kind, theta + h * np.array([x, y, *[0] * (len(theta) - 2)]))
+        return response(grid, effective_drop(grid.coverage(moved), moved.drop, kind))[0]
+
+    here, right, left, up, down = at(0, 0), at(1, 0), at(-1, 0), at(0, 1), at(0, -1)
+    along, across = right + left - 2 * here, up + down - 2 * here
+    both = at(1, 1) + at(-1, -1) - 2 * here - along - across
+    return np.stack([along, both, across], axis=1) / (2 * h**2)
 
 
 def over_rotations(optima: list[KindFit]) -> list[KindFit]:
@@ -234,5 +256,6 @@ class _Whitened:
         wider = widening(shape, self._response.room(shape), count, radius is not None)
         covariance += seen_error(misfit, self._noise) * wider.factor * aside * wider.factor[:, None] - aside
         covariance += np.outer(wider.edge, wider.edge)
+        steep, flat = self._root @ slope, np.zeros((len(slope), 3))
         over_scales = float(np.logaddexp.reduce(each)) - np.log(len(each))
-        return KindFit(kind, theta, covariance, misfit, over_scales, evidence, self._root @ slope, follow, self._noise)
+        return KindFit(kind, theta, covariance, misfit, over_scales, evidence, steep, flat, follow, self._noise)

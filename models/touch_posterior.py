@@ -21,7 +21,10 @@ touch trade off along a bent valley. Found as those of models/response_error.py.
 """
 MOST_FOLLOWED = np.array([0.3, 0.3, 0.25, 0.6, 0.2, 0.3])  # of one step along a change; place: of the radius
 UNFOLLOWED = 0.01  # of a change's energy: what one step may leave of it
+BENT_STEPS = 2  # after a linear one, along the response's bend
 CURVED = 0.15  # of one step: standard deviation of what it is off by
+UNLIKELY_NOW = 1e-4  # probability below which a kind is no longer followed
+LESS_SURE, ELSEWHERE = 0.03, 0.1  # of size and drop, where a touch is elsewhere than its fit: by so much of its radius
 MOST_LEFT = 25.0  # that such an error leaves at most, where the touch is one of these kinds
 
 
@@ -29,7 +32,8 @@ MOST_LEFT = 25.0  # that such an error leaves at most, where the touch is one of
 class KindFit:
     """The likeliest touch of one kind. covariance: of theta; misfit: whitened energy it leaves, about K where it fits;
     evidence: log, nats, over the sizes that the response's error may have; as_assumed: where it is as large as was
-    assumed. slope (K, n): of the response to theta; gain (n, K): of theta to the frame.
+    assumed. slope (K, n): of the response to theta; bend (K, 3): half its second derivatives to x x, x y and y y, zeros
+    where the kind is too unlikely to be followed; gain (n, K): of theta to the frame.
     """
 
     kind: str
@@ -39,6 +43,7 @@ class KindFit:
     evidence: float
     as_assumed: float
     slope: Array
+    bend: Array
     gain: Array
     noise: float  # energy that noise leaves of a frame, on the mean
 
@@ -50,6 +55,13 @@ class KindFit:
     @property
     def shape(self) -> Shape:
         return shape_of(self.kind, self.theta)
+
+    def change(self, step: Array) -> Array:
+        """(K,) of the response, where theta goes by a step (n,): to second order in place. To first order a touch that
+        has moved looks larger and fainter, by twice the square of how many radii it went.
+        """
+        x, y = step[:2]
+        return np.asarray(self.slope @ step + self.bend @ [x * x, x * y, y * y])
 
     def drawn(self, rng: np.random.Generator, n: int) -> list[Shape]:
         """Shapes from the posterior."""
@@ -70,7 +82,6 @@ class TouchPosterior:
     integral: tuple[float, float]  # S times square model units
     area: tuple[float, float]  # square model units
     between_kinds: tuple[float, float]  # how far the kinds differ in drop and in area: relative standard deviations
-    measurements: int
 
     @property
     def fits_frame(self) -> bool:
@@ -84,20 +95,25 @@ class TouchPosterior:
         moved = []
         for fit in self.fits:
             step = fit.gain @ change
+            for _ in range(BENT_STEPS):
+                step = step + fit.gain @ (change - fit.change(step))
             most = MOST_FOLLOWED[: len(step)] * np.where(np.arange(len(step)) < 2, fit.shape.radius, 1.0)
             if (np.abs(step) > most).any():
                 continue
-            left = change - fit.slope @ step
+            left = change - fit.change(step)
             energy, usual = float(((left / sigma) ** 2).sum()), len(change) + 4 * (2 * len(change)) ** 0.5
             if energy > usual + UNFOLLOWED * float(((change / sigma) ** 2).sum()):
                 continue
-            doubt = np.diag((CURVED * step) ** 2)  # one step is not the whole way
+            doubt = np.diag((CURVED * step) ** 2)  # no step is the whole way
+            far = min(1.0, float(np.hypot(*step[:2])) / (ELSEWHERE * fit.shape.radius))
+            doubt[2, 2] += (LESS_SURE * far) ** 2
+            doubt[3, 3] += (LESS_SURE * far / (1 - fit.shape.drop)) ** 2
             theta = np.clip(fit.theta + step, LOW[: len(step)], HIGH[: len(step)])
             moved.append(replace(fit, theta=theta, covariance=fit.covariance + doubt))
         if not moved or moved[0].kind != self.fits[0].kind:
             return None
         share = np.array([self.probability[fit.kind] for fit in moved])
-        return posterior_of(tuple(moved), share / share.sum(), self.measurements)
+        return posterior_of(tuple(moved), share / share.sum())
 
     @property
     def classes(self) -> Array:
@@ -119,7 +135,7 @@ class TouchPosterior:
         return image
 
 
-def posterior_of(fits: tuple[KindFit, ...], probability: Array, measurements: int) -> TouchPosterior:
+def posterior_of(fits: tuple[KindFit, ...], probability: Array) -> TouchPosterior:
     """Moments over kinds: within each by its Gaussian, made wider; between them by their difference."""
     rows = []
     for fit in fits:
@@ -160,5 +176,4 @@ def posterior_of(fits: tuple[KindFit, ...], probability: Array, measurements: in
         mixed(3),
         mixed(4),
         (apart(2), apart(4)),
-        measurements,
     )

@@ -11,8 +11,10 @@ import logging
 import os
 import subprocess
 import sys
+import threading
 import time
 from multiprocessing.connection import Connection
+from queue import Empty, SimpleQueue
 
 from models.refine import RefineAnswer, RefineJob, Refiner
 from services.runtime.config import ROOT
@@ -30,7 +32,7 @@ class RefineProcess:
         self._command = command
         self._process: subprocess.Popen[bytes] | None = None
         self._to: Connection | None = None
-        self._from: Connection | None = None
+        self._read: SimpleQueue[RefineAnswer | None] = SimpleQueue()  # None: there will be no more
         self._waiting: dict[str, RefineJob] = {}  # the newest of each skin
         self._begun: RefineJob | None = None
         self._begun_s = self._not_before_s = 0.0
@@ -65,26 +67,24 @@ class RefineProcess:
         return answer
 
     def close(self) -> None:
-        for end in (self._to, self._from):
-            if end is not None:
-                end.close()
+        if self._to is not None:
+            self._to.close()
         if self._process is not None:
             self._process.kill()
             self._process.wait()
-        self._process = self._to = self._from = self._begun = None
+        self._process = self._to = self._begun = None
 
     def _receive(self) -> None:
-        assert self._from is not None and self._begun is not None
         try:
-            if self._from.poll():
-                answer: RefineAnswer = self._from.recv()
-                self._answers[answer.skin] = answer
-                self._begun, self._pause_s, self.problem = None, WAIT_S[0], ""
-                return
-        except (EOFError, OSError):
+            answer = self._read.get_nowait()
+        except Empty:
+            if time.monotonic() > self._begun_s + STUCK_S:
+                self._lost(f"gave no answer within {STUCK_S:.0f} s")
+            return
+        if answer is None:
             return self._lost("ended")
-        if time.monotonic() > self._begun_s + STUCK_S:
-            self._lost(f"gave no answer within {STUCK_S:.0f} s")
+        self._answers[answer.skin] = answer
+        self._begun, self._pause_s, self.problem = None, WAIT_S[0], ""
 
     def _lost(self, why: str) -> None:
         assert self._begun is not None
@@ -119,7 +119,9 @@ class RefineProcess:
         assert self._process.stdin is not None and self._process.stdout is not None
         with self._process.stdin as stdin, self._process.stdout as stdout:
             self._to = Connection(os.dup(stdin.fileno()), readable=False)
-            self._from = Connection(os.dup(stdout.fileno()), writable=False)
+            answers = Connection(os.dup(stdout.fileno()), writable=False)
+        self._read = SimpleQueue()
+        threading.Thread(target=_reading, args=(answers, self._read), daemon=True).start()
 
     def _skip(self, skin: str) -> None:
         self.skipped[skin] = self.skipped.get(skin, 0) + 1
@@ -142,6 +144,18 @@ class RefineHere:
 
     def poll(self, skin: str) -> RefineAnswer | None:
         return self._answers.pop(skin, None)
+
+
+def _reading(answers: Connection, into: SimpleQueue[RefineAnswer | None]) -> None:
+    """Until the process ends. A thread, because half of an answer would keep its reader waiting for the rest."""
+    with answers:
+        try:
+            while True:
+                into.put(answers.recv())
+        except Exception as why:  # it ended, or wrote something else
+            if not isinstance(why, EOFError | OSError):
+                log.warning("the process that refines touches gave no answer but: %s", why)
+            into.put(None)
 
 
 _shared: RefineProcess | None = None

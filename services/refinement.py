@@ -1,15 +1,15 @@
 """A touch refined by physics: its place, size, drop and kind fitted to the measurements (models/touch_fit.py), where
 skin.toml names the `indenter`.
 
-    delta, image --> job --> services/refine_process.py   (tens of milliseconds)
+    delta, image --> job --> services/refine_process.py   (refine_took_ms in the counters)
                        |<----------- answer
     image frames carry it as `refined` from the next frame on
 
 No frame waits for a fit. An answer belongs to the frame it was made of; for later ones it moves along by one
-Gauss-Newton step while that explains how the measurements have changed, and goes where it does not. While a fit runs,
-the newest frame waits for its turn, and older ones are skipped and counted. A fit begins where the last one ended, or,
-of a touch that has slid further than one step goes, at that moved along with the image: then it takes a few frames'
-time less, and its answer is young enough to be followed.
+Gauss-Newton step, to second order in place, while that explains how the measurements have changed, and goes where it
+does not. While a fit runs, the newest frame waits for its turn, and older ones are skipped and counted. A fit begins
+where the last one ended, or, of a touch that has slid further than one step goes, at that moved along with the image:
+then it takes a few frames' time less, and its answer is young enough to be followed.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from services.runtime.config import Skin
 
 log = logging.getLogger(__name__)
 
+MOST_ASKED = 1000  # frames whose fits are waited for: of older ones no answer comes any more
 QUIET_DRIFT = 1e-6  # rms: less is none
 
 
@@ -59,7 +60,7 @@ class Refinement:
         radius = skin.indenter.radius_m
         self._radius = None if radius is None else radius / bundle.metres_per_unit
         self._number, self._single, self._tare = 0, 0.0, skin.tare.frames
-        self._counted = {"fits": 0, "refined": 0, "unexplained": 0}
+        self._counted = {"fits": 0, "refined": 0, "unexplained": 0, "took_ms": 0}  # took_ms: of the newest fit
         self.forget()
 
     @property
@@ -118,6 +119,7 @@ class Refinement:
         """A frame that is reconstructed is to be fitted."""
         self._number += 1
         self._asked[self._number] = now
+        self._asked.pop(self._number - MOST_ASKED, None)
         drift = 10 ** (2 * float(context[2]) - 5) if len(context) > 2 else 0.0
         self._fits = self._fits or shared()
         self._fits.offer(
@@ -144,6 +146,7 @@ class Refinement:
         asked = self._asked[answer.number]
         self._asked = {number: each for number, each in self._asked.items() if number > answer.number}
         self._counted["fits"] += 1
+        self._counted["took_ms"] = round(1e3 * answer.took_s)
         if answer.problem:
             log.warning("%s: %s", self.name, answer.problem)
         found = answer.posterior

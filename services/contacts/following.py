@@ -41,63 +41,82 @@ class Following:
     """Of one skin's contacts."""
 
     def __init__(self) -> None:
-        self._anchors: dict[int, Anchor] = {}  # by the contact's id
+        self.forget()
 
     def forget(self) -> None:
-        self._anchors = {}
+        self._anchors: dict[int, Anchor] = {}  # by the contact's id
+        self._then: list[FollowedTouch] = []  # what was followed when the image was made
 
     def anchor(self, contacts: Sequence[Contact], followed: Sequence[FollowedTouch]) -> None:
         """Take note of contacts that a new image shows, and of what is followed at the same instant."""
-        self._anchors = {}
-        for contact in (c for c in contacts if c.state != "end"):
-            x, y = contact.on_sheet
-            near = [math.hypot(x - t.position[0], y - t.position[1]) for t in followed]
-            if near and min(near) < REACH_M:
-                k = near.index(min(near))
-                t = followed[k]
-                dx, dy = x - t.position[0], y - t.position[1]
-                apart: float | None = 0.0
-                part = 1.0  # what was measured by itself is where it is
-                if contact.position_sigma is None:
-                    agree = math.hypot(dx, dy) <= AGREE * t.sigma[0]
-                    apart, part = (None, 0.5) if agree else (math.hypot(dx, dy), 1.0)
-                self._anchors[contact.id] = Anchor(t.number, k, part * dx, part * dy, t.integral, apart)
+        self._then = list(followed)
+        found = {c.id: _anchored(c, self._then) for c in contacts if c.state != "end"}
+        self._anchors = {number: anchor for number, anchor in found.items() if anchor is not None}
 
     def motion(self, followed: Sequence[FollowedTouch]) -> dict[int, Motion]:
         """By now, of the contacts that are followed, by their ids."""
-        found = {}
-        for number, anchor in self._anchors.items():
-            if (touch := _of(anchor, followed)) is not None:
-                x, y = touch.position
-                found[number] = Motion(x + anchor.dx, y + anchor.dy, *touch.velocity)
-        return found
+        both = {number: (anchor, _of(anchor, followed)) for number, anchor in self._anchors.items()}
+        return {number: _motion(anchor, touch) for number, (anchor, touch) in both.items() if touch is not None}
 
     def moved(self, contacts: Sequence[Contact], followed: Sequence[FollowedTouch], place: Placement) -> list[Contact]:
-        """The contacts as they are by now."""
-        motion, found = self.motion(followed), []
+        """The contacts as they are by now. One that a fit refined is where the fit has it, which is surer than what is
+        followed, until it moves.
+        """
+        found = []
         for contact in contacts:
-            if contact.state != "end" and contact.id in motion:
-                anchor = self._anchors[contact.id]
-                touch = followed[anchor.place]
+            anchor = _anchored(contact, self._then) if contact.refined else self._anchors.get(contact.id)
+            touch = None if anchor is None or contact.state == "end" else _of(anchor, followed)
+            if anchor is not None and touch is not None:
                 grown = touch.integral / max(anchor.integral, 1e-30)
-                contact = _moved(contact, motion[contact.id], grown, _sigma(anchor, touch), place)
+                still = contact.refined and not any(touch.velocity)
+                now = Motion(*contact.on_sheet, 0.0, 0.0) if still else _motion(anchor, touch)
+                contact = _moved(contact, now, grown, _sigma(contact, anchor, touch), place)
             found.append(contact)
         return found
 
-    def state(self) -> list[Any]:
-        return [[number, *asdict(anchor).values()] for number, anchor in self._anchors.items()]
+    def state(self) -> dict[str, Any]:
+        anchors = [[number, *asdict(anchor).values()] for number, anchor in self._anchors.items()]
+        return {"anchors": anchors, "then": [asdict(touch) for touch in self._then]}
 
-    def load(self, state: Sequence[Any]) -> None:
-        self._anchors = {int(number): Anchor(int(n), int(k), *rest) for number, n, k, *rest in state}
+    def load(self, state: dict[str, Any] | Sequence[Any]) -> None:
+        """Older recordings have the anchors alone."""
+        kept = state if isinstance(state, dict) else {"anchors": state, "then": []}
+        self._anchors = {int(number): Anchor(int(n), int(k), *rest) for number, n, k, *rest in kept["anchors"]}
+        self._then = [FollowedTouch(**touch) for touch in kept["then"]]
 
 
-def _sigma(anchor: Anchor, touch: FollowedTouch) -> list[float]:
+def _anchored(contact: Contact, followed: Sequence[FollowedTouch]) -> Anchor | None:
+    """The contact beside the followed touch that is nearest to it; None where none is near."""
+    x, y = contact.on_sheet
+    near = [math.hypot(x - t.position[0], y - t.position[1]) for t in followed]
+    if not near or min(near) >= REACH_M:
+        return None
+    k = near.index(min(near))
+    t = followed[k]
+    dx, dy = x - t.position[0], y - t.position[1]
+    if contact.position_sigma is not None:  # what was measured by itself is where it is
+        return Anchor(t.number, k, dx, dy, t.integral)
+    if math.hypot(dx, dy) <= AGREE * t.sigma[0]:
+        return Anchor(t.number, k, 0.5 * dx, 0.5 * dy, t.integral, None)
+    return Anchor(t.number, k, dx, dy, t.integral, math.hypot(dx, dy))
+
+
+def _sigma(contact: Contact, anchor: Anchor, touch: FollowedTouch) -> list[float]:
     """Of the contact's place: in the middle of two that are about as sure it is surer than either, while it is held."""
     long, short, angle = touch.sigma
+    if (own := contact.position_sigma) is not None:
+        moved = contact.refined and any(touch.velocity)
+        return [math.hypot(own[0], long), math.hypot(own[1], long), own[2]] if moved else own
     if anchor.apart is None:
         better = 1.0 if any(touch.velocity) else math.sqrt(0.5)
         return [better * long, better * short, angle]
     return [math.hypot(long, anchor.apart), math.hypot(short, anchor.apart), angle]
+
+
+def _motion(anchor: Anchor, touch: FollowedTouch) -> Motion:
+    """Of a contact that is anchored beside a touch."""
+    x, y = touch.position
+    return Motion(x + anchor.dx, y + anchor.dy, *touch.velocity)
 
 
 def _of(anchor: Anchor, followed: Sequence[FollowedTouch]) -> FollowedTouch | None:
@@ -122,5 +141,5 @@ def _moved(contact: Contact, now: Motion, grown: float, sigma: list[float], plac
         force_n=force,
         force_sigma_n=sigma_n,
         wrench=[*pressed.tolist(), *np.cross(at.point, pressed).tolist()],
-        position_sigma=sigma if contact.position_sigma is None else contact.position_sigma,
+        position_sigma=sigma,
     )

@@ -139,3 +139,15 @@ def test_a_covariance_that_is_none(response: TouchResponse) -> None:
         TouchFit(response)(
             np.zeros(120), FrameErrors(-np.eye(120), np.zeros((120, 120))), Shape("circle", 0, 0, 0.2, 0.3)
         )
+
+
+def test_a_fit_knows_the_response_to_second_order_in_place(response: TouchResponse, gram: Array) -> None:
+    touch = Shape("circle", 0.2, -0.1, 0.25, 0.3)
+    d = frame(response, touch)
+    fit = TouchFit(response)(d, frame_errors(gram, SIGMA, d, touch.drop), near(touch), ("circle",)).fits[0]
+    moved = Shape("circle", fit.shape.x + 0.04, fit.shape.y - 0.03, fit.shape.radius, fit.shape.drop)
+    change, step = response.of(moved) - response.of(fit.shape), np.array([0.04, -0.03, 0.0, 0.0])
+    first, second = (
+        np.linalg.norm(change - said) / np.linalg.norm(change) for said in (fit.slope @ step, fit.change(step))
+    )
+    assert second < 0.7 * first and second < 0.06, "what is left is of the ten cells across a touch"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,21 @@ def test_a_place_that_was_measured_by_itself_stays_with_its_own_uncertainty():
     following.anchor([contact(0.011, 0.0, own)], [touch(0.010, 0.0)])
     (now,) = following.moved([contact(0.011, 0.0, own)], [touch(0.010, 0.0)], Flat())
     assert now.position == pytest.approx([0.011, 0.0, 0.0]) and now.position_sigma == own
+
+
+def test_a_refined_place_is_the_fits_until_the_touch_moves():
+    """The image's place was told with the fit's uncertainty: three times as far off as stated."""
+    following, own = Following(), [3e-5, 2e-5, 0.0]
+    following.anchor([contact(0.0112, 0.0)], [touch(0.0110, 0.0)])
+    fitted = replace(contact(0.0100, 0.0, own), refined=True)
+    (still,) = following.moved([fitted], [touch(0.0111, 0.0, integral=2e-5)], Flat())
+    assert still.position == pytest.approx([0.0100, 0.0, 0.0]) and still.position_sigma == own
+    assert still.force_n == pytest.approx(4.0), "pressed harder meanwhile"
+    (moved,) = following.moved([fitted], [touch(0.0130, 0.0, (0.1, 0.0))], Flat())
+    assert moved.position == pytest.approx([0.0120, 0.0, 0.0])
+    assert moved.position_sigma == pytest.approx([np.hypot(3e-5, 4e-4), np.hypot(2e-5, 4e-4), 0.0])
+    (image,) = following.moved([contact(0.0112, 0.0)], [touch(0.0110, 0.0)], Flat())
+    assert image.position == pytest.approx([0.0111, 0.0, 0.0]), "and the image's again, where there is no fit"
 
 
 def test_anchors_go_with_a_recording():
