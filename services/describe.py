@@ -10,6 +10,7 @@ import numpy as np
 
 from models.bundle import Bundle
 from models.prereconstruction import ONE_STEP_LAMBDA
+from models.symmetries import symmetries
 from protocol.frames import RawFrame
 from services.contacts.force import ForceLaw
 from services.estimation.tare import Baseline
@@ -93,6 +94,21 @@ def refinement(skin: Skin, bundle: Bundle, calibrated: bool = False) -> str:
         return "off: a fit starts at a network's image, and there is no network"
     if calibrated:
         return "off: the skin is calibrated as it is mounted, the response tables are those of its file"
+    return ON
+
+
+def symmetry(skin: Skin, bundle: Bundle) -> str:
+    """Whether a held touch's image becomes the mean over the skin's symmetries: "on", or why not."""
+    if not skin.touch.symmetry:
+        return "off: skin.toml does not say `touch = { symmetry = true }`"
+    if not skin.touch.hold:
+        return "off: `hold = false`, and only of an image that is held the mean is made"
+    if bundle.locator is not None:
+        return f"off: bundle {bundle.name} is registered to one very skin, which is like itself alone"
+    if skin.network == "none" or bundle.network_path("full") is None:
+        return "off: the mean is of a network's images, and there is no network"
+    if len(symmetries(bundle.skin, bundle.pattern)) < 2:
+        return f"off: bundle {bundle.name} has no symmetry: turned or mirrored, its outline or electrodes are others"
     return ON
 
 

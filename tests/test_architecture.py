@@ -43,6 +43,7 @@ SERVICES_USE_OF_MODELS = {
     "models.patterns",
     "models.rolling",
     "models.refine",
+    "models.symmetries",
     "models.turns",
     "models.shapes",
     "models.touch_grid",

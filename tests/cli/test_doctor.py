@@ -42,6 +42,17 @@ def test_why_touches_are_not_refined_is_said(skin, tmp_path) -> None:  # type: i
     assert "refine" not in skin("doctor").out
 
 
+def test_why_nothing_is_averaged_is_said(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    for bundle, says in (
+        ("square16", "OK palm: symmetry a held touch's image becomes the mean"),
+        ("disc16", "WARN palm: symmetry symmetry off: the mean is of a network's images"),
+    ):
+        file = tmp_path / f"{bundle}.toml"
+        file.write_text(f'[skins.palm]\nport = "stub"\nbundle = "{bundle}"\ntouch = {{ symmetry = true }}\n')
+        assert says in " ".join(skin("doctor", "--config", file).out.split())
+    assert "symmetry" not in skin("doctor").out
+
+
 def test_electrodes_in_order(bundle: Bundle) -> None:
     noise = 1 + 1e-4 * np.random.default_rng(0).standard_normal(120)
     assert electrode_order("palm", 3.0 * bundle.z0 * noise, bundle).level == "OK"
