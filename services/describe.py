@@ -11,6 +11,7 @@ import numpy as np
 from models.bundle import Bundle
 from models.prereconstruction import ONE_STEP_LAMBDA
 from models.symmetries import symmetries
+from models.touch_parameters import HIGH, LOG_RADIUS, LOW
 from protocol.frames import RawFrame
 from services.contacts.force import ForceLaw
 from services.estimation.tare import Baseline
@@ -22,6 +23,7 @@ CORNERS = 64  # of the polygon that stands for a disc
 MOVED = 2e-4  # relative: as two frames of 80 dB differ; a baseline that drifted by more is told again
 EVERY_S = 5.0  # but that at most so often
 RATE_FRAMES = 16  # of which the median time between two scans is taken
+ROUNDED = 1e-9  # relative: numbers that are the same
 RATE_CHANGED = 0.1  # relative: a rate that changed by more is told again
 
 UNITS = {"z": "ohm", "image": "S/m", "position": "m", "velocity": "m/s", "area_m2": "m^2", "force_n": "N"}
@@ -89,6 +91,13 @@ def refinement(skin: Skin, bundle: Bundle, calibrated: bool = False) -> str:
         return (
             f"off: bundle {bundle.name} has no response tables: "
             f"`python -m models.build --skin {bundle.name} --response` adds them"
+        )
+    radius = skin.indenter.radius_m
+    least, most = (float(np.exp(each[LOG_RADIUS])) * bundle.metres_per_unit for each in (LOW, HIGH))
+    if radius is not None and not least * (1 - ROUNDED) <= radius <= most * (1 + ROUNDED):
+        return (
+            f"off: `radius_m` is {radius:g} m, and with bundle {bundle.name} a fit knows touches of radius "
+            f"{least:.3g} to {most:.3g} m"
         )
     if skin.network == "none" or bundle.network_path("full") is None:
         return "off: a fit starts at a network's image, and there is no network"

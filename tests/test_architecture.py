@@ -47,6 +47,7 @@ SERVICES_USE_OF_MODELS = {
     "models.turns",
     "models.shapes",
     "models.touch_grid",
+    "models.touch_parameters",
     "models.touch_posterior",
     "models.uncertainty",
 }

@@ -22,7 +22,7 @@ from services.board.scanning import Scanning
 from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
 from services.cli.doctor_mounting import mounting_found
-from services.contacts.force import ForceLaw
+from services.contacts.force import ForceLaw, known_radius
 from services.contacts.placing import placement
 from services.describe import ON, geometry, refinement, symmetry
 from services.estimation import checks
@@ -85,6 +85,11 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
     )
     yield Finding("OK", f"{name}: bundle", f"{bundle.name}, every sha256 right ({bundle.hash[:12]}), {network}")
     yield Finding("OK", f"{name}: checks", checks.sentence(bundle) or "all of them, on every frame")
+    try:
+        known_radius(skin, bundle, name)
+    except ConfigError as why:
+        yield Finding("FAIL", f"{name}: indenter", str(why))
+        return
     if not running:
         yield from options(name, skin, {"refinement": refinement(skin, bundle), "symmetry": symmetry(skin, bundle)})
     if skin.calibration is not None:
