@@ -1,5 +1,5 @@
-"""Random changes of clean differences in training, drawn anew for each batch: symmetries of the skin, noise, drift,
-dead electrodes, model error.
+"""Random changes of clean differences in training, drawn anew for each batch: noise, drift, dead electrodes, model
+error. (Symmetries of the skin: symmetries.py.)
 """
 
 from __future__ import annotations
@@ -9,60 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from models.geometry import SkinGeometry
 from models.prereconstruction import Array, Drift, Operator, PreReconstructor
 from models.response_error import misfit_factor
-from models.turns import TURNS, Turn
 
 # What two meshes or two solvers differ by, of |d|. It is no noise: it looks like the signal of a touch that is not
 # there, a thousandth of what is, and falls off with the Gram matrix's eigenvalues almost as touches do (their power 0.4
 # in amplitude, against 0.5). Independent errors of that size on each channel would bury the corners of every shape.
 MODEL_ERROR = 1.2e-3
 SERVICE_DRIFT = Drift(scale=2e-5, contact=1e-4)  # a little less than services allow for at rest
-
-
-@dataclass(frozen=True)
-class Symmetry:
-    """d'[k] = d[measurements[k]] belongs to the turned image."""
-
-    measurements: npt.NDArray[np.integer]
-    turn: Turn
-
-
-def symmetries(skin: SkinGeometry) -> list[Symmetry]:
-    """Those of the square's eight that map the skin's electrodes (place, width) onto themselves and the
-    pattern onto itself; the first is the identity.
-
-    A pattern may read the same |Z| twice, with the current turned round or with drive and sense exchanged. Each
-    measurement is then mapped to the one that reads it in the same way: on a real skin the two differ.
-    """
-    points = skin.point(skin.electrodes)
-    same_way = {_signed(m): k for k, m in enumerate(skin.pattern)}
-    any_way = {_key(m): k for k, m in enumerate(skin.pattern)}
-    found = []
-    for turn in TURNS:
-        moved = turn.points(points)
-        distance = np.linalg.norm(points[:, None] - moved[None], axis=2)
-        source = distance.argmin(axis=1)  # electrode e stands where `source[e]` has been moved to
-        if distance.min(axis=1).max() > 1e-6 or not np.allclose(skin.widths, skin.widths[source]):
-            continue
-        moved_to = [same_way.get(_signed(source[m]), any_way.get(_key(source[m]))) for m in skin.pattern]
-        if None not in moved_to:
-            found.append(Symmetry(np.array(moved_to), turn))
-    return found
-
-
-def _signed(measurement: npt.NDArray[np.integer]) -> tuple[int, ...]:
-    """The same for the two orders that read the same Z: both pairs turned round leave its sign."""
-    a, b, c, d = (int(e) for e in measurement)
-    return min((a, b, c, d), (b, a, d, c))
-
-
-def _key(measurement: npt.NDArray[np.integer]) -> tuple[tuple[int, ...], ...]:
-    """The same for every order that reads the same |Z|: pairs turned round, drive and sense exchanged (reciprocity)."""
-    a, b, c, d = (int(e) for e in measurement)
-    first, second = sorted((tuple(sorted((a, b))), tuple(sorted((c, d)))))
-    return (first, second)
 
 
 @dataclass(frozen=True, eq=False)

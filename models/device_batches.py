@@ -11,8 +11,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from models.augmentation import Condition, Symmetry
+from models.augmentation import Condition
 from models.losses import Target
+from models.symmetries import Symmetry
 
 
 class SceneTensors:

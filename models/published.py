@@ -26,12 +26,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from models import geometry, samples
-from models.augmentation import Condition, Symmetry, condition, symmetries
+from models.augmentation import Condition, condition
 from models.bundle import Bundle
 from models.data import WORK
 from models.export import exported
 from models.network import CBAM, laid_out
 from models.prereconstruction import THRESHOLD_T, Array, Drift, Operator, PreReconstructor
+from models.symmetries import Symmetry, symmetries
 
 IN, OUT = 48, 96
 FOLDER = Path(__file__).parents[1] / "bench" / "published"
@@ -75,7 +76,7 @@ def train(
 ) -> tuple[PublishedMMCNN, dict[str, float]]:
     """Trains for so many minutes; prints the loss now and then. Also how far it came, for the file."""
     torch.manual_seed(seed)
-    rng, turns = np.random.default_rng(seed), symmetries(skin)
+    rng, turns = np.random.default_rng(seed), symmetries(skin.to_dict(), skin.pattern)
     bank = [_condition(pre, rng) for _ in range(32)]
     model = laid_out(PublishedMMCNN(attention), torch.channels_last)
     optimizer = torch.optim.Adam(model.parameters(), RATE)

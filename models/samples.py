@@ -14,11 +14,12 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from models import data, geometry
-from models.augmentation import Condition, OwnSkin, Symmetry, random_condition, symmetries
+from models.augmentation import Condition, OwnSkin, random_condition
 from models.device_batches import ConditionTensors, SceneTensors, measured, stacks
 from models.losses import IGNORE, Target
 from models.prereconstruction import Array, PreReconstructor
 from models.shapes import from_rows
+from models.symmetries import Symmetry, symmetries
 from models.turns import Pixel
 
 N = 96
@@ -109,7 +110,8 @@ class Batches:
         self.rng, self.device = np.random.default_rng(seed), torch.device(device)
         self._noise = torch.Generator(self.device).manual_seed(seed)
         self.own = own
-        self.symmetries = symmetries(skin) if own is None else symmetries(skin)[:1]
+        every = symmetries(skin.to_dict(), skin.pattern)
+        self.symmetries = every if own is None else every[:1]
         self._weigh()
         self.bank = [self._fresh() for _ in range(groups)]
 

@@ -9,6 +9,7 @@ import numpy as np
 from models.shapes import Array, Shape
 
 FREE = {"circle": 4, "hertz": 4, "triangle": 5, "rectangle": 6, "square": 5, "L": 5}  # parameters of each kind
+LOG_RADIUS = 2  # its place in theta
 PERIOD = {"triangle": 2 * np.pi / 3, "rectangle": np.pi, "square": np.pi / 2, "L": 2 * np.pi}
 
 # Prior of theta, normal: the ranges of models.scenes.TRAINING, wider. Rotation: any of the kind's period.

@@ -442,6 +442,8 @@ INFO_KEYS = {
     "not yet known",
     "force_law": "map: kind and parameters of the force law, or nil",
     "refinement": "whether touches are refined by a fit of their shape (`indenter` in skin.toml): on, or why not",
+    "symmetry": "whether the image of a held touch becomes the mean over the skin's symmetries (`touch` in skin.toml): "
+    "on, or why not",
     "mounting": "map: what the calibration to this very skin found (contacts, shifts, field, anisotropy, remarks); "
     "missing where the bundle is used as it is. `bundle_hash` covers it",
     "calibration_hash": "sha256 of the calibration file, or nil",

@@ -10,6 +10,8 @@ import numpy as np
 
 from models.bundle import Bundle
 from models.prereconstruction import ONE_STEP_LAMBDA
+from models.symmetries import symmetries
+from models.touch_parameters import HIGH, LOG_RADIUS, LOW
 from protocol.frames import RawFrame
 from services.contacts.force import ForceLaw
 from services.estimation.tare import Baseline
@@ -21,6 +23,7 @@ CORNERS = 64  # of the polygon that stands for a disc
 MOVED = 2e-4  # relative: as two frames of 80 dB differ; a baseline that drifted by more is told again
 EVERY_S = 5.0  # but that at most so often
 RATE_FRAMES = 16  # of which the median time between two scans is taken
+ROUNDED = 1e-9  # relative: numbers that are the same
 RATE_CHANGED = 0.1  # relative: a rate that changed by more is told again
 
 UNITS = {"z": "ohm", "image": "S/m", "position": "m", "velocity": "m/s", "area_m2": "m^2", "force_n": "N"}
@@ -89,10 +92,32 @@ def refinement(skin: Skin, bundle: Bundle, calibrated: bool = False) -> str:
             f"off: bundle {bundle.name} has no response tables: "
             f"`python -m models.build --skin {bundle.name} --response` adds them"
         )
+    radius = skin.indenter.radius_m
+    least, most = (float(np.exp(each[LOG_RADIUS])) * bundle.metres_per_unit for each in (LOW, HIGH))
+    if radius is not None and not least * (1 - ROUNDED) <= radius <= most * (1 + ROUNDED):
+        return (
+            f"off: `radius_m` is {radius:g} m, and with bundle {bundle.name} a fit knows touches of radius "
+            f"{least:.3g} to {most:.3g} m"
+        )
     if skin.network == "none" or bundle.network_path("full") is None:
         return "off: a fit starts at a network's image, and there is no network"
     if calibrated:
         return "off: the skin is calibrated as it is mounted, the response tables are those of its file"
+    return ON
+
+
+def symmetry(skin: Skin, bundle: Bundle) -> str:
+    """Whether a held touch's image becomes the mean over the skin's symmetries: "on", or why not."""
+    if not skin.touch.symmetry:
+        return "off: skin.toml does not say `touch = { symmetry = true }`"
+    if not skin.touch.hold:
+        return "off: `hold = false`, and only of an image that is held the mean is made"
+    if bundle.locator is not None:
+        return f"off: bundle {bundle.name} is registered to one very skin, which is like itself alone"
+    if skin.network == "none" or bundle.network_path("full") is None:
+        return "off: the mean is of a network's images, and there is no network"
+    if len(symmetries(bundle.skin, bundle.pattern)) < 2:
+        return f"off: bundle {bundle.name} has no symmetry: turned or mirrored, its outline or electrodes are others"
     return ON
 
 

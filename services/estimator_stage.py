@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from models.bundle import Bundle
-from services.describe import BaselineNews, FrameRate, describe, force, refinement
+from services.describe import BaselineNews, FrameRate, describe, force, refinement, symmetry
 from services.estimation import checks
 from services.estimation.drift import DriftRates
 from services.estimation.electrodes import ElectrodeHealth
@@ -41,7 +41,7 @@ class EstimatorStage(Stage):
         self._news = BaselineNews()
         self.frame_rate = FrameRate()
         self._unchecked = checks.sentence(bundle)
-        self._force = force(skin, bundle)
+        self._force, self._symmetry = force(skin, bundle), symmetry(skin, bundle)
         self.rolling_scans = RollingScans(bundle)
         self.always_reconstruct = False  # offline: an image of every frame, touched or not
         self.reset()
@@ -182,6 +182,7 @@ class EstimatorStage(Stage):
             return None
         said = describe(self.config, self.bundle, self._force, estimator.baseline, estimator.revision, rate_hz)
         said["refinement"] = refinement(self.config, self.bundle, bool(self.linearisation.name))
+        said["symmetry"] = self._symmetry
         return said | {"mounting": self.linearisation.found} if self.linearisation.found else said
 
     def health(self) -> Health:

@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.locator import Located, Locator
+from models.symmetries import symmetries
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
-from services.describe import ON, refinement
+from services.describe import ON, refinement, symmetry
 from services.estimation.rolling import parts_of
 from services.image_check import ImageCheck
 from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
 from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
-from services.symmetry import SymmetryMean, symmetries
+from services.symmetry import SymmetryMean
 
 if TYPE_CHECKING:
     from services.refine_process import RefineHere, RefineProcess
@@ -57,8 +58,9 @@ class Inference(Stage):
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
         self._refinement = _refinement(name, skin, bundle)
         self._symmetry: SymmetryMean | None = None
-        if skin.touch.symmetry and isinstance(self._network, Network) and bundle.locator is None:
-            self._symmetry = SymmetryMean(self._network, symmetries(bundle.skin))  # one registered is like itself alone
+        if isinstance(self._network, Network) and symmetry(skin, bundle) == ON:
+            turns = tuple(each.turn for each in symmetries(bundle.skin, bundle.pattern)[1:])
+            self._symmetry = SymmetryMean(self._network, turns)
         self._origin = list(bundle.image_origin)
         self.reset()
 

@@ -7,45 +7,13 @@ are there, the mean takes the image's place. No frame waits for it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from models.turns import TURNS, Turn
+from models.turns import Turn
 from protocol.frames import DeltaFrame
 from services.networks import Network, Pictures
-
-SAME = 1e-6  # model units: places that are the same
-
-
-def symmetries(skin: Mapping[str, Any]) -> tuple[Turn, ...]:
-    """The turns, but for the first, that leave a bundle's geometry as it is: outline, electrodes, widths, contact
-    impedances.
-    """
-    electrodes = skin.get("electrodes", {})
-    outline = np.asarray(skin.get("outline", ()), float).reshape(-1, 2)
-    centres = np.asarray(electrodes.get("centre", ()), float).reshape(-1, 2)
-    if not len(outline) or not len(centres):
-        return ()
-    each = [
-        np.broadcast_to(np.asarray(value, float), len(centres))
-        for value in (electrodes.get("width", 0.0), skin.get("contact_impedance", 0.0))
-    ]
-    marked = np.column_stack([centres, *each])
-    return tuple(
-        turn
-        for turn in TURNS[1:]
-        if _same(outline, turn.points(outline)) and _same(marked, np.column_stack([turn.points(centres), *each]))
-    )
-
-
-def _same(rows: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
-    """Whether both are the same set of rows."""
-    apart = np.abs(rows[:, None] - others[None]).max(axis=2)
-    return bool((apart.min(axis=1) < SAME).all() and (apart.min(axis=0) < SAME).all())
 
 
 class SymmetryMean:

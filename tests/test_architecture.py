@@ -43,9 +43,11 @@ SERVICES_USE_OF_MODELS = {
     "models.patterns",
     "models.rolling",
     "models.refine",
+    "models.symmetries",
     "models.turns",
     "models.shapes",
     "models.touch_grid",
+    "models.touch_parameters",
     "models.touch_posterior",
     "models.uncertainty",
 }

@@ -26,6 +26,7 @@ from models import geometry, metrics, patterns
 from models.forward import ForwardModel
 from models.scenes import TARGETS, random_scene
 from models.shapes import CLASSES, Array, Shape, from_rows, to_rows
+from models.symmetries import symmetries as skin_symmetries
 
 REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "eidors_reference.npz"
 SKIN = "square16"
@@ -89,17 +90,20 @@ def scenes(seed: int, n: int, singles: int | None = None) -> list[tuple[str, lis
 
 
 def symmetries() -> list[tuple[Array, NDArray[np.int64]]]:
-    """The square's eight: a matrix (2, 2) of the plane, and where each electrode goes (16,)."""
+    """The square's eight, those that mirror last: a matrix (2, 2) of the plane, and where each electrode goes (16,)."""
     skin = geometry.load(SKIN)
-    centres = skin.curve.point(skin.electrodes)
-    found = []
-    for mirror in (1, -1):
-        for quarter in range(4):
-            c, s = round(np.cos(quarter * np.pi / 2)), round(np.sin(quarter * np.pi / 2))
-            turn = np.array([[c, -s], [s, c]]) @ np.diag([mirror, 1.0])
-            distance = np.linalg.norm((centres @ turn.T)[:, None] - centres[None], axis=2)
-            found.append((turn, distance.argmin(1)))
-    return found
+    found = [
+        (each.turn.points(np.eye(2)).T, np.argsort(each.electrodes))
+        for each in skin_symmetries(skin.to_dict(), skin.pattern)
+    ]
+    return sorted(found, key=_mirrored_and_quarter)
+
+
+def _mirrored_and_quarter(symmetry: tuple[Array, NDArray[np.int64]]) -> tuple[bool, int]:
+    """Which of several ways to the same place is taken: it is solved on a mesh that is not quite symmetric."""
+    turn, _ = symmetry
+    side = round(np.linalg.det(turn))
+    return side < 0, round(np.arctan2(side * turn[1, 0], side * turn[0, 0]) / (np.pi / 2)) % 4
 
 
 def _solve(wanted: list[tuple[str, list[Shape]]], mesh: str, path: Path) -> Frames:

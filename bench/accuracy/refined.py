@@ -47,7 +47,7 @@ from bench.goals import Goal
 from bench.goals import table as goal_table
 from bench.json_file import write_json
 from bench.machine import provenance
-from models import export, metrics
+from models import metrics
 from models.bundle import Bundle
 from models.forward import ForwardModel
 from models.npz import read_npz
@@ -56,16 +56,20 @@ from models.response_error import frame_errors
 from models.scenes import TRAINING, random_scene
 from models.shapes import KINDS, Array, Shape, from_rows, to_rows
 from models.touch_posterior import TouchPosterior
-from models.turns import TURNS
 from protocol.frames import Contact
-from services.contacts.force import Force
-from services.contacts.refined import agrees, both, settled
+from services.contacts.contact_writer import ContactWriter
+from services.contacts.force import ForceLaw
+from services.contacts.force_curve import Curve
+from services.contacts.refined import both
+from services.contacts.surface import Placement, Plane
+from services.networks import Network
 from services.refinement import told
 
 SKIN, MESH, N = "square16", "stub", 96
 MOST = 64 * 2**20
 Row = dict[str, tuple[float, float]]
 COVERAGE_ALSO = ("60", "80")  # noise levels of which intervals alone are looked at
+WRITER = ContactWriter(ForceLaw(Curve(1.0)), Placement(Plane()), tells_force=True)
 METHODS = ("network", "found", "declared", "service", "stated", "symmetry")
 
 
@@ -98,19 +102,15 @@ def odd_frames(seed: int, count: int) -> tuple[list[OddShape], Array]:
     return touches, np.asarray(read_npz(path, MOST)["d"])
 
 
-def said(posterior: TouchPosterior, image: Array, start: Shape, unit: float) -> tuple[Force, float, float] | None:
-    """Drop, area and its standard uncertainty as the service would say them; None where it would say the image: the
-    rules of its publisher. The force law is 1 N/S.
+def said(posterior: TouchPosterior, image: Array, start: Shape, unit: float) -> Contact | None:
+    """The contact as the service's publisher has it of the fit; None where it says the image's. The force law is 1 N/S,
+    so the force is the drop.
     """
     if not posterior.fits_frame:
         return None
     (x, y), area = start.centroid * unit, float((image > 0.5 * image.max()).mean()) * 4 * unit**2
     seen = Contact(id=1, position=[float(x), float(y), 0.0], area_m2=area, force_n=float(image.max()))
-    touch, force = told(posterior, 0, unit), Force(*posterior.drop)
-    if not agrees(seen, touch, force):
-        return None
-    force, area, sigma = settled(seen, touch, force)
-    return force, area / unit**2, sigma / unit**2
+    return WRITER.fitted(seen, told(posterior, 0, unit))
 
 
 def row_of(image: Array, touch: Shape) -> dict[str, float]:
@@ -138,13 +138,13 @@ def fitted(posterior: TouchPosterior, touch: Shape) -> dict[str, float]:
     return row
 
 
-def stated(contact: tuple[Force, float, float], touch: Shape) -> dict[str, float]:
+def stated(contact: Contact, touch: Shape, unit: float) -> dict[str, float]:
     """Of what a contact says where image and fit are weighed: force and area."""
-    force, area, _ = contact
-    assert force.newton is not None and force.sigma is not None
-    off = abs(force.newton - touch.drop)
-    row = {"force %": 100 * off / touch.drop, "area %": 100 * abs(area / touch.area - 1)}
-    return row | {f"force in {percent} %": 100.0 * (off < one * force.sigma) for percent, (one, _) in INTERVALS.items()}
+    force, sigma = contact.force_n, contact.force_sigma_n
+    assert force is not None and sigma is not None
+    off = abs(force - touch.drop)
+    row = {"force %": 100 * off / touch.drop, "area %": 100 * abs(contact.area_m2 / unit**2 / touch.area - 1)}
+    return row | {f"force in {percent} %": 100.0 * (off < one * sigma) for percent, (one, _) in INTERVALS.items()}
 
 
 def shipped() -> Path:
@@ -160,7 +160,7 @@ def measured(
     """method -> one row a touch."""
     bundle, noise, rng = Bundle.load(SKIN), Level(level), np.random.default_rng([seed, 7])
     pre = bundle.prereconstructor()
-    network = export.session(shipped().read_bytes())
+    network = Network(str(shipped()))
     responses = responses_of(bundle)
     sigma = np.full(pre.measurements, noise.share)
     operator = pre.condition(sigma)
@@ -171,7 +171,7 @@ def measured(
         for method in ("symmetry", "network"):
             if method not in methods:
                 continue
-            image, spread, classes = pictures(network, made, TURNS if method == "symmetry" else TURNS[:1])
+            image, spread, classes = pictures(network, made, method == "symmetry")
             mask = (image > 0.5 * image.max()).reshape(24, 4, 24, 4).mean(axis=(1, 3))
             share = (classes * mask).sum(axis=(1, 2))
             found[method].append(
@@ -205,7 +205,7 @@ def measured(
                 if contact is not None:
                     named = both(posterior.classes.tolist(), named)
                     row["class %"] = 100.0 * (int(np.argmax(named)) == touch.shape_class)
-                    row |= stated(contact, touch)
+                    row |= stated(contact, touch, bundle.metres_per_unit)
                 row["class stated %"] = 100 * max(named)
                 found["service"].append(row | {"refined %": 100.0 * (contact is not None)})
                 found["stated"].append(None if contact is None else row)
@@ -225,20 +225,19 @@ def consistency() -> dict[str, float]:
 
     declared: Callable[[Array, Array], float] = partial(refined, kinds=("circle",))
     fits = {"found": refined, "declared": declared}
-    return ldci(export.session(shipped().read_bytes()), bundle, MESH, sigma, fits)
+    return ldci(Network(str(shipped())), bundle, MESH, sigma, fits)
 
 
 def odd(level: str, touches: list[OddShape], clean: Array, seed: int) -> dict[str, dict[str, tuple[float, float]]]:
     """What network and service say, and how often the fit counts."""
     bundle, noise, rng = Bundle.load(SKIN), Level(level), np.random.default_rng([seed, 8])
     pre, responses = bundle.prereconstructor(), responses_of(bundle)
-    network, sigma = export.session(shipped().read_bytes()), np.full(pre.measurements, noise.share)
+    network, sigma = Network(str(shipped())), np.full(pre.measurements, noise.share)
     operator = pre.condition(sigma)
     rows: dict[str, list[dict[str, float]]] = {kind: [] for kind in ODD}
     d = clean + noise.share * np.sqrt(1 + 1 / 64) * rng.standard_normal(clean.shape)
     for one, touch in zip(track(d, description=noise.title), touches, strict=True):
-        stack, context, scale = operator.stack(one)
-        image = network.run(None, {"stack": stack[None], "context": context[None]})[0][0, 0] * scale
+        image = pictures(network, operator.stack(one))[0]
         start = start_of(image)
         assert start is not None
         posterior = refined_fit(*responses, one, frame_errors(pre.m.gram.astype(float), sigma, one, start.drop), start)
@@ -250,7 +249,8 @@ def odd(level: str, touches: list[OddShape], clean: Array, seed: int) -> dict[st
         for method in ("network", "service"):
             place, area, peak, seen = start.centroid, 4 * float(mask.mean()), float(image.max()), image
             if method == "service" and contact is not None:
-                place, area, peak, seen = posterior.position, contact[1], contact[0].newton or 0.0, posterior.image(N)
+                area, peak = contact.area_m2 / bundle.metres_per_unit**2, contact.force_n or 0.0
+                place, seen = posterior.position, posterior.image(N)
             row |= {
                 f"{method}: contact IoU": metrics.iou(seen > 0.5 * seen.max(), covered > 0.5)[1],
                 f"{method}: position, % of the side": 50 * float(np.linalg.norm(place - centroid)),

@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,9 @@ from services.board.scanning import Scanning
 from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
 from services.cli.doctor_mounting import mounting_found
-from services.contacts.force import ForceLaw
+from services.contacts.force import ForceLaw, known_radius
 from services.contacts.placing import placement
-from services.describe import ON, geometry, refinement
+from services.describe import ON, geometry, refinement, symmetry
 from services.estimation import checks
 from services.estimation.tare import implausibility
 from services.runtime.config import RECORDINGS, ConfigError, ConfigFile, Skin, config_path, load
@@ -84,8 +85,13 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
     )
     yield Finding("OK", f"{name}: bundle", f"{bundle.name}, every sha256 right ({bundle.hash[:12]}), {network}")
     yield Finding("OK", f"{name}: checks", checks.sentence(bundle) or "all of them, on every frame")
-    if skin.indenter is not None and not running:
-        yield refined(name, refinement(skin, bundle))
+    try:
+        known_radius(skin, bundle, name)
+    except ConfigError as why:
+        yield Finding("FAIL", f"{name}: indenter", str(why))
+        return
+    if not running:
+        yield from options(name, skin, {"refinement": refinement(skin, bundle), "symmetry": symmetry(skin, bundle)})
     if skin.calibration is not None:
         yield _calibration(name, skin, bundle)
     if skin.surface is not None:
@@ -105,8 +111,7 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
         yield from live.processes(name)
         info = live.info(name)
         yield from live.compared(name, skin, bundle, info)
-        if skin.indenter is not None and isinstance(info.get("refinement"), str):
-            yield refined(name, info["refinement"])
+        yield from options(name, skin, info)
         said = info.get("mounting")
         if isinstance(said, dict):
             yield mounting_found(name, said, info)
@@ -116,14 +121,16 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
         yield Finding("SKIP", f"{name}: electrodes", "their order is looked at while the service runs: `skin up`")
 
 
-def refined(name: str, said: str) -> Finding:
-    """said: as info/<skin> has it; skin.toml names an indenter."""
-    good = "touches are refined by a fit of their shape"
-    return (
-        Finding("OK", f"{name}: indenter", good)
-        if said == ON
-        else Finding("WARN", f"{name}: indenter", f"refinement {said}")
+def options(name: str, skin: Skin, info: dict[str, Any]) -> Iterator[Finding]:
+    """Whether what skin.toml asks for is done, or why not. info: of info/<skin>."""
+    asked = (
+        (skin.indenter is not None, "indenter", "refinement", "touches are refined by a fit of their shape"),
+        (skin.touch.symmetry, "symmetry", "symmetry", "a held touch's image becomes the mean over the symmetries"),
     )
+    for wanted, what, key, good in asked:
+        if wanted and isinstance(said := info.get(key), str):
+            on = said == ON
+            yield Finding("OK" if on else "WARN", f"{name}: {what}", good if on else f"{key} {said}")
 
 
 def _wrapped(name: str, skin: Skin, bundle: Bundle) -> Finding:

@@ -80,9 +80,10 @@ class ForceLaw:
 
         name: what the skin is called, where that is known.
 
-        Raises ConfigError for a calibration file that is none, or belongs to another skin or bundle.
+        Raises ConfigError for a calibration file that is none, or belongs to another skin or bundle, and for an
+        indenter that cannot press this skin.
         """
-        surroundings = _surroundings(skin, bundle)
+        surroundings = _surroundings(skin, bundle, name)
         if skin.calibration is not None:
             found = calibration.load(skin.calibration, skin, bundle, name)
             return cls(found.curve, found.reads, found.most_n, True, own_error=found.own_error, **surroundings)
@@ -180,10 +181,28 @@ class ForceLaw:
         return Force(newton, newton * spread if spread > 0 else None)
 
 
-def _surroundings(skin: Skin, bundle: Bundle) -> dict[str, Any]:
-    """What every law needs to know of the skin."""
-    unit = bundle.metres_per_unit
+def known_radius(skin: Skin, bundle: Bundle, name: str = "") -> float | None:
+    """Radius [m] of the indenter; None where it is not known. Raises ConfigError where no such indenter can press this
+    skin, or an image of it show it.
+    """
     radius = None if skin.indenter is None else skin.indenter.radius_m
+    if radius is None:
+        return None
+    outline = np.asarray(bundle.skin.get("outline", ()), float).reshape(-1, 2)
+    half = float(np.ptp(outline, axis=0).min()) / 2 if len(outline) else float(bundle.skin.get("radius", 1.0))
+    least, most = bundle.metres_per_pixel / 2, half * bundle.metres_per_unit
+    if not least <= radius <= most * (1 + 1e-9):
+        key = f"skins.{name}.indenter.radius_m" if name else "indenter.radius_m"
+        raise ConfigError(
+            f"{key}: found {radius:g} m; expected {least:.2g} to {most:.3g} m with bundle {bundle.name}, from half a "
+            "pixel of its images to half its shorter side: give the radius in metres, or take `radius_m` away"
+        )
+    return radius
+
+
+def _surroundings(skin: Skin, bundle: Bundle, name: str) -> dict[str, Any]:
+    """What every law needs to know of the skin. Raises ConfigError."""
+    unit, radius = bundle.metres_per_unit, known_radius(skin, bundle, name)
     area = None if radius is None else math.pi * (radius / unit) ** 2
     variant = skin.network if bundle.network_path("full" if skin.network == "none" else skin.network) else "full"
     try:

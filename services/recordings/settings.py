@@ -33,7 +33,7 @@ from services.runtime.config import (
     TareConfig,
     TouchConfig,
 )
-from services.runtime.config_sections import Section, Skip
+from services.runtime.config_sections import Number, Section, Skip
 
 KEY = "settings"
 """The key of a recording's metadata."""
@@ -58,7 +58,7 @@ class RecordedSkin(Section):
     indenter: Indenter | None = None
     dft_points: Literal[128, 256, 512] = 128
     scan: ScanMode = "full"
-    rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0
+    rtia_ohm: Annotated[Number, Field(gt=0)] = 40_000.0
     tare: TareConfig = TareConfig()
     touch: TouchConfig = TouchConfig()
     calibration: dict[str, Any] | None = None  # the content of its file, which calibration.load checks

@@ -19,8 +19,10 @@ from protocol.errors import EitskinError
 from protocol.topics import BRIDGES
 from protocol.transport import Transport
 from services.runtime.config_sections import (
+    Count,
     FoxgloveSection,
     Logging,
+    Number,
     PageSection,
     RealTime,
     RecorderSection,
@@ -36,8 +38,8 @@ ROOT = Path(__file__).resolve().parents[2]
 BUNDLES, MANIFEST = ROOT / "models" / "bundles", "manifest.json"
 SKIN_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+Vector3 = tuple[Number, Number, Number]
+Quaternion = tuple[Number, Number, Number, Number]
 
 
 class ConfigError(EitskinError):
@@ -63,27 +65,27 @@ class Surface(Section):
     """What the sheet is wrapped round; without it the skin lies flat. See services/contacts/surface.py."""
 
     kind: Literal["cylinder"]
-    radius_m: Annotated[float, Field(gt=0, le=10)]  # of the sheet on it, not of the limb below its foam
-    axis_degrees: Annotated[float, Field(ge=-360, le=360)] = 90.0  # of the cylinder's axis to the sheet's x
+    radius_m: Annotated[Number, Field(gt=0, le=10)]  # of the sheet on it, not of the limb below its foam
+    axis_degrees: Annotated[Number, Field(ge=-360, le=360)] = 90.0  # of the cylinder's axis to the sheet's x
 
 
 class TareConfig(Section):
     """How the untouched baseline is taken and kept."""
 
-    frames: Annotated[int, Field(ge=8, le=4096)] = 64
-    max_age_s: Annotated[float, Field(gt=0)] = 3600.0  # an older persisted baseline is not loaded
+    frames: Annotated[Count, Field(ge=8, le=4096)] = 64
+    max_age_s: Annotated[Number, Field(gt=0)] = 3600.0  # an older persisted baseline is not loaded
     calibrate: Switch = True  # after `skin tare`: fit how the skin is mounted, and use matrices that fit it
-    tracking_s: Annotated[float, Field(gt=0)] = 120.0  # time constant of what drift does not explain, while untouched
+    tracking_s: Annotated[Number, Field(gt=0)] = 120.0  # time constant of what drift does not explain, while untouched
     # How fast an untouched skin may change, relative; see services/estimation/drift_prior.py. A foam that dries by 6 %,
     # electrodes whose contacts change by a quarter, within five minutes.
-    scale_per_s: Annotated[float, Field(gt=0, le=1e-2)] = 2e-4  # the sheet's conductivity
-    contact_per_s: Annotated[float, Field(gt=0, le=1e-1)] = 8e-4  # each electrode's contact impedance
+    scale_per_s: Annotated[Number, Field(gt=0, le=1e-2)] = 2e-4  # the sheet's conductivity
+    contact_per_s: Annotated[Number, Field(gt=0, le=1e-1)] = 8e-4  # each electrode's contact impedance
 
 
 class TouchConfig(Section):
     """The touch decision: see services/estimation/touch_decision.py."""
 
-    false_alarms: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
+    false_alarms: Annotated[Number, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
     hold: Switch = True  # switch of the rule "nothing changed: do not reconstruct again"
     skip_untouched: Switch = True  # switch of the rule "nothing touches: do not reconstruct"
     symmetry: Switch = False  # a held touch's image becomes the mean over the skin's symmetries: services/symmetry.py
@@ -97,7 +99,7 @@ class Indenter(Section):
     """
 
     kind: Literal["circle", "hertz", "any"] = "circle"
-    radius_m: Annotated[float, Field(gt=0, le=1)] | None = None
+    radius_m: Annotated[Number, Field(gt=0, le=1)] | None = None
     refine: Switch = True  # switch of the fit
 
     @model_validator(mode="before")
@@ -137,7 +139,7 @@ class Skin(Section):
     network: NetworkFile = "int8"
     dft_points: Literal[128, 256, 512] = 128
     scan: ScanMode = "full"  # rolling: scans in parts
-    rtia_ohm: Annotated[float, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
+    rtia_ohm: Annotated[Number, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
     tare: TareConfig = TareConfig()
     touch: TouchConfig = TouchConfig()
 

@@ -14,6 +14,8 @@ from protocol.transport import Transport, half
 from services.runtime.stage import PROCESSES
 
 Switch = Annotated[bool, Field(strict=True)]  # true or false; no word, which would be taken for true
+Number = Annotated[float, Field(strict=True)]  # no true, which would be taken for 1.0, and no word
+Count = Annotated[int, Field(strict=True)]
 
 
 class Section(BaseModel):
@@ -62,7 +64,7 @@ class Security(Section):
     server_keys: dict[str, Path] = {}  # producer -> its public key
     clients: Path | None = None  # folder with the public keys that may connect
     operators: Path | None = None  # folder with those that may also give commands that change something
-    insecure: Annotated[bool, Field(strict=True)] = False
+    insecure: Switch = False
 
     @field_validator("server_keys")
     @classmethod
@@ -97,9 +99,9 @@ class Logging(Section):
 class RealTime(Section):
     """What each process asks of the kernel: services/runtime/realtime.py. What is refused is said in `status`."""
 
-    priority: Annotated[int, Field(ge=0, le=99, strict=True)] = 0  # of SCHED_FIFO; 0: the ordinary scheduler
+    priority: Annotated[Count, Field(ge=0, le=99)] = 0  # of SCHED_FIFO; 0: the ordinary scheduler
     lock_memory: Switch = False  # mlockall: no page of it is ever swapped out
-    cpus: dict[str, list[Annotated[int, Field(ge=0)]]] = {}  # process -> processors it may run on
+    cpus: dict[str, list[Annotated[Count, Field(ge=0)]]] = {}  # process -> processors it may run on
 
     @field_validator("cpus")
     @classmethod
@@ -123,21 +125,21 @@ class RecorderSection(Section):
     """The recorder that `skin up` starts where there is this section: services/recorder.py, docs/recording.md."""
 
     folder: str = "recordings"  # relative to the folder of this file
-    before_s: Annotated[float, Field(gt=0, le=600)] = 10.0  # what a snapshot has of the time before its event
-    after_s: Annotated[float, Field(ge=0, le=300)] = 5.0
+    before_s: Annotated[Number, Field(gt=0, le=600)] = 10.0  # what a snapshot has of the time before its event
+    after_s: Annotated[Number, Field(ge=0, le=300)] = 5.0
     triggers: tuple[Literal["contact", "fault"], ...] = ()  # events that a snapshot is taken of by itself
-    keep_snapshots: Annotated[int, Field(ge=0, strict=True)] = 100  # of those taken by themselves; 0: all
-    memory_mb: Annotated[float, Field(gt=0, le=4096)] = 64.0  # for the time before
-    file_mb: Annotated[float, Field(ge=0)] = 0.0  # a recording goes on in another file then; 0: whatever its size
-    file_minutes: Annotated[float, Field(ge=0)] = 0.0  # likewise; 0: however long
-    keep_files: Annotated[int, Field(ge=0, strict=True)] = 0  # of one recording, the oldest are deleted; 0: all
+    keep_snapshots: Annotated[Count, Field(ge=0)] = 100  # of those taken by themselves; 0: all
+    memory_mb: Annotated[Number, Field(gt=0, le=4096)] = 64.0  # for the time before
+    file_mb: Annotated[Number, Field(ge=0)] = 0.0  # a recording goes on in another file then; 0: whatever its size
+    file_minutes: Annotated[Number, Field(ge=0)] = 0.0  # likewise; 0: however long
+    keep_files: Annotated[Count, Field(ge=0)] = 0  # of one recording, the oldest are deleted; 0: all
 
 
 class PageSection(Section):
     """The live page: bridges/page, docs/page.md."""
 
     host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
-    port: Annotated[int, Field(ge=1, le=65515, strict=True)] = 8080  # or the first free one of the twenty from there
+    port: Annotated[Count, Field(ge=1, le=65515)] = 8080  # or the first free one of the twenty from there
     names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]{1,253}$")], ...] = ()  # further names it is asked for by
     recordings: str = "recordings"  # folder of the button Record where there is no [recorder]; "": no button
     metrics: Switch = False  # /metrics, for Prometheus
@@ -146,7 +148,7 @@ class PageSection(Section):
 class Ros2Section(Section):
     """Topics for ROS 2: bridges/ros2, docs/ros.md."""
 
-    domain: Annotated[int, Field(ge=0, le=232, strict=True)] | None = None  # default: $ROS_DOMAIN_ID, else 0
+    domain: Annotated[Count, Field(ge=0, le=232)] | None = None  # default: $ROS_DOMAIN_ID, else 0
     interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:@-]{0,64}$")] = ""  # the only one; "lo": this host
     commands: Switch = False  # the service `tare`: anybody in the ROS domain may call it
     replay: Switch = False  # replayed frames are published too
@@ -156,5 +158,5 @@ class FoxgloveSection(Section):
     """The live server for Foxglove: bridges/foxglove."""
 
     host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65535, strict=True)] = 8765
+    port: Annotated[Count, Field(ge=0, le=65535)] = 8765
     replay: Switch = False  # replayed frames are shown too

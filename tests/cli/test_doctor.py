@@ -42,6 +42,28 @@ def test_why_touches_are_not_refined_is_said(skin, tmp_path) -> None:  # type: i
     assert "refine" not in skin("doctor").out
 
 
+def test_an_indenter_larger_than_the_skin_stops_doctor_and_service(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    file = configured(tmp_path, "stub", "indenter = { radius_m = 0.5 }\n")
+    ran = skin("doctor", "--config", file)
+    says = "skins.palm.indenter.radius_m: found 0.5 m; expected 0.00052 to 0.05 m with bundle square16"
+    assert ran.code == 1 and says in " ".join(ran.out.split())
+    ran = skin("up", "--config", file)
+    assert ran.code == 2 and says in " ".join((ran.out + ran.err).split())
+    ran = skin("doctor", "--config", configured(tmp_path, "stub", "indenter = { radius_m = 0.001 }\n"))
+    assert "WARN palm: indenter refinement off: `radius_m` is 0.001 m" in " ".join(ran.out.split())
+
+
+def test_why_nothing_is_averaged_is_said(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    for bundle, says in (
+        ("square16", "OK palm: symmetry a held touch's image becomes the mean"),
+        ("disc16", "WARN palm: symmetry symmetry off: the mean is of a network's images"),
+    ):
+        file = tmp_path / f"{bundle}.toml"
+        file.write_text(f'[skins.palm]\nport = "stub"\nbundle = "{bundle}"\ntouch = {{ symmetry = true }}\n')
+        assert says in " ".join(skin("doctor", "--config", file).out.split())
+    assert "symmetry" not in skin("doctor").out
+
+
 def test_electrodes_in_order(bundle: Bundle) -> None:
     noise = 1 + 1e-4 * np.random.default_rng(0).standard_normal(120)
     assert electrode_order("palm", 3.0 * bundle.z0 * noise, bundle).level == "OK"

@@ -11,14 +11,16 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from models import export, geometry, samples  # noqa: E402
-from models.augmentation import random_condition, symmetries  # noqa: E402
+from models.augmentation import random_condition  # noqa: E402
 from models.bundle import Bundle  # noqa: E402
 from models.forward import ForwardModel  # noqa: E402
 from models.losses import losses, total  # noqa: E402
 from models.network import NetworkConfig, compose  # noqa: E402
 from models.published import PublishedMMCNN  # noqa: E402
 from models.shapes import Shape  # noqa: E402
+from models.symmetries import symmetries  # noqa: E402
 from models.train import Trainer  # noqa: E402
+from models.turns import Turn  # noqa: E402
 
 REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "eidors_reference.npz"
 TINY = NetworkConfig(channels=(8, 8, 8), blocks=(1, 1, 1))
@@ -31,6 +33,10 @@ def trainer(pre, scenes):
     return Trainer(TINY, batches, scenes)
 
 
+def symmetries_of(skin):
+    return symmetries(skin.to_dict(), skin.pattern)
+
+
 def test_symmetries_are_those_of_the_forward_model():
     """The difference of a turned touch is the permuted difference of the touch; meshes are not symmetric: 1 %."""
     model = ForwardModel("square16", mesh="inverse")
@@ -41,7 +47,7 @@ def test_symmetries_are_those_of_the_forward_model():
 
     image = 0.4 * Shape("triangle", 0.3, -0.5, 0.3, 0.4, 0.4).fraction(96)
     d = difference(image)
-    found = symmetries(model.skin)
+    found = symmetries_of(model.skin)
     assert len(found) == 8
     for symmetry in found:
         turned = difference(symmetry.turn.image(image))
@@ -49,15 +55,26 @@ def test_symmetries_are_those_of_the_forward_model():
 
 
 def test_a_disc_has_only_the_symmetries_its_electrodes_have():
-    assert len(symmetries(geometry.load("disc16"))) == 8
+    assert len(symmetries_of(geometry.load("disc16"))) == 8
     skin = geometry.load("square16")
-    assert len(symmetries(skin.moved(np.r_[0.05, np.zeros(15)]))) == 1
+    assert len(symmetries_of(skin.moved(np.r_[0.05, np.zeros(15)]))) == 1
+
+
+def test_an_outline_or_a_contact_of_its_own_is_no_symmetry():
+    """A sheet that is cut off on one side, with electrodes that look alike; one electrode that touches badly."""
+    skin = geometry.load("square16").to_dict()
+    pattern = geometry.load("square16").pattern
+    longer = skin | {"outline": [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.2], [-1.0, 1.2]]}
+    assert [s.turn for s in symmetries(longer, pattern)] == [Turn(False, False, False), Turn(False, False, True)]
+    assert len(symmetries(skin | {"contact_impedance": [0.1, *[0.01] * 15]}, pattern)) == 1
+    assert len(symmetries(skin, pattern[1:])) < 8
+    assert symmetries({}, pattern) == []
 
 
 @pytest.mark.parametrize("skin", ["square16", "disc16"])
 def test_a_symmetry_maps_measurements_one_to_one_also_where_a_pattern_reads_each_twice(skin):
     """The disc's pattern drives each pair of electrodes in both directions: a real skin's two readings differ."""
-    found = [symmetry.measurements for symmetry in symmetries(geometry.load(skin))]
+    found = [symmetry.measurements for symmetry in symmetries_of(geometry.load(skin))]
     np.testing.assert_array_equal(found[0], np.arange(len(found[0])))
     for measurements in found:
         np.testing.assert_array_equal(np.sort(measurements), np.arange(len(measurements)))

@@ -9,7 +9,7 @@ from scipy import ndimage
 torch = pytest.importorskip("torch")
 
 from models import data, export, geometry, samples  # noqa: E402
-from models.augmentation import condition, random_condition, symmetries  # noqa: E402
+from models.augmentation import condition, random_condition  # noqa: E402
 from models.class_temperature import TEMPERATURES, SeenClasses, calibration_error, cooled, pooled  # noqa: E402
 from models.condensed import CondensedSheet  # noqa: E402
 from models.device_batches import ConditionTensors, SceneTensors, measured, stacks  # noqa: E402
@@ -20,6 +20,7 @@ from models.mismatch import BLUR_GRID, anisotropy_root, soft_drop, soft_touched,
 from models.network import FAST, FULL, MMCNN, NetworkConfig  # noqa: E402
 from models.prereconstruction import Drift  # noqa: E402
 from models.shapes import Shape, drop_image, from_rows  # noqa: E402
+from models.symmetries import symmetries  # noqa: E402
 from models.train import FINE, MUON_RATE, Trainer  # noqa: E402
 from models.warm_start import NoSuchNetwork, normalised, restored  # noqa: E402
 
@@ -101,7 +102,8 @@ def test_jaccards_index_of_soft_masks_is_best_at_the_truth():
 def test_batches_on_the_device_are_those_made_scene_by_scene(pre, scenes):
     """Without noise: eight symmetries, three conditions, one with a dead electrode, in one product."""
     rng = np.random.default_rng(1)
-    turns = symmetries(geometry.load("square16"))
+    skin = geometry.load("square16")
+    turns = symmetries(skin.to_dict(), skin.pattern)
     found = [
         condition(pre, rng, np.full(120, sigma), Drift(1e-5, 1e-4), dead=dead, exact=True)
         for sigma, dead in ((1e-4, 0), (1e-3, 1), (1e-6, 0))

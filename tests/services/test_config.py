@@ -5,14 +5,25 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
 from models.bundle import Bundle
 from services.contacts.force import ForceLaw
 from services.contacts.force_curve import Curve
-from services.runtime.config import ROOT, ConfigError, load, parse
+from services.runtime.config import (
+    ROOT,
+    ConfigError,
+    ConfigFile,
+    Skin,
+    Surface,
+    TareConfig,
+    TouchConfig,
+    load,
+    parse,
+)
+from services.runtime.config_sections import RecorderSection
 
 NAN, INF = float("nan"), float("inf")
 PALM: dict[str, Any] = {"port": "stub", "bundle": "square16"}
@@ -48,6 +59,11 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         ({"skins": {"palm": PALM | {"pose": {"quaternion_xyzw": [0, 0, NAN, 1]}}}}, "found nan; allowed: a finite"),
         ({"skins": {"palm": PALM | {"touch": {"false_alarms": NAN}}}}, "false_alarms: found nan; allowed: a finite"),
         ({"skins": {"palm": PALM | {"touch": {"hold": "yes"}}}}, "touch.hold: found 'yes'; allowed: a valid boolean"),
+        ({"skins": {"palm": PALM | {"indenter": {"radius_m": True}}}}, "radius_m: found True; allowed: a valid number"),
+        ({"skins": {"palm": PALM | {"indenter": {"radius_m": "0.01"}}}}, "radius_m: found '0.01'; allowed: a valid nu"),
+        ({"skins": {"palm": PALM | {"pose": {"position_m": [0, 0, True]}}}}, "position_m.2: found True; allowed: a va"),
+        ({"skins": {"palm": PALM | {"tare": {"frames": True}}}}, "tare.frames: found True; allowed: a valid integer"),
+        ({"skins": {"palm": PALM}, "realtime": {"cpus": {"inference": [True]}}}, "cpus.inference.0: found True; allo"),
         (
             {"skins": {"palm": PALM | {"scan": "adaptive"}}},
             """scan: found 'adaptive'; allowed: "full" or "rolling": the adaptive scan is no more, write "rolling\"""",
@@ -99,6 +115,32 @@ def test_errors_name_file_key_found_and_allowed(raw: dict[str, Any], expected: s
         parse(raw, Path("robot.toml"))
     assert str(error.value).startswith("robot.toml: ")
     assert expected in str(error.value)
+
+
+def test_no_number_is_read_from_true() -> None:
+    """Of every key of every section: true would be taken for 1."""
+    sections = {name: ConfigFile.model_fields[name].annotation for name in ("realtime", "page", "ros2", "foxglove")}
+    sections["recorder"] = RecorderSection
+    tried = 0
+    for path, section in (
+        (("skins", "palm"), Skin),
+        (("skins", "palm", "tare"), TareConfig),
+        (("skins", "palm", "touch"), TouchConfig),
+        (("skins", "palm", "surface"), Surface),
+        *(((name,), section) for name, section in sections.items()),
+    ):
+        for key, field in section.model_fields.items():  # type: ignore[union-attr]
+            if not {int, float} & {field.annotation, *get_args(field.annotation)}:
+                continue
+            raw: Any = {"skins": {"palm": dict(PALM)}}
+            at = raw
+            for part in path:
+                at = at.setdefault(part, {})
+            at[key], tried = True, tried + 1
+            with pytest.raises(ConfigError, match=re.escape(f"{'.'.join((*path, key))}: found True")):
+                parse(raw)
+    assert tried > 15
+    assert parse({"skins": {"palm": PALM | {"rtia_ohm": 20_000}}}).skin("palm").rtia_ohm == 20_000.0
 
 
 @pytest.mark.parametrize(

@@ -139,6 +139,21 @@ def test_the_calibrations_own_error_adds_to_the_images(bundle: Bundle) -> None:
     assert force.newton == pytest.approx(0.9) and force.sigma == pytest.approx(0.9 * 0.25)  # hypot(2 * 10 %, 15 %)
 
 
+@pytest.mark.parametrize(("name", "half"), [("square16", "0.05"), ("disc16", "0.08")])
+def test_an_indenter_that_cannot_press_this_skin_is_refused(name: str, half: str) -> None:
+    of = Bundle.load(name)
+    for radius in (1e-9, 0.5):
+        skin = configured(indenter={"radius_m": radius})
+        with pytest.raises(
+            ConfigError, match=rf"skins\.palm\.indenter\.radius_m: found {radius:g} m; expected 0\.000.* to {half} m"
+        ):
+            ForceLaw.of(skin, of, "palm")
+    for radius in (0.001, float(half)):
+        assert ForceLaw.of(configured(indenter={"radius_m": radius}), of).indenter_area == pytest.approx(
+            np.pi * (radius / of.metres_per_unit) ** 2
+        )
+
+
 def test_an_indenter_is_checked(tmp_path: Path) -> None:
     assert Indenter(radius_m=0.01).kind == "circle"
     with pytest.raises(ValueError, match="greater than 0"):

@@ -413,6 +413,11 @@ def test_info_says_why_nothing_is_refined(bundle: Bundle, tmp_path: object) -> N
     assert "calibrated as it is mounted" in refinement(skin, bundle, calibrated=True)
     assert "measured, not modelled" in refinement(skin, Bundle.load("disc16"))
     assert "no network" in refinement(skin.model_copy(update={"network": "none"}), bundle)
+    for radius in (0.001, 0.0499):
+        assert f"`radius_m` is {radius:g} m" in refinement(configured("circle", radius_m=radius), bundle)
+        assert "of radius 0.0025 to 0.0475 m" in refinement(configured("circle", radius_m=radius), bundle)
+    for radius in (0.0025, 0.01, 0.0475):
+        assert refinement(configured("circle", radius_m=radius), bundle) == "on"
     assert "`refine = false`" in refinement(configured("any", refine=False), bundle)
     stub = StubSkin(80.0, skin=skin)
     info = stub.pipeline.pre.info()
