@@ -1,5 +1,7 @@
 """How sure a network may be of a touch's shape: one temperature that its class logits are divided by.
 
+    python -m models.class_temperature --skin square16    what a bundle's networks state beside what is right
+
 The class of a touch is the mean over its pixels of their probabilities, as services take it. Trained with cross
 entropy on single pixels, that mean is too sure or too modest; the temperature that makes the presses of
 models/calibrate.py likeliest mends it (Guo et al. 2017, "On calibration of modern neural networks"). It is divided into
@@ -8,6 +10,7 @@ the last layer's weights, so whoever runs the network need not know of it.
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +18,11 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from models.calibrate import SolvedPresses, scans
-from models.evaluation import Predict
+from models.bundle import NETWORKS, Bundle
+from models.calibrate import SolvedPresses, scans, solve
+from models.evaluation import Predict, predict
+from models.export import session
+from models.geometry import load
 from models.network import MMCNN
 from models.prereconstruction import Array, PreReconstructor
 
@@ -48,9 +54,17 @@ class SeenClasses:
     def said(self) -> dict[str, float]:
         """For the manifest. The error is of presses that the temperature was not chosen by."""
         odd = np.arange(len(self.truth)) % 2 == 1
-        chosen = np.where(odd, self.best(~odd), self.best(odd))
-        shown = self.probabilities[chosen, np.arange(len(self.truth))]
         found = {"temperature": round(float(self.temperatures[self.best()]), 3)}
+        return found | self.errors(np.where(odd, self.best(~odd), self.best(odd)))
+
+    def as_it_is(self) -> dict[str, float]:
+        """The same without any temperature."""
+        return self.errors(np.full(len(self.truth), int(np.argmin(np.abs(self.temperatures - 1)))))
+
+    def errors(self, chosen: NDArray[np.intp]) -> dict[str, float]:
+        """Share of right answers and expected calibration error, each sighting at the temperature of this index."""
+        found: dict[str, float] = {}
+        shown = self.probabilities[chosen, np.arange(len(self.truth))]
         for name, rows in (("all", self.decibel > 0), ("noise-free", np.isinf(self.decibel))):
             right, error = calibration_error(shown[rows], self.truth[rows], self.weights()[rows])
             found |= {f"right, {name}": round(right, 3), f"calibration error, {name}": round(error, 3)}
@@ -100,3 +114,21 @@ def cooled(model: MMCNN, temperature: float) -> None:
     with torch.no_grad():
         model.classes.weight /= temperature
         model.classes.bias /= temperature
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m models.class_temperature", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument("--skin", default="square16")
+    args = parser.parse_args(argv)
+    bundle = Bundle.load(args.skin)
+    presses, pre = solve(load(args.skin)), bundle.prereconstructor()
+    for variant in NETWORKS:
+        if (path := bundle.network_path(variant)) is not None:
+            found = seen_classes(presses, pre, predict(session(path.read_bytes()))).as_it_is()
+            print(f"{variant}: " + ", ".join(f"{name} {value:.3f}" for name, value in found.items()))
+
+
+if __name__ == "__main__":
+    main()

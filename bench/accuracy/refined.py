@@ -7,10 +7,11 @@ drop 0.1 to 0.5 and 0.05 to 0.9), of all six kinds alike, and solved on the stub
 inverse uses. `network`: the image of the network that runs by default, a touch being what exceeds half its peak.
 `found`: models/touch_fit.py with every kind, the kinds weighed by their evidence; its image is the posterior mean.
 `declared`: with the kind that it was. `service`: what a contact says with `indenter = { kind = "any" }`, the fit where
-it explains the frame and the image agrees, else the image; `stated`: of those, the fits alone; `symmetry`: the image as
-the mean over the square's symmetries. Prints means with their standard errors; at 60, 70 and 80 dB and without noise,
-how often the truth lay within the stated 68 and 90 % intervals of the service; how far the stated probability of a
-shape is from how often it is right (expected calibration error); the images of shapes that neither knows
+it explains the frame and the image agrees, else the image; its IoU are of the posterior's mean image, which no frame
+carries, its outline IoU of the outline that shape frames carry; `stated`: of those, the fits alone; `symmetry`: the
+image as the mean over the square's symmetries. Prints means with their standard errors; at 60, 70 and 80 dB and without
+noise, how often the truth lay within the stated 68 and 90 % intervals of the service; how far the stated probability of
+a shape is from how often it is right (expected calibration error); shapes that neither knows
 (bench/accuracy/odd_shapes.py). Writes refined.json.
 """
 
@@ -113,6 +114,11 @@ def said(posterior: TouchPosterior, image: Array, start: Shape, unit: float) -> 
     return WRITER.fitted(seen, told(posterior, 0, unit))
 
 
+def outlined(shown: Array, covered: Array) -> float:
+    """Contact IoU of what a shape frame draws, as a mask (N, N), and of the patch that is touched."""
+    return metrics.iou(shown > 0.5, covered > 0.5)[1]
+
+
 def row_of(image: Array, touch: Shape) -> dict[str, float]:
     found = metrics.score(image.astype(np.float32), [touch])
     return {
@@ -181,6 +187,7 @@ def measured(
                     "integral %": 100 * abs(metrics.integrated(image) / touch.integral - 1),
                     "area %": 100 * abs(4 * float((image > 0.5 * image.max()).mean()) / touch.area - 1),
                     "class %": 100.0 * (int(share.argmax()) == touch.shape_class),
+                    "outline IoU": outlined(image / image.max(), touch.fraction(N, covered=True)),
                 }
                 | pixels(image, spread, touch)
             )
@@ -206,6 +213,8 @@ def measured(
                     named = both(posterior.classes.tolist(), named)
                     row["class %"] = 100.0 * (int(np.argmax(named)) == touch.shape_class)
                     row |= stated(contact, touch, bundle.metres_per_unit)
+                    drawn = posterior.fits[0].shape.fraction(N, covered=True)
+                    row["outline IoU"] = outlined(drawn, touch.fraction(N, covered=True))
                 row["class stated %"] = 100 * max(named)
                 found["service"].append(row | {"refined %": 100.0 * (contact is not None)})
                 found["stated"].append(None if contact is None else row)
@@ -247,12 +256,12 @@ def odd(level: str, touches: list[OddShape], clean: Array, seed: int) -> dict[st
         centroid = np.array([(covered * a).sum() for a in (axis, axis[:, None])]) / covered.sum()
         row: dict[str, float] = {"refined %": 100.0 * (contact is not None)}
         for method in ("network", "service"):
-            place, area, peak, seen = start.centroid, 4 * float(mask.mean()), float(image.max()), image
+            place, area, peak, drawn = start.centroid, 4 * float(mask.mean()), float(image.max()), image / image.max()
             if method == "service" and contact is not None:
                 area, peak = contact.area_m2 / bundle.metres_per_unit**2, contact.force_n or 0.0
-                place, seen = posterior.position, posterior.image(N)
+                place, drawn = posterior.position, posterior.fits[0].shape.fraction(N, covered=True)
             row |= {
-                f"{method}: contact IoU": metrics.iou(seen > 0.5 * seen.max(), covered > 0.5)[1],
+                f"{method}: outline IoU": outlined(drawn, covered),
                 f"{method}: position, % of the side": 50 * float(np.linalg.norm(place - centroid)),
                 f"{method}: force, %": 100 * abs(peak / touch.drop - 1),
                 f"{method}: area, %": 100 * abs(area / (4 * float(covered.mean())) - 1),
@@ -263,20 +272,21 @@ def odd(level: str, touches: list[OddShape], clean: Array, seed: int) -> dict[st
 
 def gains(kind: str, network: Row, service: Row) -> list[float]:
     """By how many of the network's standard errors the service is better. A perfect image of a Hertz contact is cut at
-    half its peak, inside the patch that it is scored by: its place and force count.
+    half its peak, inside the patch that it is scored by: its outline counts, and not its image.
     """
-    higher = () if kind == "hertz" else ("mean IoU", "contact IoU")
+    higher = ("outline IoU", "class %", *(() if kind == "hertz" else ("mean IoU", "contact IoU")))
     better = [(service[name][0] - network[name][0]) / max(network[name][1], 1e-9) for name in higher]
-    lower = ("position rms %", "force %", "integral %")
+    lower = ("position rms %", "force %", "integral %", "area %")
     return better + [(network[name][0] - service[name][0]) / max(network[name][1], 1e-9) for name in lower]
 
 
 def worst_odd(found: dict[str, dict[str, tuple[float, float]]]) -> float:
-    """Of what a contact says: place, force, area."""
+    """Of what contact and shape frames say: place, force, area, outline."""
+    signs = {"position, % of the side": 1, "force, %": 1, "area, %": 1, "outline IoU": -1}
     return min(
-        (row[f"network: {name}"][0] - row[f"service: {name}"][0]) / max(row[f"network: {name}"][1], 1e-9)
+        sign * (row[f"network: {name}"][0] - row[f"service: {name}"][0]) / max(row[f"network: {name}"][1], 1e-9)
         for row in found.values()
-        for name in ("position, % of the side", "force, %", "area, %")
+        for name, sign in signs.items()
     )
 
 
@@ -364,9 +374,7 @@ def main(argv: list[str] | None = None) -> int:
     odd_touches, odd_clean = odd_frames(args.seed, len(touches) // 5)
     for level in ("none", "70"):
         report["odd"][level] = found = odd(level, odd_touches, odd_clean, args.seed)
-        table = Table(
-            title=f"{Level(level).title}, shapes that neither knows: contact IoU of {len(odd_touches)} touches"
-        )
+        table = Table(title=f"{Level(level).title}, shapes that neither knows: {len(odd_touches)} touches")
         for column in ("", *found):
             table.add_column(column, justify="right" if column else "left")
         for name in next(iter(found.values())):
