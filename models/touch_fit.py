@@ -10,9 +10,10 @@ theta. There the posterior is taken as normal (Laplace), which gives each kind's
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.special import erf
 
@@ -202,24 +203,26 @@ class _Whitened:
         """The likeliest touch of a kind near theta; None where it is so far behind the evidence `best` that it need
         not be known, or where it comes to one of the optima that are `known`.
         """
+        prior = _Prior.of(kind, theta, radius)
+        climbed = self._climbed(kind, theta, prior, best, known)
+        if climbed is None:
+            return None
+        theta, left, slope = climbed
+        as_assumed, over_scales = self._evidence(theta, left, slope, prior)
+        misfit = float(left @ left)
+        covariance, gain = self._covariance(kind, theta, slope, prior, misfit, radius is not None)
+        steep, flat = self._root @ slope, np.zeros((len(slope), 3))
+        return KindFit(kind, theta, covariance, misfit, over_scales, as_assumed, steep, flat, gain, self._noise)
+
+    def _climbed(
+        self, kind: str, theta: Array, prior: _Prior, best: float, known: Sequence[Array]
+    ) -> tuple[Array, Array, Array] | None:
+        """The likeliest theta, with what is left of the frame there and the derivative; None as `fit` says."""
         count = len(theta)
-        mean, sd = MEAN[:count].copy(), SD[:count].copy()
-        if count > 4:  # any rotation of the kind's period is as likely
-            mean[4], sd[4] = theta[4], PERIOD[kind] / np.sqrt(2 * np.pi)
-        held = np.arange(count) == 2 if radius else np.zeros(count, dtype=bool)  # a known size stays as it is
-        information = np.where(held, 1e12, 1 / sd**2)
-        information[4:5] = 0.0
-        if radius:
-            mean[2] = np.log(radius)
-        occam = float(np.log(sd[~held]).sum())
         left, slope = self._linear(kind, theta)
-
-        def penalty(theta: Array) -> float:
-            return float((information * (theta - mean) ** 2).sum())
-
-        cost, damping = float(left @ left) + penalty(theta), 1e-3
+        cost, damping = float(left @ left) + prior.penalty(theta), 1e-3
         for step_number in range(STEPS):
-            hessian, uphill = slope.T @ slope + np.diag(information), slope.T @ left - information * (theta - mean)
+            hessian, uphill = prior.hessian(slope), prior.uphill(slope, left, theta)
             promised = float(uphill @ np.linalg.solve(hessian, uphill))  # by a whole step, if the response were linear
             if promised < DONE:
                 break
@@ -230,32 +233,76 @@ class _Whitened:
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), uphill)
             step *= min(1.0, float((MOST[:count] / np.maximum(np.abs(step), 1e-9)).min()))
             there = np.clip(theta + step, LOW[:count], HIGH[:count])
-            if self.misfit(kind, there) + penalty(there) < cost:
+            if self.misfit(kind, there) + prior.penalty(there) < cost:
                 theta, damping = there, damping * 0.3
                 left, slope = self._linear(kind, theta)
-                cost = float(left @ left) + penalty(theta)
+                cost = float(left @ left) + prior.penalty(theta)
             elif damping > 1e2 or promised < NO_MORE:
                 break
             else:
                 damping *= 8
-        hessian = slope.T @ slope + np.diag(information)
-        free = hessian[np.ix_(~held, ~held)]
-        evidence = -0.5 * cost - 0.5 * float(np.linalg.slogdet(free)[1]) - occam - self._volume
-        each = [evidence]
+        return theta, left, slope
+
+    def _evidence(self, theta: Array, left: Array, slope: Array, prior: _Prior) -> tuple[float, float]:
+        """Log evidence by Laplace's method: with the response's error as assumed, and over the sizes it may have."""
+        cost = float(left @ left) + prior.penalty(theta)
+        as_assumed = -0.5 * cost - 0.5 * prior.logdet(prior.hessian(slope)) - prior.occam - self._volume
+        each = [as_assumed]
         for root in self._roots:
             again, steep = (solve_triangular(root, self._root @ values, lower=True) for values in (left, slope))
-            hessian_there = steep.T @ steep + np.diag(information)
-            uphill = steep.T @ again - information * (theta - mean)
-            least = float(again @ again) + penalty(theta) - float(uphill @ np.linalg.solve(hessian_there, uphill))
-            logdet = float(np.linalg.slogdet(hessian_there[np.ix_(~held, ~held)])[1])
-            each.append(-0.5 * least - 0.5 * logdet - occam - float(np.log(root.diagonal()).sum()))
-        covariance, misfit = np.linalg.inv(hessian), float(left @ left)
-        follow = covariance @ solve_triangular(self._root.T, slope, lower=False, check_finite=False).T
-        aside = follow @ self._model @ follow.T
-        shape = shape_of(kind, theta)
-        wider = widening(shape, self._response.room(shape), count, radius is not None)
+            hessian, uphill = prior.hessian(steep), prior.uphill(steep, again, theta)
+            least = float(again @ again) + prior.penalty(theta) - float(uphill @ np.linalg.solve(hessian, uphill))
+            volume = float(np.log(root.diagonal()).sum())
+            each.append(-0.5 * least - 0.5 * prior.logdet(hessian) - prior.occam - volume)
+        return as_assumed, float(np.logaddexp.reduce(each)) - float(np.log(len(each)))
+
+    def _covariance(
+        self, kind: str, theta: Array, slope: Array, prior: _Prior, misfit: float, size_known: bool
+    ) -> tuple[Array, Array]:
+        """(n, n) of theta, made wider by what the response is wrong by, as the misfit tells, and where the skin's
+        outline is near; and (n, K) the gain of theta to the frame.
+        """
+        covariance = np.linalg.inv(prior.hessian(slope))
+        gain = covariance @ solve_triangular(self._root.T, slope, lower=False, check_finite=False).T
+        aside, shape = gain @ self._model @ gain.T, shape_of(kind, theta)
+        wider = widening(shape, self._response.room(shape), len(theta), size_known)
         covariance += seen_error(misfit, self._noise) * wider.factor * aside * wider.factor[:, None] - aside
         covariance += np.outer(wider.edge, wider.edge)
-        steep, flat = self._root @ slope, np.zeros((len(slope), 3))
-        over_scales = float(np.logaddexp.reduce(each)) - np.log(len(each))
-        return KindFit(kind, theta, covariance, misfit, over_scales, evidence, steep, flat, follow, self._noise)
+        return np.asarray(covariance), np.asarray(gain)
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """Of a kind's theta: normal, with a mean and an information (n,) that is huge where a value is held."""
+
+    mean: Array
+    information: Array
+    held: NDArray[np.bool_]
+    occam: float  # log of the free ones' standard deviations, summed
+
+    @staticmethod
+    def of(kind: str, theta: Array, radius: float | None) -> _Prior:
+        """radius: a known size stays as it is."""
+        count = len(theta)
+        mean, sd = MEAN[:count].copy(), SD[:count].copy()
+        if count > 4:  # any rotation of the kind's period is as likely
+            mean[4], sd[4] = theta[4], PERIOD[kind] / np.sqrt(2 * np.pi)
+        held = np.arange(count) == 2 if radius else np.zeros(count, dtype=bool)
+        information = np.where(held, 1e12, 1 / sd**2)
+        information[4:5] = 0.0
+        if radius:
+            mean[2] = np.log(radius)
+        return _Prior(mean, information, held, float(np.log(sd[~held]).sum()))
+
+    def penalty(self, theta: Array) -> float:
+        return float((self.information * (theta - self.mean) ** 2).sum())
+
+    def hessian(self, slope: Array) -> Array:
+        return np.asarray(slope.T @ slope + np.diag(self.information))
+
+    def uphill(self, slope: Array, left: Array, theta: Array) -> Array:
+        return np.asarray(slope.T @ left - self.information * (theta - self.mean))
+
+    def logdet(self, hessian: Array) -> float:
+        """Of what is free."""
+        return float(np.linalg.slogdet(hessian[np.ix_(~self.held, ~self.held)])[1])
