@@ -10,7 +10,9 @@
     python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin,
                                                            kept where its images are better than those without
 
-Samples and checkpoints stay in models/work/SKIN; a second call uses what is there and makes what is missing.
+Samples and checkpoints stay in models/work/SKIN; a second call uses what is there and makes what is missing. A training
+that was interrupted goes on from its checkpoint, one that is finished is not done again; a call with another budget or
+seed, or of a skin that has changed, trains anew. The fast network starts as a part of the full one and learns from it.
 """
 
 from __future__ import annotations
@@ -41,11 +43,13 @@ from models import (
     warped,
 )
 from models.augmentation import OwnSkin, random_condition
+from models.distillation import Teacher
 from models.evaluation import LEVELS, evaluate, predict
 from models.forward import ForwardModel
 from models.linearise import linearise
 from models.network import MMCNN, NetworkConfig, multiply_accumulates
 from models.prereconstruction import Array, Matrices, PreReconstructor
+from models.pruning import is_part
 from models.response_tables import response_tables
 
 VALID = 1000
@@ -256,9 +260,26 @@ def main(argv: list[str] | None = None) -> None:
             trained = [("full", plan.full), ("fast", plan.fast)]
             if start is not None:  # a registered skin: what its presses leave open no second network can know
                 trained = [("full", plan.full + plan.fast)]
+            teacher: Teacher | None = None
             for variant, minutes in trained:
-                at, seed, jobs = work / f"{variant}.pt", args.seed, args.jobs
-                train.train(variant, skin, pre, scenes, held_out, minutes, at, seed, jobs, start=start, own=own)
+                # What can be a part of the full network learns from it, which was trained before.
+                learns = teacher is not None and is_part(train.CONFIGS[variant], teacher.model.config)
+                trainer = train.train(
+                    variant,
+                    skin,
+                    pre,
+                    scenes,
+                    held_out,
+                    minutes,
+                    work / f"{variant}.pt",
+                    args.seed,
+                    args.jobs,
+                    start=start,
+                    own=own,
+                    teacher=teacher if learns else None,
+                    go_on=True,
+                )
+                teacher = teacher or trainer.as_teacher(variant)
         count, cache = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4, work / "presses.npz"
         made, said = networks(work, pre, held_out, None if own else calibrate.solve(skin, count, cache=cache), own)
         if own is None:  # the forces of a registered skin are those of its presses

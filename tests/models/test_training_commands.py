@@ -12,7 +12,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from models import average, command, data, geometry, published, samples, train  # noqa: E402
+from models import average, build, checkpoint, command, data, geometry, published, samples, train  # noqa: E402
 from models.bundle import Bundle, BundleError  # noqa: E402
 from models.checkpoint import CheckpointError, TrainingPlan  # noqa: E402
 from models.network import NetworkConfig  # noqa: E402
@@ -222,3 +222,45 @@ def test_only_the_very_same_training_is_gone_on_from(work, batches, scenes, bund
     assert not goes_on(plan) and "does not say which skin" in capsys.readouterr().out
     path.write_bytes(b"rubbish")
     assert not goes_on(plan) and "cannot be read" in capsys.readouterr().out
+
+
+class Packaging(Exception):
+    """Training is over."""
+
+
+def test_a_second_build_goes_on_and_the_fast_network_learns_from_the_full_one(
+    small, work, bundle, pre, monkeypatch, capsys
+):
+    def packaging(*_, **__):
+        raise Packaging
+
+    def built(*arguments):
+        with pytest.raises(Packaging):
+            build.main(["--work", str(work), "--minutes", "0.02", *arguments])
+        return [state(work / f"{variant}.pt") for variant in SMALL]
+
+    monkeypatch.setattr(build, "make_scenes", lambda *_: None)
+    monkeypatch.setattr(build, "physics", lambda skin, folder, _: (bundle.matrices, samples.load(folder, "valid", pre)))
+    monkeypatch.setattr(build.calibrate, "solve", packaging)
+    full, fast = built()
+    model = build.restore(work / "full.pt")[0]
+    assert fast["numbers"]["start"] == {"part_of": {"variant": "full", "network": checkpoint.weights_hash(model)}}
+    assert "taught mask" in fast["numbers"]["curve"][-1] and "taught mask" not in full["numbers"]["curve"][-1]
+    capsys.readouterr()
+
+    again = built()  # both are finished
+    assert [s["numbers"]["steps"] for s in again] == [s["numbers"]["steps"] for s in (full, fast)]
+    assert capsys.readouterr().out.count("using it, remove it to train anew") == 2
+
+    cut = {**full, "numbers": {**full["numbers"], "elapsed": 0.0, "finished": False}}
+    torch.save(cut, work / "full.pt")
+    further, other = built()
+    assert further["numbers"]["steps"] > full["numbers"]["steps"]
+    said = capsys.readouterr().out
+    assert "full.pt: found a checkpoint after 0.0 of 0.0 minutes" in said and "going on from there" in said
+    assert other["numbers"]["start"]["part_of"]["network"] == checkpoint.weights_hash(
+        build.restore(work / "full.pt")[0]
+    )
+
+    built("--seed", "2")
+    assert "with the seed 1, expected 2; trained anew" in capsys.readouterr().out
