@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from models import data, geometry, samples
-from models.bundle import Bundle
+from models import checkpoint, command, data, geometry, samples
+from models.checkpoint import CheckpointError
 from models.network import MMCNN, NetworkConfig
 
 BATCHES = 300  # that statistics are taken over
@@ -55,11 +55,20 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--limit", type=int, default=8000, help="scenes that are read")
     args = parser.parse_args(argv)
-    skin, pre = geometry.load(args.skin), Bundle.load(args.bundle or args.skin).prereconstructor()
-    scenes = samples.load(args.data or data.WORK / skin.name, "train", pre, args.limit)
-    found = [torch.load(path, map_location="cpu", weights_only=True) for path in args.checkpoints]
+    skin = geometry.load(args.skin)
+    folder = args.data or data.WORK / skin.name
+    pre = command.bundle_of(skin, args.bundle or skin.name).prereconstructor()
+    found = [checkpoint.read(path) for path in args.checkpoints]
+    for path, other in zip(args.checkpoints, found, strict=True):
+        if other["config"] != found[-1]["config"]:
+            raise CheckpointError(
+                f"found networks of other sizes in {path} and {args.checkpoints[-1]}, expected those of one "
+                "training: name no others"
+            )
+    data.check_skin(folder, skin)
+    scenes = samples.load(folder, "train", pre, args.limit)
     torch.save(average(found, samples.Batches(scenes, pre, skin, seed=1)), args.out)
 
 
 if __name__ == "__main__":
-    main()
+    command.run("models.average", main)

@@ -10,14 +10,15 @@
     python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin,
                                                            kept where its images are better than those without
 
-Samples and checkpoints stay in models/work/SKIN; a second call uses what is there and makes what is missing.
+Samples and checkpoints stay in models/work/SKIN; a second call uses what is there and makes what is missing. A training
+that was interrupted goes on from its checkpoint, one that is finished is not done again; a call with another budget or
+seed, or of a skin that has changed, trains anew. The fast network starts as a part of the full one and learns from it.
 """
 
 from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 import time
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
@@ -25,12 +26,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from models import (
     bundle,
     calibrate,
+    checkpoint,
     class_temperature,
+    command,
     data,
     export,
     geometry,
@@ -41,13 +43,14 @@ from models import (
     warped,
 )
 from models.augmentation import OwnSkin, random_condition
+from models.distillation import Teacher
 from models.evaluation import LEVELS, evaluate, predict
 from models.forward import ForwardModel
 from models.linearise import linearise
 from models.network import MMCNN, NetworkConfig, multiply_accumulates
 from models.prereconstruction import Array, Matrices, PreReconstructor
+from models.pruning import is_part
 from models.response_tables import response_tables
-from protocol.errors import EitskinError
 
 VALID = 1000
 
@@ -100,14 +103,12 @@ def networks(
 ) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Exports the checkpoints in a folder, or `only` one variant's: ONNX of each, and what the manifest says about
     them. presses: what the temperature of the class probabilities is fitted to; a registered skin has none of known
-    shapes.
+    shapes. Raises CheckpointError.
     """
     made: dict[str, bytes] = {}
     said: dict[str, Any] = {}
     stack, context = calibration(pre, held_out, own=own)
-    for variant in train.CONFIGS:
-        if not (folder / f"{variant}.pt").is_file() or variant != (only or variant):
-            continue
+    for variant in checkpoints(folder, only):
         model, state = restore(folder / f"{variant}.pt")
         shape_class = None
         if presses is not None:
@@ -145,6 +146,17 @@ def networks(
     return made, said
 
 
+def checkpoints(folder: Path, only: str | None = None) -> list[str]:
+    """Variants that a folder has a checkpoint of, or `only` one. Raises CheckpointError where there is none."""
+    wanted = list(train.CONFIGS) if only is None else [only]
+    if found := [v for v in wanted if (folder / f"{v}.pt").is_file()]:
+        return found
+    names = " or ".join(f"{v}.pt" for v in wanted)
+    raise checkpoint.CheckpointError(
+        f"found no checkpoint in {folder}, expected {names}: name the folder that has it with --work, or train it first"
+    )
+
+
 def replace_one(variant: str, skin: geometry.SkinGeometry, shipped: bundle.Bundle, work: Path) -> bundle.Bundle:
     """The bundle there is with the checkpoint of one variant; the other files stay as they are. Run times of all of its
     networks are measured anew, since those of two days cannot be compared.
@@ -165,9 +177,11 @@ def replace_one(variant: str, skin: geometry.SkinGeometry, shipped: bundle.Bundl
     return bundle.replace_manifest(replaced.path, {**replaced.manifest, "network": entries})
 
 
-def restore(checkpoint: Path) -> tuple[MMCNN, dict[str, Any]]:
-    """The network a checkpoint ships (averaged weights, best on held-out scenes), and all of its state."""
-    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+def restore(path: Path) -> tuple[MMCNN, dict[str, Any]]:
+    """The network a checkpoint ships (averaged weights, best on held-out scenes), and all of its state. Raises
+    CheckpointError.
+    """
+    state = checkpoint.read(path)
     model = MMCNN(NetworkConfig.from_dict(state["config"]))
     model.load_state_dict(state["best"] or state["average"])
     return model.eval(), state
@@ -195,7 +209,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--work", type=Path, help="samples and checkpoints (default models/work/SKIN)")
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument("--quick", action="store_true", help="a quarter of an hour in all")
-    budget.add_argument("--minutes", type=float, help="any other budget, for all of it on two idle cores")
+    budget.add_argument("--minutes", type=command.minutes, help="any other budget, for all of it on two idle cores")
     budget.add_argument("--no-network", action="store_true", help="matrices only")
     budget.add_argument("--package", action="store_true", help="export the checkpoints there are, train nothing")
     budget.add_argument("--response", action="store_true", help="response.npz alone, into the bundle there is")
@@ -217,6 +231,8 @@ def main(argv: list[str] | None = None) -> None:
         added = bundle.add_response(bundle.Bundle.load(out), response_tables(ForwardModel(skin)))
         print(f"{added.path}: response.npz added, {added.hash[:12]}, after {time.perf_counter() - began:.0f} s")
         return
+    if args.package:
+        checkpoints(work, args.only)  # before what takes minutes
     if args.package and args.only:
         replaced = replace_one(args.only, skin, bundle.Bundle.load(out), work)
         print(f"{replaced.path}: another {args.only} network, {replaced.hash[:12]}")
@@ -244,9 +260,26 @@ def main(argv: list[str] | None = None) -> None:
             trained = [("full", plan.full), ("fast", plan.fast)]
             if start is not None:  # a registered skin: what its presses leave open no second network can know
                 trained = [("full", plan.full + plan.fast)]
+            teacher: Teacher | None = None
             for variant, minutes in trained:
-                at, seed, jobs = work / f"{variant}.pt", args.seed, args.jobs
-                train.train(variant, skin, pre, scenes, held_out, minutes, at, seed, jobs, start=start, own=own)
+                # What can be a part of the full network learns from it, which was trained before.
+                learns = teacher is not None and is_part(train.CONFIGS[variant], teacher.model.config)
+                trainer = train.train(
+                    variant,
+                    skin,
+                    pre,
+                    scenes,
+                    held_out,
+                    minutes,
+                    work / f"{variant}.pt",
+                    args.seed,
+                    args.jobs,
+                    start=start,
+                    own=own,
+                    teacher=teacher if learns else None,
+                    go_on=True,
+                )
+                teacher = teacher or trainer.as_teacher(variant)
         count, cache = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4, work / "presses.npz"
         made, said = networks(work, pre, held_out, None if own else calibrate.solve(skin, count, cache=cache), own)
         if own is None:  # the forces of a registered skin are those of its presses
@@ -298,7 +331,4 @@ def make_scenes(skin: str, work: Path, scenes: int, valid: int, args: argparse.N
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except EitskinError as why:  # its text is for the person who started the build
-        sys.exit(f"models.build: {why}")
+    command.run("models.build", main)

@@ -20,7 +20,7 @@ import numpy as np
 from rich.progress import track
 from scipy import ndimage
 
-from models import bundle, geometry
+from models import bundle, command, geometry
 from models.evaluation import Predict, predict
 from models.export import session
 from models.forward import ForwardModel
@@ -295,4 +295,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.run("models.calibrate", main)

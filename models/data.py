@@ -28,10 +28,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from models import geometry
+from models import command, geometry
 from models.condensed import CondensedSheet
 from models.forward import ForwardModel
 from models.mismatch import anisotropy_root, smooth_field, soft_drop, soft_touched, turned
+from models.npz import read_npz
 from models.scenes import TRAINING, random_scene
 from models.shapes import Shape, drop_image, from_rows, to_rows
 from protocol.errors import EitskinError
@@ -39,6 +40,10 @@ from protocol.errors import EitskinError
 
 class OtherScenes(EitskinError, ValueError):
     """The folder holds scenes that must not be mixed with those of this run."""
+
+
+class NoScenes(EitskinError, FileNotFoundError):
+    """A folder has no finished scenes to train with, or to measure with."""
 
 
 WORK = Path(__file__).parent / "work"
@@ -201,10 +206,24 @@ def chunk_size(folder: Path) -> int:
     return int(json.loads(path.read_text())["chunk"]) if path.exists() else 0
 
 
+def _digest(skin: geometry.SkinGeometry) -> str:
+    return hashlib.sha256(json.dumps(skin.to_dict(), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def check_skin(folder: Path, skin: geometry.SkinGeometry) -> None:
+    """Raises OtherScenes where a folder says that its scenes are of another skin."""
+    path = folder / "data.json"
+    found = json.loads(path.read_text()) if path.is_file() else {}
+    if found.get("geometry", _digest(skin)) != _digest(skin):  # older folders do not say
+        raise OtherScenes(
+            f"{folder} holds scenes of a skin {found.get('skin')!r} that is not '{skin.name}' as it is now: name the "
+            f"folder of its scenes, or make some with python -m models.data --skin {skin.name}"
+        )
+
+
 def _check_same_run(folder: Path, spec: ChunkSpec) -> None:
     """Chunks of another seed, skin or mesh must not be mixed in: samples could repeat, or not mean the same."""
-    skin = json.dumps(geometry.load(spec.skin).to_dict(), sort_keys=True)
-    digest = hashlib.sha256(skin.encode()).hexdigest()[:16]
+    digest = _digest(geometry.load(spec.skin))
     wanted = {"schema": SCHEMA, "skin": spec.skin, "mesh": spec.mesh, "seed": spec.seed, "chunk": spec.size}
     path = folder / "data.json"
     if not path.exists():
@@ -240,10 +259,15 @@ def chunk_files(folder: Path, split: str = "train") -> list[Path]:
 
 
 def load(folder: Path, split: str = "train", limit: int | None = None, skip: int = 0) -> Dataset:
-    """Read the finished chunks of a split from number `skip` on, `limit` scenes at most. Raises FileNotFoundError."""
+    """Read the finished chunks of a split from number `skip` on, `limit` scenes at most. Raises NoScenes,
+    OtherScenes, FileError.
+    """
     parts = list(_read(folder, split, limit, skip))
     if not parts:
-        raise FileNotFoundError(f"no {split}-*.npz in {folder}: make some with python -m models.data")
+        raise NoScenes(
+            f"found no {split}-*.npz in {folder}, expected scenes: name the folder that has them, or make some with "
+            "python -m models.data"
+        )
     variant = np.repeat(np.arange(len(parts)), [len(p["difference"]) for p in parts])
     rest = {k: np.concatenate([p[k] for p in parts]) for k in ("difference", "image", "shapes", "blur")}
     cut = slice(0, limit)
@@ -256,8 +280,11 @@ def _read(folder: Path, split: str, limit: int | None, skip: int) -> Iterator[di
     for path in chunk_files(folder, split)[skip:]:
         if limit is not None and count >= limit:
             return
-        with np.load(path) as file:
-            part = {k: file[k] for k in file.files}
+        part = read_npz(path)
+        if lacks := {"difference", "image", "shapes", "blur", "z0"} - set(part):
+            raise OtherScenes(
+                f"{path}: found no array {min(lacks)!r}, expected scenes of this version: remove {folder}"
+            )
         count += len(part["difference"])
         yield part
 
@@ -291,4 +318,4 @@ if __name__ == "__main__":
     # Workers look make_chunk up by its module's name, which must not be __main__.
     from models.data import main as importable
 
-    importable()
+    command.run("models.data", importable)

@@ -81,11 +81,16 @@ def _pair(module: nn.Module) -> tuple[nn.Conv2d, nn.BatchNorm2d]:
     return convolution, normal
 
 
+def is_part(config: NetworkConfig, larger: NetworkConfig) -> bool:
+    """Whether a network of `config` can be made of the channels and blocks of a larger one."""
+    sizes = [*zip(config.channels, larger.channels, strict=True), *zip(config.blocks, larger.blocks, strict=True)]
+    return all(a <= b for a, b in sizes) and (config.lean or not larger.lean) and config.stack == larger.stack
+
+
 def part(model: MMCNN, config: NetworkConfig, lost: Worth) -> MMCNN:
     """The network of `config` with the weights of the most valuable channels. Raises NoPart."""
     mine = model.config
-    larger = [*zip(config.channels, mine.channels, strict=True), *zip(config.blocks, mine.blocks, strict=True)]
-    if any(a > b for a, b in larger) or (mine.lean and not config.lean) or config.stack != mine.stack:
+    if not is_part(config, mine):
         raise NoPart(f"{config} is no part of a network of {mine}: it may have fewer channels and blocks, not more")
 
     def best(value: Tensor, count: int) -> Tensor:

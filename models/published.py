@@ -25,10 +25,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from models import geometry, samples
+from models import command, data, geometry, samples
 from models.augmentation import Condition, condition
-from models.bundle import Bundle
-from models.data import WORK
 from models.export import exported
 from models.network import CBAM, laid_out
 from models.prereconstruction import THRESHOLD_T, Array, Drift, Operator, PreReconstructor
@@ -122,13 +120,15 @@ def to_onnx(model: PublishedMMCNN, said: dict[str, float]) -> bytes:
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m models.published", description="Train the paper's network.")
     parser.add_argument("--skin", default="square16")
-    parser.add_argument("--minutes", type=float, default=11.0)
+    parser.add_argument("--minutes", type=command.minutes, default=11.0)
     parser.add_argument("--no-attention", action="store_true")
     parser.add_argument("--limit", type=int)
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
-    skin, pre = geometry.load(args.skin), Bundle.load(args.skin).prereconstructor()
-    scenes = samples.load(WORK / skin.name, "train", pre, args.limit)
+    skin = geometry.load(args.skin)
+    pre = command.bundle_of(skin, skin.name).prereconstructor()
+    data.check_skin(data.WORK / skin.name, skin)
+    scenes = samples.load(data.WORK / skin.name, "train", pre, args.limit)
     model, said = train(pre, skin, scenes, args.minutes, not args.no_attention)
     FOLDER.mkdir(parents=True, exist_ok=True)
     target = FOLDER / ("cnn.onnx" if args.no_attention else "mmcnn.onnx")
@@ -137,4 +137,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.run("models.published", main)

@@ -45,8 +45,15 @@ class Samples:
 
 
 def load(folder: Path, split: str, pre: PreReconstructor, limit: int | None = None, skip: int = 0) -> Samples:
-    """Reads a split, but for its first `skip` chunks, and puts its differences in the bundle's normalisation."""
+    """Reads a split, but for its first `skip` chunks, and puts its differences in the bundle's normalisation. Raises
+    NoScenes, OtherScenes.
+    """
     raw = data.load(folder, split, limit, skip)
+    if raw.difference.shape[1] != pre.measurements:
+        raise data.OtherScenes(
+            f"{folder} holds scenes with {raw.difference.shape[1]} measurements, expected {pre.measurements} as the "
+            "bundle's matrices have them: name the folder, or the bundle, of the same skin"
+        )
     z0 = raw.z0[raw.variant]
     d = raw.difference.astype(np.float64)
     if pre.m.normalisation == "model":

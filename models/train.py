@@ -6,6 +6,8 @@
     python -m models.train --skin square16 --minutes 60 --variant fast --teacher square16   a part of a bundle's full
                                                                     network, which it learns from (distillation.py)
 
+A training with a teacher is resumed with the same --teacher; --from goes with neither.
+
 The budget sets the schedule: the learning rate rises over the first percent and falls to zero at the last minute,
 whatever the machine's speed. What is kept is the running average of the weights; the best on held-out scenes is kept
 aside, and training stops early where the average has not become better for a quarter of the budget; not before half
@@ -25,9 +27,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from models import data, geometry, manifest, samples
+from models import checkpoint, command, data, geometry, manifest, samples
 from models.augmentation import OwnSkin
 from models.bundle import Bundle
+from models.checkpoint import CheckpointError, TrainingPlan
 from models.distillation import Teacher, taught
 from models.evaluation import LEVELS, evaluate, predict
 from models.losses import losses, total
@@ -38,7 +41,8 @@ from models.prereconstruction import PreReconstructor
 from models.pruning import part, worth
 from models.warm_start import BATCHES, NoSuchNetwork, normalised, restored
 
-NUMBERS = ("elapsed", "steps", "curve", "best_score", "best_at", "rates", "start")  # of a checkpoint, and all plain
+# Of a checkpoint, and all plain.
+NUMBERS = ("elapsed", "steps", "curve", "best_score", "best_at", "rates", "start", "minutes", "finished")
 CONFIGS = {"full": FULL, "fast": FAST}
 MUON_RATE, ADAM_RATE = 0.02, 2e-3
 AVERAGE = 0.999
@@ -75,6 +79,8 @@ class Trainer:
         ]
         self.rates = [MUON_RATE, ADAM_RATE]
         self.elapsed, self.steps = 0.0, 0  # seconds, batches
+        self.minutes, self.finished = 0.0, False  # the budget; whether it is spent, or training has stopped before
+        self.matrices = checkpoint.matrices_hash(batches.pre.m)
         self.start: dict[str, Any] = {}  # what the manifest says of where it started
         self.teacher: Teacher | None = None
         self.curve: list[dict[str, Any]] = []
@@ -119,7 +125,7 @@ class Trainer:
     def run(
         self,
         minutes: float,
-        checkpoint: Path,
+        path: Path,
         quiet: bool = False,
         folder: Path | None = None,
         name: str = "training",
@@ -131,10 +137,11 @@ class Trainer:
         """
         chunks = len(data.chunk_files(folder)) if folder else 0
         budget, sums, count, saved = 60 * minutes, dict[str, Tensor](), 0, self.elapsed
+        self.minutes, self.finished = minutes, False
         began = time.perf_counter() - self.elapsed
         next_check = self.elapsed + max(budget / 30, 15.0)
         with TrainingBar(name, budget, quiet) as bar:
-            while self.elapsed < budget:
+            while self.elapsed < budget or not self.steps:  # finding a part can take longer than a short budget
                 terms = self.step(self.elapsed / budget)
                 sums = {k: sums[k] + v if k in sums else v for k, v in terms.items()}
                 count += 1
@@ -154,8 +161,9 @@ class Trainer:
                         break
                 if self.elapsed - saved > 120:
                     saved = self.elapsed
-                    self.save(checkpoint)
-        self.save(checkpoint)
+                    self.save(path)
+        self.finished = True
+        self.save(path)
 
     def _check(self, terms: dict[str, float]) -> dict[str, Any]:
         """Held-out figures of the averaged network, as a row of the curve. terms: means since the last check."""
@@ -189,6 +197,7 @@ class Trainer:
         path.parent.mkdir(parents=True, exist_ok=True)
         state = {
             "config": self.config.to_dict(),
+            "matrices": self.matrices,
             "said": {
                 "seed": self.seed,
                 "commit": self.commit,
@@ -210,14 +219,17 @@ class Trainer:
         """The network of a bundle as the start, with a share of the learning rates. Raises NoSuchNetwork."""
         path = bundle.network_path(variant)
         if path is None:
-            raise NoSuchNetwork(f"the bundle {bundle.name} has no network {variant!r} to start from")
+            raise NoSuchNetwork(
+                f"the bundle {bundle.name} has no network {variant!r} to start from: name another bundle, or leave "
+                "it out"
+            )
         model = restored(path.read_bytes(), self.config)
         batches = [self.batches.draw() for _ in range(BATCHES)]
         normalised(model, [(b.stack, b.context) for b in batches])
         for mine in (self.model, self.average):
             mine.load_state_dict(model.state_dict())
         self.rates = [share * rate for rate in self.rates]
-        self.start = {"from": {"bundle": bundle.hash, "network": bundle.manifest["files"][path.name]}}
+        self.start = {"from": _network_said(bundle, variant)}
 
     def start_as_part(self, teacher: Teacher) -> None:
         """The teacher's most valuable channels and blocks as the start; finding them counts as training. Raises
@@ -233,28 +245,77 @@ class Trainer:
         self.start = {"part_of": teacher.said}
         self.elapsed = time.perf_counter() - began
 
+    def as_teacher(self, variant: str) -> Teacher:
+        """The network that this training ships as the teacher of another one. variant: its name in the bundle to be."""
+        model = self.result()
+        return Teacher(model, {"variant": variant, "network": checkpoint.weights_hash(model)})
+
     def learn_from(self, teacher: Teacher) -> None:
         self.teacher = Teacher(laid_out(teacher.model.to(self.device).eval(), torch.channels_last), teacher.said)
 
-    def resume(self, path: Path) -> None:
-        state = torch.load(path, map_location=self.device, weights_only=True)
+    def resume(self, path: Path, teacher: Teacher | None = None) -> None:
+        """Goes on from a checkpoint, with the teacher that it had. Raises CheckpointError where it is not one of this
+        network, skin and teacher.
+        """
+        state = checkpoint.read(path, self.device)
+        if wrong := checkpoint.misfit(state, self.config, self.matrices, teacher.said if teacher else None):
+            raise CheckpointError(f"{path}: {wrong.found}: {wrong.do}")
+        self._take_up(path, state, teacher)
+
+    def resume_same(self, path: Path, plan: TrainingPlan, teacher: Teacher | None = None) -> bool:
+        """Whether there is a checkpoint of this very training, which is then gone on from. Says what was found."""
+        if not path.exists():
+            return False
+        try:
+            state = checkpoint.read(path, self.device)
+        except CheckpointError as why:
+            print(f"{why}; trained anew", flush=True)
+            return False
+        if wrong := checkpoint.misfit(state, self.config, self.matrices, teacher.said if teacher else None, plan):
+            print(f"{path}: {wrong.found}; trained anew", flush=True)
+            return False
+        self._take_up(path, state, teacher)
+        spent = f"{self.elapsed / 60:.1f} of {plan.minutes:.1f} minutes"
+        todo = "using it, remove it to train anew" if self.finished else "going on from there"
+        print(f"{path}: found a checkpoint after {spent} and {self.steps} batches; {todo}", flush=True)
+        return True
+
+    def _take_up(self, path: Path, state: dict[str, Any], teacher: Teacher | None) -> None:
+        try:
+            for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+                optimizer.load_state_dict(saved)
+        except (KeyError, ValueError) as why:
+            raise CheckpointError(
+                f"{path}: found a checkpoint of another version's optimizers ({why}): remove it and train anew"
+            ) from None
+        if teacher is not None:
+            self.learn_from(teacher)
         self.model.load_state_dict(state["model"])
         self.average.load_state_dict(state["average"])
         self.best = state["best"]
-        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
-            optimizer.load_state_dict(saved)
         for name, value in state["numbers"].items():
             setattr(self, name, value)
+
+
+def _network_said(bundle: Bundle | None, variant: str) -> dict[str, str] | None:
+    """What the manifest says of a bundle's network."""
+    if bundle is None or (path := bundle.network_path(variant)) is None:
+        return None
+    return {"bundle": bundle.hash, "network": bundle.manifest["files"][path.name]}
 
 
 def full_network(bundle: Bundle, batches: samples.Batches) -> Teacher:
     """A bundle's full network as a teacher. Raises NoSuchNetwork."""
     path = bundle.network_path("full")
     if path is None:
-        raise NoSuchNetwork(f"the bundle {bundle.name} has no network 'full' to learn from")
+        raise NoSuchNetwork(
+            f"the bundle {bundle.name} has no network 'full' to learn from: name another bundle, or train "
+            "without a teacher"
+        )
     model = restored(path.read_bytes(), FULL)
     normalised(model, [(b.stack, b.context) for b in (batches.draw() for _ in range(BATCHES))])
-    return Teacher(model, {"bundle": bundle.hash, "network": bundle.manifest["files"][path.name]})
+    said = {"name": bundle.name, "bundle": bundle.hash, "network": bundle.manifest["files"][path.name]}
+    return Teacher(model, said)
 
 
 def train(
@@ -264,29 +325,35 @@ def train(
     scenes: samples.Samples,
     held_out: samples.Samples,
     minutes: float,
-    checkpoint: Path,
+    path: Path,
     seed: int = 0,
     threads: int = 1,
     resume: bool = False,
     folder: Path | None = None,
     start: Bundle | None = None,
     own: OwnSkin | None = None,
-    teacher: Bundle | None = None,
+    teacher: Bundle | Teacher | None = None,
+    go_on: bool = False,
 ) -> Trainer:
-    """Trains a variant of CONFIGS; leaves the checkpoint and its curves (PNG) behind. folder: see Trainer.run.
-    start: a bundle whose network is the start, instead of random weights. own: what was measured of this very skin.
-    teacher: a bundle whose full network is larger; a part of it is the start, and training learns from its answers.
+    """Trains a variant of CONFIGS; leaves the checkpoint at `path` and its curves (PNG) behind.
+
+    folder: see Trainer.run. start: a bundle whose network is the start, instead of random weights. own: what was
+    measured of this very skin.
+    teacher: a larger network, or the bundle whose full network it is; a part of it is the start, and training learns
+    from its answers. resume: goes on from the checkpoint, which must be there. go_on: does so where it is of this very
+    training; one that is finished is not trained again. Raises CheckpointError, NoSuchNetwork, NoPart.
     """
     torch.set_num_threads(threads)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     size, groups = GPU_BATCH if device.type == "cuda" else CPU_BATCH
     batches = samples.Batches(scenes, pre, skin, seed, size, groups, device=device, own=own)
     trainer = Trainer(CONFIGS[variant], batches, held_out, seed)
-    larger = None if teacher is None else full_network(teacher, batches)
+    larger = full_network(teacher, batches) if isinstance(teacher, Bundle) else teacher
     if resume:
-        trainer.resume(checkpoint)
-        if larger is not None:
-            trainer.learn_from(larger)
+        trainer.resume(path, larger)
+    elif go_on and trainer.resume_same(path, TrainingPlan(minutes, seed, _network_said(start, variant)), larger):
+        if trainer.finished:
+            return trainer
     elif larger is not None:
         trainer.start_as_part(larger)
     elif start is not None:
@@ -294,9 +361,9 @@ def train(
     weights = sum(p.numel() for p in trainer.model.parameters()) / 1e6
     print(f"{variant}: {weights:.2f} M parameters, {len(scenes)} scenes, {trainer.device}", flush=True)
     before = trainer.steps
-    trainer.run(minutes, checkpoint, folder=folder, name=variant)
+    trainer.run(minutes, path, folder=folder, name=variant)
     print(f"{variant}: {trainer.pace.said(trainer.steps - before, trainer.batches.size)}", flush=True)
-    plot(trainer.curve, checkpoint.with_suffix(".png"))
+    plot(trainer.curve, path.with_suffix(".png"))
     return trainer
 
 
@@ -307,21 +374,27 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--bundle", help="whose matrices to train with (default SKIN's)")
     parser.add_argument("--data", type=Path, help="folder of samples (default models/work/SKIN)")
     parser.add_argument("--out", type=Path, help="checkpoint (default models/work/SKIN/VARIANT.pt)")
-    parser.add_argument("--minutes", type=float, default=80.0)
+    parser.add_argument("--minutes", type=command.minutes, default=80.0)
     parser.add_argument("--limit", type=int, help="use at most so many samples")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, with the teacher that it had")
     parser.add_argument("--from", dest="start", help="the bundle whose network to start from, at a lower rate")
     parser.add_argument("--teacher", help="the bundle whose full network to start as a part of, and to learn from")
     args = parser.parse_args(argv)
+    if args.start and (args.teacher or args.resume):
+        raise command.ArgumentError(
+            f"found --from and {'--teacher' if args.teacher else '--resume'}, expected one start: a bundle's network "
+            "(--from), a part of one (--teacher) or the checkpoint (--resume); leave --from or the other out"
+        )
     skin = geometry.load(args.skin)
     folder = args.data or data.WORK / skin.name
-    checkpoint = args.out or data.WORK / skin.name / f"{args.variant}.pt"
-    pre = Bundle.load(args.bundle or skin.name).prereconstructor()
-    scenes, held_out = (samples.load(folder, split, pre, args.limit) for split in ("train", "valid"))
-    more = None if args.limit else folder
+    path = args.out or data.WORK / skin.name / f"{args.variant}.pt"
+    pre = command.bundle_of(skin, args.bundle or skin.name).prereconstructor()
     start = Bundle.load(args.start) if args.start else None
+    teacher = command.bundle_of(skin, args.teacher) if args.teacher else None
+    data.check_skin(folder, skin)
+    scenes, held_out = (samples.load(folder, split, pre, args.limit) for split in ("train", "valid"))
     train(
         args.variant,
         skin,
@@ -329,15 +402,15 @@ def main(argv: list[str] | None = None) -> None:
         scenes,
         held_out,
         args.minutes,
-        checkpoint,
+        path,
         args.seed,
         args.threads,
-        args.resume,
-        more,
-        start,
-        teacher=Bundle.load(args.teacher) if args.teacher else None,
+        resume=args.resume,
+        folder=None if args.limit else folder,
+        start=start,
+        teacher=teacher,
     )
 
 
 if __name__ == "__main__":
-    main()
+    command.run("models.train", main)

@@ -28,6 +28,10 @@ class EitskinError(Exception):
         ├── TooFewMeasured                    an untouched frame in which too little was measured to calibrate on
         ├── CalibrationFileError              what a calibration found cannot be read, kept or used
         ├── OtherScenes (ValueError)          training scenes of another skin, or of this one as it was
+        ├── NoScenes (FileNotFoundError)      a folder has no training scenes
+        ├── CheckpointError (ValueError)      a checkpoint of a training is not there, damaged, or of another training
+        ├── OtherSkin (ValueError)            a bundle of another skin than the one that is trained
+        ├── ArgumentError                     arguments of a program of models/ that cannot be meant
         ├── NoSuchNetwork (ValueError)        a file without the network that training is to start from
         ├── NoPart (ValueError)               a network that is not made of another's channels and blocks
         ├── NotRegistered (ValueError)        a folder to train for holds a bundle of no registered skin

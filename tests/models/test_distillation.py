@@ -110,11 +110,10 @@ def test_training_starts_as_a_part_of_a_bundles_network_and_learns_from_it(bundl
     trainer = Trainer(FAST, batches, scenes)
     trainer.start_as_part(full_network(bundle, batches))
     file = bundle.manifest["files"]["network.onnx"]
-    assert trainer.start == {"part_of": {"bundle": bundle.hash, "network": file}}
+    assert trainer.start == {"part_of": {"name": "square16", "bundle": bundle.hash, "network": file}}
     assert trainer.rates[1] == pytest.approx(PART * 2e-3)
     assert trainer.step(0.5).keys() >= {"taught mask", "taught amplitude", "taught class", "mask"}
     trainer.save(tmp_path / "fast.pt")
     again = Trainer(FAST, batches, scenes)
-    again.resume(tmp_path / "fast.pt")
-    again.learn_from(full_network(bundle, batches))
+    again.resume(tmp_path / "fast.pt", full_network(bundle, batches))
     assert again.start == trainer.start and again.rates == trainer.rates and "taught mask" in again.step(0.5)
