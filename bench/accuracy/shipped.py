@@ -83,6 +83,9 @@ def run(frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int, untouc
     return rows
 
 
+FAR = 10.0  # per cent of the side: a contact that is so far off is told where nothing touches
+
+
 def contacts(found: dict[str, Array], frames: Frames) -> Row:
     """Position, force, count and shape as the publisher gives them; a touch not seen is off by half the diagonal."""
     singles = [k for k in frames.of("shapes", "hertz", "force") if found["count"][k] >= 1]
@@ -110,6 +113,7 @@ def contacts(found: dict[str, Array], frames: Frames) -> Row:
         "force_%_se": standard_error(errors),
         "shape_%_se": 100 * standard_error(right),
         "missed": missed,
+        "far": int((distance[: len(singles)] > FAR).sum()),
         "position_%": float(distance.mean()),
         "position_rms_%": float(np.sqrt((distance**2).mean())),
         "position_p95_%": float(np.percentile(distance, 95)),
