@@ -34,7 +34,7 @@ from services.contacts.lasting import LastingStates
 from services.contacts.motion import Patch, Track
 from services.contacts.outline import outline
 from services.contacts.placing import placement
-from services.contacts.refined import both, refined_outline
+from services.contacts.refined import area_of_image, both, refined_outline
 from services.contacts.registered import measures_force, patches
 from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.tracking import Tracker
@@ -308,7 +308,7 @@ class Publishing(Stage):
         return ShapeFrame(
             **inherited(frame),
             ids=[c.id for c in present],
-            outlines=outlines if fitted is None else [refined_outline(fitted)],
+            outlines=outlines if fitted is None or area_of_image(fitted) else [refined_outline(fitted)],
             orientation=[c.orientation for c in present],
             probabilities=probabilities if fitted is None else [fitted.probabilities],
             refined=fitted is not None,

@@ -18,6 +18,7 @@ a shape is from how often it is right (expected calibration error); shapes that 
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -61,7 +62,7 @@ from protocol.frames import Contact
 from services.contacts.contact_writer import ContactWriter
 from services.contacts.force import ForceLaw
 from services.contacts.force_curve import Curve
-from services.contacts.refined import both
+from services.contacts.refined import area_of_image, both
 from services.contacts.surface import Placement, Plane
 from services.networks import Network
 from services.refinement import told
@@ -117,6 +118,13 @@ def said(posterior: TouchPosterior, image: Array, start: Shape, unit: float) -> 
 def outlined(shown: Array, covered: Array) -> float:
     """Contact IoU of what a shape frame draws, as a mask (N, N), and of the patch that is touched."""
     return metrics.iou(shown > 0.5, covered > 0.5)[1]
+
+
+def drawn(posterior: TouchPosterior, image: Array) -> Array:
+    """(N, N) the touch as the shape frame of a refined contact draws it: what exceeds 0.5."""
+    if area_of_image(told(posterior, 0, 1.0)):
+        return np.asarray(image / image.max())
+    return posterior.fits[0].shape.fraction(N, covered=True)
 
 
 def row_of(image: Array, touch: Shape) -> dict[str, float]:
@@ -213,8 +221,7 @@ def measured(
                     named = both(posterior.classes.tolist(), named)
                     row["class %"] = 100.0 * (int(np.argmax(named)) == touch.shape_class)
                     row |= stated(contact, touch, bundle.metres_per_unit)
-                    drawn = posterior.fits[0].shape.fraction(N, covered=True)
-                    row["outline IoU"] = outlined(drawn, touch.fraction(N, covered=True))
+                    row["outline IoU"] = outlined(drawn(posterior, image), touch.fraction(N, covered=True))
                 row["class stated %"] = 100 * max(named)
                 found["service"].append(row | {"refined %": 100.0 * (contact is not None)})
                 found["stated"].append(None if contact is None else row)
@@ -256,12 +263,12 @@ def odd(level: str, touches: list[OddShape], clean: Array, seed: int) -> dict[st
         centroid = np.array([(covered * a).sum() for a in (axis, axis[:, None])]) / covered.sum()
         row: dict[str, float] = {"refined %": 100.0 * (contact is not None)}
         for method in ("network", "service"):
-            place, area, peak, drawn = start.centroid, 4 * float(mask.mean()), float(image.max()), image / image.max()
+            place, area, peak, shown = start.centroid, 4 * float(mask.mean()), float(image.max()), image / image.max()
             if method == "service" and contact is not None:
                 area, peak = contact.area_m2 / bundle.metres_per_unit**2, contact.force_n or 0.0
-                place, drawn = posterior.position, posterior.fits[0].shape.fraction(N, covered=True)
+                place, shown = posterior.position, drawn(posterior, image)
             row |= {
-                f"{method}: outline IoU": outlined(drawn, covered),
+                f"{method}: outline IoU": outlined(shown, covered),
                 f"{method}: position, % of the side": 50 * float(np.linalg.norm(place - centroid)),
                 f"{method}: force, %": 100 * abs(peak / touch.drop - 1),
                 f"{method}: area, %": 100 * abs(area / (4 * float(covered.mean())) - 1),
@@ -271,22 +278,28 @@ def odd(level: str, touches: list[OddShape], clean: Array, seed: int) -> dict[st
 
 
 def gains(kind: str, network: Row, service: Row) -> list[float]:
-    """By how many of the network's standard errors the service is better. A perfect image of a Hertz contact is cut at
+    """By how many standard errors of the difference the service is better. A perfect image of a Hertz contact is cut at
     half its peak, inside the patch that it is scored by: its outline counts, and not its image.
     """
     higher = ("outline IoU", "class %", *(() if kind == "hertz" else ("mean IoU", "contact IoU")))
-    better = [(service[name][0] - network[name][0]) / max(network[name][1], 1e-9) for name in higher]
     lower = ("position rms %", "force %", "integral %", "area %")
-    return better + [(network[name][0] - service[name][0]) / max(network[name][1], 1e-9) for name in lower]
+    return [better(service[name], network[name]) for name in higher] + [
+        better(network[name], service[name]) for name in lower
+    ]
+
+
+def better(more: tuple[float, float], less: tuple[float, float]) -> float:
+    """more - less in standard errors; 0 where both are known exactly, and the same."""
+    off, error = more[0] - less[0], math.hypot(more[1], less[1])
+    return off / error if error else 0.0
 
 
 def worst_odd(found: dict[str, dict[str, tuple[float, float]]]) -> float:
     """Of what contact and shape frames say: place, force, area, outline."""
-    signs = {"position, % of the side": 1, "force, %": 1, "area, %": 1, "outline IoU": -1}
+    lower = ("position, % of the side", "force, %", "area, %")
     return min(
-        sign * (row[f"network: {name}"][0] - row[f"service: {name}"][0]) / max(row[f"network: {name}"][1], 1e-9)
-        for row in found.values()
-        for name, sign in signs.items()
+        min(better(row["service: outline IoU"], row["network: outline IoU"]) for row in found.values()),
+        min(better(row[f"network: {n}"], row[f"service: {n}"]) for row in found.values() for n in lower),
     )
 
 

@@ -38,17 +38,21 @@ def agrees(contact: Contact, touch: RefinedTouch, force: Force) -> bool:
     return abs(force.newton - contact.force_n) <= APART * unsure
 
 
+def area_of_image(touch: RefinedTouch) -> bool:
+    """Whether a contact's area is its image's, and its outline too: the kinds that explain the frame differ in it."""
+    return touch.between_kinds[1] > DIFFER[1]
+
+
 def settled(contact: Contact, touch: RefinedTouch, force: Force) -> tuple[Force, float, float]:
     """Force, area and its standard uncertainty. A fit knows them as far as it knows what kind of shape it is: where the
     kinds that explain the frame differ, it may as well be one that was not fitted. Then the area is the image's, which
     is nearer on 300 touches, and the force the geometric mean of both; what that changes counts as uncertain.
     """
-    drop_apart, area_apart = touch.between_kinds
-    if drop_apart > DIFFER[0] and force.newton is not None and contact.force_n is not None:
+    if touch.between_kinds[0] > DIFFER[0] and force.newton is not None and contact.force_n is not None:
         mean = math.sqrt(force.newton * contact.force_n)
         sigma = None if force.sigma is None else math.hypot(force.sigma, mean - force.newton)
         force = Force(mean, sigma)
-    if area_apart > DIFFER[1]:
+    if area_of_image(touch):
         return force, contact.area_m2, math.hypot(touch.area_sigma_m2, touch.area_m2 - contact.area_m2)
     return force, touch.area_m2, touch.area_sigma_m2
 

@@ -66,6 +66,11 @@ def test_a_round_touch_is_refined_and_its_uncertainties_hold() -> None:
     outline = np.array(shape.outlines[0])  # type: ignore[attr-defined]
     assert np.hypot(*(outline - image.refined.centre).T) == pytest.approx(image.refined.radius_m)
     assert shape.ids == [contacts.contacts[0].id]  # type: ignore[attr-defined]
+    image.refined.between_kinds = [0.0, 0.2]  # where the area is the image's, the outline is
+    contacts, _, shape = stub.pipeline.publishing.process(image, FORCE)
+    x, y = np.array(shape.outlines[0]).T  # type: ignore[attr-defined]
+    area = 0.5 * abs(float(x @ np.roll(y, 1) - y @ np.roll(x, 1)))
+    assert len(x) != len(outline) and area == pytest.approx(contacts.contacts[0].area_m2, rel=0.05)
 
 
 def test_a_held_touch_keeps_it_and_a_release_ends_it() -> None:
