@@ -64,7 +64,8 @@ class Following:
         """
         found = []
         for contact in contacts:
-            anchor = _anchored(contact, self._then) if contact.refined else self._anchors.get(contact.id)
+            own = _anchored(contact, self._then) if contact.refined else None
+            anchor = own or self._anchors.get(contact.id)
             touch = None if anchor is None or contact.state == "end" else _of(anchor, followed)
             if anchor is not None and touch is not None:
                 grown = touch.integral / max(anchor.integral, 1e-30)
