@@ -260,6 +260,7 @@ COMMANDS = (
     Row(r"\.venv/bin/python -m bench\.speed\.page", "help"),
     Row(r"\.venv/bin/python -m bench\.registered_network FILE my-skin", "help"),
     Row("python -m models.average", "help"),
+    Row(r"python -m models.published --minutes 45", "help"),
     Row(r"\.venv/bin/python -m models.class_temperature", "slow", says=r"int8: right, all 0.68.*, all 0.03"),
     Row(r"(\.venv/bin/)?python -m models.build .*", "help"),
     Row("python -m protocol.wire_doc", "ends", instead=".venv/bin/python -m protocol.wire_doc"),
