@@ -1,7 +1,10 @@
 """Offline: geometry, forward model, data, networks, bundles."""
 
+import os
 import sys
 from types import TracebackType
+
+from protocol.errors import interrupted
 
 OURS = ("bench", "examples", "firmware_stub", "models", "protocol", "services", "tests")
 
@@ -18,8 +21,10 @@ def _last_words(kind: type[BaseException], error: BaseException, trace: Tracebac
     """No traceback for Ctrl-C, nor for a program that lacks what it needs."""
     if isinstance(error, ImportError) and (said := not_installed(error)):
         print(said, file=sys.stderr)
-    elif kind is not KeyboardInterrupt:
+    elif not interrupted(error):
         _usual(kind, error, trace)
+    elif kind is not KeyboardInterrupt:  # of which Python knows by itself how to end
+        os._exit(130)
 
 
 _usual = sys.excepthook

@@ -1,4 +1,4 @@
-"""The base of the project's exceptions."""
+"""The base of the project's exceptions, and which errors are a Ctrl-C."""
 
 from __future__ import annotations
 
@@ -56,3 +56,13 @@ class EitskinError(Exception):
         ├── Broken                            bench: a promise was broken under changed bytes
         └── RosMissing (RuntimeError)         bench: there is no ROS 2 to listen with
     """
+
+
+def interrupted(error: BaseException) -> bool:
+    """Whether Ctrl-C caused an error: a compiled module that is interrupted while it loads says `initialization
+    failed`.
+    """
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    return cause is not None

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from protocol import __version__
+from protocol.errors import interrupted
 from services.cli import (
     board,
     bridge,
@@ -23,7 +24,7 @@ from services.cli import (
     service,
     watch,
 )
-from services.cli.common import FAILED, expected_code, interrupted
+from services.cli.common import FAILED, expected_code
 
 app = typer.Typer(
     name="skin",

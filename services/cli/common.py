@@ -100,16 +100,6 @@ EXPECTED = {
 """Exceptions of other modules whose text is already meant for the person at the terminal, and the exit code of each."""
 
 
-def interrupted(error: BaseException) -> bool:
-    """Whether Ctrl-C caused an error: a compiled module that is interrupted while it loads says `initialization
-    failed`.
-    """
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, KeyboardInterrupt):
-        cause = cause.__cause__ or cause.__context__
-    return cause is not None
-
-
 def expected_code(error: BaseException) -> int | None:
     """The exit code of an error whose text explains itself; None for other errors. This imports nothing."""
     if isinstance(error, CliError):

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from services.cli.common import FAILED, USAGE, JsonOption, emit, fail, interrupted, load_npz
+from protocol.errors import interrupted
+from services.cli.common import FAILED, USAGE, JsonOption, emit, fail, load_npz
 
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 

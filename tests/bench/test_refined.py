@@ -7,7 +7,7 @@ import pytest
 
 from bench.accuracy.intervals import class_error, pixels, summary
 from bench.accuracy.odd_shapes import FLAT, HOLE, ODD, OddShape, random_odd
-from bench.accuracy.refined import gains
+from bench.accuracy.refined import better, gains
 from models.forward import shared
 from models.shapes import Shape
 
@@ -33,14 +33,15 @@ def test_odd_shapes_lie_on_the_skin() -> None:
     assert all(abs(s.x) + s.radius <= 1 and abs(s.y) + s.radius <= 1 for s in (random_odd(rng, k) for k in ODD * 5))
 
 
-def test_a_row_is_worse_by_the_networks_standard_errors() -> None:
-    names = ("mean IoU", "contact IoU", "position rms %", "force %", "integral %")
-    network = dict.fromkeys(names, (1.0, 0.1))
-    better = {"mean IoU": 1.1, "contact IoU": 1.1, "position rms %": 0.9, "force %": 0.9, "integral %": 0.9}
-    service = {name: (value, 0.1) for name, value in better.items()}
-    assert gains("circle", network, service) == pytest.approx([1.0] * 5)
-    assert min(gains("circle", network, service | {"force %": (1.2, 0.1)})) == pytest.approx(-2.0)
-    assert min(gains("hertz", network, service | {"mean IoU": (0.5, 0.1)})) > 0
+def test_a_row_is_worse_by_standard_errors_of_the_difference() -> None:
+    higher = ("outline IoU", "class %", "mean IoU", "contact IoU")
+    lower = ("position rms %", "force %", "integral %", "area %")
+    network = dict.fromkeys((*higher, *lower), (1.0, 0.08))
+    service = dict.fromkeys(higher, (1.1, 0.06)) | dict.fromkeys(lower, (0.9, 0.06))
+    assert gains("circle", network, service) == pytest.approx([1.0] * 8)
+    assert min(gains("circle", network, service | {"force %": (1.2, 0.06)})) == pytest.approx(-2.0)
+    assert min(gains("hertz", network, service | {"mean IoU": (0.5, 0.06)})) > 0
+    assert better((1.0, 0.0), (1.0, 0.0)) == 0.0
 
 
 def test_the_class_is_as_sure_as_it_is_right() -> None:

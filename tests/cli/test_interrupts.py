@@ -78,6 +78,20 @@ def test_offline_programs(runtime: Path, module: str) -> None:
     assert code in LEFT and "Traceback" not in out, (code, out)
 
 
+LOADING = """
+import models
+try:
+    raise KeyboardInterrupt
+except KeyboardInterrupt as stopped:
+    raise ImportError("initialization failed") from stopped
+"""
+
+
+def test_a_compiled_module_that_is_interrupted_while_it_loads_says_so() -> None:
+    ended = subprocess.run([sys.executable, "-c", LOADING], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
+
+
 def test_a_robot_stands_still_however_its_controller_ends(capsys: pytest.CaptureFixture[str]) -> None:
     from examples.robot import Robot
 
