@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.response_error import FrameErrors, frame_errors
 from models.shapes import KINDS, Array, Shape
-from models.touch_fit import TouchFit
+from models.touch_fit import TouchFit, bent
 from models.touch_posterior import UNLIKELY_NOW, TouchPosterior
 from models.touch_response import TouchResponse
 from protocol.errors import EitskinError
@@ -87,7 +87,7 @@ def refined_fit(
 ) -> TouchPosterior:
     """As TouchFit, in two steps. Raises ValueError where a covariance is none."""
     before = before or likely(TouchFit(coarse, scales=(1.0,))(d, errors, start, kinds, radius))
-    return TouchFit(fine)(d, errors, start, kinds, radius, before)
+    return bent(fine, TouchFit(fine)(d, errors, start, kinds, radius, before))
 
 
 class Refiner:

@@ -77,12 +77,7 @@ class TouchFit:
             found += over_rotations(optima)
         found.sort(key=lambda fit: -fit.evidence)
         weight = np.exp([fit.evidence - found[0].evidence for fit in found])
-        share = weight / weight.sum()
-        fits = [
-            replace(fit, bend=bend(self.response, fit.kind, fit.theta)) if p > UNLIKELY_NOW else fit
-            for fit, p in zip(found, share, strict=True)
-        ]
-        return posterior_of(tuple(fits), share)
+        return posterior_of(tuple(found), weight / weight.sum())
 
     def _starts(self, frame: _Whitened, kind: str, start: Shape, radius: float | None) -> list[Array]:
         """The likeliest rotation, place and area being the start's, and those that divide the period with it: its
@@ -102,6 +97,17 @@ class TouchFit:
             turned.append(theta)
         best = int(np.argmin([frame.misfit(kind, theta) for theta in turned]))
         return [turned[(best + k * STARTS[kind] // TRIED[kind]) % STARTS[kind]] for k in range(TRIED[kind])]
+
+
+def bent(response: TouchResponse, posterior: TouchPosterior) -> TouchPosterior:
+    """A fit with the bend of each kind that may be followed."""
+    fits = (
+        replace(fit, bend=bend(response, fit.kind, fit.theta))
+        if posterior.probability[fit.kind] > UNLIKELY_NOW
+        else fit
+        for fit in posterior.fits
+    )
+    return replace(posterior, fits=tuple(fits))
 
 
 def bend(response: TouchResponse, kind: str, theta: Array) -> Array:

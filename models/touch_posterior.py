@@ -33,7 +33,7 @@ class KindFit:
     """The likeliest touch of one kind. covariance: of theta; misfit: whitened energy it leaves, about K where it fits;
     evidence: log, nats, over the sizes that the response's error may have; as_assumed: where it is as large as was
     assumed. slope (K, n): of the response to theta; bend (K, 3): half its second derivatives to x x, x y and y y, zeros
-    where the kind is too unlikely to be followed; gain (n, K): of theta to the frame.
+    where it is not to be followed (touch_fit.bent); gain (n, K): of theta to the frame.
     """
 
     kind: str

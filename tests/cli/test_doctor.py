@@ -31,15 +31,29 @@ def test_what_the_bundle_cannot_tell_is_said(skin, tmp_path) -> None:  # type: i
     assert "not checked with the bundle disc16: shorts" in " ".join(skin("doctor", "--config", file).out.split())
 
 
-def test_why_touches_are_not_refined_is_said(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
-    for bundle, says in (
-        ("square16", "touches are refined by a fit"),
-        ("disc16", "refinement off: bundle disc16 is measured"),
-    ):
+@pytest.mark.parametrize(
+    ("key", "said", "is_on", "is_off"),
+    [
+        (
+            'indenter = { kind = "any" }',
+            "refine",
+            "touches are refined by a fit",
+            "refinement off: bundle disc16 is measured",
+        ),
+        (
+            "touch = { symmetry = true }",
+            "symmetry",
+            "OK palm: symmetry a held touch's image becomes the mean",
+            "WARN palm: symmetry symmetry off: the mean is of a network's images",
+        ),
+    ],
+)
+def test_why_an_option_is_off_is_said(skin, tmp_path, key: str, said: str, is_on: str, is_off: str) -> None:  # type: ignore[no-untyped-def]
+    for bundle, says in (("square16", is_on), ("disc16", is_off)):
         file = tmp_path / f"{bundle}.toml"
-        file.write_text(f'[skins.palm]\nport = "stub"\nbundle = "{bundle}"\nindenter = {{ kind = "any" }}\n')
+        file.write_text(f'[skins.palm]\nport = "stub"\nbundle = "{bundle}"\n{key}\n')
         assert says in " ".join(skin("doctor", "--config", file).out.split())
-    assert "refine" not in skin("doctor").out
+    assert said not in skin("doctor").out
 
 
 def test_an_indenter_larger_than_the_skin_stops_doctor_and_service(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
@@ -51,17 +65,6 @@ def test_an_indenter_larger_than_the_skin_stops_doctor_and_service(skin, tmp_pat
     assert ran.code == 2 and says in " ".join((ran.out + ran.err).split())
     ran = skin("doctor", "--config", configured(tmp_path, "stub", "indenter = { radius_m = 0.001 }\n"))
     assert "WARN palm: indenter refinement off: `radius_m` is 0.001 m" in " ".join(ran.out.split())
-
-
-def test_why_nothing_is_averaged_is_said(skin, tmp_path) -> None:  # type: ignore[no-untyped-def]
-    for bundle, says in (
-        ("square16", "OK palm: symmetry a held touch's image becomes the mean"),
-        ("disc16", "WARN palm: symmetry symmetry off: the mean is of a network's images"),
-    ):
-        file = tmp_path / f"{bundle}.toml"
-        file.write_text(f'[skins.palm]\nport = "stub"\nbundle = "{bundle}"\ntouch = {{ symmetry = true }}\n')
-        assert says in " ".join(skin("doctor", "--config", file).out.split())
-    assert "symmetry" not in skin("doctor").out
 
 
 def test_electrodes_in_order(bundle: Bundle) -> None:

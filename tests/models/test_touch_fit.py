@@ -9,7 +9,7 @@ from models.forward import shared
 from models.response_error import FrameErrors, frame_errors
 from models.response_tables import response_tables
 from models.shapes import Array, Shape
-from models.touch_fit import TouchFit
+from models.touch_fit import TouchFit, bent
 from models.touch_response import TouchResponse
 
 SIGMA = np.full(120, 10 ** (-70 / 20))
@@ -144,7 +144,8 @@ def test_a_covariance_that_is_none(response: TouchResponse) -> None:
 def test_a_fit_knows_the_response_to_second_order_in_place(response: TouchResponse, gram: Array) -> None:
     touch = Shape("circle", 0.2, -0.1, 0.25, 0.3)
     d = frame(response, touch)
-    fit = TouchFit(response)(d, frame_errors(gram, SIGMA, d, touch.drop), near(touch), ("circle",)).fits[0]
+    found = TouchFit(response)(d, frame_errors(gram, SIGMA, d, touch.drop), near(touch), ("circle",))
+    fit = bent(response, found).fits[0]
     moved = Shape("circle", fit.shape.x + 0.04, fit.shape.y - 0.03, fit.shape.radius, fit.shape.drop)
     change, step = response.of(moved) - response.of(fit.shape), np.array([0.04, -0.03, 0.0, 0.0])
     first, second = (
