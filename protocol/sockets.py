@@ -172,6 +172,11 @@ class StageReader(_SkippingReader):
         self._part: PartFrame | None = None
         self._after = -1  # scan of the image frame that was read last
 
+    def ask_again(self) -> None:
+        """Subscribe anew, so that upstream sends its latched values and held image again."""
+        self.listen(False)
+        self.listen(True)
+
     @property
     def more(self) -> bool:
         """Whether another frame is here already, whatever the socket says."""

@@ -19,10 +19,10 @@ from protocol import transport
 from protocol.frames import Frame, FrameError, InfoFrame
 from protocol.publishing import covers
 from protocol.runtime import host_id
-from protocol.sockets import ControlServer, Publisher
+from protocol.sockets import ControlServer, Publisher, StageReader
 from protocol.topics import TOPIC_OF
 from services.runtime import persistence
-from services.runtime.channel import Channel, Feed, Newest
+from services.runtime.channel import Channel, Feed
 from services.runtime.commands import Commands
 from services.runtime.config import ConfigFile
 from services.runtime.lateness import Lateness
@@ -71,7 +71,7 @@ class Runner:
 
     def add(self, stage: Stage, feed: Feed | None = None) -> None:
         """Drive this stage; without a feed, from the topic that it reads."""
-        channel = Channel(self.process, stage, Newest(stage.reads, stage.skin) if feed is None else feed)
+        channel = Channel(self.process, stage, StageReader(stage.reads, stage.skin) if feed is None else feed)
         self.channels[stage.skin] = channel
         self._by_socket[channel.feed.socket] = channel
         for command in stage.commands:
@@ -138,7 +138,7 @@ class Runner:
         frames: list[Frame] = []
         while len(frames) < AT_ONCE and (frame := channel.feed.recv()) is not None:
             frames.append(frame)
-            if isinstance(channel.feed, Newest) and not channel.feed.more:
+            if isinstance(channel.feed, StageReader) and not channel.feed.more:
                 return frames
         news = self._lateness.news(frames, stood)
         channel.heartbeat.drops["late"] += len(frames) - len(news)
@@ -165,7 +165,7 @@ class Runner:
                 add_reason(out.reasons, "late")
             self._send(channel, out)
         beat.done(frame, now, time.monotonic_ns(), late)
-        if stage.lacks and not channel.asleep and isinstance(channel.feed, Newest):
+        if stage.lacks and not channel.asleep and isinstance(channel.feed, StageReader):
             channel.feed.ask_again()
         self._frames += 1
 
@@ -231,7 +231,7 @@ class Runner:
         for channel in self.channels.values():
             channel.wanted = self._wanted(channel.stage)
             self._sleep_or_wake(channel)
-            if isinstance(channel.feed, Newest):
+            if isinstance(channel.feed, StageReader):
                 channel.feed.mind()
             beat = channel.heartbeat
             beat.drops["malformed"], beat.drops["skipped"] = channel.feed.malformed, channel.feed.skipped
@@ -259,7 +259,7 @@ class Runner:
 
     def _sleep_or_wake(self, channel: Channel) -> None:
         """A stage whose frames nobody reads does not read either, so that upstream need not work for it."""
-        if not channel.stage.sleeps or not isinstance(channel.feed, Newest):
+        if not channel.stage.sleeps or not isinstance(channel.feed, StageReader):
             return
         idle = not channel.wanted
         if idle != channel.asleep:

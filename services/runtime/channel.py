@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from protocol.frames import Frame
-from protocol.sockets import StageReader
 from protocol.topics import wire_topic
 from services.runtime.heartbeat import Heartbeat
 from services.runtime.stage import Stage
@@ -35,42 +34,3 @@ class Channel:
         self.asleep = False
         self.wanted: frozenset[str] = frozenset()  # topics somebody subscribes to, as of the last tick
         self.errors: set[str] = set()
-
-
-class Newest:
-    """A stage's input from a socket: the newest frame, and what belongs to it."""
-
-    def __init__(self, topic: str, skin: str) -> None:
-        self.reader = StageReader(topic, skin)
-        self.socket = self.reader.socket
-
-    @property
-    def malformed(self) -> int:
-        return self.reader.malformed
-
-    @property
-    def skipped(self) -> int:
-        return self.reader.skipped
-
-    @property
-    def more(self) -> bool:
-        """Whether another frame waits that the socket says nothing of."""
-        return self.reader.more
-
-    def recv(self) -> Frame | None:
-        return self.reader.recv()
-
-    def listen(self, on: bool) -> None:
-        self.reader.listen(on)
-
-    def mind(self) -> None:
-        """Connect anew where ZeroMQ has given up; no arriving frame would make us notice."""
-        self.reader.mind()
-
-    def ask_again(self) -> None:
-        """Subscribe anew, so that upstream sends its latched values and held image again."""
-        self.listen(False)
-        self.listen(True)
-
-    def close(self) -> None:
-        self.reader.close()
