@@ -13,7 +13,7 @@ TORCH := torch==2.13.0+cpu
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: up venv venv-dev ros-venv test golden lint site train lock clean
+.PHONY: up venv venv-dev ros-venv test test-all golden lint site train lock clean
 
 up: venv
 	./skin up
@@ -54,8 +54,12 @@ $(ROS_VENV)/.done:
 	$(ROS_VENV)/bin/python -m pip install -q --disable-pip-version-check numpy $(ROS_PACKAGES:%=ros-$(ROS)-%)
 	@touch $@
 
+# Five minutes on two cores once all is installed. What is slow by nature is in test-all, which CI runs.
 test: venv-dev lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+test-all: venv-dev lint
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "slow or not slow"
 
 # What recordings of tests/ give now is what they are to give from now on; git diff shows what changed.
 golden: venv-dev

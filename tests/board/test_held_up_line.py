@@ -24,6 +24,7 @@ import zmq
 
 from tests.board.delaying_proxy import DelayingProxy
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 HALF_SCAN_S = 0.0218  # of 120 measurements at 128 points
 LINE_S = 0.0114  # that a full scan takes at 921 600 baud

@@ -116,6 +116,7 @@ def test_an_uneven_skin_is_learned_from_differences_of_any_scale(bundle: Bundle,
     assert np.allclose(errors[0], errors[1], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_many_presses_correct_what_the_likelihood_gets_wrong(bundle: Bundle, reference: Path) -> None:
     arrays = load_npz(reference / "hydrogel_vse_concentric.npz")
     order = np.random.default_rng(1).permutation(len(arrays["xy"]))

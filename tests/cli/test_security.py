@@ -189,6 +189,7 @@ def refused(folder: Path, more: str) -> str:
     return done.stderr
 
 
+@pytest.mark.slow
 def test_up_refuses_what_a_process_would_die_of(runtime: Path, tmp_path: Path) -> None:
     address = '[sockets.addresses]\npublisher = "tcp://0.0.0.0:{}"\n'
     free, taken = free_ports()
@@ -216,6 +217,7 @@ def test_up_refuses_what_a_process_would_die_of(runtime: Path, tmp_path: Path) -
     assert "there is no such folder" in refused(tmp_path, nowhere)
 
 
+@pytest.mark.slow
 def test_up_says_the_addresses_it_really_uses(runtime: Path, tmp_path: Path) -> None:
     port = free_ports()[0]
     (tmp_path / "skin.toml").write_text(SKIN + f'[sockets.addresses]\npublisher = "tcp://127.0.0.1:{port}"\n')

@@ -93,6 +93,7 @@ def run(checkout: Path, *arguments: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_every_block_fits_and_what_it_adds_is_there(extended: Path) -> None:
     assert len(BLOCKS) >= 15
     run(extended, "-c", ADDED)

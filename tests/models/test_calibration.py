@@ -33,6 +33,7 @@ def measured(mismatch: Mismatch, shapes: tuple[Shape, ...] = ()) -> np.ndarray:
     return np.abs(MismatchedSheet("square16", mismatch).solve(shapes).impedances())
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_forward_model(skin: geometry.SkinGeometry) -> None:
     modes, rng = FieldModes(skin), np.random.default_rng(0)
     nominal = Mounting.nominal(skin, modes.count)
@@ -54,6 +55,7 @@ def test_derivatives_are_those_of_the_forward_model(skin: geometry.SkinGeometry)
         assert np.linalg.norm(found - slopes[mesh][:, column]) < within * np.linalg.norm(found), column
 
 
+@pytest.mark.slow
 def test_a_fit_finds_anisotropy_contacts_and_shifts(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     mismatch = Mismatch(anisotropy=0.05, contacts=3, contact_factor=3.0)
     z0 = 7.3 * measured(mismatch)  # a board in any unit
@@ -80,6 +82,7 @@ def test_an_even_well_made_skin_is_left_as_it_is(skin: geometry.SkinGeometry, ma
     assert np.abs(mounting.field).max() < 0.1
 
 
+@pytest.mark.slow
 def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(
     skin: geometry.SkinGeometry, matrices: Matrices
 ) -> None:
@@ -97,12 +100,14 @@ def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(
     assert (made.level == matrices.level).all() and made.scale_index == matrices.scale_index
 
 
+@pytest.mark.slow
 def test_linearising_about_the_file_gives_the_files_matrices(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     made = calibrated(matrices, skin, Mounting.nominal(skin, FieldModes(skin).count))
     for name in ("z0", "gram", "back", "jacobian", "contact"):
         np.testing.assert_allclose(getattr(made, name), getattr(matrices, name), rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_large_shifts_stay_bounded_and_never_make_it_worse(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     mismatch = named("shift3").seeded(1)
     z0 = measured(mismatch)

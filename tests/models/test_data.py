@@ -43,6 +43,7 @@ def test_a_run_can_be_stopped_and_taken_up(folder, tmp_path):
     assert not list(tmp_path.glob(".*.part"))
 
 
+@pytest.mark.slow
 def test_a_local_dask_cluster_gives_the_same_files(folder, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:

@@ -62,6 +62,7 @@ def simulated(bundle: Bundle, touches: list[Shape]) -> Samples:
     return Samples(d[None].astype(np.float32), *picture(rows), rows)
 
 
+@pytest.mark.slow
 def test_a_simulated_press_comes_out_as_it_was_measured(registered: Bundle, model: warped.WarpedModel) -> None:
     assert registered.locator is not None
     locator = Locator(registered.locator)

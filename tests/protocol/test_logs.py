@@ -80,6 +80,7 @@ def test_a_traceback_is_kept_and_bounded(log):
     assert "Traceback" in text and len(text) <= logs.LINE + 100
 
 
+@pytest.mark.slow
 def test_a_peer_that_sends_rubbish_cannot_fill_the_log(runtime, context, log):
     publisher = Publisher("publisher", context)
     reader = NewestReader("contact", "palm", context=context)

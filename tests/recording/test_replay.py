@@ -94,6 +94,7 @@ with RecordingWriter(Path(sys.argv[2])) as writer:
 """
 
 
+@pytest.mark.slow
 def test_scans_in_parts_of_which_some_were_lost_give_the_contacts_of_one_process(runtime: Path, tmp_path: Path) -> None:
     """Which image meets which part is decided by their numbers: images and parts come to publisher from two processes,
     and whichever is first, the contacts are bit by bit those of the stages called one after the other.
@@ -115,6 +116,7 @@ def test_scans_in_parts_of_which_some_were_lost_give_the_contacts_of_one_process
         assert msgpack.packb(a) == msgpack.packb(b), a["scan"]
 
 
+@pytest.mark.slow
 def test_a_socket_file_deleted_during_a_replay_is_there_again_and_no_frame_is_lost(
     recording: Path, tmp_path: Path
 ) -> None:

@@ -84,6 +84,7 @@ def pid_of(process: str) -> int:
     raise AssertionError(f"no process of {process}")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("service")
 def test_no_stopped_process_makes_a_controller_act_on_an_old_frame() -> None:
     robot = Controller()

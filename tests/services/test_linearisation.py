@@ -98,6 +98,7 @@ def forces(tmp_path: Path, bundle: Bundle) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(
     sheet: MismatchedSheet, bundle: Bundle, forces: Path
 ) -> None:
@@ -149,6 +150,7 @@ def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(
     assert bench.pipeline.pre.linearisation.name == "" and bench.feed().contact.valid
 
 
+@pytest.mark.slow
 def test_no_calibration_is_adopted_while_something_touches(sheet: MismatchedSheet) -> None:
     bench = Bench(sheet)
     bench.feed(frames=80)
@@ -226,6 +228,7 @@ def _raw(bench: Bench) -> RawFrame:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_forces_are_calibrated_on_the_images_that_a_tare_leads_to(
     sheet: MismatchedSheet, bundle: Bundle, tmp_path: Path
 ) -> None:

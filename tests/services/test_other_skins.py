@@ -57,7 +57,9 @@ class Made:
         return result
 
 
-@pytest.fixture(scope="module", params=["disc12", "ell16", pytest.param("disc32", marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module", params=["disc12", *(pytest.param(skin, marks=pytest.mark.slow) for skin in ("ell16", "disc32"))]
+)
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Made:
     return Made(request.param, tmp_path_factory.mktemp("skins"))
 

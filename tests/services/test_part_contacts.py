@@ -64,6 +64,7 @@ def test_a_touch_beside_an_electrode_is_shown_from_two_parts(bundle, evidence, p
     assert sum(after for _, after in found) >= 14
 
 
+@pytest.mark.slow
 def test_while_a_contact_rises_no_frame_shows_a_touch_and_a_whole_scan_names_it():
     """In the fault matrix, at this electrode and rise, the first parts made a phantom."""
     row = next(row for row in ROWS if row.title == CONTACT_RISES)

@@ -208,6 +208,7 @@ class OneFrame:
         pass
 
 
+@pytest.mark.slow
 def test_a_tare_by_command_is_followed_by_a_calibration_that_outlives_a_crash(
     process: Process, board: Board, bundle: Bundle, runtime: Path
 ) -> None:

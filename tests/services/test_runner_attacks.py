@@ -52,6 +52,7 @@ def keep_feeding(process: Process, board: Board, seconds: float) -> tuple[float,
     return max(longest, time.monotonic() - last), said
 
 
+@pytest.mark.slow
 def test_deleted_sockets_are_bound_anew(process: Process, board: Board, runtime: Path) -> None:  # noqa: F811
     process.connect(board)
     for name in ("preprocessing.ipc", "preprocessing.ctl"):
@@ -62,6 +63,7 @@ def test_deleted_sockets_are_bound_anew(process: Process, board: Board, runtime:
     assert process.control.call("status")["flowing"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "socket", "count", "says"),
     [
