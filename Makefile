@@ -18,8 +18,8 @@ export OPENBLAS_NUM_THREADS ?= 1
 up: venv
 	./skin up
 
-venv: $(VENV)/.service $(VENV)/.three $(WANTED:%=$(VENV)/.%)
-venv-dev: $(VENV)/.dev $(VENV)/.three
+venv: $(VENV)/.service $(WANTED:%=$(VENV)/.%)
+venv-dev: $(VENV)/.dev
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "found Python %s; eitskin needs 3.11 or newer: make PYTHON=python3.11 ..." % sys.version.split()[0])'
@@ -38,11 +38,6 @@ $(VENV)/.dev: requirements/dev.lock requirements/service.lock | $(BIN)/python
 	$(BIN)/python -m pip install -q --disable-pip-version-check "$(TORCH)" || { echo \
 	  "no wheel of $(TORCH) found: install PyTorch's CPU build 2.13.0 into $(VENV) as pytorch.org describes, then run make again"; exit 1; }
 	@touch $@ $(VENV)/.service
-
-# three.js, which draws the skin as a surface on the page; without it the page has the flat map alone.
-$(VENV)/.three: bridges/page/fetch_three.py | $(BIN)/python
-	@$(BIN)/python -m bridges.page.fetch_three
-	@touch $@
 
 # ROS 2 itself, as wheels, in an environment of its own: what tests/bridges/test_ros2_node.py listens with. 270 MB.
 ROS ?= kilted

@@ -28,7 +28,6 @@ from protocol.topics import RECORDER
 from .advice import ADVICE
 from .commands import BUTTONS, Buttons
 from .feed import SkinFeed
-from .fetch_three import three_folder, verified
 from .replays import REPLAY
 from .settings import LOOPBACK, PageSettings
 from .viewer import Viewer
@@ -59,9 +58,7 @@ class PageServer:
         self.buttons = Buttons(secret, self.feeds, settings.recordings, partial(self._tell, REPLAY))
         self._viewers: set[Viewer] = set()
         self._metrics: SkinMetrics | None = None
-        self._three = verified(three_folder())
         self._files = {f"/{path.name}": path.read_bytes() for path in WEB.iterdir() if path.suffix in TYPES}
-        self._files |= {f"/three/{name}": content for name, content in self._three.items()}
         self._files["/"] = self._files["/index.html"]
 
     def listen(self) -> socket.socket:
@@ -187,7 +184,6 @@ class PageServer:
             "reasons": REASONS,
             "advice": ADVICE,
             "electrode_states": list(ELECTRODE_STATES),
-            "three": bool(self._three),
             "buttons": [
                 name
                 for name, button in BUTTONS.items()

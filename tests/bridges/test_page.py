@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import json
 import re
 import time
@@ -18,7 +17,6 @@ import msgpack
 import numpy as np
 import pytest
 
-from bridges.page import fetch_three
 from bridges.page.advice import ADVICE
 from bridges.page.commands import OwnRecorder
 from bridges.page.replays import Replay, ReplayRefused, listed
@@ -106,7 +104,7 @@ def test_asked_by_another_name_or_from_another_page_it_refuses(runtime: Path) ->
             assert status == 200 and "default-src 'none'" in policy and "unsafe" not in policy
             assert (await asked("/", Host="evil.example"))[0] == 421
             assert (await asked("/", Host=f"evil.example:{server.port}"))[0] == 421
-            for path in ("/server.py", "/../server.py", "/%2e%2e/server.py", "/three/../main.js.map", "/etc/passwd"):
+            for path in ("/server.py", "/../server.py", "/%2e%2e/server.py", "/web/../main.js.map", "/etc/passwd"):
                 assert (await asked(path))[0] == 404, path
             for origin in ("http://evil.example", f"https://127.0.0.1:{server.port}", "null", ""):
                 with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
@@ -349,19 +347,6 @@ def test_only_recordings_of_the_folder_are_replayed(tmp_path: Path) -> None:
     for speed, start in ((0, 0.0), (1e9, 0.0), (1.0, -1.0), (float("nan"), 0.0), ("fast", 0.0), (1.0, None)):
         with pytest.raises(ReplayRefused, match="expected 0.05 to 50"):
             Replay(tmp_path / "in", "cut.mcap", speed, start)
-
-
-def test_three_js_is_taken_by_its_hash_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    contents = {name: f"// {name}".encode() for name in fetch_three.SHA256}
-    for name, content in contents.items():
-        (tmp_path / name).write_bytes(content)
-    assert fetch_three.verified(tmp_path) == {}
-    monkeypatch.setattr(fetch_three, "SHA256", {n: hashlib.sha256(c).hexdigest() for n, c in contents.items()})
-    assert fetch_three.verified(tmp_path) == contents
-    (tmp_path / "three.core.min.js").unlink()
-    assert fetch_three.verified(tmp_path) == {}
-    monkeypatch.setenv("PATH", "")
-    assert fetch_three.fetch(tmp_path / "new") == "there is no npm here" and not (tmp_path / "new").exists()
 
 
 def test_the_settings_in_skin_toml_reach_it() -> None:

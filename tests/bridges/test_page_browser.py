@@ -14,19 +14,19 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from bridges.page.fetch_three import three_folder, verified
 from protocol.frames import unpack
 from services.recordings.recording import RecordingReader
 
 ROOT = Path(__file__).resolve().parents[2]
 VECTORS = ROOT / "protocol" / "vectors"
 WAIT_MS = 30_000
-# No sandbox: CI is root in a container. Software drawing without WebGL, but where a test wants it.
+# No sandbox: CI is root in a container. Without WebGL, but where a test wants it: software draws it then.
 FLAT = ["--no-sandbox", "--disable-gpu", "--disable-3d-apis"]
 SOLID = ["--no-sandbox", "--disable-gpu-compositing", "--use-angle=swiftshader-webgl", "--enable-unsafe-swiftshader"]
 TRUST_CHANGES = """() => {
@@ -83,9 +83,29 @@ def browser(launch: Callable[..., Any]) -> Iterator[Any]:
         yield one
 
 
+@pytest.fixture(scope="module")
+def solid_browser(launch: Callable[..., Any]) -> Iterator[Any]:
+    with launch(SOLID) as one:
+        yield one
+
+
 @pytest.fixture
 def page(browser: Any, address: str) -> Iterator[Open]:
-    """Opens the page; a test fails where the browser complains, or asks anybody else for anything."""
+    """Opens the page, with the flat map alone."""
+    with opening(browser, address) as opened:
+        yield opened
+
+
+@pytest.fixture
+def solid(solid_browser: Any, address: str) -> Iterator[Open]:
+    """Opens the page, with the surface."""
+    with opening(solid_browser, address) as opened:
+        yield opened
+
+
+@contextmanager
+def opening(browser: Any, address: str) -> Iterator[Open]:
+    """Opens pages; a test fails where the browser complains, or asks anybody else for anything."""
     wrong: list[str] = []
     contexts = []
     own = address.split("/#")[0]
@@ -323,26 +343,124 @@ def test_what_is_no_message_is_refused(page: Open) -> None:
         assert found.evaluate(refuses, list(bad)) != "took it", bad
 
 
-def test_the_surface_dents(launch: Callable[..., Any], address: str) -> None:
-    """With WebGL, which software draws here."""
-    if not verified(three_folder()):
-        missing("THREE.JS MISSING: `make venv` fetches it with npm")
-    with launch(SOLID) as one:
-        page = one.new_page(viewport={"width": 1280, "height": 900})
-        page.set_default_timeout(WAIT_MS)
-        page.goto(address)
-        page.wait_for_selector("#surface canvas")
-        deepest = """async () => {
-          const { Surface } = await import("/surface.js");
-          const s = await Surface.on(document.createElement("div"));
-          const drop = new Float32Array(96 * 96); drop[48 * 96 + 24] = drop[49 * 96 + 24] = 0.5;
-          s.dent(drop, 96, 96, 0.5); s.draw(1e9);
-          const p = s.plane.attributes.position; let k = 0;
-          for (let i = 1; i < p.count; i++) if (p.getZ(i) < p.getZ(k)) k = i;
-          return [p.getX(k), p.getY(k), p.getZ(k)];
-        }"""
-        x, y, z = page.evaluate(deepest)
-        assert z < -0.05 and abs(x + 0.5) < 0.06 and abs(y) < 0.06
+def ask_surface(page: Any, function: str, *arguments: object) -> Any:
+    """What a function of the page's surface, and of these, returns."""
+    ask = f"async rest => ({function})((await import('/main.js')).surface, ...rest)"
+    return page.evaluate(ask, arguments)
+
+
+def shade(page: Any, x_mm: float, y_mm: float, above_mm: float | None = None) -> list[int]:
+    """Red, green, blue and alpha that are drawn at a place of the skin: of its face, or above where it is flat."""
+    function = """(s, x, y, above) => {
+      s.draw(performance.now());
+      if (!s.view) return [0, 0, 0, 0];
+      const at = [x / 1e3 / s.half, y / 1e3 / s.half], z = above === null ? s.height(at) : above / 1e3 / s.half;
+      const scale = s.canvas.width / s.root.clientWidth, [across, down] = s.project([...at, z]);
+      const found = new Uint8Array(4);
+      s.gl.readPixels(scale * across, s.canvas.height - scale * down, 1, 1, s.gl.RGBA, s.gl.UNSIGNED_BYTE, found);
+      return Array.from(found);
+    }"""
+    return ask_surface(page, function, x_mm, y_mm, above_mm)  # type: ignore[no-any-return]
+
+
+def is_bare(colour: list[int]) -> bool:
+    return colour[3] == 255 and max(colour[:3]) - min(colour[:3]) < 60
+
+
+def is_hot(colour: list[int]) -> bool:
+    """As the map has it in the middle of a press."""
+    return colour[3] == 255 and colour[0] > 150 and colour[0] - colour[2] > 80
+
+
+def is_well(colour: list[int]) -> bool:
+    return colour[1] > colour[0] + 30
+
+
+def electrode(page: Any, number: int) -> tuple[float, float]:
+    """Where it is, in millimetres."""
+    x, y = ask_surface(page, "(s, k) => s.pins[k].map(v => 1e3 * v * s.half)", number)
+    return x, y
+
+
+def drawn_ms(page: Any) -> float:
+    """When the surface was drawn last."""
+    return float(ask_surface(page, "s => s.drawn"))
+
+
+def test_the_surface_is_hot_where_it_is_pressed(solid: Open) -> None:
+    found = solid()
+    until(lambda: is_bare(shade(found, 16, -15)) and is_bare(shade(found, -16, 15)))
+    assert shade(found, 0, 300)[3] == 0  # nothing is drawn beside the skin
+    found.mouse.move(*place(found, 20, -10))
+    found.mouse.down()
+    until(lambda: is_hot(shade(found, 16, -15)))  # in front of the arrow
+    assert ask_surface(found, "s => s.height([0.02 / s.half, -0.01 / s.half])") < -0.05
+    assert is_bare(shade(found, -16, 15))
+    until(lambda: re.search(r"\d N", found.inner_text("#surface .force")))
+    found.mouse.up()
+    until(lambda: is_bare(shade(found, 16, -15)))
+
+
+def test_a_dead_electrode_is_seen_on_the_surface(solid: Open) -> None:
+    found = solid()
+    at = electrode(found, 5)
+    until(lambda: is_well(shade(found, *at, 1)))
+    found.click("text=Dead electrode")
+    until(lambda: found.locator("#surface .fault").all_inner_texts() == ["5 ×"])
+    until(lambda: (colour := shade(found, *at, 2))[0] > colour[1] + 60)
+    found.click("text=All well again")
+    until(lambda: is_well(shade(found, *at, 1)))
+    assert found.locator("#surface .fault").count() == 0
+
+
+def test_the_surface_is_turned_by_hand_and_drawn_only_when_it_changes(solid: Open) -> None:
+    found = solid(390, 500)
+    until(lambda: nothing_touches(found))
+    found.locator("#surface").scroll_into_view_if_needed()
+    first = found.locator("#surface .number").first
+
+    def is_still() -> bool:
+        before = drawn_ms(found)
+        time.sleep(0.5)
+        return before > 0 and drawn_ms(found) == before
+
+    until(is_still)
+    before = first.bounding_box()
+    found.locator("#surface").press("ArrowLeft")
+    until(lambda: first.bounding_box() != before)
+    found.locator("#surface").press("Home")
+    until(lambda: first.bounding_box() == before)
+    box = found.locator("#surface").bounding_box()
+    found.mouse.move(box["x"] + 100, box["y"] + 100)
+    found.mouse.down()
+    found.mouse.move(box["x"] + 160, box["y"] + 110)
+    found.mouse.up()
+    until(lambda: first.bounding_box() != before)
+    found.evaluate("scrollTo(0, document.body.scrollHeight)")
+    until(lambda: not ask_surface(found, "s => s.seen"))
+    unseen = drawn_ms(found)
+    found.locator("#surface").dispatch_event("keydown", {"key": "ArrowLeft"})
+    time.sleep(0.5)
+    assert drawn_ms(found) == unseen
+    found.locator("#surface").scroll_into_view_if_needed()
+    until(lambda: drawn_ms(found) > unseen)
+
+
+def test_a_lost_surface_is_said_and_comes_back(solid: Open) -> None:
+    found = solid()
+    at = electrode(found, 0)
+    until(lambda: shade(found, *at, 1)[3] == 255)
+    ask_surface(found, "s => { window.taken = s.gl.getExtension('WEBGL_lose_context'); taken.loseContext(); }")
+    until(lambda: found.is_hidden("#surface-panel"))
+    assert "map shows the same" in found.inner_text("#surface-why")
+    found.evaluate("taken.restoreContext()")
+    until(lambda: found.is_visible("#surface-panel") and found.is_hidden("#surface-why"))
+    until(lambda: is_well(shade(found, *at, 1)))
+
+
+def test_without_webgl_the_page_says_that_the_map_is_alone(page: Open) -> None:
+    found = page()
+    assert found.is_hidden("#surface-panel") and "WebGL 2" in found.inner_text("#surface-why")
 
 
 def test_a_snapshot_has_the_press_before_it(page: Open) -> None:

@@ -33,6 +33,13 @@ export function paint(canvas, values, rows, columns, top) {
   context.putImageData(image, 0, 0);
 }
 
+/** Of the electrodes' states, as the service numbers them. */
+export const SIGNS = ["", "×", "=", "?", "~", "⇄", "#"];
+const WELL = "#2f9e44", BROKEN = "#d6336c", DOUBTFUL = "#b35c00";
+const STATES = [WELL, BROKEN, BROKEN, DOUBTFUL, DOUBTFUL];
+/** An electrode's colour by its state. */
+export function stateColour(state) { return STATES[state] ?? BROKEN; }
+
 const LINES = ["#e8590c", "#1c7ed6", "#2f9e44", "#ae3ec9", "#e03131", "#0c8599"];
 /** A contact's colour by its id. */
 export function lineColour(id) { return LINES[id % LINES.length]; }

@@ -24,7 +24,8 @@ const map = new SkinMap(by("map"));
 const timeline = new Timeline(by("timeline"));
 const state = { skin: "", hello: null, newest: {}, pictures: {}, statuses: new Map(), info: null, session: "", noise: 0 };
 const recent = { scans: new panels.Recent(), latency: new panels.Recent(), shown: new panels.Recent(), draw: new panels.Recent() };
-let surface = null, verdict = { ok: false }, undrawn = false;
+const surface = new Surface(by("surface"), noSurface);
+let verdict = { ok: false }, undrawn = false;
 const drawn = { ms: 0, words: 0, summary: 0 };
 
 /** The token of the printed address; kept for this tab, and taken out of the address bar. */
@@ -44,8 +45,6 @@ const link = new Link({
     select.replaceChildren(...message.skins.map((name) => new Option(name, name)));
     select.value = message.skins.includes(state.skin) ? state.skin : message.skins[0];
     by("record").hidden = by("snapshot").hidden = by("recordings").hidden = !message.buttons.includes("record");
-    by("surface-panel").hidden = !message.three;
-    if (message.three && !surface) Surface.on(by("surface")).then(hasSurface);
     watch();
   },
   frames(skin, frames) {
@@ -56,10 +55,11 @@ const link = new Link({
   state() { look(); },
 }, token);
 
-function hasSurface(found) {
-  surface = found;
-  by("surface-panel").hidden = !found;
-  if (found && state.info) found.geometry(map.points, state.info.geometry.electrodes);
+/** Without a surface the map has its room, and says why. */
+function noSurface(why) {
+  by("surface-panel").hidden = why !== "";
+  by("surface-why").hidden = !why;
+  panels.text("surface-why", why);
 }
 
 function watch(name = by("skin").value) {
@@ -85,7 +85,7 @@ function know(info) {
   if (know.shape === shape) return;
   know.shape = shape;
   map.geometry(info.geometry);
-  surface?.geometry(map.points, info.geometry.electrodes);
+  surface.geometry(map.points, info.geometry.electrodes);
 }
 
 function contact(frame, now) {
@@ -154,14 +154,13 @@ function draw(now) {
   look();
   press.step();
   if (map.draw(elapsed, still.matches)) {
-    surface?.dent(map.shown, map.rows, map.columns, map.top);
+    surface.dent(map.shown, map.last, map.top);
     by("ramp-top").textContent = `${map.top.toFixed(2)} S/m`;
   }
   if (undrawn && map.bounds) {
     undrawn = false;
     news(now);
   }
-  surface?.draw(now);
   replays.look(now);
   timeline.draw(now, still.matches ? 500 : 66);
   if (now - drawn.words > WORDS_MS) words(now);
@@ -175,12 +174,15 @@ function news(now) {
     const same = shape?.frame.session === found.frame.session && Math.abs(shape.frame.scan - found.frame.scan) <= 1;
     const outlines = new Map(same ? shape.frame.ids.map((id, k) => [id, shape.frame.outlines[k]]) : []);
     map.contacts(list, outlines, now);
-    surface?.contacts(list);
+    surface.contacts(list);
     panels.contacts(list);
     if (found.measured !== null && link.clock.known) recent.shown.add(now, link.clock.now() - found.measured / 1e6);
   }
   map.truth(truth && now - truth.heard < TRUTH_MS ? truth.frame.touches : []);
-  if (change) map.electrodes(change.frame.electrodes, state.hello?.electrode_states ?? []);
+  if (change) {
+    map.electrodes(change.frame.electrodes, state.hello?.electrode_states ?? []);
+    surface.electrodes(change.frame.electrodes);
+  }
   panels.compare(state.pictures.delta, state.pictures.image, state.info?.stack);
   panels.fade("one-step", !change?.frame.touched || change.frame.stack.length === 0);
   panels.fade("network", !picture?.frame.touched);
@@ -233,4 +235,4 @@ paint(by("heat"), new Float32Array(4), 2, 2, 1);
 setInterval(() => { look(); press.step(); }, 100); // also where nothing is drawn, as in a tab at the back
 requestAnimationFrame(draw);
 
-export { link, map, state }; // for tests, and for who looks with the browser's tools
+export { link, map, state, surface }; // for tests, and for who looks with the browser's tools

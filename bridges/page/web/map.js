@@ -1,11 +1,10 @@
 // The flat map: the image of the conductivity drop, and over it the outline, axes, electrodes, contacts and the truth.
 // Lengths of the overlay are millimetres, y downwards as SVG has it.
 
-import { FULL_SCALE, lineColour, paint } from "./colours.js";
+import { FULL_SCALE, lineColour, paint, SIGNS, stateColour } from "./colours.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const MARGIN = 0.16; // of the skin's width, for axes and electrodes
-const SIGNS = ["", "×", "=", "?", "~", "⇄", "#"]; // of the electrodes' states, as the service numbers them
 const TRAIL_MS = 2000;
 const EASE_MS = 30;
 const PIXELS_A_CELL = 4; // the network's own grid is so much coarser: errors of neighbouring pixels are the same error
@@ -94,6 +93,7 @@ export class SkinMap {
       const state = states[k] ?? 0;
       if (dot.dataset.state === `${state}`) return;
       dot.dataset.state = state;
+      dot.style.setProperty("--colour", stateColour(state));
       dot.dataset.name = names[state] ?? "ok";
       dot.children[1].textContent = SIGNS[state] ?? "?";
       dot.children[2].textContent = `electrode ${k}: ${names[state] ?? "ok"}`;

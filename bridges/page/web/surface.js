@@ -1,182 +1,276 @@
-// The skin as a surface that dents where it is pressed, with the contacts' forces as arrows. Drawn by three.js, which is
-// fetched when the environment is made; without it, or without WebGL, there is no surface.
+// The skin as a surface that dents where it is pressed, with its electrodes, and the contacts' forces as arrows. Drawn by
+// WebGL 2, when something has changed and it is seen.
 
-import { colour, lineColour } from "./colours.js";
+import { colour, lineColour, SIGNS, stateColour } from "./colours.js";
+import { camera, drawing, picture, Program } from "./gl.js";
+import { cone, pin, rod, sheet, square } from "./meshes.js";
+import { relief } from "./relief.js";
+import { SHADOW, SHEET, SOLID } from "./shaders.js";
+import { Tags } from "./tags.js";
 
-const GRID = 72;
-const DEPTH = 0.22; // of the skin's width: the dent of the drop that has the brightest colour
-const ARROW = 0.05; // of the skin's width, for each newton
-const TURN = 0.08;
-const SLOW = /swiftshader|llvmpipe|software/i; // drawn by the processor
-const EVERY_MS = 33, SLOW_EVERY_MS = 150;
-const TINTS = Array.from({ length: 65 }, (_, k) => // of drops from 0 to 1; the bare skin is grey
-  (k < 2 ? [84, 92, 110] : colour(0.15 + (0.85 * k) / 64)).map((v) => (v / 255) ** 2.2));
+// Lengths are half-widths of the skin.
+const CELL = 1 / 32;
+const DEPTH = 0.27; // the dent of the drop that has the brightest colour
+const THICK = 0.3;
+const PIN = 0.042, PIN_BAD = 0.06;
+const NUMBER = 0.11; // an electrode's number, from its pin inwards
+const ARROW = 0.15, ARROW_A_NEWTON = 0.09;
+const HEAD = [0.055, 0.15], SHAFT = 0.018; // radius and length, radius
+const REACH = 0.35; // of the shadow
+const LENS = Math.tan(0.26), ROUND = 1.62; // how much of the skin's surroundings is seen
+const BARE = [92, 101, 120]; // the skin's colour where nothing presses
+const START = { turn: -0.5, tilt: 0.85 }, LEAST_TILT = 0.2, MOST_TILT = 1.5;
+const TURN = 0.08, TURN_A_PIXEL = 0.01;
+const SLOW = /swiftshader|llvmpipe|software/i, SLOW_EVERY_MS = 150; // drawn by the processor, which has other work
+
+const NONE = "The surface needs WebGL 2, which this browser does not have here: the map shows the same.";
+const REFUSED = "This browser's WebGL 2 refuses what draws the surface (its console says why): the map shows the same.";
+const LOST = "The browser took the surface's graphics away; it comes back when the browser gives them again. The map shows the same.";
+
+const bytes = (css) => [1, 3, 5].map((at) => parseInt(css.slice(at, at + 2), 16));
+const light = (rgb) => rgb.map((v) => v / 255);
+const RAMP = Uint8Array.from({ length: 4 * 256 }, (_, at) => {
+  const value = (at >> 2) / 255, share = Math.min(1, value / 0.2);
+  return at % 4 === 3 ? 255 : BARE[at % 4] + share * (colour(0.15 + 0.85 * value)[at % 4] - BARE[at % 4]);
+});
+
+/** Columns of a matrix that turns z to `normal`, stretched to this radius and length. */
+function axes(normal, radius, length) {
+  const [x, y, z] = normal, side = Math.abs(z) < 0.9 ? [0, 0, 1] : [1, 0, 0];
+  const cross = ([a, b, c], [d, e, f]) => [b * f - c * e, c * d - a * f, a * e - b * d];
+  const first = cross(side, normal), long = Math.hypot(...first), unit = first.map((v) => v / long);
+  return [...unit.map((v) => radius * v), ...cross([x, y, z], unit).map((v) => radius * v), ...[x, y, z].map((v) => length * v)];
+}
 
 export class Surface {
-  /** null where it cannot be drawn here. */
-  static async on(root) {
-    const probe = document.createElement("canvas").getContext("webgl2");
-    if (!probe) return null;
-    try {
-      const three = await import("/three/three.module.min.js");
-      return new Surface(root, three, probe);
-    } catch (why) {
-      console.info(`no surface: ${why.message}`);
-      return null;
+  /** said(text): called with why there is no surface, and with "" once there is one. */
+  constructor(root, said) {
+    Object.assign(this, { root, said, ...START, scene: null, seen: true, asked: 0, drawn: 0 });
+    Object.assign(this, { outline: null, image: null, pins: [], states: [], arrows: [] });
+    this.canvas = root.appendChild(document.createElement("canvas"));
+    this.tags = new Tags(root);
+    this.gl = this.canvas.getContext("webgl2", { alpha: true, antialias: true });
+    if (!this.gl) {
+      said(NONE);
+      return;
     }
-  }
-
-  constructor(root, three, probe) {
-    this.root = root;
-    this.three = three;
-    const named = probe.getExtension("WEBGL_debug_renderer_info");
-    this.slow = SLOW.test(named ? probe.getParameter(named.UNMASKED_RENDERER_WEBGL) : "");
-    probe.getExtension("WEBGL_lose_context")?.loseContext();
-    this.renderer = new three.WebGLRenderer({ antialias: !this.slow, alpha: true });
-    this.renderer.debug.checkShaderErrors = false; // asking would wait for the compiler
-    this.drawn = 0;
-    root.append(this.renderer.domElement);
-    this.scene = new three.Scene();
-    this.camera = new three.PerspectiveCamera(32, 1, 0.1, 20);
-    this.turn = -0.5;
-    this.tilt = 0.85;
-    const plane = new three.PlaneGeometry(2, 2, GRID - 1, GRID - 1);
-    plane.setAttribute("color", new three.BufferAttribute(new Float32Array(3 * GRID * GRID), 3));
-    this.plane = plane;
-    this.material = new three.MeshLambertMaterial({ vertexColors: true, side: three.DoubleSide });
-    this.scene.add(new three.Mesh(plane, this.material));
-    this.scene.add(new three.HemisphereLight(0xffffff, 0x556070, 1.6));
-    const sun = new three.DirectionalLight(0xffffff, 2.2);
-    sun.position.set(-1.5, 1.2, 2);
-    this.scene.add(sun);
-    this.arrows = new three.Group();
-    this.rim = new three.Group();
-    this.scene.add(this.arrows, this.rim);
-    this.arrows.add(this.arrow());
-    this.values = new Float32Array(GRID * GRID);
-    this.dent(null, 0, 0, 1);
-    this.hands();
-    new ResizeObserver(() => this.resize()).observe(root);
-    this.resize();
-  }
-
-  /** points, electrodes: places in metres. */
-  geometry(points, electrodes) {
-    const all = points.flat().map(Math.abs);
-    this.half = Math.max(...all);
-    const line = [...points, points[0]].map(([x, y]) => new this.three.Vector3(x / this.half, y / this.half, 0.004));
-    const edge = new this.three.Line(new this.three.BufferGeometry().setFromPoints(line), new this.three.LineBasicMaterial({ color: 0x8a93a6 }));
-    const ball = new this.three.SphereGeometry(0.035, 12, 8), skin = new this.three.MeshLambertMaterial({ color: 0x2f9e44 });
-    const balls = [];
-    for (let k = 0; k < electrodes.length / 2; k++) {
-      const each = new this.three.Mesh(ball, skin);
-      each.position.set(electrodes[2 * k] / this.half, electrodes[2 * k + 1] / this.half, 0);
-      balls.push(each);
-    }
-    this.rim.clear();
-    this.rim.add(edge, ...balls);
-    this.dirty = true;
-  }
-
-  /** The drops (rows from the lowest y), `top` being the brightest colour; null: flat. */
-  dent(values, rows, columns, top) {
-    this.late = values && [values, rows, columns, top];
-    if (values === null) this.bend(values, rows, columns, top);
-    this.dirty = true;
-  }
-
-  bend(values, rows, columns, top) {
-    const place = this.plane.attributes.position, tint = this.plane.attributes.color;
-    const at = (row, column) => values[Math.min(rows - 1, Math.max(0, row)) * columns + Math.min(columns - 1, Math.max(0, column))];
-    for (let i = 0; i < GRID; i++) { // from the highest y down, as the plane is made
-      const row = Math.round(((GRID - 1 - i) * (rows - 1)) / (GRID - 1));
-      for (let j = 0; j < GRID; j++) {
-        const k = i * GRID + j, column = Math.round((j * (columns - 1)) / (GRID - 1));
-        // A foam has no steps: each place is the mean of itself and its neighbours.
-        const mean = values ? (2 * at(row, column) + at(row - 2, column) + at(row + 2, column) + at(row, column - 2) + at(row, column + 2)) / 6 : 0;
-        const drop = Math.max(0, mean / top);
-        place.setZ(k, -2 * DEPTH * drop);
-        tint.setXYZ(k, ...TINTS[Math.min(64, Math.round(64 * drop))]);
-      }
-    }
-    place.needsUpdate = tint.needsUpdate = true;
-    this.plane.computeVertexNormals();
-  }
-
-  /** An arrow along each contact's normal, as long as its force. They are kept: making a shader anew takes long. */
-  contacts(contacts) {
-    if (!this.half) return;
-    while (this.arrows.children.length < contacts.length) this.arrows.add(this.arrow());
-    this.arrows.children.forEach((arrow, k) => {
-      const c = contacts[k];
-      if (arrow.visible || c) this.dirty = true;
-      arrow.visible = c !== undefined;
-      if (!c) return;
-      const normal = new this.three.Vector3(...c.normal).normalize(), long = 0.15 + 2 * ARROW * (c.force_n ?? 1);
-      arrow.position.set(c.position[0] / this.half, c.position[1] / this.half, 0.02);
-      arrow.quaternion.setFromUnitVectors(new this.three.Vector3(0, 1, 0), normal);
-      arrow.children[1].scale.y = long;
-      for (const part of arrow.children) part.material.color.set(lineColour(c.id));
+    const named = this.gl.getExtension("WEBGL_debug_renderer_info");
+    this.slow = SLOW.test(named ? this.gl.getParameter(named.UNMASKED_RENDERER_WEBGL) : "");
+    this.canvas.addEventListener("webglcontextlost", (event) => {
+      event.preventDefault();
+      this.scene = null;
+      said(LOST);
     });
+    this.canvas.addEventListener("webglcontextrestored", () => this.begin());
+    this.begin();
+    this.hands();
+    new ResizeObserver(() => this.ask()).observe(root);
+    addEventListener("resize", () => this.ask()); // also another screen's pixels
+    new IntersectionObserver(([{ isIntersecting }]) => {
+      this.seen = isIntersecting;
+      this.ask();
+    }).observe(root);
   }
 
-  /** Its tip at its origin, pointing down its y axis. */
-  arrow() {
-    const { Group, Mesh, MeshBasicMaterial, ConeGeometry, CylinderGeometry } = this.three;
-    const found = new Group(), material = new MeshBasicMaterial();
-    const head = new Mesh(new ConeGeometry(0.05, 0.12, 12).rotateX(Math.PI).translate(0, 0.06, 0), material);
-    found.add(head, new Mesh(new CylinderGeometry(0.016, 0.016, 1, 8).translate(0, 0.5, 0), material));
-    found.visible = false;
-    return found;
+  /** All that the graphics processor keeps. */
+  begin() {
+    const { gl } = this;
+    this.scene = {
+      sheet: new Program(gl, ...SHEET, { field: 0, ramp: 1 }), solid: new Program(gl, ...SOLID), shadow: new Program(gl, ...SHADOW),
+      pin: drawing(gl, pin()), cone: drawing(gl, cone()), rod: drawing(gl, rod()), ground: drawing(gl, square()),
+      field: picture(gl, 0), face: null, dented: false,
+    };
+    picture(gl, 1)(RAMP, 256, 1);
+    gl.enable(gl.DEPTH_TEST);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    this.said("");
+    this.ask();
+  }
+
+  /** points: the outline [(x, y)]; electrodes: their places, x and y in turn; all in metres. */
+  geometry(points, electrodes) {
+    this.half = Math.max(...points.flat().map(Math.abs));
+    this.outline = points.map((p) => p.map((v) => v / this.half));
+    this.size = [0, 1].map((c) => Math.max(...this.outline.map((p) => Math.abs(p[c]))));
+    this.pins = Array.from({ length: electrodes.length / 2 }, (_, k) => [electrodes[2 * k] / this.half, electrodes[2 * k + 1] / this.half]);
+    Object.assign(this, { states: [], image: null, arrows: [] });
+    if (this.scene) this.scene.face = null;
+    this.label();
+  }
+
+  /** states: of each electrode, as the service numbers them. */
+  electrodes(states) {
+    if (states.length === this.states.length && this.states.every((state, k) => state === states[k])) return;
+    this.states = Array.from(states);
+    this.label();
+  }
+
+  /** values: the conductivity drop in the pixels of this image frame, `top` being the brightest colour. */
+  dent(values, frame, top) {
+    this.image = { values, top, rows: frame.image.shape[0], columns: frame.image.shape[1], origin: frame.origin, side: frame.metres_per_pixel };
+    if (this.scene) this.scene.dented = false;
+    this.ask();
+  }
+
+  /** An arrow along each contact's normal, as long as its force. */
+  contacts(contacts) {
+    if (!contacts.length && !this.arrows.length) return;
+    this.arrows = !this.half ? [] : contacts.map((c) => ({
+      at: [c.position[0] / this.half, c.position[1] / this.half], normal: c.normal.map((v) => v / (Math.hypot(...c.normal) || 1)),
+      long: ARROW + ARROW_A_NEWTON * (c.force_n ?? 1), colour: lineColour(c.id),
+      text: `${c.id}${c.force_n === null ? "" : ` ${c.force_n.toFixed(1)} N`}`,
+    }));
+    this.label();
+  }
+
+  label() {
+    const numbers = this.pins.map(([x, y], k) => {
+      const state = this.states[k] ?? 0, away = Math.hypot(x, y) || 1, share = 1 - NUMBER / away;
+      return state ? { kind: "fault", text: `${k} ${SIGNS[state] ?? "?"}`, colour: stateColour(state), place: [x, y, 0.16] }
+        : { kind: "number", text: `${k}`, colour: "", place: [share * x, share * y, 0] };
+    });
+    const forces = this.arrows.map(({ at, normal, long, text, colour: each }) => ({
+      kind: "force", text, colour: each, place: normal.map((v, k) => (at[k] ?? 0) + (long + HEAD[1]) * v),
+    }));
+    this.tags.set([...numbers, ...forces]);
+    this.ask();
   }
 
   hands() {
+    const { root } = this;
     let held = null;
-    this.root.addEventListener("pointerdown", (event) => {
-      held = [event.clientX, event.clientY];
-      this.root.setPointerCapture(event.pointerId);
+    root.addEventListener("pointerdown", (event) => {
+      if (held) return;
+      held = { id: event.pointerId, x: event.clientX, y: event.clientY };
+      root.setPointerCapture(event.pointerId);
     });
-    this.root.addEventListener("pointermove", (event) => {
-      if (!held) return;
-      this.look(0.01 * (event.clientX - held[0]), 0.01 * (event.clientY - held[1]));
-      held = [event.clientX, event.clientY];
+    root.addEventListener("pointermove", (event) => {
+      if (held?.id !== event.pointerId) return;
+      this.look(TURN_A_PIXEL * (event.clientX - held.x), TURN_A_PIXEL * (event.clientY - held.y));
+      Object.assign(held, { x: event.clientX, y: event.clientY });
     });
-    for (const end of ["pointerup", "pointercancel"]) this.root.addEventListener(end, () => { held = null; });
-    this.root.addEventListener("keydown", (event) => {
+    for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      root.addEventListener(end, (event) => { if (held?.id === event.pointerId) held = null; });
+    }
+    root.addEventListener("keydown", (event) => {
       const way = { ArrowLeft: [-TURN, 0], ArrowRight: [TURN, 0], ArrowUp: [0, -TURN], ArrowDown: [0, TURN] }[event.key];
-      if (!way) return;
+      if (!way && event.key !== "Home") return;
       event.preventDefault();
-      this.look(...way);
+      if (!way) Object.assign(this, START);
+      this.look(...(way ?? [0, 0]));
     });
   }
 
   look(turn, tilt) {
     this.turn -= turn;
-    this.tilt = Math.min(1.5, Math.max(0.15, this.tilt + tilt));
-    this.dirty = true;
+    this.tilt = Math.min(MOST_TILT, Math.max(LEAST_TILT, this.tilt + tilt));
+    this.ask();
   }
 
-  resize() {
-    const { clientWidth: width, clientHeight: height } = this.root;
-    if (!width || !height) return;
-    this.renderer.setPixelRatio(this.slow ? 0.75 : Math.min(2, devicePixelRatio));
-    this.renderer.setSize(width, height);
-    this.camera.aspect = width / height;
-    this.camera.updateProjectionMatrix();
-    this.dirty = true;
+  /** Have it drawn with the display's next picture; nothing is drawn where it is not seen. */
+  ask() {
+    if (this.asked || !this.scene || !this.seen || !this.outline) return;
+    this.asked = requestAnimationFrame((now) => {
+      this.asked = 0;
+      if (this.slow && now - this.drawn < SLOW_EVERY_MS) this.ask();
+      else this.draw(now);
+    });
   }
 
-  /** Draw what has changed, not more often than the machine can. */
-  draw(nowMs) {
-    if (!this.dirty || nowMs - this.drawn < (this.slow ? SLOW_EVERY_MS : EVERY_MS)) return;
-    this.drawn = nowMs;
-    this.dirty = false;
-    if (this.late) this.bend(...this.late);
-    this.late = null;
-    const far = 5.2 / Math.min(1, this.camera.aspect), flat = Math.cos(this.tilt) * far;
-    this.camera.up.set(0, 0, 1);
-    this.camera.position.set(flat * Math.sin(this.turn), -flat * Math.cos(this.turn), Math.sin(this.tilt) * far);
-    this.camera.lookAt(0, 0, 0);
-    this.renderer.render(this.scene, this.camera);
+  draw(now) {
+    const { scene, gl } = this;
+    if (!scene || gl.isContextLost() || !this.fit()) return;
+    try {
+      const ready = [scene.sheet, scene.solid, scene.shadow].map((each) => each.ready);
+      if (!ready.every(Boolean)) {
+        this.ask();
+        return;
+      }
+    } catch (why) {
+      console.warn(why.message);
+      this.scene = null;
+      this.said(REFUSED);
+      return;
+    }
+    this.drawn = now;
+    scene.face ??= drawing(gl, sheet(this.outline, CELL));
+    if (!scene.dented) this.bend();
+    this.view = this.camera();
+    const { matrix, eye, right } = this.view;
+    const sun = [0, 1, 2].map((k) => [-0.2, -0.2, 0.75][k] - 0.6 * right[k]), bright = Math.hypot(...sun);
+    const all = { matrix, eye, sun: sun.map((v) => v / bright), depth: DEPTH, thick: THICK, box: this.box, size: this.size, reach: REACH };
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    scene.shadow.use(all);
+    scene.ground();
+    scene.sheet.use({ ...all, mesh: 0.01 / this.half });
+    scene.face();
+    scene.solid.use(all);
+    this.pins.forEach((place, k) => this.pin(place, this.states[k] ?? 0));
+    for (const arrow of this.arrows) this.arrow(arrow);
+    this.tags.move((place) => this.project(place));
+  }
+
+  /** Whether there is room; the canvas has as many pixels as the screen there. */
+  fit() {
+    const { clientWidth: width, clientHeight: height } = this.root, ratio = this.slow ? 1 : Math.min(2, devicePixelRatio);
+    const [across, down] = [width, height].map((v) => Math.round(ratio * v));
+    if (!across || !down) return false;
+    if (this.canvas.width !== across || this.canvas.height !== down) Object.assign(this.canvas, { width: across, height: down });
+    this.gl.viewport(0, 0, across, down);
+    return true;
+  }
+
+  bend() {
+    const { image, half, scene } = this;
+    if (image) {
+      const { values, top, rows, columns, origin, side } = image;
+      this.field = relief(values, rows, columns, top, side / half);
+      this.box = [origin[0] / half, origin[1] / half, half / (columns * side), half / (rows * side)];
+      scene.field(this.field, columns, rows);
+    } else {
+      this.field = new Float32Array(4);
+      this.box = [-1, -1, 0.5, 0.5];
+      scene.field(this.field, 1, 1);
+    }
+    scene.dented = true;
+  }
+
+  /** The face's height there. */
+  height([x, y]) {
+    const [rows, columns] = this.image ? [this.image.rows, this.image.columns] : [1, 1], [left, low, wide, high] = this.box;
+    const pixel = (v, count) => Math.min(count - 1, Math.max(0, Math.floor(v * count)));
+    return -DEPTH * this.field[4 * (pixel((y - low) * high, rows) * columns + pixel((x - left) * wide, columns))];
+  }
+
+  camera() {
+    const aspect = this.canvas.width / this.canvas.height, { turn, tilt } = this;
+    const away = (ROUND / LENS) * Math.max(1 / aspect, Math.sin(tilt) + 0.1);
+    return camera({ turn, tilt, away, aspect, lens: LENS, middle: [0, 0, -THICK / 2] });
+  }
+
+  /** Where a place (x, y, z) is in the panel, in CSS pixels. */
+  project(place) {
+    const { matrix: m } = this.view, along = (row) => m[row] * place[0] + m[4 + row] * place[1] + m[8 + row] * place[2] + m[12 + row];
+    const w = along(3), { clientWidth: width, clientHeight: height } = this.root;
+    return [(0.5 + along(0) / w / 2) * width, (0.5 - along(1) / w / 2) * height];
+  }
+
+  pin(place, state) {
+    const radius = state ? PIN_BAD : PIN;
+    this.solid("pin", [...place, 0.01], axes([0, 0, 1], radius, state ? 0.09 : PIN), stateColour(state));
+  }
+
+  /** Its tip where the skin is pressed. */
+  arrow({ at, normal, long, colour: each }) {
+    const tip = [...at, this.height(at) + 0.02], base = tip.map((v, k) => v + HEAD[1] * normal[k]);
+    this.solid("cone", tip, axes(normal, ...HEAD), each);
+    this.solid("rod", base, axes(normal, SHAFT, long), each);
+  }
+
+  solid(mesh, origin, turned, css) {
+    this.scene.solid.use({ origin, axes: turned, colour: light(bytes(css)) });
+    this.scene[mesh]();
   }
 }
