@@ -446,6 +446,21 @@ def test_the_surface_is_turned_by_hand_and_drawn_only_when_it_changes(solid: Ope
     until(lambda: drawn_ms(found) > unseen)
 
 
+def test_no_force_stands_at_the_arrow_of_another_contact(solid: Open) -> None:
+    """Contacts change their order, and the arrows are drawn with the display's next picture."""
+    found = solid()
+    until(lambda: shade(found, *electrode(found, 0), 1)[3] == 255)
+    function = """s => {
+      const [left, right] = [-0.02, 0.02].map((x, k) => ({ id: k, position: [x, x, 0], normal: [0, 0, 1], force_n: 3 }));
+      s.contacts([left, right]);
+      s.draw(performance.now());
+      s.contacts([right, left]);
+      const tags = [...document.querySelectorAll("#surface .force:not([hidden])")];
+      return tags.map((tag) => [tag.textContent[0], tag.getBoundingClientRect().x]).sort(([, a], [, b]) => a - b);
+    }"""
+    assert [name for name, _ in ask_surface(found, function)] == ["0", "1"]
+
+
 def test_a_lost_surface_is_said_and_comes_back(solid: Open) -> None:
     found = solid()
     at = electrode(found, 0)

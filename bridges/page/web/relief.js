@@ -1,7 +1,8 @@
-// From an image of the conductivity drop to the skin's relief: how deep it is dented where, and which way it slopes.
+// What the surface is drawn from, pixel by pixel: how deep the skin is dented where, and its shadow on the ground.
 
 const CRISP = 0.7, SOFT = 3; // pixels: how far the colours run, and how far the foam round a dent gives way
 const SOFT_SHARE = 0.5;
+const SHADOW = 48, SHADOW_SOFT = 1.6; // pixels across, and how far it runs
 
 /** Low-pass with exponential tails, along rows and columns, twice so that it is nearly round. Changes `field`. */
 function relax(field, rows, columns, length) {
@@ -38,4 +39,16 @@ export function relief(values, rows, columns, top, cell) {
     }
   }
   return found;
+}
+
+/** {pixels, side}: how much light, in bytes four a pixel, a sheet of this outline takes from a square of -width to width. */
+export function shadow(outline, width) {
+  const field = new Float32Array(SHADOW * SHADOW), at = (k) => (2 * (k + 0.5) / SHADOW - 1) * width;
+  const inside = (x, y) => outline.reduce((odd, [x0, y0], k) => {
+    const [x1, y1] = outline[(k + 1) % outline.length];
+    return y0 > y !== y1 > y && x < x0 + ((y - y0) / (y1 - y0)) * (x1 - x0) ? !odd : odd;
+  }, false);
+  for (let k = 0; k < field.length; k++) field[k] = inside(at(k % SHADOW), at(Math.floor(k / SHADOW))) ? 255 : 0;
+  relax(field, SHADOW, SHADOW, SHADOW_SOFT);
+  return { pixels: Uint8Array.from({ length: 4 * field.length }, (_, k) => field[k >> 2]), side: SHADOW };
 }

@@ -62,18 +62,13 @@ void main() {
 uniform vec3 colour;
 void main() { seen = lit(colour, normalize(facing), 0.25); }`];
 
-/** The shadow round a box of half-widths `size` on the ground below it. */
+/** On the ground below the sheet, from -wide to wide: `shade` has how much light is taken there. */
 export const SHADOW = [`${VERTEX}
-uniform float thick, reach;
-uniform vec2 size;
+uniform float thick, wide;
 void main() {
-  at = vec3(place.xy * (size + reach), -thick - 0.02);
-  facing = normal;
+  at = vec3(place.xy * wide, -thick - 0.02);
+  facing = place;
   gl_Position = matrix * vec4(at, 1.0);
 }`, `${FRAGMENT}
-uniform float reach;
-uniform vec2 size;
-void main() {
-  float outside = length(max(vec2(0.0), abs(at.xy) - size + 0.1));
-  seen = vec4(0.0, 0.0, 0.0, 0.3 * pow(max(0.0, 1.0 - outside / (reach + 0.1)), 2.0));
-}`];
+uniform sampler2D shade;
+void main() { seen = vec4(0.0, 0.0, 0.0, 0.36 * smoothstep(0.05, 1.0, texture(shade, 0.5 + 0.5 * facing.xy).x)); }`];

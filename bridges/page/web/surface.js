@@ -4,7 +4,7 @@
 import { colour, lineColour, SIGNS, stateColour } from "./colours.js";
 import { camera, drawing, picture, Program } from "./gl.js";
 import { cone, pin, rod, sheet, square } from "./meshes.js";
-import { relief } from "./relief.js";
+import { relief, shadow } from "./relief.js";
 import { SHADOW, SHEET, SOLID } from "./shaders.js";
 import { Tags } from "./tags.js";
 
@@ -16,7 +16,7 @@ const PIN = 0.042, PIN_BAD = 0.06;
 const NUMBER = 0.11; // an electrode's number, from its pin inwards
 const ARROW = 0.15, ARROW_A_NEWTON = 0.09;
 const HEAD = [0.055, 0.15], SHAFT = 0.018; // radius and length, radius
-const REACH = 0.35; // of the shadow
+const GROUND = 1.45; // half of what the shadow falls on
 const LENS = Math.tan(0.26), ROUND = 1.62; // how much of the skin's surroundings is seen
 const BARE = [92, 101, 120]; // the skin's colour where nothing presses
 const START = { turn: -0.5, tilt: 0.85 }, LEAST_TILT = 0.2, MOST_TILT = 1.5;
@@ -76,9 +76,9 @@ export class Surface {
   begin() {
     const { gl } = this;
     this.scene = {
-      sheet: new Program(gl, ...SHEET, { field: 0, ramp: 1 }), solid: new Program(gl, ...SOLID), shadow: new Program(gl, ...SHADOW),
+      sheet: new Program(gl, ...SHEET, { field: 0, ramp: 1 }), solid: new Program(gl, ...SOLID), shadow: new Program(gl, ...SHADOW, { shade: 2 }),
       pin: drawing(gl, pin()), cone: drawing(gl, cone()), rod: drawing(gl, rod()), ground: drawing(gl, square()),
-      field: picture(gl, 0), face: null, dented: false,
+      field: picture(gl, 0), shade: picture(gl, 2), face: null, dented: false,
     };
     picture(gl, 1)(RAMP, 256, 1);
     gl.enable(gl.DEPTH_TEST);
@@ -92,18 +92,17 @@ export class Surface {
   geometry(points, electrodes) {
     this.half = Math.max(...points.flat().map(Math.abs));
     this.outline = points.map((p) => p.map((v) => v / this.half));
-    this.size = [0, 1].map((c) => Math.max(...this.outline.map((p) => Math.abs(p[c]))));
     this.pins = Array.from({ length: electrodes.length / 2 }, (_, k) => [electrodes[2 * k] / this.half, electrodes[2 * k + 1] / this.half]);
     Object.assign(this, { states: [], image: null, arrows: [] });
     if (this.scene) this.scene.face = null;
-    this.label();
+    this.ask();
   }
 
   /** states: of each electrode, as the service numbers them. */
   electrodes(states) {
     if (states.length === this.states.length && this.states.every((state, k) => state === states[k])) return;
     this.states = Array.from(states);
-    this.label();
+    this.ask();
   }
 
   /** values: the conductivity drop in the pixels of this image frame, `top` being the brightest colour. */
@@ -121,10 +120,11 @@ export class Surface {
       long: ARROW + ARROW_A_NEWTON * (c.force_n ?? 1), colour: lineColour(c.id),
       text: `${c.id}${c.force_n === null ? "" : ` ${c.force_n.toFixed(1)} N`}`,
     }));
-    this.label();
+    this.ask();
   }
 
-  label() {
+  /** The electrodes' numbers, with what is the matter, and the contacts' forces. */
+  words() {
     const numbers = this.pins.map(([x, y], k) => {
       const state = this.states[k] ?? 0, away = Math.hypot(x, y) || 1, share = 1 - NUMBER / away;
       return state ? { kind: "fault", text: `${k} ${SIGNS[state] ?? "?"}`, colour: stateColour(state), place: [x, y, 0.16] }
@@ -133,8 +133,7 @@ export class Surface {
     const forces = this.arrows.map(({ at, normal, long, text, colour: each }) => ({
       kind: "force", text, colour: each, place: normal.map((v, k) => (at[k] ?? 0) + (long + HEAD[1]) * v),
     }));
-    this.tags.set([...numbers, ...forces]);
-    this.ask();
+    return [...numbers, ...forces];
   }
 
   hands() {
@@ -194,12 +193,12 @@ export class Surface {
       return;
     }
     this.drawn = now;
-    scene.face ??= drawing(gl, sheet(this.outline, CELL));
+    if (!scene.face) this.build();
     if (!scene.dented) this.bend();
     this.view = this.camera();
     const { matrix, eye, right } = this.view;
     const sun = [0, 1, 2].map((k) => [-0.2, -0.2, 0.75][k] - 0.6 * right[k]), bright = Math.hypot(...sun);
-    const all = { matrix, eye, sun: sun.map((v) => v / bright), depth: DEPTH, thick: THICK, box: this.box, size: this.size, reach: REACH };
+    const all = { matrix, eye, sun: sun.map((v) => v / bright), depth: DEPTH, thick: THICK, box: this.box, wide: GROUND };
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     scene.shadow.use(all);
@@ -209,7 +208,13 @@ export class Surface {
     scene.solid.use(all);
     this.pins.forEach((place, k) => this.pin(place, this.states[k] ?? 0));
     for (const arrow of this.arrows) this.arrow(arrow);
-    this.tags.move((place) => this.project(place));
+    this.tags.draw(this.words(), (place) => this.project(place)); // not sooner: an arrow may have become another contact's
+  }
+
+  build() {
+    this.scene.face = drawing(this.gl, sheet(this.outline, CELL));
+    const { pixels, side } = shadow(this.outline, GROUND);
+    this.scene.shade(pixels, side, side);
   }
 
   /** Whether there is room; the canvas has as many pixels as the screen there. */
