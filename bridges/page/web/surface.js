@@ -94,7 +94,7 @@ export class Surface {
     this.outline = points.map((p) => p.map((v) => v / this.half));
     this.pins = Array.from({ length: electrodes.length / 2 }, (_, k) => [electrodes[2 * k] / this.half, electrodes[2 * k + 1] / this.half]);
     Object.assign(this, { states: [], image: null, arrows: [] });
-    if (this.scene) this.scene.face = null;
+    if (this.scene) Object.assign(this.scene, { face: null, dented: false });
     this.ask();
   }
 
@@ -177,21 +177,24 @@ export class Surface {
     });
   }
 
-  draw(now) {
-    const { scene, gl } = this;
-    if (!scene || gl.isContextLost() || !this.fit()) return;
+  /** Whether the shaders are compiled; asks again where they are not yet. */
+  compiled() {
+    const { sheet: face, solid, shadow: ground } = this.scene;
     try {
-      const ready = [scene.sheet, scene.solid, scene.shadow].map((each) => each.ready);
-      if (!ready.every(Boolean)) {
-        this.ask();
-        return;
-      }
+      const ready = [face, solid, ground].every((each) => each.ready);
+      if (!ready) this.ask();
+      return ready;
     } catch (why) {
       console.warn(why.message);
       this.scene = null;
       this.said(REFUSED);
-      return;
+      return false;
     }
+  }
+
+  draw(now) {
+    const { scene, gl } = this;
+    if (!scene || gl.isContextLost() || !this.fit() || !this.compiled()) return;
     this.drawn = now;
     if (!scene.face) this.build();
     if (!scene.dented) this.bend();
@@ -211,6 +214,7 @@ export class Surface {
     this.tags.draw(this.words(), (place) => this.project(place)); // not sooner: an arrow may have become another contact's
   }
 
+  /** What the skin's geometry decides. */
   build() {
     this.scene.face = drawing(this.gl, sheet(this.outline, CELL));
     const { pixels, side } = shadow(this.outline, GROUND);
@@ -227,6 +231,7 @@ export class Surface {
     return true;
   }
 
+  /** What the newest image decides. */
   bend() {
     const { image, half, scene } = this;
     if (image) {
