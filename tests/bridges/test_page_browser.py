@@ -451,7 +451,8 @@ def test_no_force_stands_at_the_arrow_of_another_contact(solid: Open) -> None:
     found = solid()
     until(lambda: shade(found, *electrode(found, 0), 1)[3] == 255)
     function = """s => {
-      const [left, right] = [-0.02, 0.02].map((x, k) => ({ id: k, position: [x, x, 0], normal: [0, 0, 1], force_n: 3 }));
+      const [left, right] = [-0.02, 0.02].map((x, k) =>
+        ({ id: k, position: [x, x, 0], normal: [0, 0, 1], force_n: 3 }));
       s.contacts([left, right]);
       s.draw(performance.now());
       s.contacts([right, left]);
@@ -459,6 +460,32 @@ def test_no_force_stands_at_the_arrow_of_another_contact(solid: Open) -> None:
       return tags.map((tag) => [tag.textContent[0], tag.getBoundingClientRect().x]).sort(([, a], [, b]) => a - b);
     }"""
     assert [name for name, _ in ask_surface(found, function)] == ["0", "1"]
+
+
+def test_another_skin_is_flat_until_its_image_comes(solid: Open) -> None:
+    found = solid()
+    found.mouse.move(*place(found, 20, -10))
+    found.mouse.down()
+    until(lambda: is_hot(shade(found, 16, -15)))
+    function = """s => {
+      const corners = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]];
+      s.geometry(corners, corners.flat());
+      s.draw(performance.now());
+      return [s.height([0.2, -0.1]), document.querySelectorAll("#surface .tag:not([hidden])").length];
+    }"""
+    assert [abs(each) for each in ask_surface(found, function)] == [0, 4]
+
+
+def test_a_browser_that_refuses_the_shaders_says_so_and_keeps_the_map(solid_browser: Any, address: str) -> None:
+    with solid_browser.new_context() as context:
+        page = context.new_page()
+        page.set_default_timeout(WAIT_MS)
+        shaders = (ROOT / "bridges" / "page" / "web" / "shaders.js").read_text()
+        broken = shaders.replace("seen = lit(", "seen = unlit(")
+        page.route("**/shaders.js", lambda route: route.fulfill(body=broken, content_type="text/javascript"))
+        page.goto(address)
+        until(lambda: "refuses" in page.inner_text("#surface-why"))
+        assert page.is_hidden("#surface-panel") and page.is_visible("#map")
 
 
 def test_a_lost_surface_is_said_and_comes_back(solid: Open) -> None:
