@@ -2,7 +2,7 @@
 stability, accuracy.
 
     skin bench all                      the page of README: about an hour on two idle cores
-    skin bench all --quick              the short form of CI; exit status 1 where a ratio is beyond its gate
+    skin bench all --quick              the short form of CI; exit status 1 where a gate is not met, or was not tried
     skin bench all --reuse              the page from the reports that are there; runs nothing
     skin bench all --only latency skip
 
@@ -219,15 +219,16 @@ def section(benchmark: Benchmark, folder: Path) -> tuple[list[str], list[Goal], 
     return [*lines, ""], goals, report["commit"]
 
 
-def page(chosen: Sequence[Benchmark], folder: Path) -> tuple[str, list[Goal]]:
-    """The page in Markdown, and all goals on it."""
-    bodies, every, commits = [], [], set()
+def page(chosen: Sequence[Benchmark], folder: Path) -> tuple[str, list[Goal], list[Benchmark]]:
+    """The page in Markdown, all goals on it, and the benchmarks that have no report to read."""
+    bodies, every, absent, commits = [], [], [], set()
     for benchmark in chosen:
         try:
             lines, goals, commit = section(benchmark, folder)
-        except (FileNotFoundError, KeyError):
+        except (FileNotFoundError, KeyError, ValueError):
             command = " ".join(("skin bench", benchmark.command, *benchmark.arguments))
             bodies += [f"## {benchmark.title}", "", f"Not run: `{command}`.", ""]
+            absent.append(benchmark)
             continue
         bodies += lines
         every += goals
@@ -235,14 +236,36 @@ def page(chosen: Sequence[Benchmark], folder: Path) -> tuple[str, list[Goal]]:
     made = "all at one commit" if len(commits) == 1 else f"at {len(commits)} commits, each by a command of its own"
     with_target = [goal for goal in every if goal.met is not None]
     met = sum(bool(goal.met) for goal in with_target)
+    lacking = f" Not run: {', '.join(b.name for b in absent)}." if absent else ""
     top = [
         "# Benchmarks",
         "",
-        f"`skin bench all`: {met} of {len(with_target)} targets met. The parts were run {made}; each section says its "
-        "command and machine.",
+        f"`skin bench all`: {met} of {len(with_target)} targets met.{lacking} The parts were run {made}; each section "
+        "says its command and machine.",
         "",
     ]
-    return "\n".join(top + bodies), every
+    return "\n".join(top + bodies), every, absent
+
+
+def gates(benchmark: Benchmark, folder: Path) -> set[str]:
+    """The figures with a gate in a report; none where there is no report."""
+    try:
+        report = json.loads((folder / f"{benchmark.name}.json").read_text(encoding="utf-8"))
+        return {found["figure"] for found in report["targets"] if found.get("gate") is not None}
+    except (FileNotFoundError, KeyError, ValueError):
+        return set()
+
+
+def left_out(chosen: Sequence[Benchmark], folder: Path) -> list[str]:
+    """What the short form does not try: benchmarks that have none, and gates of the full form's reports."""
+    lines = []
+    for benchmark in chosen:
+        if benchmark.quick is None:
+            lines.append(f"{benchmark.name}: has no short form")
+            continue
+        untried = gates(benchmark, REPORTS) - gates(benchmark, folder)
+        lines += [f"{benchmark.name}: {figure}" for figure in sorted(untried)]
+    return lines
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -253,24 +276,27 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()
-    chosen = [b for b in BENCHMARKS if args.only is None or b.name in args.only]
-    if args.quick and args.only is None:
-        chosen = [b for b in chosen if b.quick is not None]
+    wanted = [b for b in BENCHMARKS if args.only is None or b.name in args.only]
+    chosen = [b for b in wanted if b.quick is not None or args.only is not None] if args.quick else wanted
     args.out.mkdir(parents=True, exist_ok=True)
-    began, wrong = time.perf_counter(), []
+    began, failed = time.perf_counter(), []
     if not args.reuse:
-        wrong = [problem for b in chosen if (problem := run(b, args.out.resolve(), args.quick))]
-    failed = bool(wrong)
-    text, goals = page(BENCHMARKS if args.only is None or args.reuse else chosen, args.out)
+        failed = [problem for b in chosen if (problem := run(b, args.out.resolve(), args.quick))]
+    whole = not args.quick and (args.only is None or args.reuse)
+    text, goals, absent = page(BENCHMARKS if whole else chosen, args.out)
     print("\n" + text)
-    if not args.quick and (args.only is None or args.reuse):
+    if whole:
         (args.out / "README.md").write_text(text, encoding="utf-8")
         print(f"wrote {args.out / 'README.md'}")
-    wrong += [f"{goal.figure}: {goal.measured}, gate {goal.gate:g}" for goal in goals if not goal.passed]
-    for problem in wrong:
+    if not args.reuse or args.quick:  # the page alone says it in its own words
+        failed += [f"{b.name}: there is no report of it: a gate that was not tried is not met" for b in absent]
+    beyond = [f"{goal.figure}: {goal.measured}, gate {goal.gate:g}" for goal in goals if not goal.passed]
+    for problem in failed + beyond:
         print(f"FAILED: {problem}", file=sys.stderr)
+    for what in left_out(wanted, args.out) if args.quick else ():
+        print(f"left out of the short form: {what}")
     print(f"{(time.perf_counter() - began) / 60:.1f} minutes, {os.cpu_count()} cores")
-    return 1 if failed or (args.quick and wrong) else 0
+    return 1 if failed or (args.quick and beyond) else 0
 
 
 if __name__ == "__main__":

@@ -69,11 +69,47 @@ def test_a_benchmark_that_fails_leaves_no_old_figures(tmp_path, monkeypatch, cap
     assert "old" not in capsys.readouterr().out
 
 
-def test_a_ratio_beyond_its_gate_fails_the_short_form(tmp_path, capsys):
+def test_a_ratio_beyond_its_gate_fails_the_short_form(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(page, "BENCHMARKS", tuple(b for b in page.BENCHMARKS if b.name == "skip"))
     report(tmp_path, "skip", Goal("untouched, of moving", 0.6, at_most=0.25, gate=0.45))
     assert page.main(["--reuse", "--quick", "--out", str(tmp_path)]) == 1
     assert "untouched, of moving: 0.6, gate 0.45" in capsys.readouterr().err
     assert page.main(["--reuse", "--out", str(tmp_path)]) == 0  # the page itself only says it
+
+
+@pytest.mark.parametrize("content", [None, '{"machine": "one"}', '{"mach'], ids=["missing", "older", "cut"])
+def test_a_gate_that_was_not_tried_is_not_met(tmp_path, monkeypatch, capsys, content):
+    """Of a report that is not there, or of which nothing can be read."""
+    monkeypatch.setattr(page, "BENCHMARKS", tuple(b for b in page.BENCHMARKS if b.name in ("skip", "peers")))
+    report(tmp_path, "peers", Goal("ratio", 1.5, at_most=2.0, gate=3.0))
+    if content is not None:
+        (tmp_path / "skip.json").write_text(content)
+    assert page.main(["--reuse", "--quick", "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    assert "FAILED: skip: there is no report of it" in said.err and "Not run: skip." in said.out
+    report(tmp_path, "skip", Goal("untouched", 0.2, at_most=0.25, gate=0.45))
+    assert page.main(["--reuse", "--quick", "--out", str(tmp_path)]) == 0
+
+
+def test_a_benchmark_that_ends_well_without_a_report_failed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(page, "BENCHMARKS", (page.Benchmark("skip", "Skip rules", ()),))
+    monkeypatch.setattr(page, "commands", lambda: {"skip": "this"})
+    assert page.main(["--only", "skip", "--out", str(tmp_path)]) == 1
+    assert "FAILED: skip: there is no report of it" in capsys.readouterr().err
+
+
+def test_the_short_form_says_which_gates_it_leaves_out(tmp_path, monkeypatch, capsys):
+    full, quick = tmp_path / "full", tmp_path / "quick"
+    full.mkdir()
+    quick.mkdir()
+    none, short = page.Benchmark("reaction", "Reaction", None), page.Benchmark("scale", "Many skins", ("--skins", "8"))
+    monkeypatch.setattr(page, "BENCHMARKS", (none, short))
+    monkeypatch.setattr(page, "REPORTS", full)
+    report(full, "scale", Goal("8 skins", 1.0, gate=2.0), Goal("32 skins", 1.0, gate=2.0), Goal("ms", 1.0))
+    report(quick, "scale", Goal("8 skins", 1.0, gate=2.0))
+    assert page.main(["--reuse", "--quick", "--out", str(quick)]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("left out of the short form: ")]
+    assert [line.partition(": ")[2] for line in lines] == ["reaction: has no short form", "scale: 32 skins"]
 
 
 def test_every_benchmark_of_the_page_is_there() -> None:
