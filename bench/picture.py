@@ -18,6 +18,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from models.bundle import Bundle
+from models.command import real
 from models.forward import ForwardModel
 from models.prereconstruction import Array, PreReconstructor
 from models.shapes import Shape, drop_image
@@ -48,7 +49,7 @@ def frames(snr_db: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="bench.picture", description=__doc__)
-    parser.add_argument("--snr", type=float, default=70.0, help="noise, dB (default: %(default)s)")
+    parser.add_argument("--snr", type=real(), default=70.0, help="noise, dB (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("docs/touches.png"))
     options = parser.parse_args(argv)
     touched, untouched = frames(options.snr)

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from bench.press_splits import CASES, CONCENTRIC, print_splits, splits
 from models.bundle import Bundle, BundleError
+from models.command import whole
 from services.calibration.locating import build
 from services.calibration.presses import Presses, part, read_presses
 from services.calibration.registration import Similarity, register
@@ -169,7 +170,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="bench.real_presses", description=__doc__.splitlines()[0])
     parser.add_argument("file", type=Path, nargs="?", help="hydrogel_disc16.npz; default: in $EITSKIN_REFERENCE")
     parser.add_argument("--skin", default="disc16", help="bundle of the uniform disc")
-    parser.add_argument("--splits", type=int, default=3, help="random splits of each row of the second table")
+    parser.add_argument("--splits", type=whole(), default=3, help="random splits of each row of the second table")
     parser.add_argument("--quick", action="store_true", help="one split, and at most 300 presses")
     parser.add_argument("--out", type=Path, help="write the rows as JSON")
     args = parser.parse_args(argv)

@@ -36,7 +36,7 @@ class Control:
     def _bind(self) -> ControlServer:
         handlers = {
             "press": lambda args: self._rig(args).press(_touch(args), self._clock()),
-            "release": lambda args: self._rig(args).release(self._clock(), str(args.get("finger", ""))),
+            "release": lambda args: self._rig(args).release(self._clock(), args.get("finger", "")),
             "scene": self._scene,
             "faults": self._fault,
             "fault": self._fault,
@@ -54,7 +54,7 @@ class Control:
     def _scene(self, args: dict[str, Any]) -> dict[str, Any]:
         if not args.get("name"):
             return {"scenes": {name: scenes.load(name).about for name in scenes.names()}}
-        rig, name = self._rig(args), str(args["name"])
+        rig, name = self._rig(args), args["name"]
         solved = rig.solve(name) if args.get("solved") else None
         now, wait_s = self._clock(), SOON_S if solved else 0.0
         played = rig.play(name, now, wait_s)
@@ -63,14 +63,14 @@ class Control:
     def _fault(self, args: dict[str, Any]) -> dict[str, Any]:
         rig, now, name = self._rig(args), self._clock(), args.get("name")
         if args.get("clear"):
-            rig.faults.clear(*([str(name)] if name else []))
+            rig.faults.clear(*([name] if name else []))
             return {"faults": rig.faults.listing(now)}
         if not name:
             known = {
                 key: {"what": row.what, "args": dict(row.args), "sticky": row.sticky} for key, row in FAULTS.items()
             }
             return {"known": known, "faults": rig.faults.listing(now)}
-        return rig.fault(str(name), args.get("args") or {}, now, float(args.get("seconds", 5.0)))
+        return rig.fault(name, args.get("args", {}), now, args.get("seconds", 5.0))
 
     def _serve(self) -> None:
         try:
@@ -88,10 +88,7 @@ class Control:
 
 
 def _touch(args: dict[str, Any]) -> dict[str, Any]:
-    """The arguments of a press, where it has the ones that it needs."""
-    for key in ("x", "y"):
-        if key not in args:
-            raise ValueError(f"press needs {key}, in metres")
-    if args.get("force") is None and args.get("drop") is None:
+    """The arguments of a press, where it says how firm it is."""
+    if "force" not in args and "drop" not in args:
         raise ValueError("press needs force (N) or drop (S/m)")
     return {key: value for key, value in args.items() if key != "skin"}

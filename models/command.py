@@ -32,6 +32,38 @@ def run(name: str, main: Callable[[], None]) -> None:
         sys.exit(f"{name}: {' '.join(str(why).split())}")
 
 
+def whole(least: int = 1) -> Callable[[str], int]:
+    """A type of argparse: a whole number of at least this."""
+
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least:
+            raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number of at least {least}")
+        return value
+
+    return read
+
+
+def real(above: float = 0.0, *, itself: bool = False, infinite: bool = False) -> Callable[[str], float]:
+    """A type of argparse: a number above this one; `itself`: or equal to it; `infinite`: or inf."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not (value > above or (itself and value == above)) or (math.isinf(value) and not infinite):
+            which = f"of at least {above:g}" if itself else f"above {above:g}"
+            tail = ", or inf" if infinite else ""
+            raise argparse.ArgumentTypeError(f"found {text!r}, expected a finite number {which}{tail}")
+        return value
+
+    return read
+
+
 def minutes(text: str) -> float:
     """An argument of argparse. Raises ArgumentError where a training cannot take so long."""
     try:

@@ -169,8 +169,9 @@ def _svg(path: Path, unit: str) -> tuple[list[Array], list[Any], float]:
             x0, x1, y0, y1 = one.bbox()
             points.append(((x0 + x1) / 2, -(y0 + y1) / 2))
             continue
-        x0, x1, y0, y1 = one.bbox()
-        lines += _closed(_flat(one, max(x1 - x0, y1 - y0)), one.isclosed())
+        for line in one.continuous_subpaths():  # a path may lift its pen
+            x0, x1, y0, y1 = line.bbox()
+            lines += _closed(_flat(line, max(x1 - x0, y1 - y0)), line.isclosed())
     return lines, points, _svg_unit(path, document.root, unit)
 
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from models import geometry, patterns
+from models.command import real, whole
 from models.elements import Array
 from models.fisher import Floor, MeasurementNoise, SizePrior, floors, mean_floor
 from models.forward import shared
@@ -27,6 +28,7 @@ from models.shapes import Shape
 
 __all__ = ["Floor", "MeasurementNoise", "SizePrior", "floors", "map_floors", "mean_floor", "rank_patterns"]
 
+DEFAULT_RADIUS = 0.2  # of the skin's half width
 MAP_SIDE = 12  # positions along the side, at least, in a map
 DROPS = (0.1, 0.15, 0.3, 0.5)  # 1, 1.5, 3 and 5 N by the default force law
 
@@ -58,7 +60,7 @@ def map_floors(case: Case, radius: float, drop: float, per_side: int = 9) -> tup
     """Positions (m, 2) and at each of them the floors, by kind."""
     points = positions(case.skin, radius, per_side)
     if not len(points):
-        raise ValueError(f"no touch of radius {radius} fits on skin '{case.skin}'")
+        raise ValueError(f"no touch of radius {_mm(case.skin, radius)} fits on skin '{case.skin}'")
     both = [case.floor(x, y, radius, drop) for x, y in points]
     return points, {kind: [f[kind] for f in both] for kind in ("cramer_rao", "bayes")}
 
@@ -109,21 +111,28 @@ def draw(case: Case, radius: float, drop: float, per_side: int, path: Path) -> N
     figure, axes = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
     panels = {"position": "position_percent", "drop": "drop_percent", "integrated drop": "integral_percent"}
     cell = np.round((points + 1) * per_side / 2 - 0.5).astype(int)
-    edges = np.linspace(-1, 1, per_side + 1)
+    half_mm = 1e3 * skin.metres_per_unit
+    edges = np.linspace(-half_mm, half_mm, per_side + 1)
     for axis, (title, key) in zip(axes, panels.items(), strict=True):
         image = np.full((per_side, per_side), np.nan)
         image[cell[:, 1], cell[:, 0]] = [_figures(f)[key] for f in by_kind["bayes"]]
         unit = "% of the side" if key == "position_percent" else "%"
         figure.colorbar(axis.pcolormesh(edges, edges, image), ax=axis, label=unit)
-        axis.plot(*outline.T, color="0.3")
-        axis.plot(*skin.point(skin.electrodes).T, "k.", markersize=8)
-        axis.set(title=title, aspect="equal", xlabel="x (model units)", ylabel="y (model units)")
+        axis.plot(*(half_mm * outline).T, color="0.3")
+        axis.plot(*(half_mm * skin.point(skin.electrodes)).T, "k.", markersize=8)
+        axis.set(title=title, aspect="equal", xlabel="x (mm)", ylabel="y (mm)")
     name = case.pattern or skin.pattern_name
     figure.suptitle(
-        f"{case.skin}, {name}, {_noise(case.noise)}: Bayesian floor of a touch, radius {radius}, drop {drop} S/m"
+        f"{case.skin}, {name}, {_noise(case.noise)}: Bayesian floor of a touch, radius "
+        f"{_mm(case.skin, radius)}, drop {drop} S/m"
     )
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _mm(skin: str, radius: float) -> str:
+    """A radius in half widths of the skin, as a person reads it."""
+    return f"{1e3 * radius * shared(skin, 'inverse').skin.metres_per_unit:.3g} mm"
 
 
 def _noise(noise: MeasurementNoise) -> str:
@@ -136,16 +145,23 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--skin", default="square16", help=f"one of {', '.join(geometry.shipped())}, or a .toml file")
     parser.add_argument("--pattern", choices=patterns.NAMES, help="default: the skin's own")
     parser.add_argument(
-        "--snr", type=float, default=70.0, metavar="DB", help="noise relative to each |Z|; inf for none"
+        "--snr", type=real(infinite=True), default=70.0, metavar="DB", help="noise relative to each |Z|; inf for none"
     )
-    parser.add_argument("--floor-ohm", type=float, default=0.0, help="noise of the converter, the same on all channels")
     parser.add_argument(
-        "--drift", type=float, default=0.0, help="scale and contacts since the tare, relative; inf: lost"
+        "--floor-ohm", type=real(itself=True), default=0.0, help="noise of the converter, the same on all channels"
     )
-    parser.add_argument("--radius", type=float, default=0.2, help="of the touch, model units")
-    parser.add_argument("--drop", type=float, default=0.15, help="S/m, for --map and --rank")
+    parser.add_argument(
+        "--drift",
+        type=real(itself=True, infinite=True),
+        default=0.0,
+        help="scale and contacts since the tare, relative; inf: lost",
+    )
+    parser.add_argument(
+        "--radius", type=real(), metavar="METRES", help="of the touch; default: a fifth of the skin's half width"
+    )
+    parser.add_argument("--drop", type=real(), default=0.15, help="S/m, for --map and --rank")
     parser.add_argument("--known-radius", action="store_true", help="the indenter's size is known")
-    parser.add_argument("--grid", type=int, default=6, help="positions along the skin's side")
+    parser.add_argument("--grid", type=whole(), default=6, help="positions along the skin's side")
     parser.add_argument("--rank", action="store_true", help="rank the drive patterns instead")
     parser.add_argument("--map", type=Path, metavar="PNG", help="draw the floors over the skin")
     parser.add_argument("--json", action="store_true")
@@ -155,15 +171,16 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
 def main(argv: Sequence[str] | None = None) -> int:
     """`skin limits`: prints a table (or JSON), draws maps. Returns the exit status."""
     options = _arguments(argv)
-    radius = options.radius
-    case = Case(
-        options.skin,
-        options.pattern,
-        MeasurementNoise(options.snr, options.floor_ohm),
-        SizePrior(radius=(radius, radius)) if options.known_radius else SizePrior(),
-        Drift(options.drift, options.drift),
-    )
     try:
+        metres_per_unit = shared(options.skin, "inverse").skin.metres_per_unit
+        radius = DEFAULT_RADIUS if options.radius is None else options.radius / metres_per_unit
+        case = Case(
+            options.skin,
+            options.pattern,
+            MeasurementNoise(options.snr, options.floor_ohm),
+            SizePrior(radius=(radius, radius)) if options.known_radius else SizePrior(),
+            Drift(options.drift, options.drift),
+        )
         if options.rank:
             ranked = rank_patterns(case, radius, options.drop, options.grid)
             rows = [{"pattern": name} | _figures(floor) for name, floor in ranked]
@@ -176,11 +193,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     if options.json:
         given = json.loads(json.dumps(asdict(case)), parse_constant=str)  # infinities as words: JSON has none
-        print(json.dumps({"case": given, "radius": radius, "rows": rows}, indent=1))
+        given["prior"]["radius"] = [each * metres_per_unit for each in case.prior.radius]
+        print(json.dumps({"case": given, "radius_m": radius * metres_per_unit, "rows": rows}, indent=1))
         return 0
     size = "known" if options.known_radius else "unknown"
     used = options.pattern or shared(options.skin, "inverse").skin.pattern_name
-    print(f"{options.skin}, {used}, {_noise(case.noise)}, touch of radius {radius}, size {size};")
+    print(f"{options.skin}, {used}, {_noise(case.noise)}, touch of radius {_mm(options.skin, radius)}, size {size};")
     print("standard deviations no estimator beats, root mean square over the skin, position in % of the side")
     _print(rows)
     if options.map:

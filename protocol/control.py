@@ -1,7 +1,7 @@
 """Commands: one control socket per process, typed replies, and no caller that waits for ever.
 
-A request is a msgpack map {command: text, args: map}; the reply {ok: true, result: map} or {ok: false, error: {type,
-message}}. Any ZeroMQ REQ socket can talk to it.
+A request is a msgpack map {command: text, args: map}, checked against the table of protocol/commands.py; the reply
+{ok: true, result: map} or {ok: false, error: {type, message}}. Any ZeroMQ REQ socket can talk to it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import msgpack
 import zmq
 
 from . import transport
+from .commands import COMMANDS, BadArgument, Command, checked
 from .errors import EitskinError
 from .fields import brief
 from .frames import FrameError, read_map
@@ -62,9 +63,10 @@ class ControlError(EitskinError, RuntimeError):
 class ControlServer:
     """Takes a process's commands: `handlers` maps a command's name to a function from its arguments to its result.
 
-    Poll `socket` and call `serve_once` when it is readable, and `mind` at least once a second. An exception in a
-    handler becomes the reply; the process goes on. `clock` is built in: this host's monotonic clock, from which a
-    reader elsewhere finds its offset (see `clock_offset`).
+    Their arguments are checked by the table `commands` first: a handler gets those of its command, each of its type,
+    and none that is nil. Poll `socket` and call `serve_once` when it is readable, and `mind` at least once a second. An
+    exception in a handler becomes the reply; the process goes on. `clock` is built in: this host's monotonic clock,
+    from which a reader elsewhere finds its offset (see `clock_offset`).
 
     On an ipc socket the runtime folder's rights decide who may give commands. Over TCP clients may give READ_ONLY
     ones, and operators, known by their keys, all.
@@ -77,9 +79,13 @@ class ControlServer:
         *,
         address: str | None = None,
         context: Context | None = None,
+        commands: Mapping[str, Command] = COMMANDS,
     ) -> None:
+        """Raises ValueError for a handler of a command that is not in the table."""
         self.process = process
-        self.handlers: dict[str, Handler] = {"clock": _clock, **handlers}
+        self.handlers: dict[str, Handler] = {}
+        self._table = {**commands, "clock": COMMANDS["clock"]}
+        self.add({"clock": _clock, **handlers})
         self.malformed = 0
         self._listening = Listening(
             context or zmq.Context.instance(),
@@ -88,6 +94,12 @@ class ControlServer:
             {zmq.LINGER: 200, zmq.RCVHWM: QUEUE, zmq.SNDHWM: QUEUE},  # so long the answer to "stop" may still go out
         )
         self._second, self._asked, self._flood, self._flood_until = 0, 0, "", 0.0
+
+    def add(self, handlers: Mapping[str, Handler]) -> None:
+        """Take further commands. Raises ValueError for one that is not in the table."""
+        if unknown := sorted(handlers.keys() - self._table.keys()):
+            raise ValueError(f"no command {', '.join(unknown)} in protocol/commands.py: add it with its arguments")
+        self.handlers.update(handlers)
 
     @property
     def socket(self) -> Socket:
@@ -175,11 +187,13 @@ class ControlServer:
         if forbidden:
             return _refusal("forbidden", forbidden)
         try:
-            return _packed({"ok": True, "result": handler(args) or {}})
+            return _packed({"ok": True, "result": handler(checked(command, self._table[command], args)) or {}})
+        except BadArgument as bad:
+            return _refusal("bad_request", str(bad))
         except ControlError as bad:
             return _refusal(bad.kind, bad.message)
         except Exception as bad:
-            why = f"{command} needs the argument {bad}" if isinstance(bad, KeyError) else str(bad) or type(bad).__name__
+            why = str(bad) or type(bad).__name__
             log.warning(
                 "command %s failed: %s: %s", command, type(bad).__name__, foreign(why), exc_info=log.isEnabledFor(10)
             )
@@ -233,7 +247,8 @@ class ControlClient:
         if isinstance(error, dict):
             kind, message = error.get("type"), error.get("message")
             if isinstance(kind, str) and isinstance(message, str):
-                raise ControlError(kind, message)
+                unsaid = f"{self.process} refused {command} without saying why ({kind or 'no type'}): its log may"
+                raise ControlError(kind or "bad_reply", message if message.strip() else unsaid)
         raise ControlError("bad_reply", f"{self.process} answered {command} with neither result nor error")
 
 

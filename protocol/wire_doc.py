@@ -1,4 +1,4 @@
-"""WIRE.md's tables, printed from topics.py, frame_types.py and link_messages.py.
+"""WIRE.md's tables, printed from topics.py, frame_types.py, commands.py and link_messages.py.
 
 python -m protocol.wire_doc            writes them into WIRE.md, between its markers
 python -m protocol.wire_doc --check    exits 1 where WIRE.md is not current
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from . import fields, frame_types, frames, link, link_messages, publishing, records, runtime, topics
+from . import commands, fields, frame_types, frames, link, link_messages, publishing, records, runtime, topics
 
 WIRE_MD = Path(__file__).with_name("WIRE.md")
 
@@ -105,6 +105,17 @@ def reason_table() -> str:
     return table(("reason", "means"), ((f"`{name}`", meaning) for name, meaning in frames.REASONS.items()))
 
 
+def command_table() -> str:
+    """The commands, with their arguments."""
+    rows: list[tuple[object, ...]] = []
+    for name, command in commands.COMMANDS.items():
+        rows.append((f"`{name}`", command.by, "", "", "", command.doc))
+        for key, argument in command.arguments.items():
+            type_ = argument.check.describe() + (", needed" if argument.needed else "")
+            rows.append(("", "", f"`{key}`", type_, argument.check.unit, argument.doc))
+    return table(("command", "taken by", "argument", "type", "unit", "meaning"), rows)
+
+
 def limit_table() -> str:
     """The limits that bound what a message may cost its reader."""
     return table(
@@ -167,6 +178,7 @@ SECTIONS: dict[str, Callable[[], str]] = {
     "reasons": reason_table,
     "frames": frame_tables,
     "limits": limit_table,
+    "commands": command_table,
     "messages": link_tables,
     "codes": code_tables,
     "schema": schema_block,

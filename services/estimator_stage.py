@@ -97,18 +97,18 @@ class EstimatorStage(Stage):
 
     def command(self, name: str, args: dict[str, Any]) -> dict[str, Any]:
         if name == "part":
-            return {**self.rolling_scans.handed_on(int(args.get("scan", -1)))}
+            return {**self.rolling_scans.handed_on(args["scan"])}
         if name != "tare":
             return super().command(name, args)
         try:
             # A baseline with which frames are of no touch is wrong, and so is its word that something touches.
-            force = bool(args.get("force", False)) or self._impossible_ns > 0
+            force = args.get("force", False) or self._impossible_ns > 0
             baseline = self.baseline_estimator.tare(self.touch_estimator.touched, force)
         except NoBaseline as why:
             raise Refused(str(why)) from None
         self._begin_anew()
         relative = float(np.median(baseline.sigma / np.maximum(baseline.z0, 1e-12)))
-        wanted = self.config.tare.calibrate and bool(args.get("calibrate", True))
+        wanted = self.config.tare.calibrate and args.get("calibrate", True)
         calibrating = wanted and self.linearisation.tared(baseline)
         answer = {"frames": baseline.frames, "snr_db": -20 * np.log10(max(relative, 1e-12)), "hash": baseline.hash}
         return answer | {"calibrating": calibrating, "problem": self.linearisation.problem if wanted else ""}

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import logging
-import math
 import os
 import signal
 import sys
@@ -71,7 +70,7 @@ class RecorderService:
             self.recorder.stop()
 
     def _record(self, args: dict[str, Any]) -> dict[str, Any]:
-        if args.get("on", True):
+        if args["on"]:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.recorder.record(file_in(self.folder), named_by_time=True)
             self.gave_up = ""
@@ -89,14 +88,13 @@ class RecorderService:
         most = {"before_s": snapshots.keeping.before_s, "after_s": LONGEST_S}
         wanted: dict[str, float] = {}
         for name, limit in most.items():
-            value = args.get(name)
-            if value is None:
+            if name not in args:
                 continue
-            if not isinstance(value, (int, float)) or not math.isfinite(value) or not 0 <= value <= limit:
+            if not 0 <= args[name] <= limit:
                 hint = ": before_s in [recorder] of skin.toml says how much is kept" if name == "before_s" else ""
-                raise RecordingError(f"found {name} {value!r:.40}, expected 0 to {limit:g} s{hint}")
-            wanted[name] = float(value)
-        asked = str(args.get("why") or "by command")[:200]
+                raise RecordingError(f"found {name} {args[name]!r:.40}, expected 0 to {limit:g} s{hint}")
+            wanted[name] = args[name]
+        asked = (args.get("why") or "by command")[:200]
         path = snapshots.take("snapshot", asked, self.recorder.now_ns(), **wanted)
         return {"file": str(path), "after_s": wanted.get("after_s", snapshots.keeping.after_s)}
 

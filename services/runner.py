@@ -74,8 +74,7 @@ class Runner:
         channel = Channel(self.process, stage, StageReader(stage.reads, stage.skin) if feed is None else feed)
         self.channels[stage.skin] = channel
         self._by_socket[channel.feed.socket] = channel
-        for command in stage.commands:
-            self.control.handlers[command] = self._commands.of_the_stage(command)
+        self.control.add({command: self._commands.of_the_stage(command) for command in stage.commands})
         if stage.persists:
             self._restore(channel)
         stage.warm_up()

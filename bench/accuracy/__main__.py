@@ -28,6 +28,7 @@ from bench.accuracy.methods import Image, Method, Tare
 from bench.accuracy.scores import Row, score_mask, summarise
 from models import metrics
 from models.bundle import Bundle
+from models.command import whole
 from models.shapes import Array
 from services.recordings.reconstruction import resampled
 
@@ -128,7 +129,7 @@ def main(argv: list[str] | None = None) -> int:
         "--levels", nargs="+", default=None, choices=LEVELS, help="dB; none: noise-free; 70f: fixed in ohm"
     )
     parser.add_argument("--bundle", default="square16", help="the bundle that stands for what is shipped")
-    parser.add_argument("--seed", type=int, default=5, help="of the frames and the noise")
+    parser.add_argument("--seed", type=whole(0), default=5, help="of the frames and the noise")
     parser.add_argument(
         "--only", nargs="*", default=None, help="methods whose name contains one of these; no name: what is shipped"
     )

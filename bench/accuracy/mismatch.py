@@ -29,6 +29,7 @@ from bench.machine import provenance
 from models import metrics
 from models.bundle import Bundle
 from models.calibration_file import found_by, unpack
+from models.command import whole
 from models.fit_calibration import calibrate
 from models.mismatch import NAMED, Mismatch, MismatchedSheet, soft_drop
 from models.prereconstruction import noise_of_frames
@@ -170,13 +171,13 @@ def shown(rows: Sequence[dict[str, Any]]) -> Table:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench mismatch", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--quick", action="store_true", help="one skin each, one touch of each shape, a coarser mesh")
-    parser.add_argument("--skins", type=int, default=3, help="drawn of each mismatch")
-    parser.add_argument("--touches", type=int, default=4, help="of each shape on each skin")
+    parser.add_argument("--skins", type=whole(), default=3, help="drawn of each mismatch")
+    parser.add_argument("--touches", type=whole(), default=4, help="of each shape on each skin")
     parser.add_argument("--levels", nargs="+", default=list(LEVELS), help="dB, or none")
     parser.add_argument("--only", nargs="+", default=list(WANTED), choices=list(NAMED), help="some mismatches")
     parser.add_argument("--mesh", choices=("reference", "stub"), help="that frames are solved on")
     parser.add_argument("--bundle", default=SKIN)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=whole(0), default=1)
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     skins, touches = (1, 1) if args.quick else (args.skins, args.touches)

@@ -51,6 +51,7 @@ from bench.json_file import write_json
 from bench.machine import provenance
 from models import metrics
 from models.bundle import Bundle
+from models.command import whole
 from models.forward import ForwardModel
 from models.npz import read_npz
 from models.refine import refined_fit, responses_of, start_of
@@ -348,10 +349,10 @@ def goals(report: dict[str, Any], quick: bool) -> list[Goal]:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench refined", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--touches", type=int, default=None, help="500; 60 with --quick")
+    parser.add_argument("--touches", type=whole(), default=None, help="500; 60 with --quick")
     parser.add_argument("--levels", nargs="+", default=["none", "70"])
-    parser.add_argument("--coverage-touches", type=int, default=None, help="at 60 and 80 dB: 300; 12 with --quick")
-    parser.add_argument("--seed", type=int, default=33)
+    parser.add_argument("--coverage-touches", type=whole(), default=None, help="at 60 and 80 dB: 300; 12 with --quick")
+    parser.add_argument("--seed", type=whole(0), default=33)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)

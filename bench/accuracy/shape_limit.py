@@ -28,6 +28,7 @@ from bench.goals import Goal
 from bench.json_file import write_json
 from bench.machine import provenance
 from models.bundle import Bundle
+from models.command import real, whole
 from models.prereconstruction import TARE_FRAMES
 from models.scenes import TARGETS, random_shape
 from models.shapes import CLASSES, Shape
@@ -125,9 +126,9 @@ def run(touches: int, snr_db: float, seed: int) -> dict[str, Any]:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench shape_limit", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--touches", type=int, default=300)
-    parser.add_argument("--snr", type=float, default=70.0, help="dB")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--touches", type=whole(), default=300)
+    parser.add_argument("--snr", type=real(), default=70.0, help="dB")
+    parser.add_argument("--seed", type=whole(0), default=1)
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     found = run(args.touches, args.snr, args.seed)

@@ -26,6 +26,7 @@ from bench.reliability.scenes import grid, touches_at_random
 from bench.speed.service import end_on_sigterm
 from firmware_stub.world import Touch
 from models.bundle import Bundle
+from models.command import whole
 
 PARTS = ("starts", "gains", "rows", "history")
 
@@ -170,8 +171,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a few places: a minute on two cores")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="these parts; writes no report")
     parser.add_argument("--bundle", default="square16")
-    parser.add_argument("--seed", type=int, default=5, help="of contact impedances, electrodes and noise")
-    parser.add_argument("--cores", type=int, default=workers.cores())
+    parser.add_argument("--seed", type=whole(0), default=5, help="of contact impedances, electrodes and noise")
+    parser.add_argument("--cores", type=whole(), default=workers.cores())
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()

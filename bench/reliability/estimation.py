@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from models import geometry
 from models.bundle import Bundle
+from models.command import whole
 from models.forward import ForwardModel, shared
 from models.scenes import Prior, random_scene
 from models.shapes import Shape
@@ -131,8 +132,8 @@ def main() -> None:
         prog="skin bench estimation", description=__doc__.splitlines()[0] if __doc__ else ""
     )
     parser.add_argument("part", choices=("drift", "start"))
-    parser.add_argument("--count", type=int, default=120, help="scenes, or untouched starts")
-    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--count", type=whole(), default=120, help="scenes, or untouched starts")
+    parser.add_argument("--seed", type=whole(0), default=7)
     args = parser.parse_args()
     (drift if args.part == "drift" else start)(args.count, args.seed)
 

@@ -26,6 +26,7 @@ from bench.reliability import availability, faults_report, matrix, report, soak,
 from bench.reliability.matrix import ROWS, SITUATIONS, FaultScore
 from bench.speed.service import end_on_sigterm
 from firmware_stub.world import Touch
+from models.command import whole
 from services.pipeline import Pipeline
 
 PLACES, QUICK_PLACES = 20, 2
@@ -116,14 +117,14 @@ def run_availability(
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench faults", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--quick", action="store_true", help="two places, fewer frames: two minutes on two cores")
-    parser.add_argument("--places", type=int, help=f"default: {PLACES}, with --quick {QUICK_PLACES}")
+    parser.add_argument("--places", type=whole(), help=f"default: {PLACES}, with --quick {QUICK_PLACES}")
     parser.add_argument("--only", nargs="+", metavar="FAULT", help="rows of the matrix that begin so; writes no report")
-    parser.add_argument("--frames", type=int, help="random faults and presses instead of the matrix")
+    parser.add_argument("--frames", type=whole(), help="random faults and presses instead of the matrix")
     parser.add_argument("--more", action="store_true", help="with --frames: add to what the last report counted")
     parser.add_argument("--bundle", default="square16")
     parser.add_argument("--scan", choices=("full", "rolling"), default="full", help="whole scans, or scans in parts")
-    parser.add_argument("--seed", type=int, default=5, help="of places, arguments and noise")
-    parser.add_argument("--cores", type=int, default=workers.cores())
+    parser.add_argument("--seed", type=whole(0), default=5, help="of places, arguments and noise")
+    parser.add_argument("--cores", type=whole(), default=workers.cores())
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     titles = tuple(r.title for r in ROWS if args.only is None or any(r.title.startswith(word) for word in args.only))

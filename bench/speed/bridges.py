@@ -33,6 +33,7 @@ from bench.goals import Goal
 from bench.json_file import write_json
 from bench.machine import provenance
 from bench.speed.service import BEGIN, Outside, Service, end_on_sigterm, running
+from models.command import real, whole
 from protocol.sockets import ControlClient, ControlError
 from services.bridge import NEEDS
 
@@ -242,8 +243,8 @@ def table(since: dict[str, list[float]], heard: dict[str, HandedOn]) -> Table:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench bridges", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--seconds", type=float, default=40.0, help="of each condition, all rounds together")
-    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--seconds", type=real(), default=40.0, help="of each condition, all rounds together")
+    parser.add_argument("--rounds", type=whole(), default=4)
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()

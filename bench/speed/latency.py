@@ -35,6 +35,7 @@ from bench.json_file import write_json
 from bench.machine import machine, provenance
 from bench.speed import latency_parts
 from bench.speed.service import BEGIN, Outside, Service, end_on_sigterm, running
+from models.command import real, whole
 from protocol.frames import RawFrame, TruthFrame
 from protocol.sockets import AllReader
 from services.pipeline import Pipeline
@@ -52,6 +53,7 @@ SETTLE_S = 2.0
 TARE_S = 6.0
 CONTROLLER = """
 import sys, zmq
+from models.command import real, whole
 s = zmq.Context.instance().socket(zmq.SUB)
 s.setsockopt(zmq.CONFLATE, 1)
 s.connect(sys.argv[1])
@@ -228,8 +230,8 @@ def table(rows: dict[str, dict[str, Any]]) -> Table:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench latency", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each condition")
-    parser.add_argument("--controllers", type=int, nargs="+", default=[1, 4, 16])
+    parser.add_argument("--seconds", type=real(), default=20.0, help="of each condition")
+    parser.add_argument("--controllers", type=whole(), nargs="+", default=[1, 4, 16])
     parser.add_argument("--parts-only", action="store_true", help="scans in parts alone; writes no report")
     parser.add_argument("--usual-priority", action="store_true", help="without the rows of a real-time priority")
     parser.add_argument("--out", type=Path, default=REPORTS)

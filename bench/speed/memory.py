@@ -18,6 +18,7 @@ from bench.json_file import write_json
 from bench.machine import provenance
 from bench.speed.skip import run_once, scenes
 from models.bundle import Bundle
+from models.command import whole
 from services.pipeline import build_stages
 from services.runtime.config import Skin
 
@@ -53,7 +54,7 @@ def _resident_mb() -> float:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench memory", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--frames", type=int, default=1_000_000)
+    parser.add_argument("--frames", type=whole(), default=1_000_000)
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     found = memory(args.frames)

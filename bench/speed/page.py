@@ -27,6 +27,7 @@ from bench.machine import provenance
 from bench.speed.bridges import quantiles
 from bench.speed.service import BEGIN, Service, end_on_sigterm, running
 from bridges.page.feed import NEWEST
+from models.command import real, whole
 from protocol.frames import ContactFrame
 from protocol.sockets import AllReader
 
@@ -125,8 +126,8 @@ def goals(cores: dict[int, list[float]], times: dict[int, list[float]]) -> list[
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench page", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--seconds", type=float, default=60.0, help="of each number of viewers, all rounds together")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=real(), default=60.0, help="of each number of viewers, all rounds together")
+    parser.add_argument("--rounds", type=whole(), default=5)
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()

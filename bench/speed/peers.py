@@ -40,6 +40,7 @@ from bench.speed.relay_frames import HOPS, sizes
 from bench.speed.service import end_on_sigterm
 from bench.speed.skip import ENDS_S, QUIET_S, scenes
 from bench.tracking.scene import Recorded
+from models.command import whole
 from services.pipeline import Pipeline
 from services.recordings.replay_session import stop
 from services.runtime.config import Skin
@@ -252,8 +253,8 @@ def table(title: str, rows: dict[str, dict[str, float]], reference: str) -> Tabl
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench peers", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--frames", type=int, default=100, help="of each transport in a round")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--frames", type=whole(), default=100, help="of each transport in a round")
+    parser.add_argument("--rounds", type=whole(), default=3)
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()

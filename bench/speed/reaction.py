@@ -47,6 +47,7 @@ from bench.speed.reaction_report import (
 from bench.speed.service import Service, end_on_sigterm, running
 from bench.speed.simulated_host import SimulatedHost
 from models import manifest
+from models.command import whole
 from protocol.frames import ContactFrame, unpack
 from protocol.sockets import ControlClient
 from protocol.transport import Context
@@ -145,10 +146,10 @@ def by_event(plan: list[TouchEvent], frames: list[SeenFrame]) -> list[tuple[Touc
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench reaction", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--steps", type=int, default=STEPS, help="of 2 N; the others in proportion")
+    parser.add_argument("--steps", type=whole(), default=STEPS, help="of 2 N; the others in proportion")
     parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES))
     parser.add_argument("--simulated", action="store_true", help="in simulated time, without processes")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=whole(0), default=1)
     parser.add_argument("--more", action="store_true", help="add so many other touches to those of the last report")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} steps and a few of the others")
     parser.add_argument("--out", type=Path, default=REPORTS)

@@ -40,6 +40,7 @@ from bench.machine import provenance
 from bench.speed.bridges import NEAR_NS, P99_MS, SETTLE_S, SKINS, quantiles
 from bench.speed.service import Service, end_on_sigterm, running
 from bridges import views
+from models.command import real
 from protocol.control import ControlClient, ControlError
 from protocol.errors import EitskinError
 from protocol.frames import ContactFrame, ImageFrame, StatusFrame
@@ -258,7 +259,7 @@ def table(rows: dict[str, Row]) -> Table:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench ros_node", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--minutes", type=real(), default=10.0)
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()

@@ -32,6 +32,7 @@ from bench.json_file import write_json
 from bench.machine import machine, provenance
 from bench.speed.service import Outside, Service, end_on_sigterm, running
 from bench.speed.skip import scenes
+from models.command import real, whole
 from protocol.frames import RawFrame, pack
 from protocol.transport import Context
 from services.recordings.recording import RecordingWriter
@@ -237,9 +238,9 @@ def table(rows: list[dict[str, Any]]) -> Table:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench scale", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--skins", type=int, nargs="+", default=[1, 4, 16, 32, 64])
-    parser.add_argument("--seconds", type=float, default=15.0, help="of each measurement")
-    parser.add_argument("--touched", type=float, nargs="+", default=[0.25, 1.0], help="shares of the skins")
+    parser.add_argument("--skins", type=whole(), nargs="+", default=[1, 4, 16, 32, 64])
+    parser.add_argument("--seconds", type=real(), default=15.0, help="of each measurement")
+    parser.add_argument("--touched", type=real(itself=True), nargs="+", default=[0.25, 1.0], help="shares of the skins")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()

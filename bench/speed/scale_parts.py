@@ -30,6 +30,7 @@ from bench.speed.service import end_on_sigterm, running
 from bench.speed.skip import scripts
 from bench.tracking.host import Host
 from firmware_stub.rig import Rig
+from models.command import real, whole
 from protocol.frames import RawFrame
 from services.runtime.config import Skin
 
@@ -115,9 +116,9 @@ def table(rows: list[dict[str, Any]]) -> Table:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench scale_parts", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--skins", type=int, nargs="+", default=[1, 4, TARGET_SKINS])
-    parser.add_argument("--seconds", type=float, default=15.0, help="of each measurement")
-    parser.add_argument("--touched", type=float, default=0.25, help="share of the skins")
+    parser.add_argument("--skins", type=whole(), nargs="+", default=[1, 4, TARGET_SKINS])
+    parser.add_argument("--seconds", type=real(), default=15.0, help="of each measurement")
+    parser.add_argument("--touched", type=real(itself=True), default=0.25, help="share of the skins")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()

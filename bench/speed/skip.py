@@ -37,6 +37,7 @@ from bench.speed.skip_batching import TOGETHER, batch_table, batched
 from bench.speed.skip_beside import beside, ratios, table_of
 from bench.tracking.scene import Recorded, record
 from models.bundle import Bundle
+from models.command import real
 from models.refine import RefineJob
 from protocol.frames import ContactFrame, Frame, RawFrame, pack, unpack
 from services.pipeline import build_stages
@@ -223,8 +224,10 @@ def live(seconds: float) -> dict[str, Any]:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench skip", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each scene, simulated")
-    parser.add_argument("--live", type=float, default=15.0, help="seconds of each scene with the real processes")
+    parser.add_argument("--seconds", type=real(), default=20.0, help="of each scene, simulated")
+    parser.add_argument(
+        "--live", type=real(itself=True), default=15.0, help="seconds of each scene with the real processes"
+    )
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     for name, given, least in (("seconds", args.seconds, LEAST_S), ("live", args.live, LEAST_LIVE_S)):

@@ -26,6 +26,7 @@ from bench.json_file import write_json
 from bench.machine import provenance
 from bench.speed.service import end_on_sigterm
 from bench.speed.simulated_host import SimulatedHost
+from models.command import real, whole
 
 SNR_DB = 80.0
 BASELINE_S = 7.0
@@ -71,9 +72,9 @@ def chunk(seconds: float, seed: int) -> dict[str, Any]:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench untouched_parts", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--hours", type=float, default=3.0, help="of simulated time, in all")
-    parser.add_argument("--chunk-minutes", type=float, default=10.0)
-    parser.add_argument("--seed", type=int, default=1, help="of the first chunk; each has the next one")
+    parser.add_argument("--hours", type=real(), default=3.0, help="of simulated time, in all")
+    parser.add_argument("--chunk-minutes", type=real(), default=10.0)
+    parser.add_argument("--seed", type=whole(0), default=1, help="of the first chunk; each has the next one")
     parser.add_argument("--anew", action="store_true", help="forget what ran before")
     parser.add_argument("--mixed", action="store_true", help="what ran at other commits counts too")
     parser.add_argument("--quick", action="store_true", help="the ten minutes of CI")

@@ -33,6 +33,7 @@ from bench.stability import (
 )
 from bench.stability.run import SKIN, Row, Setting
 from models.bundle import Bundle
+from models.command import whole
 
 PARTS = {
     **matrices.PARTS,
@@ -66,7 +67,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="*", default=(), metavar="PART", help="parts whose name contains one of these")
     parser.add_argument("--bundle", default=SKIN, help=f"a bundle of the skin {SKIN}")
     parser.add_argument("--scan", choices=("full", "rolling"), default="full", help="whole scans, or scans in parts")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=whole(0), default=1)
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     began, cpu = time.perf_counter(), time.process_time()

@@ -173,7 +173,7 @@ def commands(site: Site) -> Row:
     site.use("robot")
 
     def tare(args: dict[str, Any]) -> dict[str, Any]:
-        carried_out.append(str(args.get("by")))
+        carried_out.append(args["skin"])
         return {}
 
     handlers = {"tare": tare, "status": lambda args: {}}
@@ -184,7 +184,7 @@ def commands(site: Site) -> Row:
         for name in ("arm", "chief"):
             site.use(name)
             try:
-                ControlClient("publisher", CONNECT_S / 2, context=site.context).call("tare", by=name)
+                ControlClient("publisher", CONNECT_S / 2, context=site.context).call("tare", skin=name)
                 answers[name] = "carried out"
             except ControlError as refused:
                 answers[name] = refused.kind

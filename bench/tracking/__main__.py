@@ -23,6 +23,7 @@ from bench.tracking import faults, report
 from bench.tracking.scene import Recorded, record
 from bench.tracking.scores import Scorer, StageOutput, all_of
 from models.bundle import Bundle
+from models.command import real, whole
 from services.pipeline import Pipeline
 from services.runtime.config import Skin
 
@@ -82,12 +83,12 @@ def fade(recorded: Recorded, seen: list[StageOutput]) -> float | None:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench tracking", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--scene", default="ten_minutes", help="a scene of the stub, or a .toml file")
-    parser.add_argument("--seconds", type=float, default=None, help="only the scene's beginning")
-    parser.add_argument("--snr", type=float, default=80.0, help="the stub's signal over noise, dB")
+    parser.add_argument("--seconds", type=real(), default=None, help="only the scene's beginning")
+    parser.add_argument("--snr", type=real(), default=80.0, help="the stub's signal over noise, dB")
     parser.add_argument("--bundle", default="square16")
     parser.add_argument("--scan", choices=("full", "rolling"), default="full", help="whole scans, or scans in parts")
     parser.add_argument("--network", choices=("full", "fast", "int8", "none"), help="default: the services'")
-    parser.add_argument("--seed", type=int, default=4, help="of the noise")
+    parser.add_argument("--seed", type=whole(0), default=4, help="of the noise")
     parser.add_argument("--notes", action="store_true", help="also say what went wrong when")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)

@@ -40,9 +40,7 @@ def services(skins: dict[str, BridgedSkin], token: str) -> list[Service]:
 
 
 def _record(asked: dict[str, Any]) -> dict[str, Any]:
-    if not isinstance(on := asked.get("on", True), bool):
-        raise ValueError(f'found "on": {on!r:.40}, expected true or false')
-    return _recorder("record", {"on": on})
+    return _recorder("record", asked)
 
 
 def _snapshot(asked: dict[str, Any]) -> dict[str, Any]:

@@ -40,7 +40,7 @@ class Commands:
 
     def _channel(self, args: dict[str, Any]) -> Channel:
         name = args.get("skin") or next(iter(self.channels))
-        if not isinstance(name, str) or name not in self.channels:
+        if name not in self.channels:
             raise ControlError("bad_request", f"no skin called {name!r}; configured: {', '.join(self.channels)}")
         return self.channels[name]
 
@@ -55,8 +55,6 @@ class Commands:
 
     def _load(self, args: dict[str, Any]) -> dict[str, Any]:
         """Take over a state that `state` gave."""
-        if not isinstance(args.get("state"), dict):
-            raise ControlError("bad_request", "load needs `state`, a map as the command state gives it")
         stage = self._channel(args).stage
         try:
             stage.load(persistence.arrays(args["state"]))

@@ -151,6 +151,8 @@ def test_the_recorder_is_told_by_who_has_the_token(
                 assert (await viewer.call("/record", **wrong))["success"] is False
             odd = await viewer.call("/record", token=token, on="yes")
             assert odd["success"] is False and "true or false" in odd["message"] and not told
+            unsaid = await viewer.call("/record", token=token)
+            assert unsaid["success"] is False and "argument on: found none" in unsaid["message"] and not told
             done = await viewer.call("/record", token=token, on=True)
             assert done["success"] is True and "20260101" in done["message"]
             await viewer.call("/record", token=token, on=False)

@@ -107,7 +107,7 @@ def test_commands_explain_what_was_wrong(stub):
     for command, args, says in (
         ("press", {"x": 1.0, "y": 0.0, "force": 1.0}, "not on the skin"),
         ("press", {"x": 0.0, "y": 0.0}, "force"),
-        ("press", {"y": 0.0, "force": 1.0}, "needs x"),
+        ("press", {"y": 0.0, "force": 1.0}, "argument x: found none, expected a finite number .m."),
         ("press", {"x": "left", "y": 0.0, "force": 1.0}, "left"),
         ("press", {"x": 0.0, "y": 0.0, "force": 1.0, "skin": "sole"}, "no skin 'sole': expected one of palm"),
         ("scene", {"name": "nowhere"}, "paper_49"),

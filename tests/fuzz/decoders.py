@@ -89,9 +89,8 @@ def _bundle() -> bundles.Bundle:
 @cache
 def _server() -> ControlServer:
     """`load` as the runner's, which takes over what a recording holds. Its socket is of this process alone."""
-    server = ControlServer("preprocessing", {}, address="inproc://fuzz")
-    server.handlers = {"load": _load, "tare": lambda args: _stage().command("tare", args)}
-    return server
+    handlers = {"load": _load, "tare": lambda args: _stage().command("tare", args)}
+    return ControlServer("preprocessing", handlers, address="inproc://fuzz")
 
 
 _broken: list[Exception] = []

@@ -7,7 +7,9 @@ import msgpack
 import pytest
 import zmq
 
+from protocol.commands import COMMANDS, Argument, Command, Content
 from protocol.control import BUSY
+from protocol.fields import Bool, Float, Int, Text
 from protocol.runtime import control_endpoint
 from protocol.sockets import ControlClient, ControlError, ControlServer, clock_offset
 
@@ -35,6 +37,15 @@ def server(runtime, context):
             "odd": lambda a: {"x": object()},
         },
         context=context,
+        commands={
+            "needs": Command("test", "", {"x": Argument(Int(), "a number", needed=True)}),
+            "press": Command(
+                "test",
+                "",
+                {"x": Argument(Float(unit="m"), ""), "shape": Argument(Text(), ""), "n": Argument(Int(), "")},
+            ),
+            **{name: Command("test", "") for name in ("fail", "refuse", "slow", "odd")},
+        },
     )
     stop = threading.Event()
 
@@ -62,7 +73,7 @@ def test_a_command_is_answered(server, context):
         ("fail", "FileNotFoundError", "see models/bundles"),
         ("refuse", "busy", "taring"),
         ("odd", "TypeError", "serialize"),
-        ("needs", "KeyError", "needs the argument 'x'"),
+        ("needs", "bad_request", "needs, argument x: found none, expected a whole number: a number"),
     ],
 )
 def test_a_failing_command_is_a_typed_error_and_the_server_lives(server, context, command, kind, says):
@@ -71,6 +82,86 @@ def test_a_failing_command_is_a_typed_error_and_the_server_lives(server, context
         client.call(command)
     assert caught.value.kind == kind
     assert client.call("press") == {"got": {}}
+
+
+@pytest.fixture
+def all_commands(runtime, context):
+    """Every command of the table, each of which notes with what it was carried out; gives those notes."""
+    carried_out = []
+    handlers = {name: lambda args, name=name: carried_out.append((name, args)) or {} for name in COMMANDS}
+    own, stop = ControlServer("stub", handlers, context=context), threading.Event()
+    thread = threading.Thread(target=lambda: [own.serve_once(0.02) for _ in iter(stop.is_set, True)])
+    thread.start()
+    yield carried_out
+    stop.set()
+    thread.join()
+    own.close()
+
+
+RIGHT = {Bool: True, Float: 1.5, Int: 1, Text: "x", Content: {"a": 1}}
+WRONG = {
+    Bool: ("no", "true", "", 0, 1, 1.0, [], {}, b"\1"),
+    Float: ("1", True, [1.0], {}, float("nan"), float("inf"), -float("inf"), b""),
+    Int: ("1", True, 1.5, float("nan"), [1]),
+    Text: (1, True, ["x"], {}, b"x", "x" * 5000),
+    Content: ("x", 1, True, []),
+}
+ARGUMENTS = [(name, key) for name, command in COMMANDS.items() for key in command.arguments]
+
+
+def right(name):
+    return {key: RIGHT[type(argument.check)] for key, argument in COMMANDS[name].arguments.items()}
+
+
+@pytest.mark.parametrize(("name", "key"), ARGUMENTS)
+def test_an_argument_of_another_type_carries_nothing_out(all_commands, context, name, key):
+    """`tare` with force: "no" is no tare by force."""
+    client = ControlClient("stub", context=context)
+    for wrong in WRONG[type(COMMANDS[name].arguments[key].check)]:
+        with pytest.raises(ControlError, match=f"{name}, argument {key}: found .*, expected ") as refused:
+            client.call(name, **{**right(name), key: wrong})
+        assert refused.value.kind == "bad_request" and len(str(refused.value)) < 300, wrong
+    assert not all_commands
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_arguments_of_their_types_are_handed_on(all_commands, context, name):
+    client, given = ControlClient("stub", context=context), right(name)
+    client.call(name, **given)
+    needed = {key for key, argument in COMMANDS[name].arguments.items() if argument.needed}
+    client.call(name, **{key: value if key in needed else None for key, value in given.items()})
+    with pytest.raises(ControlError, match=f"{name}: found the argument forse, expected (only|no argument)"):
+        client.call(name, **given, forse=True)
+    for key in needed:
+        for without in ({k: v for k, v in given.items() if k != key}, {**given, key: None}):
+            with pytest.raises(ControlError, match=f"{name}, argument {key}: found none, expected "):
+                client.call(name, **without)
+    if name != "clock":  # which is the server's own
+        assert all_commands == [(name, given), (name, {key: given[key] for key in needed})]
+
+
+def test_a_command_without_its_arguments_in_the_table_is_not_taken(runtime, context):
+    with pytest.raises(ValueError, match="no command melt in protocol/commands.py"):
+        ControlServer("stub", {"melt": lambda args: {}}, context=context)
+
+
+@pytest.mark.parametrize("message", ["", "  "])
+def test_a_refusal_without_a_word_says_at_least_of_what(runtime, context, message):
+    socket = context.socket(zmq.REP)
+    socket.bind(control_endpoint("stub"))
+
+    def answer():
+        assert socket.poll(3000)
+        socket.recv()
+        socket.send(msgpack.packb({"ok": False, "error": {"type": "refused", "message": message}}))
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    with pytest.raises(ControlError, match="stub refused tare without saying why .refused.") as refused:
+        ControlClient("stub", context=context).call("tare")
+    assert refused.value.kind == "refused"
+    thread.join()
+    socket.close(0)
 
 
 def test_nobody_there_is_found_out_in_time(runtime, context):
@@ -128,7 +219,7 @@ def test_what_a_replay_asks_after_each_part_is_no_flood(runtime, context):
 
     def ask(command):
         for _ in range(2 * BUSY + 1):  # of which BUSY are in one second, unless they take more than two
-            socket.send(msgpack.packb({"command": command}))
+            socket.send(msgpack.packb({"command": command, "args": {"scan": 1} if command == "part" else {}}))
             assert control.serve_once(1.0)
             assert socket.poll(1000) and msgpack.unpackb(socket.recv())["ok"]
 

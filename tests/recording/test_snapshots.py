@@ -240,6 +240,10 @@ def test_it_records_and_takes_snapshots_when_told_to(waiting: tuple[Publisher, C
         control.call("snapshot", after_s=1e9)
     with pytest.raises(ControlError, match="before_s in .recorder. of skin.toml"):
         control.call("snapshot", before_s=11)
+    for wrong in ({}, {"on": None}, {"on": "no"}, {"on": 1}):
+        with pytest.raises(ControlError, match="record, argument on: found .*, expected true or false"):
+            control.call("record", **wrong)
+    assert not control.call("status")["recording"]
     begun = control.call("record", on=True)
     assert begun["recording"] and begun["file"].startswith(str(tmp_path / "kept"))
     with pytest.raises(ControlError, match="being made already"):

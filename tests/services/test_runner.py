@@ -138,10 +138,15 @@ def test_frames_commands_silence_and_a_crash(process: Process, board: Board, bun
     with pytest.raises(ControlError, match="touched") as refused:
         process.control.call("tare", skin="palm")
     assert refused.value.kind == "refused"
+    for truthy in ("no", "false", 1, [0]):
+        with pytest.raises(ControlError, match="argument force: found .*, expected true or false") as refused:
+            process.control.call("tare", skin="palm", force=truthy)
+        assert refused.value.kind == "bad_request"
+    assert process.feed(board, 1, touch)[-1].touched  # by the baseline that it had
     with pytest.raises(ControlError, match="configured: palm"):
         process.control.call("tare", skin="plam")
     for no_name in ([1], {"palm": 1}, 7):
-        with pytest.raises(ControlError, match="configured: palm") as refused:
+        with pytest.raises(ControlError, match="argument skin: found .*, expected text") as refused:
             process.control.call("status", skin=no_name)
         assert refused.value.kind == "bad_request"
     assert process.control.call("status")["flowing"]
