@@ -15,7 +15,7 @@ def commands() -> dict[str, str]:
     """The benchmarks that can be run: name -> module. A folder's `__main__` has the folder's name."""
     found = {}
     for file in sorted([*(ROOT / "bench").glob("*.py"), *(ROOT / "bench").glob("*/*.py")]):
-        if file.parent != WORK and "\ndef main(" in file.read_text(encoding="utf-8"):
+        if file.parent != WORK and "\ndef main(argv" in file.read_text(encoding="utf-8"):
             module = ".".join(file.relative_to(ROOT).with_suffix("").parts)
             found[file.parent.name if file.stem == "__main__" else file.stem] = module
     return found

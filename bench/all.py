@@ -159,6 +159,14 @@ BENCHMARKS = (
 )
 
 
+def short_form(name: str, arguments: Sequence[str]) -> list[str]:
+    """The arguments of a benchmark with its own ones in the place of --quick, where its program has no such option."""
+    for benchmark in BENCHMARKS:
+        if benchmark.command == name and benchmark.quick is not None and "--quick" not in benchmark.quick:
+            return [*benchmark.quick, *(word for word in arguments if word != "--quick")]
+    return list(arguments)
+
+
 def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
     """Runs it; its tables go to our output and to NAME.txt. Returns what went wrong, or ""."""
     module = commands().get(benchmark.command, f"bench.{benchmark.command}")

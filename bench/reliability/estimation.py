@@ -127,14 +127,14 @@ def start(count: int, seed: int) -> None:
         line(f"electrodes off by {shift:g}: touched", seen)
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="skin bench estimation", description=__doc__.splitlines()[0] if __doc__ else ""
     )
     parser.add_argument("part", choices=("drift", "start"))
     parser.add_argument("--count", type=whole(), default=120, help="scenes, or untouched starts")
     parser.add_argument("--seed", type=whole(0), default=7)
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     (drift if args.part == "drift" else start)(args.count, args.seed)
 
 

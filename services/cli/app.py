@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from typing import Annotated
@@ -24,7 +25,7 @@ from services.cli import (
     service,
     watch,
 )
-from services.cli.common import FAILED, expected_code
+from services.cli.common import FAILED, USAGE, expected_code, with_values
 
 app = typer.Typer(
     name="skin",
@@ -54,8 +55,24 @@ for group in (service, watch, board, recordings, info, golden, export, calibrate
     group.register(app)
 
 
+def _with_values(of: typer.Typer) -> None:
+    """Every command of the app, and of the groups in it, refuses values that are none."""
+    for command in of.registered_commands:
+        assert command.callback is not None
+        command.callback = with_values(command.callback)
+    for inner in of.registered_groups:
+        if inner.typer_instance is not None:
+            _with_values(inner.typer_instance)
+
+
+_with_values(app)
+
+
 def run() -> int:
     """Runs the command line of this process and returns its exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a file's name need not be text, nor a terminal UTF-8
     try:
         app()
     except SystemExit as end:
@@ -68,6 +85,9 @@ def run() -> int:
     except Exception as error:
         if interrupted(error):
             return 130
+        if isinstance(error, OSError) and error.filename and not os.environ.get("EITSKIN_DEBUG"):
+            print(f"skin: {error.filename}: {error.strerror or error}: name another file or folder", file=sys.stderr)
+            return USAGE
         code = expected_code(error)
         if os.environ.get("EITSKIN_DEBUG"):
             raise

@@ -8,7 +8,18 @@ from typing import Annotated, Any
 
 import typer
 
-from services.cli.common import USAGE, CliError, JsonOption, SkinOption, control, emit, fail, of_service, skin_name
+from services.cli.common import (
+    LONGEST_S,
+    USAGE,
+    CliError,
+    JsonOption,
+    SkinOption,
+    control,
+    emit,
+    fail,
+    of_service,
+    skin_name,
+)
 
 EARLY = ": wait"  # in a tare's refusal: too few frames came since the start or the last touch, and more will
 
@@ -23,12 +34,12 @@ def register(app: typer.Typer) -> None:
 def press(
     x: Metre,
     y: Metre,
-    force: Annotated[float, typer.Option(help="Newtons.")],
-    radius: Annotated[float, typer.Option(help="Metres, of the circumscribed circle.")] = 0.01,
+    force: Annotated[float, typer.Option(min=0, help="Newtons.")],
+    radius: Annotated[float, typer.Option(min=1e-4, help="Metres, of the circumscribed circle.")] = 0.01,
     shape: Annotated[str, typer.Option(help="circle, triangle, rectangle, square, L or hertz.")] = "circle",
     to_x: Annotated[float | None, typer.Option(help="Slide to this x.")] = None,
     to_y: Annotated[float | None, typer.Option(help="Slide to this y.")] = None,
-    seconds: Annotated[float, typer.Option(help="How long the press goes on.")] = 20.0,
+    seconds: Annotated[float, typer.Option(min=0.001, max=LONGEST_S, help="How long the press goes on.")] = 20.0,
     skin: SkinOption = "",
     as_json: JsonOption = False,
 ) -> None:
@@ -86,7 +97,7 @@ def scene(
 def fault(
     name: Annotated[str, typer.Argument(help="Which fault; without one, list them.")] = "",
     arguments: Annotated[list[str] | None, typer.Argument(help="key=value, as the list shows them.")] = None,
-    seconds: Annotated[float, typer.Option(help="How long it lasts.")] = 5.0,
+    seconds: Annotated[float, typer.Option(min=0.001, max=LONGEST_S, help="How long it lasts.")] = 5.0,
     clear: Annotated[bool, typer.Option("--clear", help="End this fault, or all.")] = False,
     skin: SkinOption = "",
     as_json: JsonOption = False,
@@ -142,7 +153,9 @@ def tare(
     calibrate: Annotated[
         bool, typer.Option(help="Also fit how the skin is mounted, and use matrices that fit it; takes some seconds.")
     ] = True,
-    wait: Annotated[float, typer.Option(min=0.0, help="Seconds to try again for, where too few frames came.")] = 10.0,
+    wait: Annotated[
+        float, typer.Option(min=0.0, max=LONGEST_S, help="Seconds to try again for, where too few frames came.")
+    ] = 10.0,
     skin: SkinOption = "",
     as_json: JsonOption = False,
 ) -> None:

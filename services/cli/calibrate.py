@@ -42,7 +42,9 @@ def force(
     ] = None,
     save: Annotated[Path | None, typer.Option(help="Also keep the presses, as a CSV that --csv reads.")] = None,
     out: Annotated[Path | None, typer.Option(help="The calibration; default: calibration/SKIN-force.json.")] = None,
-    most: Annotated[float, typer.Option(help="Newtons beyond which it is extrapolated; default: the firmest.")] = 0.0,
+    most: Annotated[
+        float, typer.Option(min=0, help="Newtons beyond which it is extrapolated; default: the firmest.")
+    ] = 0.0,
     as_json: JsonOption = False,
 ) -> None:
     """Fit the skin's force law to presses of known force and say how well it predicts each press from the others.

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 FORCES = (3.0, 1.5, 5.0, 2.0, 4.0)  # newtons with which the stub is pressed, in turn
 STUB_PATIENCE_S = 20.0  # a press of the stub is there at once, or not seen at all
+MOST_PRESSES = 2000  # a day's work of a machine
 MOST_FAILED = 3  # presses in a row that do not count: the next ones will not either
 
 
@@ -39,8 +40,12 @@ def register(app: typer.Typer) -> None:
 
 def collect(
     target: Annotated[Path, typer.Argument(metavar="OUT.npz", help="What `skin register` reads.")],
-    stub: Annotated[int, typer.Option(metavar="N", help="Press the stub by itself, at N places.")] = 0,
-    radius: Annotated[float, typer.Option(metavar="METRES", help="With --stub: of the indenter.")] = 0.005,
+    stub: Annotated[
+        int, typer.Option(metavar="N", min=0, max=MOST_PRESSES, help="Press the stub by itself, at N places.")
+    ] = 0,
+    radius: Annotated[
+        float, typer.Option(metavar="METRES", min=1e-4, max=0.1, help="With --stub: of the indenter.")
+    ] = 0.005,
     skin: SkinOption = "",
     as_json: JsonOption = False,
 ) -> None:
@@ -83,10 +88,18 @@ def collect(
     if as_json:
         emit(report)
         return
-    register = f"skin register {target} --skin {configured.bundle} --presses {len(found)}"
-    print(f"wrote {target}: {len(found)} presses; next: {register}")
+    print(f"wrote {target}: {len(found)} presses; {_next(target, configured.bundle, len(found))}")
     if forces is not None:
         print(f"wrote {forces}; next: skin calibrate force --csv {forces} --measurements {target} --skin {name}")
+
+
+def _next(target: Path, bundle: str, presses: int) -> str:
+    """What may be done with so many presses."""
+    from services.calibration.registration import FEWEST
+
+    if presses < FEWEST:
+        return f"`skin register` needs at least {FEWEST}: collect more for that"
+    return f"next: skin register {target} --skin {bundle} --presses {presses}"
 
 
 def _on_the_stub(collector: Collector, name: str, bundle: Bundle, n: int, radius: float) -> Iterator[Collected]:

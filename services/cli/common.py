@@ -6,6 +6,7 @@ import contextlib
 import functools
 import inspect
 import json
+import math
 import os
 import sys
 import tomllib
@@ -20,6 +21,9 @@ from protocol.errors import EitskinError
 ROOT = Path(__file__).resolve().parents[2]
 FAILED, USAGE, NOT_RUNNING = 1, 2, 3
 """Exit codes: it did not work, the request itself is wrong, no service answers."""
+
+LONGEST_S = 86400.0
+"""For which a command waits or works, at most."""
 
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", help="Configuration; default: the running service's, else skin.toml.")
@@ -41,6 +45,43 @@ class CliError(EitskinError):
 
 def fail(message: str, code: int = FAILED) -> NoReturn:
     raise CliError(message, code)
+
+
+def with_values(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The command, which refuses what no range of typer's keeps out: infinite numbers, and text that is none."""
+    signature = inspect.signature(command, eval_str=True)
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, **given: Any) -> Any:
+        for name, value in given.items():
+            for one in value if isinstance(value, list) else [value]:
+                if expected := _not(one):
+                    found = f"{one:g}" if isinstance(one, float) else repr(one)
+                    fail(f"{_spelled(signature.parameters[name])}: found {found}, expected {expected}", USAGE)
+        return command(*args, **given)
+
+    return wrapped
+
+
+def _not(value: Any) -> str:
+    """What a value should be and is not; "" where it is."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return "a finite number"
+    try:
+        if isinstance(value, str):
+            value.encode()
+    except UnicodeEncodeError:
+        return "text in UTF-8"
+    return ""
+
+
+def _spelled(parameter: inspect.Parameter) -> str:
+    """An option as it is typed, an argument by its name."""
+    for said in getattr(parameter.annotation, "__metadata__", ()):
+        for spelling in (getattr(said, "default", None), *(getattr(said, "param_decls", None) or ())):
+            if isinstance(spelling, str) and spelling.startswith("--"):
+                return spelling
+    return "--" + parameter.name.replace("_", "-")
 
 
 def of_service(command: Callable[..., Any], starts: bool = False) -> Callable[..., Any]:

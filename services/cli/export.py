@@ -40,6 +40,8 @@ def export(
     if len(kinds) != 1:
         fail(f"found {len(kinds)} formats, expected one of --{', --'.join(SUFFIXES)}", USAGE)
     (kind,) = kinds
+    if not file.is_file():
+        fail(f"no file {file}: expected a recording, FILE.mcap", USAGE)
     if kind in NEEDS and importlib.util.find_spec(NEEDS[kind][0]) is None:
         fail(f"--{kind} needs the package {NEEDS[kind][0]}, which is not installed: {NEEDS[kind][1]}", USAGE)
     target = out or file.with_suffix(SUFFIXES[kind])

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from services.cli.common import FAILED, fail
+from services.cli.common import FAILED, USAGE, fail
 
 ROWS = 20
 
@@ -26,6 +26,8 @@ def golden(
 
     differ = 0
     for file in files:
+        if not file.is_file():
+            fail(f"no file {file}: expected a recording, FILE.mcap", USAGE)
         before = _before(file, accept)
         now = recorded.run(file)
         found = recorded.compare(before, now) if before is not None else None

@@ -98,7 +98,9 @@ def register_frame(
         Path | None, typer.Option(help="Folder for the skin's own bundle and a skin.toml; default: calibration/NAME.")
     ] = None,
     skin: Annotated[str, typer.Option("--skin", metavar="NAME", help="A configured skin, or a bundle.")] = "disc16",
-    presses: Annotated[int | None, typer.Option(help="How many presses to use, from the first; default: all.")] = None,
+    presses: Annotated[
+        int | None, typer.Option(min=1, help="How many presses to use, from the first; default: all.")
+    ] = None,
     diameter: Annotated[
         float | None, typer.Option(metavar="METRES", min=1e-3, max=10, help="Of the circle through the electrodes.")
     ] = None,
@@ -177,10 +179,16 @@ def bench(
     names = commands()
     if name in ("", "--help"):
         print("skin bench NAME [options], NAME one of: " + ", ".join(names))
+        print("Those of `skin bench all` have a short form: --quick. `skin bench NAME --help` shows the other options.")
         return
     if name not in names:
         fail(f"no benchmark {name!r}: expected one of {', '.join(names)}", USAGE)
-    _dispatch(names[name], context.args)
+    arguments = context.args
+    if "--quick" in arguments:
+        from bench.all import short_form
+
+        arguments = short_form(name, arguments)
+    _dispatch(names[name], arguments)
 
 
 def _dispatch(module: str, args: list[str]) -> None:

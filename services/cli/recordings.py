@@ -22,6 +22,8 @@ from services.cli.common import (
     use_configured_sockets,
 )
 
+DAYS_S = 1e7  # of a recording, at most
+
 RecordedSkin = Annotated[str, typer.Option("--skin", help="Which skin; default: all.", metavar="NAME")]
 
 if TYPE_CHECKING:
@@ -38,7 +40,7 @@ def register(app: typer.Typer) -> None:
 
 def record(
     file: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="With --trigger: a folder, a file for each event.")],
-    seconds: Annotated[float, typer.Option(help="Stop after so long; 0: at Ctrl-C.")] = 0.0,
+    seconds: Annotated[float, typer.Option(min=0, max=DAYS_S, help="Stop after so long; 0: at Ctrl-C.")] = 0.0,
     topics: Annotated[str, typer.Option(help="Which topics; naming a lazy one wakes it.")] = "raw,contact,status,info",
     skin: RecordedSkin = "",
     file_mb: Annotated[float, typer.Option(min=0, help="Go on in FILE-2.mcap when FILE is so large; 0: never.")] = 0.0,
@@ -146,7 +148,7 @@ def replay(
     file: Annotated[Path, typer.Argument(metavar="FILE.mcap")],
     speed: Annotated[float, typer.Option(help="So many times the recorded speed.")] = 1.0,
     fast: Annotated[bool, typer.Option("--fast", help="As fast as the stages can.")] = False,
-    start: Annotated[float, typer.Option("--from", help="Begin so many seconds into the file.")] = 0.0,
+    start: Annotated[float, typer.Option("--from", min=0, help="Begin so many seconds into the file.")] = 0.0,
     out: Annotated[Path | None, typer.Option(help="Write the contacts that come out to this recording.")] = None,
     private: Annotated[bool, typer.Option("--private", help="Use a runtime folder of its own.")] = False,
     bundle: Annotated[Path | None, typer.Option(help="Use this one, not the recorded one (found by its hash).")] = None,
@@ -190,7 +192,7 @@ def import_file(
         str,
         typer.Option("--skin", help="A configured skin, or a bundle; default: the first of skin.toml.", metavar="NAME"),
     ] = "",
-    rate: Annotated[float, typer.Option(help="Frames per second to give the recording.")] = 10.0,
+    rate: Annotated[float, typer.Option(min=1e-3, help="Frames per second to give the recording.")] = 10.0,
     overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from services.cli.common import (
+    LONGEST_S,
     NOT_RUNNING,
     USAGE,
     JsonOption,
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
     from services.cli.monitor import Monitor
 
 
+SHORTEST_S = 0.01  # in less than that no frame comes
+
+
 def register(app: typer.Typer) -> None:
     for command in (top, echo, compare):
         app.command()(of_service(command))
@@ -31,12 +36,14 @@ def register(app: typer.Typer) -> None:
 def top(
     skin: SkinOption = "",
     once: Annotated[bool, typer.Option("--once", help="Watch for a moment, print, leave.")] = False,
-    seconds: Annotated[float, typer.Option(help="How long --once watches.")] = 2.0,
+    seconds: Annotated[float, typer.Option(min=SHORTEST_S, max=LONGEST_S, help="How long --once watches.")] = 2.0,
     as_json: JsonOption = False,
 ) -> None:
     """The skin as a heat map, its contacts, and every topic's and process's rates, delays, losses and CPU; q leaves."""
     from services.cli.monitor import Monitor
 
+    if not (once or as_json or sys.stdout.isatty()):
+        fail("the output is no terminal, expected one to draw on: give --once for one look, or --json", USAGE)
     use_configured_sockets()
     monitor = Monitor(skin_name(skin))
     if once or as_json:
@@ -78,8 +85,10 @@ def echo(
         str, typer.Argument(help="raw, delta, part, image, contact, force, shape, status, info or truth.")
     ],
     skin: SkinOption = "",
-    count: Annotated[int, typer.Option("--count", "-n", help="Leave after so many frames; 0: never.")] = 0,
-    timeout: Annotated[float, typer.Option(help="Give up after so many seconds without a frame; 0: never.")] = 10.0,
+    count: Annotated[int, typer.Option("--count", "-n", min=0, help="Leave after so many frames; 0: never.")] = 0,
+    timeout: Annotated[
+        float, typer.Option(min=0, max=LONGEST_S, help="Give up after so many seconds without a frame; 0: never.")
+    ] = 10.0,
     as_json: JsonOption = False,
 ) -> None:
     """Print a topic's frames as they come."""
@@ -151,8 +160,10 @@ def _short(value: Any) -> str:
 
 def compare(
     skin: SkinOption = "",
-    seconds: Annotated[float, typer.Option(help="How long to compare.")] = 10.0,
-    count: Annotated[int, typer.Option("--count", "-n", help="Leave after so many frames; 0: after --seconds.")] = 0,
+    seconds: Annotated[float, typer.Option(min=SHORTEST_S, max=LONGEST_S, help="How long to compare.")] = 10.0,
+    count: Annotated[
+        int, typer.Option("--count", "-n", min=0, help="Leave after so many frames; 0: after --seconds.")
+    ] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Print position and force of every contact beside the stub's truth, scan by scan, and the errors at the end."""
