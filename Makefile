@@ -70,7 +70,7 @@ site: $(VENV)/.docs
 
 # geometry -> forward model -> data -> network -> bundle in models/bundles/$(SKIN)
 train: venv-dev
-	$(BIN)/python -m models.build --skin $(SKIN) $(if $(filter-out 0,$(QUICK)),--quick) $(if $(MINUTES),--minutes $(MINUTES))
+	$(BIN)/python -m models.build --skin $(SKIN) $(if $(filter-out 0,$(QUICK)),--quick) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(filter-out 0,$(ANYWAY)),--anyway)
 
 # Needs uv (one lock for every Python from 3.11 on, hashes of every file).
 LOCK := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url

@@ -51,6 +51,12 @@ def reconstruct(
     from services.recordings.reconstruction import UNKNOWN_AGE_S, find_skin
     from services.recordings.reconstruction import reconstruct as run
 
+    if source.suffix == ".mcap":
+        fail(
+            f"found the recording {source}, expected IN.npz: `skin replay {source} --fast --private --out OUT.mcap` "
+            "runs the stages over a recording, and `skin export OUT.mcap --csv` makes a table of its contacts",
+            USAGE,
+        )
     found, bundle = find_skin(skin)
     try:
         data = read_scans(load_npz(source), bundle)

@@ -149,7 +149,9 @@ def replay(
     speed: Annotated[float, typer.Option(help="So many times the recorded speed.")] = 1.0,
     fast: Annotated[bool, typer.Option("--fast", help="As fast as the stages can.")] = False,
     start: Annotated[float, typer.Option("--from", min=0, help="Begin so many seconds into the file.")] = 0.0,
-    out: Annotated[Path | None, typer.Option(help="Write the contacts that come out to this recording.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the contacts that come out to this recording, at the recorded times.")
+    ] = None,
     private: Annotated[bool, typer.Option("--private", help="Use a runtime folder of its own.")] = False,
     bundle: Annotated[Path | None, typer.Option(help="Use this one, not the recorded one (found by its hash).")] = None,
     skin: RecordedSkin = "",

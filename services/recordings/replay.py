@@ -152,17 +152,19 @@ class Replayer:
         mark(raw)
         self.publisher.send(raw)
         self.counts["frames"] += 1
-        contact = self._answer(step.skin, raw)
+        contact = self._answer(step.skin, raw, step.at_ns)
         self._report()
         if contact is not None:
             yield contact
 
-    def _answer(self, skin: str, raw: RawFrame) -> ContactFrame | None:
-        """Returns the contacts made of a raw frame; None where it is known that there will be none."""
+    def _answer(self, skin: str, raw: RawFrame, at_ns: int) -> ContactFrame | None:
+        """Returns the contacts made of a raw frame, which was recorded at `at_ns`; None where it is known that there
+        will be none.
+        """
         end = time.monotonic() + ANSWER_S
         while time.monotonic() < end:
             wait_s = ANSWER_S if raw.parts == 1 else PART_EVERY_S
-            if (contact := self._contact(skin, raw.scan, wait_s)) is not None:
+            if (contact := self._contact(skin, raw.scan, wait_s, at_ns)) is not None:
                 return contact
             told = {} if raw.parts == 1 else self._call("preprocessing", "part", skin=skin, scan=raw.scan)
             if told.get("seen") and not told.get("handed_on"):
@@ -171,7 +173,7 @@ class Replayer:
             f"no contacts of scan {raw.scan} came within {ANSWER_S:g} s: is a stage down? `skin top` shows which"
         )
 
-    def _contact(self, skin: str, scan: int, timeout_s: float) -> ContactFrame | None:
+    def _contact(self, skin: str, scan: int, timeout_s: float, at_ns: int = 0) -> ContactFrame | None:
         end = time.monotonic() + timeout_s
         while (left := end - time.monotonic()) > 0:
             got = self.contacts.recv_message(left)
@@ -180,7 +182,7 @@ class Replayer:
             frame, message = got
             if isinstance(frame, ContactFrame) and frame.skin == skin and frame.scan == scan:
                 if self.out is not None and skin in self._started:
-                    self.out.write(f"contact/{skin}", message.partition(b"\0")[2], time.time_ns())
+                    self.out.write(f"contact/{skin}", message.partition(b"\0")[2], at_ns)
                 self.counts["contacts"] += 1
                 self.counts["valid"] += frame.valid
                 self.counts["touched"] += any(c.state != "end" for c in frame.contacts)

@@ -14,7 +14,7 @@ from bench.all import BENCHMARKS
 from bench.json_file import write_json  # noqa: F401  (numerical libraries get one thread before they are loaded)
 
 MODULES = {**bench.commands(), "limits": "models.limits"}
-NEEDED = {"registered_network": ["presses.npz", "folder"]}
+NEEDED = {"registered_network": ["presses.npz", "folder"], "estimation": ["start"]}
 NUMBERS = ("x", "", "nan", "-1", "-inf", "1.5.2")
 
 

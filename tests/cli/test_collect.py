@@ -1,5 +1,7 @@
 """`skin collect` where it cannot begin; what it measures: tests/services/test_collecting.py, tests/docs."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -33,6 +35,12 @@ def test_what_cannot_be_collected(skin, tmp_path):
 )
 def test_what_is_typed_is_millimetres_and_newtons(text, numbers):
     assert collect._numbers(text) == pytest.approx(numbers) if numbers else collect._numbers(text) is None
+
+
+def test_a_registration_is_suggested_of_as_many_presses_as_it_takes(skin, tmp_path):
+    assert "skin register a.npz --skin disc16 --presses 10" in collect._next(Path("a.npz"), "disc16", 10)
+    said = collect._next(Path("a.npz"), "disc16", 6)
+    assert "at least 10" in said and "skin register a.npz" not in said
 
 
 class Touched:

@@ -54,6 +54,16 @@ def test_what_cannot_be(skin, tmp_path: Path, arguments, message):
     assert re.search(message, ran.err), ran.err
 
 
+def test_a_path_that_lifts_its_pen(skin, tmp_path):
+    """One path of several lines, of which one is closed: the drawings of diagrams are made of such."""
+    path = tmp_path / "lines.svg"
+    lines = "M 0 0 L 100 0 L 100 60 L 0 60 Z M 10 10 L 20 20 M 30 30 L 40 30 L 40 40"
+    size = 'width="100mm" height="60mm" viewBox="0 0 100 60"'
+    path.write_text(f'<svg xmlns="http://www.w3.org/2000/svg" {size}><path d="{lines}"/></svg>')
+    ran = skin("new", "pen", "--outline", path, "--out", tmp_path)
+    assert ran.code == 0 and "100 x 60 mm" in ran.out, ran.err
+
+
 def test_a_name_that_is_no_name(skin, tmp_path):
     ran = skin("new", "My Skin", "--disc", 0.06, "--out", tmp_path)
     assert ran.code == 2 and "found the name 'My Skin', expected lower-case letters" in ran.err

@@ -55,7 +55,7 @@ COMMANDS = (
         says="look at the skin, and press it, at http://127.0.0.1:",
         instead="EITSKIN_RUNTIME={folder}/page ./skin bridge page",  # beside the one of the service of these tests
     ),
-    Row("make train SKIN=square16 QUICK=1", "ci", says="models.build --skin square16 --minutes 3"),
+    Row("make train SKIN=square16 QUICK=1", "ci", says="models.build --skin square16 --minutes 5 --anyway"),
     Row("(./)?skin up", "service"),
     Row("(./)?skin up --no-board", "ends", says="--no-board", instead="./skin up --help"),
     Row(

@@ -136,6 +136,18 @@ def test_command_line(capsys, tmp_path):
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_lengths_are_metres(capsys):
+    """Of a skin of 100 mm: the touch that the default is has a radius of 10 mm."""
+
+    def said(*more):
+        assert limits.main(["--grid", "2", *more]) == 0
+        return capsys.readouterr().out
+
+    assert said("--radius", "0.01") == said() and "touch of radius 10 mm" in said()
+    report = json.loads(said("--known-radius", "--json"))
+    assert report["radius_m"] == pytest.approx(0.01) and report["case"]["prior"]["radius"] == pytest.approx([0.01] * 2)
+
+
 def test_a_touch_off_the_skin_is_refused():
     with pytest.raises(ValueError, match=r"a touch at \(0.9, 0.9\) is not on skin 'disc16'"):
         floors("disc16", Shape("circle", 0.9, 0.9, 0.1, 0.3))

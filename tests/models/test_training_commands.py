@@ -12,7 +12,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from models import average, build, checkpoint, command, data, geometry, published, samples, train  # noqa: E402
+from models import average, build, checkpoint, command, data, geometry, published, samples, train, verdict  # noqa: E402
 from models.bundle import Bundle, BundleError  # noqa: E402
 from models.checkpoint import CheckpointError, TrainingPlan  # noqa: E402
 from models.network import NetworkConfig  # noqa: E402
@@ -102,7 +102,10 @@ def test_minutes_are_a_number():
             command.minutes(text)
 
 
-@pytest.mark.parametrize(("given", "passed"), [("QUICK=1", "--quick"), ("QUICK=0", ""), ("MINUTES=0", "--minutes 0")])
+@pytest.mark.parametrize(
+    ("given", "passed"),
+    [("QUICK=1", "--quick"), ("QUICK=0", ""), ("MINUTES=0", "--minutes 0"), ("ANYWAY=1", "--anyway")],
+)
 def test_make_passes_on_what_it_is_given(given, passed):
     printed = subprocess.run(["make", "-n", "train", given], cwd=ROOT, capture_output=True, text=True).stdout
     ran = next(line for line in printed.splitlines() if "models.build" in line)
@@ -222,6 +225,26 @@ def test_only_the_very_same_training_is_gone_on_from(work, batches, scenes, bund
     assert not goes_on(plan) and "does not say which skin" in capsys.readouterr().out
     path.write_bytes(b"rubbish")
     assert not goes_on(plan) and "cannot be read" in capsys.readouterr().out
+
+
+def test_a_bundle_of_too_little_training_is_not_written_unless_asked_for(small, work, bundle, pre, monkeypatch):
+    entry, judged = bundle.manifest["network"]["full"], verdict.TrainingVerdict("too little", "far from it.", {})
+    monkeypatch.setattr(build, "make_scenes", lambda *_: None)
+    monkeypatch.setattr(build, "physics", lambda skin, folder, _: (bundle.matrices, samples.load(folder, "valid", pre)))
+    monkeypatch.setattr(build.calibrate, "solve", lambda *_, **__: None)
+    monkeypatch.setattr(build.calibrate, "uncertainty", lambda *_: {"full": entry["uncertainty"]})
+    monkeypatch.setattr(build, "response_tables", lambda _: None)
+    networks = {"full": bundle.network_path("full").read_bytes()}, {"full": dict(entry)}
+    monkeypatch.setattr(build, "networks", lambda *_: networks)
+    monkeypatch.setattr(build, "_verdict", lambda *_: judged)
+    out, asked = work / "bundle", ["--work", str(work), "--minutes", "0.02", "--out", str(work / "bundle")]
+    with pytest.raises(
+        build.TooLittle, match=r"far from it\. .*bundle is not written, .*: train longer, or .*--anyway"
+    ):
+        build.main(asked)
+    assert not out.exists()
+    build.main([*asked, "--anyway"])
+    assert Bundle.load(out).manifest["network"]["full"]["verdict"]["grade"] == "too little"
 
 
 class Packaging(Exception):

@@ -80,6 +80,15 @@ def held_out(iou, position, kind=0.7):
     }
 
 
+def test_a_plan_takes_the_minutes_that_it_is_given():
+    """Scenes at 40 a second, both networks, and two minutes of packaging."""
+    for minutes in (3.0, 4.0, 10.0, 60.0, 130.0):
+        plan = build.Plan.of(minutes)
+        assert plan.scenes / 40 / 60 + plan.full + plan.fast + 2.0 <= minutes
+        assert plan.full > 0.15 * minutes
+    assert build.QUICK == build.Plan.of(14.5) and build.QUICK.full == pytest.approx(7.25)
+
+
 @pytest.mark.parametrize(
     ("iou", "position", "grade", "says"),
     [

@@ -70,6 +70,8 @@ def test_two_replays_give_identical_contacts(runtime: Path, recording: Path, tmp
     assert [msgpack.packb(f) for f in second] == [msgpack.packb(f) for f in first[: len(second)]]
     assert [f["seq"] for f in first] == list(range(94))
     assert all(f["source"] == "replay" and "replay" in f["reasons"] for f in first)  # type: ignore[operator]
+    recorded = [m.log_time_ns for m in RecordingReader(recording).messages({"raw"})]
+    assert [m.log_time_ns for m in RecordingReader(tmp_path / "one.mcap").messages({"contact"})] == recorded
     states = [[c["state"] for c in f["contacts"]] for f in first]  # type: ignore[attr-defined]
     assert states[64:72] == [[]] * 8 and states[72] == ["begin"] and states[73:88] == [["hold"]] * 15
     assert [s for s in states[88:] if s] == [["end"]], "it ends once, and is not there any more"
