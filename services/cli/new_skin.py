@@ -29,12 +29,8 @@ def new(
     disc: Annotated[float, typer.Option(metavar="METRES", min=0, help="A disc of this diameter.")] = 0.0,
     outline: Annotated[Path | None, typer.Option(metavar="FILE", help="A drawing, .dxf or .svg.")] = None,
     unit: Annotated[str, typer.Option(help="Of the drawing, where it does not say: mm, cm, m, inch.")] = "",
-    electrodes: Annotated[
-        int, typer.Option(min=4, max=64, help="How many, evenly spaced; where the drawing has none.")
-    ] = 16,
-    width: Annotated[
-        float, typer.Option(metavar="METRES", min=0, help="Of an electrode; default: 0.3 of the spacing.")
-    ] = 0.0,
+    electrodes: Annotated[int, typer.Option(help="How many, evenly spaced; where the drawing has none.")] = 16,
+    width: Annotated[float, typer.Option(metavar="METRES", help="Of an electrode; default: 0.3 of the spacing.")] = 0.0,
     first: Annotated[float, typer.Option(metavar="METRES", help="Along the outline to the first electrode.")] = 0.0,
     pattern: Annotated[str, typer.Option(help="pairs, adjacent or opposite.")] = "pairs",
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Default: models/skins of the checkout.")] = None,
