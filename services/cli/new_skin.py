@@ -42,12 +42,14 @@ def new(
 
     from models import drawing, geometry
     from models.meshing import MeshError, build
-    from models.patterns import PatternError
+    from models.patterns import NAMES, PatternError
 
     if not re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,31}", name):
         fail(f"found the name {name!r}, expected lower-case letters, digits, - and _, at most 32", USAGE)
     if (disc > 0) == (outline is not None):
         fail("give either --disc METRES (its diameter) or --outline FILE (.dxf or .svg)", USAGE)
+    if pattern not in NAMES:
+        fail(f"--pattern: found {pattern!r}, expected one of {', '.join(NAMES)}", USAGE)
     path = (out or ROOT / "models" / "skins") / f"{name}.toml"
     if path.exists() and not overwrite:
         fail(f"{path} is there already: choose another name, or give --overwrite", USAGE)
