@@ -6,8 +6,8 @@ stability, accuracy.
     skin bench all --reuse              the page from the reports that are there; runs nothing
     skin bench all --only latency skip
 
-Each runs in a process of its own, one after another. Prints the page and writes it, as README.md beside the reports:
-figures beside targets, the command, machine and versions of each.
+Each runs in a process of its own: one after another where times are measured, the others one a core. Prints the page
+and writes it, as README.md beside the reports: figures beside targets, the command, machine and versions of each.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,6 +28,7 @@ from bench.goals import Goal
 from bench.speed.service import end_on_sigterm
 
 LIMIT_S = 3600.0  # for one benchmark
+POLL_S = 0.2
 LONG = 12_000  # characters of its tables beyond which the page only names the file
 
 
@@ -45,6 +45,7 @@ class Benchmark:
     limits: str = ""  # why it misses what it misses, for a person
     of: str = ""  # the command that writes it, where that has another name
     arguments: tuple[str, ...] = ()
+    beside: bool = False  # it takes one core, and no figure of it depends on how long anything takes
 
     @property
     def command(self) -> str:
@@ -100,6 +101,7 @@ BENCHMARKS = (
         "Full scans are there to compare with: theirs take 45 ms. A light touch and a force that grows are told later.",
         of="reaction",
         arguments=("--simulated", "--steps", "90"),
+        beside=True,
     ),
     Benchmark(
         "peers",
@@ -119,8 +121,8 @@ BENCHMARKS = (
         ("--seconds", "8", "--rounds", "2"),
         limits="What viewers cost the pipeline is the processor that ten of them, here on the same cores, have.",
     ),
-    Benchmark("untouched_parts", "False touches of scans in parts", ("--quick",)),
-    Benchmark("tracking", "Ten minutes of contacts", ("--seconds", "60")),
+    Benchmark("untouched_parts", "False touches of scans in parts", ("--quick",), beside=True),
+    Benchmark("tracking", "Ten minutes of contacts", ("--seconds", "60"), beside=True),
     Benchmark(
         "faults",
         "Faults of the board",
@@ -154,8 +156,9 @@ BENCHMARKS = (
         "Mismatched skins",
         ("--quick", "--only", "anisotropy5", "mild"),
         limits="A soft edge shows in no untouched frame: networks that are trained with soft edges are to see it.",
+        beside=True,
     ),
-    Benchmark("memory", "Memory over many frames", ("--frames", "20000")),
+    Benchmark("memory", "Memory over many frames", ("--frames", "20000"), beside=True),
 )
 
 
@@ -167,35 +170,67 @@ def short_form(name: str, arguments: Sequence[str]) -> list[str]:
     return list(arguments)
 
 
-def run(benchmark: Benchmark, folder: Path, quick: bool) -> str:
-    """Runs it; its tables go to our output and to NAME.txt. Returns what went wrong, or ""."""
-    module = commands().get(benchmark.command, f"bench.{benchmark.command}")
-    arguments = benchmark.quick or () if quick else benchmark.arguments
-    command = [sys.executable, "-m", module, *arguments]
-    print(f"\n=== {benchmark.title}: {' '.join(command[2:])}", flush=True)
-    for suffix in ("json", "txt"):  # what an earlier run left is not this one's
-        (folder / f"{benchmark.name}.{suffix}").unlink(missing_ok=True)
-    process = subprocess.Popen(
-        [*command, "--out", os.path.relpath(folder, ROOT)],  # what it says of it names no place of this machine
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"COLUMNS": "150"},
-    )
-    late = threading.Timer(LIMIT_S, process.terminate)
-    late.start()
-    assert process.stdout is not None
+def run(chosen: Sequence[Benchmark], folder: Path, quick: bool) -> list[str]:
+    """Runs them, those that measure times first and each alone, the others side by side, one a core. Each one's tables
+    go to NAME.txt, and to our output when it ends. Returns what went wrong.
+    """
+    waiting = sorted(chosen, key=lambda benchmark: benchmark.beside)
+    running: list[Running] = []
+    wrong = []
     try:
-        with (folder / f"{benchmark.name}.txt").open("w", encoding="utf-8") as kept:
-            for line in process.stdout:
-                print(line, end="", flush=True)
-                kept.write(line)
-        status = process.wait()
-    finally:  # it ends when we are told to end
-        late.cancel()
-        process.terminate()
-        process.wait()
-    return f"{benchmark.name} ended with exit status {status}" if status else ""
+        while waiting or running:
+            while waiting and may_begin(waiting[0], running):
+                running.append(Running(waiting.pop(0), folder, quick))
+            time.sleep(POLL_S)
+            for each in [each for each in running if each.ended()]:
+                running.remove(each)
+                wrong += each.told()
+    finally:  # they end when we are told to end
+        for each in running:
+            each.process.kill()
+            each.process.wait()
+    return wrong
+
+
+def may_begin(benchmark: Benchmark, running: Sequence[Running]) -> bool:
+    """Whether a core is free for it, and no time that is being measured is disturbed."""
+    alone = not benchmark.beside or any(not each.benchmark.beside for each in running)
+    return len(running) < (1 if alone else len(os.sched_getaffinity(0)))
+
+
+class Running:
+    """A benchmark in a process of its own."""
+
+    def __init__(self, benchmark: Benchmark, folder: Path, quick: bool) -> None:
+        module = commands().get(benchmark.command, f"bench.{benchmark.command}")
+        arguments = benchmark.quick or () if quick else benchmark.arguments
+        command = [sys.executable, "-m", module, *arguments]
+        print(f"\n=== {benchmark.title}: {' '.join(command[2:])}", flush=True)
+        for suffix in ("json", "txt"):  # what an earlier run left is not this one's
+            (folder / f"{benchmark.name}.{suffix}").unlink(missing_ok=True)
+        self.benchmark = benchmark
+        self.began = time.monotonic()
+        self.tables = folder / f"{benchmark.name}.txt"
+        with self.tables.open("wb") as kept:
+            self.process = subprocess.Popen(
+                [*command, "--out", os.path.relpath(folder, ROOT)],  # what it says of it names no place of this machine
+                cwd=ROOT,
+                stdout=kept,
+                env=os.environ | {"COLUMNS": "150"},
+            )
+
+    def ended(self) -> bool:
+        if time.monotonic() - self.began > LIMIT_S:
+            self.process.terminate()
+        return self.process.poll() is not None
+
+    def told(self) -> list[str]:
+        """Prints what it printed. What went wrong, if anything."""
+        minutes = (time.monotonic() - self.began) / 60
+        print(f"\n--- {self.benchmark.title}: {minutes:.1f} minutes", flush=True)
+        print(self.tables.read_text(encoding="utf-8", errors="replace"), end="", flush=True)
+        status = self.process.returncode
+        return [f"{self.benchmark.name} ended with exit status {status}"] if status else []
 
 
 def section(benchmark: Benchmark, folder: Path) -> tuple[list[str], list[Goal], str]:
@@ -289,7 +324,7 @@ def main(argv: list[str] | None = None) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     began, failed = time.perf_counter(), []
     if not args.reuse:
-        failed = [problem for b in chosen if (problem := run(b, args.out.resolve(), args.quick))]
+        failed = run(chosen, args.out.resolve(), args.quick)
     whole = not args.quick and (args.only is None or args.reuse)
     text, goals, absent = page(BENCHMARKS if whole else chosen, args.out)
     print("\n" + text)

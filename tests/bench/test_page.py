@@ -115,3 +115,15 @@ def test_the_short_form_says_which_gates_it_leaves_out(tmp_path, monkeypatch, ca
 def test_every_benchmark_of_the_page_is_there() -> None:
     for benchmark in page.BENCHMARKS:
         assert benchmark.command in page.commands()
+
+
+def test_nothing_runs_beside_a_benchmark_of_times(monkeypatch):
+    class Begun:
+        def __init__(self, beside: bool) -> None:
+            self.benchmark = page.Benchmark("one", "One", (), beside=beside)
+
+    timed, untimed = Begun(False), Begun(True)
+    monkeypatch.setattr(page.os, "sched_getaffinity", lambda _: {0, 1})
+    assert page.may_begin(timed.benchmark, []) and page.may_begin(untimed.benchmark, [untimed])
+    assert not page.may_begin(timed.benchmark, [untimed]) and not page.may_begin(untimed.benchmark, [timed])
+    assert not page.may_begin(untimed.benchmark, [untimed, untimed])
