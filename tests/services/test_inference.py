@@ -12,6 +12,7 @@ from onnx import TensorProto, helper
 from models.bundle import Bundle, write
 from protocol.frames import DeltaFrame, ImageFrame, pack
 from services.estimation import rolling
+from services.estimation.by_bundle import ByBundle
 from services.estimation.quality import KEPT
 from services.estimation.touch_decision import MEANS
 from services.inference import SETTLED, Inference
@@ -318,7 +319,7 @@ def test_what_other_touches_displaced_is_prepared_again(skin: Skin, networked: B
 
 def test_no_frame_waits_for_the_order_of_the_parts(skin: Skin, bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
     """It takes half a second, in which a press is over."""
-    monkeypatch.setattr(rolling, "_orders", {})
+    monkeypatch.setattr(rolling, "rolling_order", ByBundle(rolling._order_of, rolling.KEPT))
     stage = Inference("palm", skin.model_copy(update={"scan": "rolling", "network": "none"}), bundle)
     stage.warm_up()
     monkeypatch.setattr(rolling.rolling, "order", None)
