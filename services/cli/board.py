@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from protocol.pause import pause
 from services.cli.common import USAGE, CliError, JsonOption, SkinOption, control, emit, fail, of_service, skin_name
 
 EARLY = ": wait"  # in a tare's refusal: too few frames came since the start or the last touch, and more will
@@ -155,7 +156,7 @@ def tare(
         except CliError as why:
             if EARLY not in str(why) or time.monotonic() >= until:
                 raise
-        time.sleep(0.25)
+        pause(0.25)
     if as_json:
         emit(answer)
     else:

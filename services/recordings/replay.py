@@ -15,6 +15,7 @@ from typing import Any
 
 from protocol.errors import EitskinError
 from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, read_map, unpack
+from protocol.pause import pause
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
 from services.recordings.recording import STATE_TOPIC, RecordedMessage, RecordingError, RecordingReader, RecordingWriter
 from services.runtime.config import SKIN_NAME
@@ -140,11 +141,11 @@ class Replayer:
             return
         if self._before_ns is None:
             self._before_ns, self._due = at_ns, time.monotonic()
-        pause = (at_ns - self._before_ns) * 1e-9
+        apart_s = (at_ns - self._before_ns) * 1e-9
         self._before_ns = at_ns
-        self._due += min(max(0.0, pause), LONGEST_PAUSE_S) / self.speed
+        self._due += min(max(0.0, apart_s), LONGEST_PAUSE_S) / self.speed
         while (left := self._due - time.monotonic()) > 0:
-            time.sleep(min(left, 0.2))
+            pause(min(left, 0.2))
             self._report()
 
     def _send(self, step: Step, raw: RawFrame) -> Iterator[ContactFrame]:

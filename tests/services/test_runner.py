@@ -370,7 +370,7 @@ def test_a_stop_and_a_sleep_of_the_host_are_noticed(monkeypatch: pytest.MonkeyPa
     """By the loop's own time; and by the clock that goes on while the host is suspended."""
     now, slept, naps = [100.0], [0.0], []
     monkeypatch.setattr("services.runtime.lateness.time.monotonic", lambda: now[0])
-    monkeypatch.setattr("services.runtime.lateness.time.sleep", naps.append)
+    monkeypatch.setattr("services.runtime.lateness.pause", naps.append)
     monkeypatch.setattr("protocol.ages._slept_ns", lambda: int(slept[0] * 1e9))
     lateness = Lateness()
 
