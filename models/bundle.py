@@ -35,6 +35,7 @@ from models.bundle_check import Wrong, check
 from models.files import FileError, read_bytes
 from models.locator_arrays import LocatorArrays, arrays_of
 from models.npz import read_npz
+from models.onnx_external import external_data
 from models.prereconstruction import Matrices, PreReconstructor
 from models.response_file import arrays_of_tables, tables_of
 from models.touch_response import ResponseTables
@@ -163,12 +164,15 @@ class Bundle:
                 raise BundleError(
                     f"{path / name} is missing, though the manifest lists it: restore it or build the bundle again"
                 )
-            found = hashlib.sha256(_read(path / name, MAX_BYTES)).hexdigest()
+            content = _read(path / name, MAX_BYTES)
+            found = hashlib.sha256(content).hexdigest()
             if found != expected:
                 raise BundleError(
                     f"{path / name}: sha256 {found[:12]}..., the manifest says {expected[:12]}...: "
                     "the file was changed or damaged; restore it or build the bundle again"
                 )
+            if name in NETWORKS.values():
+                _whole(path / name, content)
         matrices = _read_matrices(path / "matrices.npz")
         try:
             check(manifest, matrices)
@@ -270,6 +274,19 @@ def _read(path: Path, most: int) -> bytes:
         return read_bytes(path, most)
     except FileError as why:
         raise BundleError(f"{why}: restore it or build the bundle again") from None
+
+
+def _whole(path: Path, content: bytes) -> None:
+    """Raises BundleError for a network whose weights are elsewhere."""
+    try:
+        elsewhere = external_data(content)
+    except ValueError:  # no ONNX file: whoever runs it says so
+        return
+    if elsewhere:
+        raise BundleError(
+            f"{path} keeps weights in another file ({elsewhere}), which no hash covers; expected all of them inside: "
+            "export it as one file and build the bundle again"
+        )
 
 
 def _manifest(path: Path, text: bytes) -> dict[str, Any]:

@@ -13,7 +13,9 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from models.bundle import Bundle, BundleError
+from models.bundle import MAX_BYTES, Bundle, BundleError
+from models.files import read_bytes
+from models.onnx_external import external_data
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame
 
@@ -40,7 +42,10 @@ class Network:
         options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
-            self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            content = read_bytes(path, MAX_BYTES)
+            if elsewhere := external_data(content):
+                raise ValueError(f"it keeps weights in another file: {elsewhere}")
+            self.session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
             inputs = {i.name: [d if isinstance(d, int) else 1 for d in i.shape] for i in self.session.get_inputs()}
             for _ in range(WARM_UP_RUNS):
                 self.session.run(OUTPUTS, {name: np.zeros(inputs[name], np.float32) for name in INPUTS})

@@ -25,11 +25,10 @@ from services.recordings.ring import RingEntry
 from services.recordings.rotation import RotatingWriter, Rotation
 from services.recordings.snapshots import STATE_EVERY_S, Keeping, Snapshots, file_in
 from services.recordings.stage_states import StateReader
-from services.runtime.config import ConfigError, load
+from services.runtime.config import MOST_SKINS, ConfigError, load
 
 DEFAULT_TOPICS = ("raw", "contact", "status", "info")
 POLL_S = 0.05
-MOST_SKINS = 64
 MOST_LATCHED = 1024
 
 log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_
 from protocol.pause import pause
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
 from services.recordings.recording import STATE_TOPIC, RecordedMessage, RecordingError, RecordingReader, RecordingWriter
-from services.runtime.config import SKIN_NAME
+from services.runtime.config import MOST_SKINS, SKIN_NAME
 from services.runtime.stage import STAGES, add_reason
 
 CHAIN_S = 20.0  # for the stages to start and find each other
@@ -26,7 +26,6 @@ ANSWER_S = 5.0  # for the contacts of one frame
 PART_EVERY_S = 0.002  # a part of a scan that is not answered is asked after
 PRIME_EVERY_S = 0.25
 LONGEST_PAUSE_S = 10.0  # between two recorded frames: a file's times are its maker's, and nobody is to wait for years
-MOST_SKINS = 64
 
 
 class ReplayError(EitskinError):
