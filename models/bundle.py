@@ -17,6 +17,7 @@ bundle without any is a working bundle: the services then show the one-step imag
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -172,7 +173,8 @@ class Bundle:
                     "the file was changed or damaged; restore it or build the bundle again"
                 )
             if name in NETWORKS.values():
-                _whole(path / name, content)
+                with contextlib.suppress(ValueError):  # whoever runs it says that it is none
+                    _whole(path / name, content)
         matrices = _read_matrices(path / "matrices.npz")
         try:
             check(manifest, matrices)
@@ -276,12 +278,19 @@ def _read(path: Path, most: int) -> bytes:
         raise BundleError(f"{why}: restore it or build the bundle again") from None
 
 
-def _whole(path: Path, content: bytes) -> None:
-    """Raises BundleError for a network whose weights are elsewhere."""
+def read_network(path: Path) -> bytes:
+    """The content of an ONNX file that holds all of its weights. Raises BundleError."""
+    content = _read(path, MAX_BYTES)
     try:
-        elsewhere = external_data(content)
-    except ValueError:  # no ONNX file: whoever runs it says so
-        return
+        _whole(path, content)
+    except ValueError as why:
+        raise BundleError(f"{path} is no network that can be run ({why}): build the bundle again") from None
+    return content
+
+
+def _whole(path: Path, content: bytes) -> None:
+    """Raises BundleError for a network whose weights are elsewhere, ValueError for what is no network."""
+    elsewhere = external_data(content)
     if elsewhere:
         raise BundleError(
             f"{path} keeps weights in another file ({elsewhere}), which no hash covers; expected all of them inside: "

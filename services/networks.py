@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from models.bundle import MAX_BYTES, Bundle, BundleError
-from models.files import read_bytes
-from models.onnx_external import external_data
+from models.bundle import Bundle, BundleError, read_network
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame
 
@@ -37,14 +36,12 @@ class Network:
     """A bundle's ONNX file."""
 
     def __init__(self, path: str) -> None:
+        content = read_network(Path(path))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
-            content = read_bytes(path, MAX_BYTES)
-            if elsewhere := external_data(content):
-                raise ValueError(f"it keeps weights in another file: {elsewhere}")
             self.session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
             inputs = {i.name: [d if isinstance(d, int) else 1 for d in i.shape] for i in self.session.get_inputs()}
             for _ in range(WARM_UP_RUNS):
