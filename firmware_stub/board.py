@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import link
+from protocol.ad5940 import LEAST_RTIA_OHM, MOST_RTIA_OHM
 from protocol.link import EventCode, NakReason, SelfTestFault
 
 from .analog import Analog
@@ -170,8 +171,8 @@ class Board:
         wrong = ""
         if config.dft_points not in POINTS:
             wrong = f"{config.dft_points} DFT points: a power of two from {POINTS[0]} to {POINTS[-1]}"
-        elif not 100 <= config.rtia_ohm <= 1e6:
-            wrong = f"RTIA of {config.rtia_ohm:g} ohm: 100 to 1e6"
+        elif not LEAST_RTIA_OHM <= config.rtia_ohm <= MOST_RTIA_OHM:
+            wrong = f"RTIA of {config.rtia_ohm:g} ohm: {LEAST_RTIA_OHM:g} to {MOST_RTIA_OHM:g}"
         elif config.scan.max() >= self.electrodes:
             wrong = f"electrode {config.scan.max()}: 0 to {self.electrodes - 1}"
         elif (config.scan[:, 0] == config.scan[:, 1]).any() or (config.scan[:, 2] == config.scan[:, 3]).any():

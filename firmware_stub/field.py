@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from protocol.pause import pause
+
 from .timeline import Script, Timeline, WorldSegment
 from .world import World, blend, steps_between
 
@@ -229,7 +231,7 @@ class Field:
                 world = self._wanted.pop(0)
             began = time.thread_time()
             self._solved_now(world)
-            time.sleep((time.thread_time() - began) * (1 / THREAD_SHARE - 1))
+            pause((time.thread_time() - began) * (1 / THREAD_SHARE - 1))
 
 
 @lru_cache(maxsize=64)

@@ -17,6 +17,7 @@ bundle without any is a working bundle: the services then show the one-step imag
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -35,6 +36,7 @@ from models.bundle_check import Wrong, check
 from models.files import FileError, read_bytes
 from models.locator_arrays import LocatorArrays, arrays_of
 from models.npz import read_npz
+from models.onnx_external import external_data
 from models.prereconstruction import Matrices, PreReconstructor
 from models.response_file import arrays_of_tables, tables_of
 from models.touch_response import ResponseTables
@@ -163,12 +165,16 @@ class Bundle:
                 raise BundleError(
                     f"{path / name} is missing, though the manifest lists it: restore it or build the bundle again"
                 )
-            found = hashlib.sha256(_read(path / name, MAX_BYTES)).hexdigest()
+            content = _read(path / name, MAX_BYTES)
+            found = hashlib.sha256(content).hexdigest()
             if found != expected:
                 raise BundleError(
                     f"{path / name}: sha256 {found[:12]}..., the manifest says {expected[:12]}...: "
                     "the file was changed or damaged; restore it or build the bundle again"
                 )
+            if name in NETWORKS.values():
+                with contextlib.suppress(ValueError):  # whoever runs it says that it is none
+                    _whole(path / name, content)
         matrices = _read_matrices(path / "matrices.npz")
         try:
             check(manifest, matrices)
@@ -270,6 +276,26 @@ def _read(path: Path, most: int) -> bytes:
         return read_bytes(path, most)
     except FileError as why:
         raise BundleError(f"{why}: restore it or build the bundle again") from None
+
+
+def read_network(path: Path) -> bytes:
+    """The content of an ONNX file that holds all of its weights. Raises BundleError."""
+    content = _read(path, MAX_BYTES)
+    try:
+        _whole(path, content)
+    except ValueError as why:
+        raise BundleError(f"{path} is no network that can be run ({why}): build the bundle again") from None
+    return content
+
+
+def _whole(path: Path, content: bytes) -> None:
+    """Raises BundleError for a network whose weights are elsewhere, ValueError for what is no network."""
+    elsewhere = external_data(content)
+    if elsewhere:
+        raise BundleError(
+            f"{path} keeps weights in another file ({elsewhere}), which no hash covers; expected all of them inside: "
+            "export it as one file and build the bundle again"
+        )
 
 
 def _manifest(path: Path, text: bytes) -> dict[str, Any]:

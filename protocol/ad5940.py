@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 DATA_BITS = 18
 DATA_MAX = 2 ** (DATA_BITS - 1) - 1
 DATA_MIN = -(2 ** (DATA_BITS - 1))
+LEAST_RTIA_OHM, MOST_RTIA_OHM = 100.0, 1e6
+"""Gain resistors of the current measurement that a board may have, in the chip or beside it."""
 CHANNEL_DFT = 0b11111
 """Channel id of a DFT result."""
 

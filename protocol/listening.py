@@ -15,6 +15,7 @@ from typing import Any
 
 from . import transport
 from .gate import described, is_one
+from .pause import pause
 from .runtime import RuntimeDirError, runtime_dir
 from .transport import Context, Socket, TransportError
 
@@ -134,7 +135,7 @@ class Listening:
                     self.socket.linger = 0
                     self._unbound = str(why)
                     break
-                time.sleep(0.002)
+                pause(0.002)
         self._file = self._inode()
 
     def _inode(self) -> tuple[int, int] | None:

@@ -9,11 +9,11 @@ recorder is healthy while the number of frames it has written grows.
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterable
 from typing import Any
 
 from protocol import transport
+from protocol.pause import pause
 from protocol.runtime import RuntimeDirError
 from protocol.sockets import ControlClient, ControlError
 from protocol.transport import TransportError
@@ -54,7 +54,7 @@ def _stub(client: ControlClient) -> str:
 
 def _recorder(client: ControlClient) -> str:
     before = _recorded(client.call("status"))
-    time.sleep(GROWING_S)
+    pause(GROWING_S)
     status = client.call("status")
     after = _recorded(status)
     if status.get("level") == "ERROR":

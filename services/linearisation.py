@@ -19,7 +19,10 @@ from services.mounting import MountedSkin, MountingFit, keep, kept, needs_fit
 
 log = logging.getLogger(__name__)
 
-UNKNOWN = 3  # frames of a calibration that cannot be found after which it is no longer looked for
+UNKNOWN, SELDOM = 3, 20
+"""What cannot be found is looked for again at the next UNKNOWN frames, and then at every SELDOM-th: a calibration may
+come late, and looking takes as long as reading a megabyte.
+"""
 
 REMEMBERED = 16  # calibrations, a megabyte each
 
@@ -95,12 +98,14 @@ class Linearisation:
             self.mounted = None
             return True
         missing, times = self._missing
-        if missing == name and times >= UNKNOWN:
+        times = times + 1 if missing == name else 1
+        self._missing = (name, times)
+        if times > UNKNOWN and times % SELDOM:
             return None
         found = _adopted.get(name) or kept(self.skin, self.file)
         if found is None or found.bundle.hash != name:
-            self._missing = (name, times + 1 if missing == name else 1)
             return None
+        self._missing = ("", 0)
         self._use(found)
         return True
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.calibration_file import CalibrationFileError, unpack
 from models.files import FileError, read_bytes
-from services.estimation.evidence import evidence_of
+from services.estimation.evidence import TouchEvidence, evidence_of
 from services.estimation.tare import Baseline, implausibility
 from services.runtime import persistence
 from services.runtime.config import ROOT
@@ -44,6 +44,11 @@ class MountedSkin:
         """Raises CalibrationFileError."""
         self.packed = packed
         self.bundle = unpack(packed, bundle)
+        self._evidence: TouchEvidence | None = None
+
+    def make_ready(self) -> None:
+        """Make what its stages would otherwise make at their first frame, and hold it for them."""
+        self._evidence = evidence_of(self.bundle)
 
 
 def needs_fit(baseline: Baseline, bundle: Bundle) -> bool:
@@ -159,7 +164,7 @@ class MountingFit:
                 read = kept(self._keep_as, self.bundle)
                 if read is None or read.bundle.hash != found.bundle.hash:  # inference could not follow
                     raise CalibrationFileError("what was found could not be kept in the runtime folder: is it full?")
-            evidence_of(found.bundle)
+            found.make_ready()
             self._read = found
         except (CalibrationFileError, FileError, OSError) as why:
             self.problem = f"the skin could not be calibrated: {why}"

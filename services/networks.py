@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from models.bundle import Bundle, BundleError
+from models.bundle import Bundle, BundleError, read_network
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame
 
@@ -35,12 +36,13 @@ class Network:
     """A bundle's ONNX file."""
 
     def __init__(self, path: str) -> None:
+        content = read_network(Path(path))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
-            self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            self.session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
             inputs = {i.name: [d if isinstance(d, int) else 1 for d in i.shape] for i in self.session.get_inputs()}
             for _ in range(WARM_UP_RUNS):
                 self.session.run(OUTPUTS, {name: np.zeros(inputs[name], np.float32) for name in INPUTS})

@@ -26,7 +26,7 @@ from protocol.topics import RECORDER
 from protocol.transport import TransportError
 from services.recordings.recorder import DEFAULT_TOPICS, Recorder
 from services.recordings.recording import RecordingError
-from services.recordings.rotation import Rotation
+from services.recordings.rotation import PRIVATE, Rotation
 from services.recordings.snapshots import LONGEST_S, Keeping, file_in
 from services.runtime.config import ConfigError, ConfigFile, load
 from services.runtime.config_sections import RecorderSection
@@ -71,11 +71,12 @@ class RecorderService:
 
     def _record(self, args: dict[str, Any]) -> dict[str, Any]:
         if args["on"]:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(PRIVATE, parents=True, exist_ok=True)
             self.recorder.record(file_in(self.folder), named_by_time=True)
             self.gave_up = ""
             _wanted().write_text(str(os.getppid()))
             return self.status()
+        self.recorder.look(now=True)
         before = self.status()
         _wanted().unlink(missing_ok=True)
         self.recorder.stop()
@@ -99,21 +100,22 @@ class RecorderService:
         return {"file": str(path), "after_s": wanted.get("after_s", snapshots.keeping.after_s)}
 
     def status(self) -> dict[str, Any]:
-        """`level` and `problems` as in status frames; `lost`: messages that there was no room for on the disk."""
+        """`level` and `problems` as in status frames; `lost`: messages that are in no file."""
         recorder, snapshots = self.recorder, self.recorder.snapshots
         writer = recorder.writer
         problems = [text for text in (recorder.problem, self.gave_up) if text]
         problems += self.control.problems + self.publisher.problems
+        stuck = writer is not None and (writer.full or writer.nowhere)
         found: dict[str, Any] = {
             "recording": writer is not None,
             "folder": str(self.folder),
-            "file": str(writer.path) if writer is not None else "",
+            "file": str(writer.path) if writer is not None and not writer.nowhere else "",
             "messages": {f"{topic}/{skin}": n for (topic, skin), n in recorder.heard.items()},
             "gaps": recorder.gaps,
             "lost": writer.lost if writer is not None else 0,
             "files": writer.files if writer is not None else 0,
             "deleted": (writer.deleted if writer is not None else 0) + (snapshots.deleted if snapshots else 0),
-            "level": "ERROR" if writer is not None and writer.full else "WARN" if problems else "OK",
+            "level": "ERROR" if stuck else "WARN" if problems else "OK",
             "problems": problems,
         }
         if snapshots is not None:
@@ -131,7 +133,7 @@ class RecorderService:
     def _say(self) -> None:
         now, said = time.monotonic(), self.status()
         counters = {name: int(said[name]) for name in COUNTED if name in said}
-        doing = f"recording to {said['file']}" if said["recording"] else "not recording"
+        doing = f"recording to {said['file'] or 'nowhere'}" if said["recording"] else "not recording"
         if said.get("writing"):
             doing += f"; a snapshot is being written: {said['snapshot']}"
         for skin, beat in self._beats.items():
@@ -214,7 +216,7 @@ def _run(args: argparse.Namespace, config: ConfigFile, stop: threading.Event) ->
     section = config.recorder or RecorderSection()
     folder = (args.folder or args.file.parent).absolute()
     if not args.wait:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(PRIVATE, parents=True, exist_ok=True)
     keeping = keeping_of(section, folder) if args.folder is not None else None
     path = None if args.wait and not _crashed() else args.file or file_in(folder)
     with Recorder(None, args.topics.split(","), args.skin, rotation=rotation_of(section), keeping=keeping) as recorder:

@@ -128,7 +128,8 @@ class Runner:
             try:
                 type(work[0][0].stage).together([(channel.stage, frame) for channel, frame in work])
             except Exception as why:  # each frame is still processed by itself
-                log.exception("%d frames could not be processed together", len(work), exc_info=why)
+                text = "%s: frames of several skins could not be processed together (further such failures are counted)"
+                self._log_failure(work[0][0], why, text)
         for channel, frame in work:
             self._handle(channel, frame)
 
@@ -187,7 +188,7 @@ class Runner:
             try:
                 channel.stage.prepare()
             except Exception as why:  # the work is done when it is needed, or fails then
-                self._log_once(channel, why, "%s: could not prepare (further such failures are not logged)")
+                self._log_failure(channel, why, "%s: could not prepare (further such failures are counted)")
 
     def _send(self, channel: Channel, frame: Frame) -> None:
         try:
@@ -205,13 +206,15 @@ class Runner:
     def _failed(self, channel: Channel, why: Exception) -> None:
         channel.heartbeat.drops["failed"] += 1
         channel.heartbeat.failure = f"a frame could not be processed: {type(why).__name__}: {why}"
-        self._log_once(channel, why, "%s: a frame was dropped (further ones of this kind are only counted)")
+        self._log_failure(channel, why, "%s: a frame was dropped (further such failures are counted)")
 
     @staticmethod
-    def _log_once(channel: Channel, why: Exception, text: str) -> None:
-        if str(why) not in channel.errors and len(channel.errors) < 100:
-            channel.errors.add(str(why))
+    def _log_failure(channel: Channel, why: Exception, text: str) -> None:
+        channel.heartbeat.failures += 1
+        if channel.failures.worth_a_line(why, text):
             log.exception(text, channel.stage.skin, exc_info=why)
+        else:
+            channel.heartbeat.unlogged += 1
 
     # housekeeping
 
@@ -238,7 +241,7 @@ class Runner:
             try:
                 channel.stage.between_frames()
             except Exception as why:  # what could not be adopted is not in use
-                self._log_once(channel, why, "%s: could not adopt (further such failures are not logged)")
+                self._log_failure(channel, why, "%s: could not adopt (further such failures are counted)")
             health = channel.stage.health().with_problems(problems)
             status = beat.status(health, silent, now, HEARTBEAT_S, asleep=channel.asleep)
             if status is not None:

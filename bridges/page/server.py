@@ -20,12 +20,12 @@ from aiohttp import web
 from aiohttp.typedefs import Handler, Middleware
 
 from bridges.process import BridgeError
+from protocol.advice import ADVICE
 from protocol.frame_types import ELECTRODE_STATES, REASONS
 from protocol.logs import foreign
 from protocol.runtime import host_id
 from protocol.topics import RECORDER
 
-from .advice import ADVICE
 from .commands import BUTTONS, Buttons
 from .feed import SkinFeed
 from .replays import REPLAY

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+from protocol.pause import pause
+
 STOOD_STILL_S = 0.2  # a loop that comes round every 0.1 s has not run for so long: stopped, suspended, swapped out
 SUSPENDED_NS = 50_000_000  # that the suspended time must have grown by
 READ_NS = 1_000_000  # two clocks read within this belong together
@@ -27,7 +29,7 @@ class HostTime:
                 return boot - (before + after) // 2
 
     def sleep(self, seconds: float) -> None:
-        time.sleep(seconds)
+        pause(seconds)
 
 
 class Suspensions:

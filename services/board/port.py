@@ -5,6 +5,7 @@ in again.
 from __future__ import annotations
 
 import os
+import re
 import select
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,7 +32,7 @@ class Port:
         self.url = url
         try:
             self._serial: Any = serial.serial_for_url(url, baudrate=BAUD, timeout=0, write_timeout=1, exclusive=True)
-        except (serial.SerialException, OSError, ValueError) as why:
+        except (serial.SerialException, OSError, ValueError, re.error) as why:
             raise PortError(explain(url, why)) from None
         try:
             self._serial.set_low_latency_mode(True)

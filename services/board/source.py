@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Generator, Iterator
@@ -16,6 +15,7 @@ from dataclasses import replace
 from models.bundle import Bundle
 from protocol import link
 from protocol.frames import RawFrame
+from protocol.pause import pause
 from services.board import port as ports
 from services.board.boardlink import BoardLink
 from services.board.clock import UNSETTLED_NS
@@ -59,7 +59,7 @@ class Source(ABC):
         """There is nothing more to come, for this reason or for one that was found before."""
         self.problem = self.problem or problem
         while True:
-            time.sleep(POLL_S)
+            pause(POLL_S)
             yield None
 
     def close(self) -> None:  # noqa: B027  (nothing to close is a valid case)

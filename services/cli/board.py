@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from protocol.pause import pause
 from services.cli.common import (
     LONGEST_S,
     USAGE,
@@ -168,7 +169,7 @@ def tare(
         except CliError as why:
             if EARLY not in str(why) or time.monotonic() >= until:
                 raise
-        time.sleep(0.25)
+        pause(0.25)
     if as_json:
         emit(answer)
     else:

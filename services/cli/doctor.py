@@ -27,7 +27,7 @@ from services.contacts.placing import placement
 from services.describe import ON, geometry, refinement, symmetry
 from services.estimation import checks
 from services.estimation.tare import implausibility
-from services.runtime.config import RECORDINGS, ConfigError, ConfigFile, Skin, config_path, load
+from services.runtime.config import RECORDINGS, ConfigError, Skin, config_path, load
 
 BOARD_S = 2.5  # for a board to say who it is
 LATENCY_TIMER_MS = 1
@@ -55,12 +55,13 @@ def _examine(path: Path | None) -> Iterator[Finding]:
         yield Finding("FAIL", "runtime folder", str(why))
         return
     running = live.running()
+    ours = running and live.another(config.path) is None
     yield Finding("OK", "runtime folder", f"{folder}, {'a service runs' if running else 'no service runs'} there")
     if running:
         yield from live.configuration(config.path)
     yield _clock()
     for name, skin in config.skins.items():
-        yield from _skin(name, skin, config, running)
+        yield from _skin(name, skin, running, ours)
 
 
 def _clock() -> Finding:
@@ -74,7 +75,10 @@ def _clock() -> Finding:
     return Finding("WARN", "clock", f"the kernel's clock source is {source}, slow to read; expected {GOOD_CLOCKS[0]}")
 
 
-def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[Finding]:
+def _skin(name: str, skin: Skin, running: bool, ours: bool) -> Iterator[Finding]:
+    """running: whether a service runs, and holds boards; ours: whether with this configuration, so that it can be
+    asked.
+    """
     try:
         bundle = Bundle.load(skin.bundle)
     except BundleError as why:
@@ -90,35 +94,50 @@ def _skin(name: str, skin: Skin, config: ConfigFile, running: bool) -> Iterator[
     except ConfigError as why:
         yield Finding("FAIL", f"{name}: indenter", str(why))
         return
-    if not running:
+    if not ours:
         yield from options(name, skin, {"refinement": refinement(skin, bundle), "symmetry": symmetry(skin, bundle)})
     if skin.calibration is not None:
         yield _calibration(name, skin, bundle)
     if skin.surface is not None:
         yield _wrapped(name, skin, bundle)
-    if Path(skin.port).suffix in RECORDINGS:
-        found = Path(skin.port).is_file()
-        yield Finding("OK" if found else "FAIL", f"{name}: port", f"{skin.port} {'is' if found else 'is not'} there")
-    elif running:
-        yield from live.port(name, skin)
-    elif skin.port == "stub":
-        yield Finding("OK", f"{name}: port", "the stub board, which `skin up` starts")
-    else:
-        yield from _device(name, skin, bundle)
+    yield from _port(name, skin, bundle, running, ours)
     if skin.port != "stub":
         yield from _latency_timer(name, skin)
-    if running:
-        yield from live.processes(name)
-        info = live.info(name)
-        yield from live.compared(name, skin, bundle, info)
-        yield from options(name, skin, info)
-        said = info.get("mounting")
-        if isinstance(said, dict):
-            yield mounting_found(name, said, info)
-        if not isinstance(said, dict) or not float(said.get("misfit", 1.0)) <= GOOD_FIT:
-            yield electrode_order(name, live.baseline(info), bundle)
+    if ours:
+        yield from _live(name, skin, bundle)
+    elif running:
+        yield Finding("SKIP", f"{name}: contacts", "not asked for: the service runs another configuration, see above")
     else:
         yield Finding("SKIP", f"{name}: electrodes", "their order is looked at while the service runs: `skin up`")
+
+
+def _port(name: str, skin: Skin, bundle: Bundle, running: bool, ours: bool) -> Iterator[Finding]:
+    what = f"{name}: port"
+    if Path(skin.port).suffix in RECORDINGS:
+        found = Path(skin.port).is_file()
+        yield Finding("OK" if found else "FAIL", what, f"{skin.port} {'is' if found else 'is not'} there")
+    elif ours:
+        yield from live.port(name, skin)
+    elif skin.port == "stub":
+        yield Finding("OK", what, "the stub board, which `skin up` starts")
+    elif running:
+        yield Finding("SKIP", what, f"{skin.port} is not opened: a service runs, which may use it")
+    else:
+        yield from _device(name, skin, bundle)
+
+
+def _live(name: str, skin: Skin, bundle: Bundle) -> Iterator[Finding]:
+    """What the service that runs this configuration says of a skin."""
+    yield from live.processes(name)
+    yield from live.contacts(name)
+    info = live.info(name)
+    yield from live.compared(name, skin, bundle, info)
+    yield from options(name, skin, info)
+    said = info.get("mounting")
+    if isinstance(said, dict):
+        yield mounting_found(name, said, info)
+    if not isinstance(said, dict) or not float(said.get("misfit", 1.0)) <= GOOD_FIT:
+        yield electrode_order(name, live.baseline(info), bundle)
 
 
 def options(name: str, skin: Skin, info: dict[str, Any]) -> Iterator[Finding]:

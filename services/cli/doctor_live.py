@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import InfoFrame, RawFrame
+from protocol.advice import ADVICE
+from protocol.frame_types import REASONS
+from protocol.frames import ContactFrame, InfoFrame, RawFrame
 from protocol.runtime import CONFIG_LINK, AlreadyRunning, lock, runtime_dir
 from protocol.sockets import AllReader, ControlClient, ControlError, NewestReader
 from services.runtime.config import Skin
@@ -22,6 +25,9 @@ from services.runtime.stage import PROCESSES
 
 ANSWER_S = 1.0
 FRAME_S = 1.5
+LISTEN_S = 3.0  # to contact frames: what is judged is the skin as it is, not a moment of it
+WELL, BADLY = 0.95, 0.5
+"""Share of valid frames: less than the first is warned of, less than the second stops whoever acts on contacts."""
 
 
 @dataclass(frozen=True)
@@ -54,16 +60,20 @@ def running() -> bool:
     return False
 
 
+def another(path: Path) -> Path | None:
+    """The configuration that the service runs, where that is not this one."""
+    link = runtime_dir() / CONFIG_LINK
+    theirs = link.readlink() if link.is_symlink() else None
+    return None if theirs == path.resolve() else theirs
+
+
 def configuration(path: Path) -> Iterator[Finding]:
     """Whether the service runs this configuration, as it stands now."""
     link = runtime_dir() / CONFIG_LINK
-    if not link.is_symlink():
-        return
-    theirs = link.readlink()
-    if theirs != path.resolve():
+    if (theirs := another(path)) is not None:
         text = f"the service runs {theirs}, this is {path}: leave --config away, or restart the service with it"
         yield Finding("WARN", "configuration", text)
-    elif path.stat().st_mtime > link.lstat().st_mtime:
+    elif link.is_symlink() and path.stat().st_mtime > link.lstat().st_mtime:
         yield Finding("WARN", "configuration", f"{path} was changed since the service started: restart the service")
 
 
@@ -91,6 +101,33 @@ def processes(name: str) -> Iterator[Finding]:
         yield Finding(level, f"{name}: frames", text)
     else:
         yield Finding("FAIL", f"{name}: frames", f"no raw frame came within {FRAME_S:g} s: see the lines above")
+
+
+def contacts(name: str) -> Iterator[Finding]:
+    """Whether contact frames may be acted on: the share of the last seconds' that is valid, and why the others are not,
+    the most frequent reason first.
+    """
+    what, reader = f"{name}: contacts", AllReader(["contact"], name)
+    end, count, reasons = time.monotonic() + LISTEN_S, Counter[bool](), Counter[str]()
+    try:
+        while (left := end - time.monotonic()) > 0:
+            frame = reader.recv(left)
+            if isinstance(frame, ContactFrame):
+                count[frame.valid] += 1
+                reasons.update([] if frame.valid else set(frame.reasons) or {"no reason"})
+    finally:
+        reader.close()
+    total = count.total()
+    if not total:
+        yield Finding("FAIL", what, f"no contact frame came within {LISTEN_S:g} s: see the lines above")
+        return
+    share = count[True] / total
+    level = "OK" if share >= WELL else "WARN" if share >= BADLY else "FAIL"
+    text = f"{count[True]} of {total} frames of {LISTEN_S:g} s are valid ({100 * share:.0f} %)"
+    yield Finding(level, what, text)
+    for reason, times in reasons.most_common() if level != "OK" else ():
+        meaning, todo = REASONS.get(reason, ""), ADVICE.get(reason, "")
+        yield Finding(level, f"{name}: not valid", f"{reason} in {times} of {total}: {meaning}. {todo}".rstrip(": ."))
 
 
 def _status(process: str, name: str) -> Finding:

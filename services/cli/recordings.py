@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from protocol.pause import pause
 from services.cli.common import (
     USAGE,
     JsonOption,
@@ -135,7 +136,7 @@ def snapshot(
     while (now := control("recorder", "status", timeout_s=10.0)).get("writing") and now.get("snapshot") == made["file"]:
         if time.monotonic() > end:
             fail(f"{made['file']} is still being written: `skin top` shows how the recorder does")
-        time.sleep(0.1)
+        pause(0.1)
     for problem in now.get("problems", []):
         print(f"skin: {problem}", file=sys.stderr)
     if as_json:

@@ -38,6 +38,7 @@ class BaselineEstimator:
     def __init__(self, bundle: Bundle, rates: DriftRates, frames: int, tracking_s: float) -> None:
         """frames: that the mean of a baseline is of; tracking_s: see DriftFilter."""
         self.bundle = bundle
+        self._evidence: TouchEvidence | None = None
         self.pre = bundle.prereconstructor()
         self.window = TareWindow(self.pre, frames)
         self.drift_filter = DriftFilter(self.pre, rates, tracking_s)
@@ -102,8 +103,10 @@ class BaselineEstimator:
 
     @property
     def evidence(self) -> TouchEvidence:
-        """Made when it is first asked for, which takes a third of a second, and kept for all skins of the bundle."""
-        return evidence_of(self.bundle)
+        """Made when it is first asked for, and held from then on."""
+        if self._evidence is None:
+            self._evidence = evidence_of(self.bundle)
+        return self._evidence
 
     def _begin(self, found: Baseline) -> bool:
         """Use the first baseline, unless something touches: whether there is one now."""

@@ -19,6 +19,7 @@ from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.optimize import nnls
 
 from models.bundle import Bundle
+from services.estimation.by_bundle import ByBundle
 from services.estimation.physics import SkinPhysics
 from services.estimation.tuning import TUNING, Tuning
 
@@ -219,14 +220,14 @@ def _restricted(error: Array, columns: Array, prior: Array, live: NDArray[np.boo
     return np.asarray(error[np.ix_(live, live)] + b @ prior @ b.T)
 
 
-_made: dict[str, TouchEvidence] = {}  # by the bundle's hash
+def _of(bundle: Bundle) -> TouchEvidence:
+    skin, series = bundle.skin, None
+    if "contact_impedance" in skin:
+        series = np.asarray(skin["contact_impedance"], float) / np.asarray(skin["electrodes"]["width"], float)
+    return TouchEvidence(SkinPhysics.of(bundle.matrices, bundle.half_width, series))
 
 
-def evidence_of(bundle: Bundle) -> TouchEvidence:
-    """Made when it is first asked for, which takes a third of a second, and kept for all skins of the bundle."""
-    if bundle.hash not in _made:
-        skin, series = bundle.skin, None
-        if "contact_impedance" in skin:
-            series = np.asarray(skin["contact_impedance"], float) / np.asarray(skin["electrodes"]["width"], float)
-        _made[bundle.hash] = TouchEvidence(SkinPhysics.of(bundle.matrices, bundle.half_width, series))
-    return _made[bundle.hash]
+KEPT = 4  # of one and a half megabytes each
+
+evidence_of = ByBundle(_of, KEPT)
+"""Made when it is first asked for, which takes a third of a second, and shared by all skins of the bundle."""

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from models import rolling
 from models.bundle import Bundle
+from services.estimation.by_bundle import ByBundle
 
-_orders: dict[str, NDArray[np.integer]] = {}  # by the bundle's hash
+KEPT = 64  # orders, of a kilobyte each
 
 
 def parts_of(bundle: Bundle) -> int:
@@ -16,11 +17,12 @@ def parts_of(bundle: Bundle) -> int:
     return rolling.most_parts(len(bundle.pattern), int(bundle.pattern.max()) + 1)
 
 
-def rolling_order(bundle: Bundle) -> NDArray[np.integer]:
-    """The order of this bundle's scan in parts: computed once in a process, the same in every process."""
-    if bundle.hash not in _orders:
-        _orders[bundle.hash] = rolling.order(bundle.matrices, bundle.pattern, parts_of(bundle), bundle.half_width)
-    return _orders[bundle.hash]
+def _order_of(bundle: Bundle) -> NDArray[np.integer]:
+    return rolling.order(bundle.matrices, bundle.pattern, parts_of(bundle), bundle.half_width)
+
+
+rolling_order = ByBundle(_order_of, KEPT)
+"""(K,) the order of a bundle's scan in parts: the same in every process."""
 
 
 def measured_at(bundle: Bundle, part: int) -> NDArray[np.float64]:

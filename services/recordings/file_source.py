@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import FrameError, RawFrame, unpack
+from protocol.pause import pause
 from services.board.source import POLL_S, Source
 from services.recordings.npz_file import InputError, frames_of, load_npz, read_scans
 from services.runtime.stage import SEPARATE, valid_for_s
@@ -98,6 +99,6 @@ def file_frame(
 
 def _wait_until(due: float) -> Iterator[None]:
     while (left := due - time.monotonic()) > 0:
-        time.sleep(min(left, POLL_S))
+        pause(min(left, POLL_S))
         if left > POLL_S:
             yield None

@@ -20,7 +20,9 @@ class PatientFile:
 
     def __init__(self, path: Path, overwrite: bool = False) -> None:
         kind = os.O_TRUNC if overwrite else os.O_EXCL
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | kind, 0o666)
+        self._path = path
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | kind, 0o600)
+        os.fchmod(self._fd, 0o600)  # one that is overwritten too: who pressed where is nobody else's business
         self._written = 0
         self._waiting = bytearray()
         self._retry_at = 0.0
@@ -39,6 +41,17 @@ class PatientFile:
     def room(self) -> bool:
         """Whether more may be written."""
         return not self.full or len(self._waiting) < KEPT_BYTES
+
+    @property
+    def elsewhere(self) -> str:
+        """ "" while the file is where it was made, else "deleted" or "moved"."""
+        ours = os.fstat(self._fd)
+        try:
+            there = os.stat(self._path)
+        except OSError:  # no such file, no such folder
+            return "deleted" if ours.st_nlink == 0 else "moved"
+        same = (there.st_dev, there.st_ino) == (ours.st_dev, ours.st_ino)
+        return "" if same else "deleted" if ours.st_nlink == 0 else "moved"
 
     def flush(self, now: bool = False) -> None:
         """Hand what waits to the operating system, as far as there is room. While the disk is full it is tried every

@@ -25,11 +25,10 @@ from services.recordings.ring import RingEntry
 from services.recordings.rotation import RotatingWriter, Rotation
 from services.recordings.snapshots import STATE_EVERY_S, Keeping, Snapshots, file_in
 from services.recordings.stage_states import StateReader
-from services.runtime.config import ConfigError, load
+from services.runtime.config import MOST_SKINS, ConfigError, load
 
 DEFAULT_TOPICS = ("raw", "contact", "status", "info")
 POLL_S = 0.05
-MOST_SKINS = 64
 MOST_LATCHED = 1024
 
 log = logging.getLogger(__name__)
@@ -88,8 +87,17 @@ class Recorder:
 
         self.writer = RotatingWriter(path, self.rotation, following, head, self._metadata, overwrite)
         self.writer.begin()
+        self._ask_for_file()
+
+    def _ask_for_file(self) -> None:
+        """A file has begun: ask for the stages' state."""
         for skin in self._skins:
             self.states.ask(skin, "file")
+
+    def look(self, now: bool = False) -> None:
+        """See whether the recording is still where it was begun; where it is not, go on in another file."""
+        if self.writer is not None and self.writer.look(now):
+            self._ask_for_file()
 
     def stop(self) -> None:
         """End the recording."""
@@ -108,6 +116,7 @@ class Recorder:
                 taken += 1
             if got is None or (taken and time.monotonic() >= end):
                 break
+        self.look()
         if self.writer is not None:
             self.writer.flush_if_due()
         if self.snapshots is not None:
@@ -130,8 +139,7 @@ class Recorder:
 
     def _put(self, heard: RingEntry, frame: Frame | None, in_file: bool = True) -> None:
         if self.writer is not None and in_file and self.writer.write(heard.message):
-            for skin in self._skins:
-                self.states.ask(skin, "file")
+            self._ask_for_file()
         if self.snapshots is not None:
             self.snapshots.hear(heard, frame)
 
@@ -174,9 +182,9 @@ class Recorder:
                 found += [
                     f"{writer.full}: make room in {folder}; {lost}, recording goes on by itself when there is room"
                 ]
-            elif writer.lost:
+            elif writer.lost and not writer.torn:
                 found += [f"{lost}: the disk was full"]
-            found += [writer.problem] if writer.problem else []
+            found += [text for text in (writer.problem, writer.torn) if text]
         return "; ".join(found)
 
     @property

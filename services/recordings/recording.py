@@ -117,6 +117,11 @@ class RecordingWriter:
         return self._file.full
 
     @property
+    def elsewhere(self) -> str:
+        """ "" while the file is where it was made, else "deleted" or "moved"."""
+        return self._file.elsewhere
+
+    @property
     def bytes(self) -> int:
         """Size of the file, with what still waits to be written."""
         return self._file.tell()

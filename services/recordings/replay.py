@@ -15,9 +15,10 @@ from typing import Any
 
 from protocol.errors import EitskinError
 from protocol.frames import ContactFrame, FrameError, RawFrame, StatusFrame, as_sent, read_map, unpack
+from protocol.pause import pause
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
 from services.recordings.recording import STATE_TOPIC, RecordedMessage, RecordingError, RecordingReader, RecordingWriter
-from services.runtime.config import SKIN_NAME
+from services.runtime.config import MOST_SKINS, SKIN_NAME
 from services.runtime.stage import STAGES, add_reason
 
 CHAIN_S = 20.0  # for the stages to start and find each other
@@ -25,7 +26,6 @@ ANSWER_S = 5.0  # for the contacts of one frame
 PART_EVERY_S = 0.002  # a part of a scan that is not answered is asked after
 PRIME_EVERY_S = 0.25
 LONGEST_PAUSE_S = 10.0  # between two recorded frames: a file's times are its maker's, and nobody is to wait for years
-MOST_SKINS = 64
 
 
 class ReplayError(EitskinError):
@@ -140,11 +140,11 @@ class Replayer:
             return
         if self._before_ns is None:
             self._before_ns, self._due = at_ns, time.monotonic()
-        pause = (at_ns - self._before_ns) * 1e-9
+        apart_s = (at_ns - self._before_ns) * 1e-9
         self._before_ns = at_ns
-        self._due += min(max(0.0, pause), LONGEST_PAUSE_S) / self.speed
+        self._due += min(max(0.0, apart_s), LONGEST_PAUSE_S) / self.speed
         while (left := self._due - time.monotonic()) > 0:
-            time.sleep(min(left, 0.2))
+            pause(min(left, 0.2))
             self._report()
 
     def _send(self, step: Step, raw: RawFrame) -> Iterator[ContactFrame]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections import Counter, deque
@@ -12,6 +13,8 @@ from pathlib import Path
 from services.recordings.recording import RecordedMessage, RecordingError, RecordingWriter
 
 RETRY_S = 10.0
+LOOK_S = 0.3  # how often it is looked whether the file is still there
+PRIVATE = 0o700  # of a folder of recordings
 
 log = logging.getLogger(__name__)
 
@@ -49,12 +52,61 @@ class RotatingWriter:
         """Files begun, and files deleted since."""
         self.problem = ""
         """Why no new file could begin; "" while all is well."""
+        self.torn = ""
+        """What became of the last file that was deleted or moved while it was written; "" where none was."""
+        self._tear, self._looked_s = "", self._began_s
+        self.nowhere = False
+        """Whether the file is gone and no other could begin: nothing is recorded."""
 
     def write(self, message: RecordedMessage) -> bool:
         """Takes one message; whether a new file begins with it, which then lacks the stages' state."""
+        if self.nowhere:
+            self._lost += 1
+            return False
         turned = self._due() and self._turn()
         self._writer.write(message.topic, message.data, message.log_time_ns)
         return turned
+
+    def look(self, now: bool = False) -> bool:
+        """Whether a new file has begun, which lacks the stages' state, because the one before was deleted or moved.
+        Looks every LOOK_S, or `now`.
+        """
+        if not now and time.monotonic() - self._looked_s < LOOK_S:
+            return False
+        self._looked_s = time.monotonic()
+        if not self.nowhere:
+            how = self._writer.elsewhere
+            if not how:
+                return False
+            self._let_go(how)
+        return self._begin_anew()
+
+    def _let_go(self, how: str) -> None:
+        """The file is no longer under its name; what a deleted one held is lost."""
+        held = sum(self._writer.counts.values())
+        self._counts += Counter(self._writer.counts)
+        self._lost += self._writer.lost + (held if how == "deleted" else 0)
+        self.nowhere = True
+        with contextlib.suppress(OSError):  # its disk may be gone too
+            self._writer.close()
+        self._bytes += self._writer.bytes
+        lost = f": its {held} messages are lost" if how == "deleted" else ""
+        self._tear = f"{self.path} was {how} while it was recorded{lost}"
+        log.error("%s", self._tear)
+
+    def _begin_anew(self) -> bool:
+        path = self._following(self.files + 1)
+        try:
+            path.parent.mkdir(mode=PRIVATE, exist_ok=True)
+            self._writer = RecordingWriter(path, self._metadata())
+        except (RecordingError, OSError) as why:
+            self.torn = f"{self._tear}; nothing is recorded until a file can begin again: {why}"
+            return False
+        self.nowhere, self.path = False, path
+        self.torn = f"{self._tear}; the recording goes on in {path}"
+        log.warning("%s", self.torn)
+        self._begin_file(path)
+        return True
 
     def begin(self) -> None:
         """Write what each file begins with."""
@@ -80,39 +132,44 @@ class RotatingWriter:
         self._writer.close()
         self._bytes += self._writer.bytes
         self._writer, self.path, self.problem = following, path, ""
+        self._begin_file(path)
+        return True
+
+    def _begin_file(self, path: Path) -> None:
         self._began_s = time.monotonic()
         self.files += 1
         self._files.append(path)
         while 0 < self._rotation.keep < len(self._files):
             self.deleted += removed(self._files.popleft())
         self.begin()
-        return True
 
     def flush_if_due(self) -> None:
-        self._writer.flush_if_due()
+        if not self.nowhere:
+            self._writer.flush_if_due()
 
     @property
     def full(self) -> str:
         """Why nothing can be written now, as the system says it; "" while all is well."""
-        return self._writer.full
+        return "" if self.nowhere else self._writer.full
 
     @property
     def lost(self) -> int:
-        """Messages that there was no room for, in all files."""
-        return self._lost + self._writer.lost
+        """Messages that are in no file: there was no room for them, or the file that held them was deleted."""
+        return self._lost + (0 if self.nowhere else self._writer.lost)
 
     @property
     def bytes(self) -> int:
         """Of all files, those deleted too."""
-        return self._bytes + self._writer.bytes
+        return self._bytes + (0 if self.nowhere else self._writer.bytes)
 
     @property
     def counts(self) -> dict[str, int]:
         """Messages taken so far, by topic, in all files."""
-        return dict(self._counts + Counter(self._writer.counts))
+        return dict(self._counts + Counter({} if self.nowhere else self._writer.counts))
 
     def close(self) -> None:
-        self._writer.close()
+        if not self.nowhere:
+            self._writer.close()
 
 
 def removed(path: Path) -> bool:

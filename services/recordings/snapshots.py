@@ -14,13 +14,17 @@ from pathlib import Path
 from protocol.frames import Frame
 from services.recordings.recording import RecordingError, RecordingWriter
 from services.recordings.ring import Ring, RingEntry
-from services.recordings.rotation import removed
+from services.recordings.rotation import PRIVATE, removed
 from services.recordings.triggers import Trigger, TriggerWatch
 
 STATE_EVERY_S = 5.0
 """How often the stages are asked for their state, so that a snapshot may begin there."""
 LONGEST_S = 300.0
 """Of one snapshot after its first event: further ones that come meanwhile make it longer."""
+
+ASKED_A_MINUTE, ASKED_IN_ALL = 10, 200
+"""Snapshots by command: nobody fills a disk by asking."""
+MINUTE_NS = 60 * 10**9
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +61,7 @@ class Snapshots:
         self._watch = TriggerWatch(keeping.triggers)
         self._open: OpenSnapshot | None = None
         self._automatic: deque[Path] = deque()
+        self._asked: deque[tuple[int, Path]] = deque()  # by command, and when
         self.taken, self.missed, self.deleted, self.lost = 0, 0, 0, 0
         """Snapshots begun; events of which none could be; old ones deleted; messages that there was no room for."""
         self.last = ""
@@ -94,8 +99,10 @@ class Snapshots:
         if self._open is not None:
             self._open.end_ns = min(max(self._open.end_ns, end_ns), self._open.last_end_ns)
             return self._open.path
+        if kind == "snapshot":
+            self._allow(now_ns)
         try:
-            self.keeping.folder.mkdir(parents=True, exist_ok=True)
+            self.keeping.folder.mkdir(PRIVATE, parents=True, exist_ok=True)
             path = file_in(self.keeping.folder, f"-{kind}")
             writer = RecordingWriter(path, self._metadata(event))
             self._open = OpenSnapshot(path, writer, end_ns, now_ns + int(LONGEST_S * 1e9))
@@ -114,7 +121,26 @@ class Snapshots:
             self._automatic.append(path)
             while 0 < self.keeping.keep < len(self._automatic):
                 self.deleted += removed(self._automatic.popleft())
+        else:
+            self._asked.append((now_ns, path))
         return path
+
+    def _allow(self, now_ns: int) -> None:
+        """Whether one more may be taken by command. Raises RecordingError."""
+        lately = [at for at, _ in self._asked if now_ns - at < MINUTE_NS]
+        if len(lately) >= ASKED_A_MINUTE:
+            wait_s = (lately[-ASKED_A_MINUTE] + MINUTE_NS - now_ns) * 1e-9
+            raise RecordingError(
+                f"found {len(lately)} snapshots by command within a minute, allowed are {ASKED_A_MINUTE}: wait "
+                f"{wait_s:.0f} s, or use {self.last}, the newest"
+            )
+        if len(self._asked) >= ASKED_IN_ALL:
+            self._asked = deque((at, path) for at, path in self._asked if path.exists())
+        if len(self._asked) >= ASKED_IN_ALL:
+            raise RecordingError(
+                f"found {len(self._asked)} snapshots by command in {self.keeping.folder}, allowed are {ASKED_IN_ALL} "
+                "of one recorder: move or delete those that you do not need"
+            )
 
     def mind(self, now_ns: int) -> None:
         """End what is long enough, and write what is due."""
@@ -137,6 +163,8 @@ class Snapshots:
         if found is None:
             return
         try:
+            if how := found.writer.elsewhere:
+                self._failed(f"the snapshot {found.path} was {how} while it was written")
             found.writer.close()
         except OSError as why:
             self._failed(f"the snapshot {found.path} has no end: {why.strerror or why}")

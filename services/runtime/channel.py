@@ -7,6 +7,7 @@ from typing import Any, Protocol
 from protocol.frames import Frame
 from protocol.topics import wire_topic
 from services.runtime.heartbeat import Heartbeat
+from services.runtime.said_once import SaidOnce
 from services.runtime.stage import Stage
 
 
@@ -33,4 +34,4 @@ class Channel:
         self.heads = {topic: wire_topic(topic, stage.skin) + b"\0" for topic in stage.writes}  # of its messages
         self.asleep = False
         self.wanted: frozenset[str] = frozenset()  # topics somebody subscribes to, as of the last tick
-        self.errors: set[str] = set()
+        self.failures = SaidOnce()

@@ -9,12 +9,14 @@ import itertools
 import os
 import re
 import tomllib
+import unicodedata
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from models.files import FileError, read_text
+from protocol.ad5940 import LEAST_RTIA_OHM, MOST_RTIA_OHM
 from protocol.errors import EitskinError
 from protocol.topics import BRIDGES
 from protocol.transport import Transport
@@ -139,13 +141,17 @@ class Skin(Section):
     network: NetworkFile = "int8"
     dft_points: Literal[128, 256, 512] = 128
     scan: ScanMode = "full"  # rolling: scans in parts
-    rtia_ohm: Annotated[Number, Field(gt=0)] = 40_000.0  # gain resistor of the board's current measurement
+    rtia_ohm: Annotated[Number, Field(ge=LEAST_RTIA_OHM, le=MOST_RTIA_OHM)] = (
+        40_000.0  # gain resistor of the board's current measurement
+    )
     tare: TareConfig = TareConfig()
     touch: TouchConfig = TouchConfig()
 
     @field_validator("port")
     @classmethod
     def some_port(cls, port: str) -> str:
+        if port.startswith(BY_NAME):
+            _pattern(port.removeprefix(BY_NAME).partition("&")[0])
         if port == "stub" or port.startswith("/") or "://" in port or Path(port).suffix in RECORDINGS:
             return port
         raise ValueError(
@@ -168,6 +174,17 @@ class Skin(Section):
 
 
 RECORDINGS = (".mcap", ".npz")
+BY_NAME = "hwgrep://"
+MOST_SKINS = 64  # of one service
+
+
+def _pattern(text: str) -> None:
+    try:
+        re.compile(text)
+    except (re.error, RecursionError, OverflowError) as why:
+        raise ValueError(
+            f"{BY_NAME} and a regular expression that a port's name matches (found {text!r}: {why})"
+        ) from why
 
 
 def _one_board(port: str, other: str) -> bool:
@@ -196,6 +213,11 @@ class ConfigFile(Section):
     @field_validator("skins")
     @classmethod
     def names(cls, skins: dict[str, Skin]) -> dict[str, Skin]:
+        if len(skins) > MOST_SKINS:
+            raise ValueError(
+                f"at most {MOST_SKINS} skins (found {len(skins)}): run the others in a service of their own, with "
+                "another skin.toml and another EITSKIN_RUNTIME"
+            )
         for name in skins:
             if not SKIN_NAME.fullmatch(name):
                 raise ValueError(f"skin names of lower-case letters, digits, - and _ (found {name!r})")
@@ -259,11 +281,37 @@ def load(path: str | Path | None = None) -> ConfigFile:
 
 def parse(raw: dict[str, Any], file: Path = Path("skin.toml")) -> ConfigFile:
     """Check a configuration that is already a dict; `file` is named in errors."""
+    if wrong_text := _control_characters(raw):
+        raise ConfigError("\n".join(f"{file}: {line}" for line in wrong_text))
     try:
         config = ConfigFile.model_validate(raw | {"path": file})
         return config.model_copy(update={"skins": {n: config._resolved(s) for n, s in config.skins.items()}})
     except ValidationError as wrong:
         raise ConfigError("\n".join(_explain(file, e) for e in wrong.errors())) from None
+
+
+def _control_characters(raw: dict[str, Any]) -> list[str]:
+    """A line for each text, or name of a key, that no terminal or file name should get."""
+    found, waiting = [], [("", raw)]
+    while waiting:
+        key, value = waiting.pop()
+        if isinstance(value, str) and _controls(value):
+            found.append(f"{key}: found {_shown(value)}; allowed: text without control characters")
+        elif isinstance(value, dict):
+            for name, inner in value.items():
+                if _controls(name):
+                    found.append(
+                        f"{key or '(top level)'}: found the name {_shown(name)}; allowed: printable characters"
+                    )
+                else:
+                    waiting.append((f"{key}.{name}".lstrip("."), inner))
+        elif isinstance(value, list):
+            waiting += [(f"{key}.{place}", inner) for place, inner in enumerate(value)]
+    return sorted(found)
+
+
+def _controls(text: str) -> bool:
+    return any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in text)
 
 
 def _explain(file: Path, error: Any) -> str:

@@ -25,6 +25,7 @@ class Heartbeat:
         self.sent = self._meter.sent
         self.drops: Counter[str] = Counter({"late": 0, "failed": 0})
         self.late = 0  # frames that were sent too old to be acted on
+        self.failures = self.unlogged = 0  # exceptions in the stage, and those of them that the log does not have
         self._late_at, self._late_by_s = -math.inf, 0.0
         self._failure, self._failed_at = "", 0.0
         self._since = self._heard = time.monotonic()
@@ -86,7 +87,8 @@ class Heartbeat:
             )
         if asleep:
             messages.append("idle: nobody subscribes")
-        return self._beat.frame(level, messages, now, every_s, self.drops, {**health.counters, "late": self.late})
+        counters = {**health.counters, "late": self.late, "failures": self.failures, "unlogged": self.unlogged}
+        return self._beat.frame(level, messages, now, every_s, self.drops, counters)
 
     def summary(self, asleep: bool, silent_s: float) -> dict[str, Any]:
         """For the control command `status`."""
@@ -100,5 +102,7 @@ class Heartbeat:
             "messages": list(last.messages) if last else [],
             "rates": dict(self._meter.rates),
             "drops": dict(self.drops),
+            "failures": self.failures,
+            "unlogged": self.unlogged,
             "latency": self._meter.quantiles(),
         }

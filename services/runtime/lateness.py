@@ -6,6 +6,7 @@ import time
 
 from protocol.ages import Ages
 from protocol.frames import Frame
+from protocol.pause import pause
 
 STOOD_S = 0.1  # a wait that is longer than meant by so much: the process stood still, and what came meanwhile is old
 ARRIVING_S = 0.01  # for all that has queued up in sockets and threads to arrive
@@ -27,7 +28,7 @@ class Lateness:
         now = time.monotonic()
         stood = self._ages.look() or now - self._looked_s > max(0.0, timeout_s) + STOOD_S
         if stood:
-            time.sleep(ARRIVING_S)
+            pause(ARRIVING_S)
             now = time.monotonic()
         self._looked_s = now
         return stood

@@ -18,9 +18,10 @@ import msgpack
 import numpy as np
 
 from models.files import check
+from protocol.ages import BOOTTIME
 from protocol.fields import FieldError, decode_array, encode_array
 from protocol.frames import MAX_MESSAGE, read_map
-from protocol.runtime import runtime_dir
+from protocol.runtime import host_id, runtime_dir
 
 LARGEST = MAX_MESSAGE
 CHECKSUM = hashlib.sha256().digest_size
@@ -33,7 +34,8 @@ def save(process: str, skin: str, state: dict[str, Any]) -> None:
     """Keep a state, with its checksum before it; what a crash leaves behind is the old one or the new one."""
     name = f"{process}-{skin}.msgpack"
     fresh = f"{name}.{os.getpid()}"
-    packed: bytes = msgpack.packb({"saved_unix_s": time.time(), "state": plain(state)})
+    when = {"saved_unix_s": time.time(), "boot": host_id(), "saved_boot_s": time.clock_gettime(BOOTTIME)}
+    packed: bytes = msgpack.packb({**when, "state": plain(state)})
     try:
         with _folder(create=True) as folder:
             with contextlib.suppress(FileNotFoundError):
@@ -55,7 +57,7 @@ def restore(process: str, skin: str) -> tuple[dict[str, Any], float] | None:
         if hashlib.sha256(packed[CHECKSUM:]).digest() != packed[:CHECKSUM]:
             raise ValueError("its checksum is not that of its content")
         kept = read_map(packed[CHECKSUM:], "the kept state")
-        ahead = float(kept["saved_unix_s"]) - time.time()
+        ahead = _ahead_s(kept)
         if not ahead <= AHEAD_S:
             raise ValueError(f"it is of {ahead:.0f} s from now: was the clock set back?")
         state = arrays(kept["state"])
@@ -67,6 +69,13 @@ def restore(process: str, skin: str) -> tuple[dict[str, Any], float] | None:
     except Exception as why:  # whatever is in the file, the service starts
         log.warning("%s: %s is no kept state (%s): starting without it", skin, _place() / name, why)
         return None
+
+
+def _ahead_s(kept: dict[str, Any]) -> float:
+    """How far from now it was saved. Within one boot no setting of the clock counts. Raises ValueError, KeyError."""
+    if kept.get("boot") == host_id():
+        return float(kept["saved_boot_s"]) - time.clock_gettime(BOOTTIME)
+    return float(kept["saved_unix_s"]) - time.time()
 
 
 def _place() -> Path:

@@ -1,8 +1,9 @@
 """Process supervision of `skin up`: supervisord as a library, in the foreground, quick.
 
-Three things differ from supervisord as it comes: it looks at its children every POLL_S instead of every second and
+Four things differ from supervisord as it comes: it looks at its children every POLL_S instead of every second and
 restarts one in the same round in which it was reaped; a process that keeps failing is retried for ever, at growing
-intervals, instead of being given up; children write to our own stdout (one log stream, no copying) and die with us,
+intervals, instead of being given up; no setting of the system's clock delays a restart or cuts a stop short; children
+write to our own stdout (one log stream, no copying) and die with us,
 whatever kills us.
 """
 
@@ -19,6 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import supervisor.process
+import supervisor.supervisord
 from supervisor.medusa import asyncore_25 as asyncore
 from supervisor.options import ServerOptions
 from supervisor.process import Subprocess
@@ -35,6 +38,15 @@ HEALTHY_S = 3  # a process that lived this long starts its next restarts from th
 FIRST_RETRY_S, LONGEST_RETRY_S = 0.1, 5.0
 STOP_S = 1  # from SIGTERM to SIGKILL
 PR_SET_PDEATHSIG = 1
+
+
+class _Monotonic:
+    """What supervisor takes for the module `time`: it counts restart and stop delays by it."""
+
+    time = staticmethod(time.monotonic)
+
+
+supervisor.process.time = supervisor.supervisord.time = _Monotonic
 
 
 @dataclass(frozen=True)
@@ -148,7 +160,7 @@ class _Stage(Subprocess):  # type: ignore[misc]
     def change_state(self, new_state: int, expected: bool = True) -> Any:
         changed = super().change_state(new_state, expected)
         if new_state == ProcessStates.BACKOFF:
-            self.delay = time.time() + min(FIRST_RETRY_S * 2 ** (self.backoff - 1), LONGEST_RETRY_S)
+            self.delay = time.monotonic() + min(FIRST_RETRY_S * 2 ** (self.backoff - 1), LONGEST_RETRY_S)
         return changed
 
     def _prepare_child_fds(self) -> None:

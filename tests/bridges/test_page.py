@@ -17,12 +17,12 @@ import msgpack
 import numpy as np
 import pytest
 
-from bridges.page.advice import ADVICE
 from bridges.page.commands import OwnRecorder
 from bridges.page.replays import Replay, ReplayRefused, listed
 from bridges.page.server import PageServer
 from bridges.page.settings import PageSettings
 from bridges.process import BridgeError, Handed, openable
+from protocol.advice import ADVICE
 from protocol.frames import REASONS, ContactFrame, Frame, ImageFrame, unpack
 from protocol.sockets import ControlServer, Publisher
 from protocol.transport import Transport

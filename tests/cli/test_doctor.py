@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import pty
+import re
+import threading
 import tty
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from models.bundle import Bundle
 from protocol import link
+from protocol.advice import ADVICE
+from protocol.frames import ContactFrame
+from protocol.runtime import CONFIG_LINK, lock
+from protocol.sockets import Publisher
 from services.cli.doctor import _key, electrode_order
 
 
@@ -65,6 +75,74 @@ def test_an_indenter_larger_than_the_skin_stops_doctor_and_service(skin, tmp_pat
     assert ran.code == 2 and says in " ".join((ran.out + ran.err).split())
     ran = skin("doctor", "--config", configured(tmp_path, "stub", "indenter = { radius_m = 0.001 }\n"))
     assert "WARN palm: indenter refinement off: `radius_m` is 0.001 m" in " ".join(ran.out.split())
+
+
+@contextlib.contextmanager
+def service(runtime: Path, config: Path, frames: Sequence[ContactFrame]) -> Iterator[None]:
+    """What `skin up` holds of a runtime folder; its publisher sends these frames again and again."""
+    over = threading.Event()
+
+    def publish() -> None:
+        publisher = Publisher("publisher")
+        for frame in itertools.cycle(frames):
+            publisher.poll()
+            publisher.send(frame)
+            if over.wait(0.02):
+                break
+        publisher.close()
+
+    (runtime / CONFIG_LINK).symlink_to(Path(config).resolve())
+    thread = threading.Thread(target=publish)
+    with lock():
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+
+def contact(*reasons: str) -> ContactFrame:
+    return ContactFrame(skin="palm", valid=not reasons, reasons=list(reasons), valid_for_s=0.25)
+
+
+@pytest.mark.parametrize(
+    ("frames", "level", "expected"),
+    [
+        ([contact("out_of_distribution")], "FAIL", r"0 of \d+ frames of 3 s are valid \(0 %\)"),
+        ([contact()] * 3 + [contact("gap")], "WARN", r"\d+ of \d+ frames of 3 s are valid \(7\d %\)"),
+        ([contact()], "OK", r"(\d+) of \1 frames of 3 s are valid \(100 %\)"),
+    ],
+)
+def test_contacts_are_judged_by_the_share_of_valid_frames(  # type: ignore[no-untyped-def]
+    skin, runtime, tmp_path, frames, level, expected
+) -> None:
+    config = configured(tmp_path, "stub", "")
+    with service(runtime, config, frames):
+        out = skin("doctor", "--config", config).out
+    assert re.search(rf"{level} +palm: contacts +{expected}", out), out
+    for reason in {reason for frame in frames for reason in frame.reasons}:
+        line = next(line for line in out.splitlines() if "palm: not valid" in line and reason in line)
+        assert re.search(rf"{level} .*{reason} in \d+ of \d+", line) and ADVICE[reason].rstrip(".") in line
+    assert ("not valid" in out) == (level != "OK")
+
+
+def test_no_contact_frame_is_a_failure(skin, runtime, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    config = configured(tmp_path, "stub", "")
+    other = ContactFrame(skin="sole", valid=True)
+    with service(runtime, config, [other]):
+        assert re.search(r"FAIL +palm: contacts +no contact frame came", skin("doctor", "--config", config).out)
+
+
+@pytest.mark.parametrize("port", ["stub", "/dev/null"])
+def test_against_another_configuration_that_is_named_and_nothing_fails(skin, runtime, tmp_path, port) -> None:  # type: ignore[no-untyped-def]
+    config = configured(tmp_path, port, "")
+    running = tmp_path / "running.toml"
+    running.write_text('[skins.another]\nport = "stub"\nbundle = "disc16"\n')
+    with service(runtime, running, [contact("late")]):
+        ran = skin("doctor", "--config", config)
+    assert f"the service runs {running}, this is {config}" in ran.out
+    assert ran.code == 0 and "FAIL" not in ran.out, ran.out
 
 
 def test_electrodes_in_order(bundle: Bundle) -> None:

@@ -135,17 +135,23 @@ def test_the_doctor_looks_at_what_the_service_runs(folder: Path) -> None:
     assert {"palm: acquisition", "sole: publisher", "palm: baseline", "sole: baseline"} <= set(levels)
     assert str(folder / "two.toml") in found[0]["text"] and not any({"OK", "FAIL"} <= v for v in levels.values())
     other = skin(folder, "doctor", "--config", str(ROOT / "skin.toml"), check=False).stdout
-    assert f"the service runs {folder / 'two.toml'}" in other
+    assert f"the service runs {folder / 'two.toml'}" in other and "FAIL" not in other
 
 
 def test_the_doctor_names_a_bundle_and_a_calibration_changed_since(folder: Path) -> None:
-    changed = folder / "changed.toml"
+    config = folder / "two.toml"
+    before = config.read_text()
     (folder / "palm.json").write_text('{"newtons_per_siemens": 8.5}')
-    text = (
-        (folder / "two.toml").read_text().replace('bundle = "square16"', 'bundle = "disc16"\ncalibration = "palm.json"')
-    )
-    changed.write_text(text)
-    said = skin(folder, "doctor", "--config", str(changed), check=False)
+    changed = before.replace('bundle = "square16"', 'bundle = "disc16"\ncalibration = "palm.json"')
+    (folder / "changed.toml").write_text(changed)
+    elsewhere = skin(folder, "doctor", "--config", str(folder / "changed.toml"), check=False)
+    assert f"the service runs {config}" in elsewhere.stdout and "restart the service:" not in elsewhere.stdout
+    assert "FAIL" not in elsewhere.stdout and re.search(r"SKIP +palm: contacts", elsewhere.stdout)
+    config.write_text(changed)
+    try:
+        said = skin(folder, "doctor", check=False)
+    finally:
+        config.write_text(before)
     assert said.returncode == 1
     assert re.search(r"FAIL +palm: runs +bundle square16 \(\w{12}\), not disc16 \(\w{12}\): restart", said.stdout)
     assert re.search(r"FAIL +palm: runs +calibration no calibration, expected .*palm.json", said.stdout)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -259,6 +261,86 @@ def test_it_records_and_takes_snapshots_when_told_to(waiting: tuple[Publisher, C
     for path in (snapshot, recording):  # what is latched is in both, though it was said long before
         assert [m.topic for m in RecordingReader(path).messages({"info"})] == ["info/palm"]
     assert str(RecordingReader(recording).damage) == "whole"
+
+
+def until(control: ControlClient, publisher: Publisher, what: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+    """The recorder's status once it is so, while contacts come."""
+    end = time.monotonic() + 20
+    while True:
+        send(publisher, 5)
+        said = control.call("status")
+        if what(said):
+            return said
+        assert time.monotonic() < end, said
+
+
+@pytest.mark.parametrize("how", ["file deleted", "file moved", "folder deleted"])
+def test_a_recording_that_is_taken_away_is_said_and_goes_on(
+    waiting: tuple[Publisher, ControlClient], tmp_path: Path, how: str
+) -> None:
+    publisher, control = waiting
+    first = Path(control.call("record", on=True)["file"])
+    until(control, publisher, lambda said: said["messages"].get("contact/palm", 0) > 10)
+    if how == "file moved":
+        first.rename(tmp_path / "moved.mcap")
+    elif how == "file deleted":
+        first.unlink()
+    else:
+        shutil.rmtree(first.parent)
+    said = until(control, publisher, lambda said: said["level"] == "WARN" and said["files"] == 2)
+    assert str(first) in said["problems"][0] and ("moved" if how == "file moved" else "deleted") in said["problems"][0]
+    assert (said["lost"] > 10) == (how != "file moved")
+    time.sleep(0.2)
+    send(publisher, 20)
+    time.sleep(0.2)
+    last = Path(control.call("record", on=False)["file"])
+    assert last.is_file() and len(contacts_in(last)) >= 20 and RecordingReader(last).metadata
+    if how == "file moved":
+        assert contacts_in(tmp_path / "moved.mcap")
+
+
+def test_where_none_can_begin_anew_nothing_is_called_recorded(
+    waiting: tuple[Publisher, ControlClient], tmp_path: Path
+) -> None:
+    publisher, control = waiting
+    first = Path(control.call("record", on=True)["file"])
+    shutil.rmtree(first.parent)
+    first.parent.write_text("a file where the folder was")
+    said = until(control, publisher, lambda said: said["level"] == "ERROR")
+    assert said["file"] == "" and "nothing is recorded" in said["problems"][0]
+    first.parent.unlink()
+    said = until(control, publisher, lambda said: said["level"] == "WARN")
+    assert Path(said["file"]).is_file() and said["lost"] > 0
+
+
+def test_recordings_and_snapshots_are_their_owners_alone(waiting: tuple[Publisher, ControlClient]) -> None:
+    publisher, control = waiting
+    files = Path(control.call("record", on=True)["file"]), Path(control.call("snapshot", after_s=0)["file"])
+    for file in files:
+        assert (file.stat().st_mode & 0o777, file.parent.stat().st_mode & 0o777) == (0o600, 0o700)
+
+
+def test_nobody_fills_a_disk_by_asking_for_snapshots(tmp_path: Path) -> None:
+    made = Clock(Keeping(tmp_path, 0.1, 0.0))
+    with pytest.raises(RecordingError, match=r"found 10 snapshots by command within a minute.*: wait \d+ s"):
+        for _ in range(500):
+            made.of.take("snapshot", "again", made.ns)
+            made.hear(touched())
+    assert len(list(tmp_path.iterdir())) == 10
+    made.ns += 61 * 10**9
+    assert made.of.take("snapshot", "later", made.ns).is_file()
+
+
+def test_snapshots_by_command_are_bounded_in_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(snapshots, "ASKED_IN_ALL", 3)
+    made = Clock(Keeping(tmp_path, 0.1, 0.0))
+    for _ in range(3):
+        first = made.of.take("snapshot", "again", made.ns)
+        made.hear(touched())
+    with pytest.raises(RecordingError, match="found 3 snapshots by command in .*: move or delete"):
+        made.of.take("snapshot", "again", made.ns)
+    first.unlink()
+    assert made.of.take("snapshot", "again", made.ns).is_file()
 
 
 def test_its_status_says_what_it_does(waiting: tuple[Publisher, ControlClient]) -> None:

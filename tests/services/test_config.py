@@ -104,6 +104,34 @@ def test_the_shipped_configuration_is_the_demo() -> None:
             "allowed: a port of its own for each skin (palm has 'socket://board:4000', arm has 'socket://board:4000'",
         ),
         (
+            {"skins": {"palm": PALM | {"port": "hwgrep://("}}},
+            "skins.palm.port: found 'hwgrep://('; allowed: hwgrep:// and a regular expression",
+        ),
+        (
+            {"skins": {"palm": PALM | {"rtia_ohm": 1e300}}},
+            "skins.palm.rtia_ohm: found 1e+300; allowed: less than or equal to 1000000",
+        ),
+        (
+            {"skins": {"palm": PALM}, "recorder": {"folder": "a\0b"}},
+            r"recorder.folder: found 'a\x00b'; allowed: text without control characters",
+        ),
+        (
+            {"skins": {"palm": PALM | {"frame_id": "palm\x1b[2J"}}},
+            r"skins.palm.frame_id: found 'palm\x1b[2J'; allowed: text without control characters",
+        ),
+        (
+            {"skins": {"palm\x07": PALM}},
+            r"skins: found the name 'palm\x07'; allowed: printable characters",
+        ),
+        (
+            {"skins": {"palm": PALM}, "page": {"names": ["robot", "a\x85b"]}},
+            r"page.names.1: found 'a\x85b'; allowed: text without control characters",
+        ),
+        (
+            {"skins": {f"s{k}": PALM for k in range(1000)}},
+            "allowed: at most 64 skins (found 1000): run the others in a service of their own",
+        ),
+        (
             {"skins": {"palm": PALM}, "loging": {}},
             "unknown key; allowed here: skins, sockets, security, realtime, skip, bridges, "
             "page, ros2, foxglove, recorder, logging",

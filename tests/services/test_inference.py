@@ -12,6 +12,7 @@ from onnx import TensorProto, helper
 from models.bundle import Bundle, write
 from protocol.frames import DeltaFrame, ImageFrame, pack
 from services.estimation import rolling
+from services.estimation.by_bundle import ByBundle
 from services.estimation.quality import KEPT
 from services.estimation.touch_decision import MEANS
 from services.inference import SETTLED, Inference
@@ -237,6 +238,46 @@ def test_a_bundle_that_was_tampered_with_is_refused(networked: Bundle, tmp_path:
     assert onnx.__version__
 
 
+def elsewhere(tensor: TensorProto) -> TensorProto:
+    """The same tensor, with its values in a file beside."""
+    tensor.ClearField("raw_data")
+    tensor.ClearField("float_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    for key, value in (("location", "weights.bin"), ("offset", "0"), ("length", "4")):
+        tensor.external_data.add(key=key, value=value)
+    return tensor
+
+
+def with_weights_elsewhere(where: str) -> bytes:
+    model = onnx.load_from_string(network())
+    if where == "initializer":
+        elsewhere(model.graph.initializer[3])
+    elif where == "location unsaid":
+        model.graph.initializer[3].data_location = TensorProto.EXTERNAL
+    else:
+        constant = elsewhere(helper.make_tensor("value", TensorProto.FLOAT, [1], [0.5]))
+        node = helper.make_node("Constant", [], ["half"], value=constant)
+        if where == "subgraph":
+            half = helper.make_tensor_value_info("half", TensorProto.FLOAT, [1])
+            branch = helper.make_graph([node], "branch", [], [half])
+            node = helper.make_node("If", ["zero"], ["some"], then_branch=branch, else_branch=branch)
+        if where == "function":
+            opsets = [helper.make_opsetid("", 17)]
+            model.functions.append(helper.make_function("own", "half", [], ["half"], [node], opsets))
+        else:
+            model.graph.node.append(node)
+    return bytes(model.SerializeToString())
+
+
+@pytest.mark.parametrize("where", ["initializer", "attribute", "subgraph", "function", "location unsaid"])
+def test_a_network_with_weights_in_another_file_is_refused(bundle: Bundle, tmp_path: Path, where: str) -> None:
+    from models.bundle import BundleError
+
+    manifest = {k: v for k, v in bundle.manifest.items() if k not in ("schema", "files")}
+    with pytest.raises(BundleError, match=r"network.onnx keeps weights in another file \(('weights.bin'|not named)"):
+        write(tmp_path / "b", manifest, bundle.matrices, {"full": with_weights_elsewhere(where)})
+
+
 @pytest.mark.parametrize("content", [b"", b"no network", network()[:200]])
 def test_a_file_that_is_no_network_is_an_error_of_the_bundle(
     skin: Skin, bundle: Bundle, tmp_path: Path, content: bytes
@@ -318,7 +359,7 @@ def test_what_other_touches_displaced_is_prepared_again(skin: Skin, networked: B
 
 def test_no_frame_waits_for_the_order_of_the_parts(skin: Skin, bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
     """It takes half a second, in which a press is over."""
-    monkeypatch.setattr(rolling, "_orders", {})
+    monkeypatch.setattr(rolling, "rolling_order", ByBundle(rolling._order_of, rolling.KEPT))
     stage = Inference("palm", skin.model_copy(update={"scan": "rolling", "network": "none"}), bundle)
     stage.warm_up()
     monkeypatch.setattr(rolling.rolling, "order", None)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import sys
+import weakref
 from dataclasses import replace as replaced
 from pathlib import Path
 from typing import Any
@@ -16,12 +18,13 @@ from models.calibration_file import CalibrationFileError, found_by, unpack
 from models.fit_calibration import calibrate
 from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
-from protocol.frames import RawFrame
+from protocol.frames import Frame, RawFrame
 from services import mounting
 from services.calibration.force_presses import of_file
 from services.contacts import calibration_file
 from services.contacts.force import ForceLaw
 from services.contacts.force_curve import Curve
+from services.estimation.evidence import evidence_of
 from services.estimation.tare import Baseline
 from services.linearisation import Linearisation
 from services.pipeline import Pipeline, Result
@@ -218,6 +221,32 @@ def test_a_calibration_that_inference_cannot_find_makes_frames_invalid(sheet: Mi
     delta.calibration = "ab" * 32  # type: ignore[attr-defined]
     image = bench.pipeline.inference.process(delta, frozenset({"image"}))[0]
     assert not image.valid and "stale_baseline" in image.reasons
+
+
+def test_a_calibration_that_arrives_late_is_used(sheet: MismatchedSheet, bundle: Bundle) -> None:
+    z0 = np.abs(sheet.solve().impedances())
+    packed = calibrate(bundle, z0, 1e-5 * z0)
+    bench = Bench(sheet)
+    bench.feed(frames=80)
+    bench.pipeline.pre.command("tare", {"calibrate": False})
+    delta = bench.pipeline.pre.process(_raw(bench), frozenset({"delta"}))[0]
+    delta.calibration = unpack(packed, bundle).hash  # type: ignore[attr-defined]
+
+    def image() -> Frame:
+        return bench.pipeline.inference.process(delta, frozenset({"image"}))[0]
+
+    assert not any(image().valid for _ in range(10))
+    mounting.keep("palm", mounting.MountedSkin(packed, bundle))
+    assert any([image().valid for _ in range(25)]) and image().valid  # a second of frames
+
+
+def test_what_is_made_of_a_calibrated_bundle_goes_with_it(bundle: Bundle) -> None:
+    """Each tare that calibrates makes a bundle with a hash of its own."""
+    held = evidence_of(bundle)
+    made = [weakref.ref(evidence_of(replaced(bundle, hash=f"{k:064x}"))) for k in range(7)]
+    gc.collect()
+    assert sum(each() is not None for each in made) <= 4
+    assert evidence_of(bundle) is held  # who uses it shares it, however many came since
 
 
 def _raw(bench: Bench) -> RawFrame:

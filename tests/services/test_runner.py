@@ -25,6 +25,7 @@ from services.runtime.lateness import Lateness
 from services.runtime.stage import Stage
 from tests.services.conftest import Board
 
+PALM = {"skins": {"palm": {"port": "stub", "bundle": "square16"}}}
 CONFIG = '[skins.palm]\nport = "stub"\nbundle = "square16"\nnetwork = "none"\n'
 
 
@@ -375,7 +376,7 @@ def test_a_stop_and_a_sleep_of_the_host_are_noticed(monkeypatch: pytest.MonkeyPa
     """By the loop's own time; and by the clock that goes on while the host is suspended."""
     now, slept, naps = [100.0], [0.0], []
     monkeypatch.setattr("services.runtime.lateness.time.monotonic", lambda: now[0])
-    monkeypatch.setattr("services.runtime.lateness.time.sleep", naps.append)
+    monkeypatch.setattr("services.runtime.lateness.pause", naps.append)
     monkeypatch.setattr("protocol.ages._slept_ns", lambda: int(slept[0] * 1e9))
     lateness = Lateness()
 
@@ -394,6 +395,43 @@ def test_a_stop_and_a_sleep_of_the_host_are_noticed(monkeypatch: pytest.MonkeyPa
     assert lateness.late(frame), "measured before the host slept"
     frame.stamps = {"sample": time.monotonic_ns()}
     assert not lateness.late(frame) and not after(0.2, 0.2)
+
+
+class Failing(Stage):
+    reads, writes, stamp = "image", ("contact",), "publish"
+    text = ""
+
+    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        raise ValueError(self.text)
+
+
+def test_failures_are_logged_however_many_there_were_and_all_are_counted(
+    runtime: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runner, stage, now = Runner("publisher", parse(PALM)), Failing("palm"), [time.monotonic()]
+    lines = 0
+
+    def fail(text: str) -> int:
+        caplog.clear()
+        stage.text = text
+        runner._handle(runner.channels["palm"], ImageFrame(skin="palm"))
+        return len(caplog.records)
+
+    def words(k: int) -> str:
+        return "".join(chr(ord("a") + int(digit)) for digit in str(k))
+
+    try:
+        runner.add(stage)
+        monkeypatch.setattr("services.runtime.said_once.time.monotonic", lambda: now[0])
+        assert fail("scan 1 is odd") == 1 and fail("scan 2 is odd") == 0, "the same failure of another scan"
+        lines = sum(fail(words(k)) for k in range(200))
+        assert 10 <= lines <= 50, "a flood of different ones does not fill the disk"
+        now[0] += 120.0
+        assert fail("of another kind") == 1 and fail("scan 3 is odd") == 1, "nor does it silence what comes later"
+        said = runner._commands.handlers()["status"]({})
+        assert said["failures"] == 204 and said["unlogged"] == 204 - 3 - lines
+    finally:
+        runner.close()
 
 
 def test_a_configuration_that_is_wrong_ends_in_one_clear_line(runtime: Path) -> None:
