@@ -7,8 +7,6 @@ import json
 import numpy as np
 import pytest
 
-pytest.importorskip("skfem")
-
 from models.forward import shared  # noqa: E402
 from models.shapes import Shape  # noqa: E402
 

@@ -6,9 +6,7 @@ One service for all, started in a copy of the checkout. `-m slow` is what .ci/ru
 from __future__ import annotations
 
 import contextlib
-import os
 import re
-import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +16,7 @@ import pytest
 from protocol.frames import ContactFrame
 from protocol.sockets import ControlClient, NewestReader
 from services.runtime.config import load
+from tests import needs
 from tests.docs.runners import CONFIGS, NOT_RUN, PROGRAMS, SCENES, TRIED_ELSEWHERE, Row, row_for
 from tests.docs.snippets import ROOT, Snippet, in_text, snippets
 from tests.docs.world import START_S, World, world
@@ -213,10 +212,7 @@ def test_make_up_from_nothing() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("snippet", [s for s in shown("slow") if s.text.startswith("g++")], ids=str)
 def test_the_cpp_line(place: World, untouched: None, snippet: Snippet) -> None:
-    headers = [Path("/usr/include", name) for name in ("zmq.hpp", "msgpack.hpp")]
-    if not (shutil.which("g++") and all(header.is_file() for header in headers)):
-        message = "C++ LINE OF README NOT TRIED: apt-get install g++ cppzmq-dev libmsgpack-cxx-dev"
-        pytest.fail(message) if os.environ.get("EITSKIN_REQUIRE_CPP") else pytest.skip(message)
+    needs.CPP.here()
     row = the_row(snippet)
     ran = place.runs(place.typed(snippet.text, row.instead), row.says)
     assert re.search(row.says, ran.out, re.MULTILINE), ran.out

@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("skfem")
-
 from models import geometry  # noqa: E402
 from models.bundle import Bundle  # noqa: E402
 from models.calibrate import SolvedPresses, solve  # noqa: E402
