@@ -13,7 +13,7 @@ from tests.docs.snippets import ROOT
 
 
 def test_the_version_is_the_same_everywhere() -> None:
-    """setuptools reads protocol.__version__; the other two are for people."""
+    """The wheel reads protocol.__version__; the other two are for people."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["dynamic"] == ["version"]
     newest = re.search(r"^## \[(\d+\.\d+\.\d+)\] - \d{4}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
