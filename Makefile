@@ -89,7 +89,7 @@ site: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -q
 
 # geometry -> forward model -> data -> network -> bundle in models/bundles/$(SKIN)
-train: venv-dev
+train: venv $(VENV)/.train
 	$(BIN)/python -m models.build --skin $(SKIN) $(if $(filter-out 0,$(QUICK)),--quick) $(if $(MINUTES),--minutes $(MINUTES))
 
 # Needs uv (one lock for every Python from 3.11 on, hashes of every file). Each agrees with those before it, since all may

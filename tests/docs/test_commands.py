@@ -102,8 +102,14 @@ def test_it_ends_well(place: World, untouched: None, snippet: Snippet) -> None:
     check_end(place, snippet)
 
 
+def has_what_it_needs(snippet: Snippet) -> None:
+    if (need := the_row(snippet).needs) is not None:
+        need.here()
+
+
 def check_end(place: World, snippet: Snippet) -> None:
     row = the_row(snippet)
+    has_what_it_needs(snippet)
     command = place.typed(snippet.text, row.instead)
     ran = place.ends(command)
     assert ran.code == row.code and "Traceback" not in ran.out, f"`{command}` exit {ran.code}:\n{ran.out}"
@@ -127,6 +133,7 @@ def test_it_runs_until_ctrl_c(place: World, untouched: None, snippet: Snippet) -
 @pytest.mark.parametrize("snippet", shown("help"), ids=str)
 def test_its_program_knows_the_options(place: World, snippet: Snippet) -> None:
     """Benchmarks and training take minutes to hours: .ci/run has them in short form."""
+    has_what_it_needs(snippet)
     command = place.typed(snippet.text, "")
     words = command.split()
     options = [word for word in words if word.startswith("--")]
@@ -204,9 +211,9 @@ def test_make_up_from_nothing() -> None:
         for command in ("./skin press --x 0.02 --y -0.01 --force 3", "./skin compare --seconds 2"):
             ran = place.ends(command)
             assert ran.code == 0, ran.out
-        for command in (".venv/bin/python -m bench.picture", "./skin bench accuracy"):
+        for command, extra in ((".venv/bin/python -m bench.picture", "plots"), ("./skin bench accuracy", "peers")):
             ran = place.ends(command)
-            assert ran.code != 0 and "make venv-dev" in ran.out and "Traceback" not in ran.out, ran.out
+            assert ran.code != 0 and f"make venv EXTRAS={extra}" in ran.out and "Traceback" not in ran.out, ran.out
 
 
 @pytest.mark.slow
@@ -221,7 +228,9 @@ def test_the_cpp_line(place: World, untouched: None, snippet: Snippet) -> None:
 @pytest.mark.slow
 def test_what_takes_longer_ends_well() -> None:
     """In the documents' order: one command reads what the one before it wrote."""
+    those = [snippet for snippet in shown("slow") if not snippet.text.startswith(("g++", "make up"))]
+    for snippet in those:
+        has_what_it_needs(snippet)
     with world() as place:
-        for snippet in shown("slow"):
-            if not snippet.text.startswith(("g++", "make up")):
-                check_end(place, snippet)
+        for snippet in those:
+            check_end(place, snippet)
