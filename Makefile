@@ -4,12 +4,15 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 SKIN ?= square16
-# What else `make venv` installs the packages of: bridges, EXTRAS=ros2,foxglove, and `docs`, which `make site` needs
+# What else `make venv`, `make venv-dev` and `make test` install, as in EXTRAS=ros2,train: the extras of pyproject.toml.
+#   ros2, foxglove   what a bridge needs          offline   making a skin from a drawing or from presses
+#   plots            matplotlib: pictures         train     the same, plots and PyTorch: several GB from PyPI
+#   peers            the same but PyTorch, and the other programs that benchmarks compare with
+#   docs             `make site`, which asks for it itself
 EXTRAS ?=
 comma := ,
 WANTED := $(subst $(comma), ,$(EXTRAS))
-# The CPU build of PyTorch by its full version: plain "torch" would bring several GB of CUDA.
-TORCH := torch==2.13.0+cpu
+TORCH := $(shell grep -o 'torch==[0-9.]*' pyproject.toml)
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
@@ -19,24 +22,37 @@ up: venv
 	./skin up
 
 venv: $(VENV)/.service $(WANTED:%=$(VENV)/.%)
-venv-dev: $(VENV)/.dev
+venv-dev: $(VENV)/.dev $(WANTED:%=$(VENV)/.%)
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "found Python %s; eitskin needs 3.11 or newer: make PYTHON=python3.11 ..." % sys.version.split()[0])'
 	$(PYTHON) -m venv $(VENV)
 
+# Every lock names the files' hashes. Sizes: `du -sh .venv` after each, Linux x86_64, Python 3.11.
+PIP := $(BIN)/python -m pip install --disable-pip-version-check
+LOCKED := $(PIP) --require-hashes -r
+
 $(VENV)/.service: requirements/service.lock | $(BIN)/python
-	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
+	@echo "installing what the service needs into $(VENV): 120 MB to fetch, 400 MB on disk, 1 to 5 minutes"
+	$(LOCKED) $<
 	@touch $@
 
-$(VENV)/.ros2 $(VENV)/.foxglove $(VENV)/.docs: $(VENV)/.%: requirements/%.lock | $(VENV)/.service
-	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
+$(VENV)/.ros2 $(VENV)/.foxglove $(VENV)/.docs $(VENV)/.offline $(VENV)/.plots $(VENV)/.peers: \
+    $(VENV)/.%: requirements/%.lock | $(VENV)/.service
+	@echo "installing the extra $*"
+	$(LOCKED) $<
 	@touch $@
 
-$(VENV)/.dev: requirements/dev.lock requirements/service.lock | $(BIN)/python
-	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r $<
-	$(BIN)/python -m pip install -q --disable-pip-version-check "$(TORCH)" || { echo \
-	  "no wheel of $(TORCH) found: install PyTorch's CPU build 2.13.0 into $(VENV) as pytorch.org describes, then run make again"; exit 1; }
+$(VENV)/.train: requirements/train.lock | $(VENV)/.service
+	@echo "installing the extra train: with PyTorch. PyPI's brings CUDA: several GB to fetch. Where that is too much, install its"
+	@echo "CPU build of the same version into $(VENV) first, as pytorch.org describes: it is taken then"
+	$(LOCKED) $<
+	$(PIP) "$(TORCH)"
+	@touch $@
+
+$(VENV)/.dev: requirements/dev.lock | $(BIN)/python
+	@echo "installing what tests need into $(VENV), the service's packages too: 300 MB to fetch, 850 MB on disk, 2 to 8 minutes"
+	$(LOCKED) $<
 	@touch $@ $(VENV)/.service
 
 # ROS 2 itself, as wheels, in an environment of its own: what tests/bridges/test_ros2_node.py listens with. 270 MB.
@@ -46,7 +62,7 @@ ROS_PACKAGES := rclpy rmw-fastrtps-cpp geometry-msgs sensor-msgs diagnostic-msgs
 ros-venv: $(ROS_VENV)/.done
 $(ROS_VENV)/.done:
 	$(PYTHON) -m venv $(ROS_VENV)
-	$(ROS_VENV)/bin/python -m pip install -q --disable-pip-version-check numpy $(ROS_PACKAGES:%=ros-$(ROS)-%)
+	$(ROS_VENV)/bin/python -m pip install --disable-pip-version-check numpy $(ROS_PACKAGES:%=ros-$(ROS)-%)
 	@touch $@
 
 # Five minutes on two cores once all is installed. What is slow by nature is in test-all, which CI runs.
@@ -60,26 +76,32 @@ test-all: venv-dev lint
 golden: venv-dev
 	./skin golden tests/recording/golden/*.mcap --accept
 
+# Without the extra train mypy takes what PyTorch gives as Any, and cannot be strict about what is made of it; CI can.
+WITHOUT_TORCH := --allow-subclassing-any --allow-untyped-decorators --no-warn-return-any --no-warn-unused-ignores
 lint: venv-dev
 	$(BIN)/ruff check .
-	$(BIN)/mypy protocol services bridges examples firmware_stub models bench
+	$(BIN)/mypy protocol services bridges examples firmware_stub models bench \
+	  $$($(BIN)/python -c 'import importlib.util as u; u.find_spec("torch") or print("$(WITHOUT_TORCH)")')
 
 # The documents as a site in build/site; a warning is an error. NO_MKDOCS_2_WARNING: advice of the theme's, not of ours.
 site: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -q
 
 # geometry -> forward model -> data -> network -> bundle in models/bundles/$(SKIN)
-train: venv-dev
+train: venv $(VENV)/.train
 	$(BIN)/python -m models.build --skin $(SKIN) $(if $(filter-out 0,$(QUICK)),--quick) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(filter-out 0,$(ANYWAY)),--anyway)
 
-# Needs uv (one lock for every Python from 3.11 on, hashes of every file).
+# Needs uv (one lock for every Python from 3.11 on, hashes of every file). Each agrees with those before it, since all may
+# meet in one environment.
 LOCK := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 lock:
-	$(LOCK) --extra service --extra stub -o requirements/service.lock pyproject.toml
-	for extra in ros2 foxglove docs; do \
-	  $(LOCK) -c requirements/service.lock --extra $$extra -o requirements/$$extra.lock pyproject.toml || exit 1; done
-	$(LOCK) -c requirements/service.lock --extra service --extra stub --extra offline --extra ros2 --extra foxglove --extra dev \
-	  -o requirements/dev.lock pyproject.toml requirements/torch-needs.in
+	made=; \
+	lock() { $(LOCK) $$made -o requirements/$$1.lock pyproject.toml "$${@:2}" && made="$$made -c requirements/$$1.lock"; }; \
+	set -e; \
+	lock service --extra service --extra stub; \
+	lock dev --extra service --extra stub --extra offline --extra ros2 --extra foxglove --extra dev; \
+	for extra in offline plots peers ros2 foxglove docs; do lock $$extra --extra $$extra; done; \
+	lock train --extra offline --extra plots requirements/torch-needs.in
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache

@@ -9,12 +9,22 @@ from protocol.errors import interrupted
 OURS = ("bench", "examples", "firmware_stub", "models", "protocol", "services", "tests")
 
 
+EXTRAS = {
+    "offline": ("ezdxf", "svgpathtools"),
+    "plots": ("matplotlib", "PIL"),
+    "peers": ("pyeit", "zenoh", "dask", "distributed"),
+    "train": ("torch", "onnx", "joblib"),
+}
+"""Which extra of pyproject.toml brings a package that offline work needs and the service does not, by import name."""
+
+
 def not_installed(error: ImportError) -> str:
     """What to do about a package that offline work needs and the service does not; "" for any other import error."""
     package = (error.name or "").split(".")[0]
     if not isinstance(error, ModuleNotFoundError) or package in ("", *OURS):
         return ""
-    return f"this needs the Python package {package!r}, which only `make venv-dev` installs: run that first"
+    extra = next((f" EXTRAS={extra}" for extra, found in EXTRAS.items() if package in found), "")
+    return f"this needs the Python package {package!r}, which is not installed: run `make venv{extra}` first"
 
 
 def _last_words(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

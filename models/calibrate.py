@@ -11,18 +11,16 @@ from __future__ import annotations
 import argparse
 import hashlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.progress import track
 from scipy import ndimage
 
 from models import bundle, command, geometry
-from models.evaluation import Predict, predict
-from models.export import session
 from models.forward import ForwardModel
 from models.prereconstruction import TARE_FRAMES, Array, Drift, Operator, PreReconstructor
 from models.scenes import Prior, random_shape
@@ -40,6 +38,9 @@ from models.uncertainty import (
     fit,
     maps,
 )
+
+if TYPE_CHECKING:
+    from models.evaluation import Predict
 
 PRIOR = Prior(radius=(0.08, 0.50), drop=(0.10, 0.50), tail=0.0)  # 1 to 5 N
 MESH = "stub"  # no training sees it, and the accuracy benchmark uses another again
@@ -221,6 +222,14 @@ def coverage(estimated: Array, sigma: Array, truth: Array, decibel: Array) -> di
     return found
 
 
+def _answers() -> Callable[[bytes | Path], Predict]:
+    """An ONNX file, or its content, as a function of arrays. Loads PyTorch, which solving presses does without."""
+    from models.evaluation import predict
+    from models.export import session
+
+    return lambda file: predict(session(file))
+
+
 def uncertainty(
     skin: geometry.SkinGeometry,
     pre: PreReconstructor,
@@ -229,10 +238,11 @@ def uncertainty(
     cache: Path | None = None,
 ) -> dict[str, dict[str, Any]]:
     """variant -> what `manifest["network"][variant]["uncertainty"]` says. About a minute."""
+    answer = _answers()
     presses = solve(skin, n, cache=cache)
     found = {}
     for variant, content in networks.items():
-        sightings = see(presses, pre, predict(session(content)))
+        sightings = see(presses, pre, answer(content))
         found[variant] = {
             **fitted(presses, sightings, hashlib.sha256(content).hexdigest()),
             "presses": len(presses.shapes),
@@ -255,6 +265,7 @@ def _in_words(said: dict[str, Any]) -> str:
 
 def check(shipped: bundle.Bundle, seed: int, n: int) -> None:
     """Prints how the shipped maps cover fresh presses."""
+    answer = _answers()
     presses = solve(geometry.load(shipped.name), n, seed)
     for variant, file in bundle.NETWORKS.items():
         path = shipped.network_path(variant)
@@ -262,7 +273,7 @@ def check(shipped: bundle.Bundle, seed: int, n: int) -> None:
         if path is None or not known:
             print(f"{variant}: {'no network' if path is None else 'no maps for this network file'}")
             continue
-        sightings = see(presses, shipped.prereconstructor(), predict(session(path)), seed)
+        sightings = see(presses, shipped.prereconstructor(), answer(path), seed)
         for name, one in known.items():
             x, estimated, truth = problem(name, presses, sightings)
             factor, sigma = one(x)

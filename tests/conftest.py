@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.needs import pytest_terminal_summary  # noqa: F401  (a hook of pytest)
+
 ROOT = Path(__file__).resolve().parents[1]
 START_S = 120
 

@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from bench import drawn
 from bench.accuracy.frames import REFERENCE, Frames, Level
 from bench.accuracy.scores import Row
 from bench.goals import Goal, table
@@ -158,6 +159,4 @@ class Report:
         write_json(
             folder / "accuracy.json", {**self.head, "targets": targets, "floors": self.floors, "rows": self.rows}
         )
-        from bench import plots  # matplotlib takes a while
-
-        plots.draw(folder / "accuracy.json")
+        drawn(folder / "accuracy.json")

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from bench import REPORTS
+from bench import REPORTS, drawn
 from bench import goals as _goals
 from bench.goals import Goal
 from bench.json_file import write_json
@@ -252,10 +252,8 @@ def main(argv: list[str] | None = None) -> int:
     report = {**provenance("latency", argv), "targets": [goal.to_dict() for goal in wanted], "rows": rows}
     report |= {"left_out": left_out, "parts": parts}
     write_json(args.out / "latency.json", report)
-    from bench import plots  # matplotlib takes a while
-
-    plots.draw(args.out / "latency.json")
-    print(f"wrote {args.out / 'latency.json'} and latency.png")
+    drawn(args.out / "latency.json")
+    print(f"wrote {args.out / 'latency.json'}")
     return 0
 
 

@@ -151,7 +151,7 @@ def relays(folder: Path, stack: ExitStack) -> tuple[dict[str, Relay], list[str]]
         title = f"eclipse-zenoh {version('eclipse-zenoh')}"
         found[title] = Relay("zenoh", str(port + 1), sys.executable, {}, log, stack)
     except PackageNotFoundError:
-        missing.append("eclipse-zenoh is not installed (pip install eclipse-zenoh): left out")
+        missing.append("eclipse-zenoh is not installed (make venv EXTRAS=peers): left out")
     ros = _ros_version()
     if ros and shutil.which("roscore"):
         at_home = {

@@ -25,7 +25,7 @@ import zmq
 from rich.console import Console
 from rich.table import Table
 
-from bench import REPORTS
+from bench import REPORTS, drawn
 from bench import goals as _goals
 from bench.goals import Goal
 from bench.json_file import write_json
@@ -250,10 +250,8 @@ def main(argv: list[str] | None = None) -> int:
     Console(width=120).print(_goals.table(wanted))
     report = {**provenance("scale", argv), "targets": [goal.to_dict() for goal in wanted], "rows": rows}
     write_json(args.out / "scale.json", report)
-    from bench import plots  # matplotlib takes a while
-
-    plots.draw(args.out / "scale.json")
-    print(f"wrote {args.out / 'scale.json'} and scale.png")
+    drawn(args.out / "scale.json")
+    print(f"wrote {args.out / 'scale.json'}")
     return 0
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from bench import drawn
 from bench.accuracy.report import text
 from bench.goals import Goal
 from bench.json_file import write_json
@@ -114,6 +115,4 @@ def write(path: Path, top: Mapping[str, Any], found: Found) -> None:
     content = {**top, "targets": targets, "broken": broken(found), "parts": dict(found)}
     write_json(path, content)
     if top["scan"] == "full":
-        from bench import plots  # matplotlib takes a while
-
-        plots.draw(path)
+        drawn(path)

@@ -32,10 +32,12 @@ def info(
 
     found = summarise(file)
     if png is not None:
+        from models import not_installed
+
         try:
             from bench.session_picture import draw
         except ImportError as missing:
-            fail(f"--png needs {missing.name}, which is not installed: run `make venv-dev`", USAGE)
+            fail(f"--png: {not_installed(missing) or missing}", USAGE)
         try:
             draw(found, png)
         except OSError as why:

@@ -6,14 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("pyeit")
+from tests import needs
+
+needs.PEERS.here()
 
 from bench.accuracy import __main__ as accuracy  # noqa: E402
-from bench.accuracy import frames as _frames
-from bench.accuracy import peers as _peers
-from bench.accuracy import report as _report
-from bench.accuracy import scores as _scores
-from bench.accuracy import shipped as _shipped
+from bench.accuracy import frames as _frames  # noqa: E402
+from bench.accuracy import peers as _peers  # noqa: E402
+from bench.accuracy import report as _report  # noqa: E402
+from bench.accuracy import scores as _scores  # noqa: E402
+from bench.accuracy import shipped as _shipped  # noqa: E402
 from bench.accuracy.frames import Frames  # noqa: E402
 from bench.accuracy.methods import Method, Tare  # noqa: E402
 from models import metrics, patterns  # noqa: E402

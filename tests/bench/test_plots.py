@@ -10,7 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from bench import REPORTS, plots
+from tests import needs
+
+needs.PLOTS.here()
+
+from bench import REPORTS, plots  # noqa: E402
 
 LETTER_PX, WIDEST_PX = 13, 1500  # at half the width of a page a letter is then still eight pixels high
 

@@ -29,6 +29,7 @@ from models.forward import shared
 from models.shapes import Array
 from protocol.frames import Contact
 from services.estimation.tare import Baseline, NoBaseline
+from tests import needs
 
 RELATIVE = 10 ** (-80 / 20)  # the board's noise
 
@@ -168,13 +169,11 @@ def test_extended_precision_solves_what_double_cannot() -> None:
 
 
 def test_pytorch_evaluates_a_shipped_file_as_onnx_runtime_does(setting: Setting, scene: Scene) -> None:
-    pytest.importorskip("torch")
-    pytest.importorskip("onnx")
+    needs.TRAIN.here()
     from bench.stability import precision
 
     path = setting.bundle.network_path("full")
-    if path is None:
-        pytest.skip("this bundle has no network")
+    assert path is not None
     import torch
 
     from bench.stability.graph import Graph

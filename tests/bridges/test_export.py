@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from protocol.frames import Contact, ContactFrame, Frame, ImageFrame, InfoFrame, ShapeFrame, StatusFrame, pack
 from services.recordings.recording import RecordingWriter
+from tests import needs
 from tests.cli.conftest import Ran, skin  # noqa: F401
 
 AHEAD_NS = 1_700_000_000_000_000_000  # the time of day, less the monotonic clock
@@ -128,8 +129,6 @@ def test_ros2_is_read_by_mcap_ros2_and_by_rosbags(skin: Skin, recording: Path) -
 
 
 def test_foxglove_is_read_by_the_schemas_inside(skin: Skin, recording: Path) -> None:  # noqa: F811
-    if importlib.util.find_spec("foxglove") is None:
-        pytest.skip("foxglove-sdk is not installed: make venv EXTRAS=foxglove")
     assert skin("export", recording, "--foxglove").code == 0
     by_topic: dict[str, list[tuple[int, dict]]] = {}  # type: ignore[type-arg]
     with open(recording.with_suffix(".foxglove.mcap"), "rb") as file:
@@ -186,9 +185,9 @@ def test_what_cannot_be_exported_is_said_in_a_line(skin: Skin, recording: Path, 
 
 
 def test_rerun_is_read_by_rerun(skin: Skin, recording: Path) -> None:  # noqa: F811
-    if importlib.util.find_spec("rerun") is None:
-        pytest.skip("RERUN MISSING: pip install 'rerun-sdk>=0.41'; what --rerun writes was not read back")
-    chunk = pytest.importorskip("rerun.chunk", reason="RERUN TOO OLD: its files are read from rerun-sdk 0.41 on")
+    needs.RERUN.here()
+    from rerun import chunk
+
     assert skin("export", recording, "--rerun").code == 0
     found: dict[str, list[tuple[int, dict[str, Any]]]] = {}
     for part in chunk.RrdReader(str(recording.with_suffix(".rrd"))).stream():

@@ -1,7 +1,6 @@
 """The page in a real browser beside the whole service: Debian's chromium, without a screen, driven by playwright.
 
-`apt-get install chromium` has the browser, `make venv-dev` playwright; where one is missing these tests say so, and
-.ci/run installs both. EITSKIN_CHROMIUM names another one.
+EITSKIN_CHROMIUM names another one.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ import pytest
 
 from protocol.frames import unpack
 from services.recordings.recording import RecordingReader
+from tests import needs
 
 ROOT = Path(__file__).resolve().parents[2]
 VECTORS = ROOT / "protocol" / "vectors"
@@ -37,22 +37,10 @@ TRUST_CHANGES = """() => {
 }"""
 
 
-def missing(what: str) -> None:
-    if os.environ.get("EITSKIN_REQUIRE_BROWSER"):
-        pytest.fail(what)
-    pytest.skip(what)
-
-
 @pytest.fixture(scope="module")
 def chromium() -> str:
-    try:
-        import playwright.sync_api  # noqa: F401
-    except ImportError:
-        missing("BROWSER MISSING: no playwright here: run `make venv-dev`")
-    path = os.environ.get("EITSKIN_CHROMIUM") or shutil.which("chromium")
-    if not path:
-        missing("BROWSER MISSING: no chromium here: apt-get install chromium")
-    return str(path)
+    needs.CHROMIUM.here()
+    return str(shutil.which(needs.CHROMIUM.programs[0]))
 
 
 @pytest.fixture(scope="module")

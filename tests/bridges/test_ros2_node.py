@@ -1,6 +1,6 @@
 """The bridge to ROS 2 beside the whole service, heard by a genuine ROS 2 node: rclpy, Fast DDS (ros_node.py).
 
-`make ros-venv` makes the virtual environment that node needs; without it these tests say so, and .ci/run has it.
+`make ros-venv` makes the virtual environment that node needs.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from bridges.ros2.definitions import type_hash
 from protocol.control import ControlClient
 from protocol.frames import ContactFrame
 from protocol.sockets import AllReader
+from tests import needs
 
 ROOT = Path(__file__).resolve().parents[2]
-ROS_PYTHON = Path(os.environ.get("EITSKIN_ROS_PYTHON") or ROOT / ".venv-ros" / "bin" / "python")
 BASE = "/eitskin/palm"
 CONFIG = """
 bridges = ["ros2"]
@@ -51,16 +51,6 @@ TYPES = {
 EVERY_S = 0.25  # far more than from one scan to the next: two messages of one stamp are one frame's
 
 
-def ros_python() -> Path:
-    """The Python that has ROS 2's packages; says so where there is none."""
-    if not ROS_PYTHON.exists():
-        message = f"ROS 2 MISSING: no {ROS_PYTHON}: `make ros-venv` makes it (270 MB), or set EITSKIN_ROS_PYTHON"
-        if os.environ.get("EITSKIN_REQUIRE_ROS"):
-            pytest.fail(message)
-        pytest.skip(message)
-    return ROS_PYTHON
-
-
 class World:
     """The service with its bridge, the ROS node, and a client of ours that keeps every contact frame."""
 
@@ -75,12 +65,12 @@ class World:
         }
         environment = {**os.environ, **told}
         self._log = open(folder / "log.txt", "wb")
-        python = ros_python()
+        needs.ROS_2.here()
         self._up = subprocess.Popen(
             [sys.executable, str(ROOT / "skin"), "up"], cwd=ROOT, env=environment, stdout=self._log, stderr=self._log
         )
         self._node = subprocess.Popen(
-            [str(python), str(ROOT / "tests/bridges/ros_node.py"), BASE],
+            [str(needs.ROS_PYTHON), str(ROOT / "tests/bridges/ros_node.py"), BASE],
             env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

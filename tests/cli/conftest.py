@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import needs
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -40,11 +42,5 @@ def skin(runtime: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 @pytest.fixture(scope="session")
 def reference() -> Path:
-    """The folder of the reference data; says so loudly where it is not there."""
-    folder = Path(os.environ.get("EITSKIN_REFERENCE") or ROOT / ".." / "shared" / "data")
-    if not (folder / "hydrogel_disc16.npz").is_file():
-        message = f"REFERENCE DATA MISSING: {folder.resolve()} (set EITSKIN_REFERENCE to the folder that holds it)"
-        if os.environ.get("EITSKIN_REQUIRE_REFERENCE"):
-            pytest.fail(message)
-        pytest.skip(message)
-    return folder
+    """The folder of the reference data."""
+    return needs.reference("hydrogel_disc16.npz").parent

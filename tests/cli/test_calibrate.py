@@ -7,10 +7,8 @@ import json
 import numpy as np
 import pytest
 
-pytest.importorskip("skfem")
-
-from models.forward import shared  # noqa: E402
-from models.shapes import Shape  # noqa: E402
+from models.forward import shared
+from models.shapes import Shape
 
 PLACES = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.5)]
 LAW = 14.0  # N per S/m: this foam is stiffer than its kind's 10

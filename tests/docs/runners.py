@@ -11,6 +11,8 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
+from tests.needs import PLOTS, TRAIN, Need
+
 How = Literal["ends", "runs", "help", "slow", "ci", "service", "walk", "elsewhere"]
 """ends: run to its end, exit status 0. runs: run until it printed `says`, then Ctrl-C, no traceback. help: too long to
 be run at all; its program knows every option that is named (.ci/run runs benchmarks in short form). slow: as `ends`,
@@ -27,6 +29,7 @@ class Row:
     says: str = ""  # regular expression that the output must hold
     instead: str = ""  # what is typed where the document's line names a file or an argument of the reader's own
     code: int = 0
+    needs: Need | None = None
 
 
 TOUCHED = "./skin press --x 0.02 --y -0.01 --force 3"
@@ -45,9 +48,14 @@ COMMANDS = (
         r"\.venv/bin/python -m tests\.bridges\.pictures ADDRESS",
         "ends",
         instead='.venv/bin/python -c "import tests.bridges.pictures"',
+        needs=PLOTS,
     ),
     Row("cp docs/systemd/.*|systemctl .*|journalctl .*", "elsewhere", says="tests/docs/test_systemd.py"),
+    Row(r"pip install (eitskin|\.)", "elsewhere", says="tests/protocol/test_client_wheel.py"),
     Row("make venv-dev", "ci", says="make test"),  # its first prerequisite
+    Row("make venv-dev EXTRAS=plots,peers", "ci", says="make test EXTRAS=train,plots,peers"),
+    Row("make venv(-dev)? EXTRAS=(train|plots|peers)", "ci", says="make test EXTRAS=train,plots,peers"),
+    Row("make test EXTRAS=train,plots,peers", "ci", says="make test EXTRAS=train,plots,peers"),
     Row("make venv", "ci", says="make up"),  # whose first prerequisite it is
     Row(
         "(./)?skin bridge page",
@@ -188,6 +196,7 @@ COMMANDS = (
         says="raw/palm",
         instead="./skin record {folder}/info.mcap --seconds 1 --overwrite && "
         "./skin info {folder}/info.mcap --png {folder}/info.png",
+        needs=PLOTS,
     ),
     Row("(./)?skin golden.*", "ends", says="as accepted", instead="./skin golden tests/recording/golden/faults.mcap"),
     Row("make golden", "ends", says="--accept", instead="make -n golden"),
@@ -254,15 +263,20 @@ COMMANDS = (
     Row(r"\./skin limits .*", "help"),
     Row("(./)?skin limits", "slow", says="position", instead="./skin limits"),
     Row("skin bench", "ends", says="accuracy"),
-    Row(r"\.venv/bin/python -m bench.plots", "slow", says="latency.png"),
-    Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB"),
+    Row(r"\.venv/bin/python -m bench.plots", "slow", says="latency.png", needs=PLOTS),
+    Row(r"\.venv/bin/python -m bench.picture", "slow", says="noise 70 dB", needs=PLOTS),
     Row(r"(\./)?skin bench (?P<name>\w+)( .*)?", "help"),
     Row(r"\.venv/bin/python -m bench\.speed\.page", "help"),
     Row(r"\.venv/bin/python -m bench\.registered_network FILE my-skin", "help"),
-    Row("python -m models.average", "help"),
-    Row(r"python -m models.published --minutes 45", "help"),
-    Row(r"\.venv/bin/python -m models.class_temperature", "slow", says=r"int8: right, all 0.68.*, all 0.03"),
-    Row(r"(\.venv/bin/)?python -m models.build .*", "help"),
+    Row("python -m models.average", "help", needs=TRAIN),
+    Row(r"python -m models.published --minutes 45", "help", needs=TRAIN),
+    Row(
+        r"\.venv/bin/python -m models.class_temperature",
+        "slow",
+        says=r"int8: right, all 0.68.*, all 0.03",
+        needs=TRAIN,
+    ),
+    Row(r"(\.venv/bin/)?python -m models.build .*", "help", needs=TRAIN),
     Row("python -m protocol.wire_doc", "ends", instead=".venv/bin/python -m protocol.wire_doc"),
     # docs/your-skin.md, in its order
     Row(r"(\./)?skin new( .*)?", "walk"),

@@ -6,9 +6,7 @@ One service for all, started in a copy of the checkout. `-m slow` is what .ci/ru
 from __future__ import annotations
 
 import contextlib
-import os
 import re
-import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +16,7 @@ import pytest
 from protocol.frames import ContactFrame
 from protocol.sockets import ControlClient, NewestReader
 from services.runtime.config import load
+from tests import needs
 from tests.docs.runners import CONFIGS, NOT_RUN, PROGRAMS, SCENES, TRIED_ELSEWHERE, Row, row_for
 from tests.docs.snippets import ROOT, Snippet, in_text, snippets
 from tests.docs.world import START_S, World, world
@@ -103,8 +102,14 @@ def test_it_ends_well(place: World, untouched: None, snippet: Snippet) -> None:
     check_end(place, snippet)
 
 
+def has_what_it_needs(snippet: Snippet) -> None:
+    if (need := the_row(snippet).needs) is not None:
+        need.here()
+
+
 def check_end(place: World, snippet: Snippet) -> None:
     row = the_row(snippet)
+    has_what_it_needs(snippet)
     command = place.typed(snippet.text, row.instead)
     ran = place.ends(command)
     assert ran.code == row.code and "Traceback" not in ran.out, f"`{command}` exit {ran.code}:\n{ran.out}"
@@ -128,6 +133,7 @@ def test_it_runs_until_ctrl_c(place: World, untouched: None, snippet: Snippet) -
 @pytest.mark.parametrize("snippet", shown("help"), ids=str)
 def test_its_program_knows_the_options(place: World, snippet: Snippet) -> None:
     """Benchmarks and training take minutes to hours: .ci/run has them in short form."""
+    has_what_it_needs(snippet)
     command = place.typed(snippet.text, "")
     words = command.split()
     options = [word for word in words if word.startswith("--")]
@@ -205,18 +211,15 @@ def test_make_up_from_nothing() -> None:
         for command in ("./skin press --x 0.02 --y -0.01 --force 3", "./skin compare --seconds 2"):
             ran = place.ends(command)
             assert ran.code == 0, ran.out
-        for command in (".venv/bin/python -m bench.picture", "./skin bench accuracy"):
+        for command, extra in ((".venv/bin/python -m bench.picture", "plots"), ("./skin bench accuracy", "peers")):
             ran = place.ends(command)
-            assert ran.code != 0 and "make venv-dev" in ran.out and "Traceback" not in ran.out, ran.out
+            assert ran.code != 0 and f"make venv EXTRAS={extra}" in ran.out and "Traceback" not in ran.out, ran.out
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("snippet", [s for s in shown("slow") if s.text.startswith("g++")], ids=str)
 def test_the_cpp_line(place: World, untouched: None, snippet: Snippet) -> None:
-    headers = [Path("/usr/include", name) for name in ("zmq.hpp", "msgpack.hpp")]
-    if not (shutil.which("g++") and all(header.is_file() for header in headers)):
-        message = "C++ LINE OF README NOT TRIED: apt-get install g++ cppzmq-dev libmsgpack-cxx-dev"
-        pytest.fail(message) if os.environ.get("EITSKIN_REQUIRE_CPP") else pytest.skip(message)
+    needs.CPP.here()
     row = the_row(snippet)
     ran = place.runs(place.typed(snippet.text, row.instead), row.says)
     assert re.search(row.says, ran.out, re.MULTILINE), ran.out
@@ -225,7 +228,9 @@ def test_the_cpp_line(place: World, untouched: None, snippet: Snippet) -> None:
 @pytest.mark.slow
 def test_what_takes_longer_ends_well() -> None:
     """In the documents' order: one command reads what the one before it wrote."""
+    those = [snippet for snippet in shown("slow") if not snippet.text.startswith(("g++", "make up"))]
+    for snippet in those:
+        has_what_it_needs(snippet)
     with world() as place:
-        for snippet in shown("slow"):
-            if not snippet.text.startswith(("g++", "make up")):
-                check_end(place, snippet)
+        for snippet in those:
+            check_end(place, snippet)

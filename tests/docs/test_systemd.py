@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import configparser
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
-import pytest
-
+from tests import needs
 from tests.docs.snippets import ROOT
 
 UNIT = ROOT / "docs" / "systemd" / "eitskin.service"
@@ -18,8 +16,7 @@ CHECKOUT = "/opt/eitskin"
 
 def verified(text: str, folder: Path) -> str:
     """What `systemd-analyze verify` has to say of a unit; empty: nothing."""
-    if shutil.which("systemd-analyze") is None:
-        pytest.skip("SYSTEMD UNIT NOT VERIFIED: systemd-analyze is not installed here")
+    needs.SYSTEMD.here()
     (folder / UNIT.name).write_text(text)
     ran = subprocess.run(["systemd-analyze", "verify", folder / UNIT.name], capture_output=True, text=True)
     return "\n".join(line for line in ran.stderr.splitlines() if UNIT.name in line)

@@ -17,6 +17,7 @@ import pytest
 
 from protocol.frames import ContactFrame
 from protocol.sockets import NewestReader
+from tests import needs
 from tests.docs.snippets import FENCE, ROOT
 from tests.docs.world import START_S, Ran, World, world
 
@@ -149,12 +150,14 @@ def check(somebody: Reader, most_mm: float) -> None:
 
 @pytest.mark.slow
 def test_the_page_is_followed_without_training() -> None:
+    needs.TRAIN.here()  # the program that makes bundles is the one that trains
     with world() as place:
         check(follow(place, SHORTER), most_mm=2.0)
 
 
 @pytest.mark.slow
 def test_the_page_is_followed_with_a_training() -> None:
+    needs.TRAIN.here()
     with world() as place:
         somebody = follow(place, TRAINED)
         check(somebody, most_mm=2.0)

@@ -9,7 +9,6 @@ import ast
 import contextlib
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -25,6 +24,7 @@ from protocol.client import ContactSubscriber, Stale
 from protocol.control import ControlClient
 from protocol.frames import Contact, ContactFrame
 from protocol.sockets import AllReader
+from tests import needs
 from tests.docs.snippets import snippets
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -221,15 +221,8 @@ def test_follow_the_finger_follows_holds_still_and_goes_on(start: Start) -> None
 
 @pytest.fixture(scope="module")
 def cpp_subscriber(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The C++ subscriber, compiled; without compiler and headers the tests say so, loudly."""
-    missing = [] if shutil.which("g++") else ["g++"]
-    headers = {"zmq.hpp": "cppzmq-dev", "msgpack.hpp": "libmsgpack-cxx-dev"}
-    missing += [package for header, package in headers.items() if not Path("/usr/include", header).is_file()]
-    if missing:
-        message = f"C++ SUBSCRIBER NOT TRIED: apt-get install {' '.join(missing)}"
-        if os.environ.get("EITSKIN_REQUIRE_CPP"):
-            pytest.fail(message)
-        pytest.skip(message)
+    """The C++ subscriber, compiled."""
+    needs.CPP.here()
     program = tmp_path_factory.mktemp("cpp") / "subscribe"
     flags = ["-std=c++17", "-Wall", "-Wextra", "-Werror", "-DMSGPACK_NO_BOOST"]
     done = subprocess.run(["g++", *flags, str(CPP), "-lzmq", "-o", str(program)], capture_output=True, text=True)

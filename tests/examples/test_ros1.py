@@ -1,9 +1,8 @@
-"""The ROS 1 example against Debian's rospy and a real roscore. A machine that has neither says so; .ci/run has them."""
+"""The ROS 1 example against Debian's rospy and a real roscore."""
 
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -11,9 +10,8 @@ import sys
 import time
 from pathlib import Path
 
-import pytest
-
 from protocol.control import ControlClient
+from tests import needs
 
 ROOT = Path(__file__).resolve().parents[2]
 SYSTEM_PYTHON = "/usr/bin/python3"
@@ -28,17 +26,10 @@ rospy.spin()
 """
 
 
-def ros1_missing() -> str:
-    """What is missing for ROS 1; "" where all is there."""
-    if shutil.which("roscore") is None:
-        return "roscore"
-    asked = subprocess.run([SYSTEM_PYTHON, "-c", "import rospy, geometry_msgs.msg"], capture_output=True)
-    return "" if asked.returncode == 0 else "rospy or geometry_msgs"
-
-
 def test_a_node_of_ros_1_hears_the_wrench(shared_service: Path, tmp_path: Path) -> None:
-    if missing := ros1_missing():
-        pytest.skip(f"ROS 1 MISSING: {missing} (Debian: python3-rospy python3-roslaunch python3-geometry-msgs)")
+    needs.ROS_1.here()
+    if subprocess.run([SYSTEM_PYTHON, "-c", "import rospy, geometry_msgs.msg"], capture_output=True).returncode:
+        needs.ROS_1.lack("rospy or geometry_msgs")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     environment = {

@@ -1,8 +1,5 @@
 """The board over its link, in simulated time: commands, timing, noise, the physics of what it measures."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,10 +10,10 @@ from models.mismatch import MismatchedSheet, named
 from models.patterns import pattern
 from models.shapes import Shape
 from protocol import link
+from tests import needs
 
 PAIRS = pattern("pairs").astype("u1")
 RAMP = "{ t = 0.52, force = 0 }, { t = 0.57, force = 2 }, { t = 0.8, force = 2 }, { t = 0.83, force = 0 }"
-REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data"), "eidors_reference.npz")
 
 
 def test_hello_is_answered_with_who_it_is(host):
@@ -121,10 +118,9 @@ def test_forced_rates_beyond_the_link_lose_scans_that_are_counted(host):
     assert frames[-1].seq - frames[0].seq > 400
 
 
-@pytest.mark.skipif(not REFERENCE.exists(), reason=f"no {REFERENCE}: set EITSKIN_REFERENCE")
 @pytest.mark.parametrize("name", ["pairs", "adjacent"])
 def test_an_untouched_skin_measures_as_eidors_says(host, name):
-    reference = np.load(REFERENCE)
+    reference = np.load(needs.reference("eidors_reference.npz"))
     board = host(snr_db=110.0)
     board.start(pattern(name).astype("u1"))
     z = board.z(0.5).mean(0)

@@ -1,30 +1,20 @@
 """Reference data that nobody here made up; where it is missing the tests that need it say so."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from models.bundle import Bundle
 from models.scenes import random_scene
 from models.shapes import to_rows
-
-FOLDER = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data"))
+from tests import needs
 
 
 @pytest.fixture(scope="session")
 def reference():
-    """reference(name) -> dict of arrays. Missing: skips, or fails where EITSKIN_REQUIRE_REFERENCE is set."""
+    """reference(name) -> dict of arrays."""
 
     def load(name):
-        path = FOLDER / f"{name}.npz"
-        if not path.is_file():
-            message = f"REFERENCE DATA MISSING: {path.resolve()} (set EITSKIN_REFERENCE to the folder that holds it)"
-            if os.environ.get("EITSKIN_REQUIRE_REFERENCE", "0") not in ("", "0"):
-                pytest.fail(message)
-            pytest.skip(message)
-        with np.load(path, allow_pickle=False) as data:
+        with np.load(needs.reference(f"{name}.npz"), allow_pickle=False) as data:
             return dict(data)
 
     return load
@@ -43,7 +33,8 @@ def pre(bundle):
 @pytest.fixture(scope="session")
 def drawn(pre):
     """drawn(n, seed, **kwargs of random_scene) -> Samples: differences by the linearised model."""
-    from models import samples  # needs torch
+    needs.TRAIN.here()
+    from models import samples
 
     def draw(count, seed, **wanted):
         rng = np.random.default_rng(seed)

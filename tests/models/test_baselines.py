@@ -1,8 +1,5 @@
 """The classical methods: their algebra, and the figures others report for them."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -10,8 +7,7 @@ from models import baselines, metrics
 from models.forward import ForwardModel
 from models.meshing import Grading
 from models.shapes import Shape, from_rows
-
-REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "eidors_reference.npz"
+from tests import needs
 
 
 @pytest.fixture(scope="module")
@@ -22,9 +18,7 @@ def physics():
 @pytest.fixture(scope="module")
 def scenes():
     """(difference, shapes) of EIDORS's single touches: another solver, another mesh."""
-    if not REFERENCE.exists():
-        pytest.skip(f"no reference data at {REFERENCE}")
-    with np.load(REFERENCE) as file:
+    with np.load(needs.reference("eidors_reference.npz")) as file:
         z, shapes = file["impedance_pairs"], file["shapes"]
     return [(z[k] / z[0] - 1, from_rows(shapes[k])) for k in range(1, len(z)) if len(from_rows(shapes[k])) == 1]
 

@@ -10,6 +10,7 @@ from models import data
 from models.forward import shared
 from models.mismatch import soft_drop, soft_touched
 from models.shapes import drop_image, from_rows
+from tests import needs
 
 
 def specs(split="train", chunks=2, size=3, seed=1):
@@ -45,7 +46,9 @@ def test_a_run_can_be_stopped_and_taken_up(folder, tmp_path):
 
 @pytest.mark.slow
 def test_a_local_dask_cluster_gives_the_same_files(folder, tmp_path):
-    distributed = pytest.importorskip("distributed")
+    needs.PEERS.here()
+    import distributed
+
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
         data.generate(tmp_path, specs(), jobs=2, backend="dask", scheduler=cluster.scheduler_address, quiet=True)
         worked = [w for w, count in cluster.scheduler.workers.items() if count.metrics]

@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+from tests import needs
+
+needs.TRAIN.here()
+
+import torch  # noqa: E402
 
 from models import geometry, samples  # noqa: E402
 from models.augmentation import random_condition  # noqa: E402

@@ -2,13 +2,14 @@
 network on another solver's frames.
 """
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+from tests import needs
+
+needs.TRAIN.here()
+
+import torch  # noqa: E402
 
 from models import export, geometry, samples  # noqa: E402
 from models.augmentation import random_condition  # noqa: E402
@@ -22,7 +23,6 @@ from models.symmetries import symmetries  # noqa: E402
 from models.train import Trainer  # noqa: E402
 from models.turns import Turn  # noqa: E402
 
-REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "eidors_reference.npz"
 TINY = NetworkConfig(channels=(8, 8, 8), blocks=(1, 1, 1))
 
 
@@ -191,13 +191,12 @@ def test_the_published_network_has_the_published_layers(attention):
     assert model.eval()(torch.zeros(2, 1, 48, 48)).shape == (2, 1, 96, 96)
 
 
-@pytest.mark.skipif(not REFERENCE.is_file(), reason="reference frames not here")
 @pytest.mark.parametrize(
     "variant, decibel, bound", [("full", None, 0.90), ("full", 70, 0.84), ("fast", None, 0.88), ("fast", 70, 0.80)]
 )
 def test_the_shipped_network_on_another_solvers_frames(pre, variant, decibel, bound):
     """EIDORS's single touches. Bounds below the benchmark's figures: they catch a broken bundle, not a bad day."""
-    z = np.load(REFERENCE)
+    z = np.load(needs.reference("eidors_reference.npz"))
     rng = np.random.default_rng(0)
     impedance = np.abs(z["impedance_pairs"])
     single = np.flatnonzero(np.isfinite(z["shapes"][:, 0, 0]) & np.isnan(z["shapes"][:, 1, 0]))

@@ -1,8 +1,5 @@
 """Shapes against another solver's rasters and closed forms; scenes against their prior."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,15 +15,12 @@ from models.shapes import (
     gap,
     to_rows,
 )
-
-REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "eidors_reference.npz"
+from tests import needs
 
 
 @pytest.fixture(scope="module")
 def reference():
-    if not REFERENCE.exists():
-        pytest.skip(f"no reference data at {REFERENCE}")
-    return dict(np.load(REFERENCE))
+    return dict(np.load(needs.reference("eidors_reference.npz")))
 
 
 def test_rasters_match_the_reference(reference):

@@ -10,7 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+from tests import needs
+
+needs.TRAIN.here()
+
+import torch  # noqa: E402
 
 from models import average, build, checkpoint, command, data, geometry, published, samples, train, verdict  # noqa: E402
 from models.bundle import Bundle, BundleError  # noqa: E402

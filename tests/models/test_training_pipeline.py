@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-torch = pytest.importorskip("torch")
+from tests import needs
+
+needs.TRAIN.here()
+
+import torch  # noqa: E402
 
 from models import data, export, geometry, samples  # noqa: E402
 from models.augmentation import condition, random_condition  # noqa: E402

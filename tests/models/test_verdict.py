@@ -5,7 +5,11 @@ import io
 import pytest
 from rich.console import Console
 
-torch = pytest.importorskip("torch")
+from tests import needs
+
+needs.TRAIN.here()
+
+import torch  # noqa: E402
 
 from models import build, geometry, samples, verdict  # noqa: E402
 from models.bundle import Bundle  # noqa: E402

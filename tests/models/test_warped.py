@@ -11,20 +11,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models import build, data, manifest, verdict, warped
-from models.bundle import Bundle, write
-from models.forward import ForwardModel
-from models.geometry import GeometryError, load
-from models.locator import Locator
-from models.samples import Samples, picture
-from models.shapes import Shape, to_rows
-from protocol.frames import DeltaFrame, ImageFrame
-from services.calibration.register_command import register_presses
-from services.calibration.registration import Similarity
-from services.inference import Inference
-from services.networks import Network, OneStep
-from services.runtime.config import Skin
-from tests.cli.test_registration import presses_of
+from tests import needs
+
+needs.TRAIN.here()
+
+from models import build, data, manifest, verdict, warped  # noqa: E402
+from models.bundle import Bundle, write  # noqa: E402
+from models.forward import ForwardModel  # noqa: E402
+from models.geometry import GeometryError, load  # noqa: E402
+from models.locator import Locator  # noqa: E402
+from models.samples import Samples, picture  # noqa: E402
+from models.shapes import Shape, to_rows  # noqa: E402
+from protocol.frames import DeltaFrame, ImageFrame  # noqa: E402
+from services.calibration.register_command import register_presses  # noqa: E402
+from services.calibration.registration import Similarity  # noqa: E402
+from services.inference import Inference  # noqa: E402
+from services.networks import Network, OneStep  # noqa: E402
+from services.runtime.config import Skin  # noqa: E402
+from tests.cli.test_registration import presses_of  # noqa: E402
 
 
 @pytest.fixture(scope="module")

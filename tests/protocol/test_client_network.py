@@ -4,12 +4,12 @@ import selectors
 import socket
 import threading
 
-import pytest
 import zmq
 
 from protocol import transport
 from protocol.client import ContactSubscriber, Stale
 from protocol.sockets import Publisher
+from tests import needs
 
 from .test_client import frame
 from .test_sockets import subscribed, until
@@ -18,7 +18,7 @@ from .test_transport import back_to_default, free_port  # noqa: F401  (a fixture
 
 def test_contacts_over_tcp_with_keys(runtime, tmp_path):
     if not zmq.has("curve"):
-        pytest.skip("libzmq without CURVE")
+        needs.CURVE.lack("CURVE in libzmq")
     context = zmq.Context()
     server_public, server_secret = transport.write_keys(tmp_path / "server", "server")
     _, friend = transport.write_keys(tmp_path / "allowed", "friend")

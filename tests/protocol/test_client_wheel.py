@@ -1,8 +1,10 @@
 """What a controller installs: protocol/ under the name eitskin, with numpy, pyzmq and msgpack alone."""
 
+import re
+import shutil
 import subprocess
 import sys
-import tomllib
+import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -34,9 +36,22 @@ def test_every_module_is_importable_under_the_wheels_name_with_its_three_package
     assert done.returncode == 0, done.stderr
 
 
-def test_the_wheel_is_typed_and_needs_three_packages():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    needs = {need.split(">")[0] for need in project["project"]["dependencies"]}
-    assert needs == {"numpy", "pyzmq", "msgpack"}
-    assert "py.typed" in project["tool"]["setuptools"]["package-data"]["eitskin"]
-    assert (ROOT / "protocol" / "py.typed").is_file()
+def test_the_wheel_is_the_client_and_leaves_nothing_beside_its_sources(tmp_path):
+    """What `pip install .` builds, in a copy of what it reads: typed, every module of protocol/, three packages."""
+    source = tmp_path / "source"
+    shutil.copytree(ROOT / "protocol", source / "protocol", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy2(ROOT / name, source)
+    before = sorted(source.rglob("*"))
+    built = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
+    done = subprocess.run([*built, "-w", tmp_path, source], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert sorted(source.rglob("*")) == before
+    (wheel,) = tmp_path.glob("eitskin-*.whl")
+    with zipfile.ZipFile(wheel) as file:
+        names = {name for name in file.namelist() if ".dist-info/" not in name}
+        (metadata,) = (name for name in file.namelist() if name.endswith(".dist-info/METADATA"))
+        needs = re.findall(r"^Requires-Dist: ([a-z]+)[^;\n]*$", file.read(metadata).decode(), re.MULTILINE)
+    modules = {f"eitskin/{path.name}" for path in (ROOT / "protocol").glob("*.py")}
+    assert names == modules | {"eitskin/py.typed", "eitskin/WIRE.md"}
+    assert set(needs) == {"numpy", "pyzmq", "msgpack"}

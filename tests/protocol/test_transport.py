@@ -8,6 +8,7 @@ import zmq
 from protocol import transport
 from protocol.frames import ContactFrame
 from protocol.sockets import NewestReader, Publisher
+from tests import needs
 
 from .test_sockets import subscribed
 
@@ -43,7 +44,7 @@ def test_unencrypted_tcp_on_the_loopback_or_when_told_to(context):
 
 def test_curve_lets_in_who_is_allowed_and_nobody_else(tmp_path):
     if not zmq.has("curve"):
-        pytest.skip("libzmq without CURVE")
+        needs.CURVE.lack("CURVE in libzmq")
     context = zmq.Context()
     server_public, server_secret = transport.write_keys(tmp_path / "server", "server")
     _, friend = transport.write_keys(tmp_path / "allowed", "friend")

@@ -11,6 +11,7 @@ import pytest
 from protocol.frames import Contact, ContactFrame, Frame, StatusFrame, pack
 from services.recordings.recording import RecordingWriter
 from services.recordings.summary import Course, strip, summarise
+from tests import needs
 from tests.cli.conftest import Ran, skin  # noqa: F401
 
 Skin = Callable[..., Ran]
@@ -98,7 +99,7 @@ def test_a_file_that_was_cut_is_told_as_far_as_it_goes(
 
 
 def test_a_picture_on_request(skin: Skin, recording: Path, tmp_path: Path) -> None:  # noqa: F811
-    pytest.importorskip("matplotlib", reason="MATPLOTLIB MISSING: run `make venv-dev`")
+    needs.PLOTS.here()
     assert skin("info", recording, "--png", tmp_path / "a.png").code == 0
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG") and (tmp_path / "a.png").stat().st_size > 10_000
     assert "cannot write" in skin("info", recording, "--png", tmp_path / "none" / "a.png").err

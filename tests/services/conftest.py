@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from services.estimation.part_evidence import PartEvidence
 from services.estimation.part_image import PartImage
 from services.estimation.rolling import parts_of
 from services.runtime.config import Skin
+from tests import needs
 
 FRAME_NS = 45_000_000
 
@@ -92,8 +92,5 @@ def board(bundle: Bundle) -> Board:
 
 @pytest.fixture(scope="session")
 def reference() -> Path:
-    """Folder of the reference data; absent: the test says so, loudly, and is skipped."""
-    folder = Path(os.environ.get("EITSKIN_REFERENCE", Path(__file__).resolve().parents[2] / ".." / "shared" / "data"))
-    if not (folder / "eidors_reference.npz").is_file():
-        pytest.skip(f"REFERENCE DATA MISSING: {folder}/eidors_reference.npz (set EITSKIN_REFERENCE)")
-    return folder
+    """The folder of the reference data."""
+    return needs.reference("eidors_reference.npz").parent

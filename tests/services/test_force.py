@@ -8,19 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("skfem")
-
-from models import geometry  # noqa: E402
-from models.bundle import Bundle  # noqa: E402
-from models.calibrate import SolvedPresses, solve  # noqa: E402
-from models.forward import shared  # noqa: E402
-from models.shapes import Shape  # noqa: E402
-from protocol.frames import Contact, RawFrame  # noqa: E402
-from services.contacts.force import ForceLaw, Look  # noqa: E402
-from services.contacts.force_curve import Curve  # noqa: E402
-from services.estimation.tare import take  # noqa: E402
-from services.pipeline import Pipeline  # noqa: E402
-from services.runtime.config import ConfigError, Indenter, Skin  # noqa: E402
+from models import geometry
+from models.bundle import Bundle
+from models.calibrate import SolvedPresses, solve
+from models.forward import shared
+from models.shapes import Shape
+from protocol.frames import Contact, RawFrame
+from services.contacts.force import ForceLaw, Look
+from services.contacts.force_curve import Curve
+from services.estimation.tare import take
+from services.pipeline import Pipeline
+from services.runtime.config import ConfigError, Indenter, Skin
 
 FRAME_NS = 45_000_000
 

@@ -1,0 +1,98 @@
+"""What tests need beyond the packages of `make venv-dev`. Where it is missing, a test is skipped with one line that
+says how to get it, and the end of the run counts what was skipped by what is missing. CI names in the environment what
+it must have ($EITSKIN_REQUIRE_TRAIN and so on): there a test that lacks it fails.
+
+    def test_the_line_compiles():
+        needs.CPP.here()
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Need:
+    """Packages, programs and files, all of which there must be. get: how. required: the variable by which CI
+    insists.
+    """
+
+    get: str
+    required: str = ""
+    packages: Sequence[str] = ()  # as they are imported
+    programs: Sequence[str] = ()
+    files: Sequence[Path] = ()
+
+    def missing(self) -> list[str]:
+        return [
+            *(name for name in self.packages if importlib.util.find_spec(name) is None),
+            *(name for name in self.programs if shutil.which(name) is None),
+            *(str(file) for file in self.files if not file.is_file()),
+        ]
+
+    def here(self) -> None:
+        """Goes on where all is there; else skips the test, or the whole file that calls this while it is imported."""
+        if missing := self.missing():
+            self.lack(", ".join(missing))
+
+    def lack(self, what: str) -> None:
+        """Skips or fails for the lack of this, as found by the test itself."""
+        said = f"no {what}: {self.get}"
+        if self.required and os.environ.get(self.required, "0") not in ("", "0"):
+            pytest.fail(f"{said} (${self.required} is set)", pytrace=False)
+        pytest.skip(said, allow_module_level=True)
+
+
+TRAIN = Need("`make venv-dev EXTRAS=train`", "EITSKIN_REQUIRE_TRAIN", packages=["torch"])
+PLOTS = Need("`make venv-dev EXTRAS=plots`", "EITSKIN_REQUIRE_PLOTS", packages=["matplotlib"])
+PEERS = Need("`make venv-dev EXTRAS=peers`", "EITSKIN_REQUIRE_PEERS", packages=["pyeit", "distributed", "zenoh"])
+RERUN = Need("`.venv/bin/pip install 'rerun-sdk>=0.41'`", packages=["rerun"])
+CHROMIUM = Need(
+    "`apt-get install chromium`, or $EITSKIN_CHROMIUM names one",
+    "EITSKIN_REQUIRE_BROWSER",
+    programs=[os.environ.get("EITSKIN_CHROMIUM") or "chromium"],
+)
+CPP = Need(
+    "`apt-get install g++ cppzmq-dev libmsgpack-cxx-dev`",
+    "EITSKIN_REQUIRE_CPP",
+    programs=["g++"],
+    files=[Path("/usr/include/zmq.hpp"), Path("/usr/include/msgpack.hpp")],
+)
+ROS_PYTHON = Path(os.environ.get("EITSKIN_ROS_PYTHON") or ROOT / ".venv-ros" / "bin" / "python")
+ROS_2 = Need("`make ros-venv` (270 MB), or $EITSKIN_ROS_PYTHON names one", "EITSKIN_REQUIRE_ROS", files=[ROS_PYTHON])
+ROS_1 = Need("`apt-get install python3-rospy python3-roslaunch python3-geometry-msgs`", programs=["roscore"])
+SYSTEMD = Need("`apt-get install systemd`", programs=["systemd-analyze"])
+CURVE = Need("a pyzmq whose libzmq has it, as PyPI's wheels do")
+
+REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE") or ROOT / ".." / "shared" / "data").resolve()
+
+
+def reference(name: str) -> Path:
+    """A file of the reference data, which nobody here made up."""
+    path = REFERENCE / name
+    Need("$EITSKIN_REFERENCE names the folder of the reference data", "EITSKIN_REQUIRE_REFERENCE", files=[path]).here()
+    return path
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """What was not run, counted by what is missing: the last lines of `make test`. A file counts once."""
+    tests: Counter[str] = Counter()
+    files: Counter[str] = Counter()
+    for report in terminalreporter.stats.get("skipped", []):
+        reason = report.longrepr[2] if isinstance(report.longrepr, Sequence) else str(report.longrepr)
+        (files if isinstance(report, pytest.CollectReport) else tests)[str(reason).removeprefix("Skipped: ")] += 1
+    for reason in sorted({*tests, *files}):
+        counts = ((tests[reason], "test"), (files[reason], "whole file"))
+        said = " and ".join(f"{n} {what}{'s' if n > 1 else ''}" for n, what in counts if n)
+        terminalreporter.write_line(f"not run, {said}: {reason}")
