@@ -108,6 +108,8 @@ class Publishing(Stage):
         self._geometry = (0.0, [0.0, 0.0])  # metres per pixel, origin of the segments' image
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        if isinstance(frame, PartFrame) and not self.last_image.precedes(frame):
+            self.after_gap.missed()
         if isinstance(frame, PartFrame) and frame.began is None:
             return self._say(self.last_image.held_by(frame), wanted, whole=False)
         if isinstance(frame, PartFrame):

@@ -38,7 +38,12 @@ class AfterGap:
         """Note whether this frame follows the one before it."""
         broken = self._continuity.broken(frame, PUT_OFF * self._parts if frame.part else 1)
         silent = frame.stamps.get("sample", 0) - self._valid_ns > frame.valid_for_s * 1e9
-        if (broken or silent) and not self.waits:
+        if broken or silent:
+            self.missed()
+
+    def missed(self) -> None:
+        """Something is missing before the next frame."""
+        if not self.waits:
             self.waits, self._images = True, 0
 
     def saw(self) -> None:

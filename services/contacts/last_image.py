@@ -39,6 +39,10 @@ class LastImage:
             refined=frame.refined,
         )
 
+    def precedes(self, part: PartFrame) -> bool:
+        """Whether it is the image that a part follows; else that one was not seen."""
+        return self._last is not None and self._last.scan == part.after
+
     def doubts(self, part: ImageFrame, after: int) -> None:
         """Make a part doubted by what its image, of the scan `after`, was refused for."""
         last = self._last

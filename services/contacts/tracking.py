@@ -89,8 +89,8 @@ class Tracker:
             ended += self._find_again(owners)
         self._merge(owners, seen, sample_ns)
         self._part(owners, seen, sample_ns)
-        steady = self.steady = near and bool(seen) and all(t and is_same(t, entry) for t, entry in zip(owners, seen, strict=True))
-        sure = sure or steady
+        steady = near and bool(seen) and all(t and is_same(t, entry) for t, entry in zip(owners, seen, strict=True))
+        self.steady, sure = steady, sure or steady
         found: list[Track] = []
         for entry, track in zip(seen, owners, strict=True):
             if track is None:

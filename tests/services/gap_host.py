@@ -4,6 +4,7 @@ contact frames out.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,7 +17,7 @@ from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import Script, Timeline, TouchPath
 from firmware_stub.world import NEWTON, Touch
 from models.bundle import Bundle
-from protocol.frames import ContactFrame, DeltaFrame, Frame, PartFrame, RawFrame
+from protocol.frames import ContactFrame, DeltaFrame, Frame, ImageFrame, PartFrame, RawFrame
 from services.pipeline import ALL, Pipeline
 from services.runtime.config import ScanMode, Skin
 from services.runtime.stage import Stage
@@ -48,12 +49,15 @@ class Press:
 
 
 class HaltingPipeline(Pipeline):
-    """Stages of `halted`, by their class's name, read nothing: what comes meanwhile is lost to them. `reads`: of so many
-    frames each reads one, as where the machine is too slow.
+    """`every`: by a stage's class, of how many frames that come it reads the newest, as where the machine is too slow;
+    0: it stands still. As in protocol/sockets.py:StageReader the frame is read too whose stack or image that one holds.
     """
 
-    halted: frozenset[str] = frozenset()
-    reads = 1
+    def __init__(self, skin: Skin, bundle: Bundle) -> None:
+        super().__init__(skin, "palm", bundle)
+        self.every: dict[str, int] = {}
+        self._came: Counter[str] = Counter()
+        self._holder: dict[str, DeltaFrame | ImageFrame] = {}  # that came last, by the stage that did not read it
 
     def run_all(self, raw: RawFrame) -> list[ContactFrame]:
         frames: list[Frame] = [raw]
@@ -64,11 +68,22 @@ class HaltingPipeline(Pipeline):
     def _made(self, stage: Stage, frame: Frame) -> list[Frame]:
         if stage is self.inference and isinstance(frame, PartFrame):
             return [frame]
-        if type(stage).__name__ in self.halted:
+        name = type(stage).__name__
+        self._came[name] += 1
+        every = self.every.get(name, 1)
+        waited = self._holder.get(name)
+        if not every or self._came[name] % every:
+            if isinstance(frame, DeltaFrame | ImageFrame) and not frame.held:
+                self._holder[name] = frame
             return []
-        if isinstance(frame, DeltaFrame):
-            self.delta = frame
-        return stage.process(frame, ALL)
+        self._holder.pop(name, None)
+        made = []
+        if isinstance(frame, DeltaFrame | ImageFrame) and frame.held and waited is not None:
+            made = stage.process(waited, ALL) if waited.reconstructed == frame.reconstructed else []
+        made = [*made, *stage.process(frame, ALL)]
+        if self.publishing.lacks:
+            self.inference.joined("image")
+        return made
 
 
 @dataclass(frozen=True)
@@ -92,7 +107,7 @@ class GapHost:
         self.rig.field.play(Timeline(Script("gap", tracks=paths), 0.0, (), self.rig.sheet.electrodes), 0.0)
         skin = Skin(port="stub", bundle="square16", scan=scan)
         self.host = Host(self.rig, seed, skin, _bundle())
-        self.pipeline = HaltingPipeline(skin, "palm", _bundle())
+        self.pipeline = HaltingPipeline(skin, _bundle())
         self.frames: list[tuple[float, ContactFrame]] = []
 
     def until(self, end: float) -> None:
@@ -107,9 +122,9 @@ class GapHost:
             name, args = ("sequence_gaps", {"fraction": 1.0}) if how == "lost" else (how, {})
             self.rig.fault(name, args, start, seconds)
             return
-        self.pipeline.halted = frozenset({how})
+        self.pipeline.every = {how: 0}
         self.until(start + seconds)
-        self.pipeline.halted = frozenset()
+        self.pipeline.every = {}
 
     def close(self) -> None:
         self.rig.close()
