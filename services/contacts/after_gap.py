@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 from protocol.frames import ImageFrame
-from services.runtime.continuity import Continuity
+from services.runtime.continuity import Continuity, longest_s
 
 IMAGES = 3  # of whole scans, after which what is not sure is believed as without a gap
 PUT_OFF = 2  # whole scans in parts, after which another one comes at the latest or a part says something
@@ -37,7 +37,7 @@ class AfterGap:
     def look(self, frame: ImageFrame) -> None:
         """Note whether this frame follows the one before it."""
         broken = self._continuity.broken(frame, PUT_OFF * self._parts if frame.part else 1)
-        silent = frame.stamps.get("sample", 0) - self._valid_ns > frame.valid_for_s * 1e9
+        silent = frame.stamps.get("sample", 0) - self._valid_ns > longest_s(frame) * 1e9
         if broken or silent:
             self.missed()
 

@@ -9,7 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 from protocol.frames import Frame
-from services.runtime.stage import SEPARATE
+from services.runtime.stage import SEPARATE, VALID_S
+
+
+def longest_s(frame: Frame) -> float:
+    """How long at most nothing may be heard before a frame, for it to follow."""
+    return max(frame.valid_for_s, VALID_S)
 
 
 class Continuity:
@@ -32,7 +37,7 @@ class Continuity:
         if last < 0 or SEPARATE in frame.reasons:
             return False
         away_s = abs(self._sample_ns - before_ns) * 1e-9
-        return "gap" in frame.reasons or not 0 <= frame.scan - last <= scans or away_s > frame.valid_for_s
+        return "gap" in frame.reasons or not 0 <= frame.scan - last <= scans or away_s > longest_s(frame)
 
     def state(self) -> list[int]:
         return [self._scan, self._sample_ns]

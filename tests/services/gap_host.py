@@ -50,13 +50,15 @@ class Press:
 
 class HaltingPipeline(Pipeline):
     """`every`: by a stage's class, of how many frames that come it reads the newest, as where the machine is too slow;
-    0: it stands still. As in protocol/sockets.py:StageReader the frame is read too whose stack or image that one holds.
+    0: it stands still. As in protocol/sockets.py:StageReader the frame is read too whose stack or image that one holds,
+    and no part of an image that was not.
     """
 
     def __init__(self, skin: Skin, bundle: Bundle) -> None:
         super().__init__(skin, "palm", bundle)
         self.every: dict[str, int] = {}
         self._came: Counter[str] = Counter()
+        self._seen = -1  # scan of the image that publisher read last
         self._holder: dict[str, DeltaFrame | ImageFrame] = {}  # that came last, by the stage that did not read it
 
     def run_all(self, raw: RawFrame) -> list[ContactFrame]:
@@ -69,13 +71,18 @@ class HaltingPipeline(Pipeline):
         if stage is self.inference and isinstance(frame, PartFrame):
             return [frame]
         name = type(stage).__name__
-        self._came[name] += 1
+        part = isinstance(frame, PartFrame)
+        if part and frame.after != self._seen:
+            return []
+        self._came[name] += not part
         every = self.every.get(name, 1)
         waited = self._holder.get(name)
         if not every or self._came[name] % every:
             if isinstance(frame, DeltaFrame | ImageFrame) and not frame.held:
                 self._holder[name] = frame
             return []
+        if isinstance(frame, ImageFrame):
+            self._seen = frame.scan
         self._holder.pop(name, None)
         made = []
         if isinstance(frame, DeltaFrame | ImageFrame) and frame.held and waited is not None:

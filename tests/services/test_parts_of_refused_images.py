@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from protocol.frames import PartFrame, pack, unpack
-from services.pipeline import ALL
 from tests.services.gap_host import GapHost, Press
 
 TOUCH = Press(0.02, -0.01, 4.0, 20.0)
@@ -39,7 +38,16 @@ def said_of(seen, *, valid: bool, reasons: list[str]):
 
 @pytest.mark.parametrize(
     "reason",
-    ["stale_baseline", "saturated", "gain", "electrode_drift", "electrode_open", "frozen", "clock", "out_of_distribution"],
+    [
+        "stale_baseline",
+        "saturated",
+        "gain",
+        "electrode_drift",
+        "electrode_open",
+        "frozen",
+        "clock",
+        "out_of_distribution",
+    ],
 )
 def test_a_part_of_an_image_that_was_refused_is_not_valid_and_says_why(seen, reason):
     contact, part = said_of(seen, valid=False, reasons=[reason])
