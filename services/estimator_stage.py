@@ -22,6 +22,7 @@ from services.kept_baseline import kept, take_over
 from services.linearisation import Linearisation
 from services.rolling_scans import RollingScans
 from services.runtime.config import Skin
+from services.runtime.continuity import Continuity
 from services.runtime.stage import Health, Refused, Stage
 
 
@@ -39,7 +40,7 @@ class EstimatorStage(Stage):
         self.gain = GainSteps(len(bundle.pattern))
         self.frame_averager = FrameAverager()
         self._news = BaselineNews()
-        self.frame_rate = FrameRate()
+        self.frame_rate, self.continuity = FrameRate(), Continuity()
         self._unchecked = checks.sentence(bundle)
         self._force, self._symmetry = force(skin, bundle), symmetry(skin, bundle)
         self.rolling_scans = RollingScans(bundle)
@@ -71,6 +72,7 @@ class EstimatorStage(Stage):
 
     def reset(self) -> None:
         self.rolling_scans.reset()
+        self.continuity.forget()
         self._impossible_ns = 0  # since when every frame is of no touch
         self.gain.reset()
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
@@ -118,6 +120,7 @@ class EstimatorStage(Stage):
             "touched": self.touch_estimator.touched,
             "waits": self.touch_estimator.state(),
             "rolling": self.rolling_scans.state(),
+            "continuity": self.continuity.state(),
             "impossible_ns": self._impossible_ns,
             "gain": self.gain.state(),
             "hold": self.frame_averager.state(),
@@ -143,6 +146,7 @@ class EstimatorStage(Stage):
         self.touch_estimator.touched = bool(state["touched"])
         self.touch_estimator.load(state.get("waits", {"last": None}))
         self.rolling_scans.load(state.get("rolling", {}))
+        self.continuity.load(state.get("continuity"))
         self._impossible_ns = int(state.get("impossible_ns", 0))
         self.frame_averager.load(state["hold"], len(self.bundle.pattern))
         self.touch_detector.reset()

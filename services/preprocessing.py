@@ -43,6 +43,9 @@ class Preprocessing(EstimatorStage):
         self._counters["frames"] += 1
         self.frame_rate(frame)
         out.valid, out.reasons = as_sent(frame)  # measurements that failed are left out below
+        if frame.kind != "sentinel" and self.continuity.broken(frame, frame.parts):
+            add_reason(out.reasons, "gap")
+            self.rolling_scans.missed()
         for reason in reasons_of(frame.status):
             add_reason(out.reasons, reason)
         if not self.rolling_scans.due(frame, out.stamps, self.baseline_estimator):

@@ -24,6 +24,7 @@ from protocol.frames import (
     ShapeFrame,
 )
 from protocol.held import ANY, HeldImage
+from services.contacts.after_gap import AfterGap
 from services.contacts.begun import begun, possible, without_image
 from services.contacts.contact_writer import ContactWriter, class_probabilities, confidence
 from services.contacts.following import Following
@@ -40,12 +41,12 @@ from services.contacts.segmentation import Segment, readable, segment
 from services.contacts.tracking import Tracker
 from services.describe import geometry
 from services.estimation.quality import NEARLY, SURE
+from services.estimation.rolling import parts_of
 from services.estimation.within_scan import CHANGING_FRAMES
 from services.runtime.config import Skin
-from services.runtime.stage import SEPARATE, Health, Stage, add_reason, inherited
+from services.runtime.stage import HARMLESS, SEPARATE, Health, Stage, add_reason, inherited
 
 EXPLAINED = 0.6  # quality from which an image counts although its peak is beyond the sheet or the law
-HARMLESS = {"replay", "uncalibrated_force"}  # reasons that make no frame invalid
 LARGEST_M = 100.0  # beyond it a number is no place on a skin
 
 
@@ -70,7 +71,7 @@ class Publishing(Stage):
         self._image_size = bundle.image_size
         self._grid = (bundle.metres_per_pixel, list(bundle.image_origin))
         self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
-        self.tracker = Tracker()
+        self.tracker, self.after_gap = Tracker(), AfterGap(parts_of(bundle))
         self.following, self.lasting, self.last_image = Following(), LastingStates(), LastImage(name)
         self.each_alone = False  # offline: frames that do not follow each other
         self.reset()
@@ -79,6 +80,7 @@ class Publishing(Stage):
         self.tracker.reset()
         self.held = HeldImage()
         self.last_image.forget()
+        self.after_gap.forget()
         self._forget()
         self._counters = {"frames": 0, "contacts": 0, "unknown": 0, "refined": 0, "disagreed": 0}
         self._invalid = InvalidSpell()
@@ -90,6 +92,7 @@ class Publishing(Stage):
     def wake(self) -> None:
         self.tracker.forget()
         self.last_image.forget()
+        self.after_gap.forget()
         self._forget()
 
     def _forget(self) -> None:
@@ -105,14 +108,19 @@ class Publishing(Stage):
         self._geometry = (0.0, [0.0, 0.0])  # metres per pixel, origin of the segments' image
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        if isinstance(frame, PartFrame) and not self.last_image.precedes(frame):
+            self.after_gap.missed()
         if isinstance(frame, PartFrame) and frame.began is None:
             return self._say(self.last_image.held_by(frame), wanted, whole=False)
         if isinstance(frame, PartFrame):
-            return self._say(without_image(frame, *self._grid), wanted, whole=False, began=frame.began)
+            alone = without_image(frame, *self._grid)
+            self.last_image.doubts(alone, frame.after)
+            return self._say(alone, wanted, whole=False, began=frame.began)
         assert isinstance(frame, ImageFrame)
-        found = self._say(frame, wanted)
-        self.last_image.take(frame)
-        return found
+        said, *rest = self._say(frame, wanted)
+        assert isinstance(said, ContactFrame)
+        self.last_image.take(frame, said)
+        return [said, *rest]
 
     def _say(
         self, frame: ImageFrame, wanted: frozenset[str], whole: bool = True, began: BegunTouch | None = None
@@ -125,6 +133,7 @@ class Publishing(Stage):
         if not self._tells_force:
             add_reason(out.reasons, "uncalibrated_force")
         self.lacks = whole and not self.held.complete(frame)
+        self.after_gap.look(frame)
         had = bool(self._segments)
         if not frame.valid and "out_of_distribution" in frame.reasons:
             self._miss(out, "out_of_distribution")
@@ -168,6 +177,9 @@ class Publishing(Stage):
         if any(self.law.impossible(*each) for each in self._drops()) and not explained:
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
+        if out.valid and not self._alone(frame) and not self.after_gap.judged(frame, whole, self._sure(frame)):
+            out.valid = False
+            add_reason(out.reasons, "gap")
         self._invalid(out.valid, [r for r in out.reasons if r not in HARMLESS], frame.stamps.get("sample", 0))
         if frame.part and out.valid:
             out.contacts = self.lasting(out.contacts, frame.stamps.get("sample", 0))
@@ -188,7 +200,7 @@ class Publishing(Stage):
         elif located:
             segments, seen = patches(frame)
         elif frame.touched and frame.image.size:
-            places = [] if self._alone(frame) else self.tracker.expected(now)
+            places = [] if self._alone(frame) or self.after_gap.waits else self.tracker.expected(now)
             segments = segment(frame.image, frame.sigma, [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places])
         if not located:
             seen = [
@@ -202,7 +214,9 @@ class Publishing(Stage):
         else:
             well = not any(reason.startswith("electrode") for reason in frame.reasons)
             near = (frame.residual or 0.0) <= NEARLY
-            tracks, ended = self.tracker.update(seen, now, _explained(frame), well, near)
+            watched = not self.after_gap.waits
+            self.after_gap.saw()
+            tracks, ended = self.tracker.update(seen, now, _explained(frame), well, near, watched)
         present = []
         said: Sequence[LocatedTouch | None] = located or [None] * len(segments)
         for track, place, s, touch in zip(tracks, seen, segments, said, strict=True):
@@ -236,6 +250,13 @@ class Publishing(Stage):
             add_reason(out.reasons, "changing")
         if "changing" not in out.reasons:  # else what is followed may be on its way to another touch
             self.tracker.carry(motion, frame.stamps.get("sample", 0))
+
+    def _sure(self, frame: ImageFrame) -> bool:
+        """Whether contacts are shown of an image that is sure by itself, or like the scan after it or the image before
+        it, and nothing waits to be confirmed.
+        """
+        sure = _explained(frame) or frame.held or self.tracker.steady
+        return sure and bool(self._segments) and not self.tracker.waits
 
     def _leaves_something(self, part: ImageFrame) -> bool:
         """Whether the image that a part holds is not all that there was: one of a touch that changed, of which a good
@@ -320,6 +341,7 @@ class Publishing(Stage):
             "following": self.following.state(),
             "lasting": self.lasting.state(),
             "last_image": self.last_image.state(),
+            "after_gap": self.after_gap.state(),
             "known": self._known,
             "touched": self._touched,
             "changing": self._changing,
@@ -337,6 +359,7 @@ class Publishing(Stage):
         self.following.load(state.get("following", []))  # older recordings have none
         self.lasting.load(state.get("lasting", {}))
         self.last_image.load(state.get("last_image"))
+        self.after_gap.load(state.get("after_gap"))
         self._known, self._touched = bool(state["known"]), bool(state.get("touched", False))
         self._changing, self._from_parts = int(state.get("changing", 0)), bool(state.get("from_parts", False))
         self._seen_in = (ANY, int(state.get("reconstructed", -1)))  # older recordings have none

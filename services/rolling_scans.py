@@ -69,6 +69,18 @@ class RollingScans:
         """There is another baseline, or none: parts say nothing before an untouched whole scan."""
         self._rest: Array | None = None  # difference of the untouched skin lately
         self._rests = 0  # whole scans that it is the mean of
+        self.change: Array | None = None  # to the whole scan's difference, for its values to be of one instant
+        self._know_nothing()
+
+    def missed(self) -> None:
+        """Something is missing before the next message: that one is taken for a whole scan, and what touches is judged
+        by it alone. The untouched skin is what it was.
+        """
+        self._whole.last = -1
+        self._know_nothing()
+
+    def _know_nothing(self) -> None:
+        """Of what touches."""
         self._held: Array | None = None  # difference of the touch that the last whole scan saw
         self._sound = False  # the last whole scan
         self._moved = False  # the next whole scan was put off since the last one
@@ -78,7 +90,6 @@ class RollingScans:
         self._shown: PartTouch | None = None  # as it was said last
         self._one = True  # no other one began since; else a whole scan tells
         self._doubted = False  # a contact that changed may be all that it is: a whole scan tells
-        self.change: Array | None = None  # to the whole scan's difference, for its values to be of one instant
         if self._made is not None:
             self._made.filter.forget()
 
@@ -154,15 +165,18 @@ class RollingScans:
         if frame.parts == 1:
             return
         known = len(out.difference) == len(frame.z) and bool(np.isfinite(out.sigma).all())
-        self._sound = known and out.valid and not out.electrodes.any() and not {"gain", "gap"} & set(out.reasons)
+        well = known and out.valid and not out.electrodes.any() and "gain" not in out.reasons
+        self._sound = well and "gap" not in out.reasons
         self._moved = self._ended = self._doubted = False
         touched, self._began_us, self._began, self._held = self._held is not None, None, None, None
         self._shown, self._one = None, True
         if not touched or not self._sound or not out.touched:
             self._models.filter.forget()  # what it followed is over
-        if not self._sound:
+        if not well:
             self._rest, self._rests = None, 0
-        elif out.touched:
+        if not self._sound:
+            return
+        if out.touched:
             self._held = out.difference.astype(float)
             self._take(out, frame, estimator)
         else:

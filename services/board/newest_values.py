@@ -23,13 +23,13 @@ class NewestValues:
         self._next_seq, self._in_a_row = -1, 0
         self._gap = False  # parts were lost since the last message that was handed on
 
-    def take(self, scan: link.ScanFrame) -> bool:
+    def take(self, scan: link.ScanFrame, gap: bool = False) -> bool:
         """Take a scan, or a part of one; False while not every value is of the last `parts` that the board sent: after
-        a gap nothing that lies before it is handed on again.
+        a gap nothing that lies before it is handed on again. gap: something is missing just before this one.
         """
         if scan.parts == 1:
             return True
-        follows = scan.seq == self._next_seq
+        follows = scan.seq == self._next_seq and not gap
         self._gap = self._gap or not (follows or self._next_seq < 0)
         self._in_a_row = self._in_a_row + 1 if follows else 1
         self._next_seq = (scan.seq + 1) % 2**32

@@ -50,11 +50,11 @@ class ScanCheck:
         if not self._order.consistent(scan) or not self._clock.possible(ended_us, arrived_ns):
             self._impossible += 1
             return "foreign"  # captured before, or of a clock that jumped
-        self._impossible, self.missing = 0, missing
+        self._impossible, self.missing, follows = 0, missing, self._order.follows(scan)
         self._order.take(scan)
         self._clock.observe(ended_us, arrived_ns, fit)
         frozen = self._frozen(scan)
-        known = ("gap", missing > 0), ("clock", self._doubted > 0), ("frozen", frozen)
+        known = ("gap", not follows), ("clock", self._doubted > 0), ("frozen", frozen)
         self.reasons[scan.seq] = [reason for reason, holds in known if holds]
         self._doubted = max(0, self._doubted - 1)
         return "scans"

@@ -195,7 +195,7 @@ class BoardSource(Source):
         self, scan: link.ScanFrame, board: BoardLink, read_ns: int, newest: NewestValues | None
     ) -> RawFrame | None:
         """Returns what goes on to preprocessing; None while values are missing."""
-        if newest is not None and not newest.take(scan):
+        if newest is not None and not newest.take(scan, "gap" in board.reasons.get(scan.seq, ())):
             return None
         frame = self.raw_frame(scan, board, read_ns)
         return frame if newest is None else newest.frame(frame, scan)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from protocol.frames import ImageFrame, PartFrame, RefinedTouch
+from protocol.frames import ContactFrame, ImageFrame, PartFrame, RefinedTouch
 from protocol.held import ANY
-from services.runtime.stage import add_reason, inherited
+from services.runtime.stage import HARMLESS, add_reason, inherited
 
 
 class LastImage:
@@ -20,20 +20,36 @@ class LastImage:
     def forget(self) -> None:
         self._last = None
 
-    def take(self, frame: ImageFrame) -> None:
-        """Take note of an image frame, without its arrays."""
+    def take(self, frame: ImageFrame, said: ContactFrame) -> None:
+        """Take note of an image frame, without its arrays, and of the contact frame that was made of it. What was only
+        late says nothing of its parts, which have an age of their own.
+        """
+        doubts = [reason for reason in said.reasons if reason not in HARMLESS | {"late"}]
+        valid = said.valid or ("late" in said.reasons and set(doubts) <= {"changing"})
         self._last = ImageFrame(
             skin=frame.skin,
             session=frame.session,
             scan=frame.scan,
-            valid="out_of_distribution" not in frame.reasons,
-            reasons=[reason for reason in frame.reasons if reason in ("changing", "out_of_distribution")],
+            valid=valid,
+            reasons=[reason for reason in frame.reasons if reason == "changing"] if valid else doubts,
             touched=frame.touched,
             reconstructed=frame.reconstructed,
             residual=frame.residual,
             noise=frame.noise,
             refined=frame.refined,
         )
+
+    def precedes(self, part: PartFrame) -> bool:
+        """Whether it is the image that a part follows; else that one was not seen."""
+        return self._last is not None and self._last.scan == part.after
+
+    def doubts(self, part: ImageFrame, after: int) -> None:
+        """Make a part doubted by what its image, of the scan `after`, was refused for."""
+        last = self._last
+        if last is not None and last.scan == after and not last.valid:
+            part.valid = False
+            for reason in last.reasons:
+                add_reason(part.reasons, reason)
 
     def held_by(self, part: PartFrame) -> ImageFrame:
         """The image frame of a part: it holds the last image, whose touches are by now where the part says. Where that
@@ -46,9 +62,9 @@ class LastImage:
         out.session, out.reconstructed = last.session, last.reconstructed
         out.residual, out.noise, out.refined = last.residual, last.noise, last.refined
         out.followed = part.followed
-        out.valid = out.valid and last.valid
         for reason in last.reasons:
             add_reason(out.reasons, reason)
+        self.doubts(out, part.after)
         return out
 
     def state(self) -> dict[str, Any] | None:

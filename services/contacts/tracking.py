@@ -41,6 +41,7 @@ class Tracker:
         self._next_id = 1
         self._looked_ns: int | None = None  # sample time of the last frame that said anything
         self._untold: list[Track] = []  # ended by a reset
+        self.steady = False  # whether the image last taken in was like the one before, touch by touch
         self.tracks: list[Track] = []
 
     def reset(self) -> None:
@@ -67,20 +68,29 @@ class Tracker:
         return list(self.tracks), ended
 
     def update(
-        self, seen: Sequence[Patch], sample_ns: int, sure: bool = True, well: bool = True, near: bool = True
+        self,
+        seen: Sequence[Patch],
+        sample_ns: int,
+        sure: bool = True,
+        well: bool = True,
+        near: bool = True,
+        watched: bool = True,
     ) -> tuple[list[Track | None], list[Track]]:
         """Take in the patches of one frame. Returns the track of each patch, in their order (None for one that is to be
         confirmed), and the tracks that ended. sure: whether new touches of this frame can be believed at once. well:
         no electrode is at fault. near: it leaves so little unexplained that it counts as sure if it is like the one
-        before.
+        before. watched: nothing is missing before it; else a touch that it does not show ended, and none is known to
+        have begun.
         """
-        begins = not self.forgotten(sample_ns)
+        begins = watched and not self.forgotten(sample_ns)
         ended = self._begin_frame(sample_ns)
         owners = self._assign(seen, sample_ns)
+        if not watched:
+            ended += self._find_again(owners)
         self._merge(owners, seen, sample_ns)
         self._part(owners, seen, sample_ns)
         steady = near and bool(seen) and all(t and is_same(t, entry) for t, entry in zip(owners, seen, strict=True))
-        sure = sure or steady
+        self.steady, sure = steady, sure or steady
         found: list[Track] = []
         for entry, track in zip(seen, owners, strict=True):
             if track is None:
@@ -169,6 +179,16 @@ class Tracker:
             if costs[k][column] < NEVER:
                 owners[k] = self.tracks[column]
         return owners
+
+    def _find_again(self, owners: Sequence[Track | None]) -> list[Track]:
+        """Keep what an image after a gap shows again -> what it does not, or hides in another one's patch."""
+        found = [track for track in owners if track is not None]
+        lost = [t for t in self.tracks if not any(t is one for one in found)]
+        gone = [one for t in lost for one in (t, *others(t))] + [one for t in found for one in others(t)]
+        for track in found:
+            track.inside, track.vx, track.vy = [], 0.0, 0.0
+        self.tracks = found
+        return [track for track in gone if track.id != UNCONFIRMED]
 
     def _merge(self, owners: list[Track | None], seen: Sequence[Patch], sample_ns: int) -> None:
         """Put lost touches into the patch of another touch that covers their place."""

@@ -22,6 +22,10 @@ SEPARATE = "separate"
 """Reason that a source of scans which do not follow each other in time gives to each of them, and stages hand on."""
 
 
+HARMLESS = {"replay", "uncalibrated_force"}
+"""Reasons that make no frame invalid."""
+
+
 class Refused(EitskinError):
     """A command that the stage will not carry out now. The text says why and what to do."""
 

@@ -116,6 +116,15 @@ def test_missing_scans_are_counted_across_the_wrap() -> None:
     assert host.counts["missing"] == 2 + 2  # two before the wrap; the last number and the 0 after it
 
 
+def test_a_board_that_paused_between_two_scans_left_a_gap_although_its_numbers_go_on() -> None:
+    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
+    now = talk(host, board, 0.0, 0.2)
+    host.received(board.scan(device_us=1_000_000), now)
+    for device_us, gap in ((1_004_500, False), (1_304_500, True), (1_308_600, False)):
+        assert len(host.received(board.scan(device_us=device_us), now + 1e-6 * (device_us - 1_000_000))) == 1
+        assert list(host.reasons.values()) == [["gap"] if gap else []]
+
+
 def test_repeated_and_older_scans_are_dropped() -> None:
     host, board = BoardLink(SCANNING, 0.0), FakeBoard()
     now = talk(host, board, 0.0, 0.2)
