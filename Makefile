@@ -16,7 +16,7 @@ TORCH := $(shell grep -o 'torch==[0-9.]*' pyproject.toml)
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: up venv venv-dev ros-venv test test-all golden lint site train lock clean
+.PHONY: up venv venv-dev ros-venv test test-all search golden lint site train lock clean
 
 up: venv
 	./skin up
@@ -71,6 +71,11 @@ test: venv-dev lint
 
 test-all: venv-dev lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "slow or not slow"
+
+# Goes on searching where tests and CI try the same inputs every time: random examples, and each decoder for a minute.
+search: venv-dev
+	EITSKIN_SEARCH=1 $(BIN)/python -m pytest -n 2 --dist loadfile $$(grep -rl --include="test_*.py" "from hypothesis" tests)
+	$(BIN)/python tests/fuzz/run.py --seconds 60
 
 # What recordings of tests/ give now is what they are to give from now on; git diff shows what changed.
 golden: venv-dev

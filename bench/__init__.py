@@ -2,23 +2,13 @@
 
 from pathlib import Path
 
-import models  # also: Ctrl-C, or a package that is missing, gives no traceback
+import models  # noqa: F401  (also: Ctrl-C, or a package that is missing, gives no traceback)
 import services  # noqa: F401  (sets it, before numpy is loaded)
 
 ROOT = Path(__file__).resolve().parents[1]
 WORK = ROOT / "bench" / "work"
 """What was solved or simulated, kept for the next run; git does not see it."""
 REPORTS = ROOT / "bench" / "reports"
-
-
-def drawn(report: Path) -> None:
-    """The picture of a report, beside it. Without matplotlib a line says so: what was measured stands all the same."""
-    try:
-        from bench import plots  # matplotlib takes a while
-    except ModuleNotFoundError as missing:
-        print(f"no picture of {report.name}: {models.not_installed(missing) or missing}")
-        return
-    plots.draw(report)
 
 
 def commands() -> dict[str, str]:

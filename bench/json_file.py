@@ -1,4 +1,4 @@
-"""Reports as strict JSON files."""
+"""Reports as strict JSON files, and their pictures."""
 
 from __future__ import annotations
 
@@ -8,11 +8,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import models
+
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Writes a report; its folder is made where there is none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(_strict(dict(content)), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def drawn(report: Path) -> None:
+    """The picture of a report, beside it. Without matplotlib a line says so: what was measured stands all the same."""
+    try:
+        from bench import plots  # matplotlib takes a while
+    except ModuleNotFoundError as missing:
+        print(f"no picture of {report.name}: {models.not_installed(missing) or missing}")
+        return
+    plots.draw(report)
 
 
 def _strict(value: Any) -> Any:

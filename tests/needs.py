@@ -57,7 +57,7 @@ class Need:
 TRAIN = Need("`make venv-dev EXTRAS=train`", "EITSKIN_REQUIRE_TRAIN", packages=["torch"])
 PLOTS = Need("`make venv-dev EXTRAS=plots`", "EITSKIN_REQUIRE_PLOTS", packages=["matplotlib"])
 PEERS = Need("`make venv-dev EXTRAS=peers`", "EITSKIN_REQUIRE_PEERS", packages=["pyeit", "distributed", "zenoh"])
-RERUN = Need("`.venv/bin/pip install 'rerun-sdk>=0.41'`", packages=["rerun"])
+RERUN = Need("`.venv/bin/pip install 'rerun-sdk>=0.41'`", "EITSKIN_REQUIRE_RERUN", packages=["rerun"])
 CHROMIUM = Need(
     "`apt-get install chromium`, or $EITSKIN_CHROMIUM names one",
     "EITSKIN_REQUIRE_BROWSER",
@@ -73,6 +73,7 @@ ROS_PYTHON = Path(os.environ.get("EITSKIN_ROS_PYTHON") or ROOT / ".venv-ros" / "
 ROS_2 = Need("`make ros-venv` (270 MB), or $EITSKIN_ROS_PYTHON names one", "EITSKIN_REQUIRE_ROS", files=[ROS_PYTHON])
 ROS_1 = Need("`apt-get install python3-rospy python3-roslaunch python3-geometry-msgs`", programs=["roscore"])
 SYSTEMD = Need("`apt-get install systemd`", programs=["systemd-analyze"])
+FAKETIME = Need("`apt-get install faketime`", "EITSKIN_REQUIRE_FAKETIME", programs=["faketime"])
 CURVE = Need("a pyzmq whose libzmq has it, as PyPI's wheels do")
 
 REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE") or ROOT / ".." / "shared" / "data").resolve()

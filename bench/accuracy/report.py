@@ -10,11 +10,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bench import drawn
 from bench.accuracy.frames import REFERENCE, Frames, Level
 from bench.accuracy.scores import Row
 from bench.goals import Goal, table
-from bench.json_file import write_json
+from bench.json_file import drawn, write_json
 from bench.machine import machine, provenance
 from models.bundle import Bundle
 

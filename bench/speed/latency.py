@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from bench import REPORTS, drawn
+from bench import REPORTS
 from bench import goals as _goals
 from bench.goals import Goal
-from bench.json_file import write_json
+from bench.json_file import drawn, write_json
 from bench.machine import machine, provenance
 from bench.speed import latency_parts
 from bench.speed.service import BEGIN, Outside, Service, end_on_sigterm, running

@@ -25,10 +25,10 @@ import zmq
 from rich.console import Console
 from rich.table import Table
 
-from bench import REPORTS, drawn
+from bench import REPORTS
 from bench import goals as _goals
 from bench.goals import Goal
-from bench.json_file import write_json
+from bench.json_file import drawn, write_json
 from bench.machine import machine, provenance
 from bench.speed.service import Outside, Service, end_on_sigterm, running
 from bench.speed.skip import scenes

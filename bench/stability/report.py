@@ -10,10 +10,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from bench import drawn
 from bench.accuracy.report import text
 from bench.goals import Goal
-from bench.json_file import write_json
+from bench.json_file import drawn, write_json
 from bench.machine import provenance
 from bench.stability.run import Row, Setting
 

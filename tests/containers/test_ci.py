@@ -18,7 +18,7 @@ PROGRAMS = ("apt-get", "chromium", "g++", "git", "ls", "make", "python3", "rosco
 
 @pytest.mark.parametrize(
     ("fails", "next_step"),
-    [("timeout 900 make ros-venv", "=== make test"), ("make test", "=== the bridge heard by the ROS 2 before")],
+    [("timeout 900 make ros-venv", "=== what tests need"), ("timeout 3000 make test-all", "=== a bundle trained")],
 )
 def test_a_step_that_fails_ends_it(tmp_path: Path, fails: str, next_step: str) -> None:
     for name in PROGRAMS:
