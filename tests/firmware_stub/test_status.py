@@ -31,7 +31,7 @@ def test_who_reads_it_can_tell_when_the_stub_has_fallen_silent() -> None:
 
 
 def said(rig: Rig) -> list[str]:
-    frame = Status("palm").due(rig, SimpleNamespace(overrun=0), 0.0)  # type: ignore[arg-type]
+    frame = Status("palm").due(rig, SimpleNamespace(overrun=0), 0.0)
     assert frame is not None and frame.level == "WARN"
     return list(frame.messages)
 
