@@ -237,6 +237,38 @@ def test_the_cause_stands_first_while_the_board_is_unplugged_under_a_finger(page
     until(lambda: re.search(r"that is over.* for [1-9]\d*\.\d s", found.inner_text("#fault-said")))
 
 
+CABLE = "/dev/ttyACM0 is not there: plug the board in, or correct `port` in skin.toml"
+
+
+@pytest.mark.parametrize(
+    ("age_s", "reasons", "acquisition", "title", "said"),
+    [
+        (2.0, ["changing"], CABLE, "No board", f"acquisition: {CABLE}."),
+        (2.0, ["changing"], "", "The newest contacts are 2.0 s old", ""),
+        (0.0, ["changing", "electrode_open"], "", "Electrode open: not to be acted on", ""),
+        (0.0, ["changing"], "", "Changing: not to be acted on", ""),
+    ],
+)
+def test_the_banner_names_the_cause_before_what_follows_from_it(
+    page: Open, age_s: float, reasons: list[str], acquisition: str, title: str, said: str
+) -> None:
+    ask = """async ([ageS, reasons, acquisition]) => {
+      const { judge } = await import("/trust.js");
+      const status = (process, level, messages) =>
+        [process, { frame: { process, level, messages, host: "x", valid_for_s: 3 }, heard: performance.now() }];
+      const statuses = new Map([status("publisher", "STALE", ["no image/palm for 1 s"]),
+        status("acquisition", acquisition ? "ERROR" : "OK", acquisition ? [acquisition] : [])]);
+      if (!acquisition) statuses.delete("publisher");
+      const frame = { reasons, valid: false, valid_for_s: 0.25 };
+      return judge({ connected: true, clock: { known: true, now: () => 9000 }, statuses, recent: [], drawMs: 30,
+        contact: { frame, measured: (9000 - 1e3 * ageS) * 1e6 }, hello: { host: "y", reasons: {}, advice: {} } });
+    }"""
+    verdict = page().evaluate(ask, [age_s, reasons, acquisition])
+    assert (verdict["ok"], verdict["title"], verdict["said"]) == (False, title, said)
+    named = [reason["name"] for reason in verdict["reasons"]]
+    assert named == ([] if age_s else reasons[::-1])  # those of an old frame are no cause
+
+
 def test_what_a_fault_did_is_said_at_its_button_and_over_the_surface(page: Open) -> None:
     found = page()
     found.click("text=Dead electrode")
