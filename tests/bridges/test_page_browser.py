@@ -326,7 +326,8 @@ def test_it_greys_within_half_a_second_of_a_killed_publisher(page: Open, shared_
     took: list[float] = []
     while not took or (min(took) > 0.5 and len(took) < 4):  # what the machine's other work adds is not the page's
         publisher = int((shared_service / "publisher.lock").read_text())
-        began = found.evaluate("changes.length = 0, performance.now()")
+        well = "document.body.dataset.trust === 'yes' && (changes.length = 0, performance.now())"
+        began = until(lambda well=well: found.evaluate(well))  # a loaded machine's frames may be late just now
         os.kill(publisher, signal.SIGKILL)
         grey = until(lambda: found.evaluate("changes.find(([trust]) => trust === 'no')"))
         took.append((grey[1] - began) / 1e3)
