@@ -18,81 +18,135 @@ MUXES = ("drive+", "drive-", "sense+", "sense-")
 
 @dataclass(frozen=True)
 class Fault:
-    """One row: what the host gets to see, and the arguments with their defaults."""
+    """One row: what the host gets to see, the arguments with their defaults, and what is said of it while it lasts."""
 
     what: str
+    says: str
     args: Mapping[str, Any] = field(default_factory=dict)
     sticky: bool = False
+
+    def said(self, args: Mapping[str, Any]) -> str:
+        """What is the matter, for a person; args: all of them."""
+        second = args.get("second", -1)
+        return self.says.format(**args) + (f", and that of electrode {second}" if second >= 0 else "")
 
 
 FAULTS: dict[str, Fault] = {
     # the chip
     "wrong_chip_id": Fault(
         "the converter answers with `id` (0x0000, 0xFFFF or 0xA0A0 on real boards): START and SELF_TEST are refused",
+        "the converter answers with a wrong id, {id:#06x}",
         {"id": 0xFFFF},
         sticky=True,
     ),
     "brown_out": Fault(
         "the registers are lost: no excitation, all measurements noise, until CONFIG comes; with `silent` no EVENT",
+        "the converter has lost its registers",
         {"silent": False},
         sticky=True,
     ),
     "stale_rtia": Fault(
         "RTIA is not what was calibrated: all impedances times `gain`, turned by `phase` rad",
+        "RTIA is not what was calibrated: impedances times {gain:g}, turned by {phase:g} rad",
         {"gain": 1.05, "phase": 0.02},
     ),
     "gain": Fault(
         "an amplifier's gain jumps between two scans: all impedances times `factor`, nothing else, no status bits",
+        "an amplifier's gain has jumped: impedances times {factor:g}",
         {"factor": 1.006},
     ),
     "clipped": Fault(
         "the voltage channel is `gain` times too sensitive and clips: plausible, low Z; with `silent` no status bits",
+        "the voltage channel is {gain:g} times too sensitive, and clips",
         {"gain": 4.0, "silent": False},
     ),
     "rtia_overrange": Fault(
-        "the current channel clips: Z too high; with `silent` no status bits", {"gain": 1.6, "silent": False}
+        "the current channel clips: Z too high; with `silent` no status bits",
+        "the current channel is {gain:g} times too sensitive, and clips",
+        {"gain": 1.6, "silent": False},
     ),
     "missed_interrupt": Fault(
         "a `fraction` of the results is read too early and is the one before; with `silent` no status bits",
+        "a share of {fraction:g} of the results is read too early",
         {"fraction": 0.02, "silent": False},
     ),
     "fifo_overflow": Fault(
-        "`words` are lost in the middle of a scan, the rest moves up", {"words": 4, "silent": False}
+        "`words` are lost in the middle of a scan, the rest moves up",
+        "{words} words are lost in the middle of each scan",
+        {"words": 4, "silent": False},
     ),
-    "fifo_underflow": Fault("the last `words` of a scan never come: zeros", {"words": 8, "silent": False}),
+    "fifo_underflow": Fault(
+        "the last `words` of a scan never come: zeros",
+        "the last {words} words of each scan never come",
+        {"words": 8, "silent": False},
+    ),
     "fifo_misaligned": Fault(
-        "all words are one late: real and imaginary parts, V and I change places", {"silent": False}
+        "all words are one late: real and imaginary parts, V and I change places",
+        "all words of a scan are one late",
+        {"silent": False},
     ),
     # electrodes and multiplexers
     "electrode_open": Fault(
         "the wire of `electrode` (and of `second`) is broken: no current, a floating voltage",
+        "the wire of electrode {electrode} is broken",
         {"electrode": 0, "second": -1},
     ),
-    "electrodes_shorted": Fault("the wires of two `electrodes` touch each other", {"electrodes": [0, 1]}),
-    "electrodes_swapped": Fault("the wires of two `electrodes` are exchanged", {"electrodes": [0, 1]}),
+    "electrodes_shorted": Fault(
+        "the wires of two `electrodes` touch each other",
+        "the wires of electrodes {electrodes[0]} and {electrodes[1]} touch each other",
+        {"electrodes": [0, 1]},
+    ),
+    "electrodes_swapped": Fault(
+        "the wires of two `electrodes` are exchanged",
+        "the wires of electrodes {electrodes[0]} and {electrodes[1]} are exchanged",
+        {"electrodes": [0, 1]},
+    ),
     "mux_stuck": Fault(
         "an address `bit` of one multiplexer (drive+, drive-, sense+, sense-) stays at `value`: rows repeat",
+        "address bit {bit} of the multiplexer {mux} stays at {value}",
         {"mux": "drive+", "bit": 2, "value": 0},
     ),
-    "mux_disabled": Fault("one multiplexer's enable stays low: nothing is connected, all open", {"mux": "drive+"}),
+    "mux_disabled": Fault(
+        "one multiplexer's enable stays low: nothing is connected, all open",
+        "the multiplexer {mux} is off: nothing is connected",
+        {"mux": "drive+"},
+    ),
     # the link
-    "partial_frames": Fault("a `fraction` of the frames ends in the middle", {"fraction": 0.3}),
-    "sequence_gaps": Fault("a `fraction` of the scans is never sent", {"fraction": 0.2}),
+    "partial_frames": Fault(
+        "a `fraction` of the frames ends in the middle",
+        "a share of {fraction:g} of the messages ends in the middle",
+        {"fraction": 0.3},
+    ),
+    "sequence_gaps": Fault(
+        "a `fraction` of the scans is never sent",
+        "a share of {fraction:g} of the scans is never sent",
+        {"fraction": 0.2},
+    ),
     "line_noise": Fault(
         "`garbage` random bytes for each byte sent, and a `flips` share of bits flipped",
+        "bits flip on the line to the board, and random bytes come between",
         {"garbage": 0.0005, "flips": 2e-5},
     ),
     "wrong_schema": Fault(
-        "the firmware is another version: another schema hash in IDENT and in every check", {"schema": 0xBAD0F00D}
+        "the firmware is another version: another schema hash in IDENT and in every check",
+        "the board says that its firmware is another version",
+        {"schema": 0xBAD0F00D},
     ),
-    "clock_jump": Fault("the microcontroller's clock jumps `by` so many seconds, once", {"by": -5.0}),
-    "frozen": Fault("the same scan is sent again and again, with new numbers and times"),
-    "hang": Fault("the board neither answers nor sends"),
+    "clock_jump": Fault(
+        "the microcontroller's clock jumps `by` so many seconds, once",
+        "the board's clock jumps by {by:g} s",
+        {"by": -5.0},
+    ),
+    "frozen": Fault(
+        "the same scan is sent again and again, with new numbers and times", "the same scan is sent again and again"
+    ),
+    "hang": Fault("the board neither answers nor sends", "the board neither answers nor sends"),
     "unplug": Fault(
         "the device vanishes and comes back, power-cycled, after the seconds; as <runtime>/`name` where one is given",
+        "the cable is out",
         {"name": ""},
     ),
-    "power_cycle": Fault("the board restarts, and forgets what it was told and what was sticky"),
+    "power_cycle": Fault("the board restarts, and forgets what it was told and what was sticky", "the board restarts"),
 }
 
 

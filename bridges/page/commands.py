@@ -51,6 +51,7 @@ BUTTONS = {
     "snapshot": Button(RECORDER, ("before_s", "after_s"), stub=False),
     "recordings": Button("", stub=False),
     "replay": Button("", ("file", "skin", "speed", "from"), stub=False),
+    "replaying": Button("", stub=False),
 }
 
 
@@ -112,6 +113,8 @@ class Buttons:
             return await asyncio.to_thread(self.recording.call, command, args)
         if command == "recordings":
             return {"files": await asyncio.to_thread(listed, self.recording.folder)}
+        if command == "replaying":
+            return self._replay.state() if self._replay is not None else {"playing": False, "failed": False}
         return await self._replayed(skin, self.recording.folder, args)
 
     async def _replayed(self, skin: str, folder: Path, args: dict[str, Any]) -> dict[str, Any]:

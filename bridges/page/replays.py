@@ -65,6 +65,11 @@ class Replay:
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment)
         self._lock = threading.Lock()
 
+    def state(self) -> dict[str, Any]:
+        """Whether it still plays, and whether it has failed."""
+        code = self._process.poll()
+        return {"playing": code is None, "failed": bool(code)}
+
     def close(self) -> None:
         """End it; its stages end with it."""
         with self._lock:

@@ -1,12 +1,13 @@
 // The page: what comes is put into a state, what is drawn is drawn from it, thirty times a second at most.
 
 import { paint } from "./colours.js";
-import { faults } from "./faults.js";
+import { Faults } from "./faults.js";
 import { Link } from "./link.js";
 import { SkinMap } from "./map.js";
 import * as panels from "./panels.js";
 import { Press } from "./press.js";
-import { Replays } from "./replays.js";
+import { Remarks } from "./remarks.js";
+import { REPLAY, Replays } from "./replays.js";
 import { Surface } from "./surface.js";
 import { Timeline } from "./timeline.js";
 import { judge } from "./trust.js";
@@ -14,6 +15,7 @@ import { judge } from "./trust.js";
 const { by } = panels;
 const TOPICS = ["contact", "image", "delta", "truth", "shape"];
 const PICTURE_MS = 28; // thirty a second
+const NO_PICTURES = { image: null, delta: null };
 const TRUTH_MS = 500;
 const WORDS_MS = 250;
 const SUMMARY_MS = 2000;
@@ -22,9 +24,10 @@ const still = matchMedia("(prefers-reduced-motion: reduce)");
 const token = keptToken();
 const map = new SkinMap(by("map"));
 const timeline = new Timeline(by("timeline"));
-const state = { skin: "", hello: null, newest: {}, pictures: {}, statuses: new Map(), info: null, session: "", noise: 0 };
+const state = { skin: "", hello: null, newest: {}, pictures: { ...NO_PICTURES }, statuses: new Map(), info: null, session: "", noise: 0 };
 const recent = { scans: new panels.Recent(), latency: new panels.Recent(), shown: new panels.Recent(), draw: new panels.Recent() };
 const surface = new Surface(by("surface"), noSurface);
+const remarks = new Remarks();
 let verdict = { ok: false }, undrawn = false;
 const drawn = { ms: 0, words: 0, summary: 0 };
 
@@ -45,7 +48,8 @@ const link = new Link({
     select.replaceChildren(...message.skins.map((name) => new Option(name, name)));
     select.value = message.skins.includes(state.skin) ? state.skin : message.skins[0];
     by("record").hidden = by("snapshot").hidden = by("recordings").hidden = !message.buttons.includes("record");
-    watch();
+    if (replays.playing) replays.stop();
+    else watch();
   },
   frames(skin, frames) {
     if (skin !== state.skin) return;
@@ -63,7 +67,13 @@ function noSurface(why) {
 }
 
 function watch(name = by("skin").value) {
-  Object.assign(state, { skin: name, newest: {}, pictures: {}, statuses: new Map(), info: null });
+  Object.assign(state, { skin: name, newest: {}, pictures: { ...NO_PICTURES }, statuses: new Map(), info: null });
+  for (const each of Object.values(recent)) each.clear();
+  Object.assign(state, { session: "", noise: 0 });
+  remarks.clear();
+  timeline.show(name, name === REPLAY);
+  map.image(null);
+  undrawn = true;
   link.watch(state.skin, TOPICS);
 }
 
@@ -71,6 +81,7 @@ function take({ topic, frame, measured }) {
   const now = performance.now();
   if (topic === "status") {
     state.statuses.set(frame.process, { frame, measured, heard: now });
+    if (frame.process === "preprocessing") remarks.steps(now, frame.counters.gain_steps ?? 0);
   } else if (topic === "info") {
     know(frame.info);
   } else {
@@ -89,12 +100,14 @@ function know(info) {
 }
 
 function contact(frame, now) {
+  if (frame.stamps.sample <= 0) return; // of no scan: the first trial of stages that begin
   if (frame.session !== state.session) {
     if (state.session) timeline.anew();
     state.session = frame.session;
   }
   recent.scans.add(now, frame.scan);
-  if (state.skin === "replay") replays.at(frame.stamps.sample / 1e9, now);
+  if (state.skin === REPLAY) replays.at(frame.stamps.sample / 1e9, now);
+  remarks.add(now, frame.reasons);
   const { sample, publish } = frame.stamps;
   if (frame.source !== "replay" && publish >= sample) recent.latency.add(now, (publish - sample) / 1e6);
   timeline.add(now, present(frame));
@@ -108,6 +121,7 @@ function image(frame) {
     if (map.bounds) map.image(frame);
     undrawn = true;
   } else if (!frame.held) {
+    state.pictures.image = null;
     map.image(null);
   }
 }
@@ -115,16 +129,20 @@ function image(frame) {
 function delta(frame) {
   if (!frame.touched || !state.noise) state.noise = panels.noiseOf(frame.sigma); // of one scan: a touch's may be of a mean
   if (frame.stack.length) state.pictures.delta = frame;
+  else if (!frame.touched) state.pictures.delta = null;
 }
 
 /** Judge what is there, and say so. Called often, whether anything comes or not: silence is news too. */
 function look() {
   const before = verdict.ok;
-  verdict = judge({ connected: link.connected, clock: link.clock, contact: state.newest.contact, statuses: state.statuses, hello: state.hello, replay: state.skin === "replay", drawMs: recent.draw.median });
+  const now = performance.now(), replay = state.skin === REPLAY ? replays.shown : null, past = remarks.recent(now);
+  verdict = judge({ connected: link.connected, clock: link.clock, contact: state.newest.contact, statuses: state.statuses, hello: state.hello, replay, recent: past, drawMs: recent.draw.median });
   panels.banner(verdict);
-  const now = performance.now();
-  timeline.trust(now, verdict.ok);
-  if (before !== verdict.ok) timeline.event(now, verdict.ok ? "✓" : "✕", verdict.title);
+  panels.text("no-contacts", verdict.ok ? "Nothing touches." : "Whether something touches is not known now.");
+  const bad = panels.trouble(state.newest.delta?.frame.electrodes ?? [], state.hello?.electrode_states ?? [], past);
+  faults.look(now, { verdict, frame: state.newest.contact?.frame, bad, past, stub: state.statuses.get("stub")?.frame, texts: state.hello?.reasons });
+  timeline.trust(now, verdict.ok || verdict.calm);
+  if (before !== verdict.ok && !verdict.calm) timeline.event(now, verdict.ok ? "✓" : "✕", verdict.title);
   const source = state.newest.contact?.frame.source ?? "";
   const chip = by("source");
   chip.hidden = !source || source === "board";
@@ -135,8 +153,8 @@ function look() {
   by("press-why").hidden = !why;
   by("press-why").textContent = why;
   by("tools").disabled = !press.enabled;
-  for (const button of by("faults").children) button.disabled = !(token && link.connected && state.statuses.has("stub"));
-  const replaying = state.skin === "replay"; // whose statuses are those of its own stages
+  faults.enabled = Boolean(token) && link.connected && state.statuses.has("stub");
+  const replaying = state.skin === REPLAY; // whose statuses are those of its own stages
   for (const id of ["tare", "play"]) by(id).disabled = !(token && link.connected);
   const recorder = panels.recorder(state.statuses, link.clock, state.hello?.host);
   by("record").disabled = !(token && link.connected && !replaying);
@@ -168,24 +186,24 @@ function draw(now) {
 
 /** What a new frame changes. */
 function news(now) {
-  const { contact: found, shape, truth, delta: change, image: picture } = state.newest;
+  const { contact: found, shape, truth, delta: change, image: picture } = state.newest, list = found ? present(found.frame) : [];
   if (found) {
-    const list = present(found.frame);
     const same = shape?.frame.session === found.frame.session && Math.abs(shape.frame.scan - found.frame.scan) <= 1;
     const outlines = new Map(same ? shape.frame.ids.map((id, k) => [id, shape.frame.outlines[k]]) : []);
     map.contacts(list, outlines, now);
-    surface.contacts(list);
-    panels.contacts(list);
     if (found.measured !== null && link.clock.known) recent.shown.add(now, link.clock.now() - found.measured / 1e6);
   }
+  if (!found) map.contacts([], new Map(), now);
+  surface.contacts(list);
+  panels.contacts(list);
   map.truth(truth && now - truth.heard < TRUTH_MS ? truth.frame.touches : []);
   if (change) {
     map.electrodes(change.frame.electrodes, state.hello?.electrode_states ?? []);
     surface.electrodes(change.frame.electrodes);
   }
-  panels.compare(state.pictures.delta, state.pictures.image, state.info?.stack);
-  panels.fade("one-step", !change?.frame.touched || change.frame.stack.length === 0);
-  panels.fade("network", !picture?.frame.touched);
+  const none = !picture ? "Nothing has come yet." : picture.frame.touched ? "No image of this touch yet." : "Nothing touches.";
+  panels.compare({ delta: state.pictures.delta, image: state.pictures.image, stack: state.info?.stack, none });
+  panels.fade("one-step", state.pictures.delta !== null && change?.frame.stack.length === 0);
 }
 
 function words(now) {
@@ -205,7 +223,7 @@ function words(now) {
 const said = (what) => { by("said").textContent = what; };
 const tools = { force: by("force"), radius: by("radius"), shape: by("shape") };
 const press = new Press(map, tools, (name, args) => link.command(state.skin, name, args), said);
-faults((name, args) => link.command(state.skin, name, args), said);
+const faults = new Faults((name, args) => link.command(state.skin, name, args));
 for (const [id, unit] of [["force", "N"], ["radius", "mm"]]) {
   tools[id].addEventListener("input", () => { by(`${id}-out`).textContent = `${tools[id].value} ${unit}`; });
 }
@@ -235,4 +253,4 @@ paint(by("heat"), new Float32Array(4), 2, 2, 1);
 setInterval(() => { look(); press.step(); }, 100); // also where nothing is drawn, as in a tab at the back
 requestAnimationFrame(draw);
 
-export { link, map, state, surface }; // for tests, and for who looks with the browser's tools
+export { link, map, state, surface, timeline }; // for tests, and for who looks with the browser's tools

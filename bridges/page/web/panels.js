@@ -1,6 +1,7 @@
 // What is told in words and bars: the banner, the contacts, the processes, the numbers, the two small images.
 
 import { lineColour, paint } from "./colours.js";
+import { plain } from "./trust.js";
 
 const MOST_N = 10;
 const WINDOW_MS = 3000;
@@ -22,17 +23,19 @@ function element(name, className, content = "") {
 
 /** Whether data may be trusted, and why not; everything that shows data greys with body's data-trust. */
 export function banner(verdict) {
-  const { body } = document;
-  if (body.dataset.trust !== (verdict.ok ? "yes" : "no")) body.dataset.trust = verdict.ok ? "yes" : "no";
-  const said = verdict.ok ? verdict.notes : verdict.reasons;
-  text("trust-title", verdict.title + (verdict.ok && said.length ? ", with a remark" : ""));
-  text("trust-reasons", said.map((r) => `${r.name.replaceAll("_", " ")}: ${r.text}`).join("; "));
-  text("trust-advice", [...said.map((r) => r.advice), verdict.ok ? "" : verdict.advice].filter(Boolean).join(" "));
+  const { dataset } = document.body, { reasons } = verdict, trust = verdict.ok ? "yes" : "no", tone = verdict.calm ? "calm" : "";
+  if (dataset.trust !== trust) dataset.trust = trust;
+  if (dataset.tone !== tone) dataset.tone = tone;
+  text("trust-title", verdict.title + (verdict.ok && reasons.length ? ", with a remark" : ""));
+  text("trust-reasons", [verdict.said, ...reasons.map((r) => `${plain(r.name)}: ${r.text}`)].filter(Boolean).join("; "));
+  text("trust-advice", [...reasons.map((r) => r.advice), verdict.advice].filter(Boolean).join(" "));
 }
 
 /** The newest values within a window, and their median. */
 export class Recent {
-  constructor() { this.values = []; }
+  constructor() { this.clear(); }
+
+  clear() { this.values = []; }
 
   add(nowMs, value) {
     this.values.push([nowMs, value]);
@@ -142,15 +145,15 @@ export function recorder(statuses, clock, host) {
   return { there, recording };
 }
 
-/** One-step image: the plane of delta's stack with the published lambda; the network's image of the same frame. */
-export function compare(delta, image, stack) {
-  if (delta?.stack.length && stack) {
+/** The same frame by two methods: {delta, image} that brought the pictures, or null where there is none; none: why. */
+export function compare({ delta, image, stack, none }) {
+  if (side("one-step", delta && stack ? "" : none)) {
     const [, rows, columns] = delta.stack.shape, size = rows * columns;
     const plane = delta.stack.subarray(size * stack.one_step, size * (stack.one_step + 1));
     paint(by("one-step"), plane, rows, columns, Math.max(1e-6, ...plane));
     text("one-step-note", `λ = ${Math.sqrt(stack.lambda_squared[stack.one_step]).toPrecision(2)}, scan ${delta.scan}`);
   }
-  if (image?.image.length) {
+  if (side("network", image ? "" : none)) {
     const [rows, columns] = image.image.shape;
     let top = 1e-6;
     for (const v of image.image) if (v > top) top = v;
@@ -159,5 +162,24 @@ export function compare(delta, image, stack) {
   }
 }
 
-/** The one-step image is of an earlier frame than what is shown beside it. */
-export function fade(id, old) { by(id).parentElement.classList.toggle("old", old); }
+/** Whether this side has a picture; where it has none, nothing of an earlier one stays. */
+function side(id, none) {
+  text(`${id}-none`, none);
+  if (!none) return true;
+  const canvas = by(id);
+  canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
+  text(`${id}-note`, "");
+  return false;
+}
+
+/** The picture is of an earlier frame than what is shown beside it. */
+export function fade(id, old) { by(id).closest("figure").classList.toggle("old", old); }
+
+/** What is the matter with the skin itself, over the surface: electrodes that are not well, and what the board did. */
+export function trouble(states, names, recent) {
+  const bad = [...states].map((state, k) => (state ? `electrode ${k}: ${names[state] ?? "unknown"}` : "")).filter(Boolean);
+  const past = recent.filter(({ name }) => name === "gain").map(({ agoMs }) => `gain step, ${(agoMs / 1e3).toFixed(0)} s ago`);
+  text("trouble", [...bad, ...past].join(" · "));
+  by("surface-panel").toggleAttribute("data-trouble", bad.length + past.length > 0);
+  return bad;
+}

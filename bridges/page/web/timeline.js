@@ -9,42 +9,49 @@ const [LEFT, RIGHT, TOP, BOTTOM] = [34, 8, 16, 20];
 export class Timeline {
   constructor(canvas) {
     this.canvas = canvas;
-    this.lines = new Map(); // id -> [ms, newton | null] ...
-    this.events = [];
-    this.doubts = []; // [from, to]
+    this.courses = new Map();
+    this.show("");
+    this.drawn = 0;
+  }
+
+  /** Go on with the course of this skin; anew: it has none yet. What a recording shows is no part of a skin's. */
+  show(name, anew = false) {
+    // lines: id -> [ms, newton, newton] ...; doubts: [from, to]
+    if (anew || !this.courses.has(name)) this.courses.set(name, { lines: new Map(), events: [], doubts: [] });
+    this.course = this.courses.get(name);
     this.drawn = 0;
   }
 
   add(nowMs, contacts) {
     for (const c of contacts) {
-      if (!this.lines.has(c.id)) {
-        this.lines.set(c.id, []);
+      if (!this.course.lines.has(c.id)) {
+        this.course.lines.set(c.id, []);
         this.event(nowMs, "▲", `contact ${c.id} began`);
       }
-      this.lines.get(c.id).push([nowMs, c.force_n ?? 0, c.force_sigma_n ?? 0]);
+      this.course.lines.get(c.id).push([nowMs, c.force_n ?? 0, c.force_sigma_n ?? 0]);
     }
-    for (const [id, points] of this.lines) {
+    for (const [id, points] of this.course.lines) {
       const over = !contacts.some((c) => c.id === id);
       if (over && !points.ended) {
         points.ended = true;
         this.event(nowMs, "▽", `contact ${id} ended`);
       }
       while (points.length && nowMs - points[0][0] > SPAN_MS) points.shift();
-      if (!points.length) this.lines.delete(id);
+      if (!points.length) this.course.lines.delete(id);
     }
   }
 
   /** Another producer: its ids have nothing to do with those before. */
   anew() {
-    for (const points of this.lines.values()) points.ended = true;
-    this.lines = new Map([...this.lines].map(([id, points]) => [`${id}.${performance.now()}`, points]));
+    for (const points of this.course.lines.values()) points.ended = true;
+    this.course.lines = new Map([...this.course.lines].map(([id, points]) => [`${id}.${performance.now()}`, points]));
   }
 
-  event(nowMs, sign, text) { this.events.push({ nowMs, sign, text }); }
+  event(nowMs, sign, text) { this.course.events.push({ nowMs, sign, text }); }
 
   trust(nowMs, ok) {
-    const last = this.doubts.at(-1);
-    if (!ok && (!last || nowMs - last[1] > GAP_MS)) this.doubts.push([nowMs, nowMs]);
+    const last = this.course.doubts.at(-1);
+    if (!ok && (!last || nowMs - last[1] > GAP_MS)) this.course.doubts.push([nowMs, nowMs]);
     else if (!ok) last[1] = nowMs;
   }
 
@@ -59,14 +66,14 @@ export class Timeline {
     const ink = style.color, faint = style.getPropertyValue("--faint"), doubt = style.getPropertyValue("--doubt");
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
     c.clearRect(0, 0, w, h);
-    this.events = this.events.filter((e) => nowMs - e.nowMs < SPAN_MS);
-    this.doubts = this.doubts.filter(([, to]) => nowMs - to < SPAN_MS);
-    const most = Math.max(4, ...[...this.lines.values()].flat().map(([, n, s]) => n + s));
+    this.course.events = this.course.events.filter((e) => nowMs - e.nowMs < SPAN_MS);
+    this.course.doubts = this.course.doubts.filter(([, to]) => nowMs - to < SPAN_MS);
+    const most = Math.max(4, ...[...this.course.lines.values()].flat().map(([, n, s]) => n + s));
     const step = most > 8 ? 4 : 2, top = Math.ceil(most / step) * step;
     const x = (ms) => LEFT + (w - LEFT - RIGHT) * Math.max(0, 1 - (nowMs - ms) / SPAN_MS);
     const y = (n) => h - BOTTOM - (h - TOP - BOTTOM) * (n / top);
     c.fillStyle = doubt;
-    for (const [from, to] of this.doubts) c.fillRect(x(from), TOP, Math.max(2, x(to) - x(from)), h - TOP - BOTTOM);
+    for (const [from, to] of this.course.doubts) c.fillRect(x(from), TOP, Math.max(2, x(to) - x(from)), h - TOP - BOTTOM);
     c.font = "12px system-ui, sans-serif";
     c.textBaseline = "middle";
     c.textAlign = "right";
@@ -82,7 +89,7 @@ export class Timeline {
       c.textAlign = s === 0 ? "right" : s === 60 ? "left" : "center";
       c.fillText(s === 0 ? "now" : s === 60 ? "−60 s" : `−${s}`, s === 0 ? at + 4 : s === 60 ? at - 4 : at, h - 8);
     }
-    for (const [id, points] of this.lines) {
+    for (const [id, points] of this.course.lines) {
       c.strokeStyle = lineColour(Number.parseInt(id, 10));
       c.fillStyle = c.strokeStyle;
       c.lineWidth = 1.6;
@@ -94,7 +101,7 @@ export class Timeline {
     c.textAlign = "center";
     c.font = "9px system-ui, sans-serif";
     let before = -Infinity;
-    for (const e of this.events) {
+    for (const e of this.course.events) {
       if (x(e.nowMs) - before < 9) continue;
       before = x(e.nowMs);
       c.fillText(e.sign, before, 7);
