@@ -55,7 +55,7 @@ class Port:
                 return b""
             data = os.read(self._fd, 65536)
         except (OSError, ValueError, TypeError, serial.SerialException) as why:
-            raise PortError(f"{self.url} is gone ({why}): is the cable plugged in?") from None
+            raise PortError(f"{self.url} is gone ({_plain(why)}): is the cable plugged in?") from None
         if not data:
             raise PortError(f"{self.url} is gone (ready to read, but nothing to be read): is the cable plugged in?")
         return data
@@ -64,13 +64,19 @@ class Port:
         try:
             self._serial.write(data)
         except (OSError, serial.SerialException) as why:
-            raise PortError(f"{self.url} is gone ({why}): is the cable plugged in?") from None
+            raise PortError(f"{self.url} is gone ({_plain(why)}): is the cable plugged in?") from None
 
     def close(self) -> None:
         try:
             self._serial.close()
         except Exception:  # a device that is gone may fail in any way
             pass
+
+
+def _plain(why: Exception) -> str:
+    """What the system says, without its number; pyserial puts a failure of the system into a text of its own."""
+    system = why if isinstance(why, OSError) and why.strerror else why.__context__
+    return system.strerror.lower() if isinstance(system, OSError) and system.strerror else str(why)
 
 
 def candidates(port: str, skin: str, usb_serial: str | None, known_board: bool) -> Iterator[str]:

@@ -503,3 +503,17 @@ def test_port_errors_are_their_own_kind(tmp_path: Path) -> None:
         Port(str(tmp_path / "nothing"))
     with pytest.raises(PortError):
         Port("nonsense://x")
+
+
+def test_a_port_that_is_gone_says_so_without_the_systems_numbers() -> None:
+    """pyserial's own text has the failure as a program prints it: (5, 'Input/output error')."""
+    from services.board.port import Port
+
+    master, slave = os.openpty()
+    port = Port(os.ttyname(slave))
+    os.close(slave)
+    os.close(master)
+    with pytest.raises(PortError) as gone:
+        port.write(b"x")
+    assert str(gone.value) == f"{port.url} is gone (input/output error): is the cable plugged in?"
+    port.close()
