@@ -11,6 +11,7 @@ from models.forward import shared
 from models.patterns import pattern
 from models.prereconstruction import Drift
 from models.shapes import Shape
+from tests import needs
 
 TOUCH = Shape("circle", 0.31, 0.27, 0.2, 0.3)
 
@@ -122,7 +123,7 @@ def test_mean_is_root_mean_square():
     assert mean_floor([a, b]).drop == pytest.approx(np.sqrt((a.drop**2 + b.drop**2) / 2))
 
 
-def test_command_line(capsys, tmp_path):
+def test_command_line(capsys):
     assert (
         limits.main(["--skin", "disc16", "--rank", "--snr", "inf", "--floor-ohm", "1e-4", "--grid", "2", "--json"]) == 0
     )
@@ -132,6 +133,10 @@ def test_command_line(capsys, tmp_path):
     assert limits.main(["--snr", "inf"]) == 2
     assert "without noise nothing limits a touch" in capsys.readouterr().err
     assert limits.main(["--skin", "hexagon6"]) == 2
+
+
+def test_its_picture(tmp_path):
+    needs.PLOTS.here()
     limits.draw(limits.Case(), 0.4, 0.3, 4, tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
 
