@@ -11,6 +11,7 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -91,6 +92,7 @@ class Rig:
             unique_id=unique_id,
             on_scan=self._scanned,
         )
+        self._waiting: list[tuple[float, bytes]] = []  # messages that come later
         self._unplugged: dict[str, Any] | None = None
         self._then = 0.0
         self._cued = 0.0
@@ -116,7 +118,7 @@ class Rig:
         self._then = now
         self.field.prepare(now)
         sent = []
-        for t, message in self.board.advance(now):
+        for t, message in sorted(self._held_up(self.board.advance(now), now), key=itemgetter(0)):
             sent.append(self.line.pull(t))
             self.line.push(self._cut(message, t), t)
         sent.append(self.line.pull(now))
@@ -257,12 +259,26 @@ class Rig:
             if gone is None:
                 self.board.power_cycle(now)
             self.line.clear()
+            self._waiting.clear()
             self._unplugged = gone
         if self.faults.active("power_cycle", now) is not None:
             self.faults.clear("power_cycle")
             self.line.clear()
+            self._waiting.clear()
             self.board.power_cycle(now)
         return self._unplugged is not None
+
+    def _held_up(self, messages: list[tuple[float, bytes]], now: float) -> list[tuple[float, bytes]]:
+        """Messages that are due by now: those that come late later, some twice."""
+        for t, message in messages:
+            late, twice = self.faults.active("late_frames", t), self.faults.active("repeated_frames", t)
+            waits = late is not None and self._rng.random() < late["fraction"]
+            self._waiting.append((t + late["by"] if late is not None and waits else t, message))
+            if twice is not None and self._rng.random() < twice["fraction"]:
+                self._waiting.append((t, message))
+        due = [each for each in self._waiting if each[0] <= now]
+        self._waiting = [each for each in self._waiting if each[0] > now]
+        return due
 
     def _cut(self, message: bytes, now: float) -> bytes:
         fault = self.faults.active("partial_frames", now)

@@ -28,6 +28,11 @@ class Touch:
     crept: float = 0.0  # S/m
 
     @property
+    def force_n(self) -> float:
+        """Newtons that make `drop`."""
+        return self.drop / NEWTON
+
+    @property
     def felt(self) -> float:
         """The drop [S/m] that is there."""
         return self.drop + self.crept

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -126,6 +127,11 @@ def sheet(name: str, seed: int, of: str = "square16") -> Sheet:
     if ailment.mounted:
         mild = Mismatch(anisotropy=0.05, field=0.05, shift=0.02, contact_spread=0.3, blur_m=ailment.edge_m)
         mismatch = mild.seeded(1 + seed % SKINS)
+    return _sheet(of, mismatch)
+
+
+@lru_cache(maxsize=8)
+def _sheet(of: str, mismatch: Mismatch) -> Sheet:
     return Sheet(of, mismatch, mesh=MESH)
 
 
