@@ -83,7 +83,7 @@ def _rounded(touch: Touch) -> Touch:
 
 
 def blend(a: World, b: World, s: float) -> World:
-    """The world a fraction `s` of the way from a to b; both have the same touches, residues and spots in the same order."""
+    """The world a fraction `s` of the way from a to b; both have the same touches, residues and spots, in one order."""
     if s <= 0 or a == b:
         return a
     if s >= 1:
@@ -93,8 +93,10 @@ def blend(a: World, b: World, s: float) -> World:
         return p + s * (q - p)
 
     def mixed(p: tuple[Touch, ...], q: tuple[Touch, ...]) -> tuple[Touch, ...]:
-        pairs = zip(p, q, strict=True)
-        return tuple(Touch(one.kind, *(mix(getattr(one, f), getattr(other, f)) for f in MOVING)) for one, other in pairs)
+        return tuple(
+            Touch(one.kind, *(mix(getattr(one, f), getattr(other, f)) for f in MOVING))
+            for one, other in zip(p, q, strict=True)
+        )
 
     return World(
         mixed(a.touches, b.touches),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import time
 from typing import Protocol
 
@@ -43,7 +44,7 @@ class Today:
         self.reset()
 
     def reset(self) -> None:
-        self._stages = Pipeline(self._skin, "palm", self._bundle)
+        self._stages = Pipeline(self._skin, f"palm-{os.getpid()}", self._bundle)  # others keep what theirs found
         self._stages.pre.warm_up()
 
     def step(self, raw: RawFrame) -> ContactFrame | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,8 +16,11 @@ from firmware_stub.world import Touch, World
 
 TARE_S = 5.0  # nothing touches and nothing fails before; then a person tares
 BEGIN_S = TARE_S + 1.0
-APART_M = 0.028  # between the centres of touches that are there at once
-INSIDE_M = 0.043  # of the sheet's 50 mm, along each axis
+APART_M = 0.028  # between the centres of touches that are there at once, at least
+GAP_M = 0.003  # between their circles
+SHEET_M = 0.0495  # from the centre, along each axis: patches lie within
+INSIDE_M = 0.043  # and their centres within that
+BESIDE_M = (0.004, 0.01)  # radius of a touch on an electrode
 RADIUS_M = (0.004, 0.025)
 FORCE_N = (0.3, 8.0)
 RAMP_S = (0.005, 0.2)
@@ -92,15 +95,20 @@ class SceneDrawer:
     def _untouched(self) -> np.ndarray:
         return self.sheet.model.read(self.sheet.transfer(World()))
 
-    def _touch(self, x: float, y: float) -> Touch:
-        """One that a scan shows. Two thirds are discs."""
+    def _touch(self, others: Sequence[Touch] = (), electrode: int | None = None) -> Touch | None:
+        """One that a scan shows, with its patch on the sheet and clear of others. Two thirds are discs. electrode: as
+        near to that one as it may be. None where there is no room.
+        """
         for _ in range(TRIES):
-            values: dict[str, object] = {"x": x, "y": y, "rotation": float(self.rng.uniform(0, 2 * np.pi))}
-            values["radius"] = float(self.rng.uniform(*RADIUS_M))
-            values["force"] = float(np.exp(self.rng.uniform(*np.log(FORCE_N))))
+            values: dict[str, object] = {"rotation": float(self.rng.uniform(0, 2 * np.pi))}
+            radius = float(self.rng.uniform(*RADIUS_M) if electrode is None else self.rng.uniform(*BESIDE_M))
+            x, y = self._place(radius, electrode)
+            values |= {"x": x, "y": y, "radius": radius, "force": float(np.exp(self.rng.uniform(*np.log(FORCE_N))))}
             if self.rng.random() < 1 / 3:
                 values["shape"] = SHAPES[self.rng.integers(len(SHAPES))]
                 values["aspect"] = 2.0 if values["shape"] in ("rectangle", "ellipse") else 1.0
+            if any(np.hypot(x - o.x, y - o.y) < self._apart(radius, o) for o in others):
+                continue
             try:
                 touch = scenes.touch(values)
             except ValueError:  # a force that this patch cannot bear
@@ -108,17 +116,25 @@ class SceneDrawer:
             change = self.sheet.model.read(self.sheet.transfer(World((touch,)))) / self._untouched - 1
             if np.linalg.norm(change) >= SEEN_SIGMA * NOISE:
                 return touch
-        raise RuntimeError(f"no touch at ({x:g}, {y:g}) m shows in a scan: {TRIES} were tried")
+        return None
+
+    def _place(self, radius: float, electrode: int | None) -> tuple[float, float]:
+        most = min(INSIDE_M, SHEET_M - radius)
+        if electrode is None:
+            return float(self.rng.uniform(-most, most)), float(self.rng.uniform(-most, most))
+        skin = self.sheet.skin
+        x, y = (skin.point(skin.electrodes[[electrode]])[0] * skin.metres_per_unit).clip(-most, most)
+        return float(x), float(y)
+
+    def _apart(self, radius: float, other: Touch) -> float:
+        return max(self.apart_m, radius + other.radius + GAP_M)
 
     def _touches(self, count: int) -> list[Touch]:
-        places: list[tuple[float, float]] = []
-        for _ in range(TRIES):
-            x, y = (float(v) for v in self.rng.uniform(-INSIDE_M, INSIDE_M, 2))
-            if all(np.hypot(x - a, y - b) >= self.apart_m for a, b in places):
-                places.append((x, y))
-            if len(places) == count:
-                break
-        return [self._touch(x, y) for x, y in places]
+        found: list[Touch] = []
+        for _ in range(count):
+            if (touch := self._touch(found)) is not None:
+                found.append(touch)
+        return found
 
     def _lasts(self) -> float:
         """Seconds of an event: most are short, one in twelve is held for up to a minute."""
@@ -146,11 +162,11 @@ class SceneDrawer:
     def _slide(self, touch: Touch, others: list[Touch], begin: float, end: float) -> list[tuple[float, Touch]]:
         """When it begins to slide and when it arrives, at up to 0.3 m/s; nothing where there is no way."""
         for _ in range(TRIES):
-            x, y = (float(v) for v in self.rng.uniform(-INSIDE_M, INSIDE_M, 2))
+            x, y = self._place(touch.radius, None)
             way = float(np.hypot(x - touch.x, y - touch.y))
             seconds = way / float(self.rng.uniform(0.03, 0.3))
             along = [(touch.x + s * (x - touch.x), touch.y + s * (y - touch.y)) for s in np.linspace(0, 1, 20)]
-            clear = all(np.hypot(a - o.x, b - o.y) >= self.apart_m for a, b in along for o in others)
+            clear = all(np.hypot(a - o.x, b - o.y) >= self._apart(touch.radius, o) for a, b in along for o in others)
             if way > 0.01 and clear and seconds < end - begin:
                 start = begin + float(self.rng.uniform(0, end - begin - seconds))
                 return [(start, touch), (start + seconds, replace(touch, x=x, y=y))]
@@ -164,20 +180,12 @@ class SceneDrawer:
         if situation == "untouched":
             self.t = at + lasts + RECOVERS_S
         else:
-            touches = [self._touch(*self._near(electrode))] if situation == "electrode" else []
-            touches = touches or self._touches(2 if situation == "two" else 1)
+            beside = self._touch(electrode=electrode) if situation == "electrode" else None
+            touches = [beside] if beside else self._touches(2 if situation == "two" else 1)
             end = self._press(touches, at, 0.8 + lasts + 1.0, situation == "sliding")
             at, self.t = at + (0.0 if situation == "begins" else 0.8), end + RECOVERS_S
         kinds = list(FAULT_KINDS)
         FAULT_KINDS[kinds[self.rng.integers(len(kinds))]](self, situation, at, lasts, electrode)
-
-    def _near(self, electrode: int) -> tuple[float, float]:
-        """A place 6 to 12 mm from the middle of an electrode, towards the centre of the sheet."""
-        skin = self.sheet.skin
-        x, y = skin.point(skin.electrodes[[electrode]])[0] * skin.metres_per_unit
-        far = float(np.hypot(x, y))
-        inward = 1 - float(self.rng.uniform(0.006, 0.012)) / far
-        return float(np.clip(x * inward, -INSIDE_M, INSIDE_M)), float(np.clip(y * inward, -INSIDE_M, INSIDE_M))
 
     def _cue(self, situation: str, at: float, lasts: float, fault: str, names: tuple[str, ...], **args: object) -> None:
         self.cues.append(Cue(at, fault, args, lasts))
@@ -205,8 +213,9 @@ class SceneDrawer:
         self._cue(situation, at, lasts, "stale_rtia", ("gain",), gain=gain)
 
     def _stuck_bit(self, situation: str, at: float, lasts: float, electrode: int) -> None:
-        args = {"mux": MUXES[self.rng.integers(4)], "bit": int(self.rng.integers(4)), "value": int(self.rng.integers(2))}
-        self._cue(situation, at, lasts, "mux_stuck", ("multiplexer",), **args)
+        bit, value = int(self.rng.integers(4)), int(self.rng.integers(2))
+        mux = MUXES[self.rng.integers(4)]
+        self._cue(situation, at, lasts, "mux_stuck", ("multiplexer",), mux=mux, bit=bit, value=value)
 
     def _open(self, situation: str, at: float, lasts: float, electrode: int) -> None:
         self._cue(situation, at, lasts, "electrode_open", ("electrode_open",), electrode=electrode)

@@ -22,8 +22,8 @@ WORST = ("phantom", "hidden", "refused", "aged", "force 6 sigma", "place 6 sigma
 
 @dataclass
 class TrustScore(Counts):
-    """counts: by name, some with a phase or a fault after a slash. sigmas: "force/hold/-37" -> how many frames had a
-    sigma in that bin. failures: by session, what was wrong in it.
+    """counts, sums: by name, some with a phase or a fault after a slash. sigmas: "force/hold/-37" -> how many frames
+    had a sigma in that bin.
     """
 
     seconds: float = 0.0  # simulated
@@ -71,9 +71,8 @@ class TrustScore(Counts):
     @classmethod
     def of(cls, found: Mapping[str, Any]) -> Self:
         """From what `to_dict` gave. Raises KeyError, TypeError for something else."""
-        counters = {name: Counter(found[name]) for name in ("counts", "sums", "sigmas")}
-        plain = {name: found[name] for name in ("seconds", "cpu_s", "sessions")}
-        return cls(**plain, **counters, notes=list(found["notes"]))
+        counts, sums, sigmas = (Counter(found[name]) for name in ("counts", "sums", "sigmas"))
+        return cls(found["seconds"], found["cpu_s"], found["sessions"], counts, sums, sigmas, list(found["notes"]))
 
     def row(self) -> dict[str, Any]:
         """The figures of a table."""

@@ -1,4 +1,4 @@
-"""One session played: the board's bytes through acquisition's own source, in simulated time, to one candidate or more."""
+"""One session played: the board's bytes through acquisition's own source, in simulated time, to some candidates."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What real skins do, as named worlds: foam, warmth, contact impedances and interference. No estimator is known here."""
+"""What real skins do, as named worlds: foam, warmth, contact impedances, interference. No estimator is known here."""

@@ -99,7 +99,8 @@ class Disturbances:
         if self.hum is not None:
             wave = np.sqrt(2) * np.sin(2 * np.pi * (self.hum.phase(instants) + self._turns))
             wave *= self.hum.on(instants, self.seed)
-            added += self.hum.share * np.abs(z) * wave * (self._pickup[rows[:, 2]] - self._pickup[rows[:, 3]]) / np.sqrt(2)
+            between = (self._pickup[rows[:, 2]] - self._pickup[rows[:, 3]]) / np.sqrt(2)
+            added += self.hum.share * np.abs(z) * wave * between
         return added
 
     def _contacts(self, instants: Array) -> Array:

@@ -1,8 +1,8 @@
 """Foam that creeps under a touch and remembers it.
 
-The drop that a force makes grows while the force lasts, J(t) = 1 + c(t) times what it is at once, and each change of the
-force adds by itself (Boltzmann's superposition: J. D. Ferry, "Viscoelastic Properties of Polymers", 1980, chapter 1). So
-what stays after a release is what crept in, and it fades as it came.
+The drop that a force makes grows while the force lasts, J(t) = 1 + c(t) times what it is at once, and each change of
+the force adds by itself (Boltzmann's superposition: J. D. Ferry, "Viscoelastic Properties of Polymers", 1980, chapter
+1). So what stays after a release is what crept in, and it fades as it came.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ class PowerCreep(Creep):
         if t <= 0:
             return 0.0
         n = self.exponent
-        return self.share * (((t + self.early_s) / 60) ** n - (self.early_s / 60) ** n)
+        return float(self.share * (((t + self.early_s) / 60) ** n - (self.early_s / 60) ** n))
 
     def summed(self, t: float) -> float:
         if t <= 0:
             return 0.0
         n, start = self.exponent, self.early_s / 60
         whole = 60 / (n + 1) * (((t + self.early_s) / 60) ** (n + 1) - start ** (n + 1))
-        return self.share * (whole - t * start**n)
+        return float(self.share * (whole - t * start**n))

@@ -70,14 +70,13 @@ class Nature:
         paths = list(_paths(timeline, inside))
         present = [path for path in paths if path.pose(inside, inside) is not None]
         touches = tuple(self._crept(touch, path, t) for touch, path in zip(plain.touches, present, strict=True))
-        places = [
-            (stay, path.pose(t, inside), path.pose(inside, inside)) for path in paths for stay in stays(path)
-        ]
+        places = [(stay, path.pose(t, inside), path.pose(inside, inside)) for path in paths for stay in stays(path)]
+        kept = [(stay, now) for stay, now, then in places if self._stays(stay, then, inside)]
         return replace(
             plain,
             touches=touches,
             background=plain.background * (1 + (self.even.at(t) if self.even else 0.0)),
-            residues=tuple(self._residue(stay, now, t) for stay, now, then in places if self._stays(stay, then, inside)),
+            residues=tuple(self._residue(stay, now, t) for stay, now in kept),
             gradient=self._gradient(t),
             spots=tuple(self._spots([stay for stay, _, _ in places], t, inside)),
         )

@@ -1,5 +1,5 @@
-"""The named worlds. Each has a source for its figures; each kind of trouble comes in more than one form, because a model
-that knows the form is not tried by it.
+"""The named worlds. Each has a source for its figures; each kind of trouble comes in more than one form, because a
+model that knows the form is not tried by it.
 
 Forms that are `reported` are never used to choose a number of the service: docs/reliability.md says so.
 """
@@ -50,36 +50,37 @@ CREEP = (
     "recovery, a fast and a slow one (M. van der Schuur et al., Polymer 2004, poly(ether urethane urea) foam)"
 )
 POWER = (
-    "the same in a minute, as a power of time with an exponent of 0.1 to 0.3 (W. N. Findley et al., Creep and Relaxation "
-    "of Nonlinear Viscoelastic Materials, 1976); without an end, as C. Pichler et al. found polyurethane foam to creep "
-    "(J. Eng. Mater. Technol. 2018)"
+    "the same in a minute, as a power of time with an exponent of 0.1 to 0.3 (W. N. Findley et al., Creep and "
+    "Relaxation of Nonlinear Viscoelastic Materials, 1976); without an end, as C. Pichler et al. found polyurethane "
+    "foam to creep (J. Eng. Mater. Technol. 2018)"
 )
 DEGREE = "ionic conductivity rises by 2 % a degree (aqion.de/site/112); "
+WARM_UP = DEGREE + "5 degrees with a time constant of 10 minutes: a robot's first hour"
 HAND = DEGREE + "skin of 33 degrees on foam of 23, of which a third arrives in the mean of its thickness, in 20 to 40 s"
-MAINS = "50 Hz and harmonics, five times the noise at 80 dB: an unshielded electrode beside a mains cable"
-MOTOR = "a motor's 1,800 to 18,000 turns a minute, 30 to 300 Hz, as it speeds up and slows down"
-BURST = "a drive that switches on: 50 ms of twenty times the noise at 80 dB, every two seconds"
-ELECTRODE = "1 / f noise of electrodes (E. Huigen et al., Med. Biol. Eng. Comput. 2002), 0.3 % of the contact impedance"
-NOISY = "the same as noise without memory: each measurement closes its multiplexers anew, 0.3 % of the contact impedance"
+MAINS = "50 Hz, twice the noise at 80 dB: electrodes beside a mains cable, of which filters leave little"
+MOTOR = "twice the noise at 80 dB: a motor of 1,800 to 18,000 turns a minute, 30 to 300 Hz, up and down again"
+BURST = "a drive that switches on: 50 ms of ten times the noise at 80 dB, every two seconds"
+ELECTRODE = "0.1 % of the contact impedance, as 1 / f noise (E. Huigen et al., Med. Biol. Eng. Comput. 2002)"
+NOISY = "0.1 % of the contact impedance, without memory: each measurement closes its multiplexers anew"
 JUMPS = "three contacts that lift and close under bending by 2 %, every two seconds each: random telegraph noise"
 EDGE = "foam of 5 mm is pressed beside a touch too: to where its thickness reaches, at most"
 MOUNTED = "electrodes off by 1 % of the side, a field of 5 %, anisotropy of 5 %, contact impedances of 30 %: as `mild`"
-MAINS_HUM = Hum(5e-4, 50.0)
-SWEEP_HUM = Hum(5e-4, 30.0, 300.0)
+MAINS_HUM = Hum(2e-4, 50.0)
+SWEEP_HUM = Hum(2e-4, 30.0, 300.0)
 
 WORLDS: Mapping[str, Ailment] = {
     "plain": Ailment("nothing but noise", "80 dB, as the board's converter has"),
     "creep": Ailment("foam relaxes and remembers, exponentially", CREEP, foam="exponentials"),
     "creep-power": Ailment("foam relaxes and remembers, as a power of time", POWER, foam="power", reported=True),
-    "warming": Ailment("the sheet warms evenly by 5 degrees in 10 minutes", DEGREE + "a robot's first hour", warmth=("even",)),
+    "warming": Ailment("the sheet warms evenly, at first by half a degree a minute", WARM_UP, warmth=("even",)),
     "gradient": Ailment("one side warms more", DEGREE + "a drive under one side", warmth=("even", "slope")),
     "warm-spot": Ailment("one place warms by 3 degrees", DEGREE + "a motor underneath", warmth=("spot",)),
     "warm-hand": Ailment("the touching hand warms its place", HAND, warmth=("hand",), reported=True),
     "line": Ailment("a disturbing line", MAINS, hum=MAINS_HUM),
     "sweep": Ailment("a disturbing frequency that sweeps", MOTOR, hum=SWEEP_HUM, reported=True),
-    "bursts": Ailment("bursts of disturbance", BURST, hum=Hum(2e-3, 120.0, on_s=0.05)),
-    "noisy-contacts": Ailment("noisy contact impedances", NOISY, flicker=Flicker(3e-3, (1e-6,))),
-    "flicker": Ailment("flickering contact impedances", ELECTRODE, flicker=Flicker(3e-3)),
+    "bursts": Ailment("bursts of disturbance", BURST, hum=Hum(1e-3, 120.0, on_s=0.05)),
+    "noisy-contacts": Ailment("noisy contact impedances", NOISY, flicker=Flicker(1e-3, (1e-6,))),
+    "flicker": Ailment("flickering contact impedances", ELECTRODE, flicker=Flicker(1e-3)),
     "telegraph": Ailment("contact impedances that jump", JUMPS, telegraph=Telegraph(0.02, 2.0), reported=True),
     "soft-1.5": Ailment("edges of touches soft by 1.5 mm", EDGE, edge_m=1.5e-3, reported=True),
     "soft-3": Ailment("edges of touches soft by 3 mm", EDGE, edge_m=3e-3),
@@ -92,7 +93,7 @@ WORLDS: Mapping[str, Ailment] = {
         warmth=("even", "slope"),
         edge_m=3e-3,
         mounted=True,
-        flicker=Flicker(3e-3),
+        flicker=Flicker(1e-3),
         hum=MAINS_HUM,
     ),
     "all-reported": Ailment(
