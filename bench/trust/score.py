@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -66,7 +66,7 @@ class TrustScore(Counts):
         return self.sums[f"{of} log"] / n if n else None
 
     def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        return vars(self)
 
     @classmethod
     def of(cls, found: Mapping[str, Any]) -> Self:

@@ -25,6 +25,7 @@ MESH = "world"  # of these worlds alone
 SKINS = 4  # skins of a kind that is mounted wrong
 PLACE_M = 0.03  # of a warm spot, from the centre
 PER_DEGREE = 0.02  # of conductivity
+WARMS_S = 6.0  # from when on: while the sheet warms as fast as at first, no baseline is taken at all
 
 
 @dataclass(frozen=True)
@@ -150,12 +151,14 @@ def nature(name: str, seed: int) -> Nature | None:
         found["creep"] = PowerCreep(1.5 * minute, float(rng.uniform(0.1, 0.3)))
     angle = float(rng.uniform(0, 2 * np.pi))
     if "even" in ailment.warmth:
-        found["even"] = Rise(5 * PER_DEGREE, 600.0)
+        found["even"] = Rise(5 * PER_DEGREE, 600.0, WARMS_S)
     if "slope" in ailment.warmth:
-        found["sloped"], found["slope"] = Rise(PER_DEGREE / 0.05, 600.0), (float(np.cos(angle)), float(np.sin(angle)))
+        found["sloped"] = Rise(PER_DEGREE / 0.05, 600.0, WARMS_S)
+        found["slope"] = float(np.cos(angle)), float(np.sin(angle))
     if "spot" in ailment.warmth:
         place = rng.uniform(-PLACE_M, PLACE_M, 2)
-        found["spot"], found["spot_place"] = Rise(3 * PER_DEGREE, 120.0), (float(place[0]), float(place[1]), 0.02)
+        found["spot"] = Rise(3 * PER_DEGREE, 120.0, WARMS_S)
+        found["spot_place"] = float(place[0]), float(place[1]), 0.02
     if "hand" in ailment.warmth:
         found["hand"] = Rise(10 / 3 * PER_DEGREE, float(rng.uniform(20, 40)))
     return Nature(**found)
