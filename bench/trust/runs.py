@@ -51,9 +51,9 @@ def own_runtime() -> Iterator[None]:
 
 
 @lru_cache(maxsize=4)
-def _made(name: str, scan: str, bundle: str) -> candidate.Candidate:
-    skin = _skin(scan, bundle)
-    return candidate.made(name, skin, Bundle.load(bundle))
+def _made(name: str, text: str, scan: str, bundle: str) -> candidate.Candidate:
+    """The candidate of this name: two that are of one class are two."""
+    return candidate.made(text, _skin(scan, bundle), Bundle.load(bundle))
 
 
 def _skin(scan: str, bundle: str) -> Skin:
@@ -64,7 +64,7 @@ def play(task: SessionTask) -> dict[str, TrustScore]:
     """Play one session; a failing one is recorded."""
     sheet = table.sheet(task.plan.world, task.plan.seed)
     played = PlayedSession(task.plan, sheet, _skin(task.scan, task.bundle), Bundle.load(task.bundle))
-    scores = played.judged({name: _made(text, task.scan, task.bundle) for name, text in task.candidates})
+    scores = played.judged({name: _made(name, text, task.scan, task.bundle) for name, text in task.candidates})
     if task.recording is not None and any(failures(score) for score in scores.values()):
         played.record(task.recording)
     return scores

@@ -18,7 +18,7 @@ from firmware_stub.rig import Rig
 from firmware_stub.sheet import Sheet
 from firmware_stub.truth import truth_frame
 from models.bundle import Bundle
-from protocol.frames import RawFrame, pack, unpack
+from protocol.frames import ContactFrame, RawFrame, pack, unpack
 from services.recordings import settings
 from services.recordings.recording import RecordingWriter
 from services.runtime.config import Skin
@@ -41,10 +41,13 @@ class SessionPlan:
 class PlayedSession:
     """A scene on a skin of a world, with candidates that get the same raw frames."""
 
-    def __init__(self, plan: SessionPlan, sheet: Sheet, skin: Skin, bundle: Bundle) -> None:
+    def __init__(
+        self, plan: SessionPlan, sheet: Sheet, skin: Skin, bundle: Bundle, scene: TrustScene | None = None
+    ) -> None:
+        """scene: what happens; None: what is drawn from the plan."""
         self.plan, self.sheet, self.skin = plan, sheet, skin
         self.rig = Rig(sheet, seed=plan.seed, world=plan.world)
-        self.scene: TrustScene = SceneDrawer(sheet, plan.seed, plan.seconds, plan.apart_m).draw()
+        self.scene = scene or SceneDrawer(sheet, plan.seed, plan.seconds, plan.apart_m).draw()
         self.rig.field.play(self.rig.timeline(self.scene.script, 0.0), 0.0)
         self.host = Host(self.rig, plan.seed, skin, bundle)
         self.messages: list[tuple[str, float, bytes]] = []  # topic, when, what: all that a recording needs
@@ -61,12 +64,21 @@ class PlayedSession:
 
     def judged(self, candidates: Mapping[str, Candidate]) -> dict[str, TrustScore]:
         """The score of each."""
-        truth = SceneTruth(self.scene, self.sheet)
+        truth, began = SceneTruth(self.scene, self.sheet), time.process_time()
         judges = {name: Judge(truth, self.plan.name) for name in candidates}
+        for name, contact in self.contacts(candidates):
+            judges[name].look(self.host.now, contact, candidates[name].refused)
+        scores = {name: judge.finish() for name, judge in judges.items()}
+        for score in scores.values():
+            score.cpu_s = time.process_time() - began
+        self.rig.close()
+        return scores
+
+    def contacts(self, candidates: Mapping[str, Candidate]) -> Iterator[tuple[str, ContactFrame]]:
+        """What each says, frame by frame; `host.now` is when."""
         for candidate in candidates.values():
             candidate.reset()
         tares = list(self.scene.tares)
-        began = time.process_time()
         for raw in self.raws():
             tared = bool(tares) and self.host.now >= tares[0]
             if tared:
@@ -76,12 +88,7 @@ class PlayedSession:
                     candidate.tare()
                 contact = candidate.step(raw if len(candidates) == 1 else _copy(raw))
                 if contact is not None:
-                    judges[name].look(self.host.now, contact, candidate.refused)
-        scores = {name: judge.finish() for name, judge in judges.items()}
-        for score in scores.values():
-            score.cpu_s = time.process_time() - began
-        self.rig.close()
-        return scores
+                    yield name, contact
 
     def record(self, path: Path) -> None:
         """Keep the raw frames and the truth as a recording that replays."""
