@@ -185,7 +185,8 @@ class Judge:
             self._note(t, f"{what}: {text}")
 
     def _note(self, t: float, text: str) -> None:
-        last = max((each for each in self.truth.scene.troubles if each.begin <= t), key=_begin, default=None)
+        lately = (each for each in self.truth.scene.troubles if each.begin <= t <= each.end + RECOVERS_S)
+        last = max(lately, key=_begin, default=None)
         after = f", {last.what} ({last.situation or 'link'}) since {last.begin:.2f} s" if last is not None else ""
         if len(self.score.notes) < 20:
             self.score.notes.append(f"{self.name} {t:.2f} s: {text}{after}")
