@@ -2,6 +2,7 @@
 
     skin bench trust --minutes 10 --world plain --scan full
     skin bench trust --minutes 10               every world, both kinds of scan
+    skin bench trust --floor                    the smallest forces that are shown, by radius
     skin bench trust --worlds                   the worlds, and where their figures come from
     skin bench trust --quick                    the short form of CI: a session of each, by a fixed seed
 
@@ -22,7 +23,7 @@ from bench import REPORTS
 from bench.reliability import report as reports
 from bench.reliability import workers
 from bench.speed.service import end_on_sigterm
-from bench.trust import kept, report, runs
+from bench.trust import floor, kept, report, runs
 from firmware_stub.worlds.table import WORLDS
 
 QUICK_SEED = "7"
@@ -44,6 +45,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench trust", description=(__doc__ or "").split("\n\n")[0])
     arguments(parser, 10.0)
     parser.add_argument("--quick", action="store_true", help="one short session of each, by a fixed seed")
+    parser.add_argument("--floor", action="store_true", help="the smallest forces that are shown, in the plain world")
     parser.add_argument("--worlds", action="store_true", help="list the worlds, and end")
     args = parser.parse_args(argv)
     if args.worlds:
@@ -56,6 +58,11 @@ def main(argv: list[str] | None = None) -> int:
     except ValueError as why:
         parser.error(str(why))
     end_on_sigterm()
+    if args.floor:
+        with runs.own_runtime():
+            found = {scan: floor.measured(scan, kept.session_seed(args.seed, "floor", 0)) for scan in runs.SCANS}
+        report.show_floor(found)
+        return 0
     began, rows = time.perf_counter(), {}
     session_s = runs.QUICK_S if args.quick else runs.SESSION_S
     minutes = runs.QUICK_S / 60 if args.quick else args.minutes

@@ -53,6 +53,16 @@ def show(rows: Mapping[str, Mapping[str, Any]], title: str) -> None:
     console().print(table_of(f"{title}: what refusing or a wide sigma would hide", "world, scan", ERRORS, rows.items()))
 
 
+def show_floor(found: Mapping[str, Mapping[float, Mapping[str, Any]]]) -> None:
+    """found: by scan and radius [m], as floor.measured gives it."""
+    columns = (
+        ("shown in 99.9 % from, N", "shown_n", "{:.2f}"),
+        ("sigma below a quarter from, N", "sure_n", "{:.2f}"),
+    )
+    rows = [(f"{scan}, {1e3 * radius:.0f} mm", row) for scan, each in found.items() for radius, row in each.items()]
+    console().print(table_of("the skin's own floor, plain world, discs", "scan, radius", columns, rows))
+
+
 def goals(rows: Mapping[str, Mapping[str, Any]], quick: bool) -> list[Goal]:
     """Over all worlds, but for the shares of the plain one. Gates are of the short form only."""
     total = {key: sum(row[key] for row in rows.values()) for _, key, form in WRONG if form == "{:.0f}"}

@@ -53,17 +53,18 @@ def own_runtime() -> Iterator[None]:
 @lru_cache(maxsize=4)
 def _made(name: str, text: str, scan: str, bundle: str) -> candidate.Candidate:
     """The candidate of this name: two that are of one class are two."""
-    return candidate.made(text, _skin(scan, bundle), Bundle.load(bundle))
+    return candidate.made(text, skin_of(scan, bundle), Bundle.load(bundle))
 
 
-def _skin(scan: str, bundle: str) -> Skin:
+def skin_of(scan: str, bundle: str) -> Skin:
+    """The skin that is judged, as skin.toml would have it."""
     return Skin.model_validate({"port": "stub", "bundle": bundle, "frame_id": "palm", "scan": scan})
 
 
 def play(task: SessionTask) -> dict[str, TrustScore]:
     """Play one session; a failing one is recorded."""
     sheet = table.sheet(task.plan.world, task.plan.seed)
-    played = PlayedSession(task.plan, sheet, _skin(task.scan, task.bundle), Bundle.load(task.bundle))
+    played = PlayedSession(task.plan, sheet, skin_of(task.scan, task.bundle), Bundle.load(task.bundle))
     scores = played.judged({name: _made(name, text, task.scan, task.bundle) for name, text in task.candidates})
     if task.recording is not None and any(failures(score) for score in scores.values()):
         played.record(task.recording)

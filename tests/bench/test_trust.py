@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.trust import __main__ as trust
-from bench.trust import kept, runs, shadow
+from bench.trust import floor, kept, runs, shadow
 from bench.trust.candidate import Today
 from bench.trust.judge import Judge
 from bench.trust.scene import BEGIN_S, SceneDrawer, Trouble, TrustScene
@@ -233,6 +233,21 @@ def test_minutes_of_earlier_runs_count(tmp_path: Path) -> None:
     first = runs.run("plain", "full", "6", 0.15, session_s=9.0, folder=tmp_path)["today"]
     same = runs.run("plain", "full", "6", 0.15, session_s=9.0, folder=tmp_path)["today"]
     assert (first.sessions, same.sessions) == (1, 1) and same.cpu_s == first.cpu_s
+
+
+def test_the_floor_is_the_force_from_which_on_all_are_shown() -> None:
+    steps = [floor.LadderStep(0.01, force, 0.0, 0.0, 0.0, 1.0) for force in (0.1, 0.2, 0.4, 0.8)]
+    said = [(0, 0.05), (999, 0.05), (1000, 0.2), (1000, 0.1)]  # shown of 1000, sigma
+    frames_of = {}
+    for step, (shown, sigma) in zip(steps, said, strict=True):
+        right = ContactFrame(skin="palm", valid=True, contacts=[contact(0.0, 0.0, step.force, sigma=sigma)])
+        none = ContactFrame(skin="palm", valid=True, contacts=[])
+        frames_of[step] = [right] * shown + [none] * (1000 - shown)
+    assert floor.floors(frames_of) == {0.01: {"shown_n": 0.2, "sure_n": 0.8}}
+    frames_of[steps[2]] = [replace(frame, valid=False) for frame in frames_of[steps[2]]]
+    assert floor.floors(frames_of) == {0.01: {"shown_n": 0.8, "sure_n": 0.8}}
+    drawn, ladder = floor.ladder()
+    assert {step.radius for step in ladder} == set(floor.RADII_M) and drawn.seconds < 400
 
 
 def test_worlds_are_listed_and_others_refused(capsys: pytest.CaptureFixture[str]) -> None:
