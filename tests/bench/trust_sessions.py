@@ -7,6 +7,7 @@ from bench.trust.candidate import Today
 from bench.trust.scene import TrustScene
 from bench.trust.session import PlayedSession, SessionPlan
 from firmware_stub import scene as scenes
+from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import PiecewiseLinear, Script, TouchPath
 from firmware_stub.world import Touch
 from firmware_stub.worlds import table
@@ -31,10 +32,12 @@ def scene(
     return TrustScene(seconds, Script("test", tracks=tracks, contact=contact), (), tares)
 
 
-def played(what: TrustScene, scan: str, seed: int = 3, world: str = "plain") -> PlayedSession:
+def played(
+    what: TrustScene, scan: str, seed: int = 3, world: str = "plain", sheet: Sheet | None = None
+) -> PlayedSession:
     skin = Skin.model_validate({"port": "stub", "bundle": "square16", "frame_id": "palm", "scan": scan})
     plan = SessionPlan(world, seed, what.seconds)
-    return PlayedSession(plan, table.sheet(world, seed), skin, Bundle.load("square16"), what)
+    return PlayedSession(plan, sheet or table.sheet(world, seed), skin, Bundle.load("square16"), what)
 
 
 def today(session: PlayedSession) -> Today:
