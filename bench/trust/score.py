@@ -10,18 +10,15 @@ from typing import Any, Self
 
 import numpy as np
 
-from bench.reliability.counts import Counts
-
 BINS = 40  # a decade of sigma
 PHASES = ("begin", "hold", "slide", "end")
 NOTES = 60
-KEPT_FAILURES = 200
 WORST = ("phantom", "hidden", "refused", "aged", "force 6 sigma", "place 6 sigma", "wrong count")
 """What makes a session a failing one, the worst first."""
 
 
 @dataclass
-class TrustScore(Counts):
+class TrustScore:
     """counts, sums: by name, some with a phase or a fault after a slash. sigmas: "force/hold/-37" -> how many frames
     had a sigma in that bin.
     """
@@ -35,8 +32,12 @@ class TrustScore(Counts):
     notes: list[str] = field(default_factory=list)
 
     def add(self, other: Self) -> None:
-        super().add(other)
-        self.notes = self.notes[:NOTES]
+        self.seconds += other.seconds
+        self.cpu_s += other.cpu_s
+        self.sessions += other.sessions
+        for mine, more in ((self.counts, other.counts), (self.sums, other.sums), (self.sigmas, other.sigmas)):
+            mine.update(more)  # a sum of counters would lose what is below zero
+        self.notes = [*self.notes, *other.notes][:NOTES]
 
     def sigma(self, of: str, phase: str, value: float) -> None:
         self.sigmas[f"{of}/{phase}/{math.floor(math.log10(max(value, 1e-12)) * BINS)}"] += 1

@@ -155,6 +155,10 @@ def test_scores_add_up_and_survive_the_disk(tmp_path: Path) -> None:
     again = kept.KeptScore("plain-full", "seed", tmp_path).score
     assert again.counts["hidden"] == 2 and again.seconds == 24.0 and again.sessions == 2
     assert again.median_sigma("force") == one.median_sigma("force")
+    bad = judged(HELD, {7.0: [contact(0.02, 0.0, 6.0)], 11.0: None})
+    store.add(bad)
+    assert bad.sums["force log"] < 0
+    assert store.score.sums["force log"] == pytest.approx(2 * one.sums["force log"] + bad.sums["force log"])
     assert kept.KeptScore("plain-full", "other", tmp_path).number == 0
 
 
