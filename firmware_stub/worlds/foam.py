@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 
-class Creep(ABC):
+class CreepLaw(ABC):
     """c(t), what a force that began t seconds ago has added to its drop, relative; 0 until it begins."""
 
     def added(self, t: float, times: Sequence[float], values: Sequence[float]) -> float:
@@ -38,7 +38,7 @@ class Creep(ABC):
 
 
 @dataclass(frozen=True)
-class ExponentialCreep(Creep):
+class ExponentialCreep(CreepLaw):
     """c(t) = sum of share (1 - exp(-t / tau))."""
 
     terms: tuple[tuple[float, float], ...]  # (share, tau [s])
@@ -53,7 +53,7 @@ class ExponentialCreep(Creep):
 
 
 @dataclass(frozen=True)
-class PowerCreep(Creep):
+class PowerCreep(CreepLaw):
     """c(t) = share ((t + 0.1 s) / 60 s)^exponent, less what that is at 0."""
 
     share: float  # added in a minute, nearly

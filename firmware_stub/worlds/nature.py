@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from firmware_stub.timeline import Timeline, TouchPath, WorldSegment
 from firmware_stub.world import Touch, WarmSpot, World
 
-from .foam import Creep
+from .foam import CreepLaw
 from .stays import Stay, stays
 
 FIRST_S, GROWS, LONGEST_S = 0.05, 1.3, 1.0
@@ -44,7 +44,7 @@ class Nature:
     each touch that stays, `hand_radius` times as wide as it.
     """
 
-    creep: Creep | None = None
+    creep: CreepLaw | None = None
     even: Rise | None = None
     sloped: Rise | None = None
     slope: tuple[float, float] = (1.0, 0.0)

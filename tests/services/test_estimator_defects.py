@@ -33,7 +33,7 @@ def _own_runtime():
     strict=True, raises=AssertionError, reason="contact_drift takes the order of the pattern for the order of time"
 )
 def test_a_contact_impedance_that_rises_within_a_scan_is_named_in_parts() -> None:
-    """Each rises for 40 ms. Parts come every 4.4 ms: of 60 ms since its beginning four lie after its end."""
+    """Each rises for 40 ms. Parts come every 4.4 ms: of 50 ms since its beginning two lie after its end."""
     rng = np.random.default_rng(4)
     begins = [7.0 + 2 * n + float(rng.uniform(0, SCAN_S)) for n in range(6)]
     electrodes = rng.permutation(16)[: len(begins)].tolist()
@@ -44,7 +44,7 @@ def test_a_contact_impedance_that_rises_within_a_scan_is_named_in_parts() -> Non
     named = set()
     for t, frame in frames(scene(19.0, contact=rises), "rolling"):
         if "electrode_drift" in frame.reasons:
-            named |= {n for n, begin in enumerate(begins) if begin <= t <= begin + 0.06}
+            named |= {n for n, begin in enumerate(begins) if begin <= t <= begin + 0.05}
     assert len(named) >= len(begins) - 1
 
 
