@@ -127,7 +127,7 @@ BENCHMARKS = (
         ("--quick", "--cores", "1"),
         limits="docs/reliability.md says of each world what is wrong today; tests/services/test_estimator_defects.py "
         "fails of it.",
-        arguments=("--minutes", "5"),
+        arguments=("--minutes", "3", "--cores", "1"),
         beside=True,
     ),
     Benchmark("untouched_parts", "False touches of scans in parts", ("--quick",), beside=True),
