@@ -13,7 +13,7 @@ import numpy as np
 BINS = 40  # a decade of sigma
 PHASES = ("begin", "hold", "slide", "end")
 NOTES = 60
-WORST = ("phantom", "hidden", "refused", "aged", "force 6 sigma", "place 6 sigma", "wrong count")
+WORST = ("phantom", "hidden", "never shown", "refused", "aged", "force 6 sigma", "place 6 sigma", "wrong count")
 """What makes a session a failing one, the worst first."""
 
 
