@@ -17,33 +17,18 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from pathlib import Path
 
-from bench import REPORTS
 from bench.reliability import report as reports
-from bench.reliability import workers
 from bench.speed.service import end_on_sigterm
-from bench.trust import floor, kept, report, runs
+from bench.trust import floor, kept, options, report, runs
 from firmware_stub.worlds.table import WORLDS
 
 QUICK_SEED = "7"
 
 
-def arguments(parser: argparse.ArgumentParser, minutes: float) -> None:
-    """Those that `skin bench shadow` has too."""
-    parser.add_argument("--minutes", type=float, default=minutes, help="simulated, of each world and kind of scan")
-    parser.add_argument("--world", nargs="+", choices=tuple(WORLDS), metavar="WORLD", help="default: every one")
-    parser.add_argument("--scan", choices=runs.SCANS, help="whole scans, or scans in parts; default: both")
-    parser.add_argument("--seed", help="a text instead of the commit")
-    parser.add_argument("--apart-mm", type=float, default=28.0, help="least distance of two touches (default: 28)")
-    parser.add_argument("--bundle", default="square16")
-    parser.add_argument("--cores", type=int, default=workers.cores())
-    parser.add_argument("--out", type=Path, default=REPORTS)
-
-
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench trust", description=(__doc__ or "").split("\n\n")[0])
-    arguments(parser, 10.0)
+    options.add(parser, 10.0)
     parser.add_argument("--quick", action="store_true", help="one short session of each, by a fixed seed")
     parser.add_argument("--floor", action="store_true", help="the smallest forces that are shown, in the plain world")
     parser.add_argument("--worlds", action="store_true", help="list the worlds, and end")

@@ -19,8 +19,7 @@ from typing import Any
 from bench.goals import Goal
 from bench.reliability import report as reports
 from bench.speed.service import end_on_sigterm
-from bench.trust import __main__ as trust
-from bench.trust import candidate, kept, report, runs
+from bench.trust import candidate, kept, options, report, runs
 from firmware_stub.worlds.table import WORLDS
 
 COUNTED = ("phantom frames", "wrong counts", "hidden", "never shown", "ids", "refused", "aged", "force 6", "place 6")
@@ -48,7 +47,7 @@ def compared(world: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench shadow", description=(__doc__ or "").split("\n\n")[0])
-    trust.arguments(parser, 10.0)
+    options.add(parser, 10.0)
     parser.add_argument("--candidate", default=candidate.TODAY, metavar="MODULE:CLASS", help="default: %(default)s")
     parser.add_argument("--session", type=float, default=runs.SESSION_S, help="seconds of one (default: 60)")
     args = parser.parse_args(argv)
