@@ -121,6 +121,15 @@ BENCHMARKS = (
         ("--seconds", "8", "--rounds", "2"),
         limits="What viewers cost the pipeline is the processor that ten of them, here on the same cores, have.",
     ),
+    Benchmark(
+        "trust",
+        "Worlds that nobody tuned to",
+        ("--quick", "--cores", "1"),
+        limits="docs/reliability.md says of each world what is wrong today; tests/services/test_estimator_defects.py "
+        "fails of it.",
+        arguments=("--minutes", "3", "--cores", "1"),
+        beside=True,
+    ),
     Benchmark("untouched_parts", "False touches of scans in parts", ("--quick",), beside=True),
     Benchmark("tracking", "Ten minutes of contacts", ("--seconds", "60"), beside=True),
     Benchmark(

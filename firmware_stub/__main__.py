@@ -12,6 +12,7 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Iterable
 
 import zmq
 
@@ -29,6 +30,7 @@ from .faults import FAULTS
 from .port import open_port, tcp_address
 from .rig import Rig
 from .stub_skin import StubSkin, link_name, unique_id
+from .worlds.table import WORLDS
 
 log = logging.getLogger("stub")
 PARENT_CHECK_S = 0.5
@@ -54,6 +56,12 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         metavar="[SKIN=]NAME",
         help="by what a sheet, or every sheet, differs from what its file says: a name of models/mismatch.py (mild)",
     )
+    add(
+        "--world",
+        action="append",
+        metavar="[SKIN=]NAME",
+        help="what a skin, or every skin, does beside, as real ones do: a name of worlds/table.py (creep)",
+    )
     add("--scene", default="demo", help=f"one of {', '.join(scenes.names())}, or a .toml file (default: %(default)s)")
     add("--snr", type=float, default=80.0, help="signal over noise in dB, at 128 DFT points (default: %(default)s)")
     add("--floor", type=float, default=0.0, help="noise floor in ohm (default: %(default)s)")
@@ -75,14 +83,10 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         if name in options.skins:
             parser.error(f"--skin {name!r} is given twice: expected one board for each skin")
         options.skins[name] = sheet or options.geometry
-    options.mismatches = dict.fromkeys(options.skins, "none")
-    for text in options.mismatch or []:
-        name, _, mismatch = text.rpartition("=")
-        if name and name not in options.skins:
-            parser.error(f"--mismatch {text!r}: no skin {name!r}; expected one of {', '.join(options.skins)}")
-        if mismatch not in NAMED:
-            parser.error(f"--mismatch {text!r}: expected one of {', '.join(NAMED)}")
-        options.mismatches |= dict.fromkeys([name] if name else options.skins, mismatch)
+    options.mismatches = _of_skins(parser, options.skins, "--mismatch", options.mismatch, NAMED, "none")
+    options.worlds = _of_skins(parser, options.skins, "--world", options.world, WORLDS, "")
+    if any(world and options.mismatches[name] != "none" for name, world in options.worlds.items()):
+        parser.error("--world and --mismatch of one skin: a world has a sheet of its own; expected one of them")
     if options.rate is not None and not 0.1 <= options.rate <= 10_000:
         parser.error(f"--rate {options.rate:g}: expected 0.1 to 10000 full scans per second")
     for name, value, low, high in (
@@ -94,6 +98,26 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         if not low <= value <= high:
             parser.error(f"{name} {value:g}: expected {low:g} to {high:g}")
     return options
+
+
+def _of_skins(
+    parser: argparse.ArgumentParser,
+    skins: Iterable[str],
+    option: str,
+    given: list[str] | None,
+    allowed: Iterable[str],
+    default: str,
+) -> dict[str, str]:
+    """Each skin's name of what an option names as [SKIN=]NAME; ends the program where there is no such skin or name."""
+    found = dict.fromkeys(skins, default)
+    for text in given or []:
+        skin, _, name = text.rpartition("=")
+        if skin and skin not in found:
+            parser.error(f"{option} {text!r}: no skin {skin!r}; expected one of {', '.join(found)}")
+        if name not in allowed:
+            parser.error(f"{option} {text!r}: expected one of {', '.join(allowed)}")
+        found |= dict.fromkeys([skin] if skin else found, name)
+    return found
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -151,6 +175,7 @@ def _open(options: argparse.Namespace, skins: dict[str, StubSkin]) -> int:
             seed=None if options.seed is None else options.seed + n,
             unique_id=unique_id(name),
             threaded=True,
+            world=options.worlds[name],
             answers_time=not options.no_time,
         )
         for n, (name, sheet) in enumerate(options.skins.items())

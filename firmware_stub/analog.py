@@ -17,6 +17,7 @@ from protocol.ad5940 import DATA_MAX, decode_fifo, dft_pair, encode_fifo, impeda
 from protocol.frame_types import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA
 
 from .faults import MUXES, Faults
+from .worlds.disturbances import Disturbances
 
 CURRENT_A = 1e-5
 FULL_SCALE_V = 0.9  # amplitude the converter takes at PGA 1
@@ -71,8 +72,14 @@ def clip(amplitude: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
 class Analog:
     """Measures scan lists; keeps its random numbers and what the last result was."""
 
-    def __init__(self, noise: BoardNoise, faults: Faults, rng: np.random.Generator) -> None:
-        self.noise, self.faults, self.rng = noise, faults, rng
+    def __init__(
+        self,
+        noise: BoardNoise,
+        faults: Faults,
+        rng: np.random.Generator,
+        disturbances: Disturbances | None = None,
+    ) -> None:
+        self.noise, self.faults, self.rng, self.disturbances = noise, faults, rng, disturbances
 
     def measure(
         self,
@@ -82,12 +89,16 @@ class Analog:
         rtia: float,
         now: float,
         weights: NDArray[np.float64] | None = None,
+        instants: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.complex64], NDArray[np.uint8]]:
         """Z (K,) ohm and status (K,) of one scan. transfer: m matrices; weights (K, m): each one's share in what each
         measurement feels. Without weights the sheet goes steadily from the first of two matrices to the second.
+        instants (K,): of the measurements, where something disturbs them.
         """
         rows, driven, sensed = self._routed(scan_list, len(transfer[0]), now)
         z = self._sheet(transfer, rows, now, weights)
+        if self.disturbances is not None and instants is not None:
+            z = z + self.disturbances.ohm(rows, instants, z)
         current = np.full(len(z), CURRENT_A * EXCITATION)
         voltage = z * PHASE * current
         sigma = self.noise.sigma(z, points) * CURRENT_A

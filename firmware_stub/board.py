@@ -245,7 +245,7 @@ class Board:
         scan = np.split(np.asarray(config.scan, np.int64), config.parts)[part]
         instants = np.asarray(start + (np.arange(len(scan)) + 0.5) * ((end - start) / len(scan)))
         transfer, weights = self.field.over(instants)
-        z, status = self.analog.measure(transfer, scan, config.dft_points, config.rtia_ohm, start, weights)
+        z, status = self.analog.measure(transfer, scan, config.dft_points, config.rtia_ohm, start, weights, instants)
         if self.faults.active("frozen", start) is not None:
             z, status = self._sent.get((config.config, part), (z, status))
         self._sent[config.config, part] = z, status

@@ -122,6 +122,16 @@ FAULTS: dict[str, Fault] = {
         "a share of {fraction:g} of the scans is never sent",
         {"fraction": 0.2},
     ),
+    "late_frames": Fault(
+        "a `fraction` of the messages arrives `by` s later, after others",
+        "a share of {fraction:g} of the messages arrives {by:g} s late",
+        {"fraction": 0.1, "by": 0.02},
+    ),
+    "repeated_frames": Fault(
+        "a `fraction` of the messages arrives twice",
+        "a share of {fraction:g} of the messages arrives twice",
+        {"fraction": 0.1},
+    ),
     "line_noise": Fault(
         "`garbage` random bytes for each byte sent, and a `flips` share of bits flipped",
         "bits flip on the line to the board, and random bytes come between",

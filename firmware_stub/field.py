@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from protocol.pause import pause
 
-from .timeline import Script, Timeline, WorldSegment
+from .timeline import Timeline, WorldSegment
 from .world import World, blend, steps_between
 
 Matrix = NDArray[np.float64]
@@ -74,12 +74,12 @@ class Field:
             self._played = (*kept, (since, timeline))
         self.prepare(at)
 
-    def solve_all(self, script: Script, electrodes: int) -> int:
+    def solve_all(self, timeline: Timeline) -> int:
         """Solve every pose of a script before it is played; returns how many there are. Raises ValueError where they
         are more than are kept.
         """
-        timeline, t, worlds = Timeline(script, 0.0, (), electrodes), 0.0, {}
-        while t < script.duration:
+        script, t, worlds = timeline.script, timeline.start, dict[World, None]()
+        while t < timeline.start + script.duration:
             segment = timeline.segment(t)
             worlds.update(dict.fromkeys(_nodes(segment)))
             t = segment.end

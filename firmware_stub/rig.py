@@ -11,6 +11,7 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,10 @@ from .faults import FAULTS, Faults
 from .field import Field
 from .port import BAUD, Line
 from .sheet import Sheet
-from .timeline import Timeline, TouchPath, press_track
+from .timeline import Script, Timeline, TouchPath, press_track
 from .world import World
+from .worlds import table as worlds
+from .worlds.nature import REMEMBERED_S
 
 UNTOUCHED = "demo"  # the scene in which nothing touches
 FELT_S = 1.0  # a scan that has felt a press ends within so much of the press's end
@@ -34,7 +37,8 @@ class Rig:
     """A stub board on a sheet. Times are seconds since it was made; nothing in here looks at a clock.
 
     rate_hz: full scans per second instead of the real board's. threaded: solve ahead in a thread (see Field), and skip
-    the scans of a pause instead of making up for them. mismatch: see Sheet.
+    the scans of a pause instead of making up for them. mismatch: see Sheet. world: what the skin does beside, a name of
+    worlds/table.py, drawn from `seed`; it has a sheet of its own, unless `geometry` is one.
     """
 
     def __init__(
@@ -53,11 +57,17 @@ class Rig:
         threaded: bool = False,
         answers_time: bool = True,
         knows_parts: bool = True,
+        world: str = "",
     ) -> None:
         script = scenes.load(scene)  # first, since it fails fast
-        self.sheet = geometry if isinstance(geometry, Sheet) else Sheet(geometry, mismatch)
+        drawn = int(np.random.default_rng().integers(2**31)) if seed is None else seed
+        if isinstance(geometry, Sheet):
+            self.sheet = geometry
+        else:
+            self.sheet = worlds.sheet(world, drawn, geometry) if world else Sheet(geometry, mismatch)
+        self.nature = worlds.nature(world, drawn) if world else None
         self.faults = Faults()
-        timeline = Timeline(script, 0.0, (), self.sheet.electrodes)
+        timeline = self.timeline(script, 0.0)
         self.field = Field(self.sheet.transfer, timeline, threaded=threaded)
         self.scans: deque[tuple[Scan, World, float]] = deque(maxlen=64)
         self.line = Line(baud)
@@ -67,7 +77,12 @@ class Rig:
         full_s = len(self.sheet.skin.pattern) * measurement_s(128)
         self.board = Board(
             self.field,
-            Analog(noise, self.faults, np.random.default_rng(self._rng.integers(2**63))),
+            Analog(
+                noise,
+                self.faults,
+                np.random.default_rng(self._rng.integers(2**63)),
+                worlds.disturbances(world, drawn, self.sheet) if world else None,
+            ),
             self.faults,
             electrodes=self.sheet.electrodes,
             speed=rate_hz * full_s if rate_hz else 1.0,
@@ -77,6 +92,7 @@ class Rig:
             unique_id=unique_id,
             on_scan=self._scanned,
         )
+        self._waiting: list[tuple[float, bytes]] = []  # messages that come later
         self._unplugged: dict[str, Any] | None = None
         self._then = 0.0
         self._cued = 0.0
@@ -102,7 +118,7 @@ class Rig:
         self._then = now
         self.field.prepare(now)
         sent = []
-        for t, message in self.board.advance(now):
+        for t, message in sorted(self._held_up(self.board.advance(now), now), key=itemgetter(0)):
             sent.append(self.line.pull(t))
             self.line.push(self._cut(message, t), t)
         sent.append(self.line.pull(now))
@@ -138,9 +154,9 @@ class Rig:
                 )
         old = self.field.timeline
         finger = str(values.get("finger", ""))
-        presses = _lifted(old.presses, finger, now)
+        presses = self._lifted(old.presses, finger, now)
         track = press_track(now, seconds, touch, to, finger)
-        self.field.play(Timeline(old.script, old.start, (*presses, track), old.electrodes), now)
+        self.field.play(replace(old, presses=(*presses, track)), now)
         return {
             "x": touch.x,
             "y": touch.y,
@@ -157,7 +173,7 @@ class Rig:
         old = self.field.timeline
         gone = sum(p.times[-1] > now for p in old.presses if finger in ("", p.finger))
         if finger:
-            self.field.play(replace(old, presses=_lifted(old.presses, finger, now)), now)
+            self.field.play(replace(old, presses=self._lifted(old.presses, finger, now)), now)
             return {"released": gone, "scene_ended": None, "faults": self.faults.listing(now)}
         self.play(UNTOUCHED, now)
         return {
@@ -168,11 +184,11 @@ class Rig:
 
     def solve(self, name: str) -> int:
         """Solve every pose of a scene before it is played; returns how many. Raises SceneError, ValueError."""
-        return self.field.solve_all(scenes.load(name), self.sheet.electrodes)
+        return self.field.solve_all(self.timeline(scenes.load(name), 0.0))
 
     def play(self, name: str, now: float, wait_s: float = 0.0) -> dict[str, Any]:
         """Begin a scene now, or after wait_s seconds. Raises SceneError."""
-        timeline = Timeline(scenes.load(name), now + wait_s, (), self.sheet.electrodes)
+        timeline = self.timeline(scenes.load(name), now + wait_s)
         self.field.play(timeline, now + wait_s)
         self._cued = now
         script = timeline.script
@@ -209,6 +225,18 @@ class Rig:
 
     # --- inside ---
 
+    def timeline(self, script: Script, start: float) -> Timeline:
+        """A script on this skin."""
+        return Timeline(script, start, (), self.sheet.electrodes, self.nature)
+
+    def _lifted(self, presses: tuple[TouchPath, ...], finger: str, now: float) -> tuple[TouchPath, ...]:
+        """The presses without what is over, and forgotten. Those of `finger` end now: the scan that goes on has begun
+        under them.
+        """
+        cut = (p.until(now) if finger and p.finger == finger else p for p in presses)
+        kept_s = FELT_S if self.nature is None else REMEMBERED_S
+        return tuple(p for p in cut if p is not None and p.times[-1] > now - kept_s)
+
     def _scanned(self, scan: Scan) -> None:
         """Note what the scan felt: the world at its middle."""
         middle = (scan.start + scan.end) / 2
@@ -231,12 +259,26 @@ class Rig:
             if gone is None:
                 self.board.power_cycle(now)
             self.line.clear()
+            self._waiting.clear()
             self._unplugged = gone
         if self.faults.active("power_cycle", now) is not None:
             self.faults.clear("power_cycle")
             self.line.clear()
+            self._waiting.clear()
             self.board.power_cycle(now)
         return self._unplugged is not None
+
+    def _held_up(self, messages: list[tuple[float, bytes]], now: float) -> list[tuple[float, bytes]]:
+        """Messages that are due by now: those that come late later, some twice."""
+        for t, message in messages:
+            late, twice = self.faults.active("late_frames", t), self.faults.active("repeated_frames", t)
+            waits = late is not None and self._rng.random() < late["fraction"]
+            self._waiting.append((t + late["by"] if late is not None and waits else t, message))
+            if twice is not None and self._rng.random() < twice["fraction"]:
+                self._waiting.append((t, message))
+        due = [each for each in self._waiting if each[0] <= now]
+        self._waiting = [each for each in self._waiting if each[0] > now]
+        return due
 
     def _cut(self, message: bytes, now: float) -> bytes:
         fault = self.faults.active("partial_frames", now)
@@ -253,9 +295,3 @@ class Rig:
         flipped ^= np.packbits(bits, axis=1)[:, 0]
         at = np.sort(self._rng.integers(0, len(data) + 1, self._rng.poisson(noise["garbage"] * len(data))))
         return np.insert(flipped, at, self._rng.integers(0, 256, len(at), np.uint8)).tobytes()
-
-
-def _lifted(presses: tuple[TouchPath, ...], finger: str, now: float) -> tuple[TouchPath, ...]:
-    """The presses without what is over. Those of `finger` end now: the scan that goes on has begun under them."""
-    cut = (p.until(now) if finger and p.finger == finger else p for p in presses)
-    return tuple(p for p in cut if p is not None and p.times[-1] > now - FELT_S)

@@ -8,13 +8,14 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from models.shapes import SIMULATED
 from protocol.errors import EitskinError
 
 from .timeline import Cue, PiecewiseLinear, Script, TouchPath
 from .world import NEWTON, Touch
 
 FOLDER = Path(__file__).with_name("scenes")
-POSE = {f.name for f in fields(Touch)} - {"kind", "drop"}
+POSE = {f.name for f in fields(Touch)} - {"kind", "drop", "crept"}
 
 
 class SceneError(EitskinError, ValueError):
@@ -81,9 +82,8 @@ def touch(values: Mapping[str, Any]) -> Touch:
     else:
         drop = NEWTON * float(values["force"])
     kind = str(values.get("shape", "circle"))
-    kinds = ("circle", "triangle", "rectangle", "square", "L", "hertz")
-    if kind not in kinds:
-        raise ValueError(f"shape {kind!r}: expected one of {', '.join(kinds)}")
+    if kind not in SIMULATED:
+        raise ValueError(f"shape {kind!r}: expected one of {', '.join(SIMULATED)}")
     if not 0 <= drop < 1:
         raise ValueError(f"a conductivity drop of {drop:g} S/m ({drop / NEWTON:g} N): expected 0 to below 1 S/m (10 N)")
     pose = {key: float(values[key]) for key in POSE & set(values)}

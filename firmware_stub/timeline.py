@@ -7,6 +7,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol
 
 from .world import Touch, World, blend
 
@@ -112,6 +113,13 @@ class Script:
         return World(touches, background, tuple(factors) if self.contact else ())
 
 
+class Cutter(Protocol):
+    """What a real skin makes of a timeline, see worlds/nature.py."""
+
+    def piece(self, timeline: Timeline, segment: WorldSegment, t: float) -> WorldSegment:
+        """The piece of a segment around t on which what the skin feels is linear."""
+
+
 @dataclass(frozen=True)
 class Timeline:
     """A script begun at `start`, and the presses made on request. Times are seconds since the stub started."""
@@ -120,9 +128,14 @@ class Timeline:
     start: float = 0.0
     presses: tuple[TouchPath, ...] = ()
     electrodes: int = 16
+    nature: Cutter | None = None
 
     def segment(self, t: float) -> WorldSegment:
         """The stretch of time around t on which everything is linear: start <= t < end."""
+        plain = self._plain(t)
+        return plain if self.nature is None else self.nature.piece(self, plain, t)
+
+    def _plain(self, t: float) -> WorldSegment:
         script, breaks = self.script, self.script.breaks
         base = self.start
         if script.loop and t >= base:

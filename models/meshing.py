@@ -1,6 +1,6 @@
 """Graded triangle meshes of a skin: fine at the electrodes' ends, where the current density is nearly singular.
 
-Four uses, four meshes that differ in spacing and in structure (the points are relaxed from different starts), so that a
+Five uses, five meshes that differ in spacing and in structure (the points are relaxed from different starts), so that a
 network is never tested on the mesh it was trained on. The same skin and use give the same mesh.
 """
 
@@ -35,6 +35,7 @@ class Grading:
 USES = {
     "training": Grading(edge=4e-4, growth=0.4, interior=0.03, offset=0.0),
     "stub": Grading(edge=8e-4, growth=0.45, interior=0.036, offset=0.37),
+    "world": Grading(edge=1e-3, growth=0.42, interior=0.042, offset=0.81),
     "inverse": Grading(edge=2e-3, growth=0.5, interior=0.045, offset=0.61),
     "reference": Grading(edge=5e-5, growth=0.14, interior=0.0115, offset=0.23, relaxation=3),
 }

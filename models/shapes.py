@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 KINDS = ("circle", "triangle", "rectangle", "square", "L", "hertz")
+SIMULATED = (*KINDS, "ellipse")  # what a sheet can be pressed with; no fit and no file knows an ellipse
 CLASSES = KINDS[:5]  # what a shape classifier names: a Hertz contact is a circle to it
 ROW = ("kind", "x", "y", "radius", "drop", "rotation", "aspect")  # one row of a `shapes` array, kind 1-based
 L_ARM = 0.4  # of the L's side
@@ -35,6 +36,9 @@ def _corners(kind: str, aspect: float) -> Array | None:
         half = np.array([aspect, 1.0] if kind == "rectangle" else [1.0, 1.0])
         corners: Array = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half / np.linalg.norm(half)
         return corners
+    if kind == "ellipse":
+        angles = 2 * np.pi / ROUND * np.arange(ROUND)
+        return np.column_stack([np.cos(angles), np.sin(angles) / aspect])
     if kind == "L":
         h = np.sqrt(0.5)
         inner = -h + 2 * h * L_ARM
@@ -85,7 +89,7 @@ def polygon_coverage(corners: Array, n: int) -> Array:
 
 @dataclass(frozen=True)
 class Shape:
-    """One contact. `kind` is one of KINDS; `aspect` (length over width) is the rectangle's alone.
+    """One contact. `kind` is one of SIMULATED; `aspect` (length over width) is the rectangle's and the ellipse's alone.
 
     Raises ValueError for an unknown kind or a size that is none.
     """
@@ -99,8 +103,8 @@ class Shape:
     aspect: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"shape kind {self.kind!r}: expected one of {', '.join(KINDS)}")
+        if self.kind not in SIMULATED:
+            raise ValueError(f"shape kind {self.kind!r}: expected one of {', '.join(SIMULATED)}")
         if not self.radius > 0 or not self.aspect > 0:
             raise ValueError(f"shape of radius {self.radius} and aspect {self.aspect}: both must be positive")
 
@@ -145,8 +149,8 @@ class Shape:
 
     @property
     def shape_class(self) -> int:
-        """Index into CLASSES; a Hertz contact counts as a circle."""
-        return 0 if self.kind == "hertz" else KINDS.index(self.kind)
+        """Index into CLASSES; a Hertz contact and an ellipse count as circles."""
+        return 0 if self.kind in ("hertz", "ellipse") else KINDS.index(self.kind)
 
     # -- drop -------------------------------------------------------------------------------------------------------
     def contains(self, points: Array) -> NDArray[np.bool_]:

@@ -37,6 +37,7 @@ class EitskinError(Exception):
         ├── NotRegistered (ValueError)        a folder to train for holds a bundle of no registered skin
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
+        ├── WorldError (ValueError)           no world of this name for a stub's skin
         ├── ConfigError                       services: skin.toml cannot be used
         ├── Refused                           a stage does not carry out a command now
         ├── NoBaseline (ValueError)           frames, or a saved state, do not make a baseline

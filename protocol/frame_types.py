@@ -472,12 +472,12 @@ class InfoFrame(Frame):
 class TrueTouch:
     """What the stub's skin is really touched by."""
 
-    shape: str = wire(Text(32), "kind: circle, triangle, rectangle, square, L, hertz")
+    shape: str = wire(Text(32), "kind: circle, triangle, rectangle, square, L, ellipse, hertz")
     x: float = wire(Float(unit="m"), "centre, in the skin's frame")
     y: float = wire(Float(unit="m"), "centre, in the skin's frame")
     radius_m: float = wire(Float(0, unit="m"), "circumscribed radius")
     rotation: float = wire(Float(unit="rad"), "counter-clockwise", 0.0)
-    aspect: float = wire(Float(0), "ratio of a rectangle's sides", 1.0)
+    aspect: float = wire(Float(0), "ratio of a rectangle's sides or an ellipse's axes", 1.0)
     drop: float = wire(Float(unit="S/m"), "conductivity drop inside")
     force_n: float | None = wire(Maybe(Float(unit="N")), "force that belongs to the drop, or nil", None)
     outline: list[list[float]] | None = wire(

@@ -41,6 +41,7 @@ class Pipeline:
             skin = Skin(port="stub", bundle=skin, frame_id=name)
         self.name = name
         self.delta: DeltaFrame | None = None  # the newest one; parts of scans come between two of them
+        self.image: ImageFrame | None = None  # the newest one
         self.pre, self.inference, self.publishing = build_stages(name, skin, bundle)
         self.pre.always_reconstruct = self.inference.each_alone = self.publishing.each_alone = always_reconstruct
 
@@ -63,6 +64,8 @@ class Pipeline:
         if isinstance(said, DeltaFrame):
             self.delta = said
             said = self._passed(self.inference, said)[0]
+            assert isinstance(said, ImageFrame)
+            self.image = said
         contact = self._passed(self.publishing, said)[0]
         assert isinstance(contact, ContactFrame)
         return contact

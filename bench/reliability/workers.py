@@ -67,4 +67,5 @@ def _kept(work: Callable[[Task], Found], task: Task) -> Found:
     try:
         return work(task)
     finally:
-        sheet().close(least=SAVED)
+        if sheet.cache_info().currsize:  # it was used
+            sheet().close(least=SAVED)

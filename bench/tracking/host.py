@@ -76,7 +76,7 @@ class Host:
             return
         read_ns = round(self.now * 1e9)
         for scan_frame in self.link.received(data, self.now):
-            self._lately.append(self._felt.pop(scan_frame.seq))
+            self._lately.append(self._felt[scan_frame.seq])  # a message may come twice
             frame = self.source.handed_on(scan_frame, self.link, read_ns, self._newest)
             if frame is not None:
                 yield frame, replace(self._lately[-1], first=self._lately[0].first)

@@ -50,7 +50,7 @@ def up(
 
 
 def _check_mismatches(config: ConfigFile) -> None:
-    """Refuse an unknown mismatch before anything starts: the stub would end at once, again and again."""
+    """Refuse an unknown mismatch or world before anything starts: the stub would end at once, again and again."""
     for name, skin in config.skins.items():
         if skin.mismatch != "none":
             from models.mismatch import NAMED
@@ -59,6 +59,11 @@ def _check_mismatches(config: ConfigFile) -> None:
                 fail(
                     f"{config.path}: skins.{name}.mismatch: found {skin.mismatch!r}; allowed: {', '.join(NAMED)}", USAGE
                 )
+        if skin.world:
+            from firmware_stub.worlds.table import WORLDS
+
+            if skin.world not in WORLDS:
+                fail(f"{config.path}: skins.{name}.world: found {skin.world!r}; allowed: {', '.join(WORLDS)}", USAGE)
 
 
 def _check_bundles(config: ConfigFile) -> None:

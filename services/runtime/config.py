@@ -136,6 +136,7 @@ class Skin(Section):
     surface: Surface | None = None  # what the sheet is wrapped round
     contacts_in: Literal["skin", "parent"] = "skin"  # "parent": contacts come in the frame that `pose` names
     mismatch: str = "none"  # how the stub's sheet differs from the bundle: a name of models/mismatch.py
+    world: str = ""  # what the stub's skin does beside, as real ones do: a name of firmware_stub/worlds/table.py
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
     indenter: Indenter | None = None
     network: NetworkFile = "int8"
@@ -170,6 +171,10 @@ class Skin(Section):
     def mismatch_of_a_stub(self) -> Skin:
         if self.mismatch != "none" and self.port != "stub":
             raise ValueError(f'`mismatch` with port = "stub" alone: a real skin has its own (found {self.port!r})')
+        if self.world and self.port != "stub":
+            raise ValueError(f'`world` with port = "stub" alone: a real skin is in its own (found {self.port!r})')
+        if self.world and self.mismatch != "none":
+            raise ValueError("`world` and `mismatch`: a world has a sheet of its own; leave one of them out")
         return self
 
 

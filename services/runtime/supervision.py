@@ -77,12 +77,13 @@ def programs(config: ConfigFile, record: Path | None = None) -> list[Program]:
 
 def stub_arguments(config: ConfigFile) -> tuple[str, ...]:
     """What `python -m firmware_stub` is told: a board for each skin whose port is "stub", with that skin's bundle and
-    the name of the mismatch between its sheet and the bundle.
+    the names of the mismatch between its sheet and the bundle and of its world.
     """
     skins = [(name, skin) for name, skin in config.skins.items() if skin.port == "stub"]
     said = [part for name, skin in skins for part in ("--skin", f"{name}={_folder(skin.bundle)}")]
     for name, skin in skins:
         said += ["--mismatch", f"{name}={skin.mismatch}"] if skin.mismatch != "none" else []
+        said += ["--world", f"{name}={skin.world}"] if skin.world else []
     return tuple(said)
 
 

@@ -187,6 +187,14 @@ def test_the_supervisor_tells_the_stub_by_what_a_sheet_differs_from_its_bundle(t
     assert "--mismatch" not in stub_arguments(load(file))
     file.write_text(file.read_text() + 'mismatch = "mild"\n')
     assert stub_arguments(load(file))[-2:] == ("--mismatch", "b=mild")
+    file.write_text(file.read_text().replace('mismatch = "mild"', 'world = "creep"'))
+    assert stub_arguments(load(file))[-2:] == ("--world", "b=creep")
+    file.write_text(file.read_text() + 'mismatch = "mild"\n')
+    with pytest.raises(ConfigError, match="a world has a sheet of its own"):
+        load(file)
+    file.write_text('[skins.a]\nport = "/dev/ttyACM0"\nbundle = "disc16"\nworld = "creep"\n')
+    with pytest.raises(ConfigError, match="a real skin is in its own"):
+        load(file)
     file.write_text('[skins.a]\nport = "/dev/ttyACM0"\nbundle = "disc16"\nmismatch = "mild"\n')
     with pytest.raises(ConfigError, match='port = "stub" alone: a real skin has its own'):
         load(file)

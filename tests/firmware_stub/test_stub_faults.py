@@ -215,6 +215,21 @@ def test_sequence_gaps_show_in_the_numbers_alone(running):
     assert board.decoder.bad == 0
 
 
+def test_late_frames_come_whole_and_after_others(running):
+    board, _ = running
+    board.rig.fault("late_frames", {"fraction": 0.3, "by": 0.1}, board.now, 3.0)
+    numbers = np.array([f.seq for f in board.frames(3.2)])
+    assert (np.diff(numbers) < 0).sum() > 5
+    assert len(set(numbers.tolist())) == len(numbers) and board.decoder.bad == 0
+
+
+def test_repeated_frames_come_twice(running):
+    board, _ = running
+    board.rig.fault("repeated_frames", {"fraction": 0.5}, board.now, 3.0)
+    numbers = [f.seq for f in board.frames(3.0)]
+    assert 1.3 < len(numbers) / len(set(numbers)) < 1.7 and board.decoder.bad == 0
+
+
 def test_partial_frames_are_told_from_whole_ones(running):
     board, healthy = running
     board.rig.fault("partial_frames", {"fraction": 0.5}, board.now, 3.0)

@@ -187,7 +187,12 @@ def test_wrong_options_are_explained(other_folder, options, says):
 
 @pytest.mark.parametrize(
     ("options", "says"),
-    [(("--mismatch", "wild"), "anisotropy5"), (("--mismatch", "sole=mild"), "no skin 'sole'; expected one of palm")],
+    [
+        (("--mismatch", "wild"), "anisotropy5"),
+        (("--mismatch", "sole=mild"), "no skin 'sole'; expected one of palm"),
+        (("--world", "moon"), "expected one of plain, creep"),
+        (("--world", "creep", "--mismatch", "mild"), "a world has a sheet of its own"),
+    ],
 )
 def test_a_mismatch_that_there_is_not(capsys, options, says):
     with pytest.raises(SystemExit):
@@ -199,6 +204,7 @@ def test_a_mismatch_is_one_skins_or_everyones():
     skins = ("--skin", "a", "--skin", "b")
     assert arguments([*skins, "--mismatch", "b=mild"]).mismatches == {"a": "none", "b": "mild"}
     assert arguments([*skins, "--mismatch", "field5"]).mismatches == {"a": "field5", "b": "field5"}
+    assert arguments([*skins, "--world", "b=creep"]).worlds == {"a": "", "b": "creep"}
 
 
 def test_it_ends_with_its_parent(other_folder):

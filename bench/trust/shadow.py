@@ -1,0 +1,88 @@
+"""Two estimators in the same sessions: the same raw frames, each judged by the same truth.
+
+    skin bench shadow --candidate MODULE:CLASS --minutes 10 --world plain --scan full
+
+A candidate is what bench/trust/candidate.py says: it takes raw frames and gives contact frames. By default it is the
+service's own stages once more, which differ from themselves in nothing. Writes shadow.json; the exit status is 1 where
+the candidate does more of what must not be than the service, beyond what chance would.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from bench.goals import Goal
+from bench.reliability import report as reports
+from bench.speed.service import end_on_sigterm
+from bench.trust import candidate, kept, options, report, runs
+from firmware_stub.worlds.table import WORLDS
+
+COUNTED = ("phantom frames", "wrong counts", "hidden", "never shown", "ids", "refused", "aged", "force 6", "place 6")
+SHARES = ("valid untouched %", "valid touched %", "valid in faults %")
+LESS_VALID = 0.1  # percentage points
+
+
+def more_than(old: float) -> float:
+    """How much a count may be where the service's is `old`."""
+    return old + 2 * math.sqrt(old + 1) if old else 0.0
+
+
+def compared(world: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Goal]:
+    """The gates of a candidate in one world."""
+    made = []
+    for key in COUNTED:
+        most = more_than(old[key])
+        made.append(Goal(f"{world}: {key}, the service {old[key]:g}", new[key], at_most=most, gate=most))
+    for key in SHARES:
+        if old[key] is not None and new[key] is not None:
+            least = old[key] - LESS_VALID
+            made.append(Goal(f"{world}: {key}, the service {old[key]:.2f}", new[key], at_least=least, gate=least))
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="skin bench shadow", description=(__doc__ or "").split("\n\n")[0])
+    options.add(parser, 10.0)
+    parser.add_argument("--candidate", default=candidate.TODAY, metavar="MODULE:CLASS", help="default: %(default)s")
+    parser.add_argument("--session", type=float, default=runs.SESSION_S, help="seconds of one (default: 60)")
+    args = parser.parse_args(argv)
+    if not 0 < args.minutes <= 1e5 or not 8 <= args.session <= 3600:
+        parser.error(f"--minutes {args.minutes:g} --session {args.session:g}: expected above 0, and 8 to 3600")
+    try:
+        args.seed = args.seed or kept.published_seed()
+    except ValueError as why:
+        parser.error(str(why))
+    end_on_sigterm()
+    began, rows, goals = time.perf_counter(), dict[str, Any](), list[Goal]()
+    both = (("today", candidate.TODAY), ("candidate", args.candidate))
+    with runs.own_runtime():
+        for world in args.world or WORLDS:
+            for scan in (args.scan,) if args.scan else runs.SCANS:
+                scores = runs.run(
+                    world,
+                    scan,
+                    args.seed,
+                    args.minutes,
+                    candidates=both,
+                    session_s=args.session,
+                    apart_m=args.apart_mm * 1e-3,
+                    bundle=args.bundle,
+                    cores=args.cores,
+                )
+                old, new = scores["today"].row(), scores["candidate"].row()
+                rows |= {f"{world}, {scan}, the service": old, f"{world}, {scan}, candidate": new}
+                goals += compared(f"{world}, {scan}", old, new)
+    report.show(rows, "shadow")
+    head = reports.head("shadow", argv, args, time.perf_counter() - began)
+    reports.show(head, goals)
+    reports.write(args.out / "shadow.json", head, {"rows": rows, "candidate": args.candidate}, goals)
+    return reports.status(goals, sys.stderr)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,1 @@
+"""What real skins do, as named worlds: foam, warmth, contact impedances, interference. No estimator is known here."""
