@@ -13,6 +13,7 @@ class EitskinError(Exception):
         │   └── NotValid                      the newest frame is new and says that it must not be acted on
         ├── FrameError (ValueError)           a message is not a frame
         ├── FieldError                        a value is not what its field allows; a FrameError names frame and field
+        │   └── BadArgument                   an argument of a command is not what the command takes
         ├── ControlError (RuntimeError)       a command was not carried out
         ├── TransportError (RuntimeError)     a socket or a key file cannot be used as configured
         ├── RuntimeDirError (RuntimeError)    the runtime folder cannot be used
@@ -35,6 +36,7 @@ class EitskinError(Exception):
         ├── NoSuchNetwork (ValueError)        a file without the network that training is to start from
         ├── NoPart (ValueError)               a network that is not made of another's channels and blocks
         ├── NotRegistered (ValueError)        a folder to train for holds a bundle of no registered skin
+        ├── TooLittle                         a bundle was trained too little to be written without --anyway
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── WorldError (ValueError)           no world of this name for a stub's skin
