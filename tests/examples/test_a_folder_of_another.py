@@ -18,6 +18,7 @@ import msgpack
 import pytest
 import zmq
 
+from tests import needs
 from tests.examples.compiled import ROOT, cpp_subscriber
 
 __all__ = ["cpp_subscriber"]
@@ -88,7 +89,7 @@ def forged(request: pytest.FixtureRequest, runtime: Path) -> Iterator[Path]:
             folder.chmod(0o755)
         elif request.param == "of another user":
             if os.geteuid() != 0:
-                pytest.skip("ANOTHER USER'S FOLDER NOT TRIED: only root can give a folder away (.ci/run is root)")
+                needs.SUPERUSER.lack("right to give a folder to another user")
             os.chown(folder, ANOTHER, ANOTHER)
         yield folder
     finally:
