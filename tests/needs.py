@@ -63,6 +63,7 @@ CHROMIUM = Need(
     "EITSKIN_REQUIRE_BROWSER",
     programs=[os.environ.get("EITSKIN_CHROMIUM") or "chromium"],
 )
+SUPERUSER = Need("run the tests as root, in a container of their own")
 CPP = Need(
     "`apt-get install g++ cppzmq-dev libmsgpack-cxx-dev`",
     "EITSKIN_REQUIRE_CPP",

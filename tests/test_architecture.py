@@ -26,7 +26,9 @@ RUNTIME_NEEDS = WIRE_NEEDS | {"serial", "onnxruntime", "scipy", "pydantic", "typ
 BRIDGES_NEED = {
     "page": {"aiohttp", "mcap", "prometheus_client"},
     "ros2": {"cyclonedds"},
-    "foxglove": {"foxglove"},
+    "foxglove": {"foxglove", "aiohttp"},
+    "door.py": {"aiohttp"},
+    "serving.py": {"aiohttp"},
     "export": {"mcap", "foxglove", "rerun"},
 }
 """What each bridge needs beside what protocol needs: an extra of its own."""

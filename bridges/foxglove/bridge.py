@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ipaddress
 import logging
-import secrets
 import time
 from collections.abc import Iterable
 
@@ -12,6 +10,7 @@ import foxglove
 from foxglove import Capability, Context
 
 from bridges.clock import WallClock
+from bridges.door import Door, kept_token
 from bridges.feeds import ContactFeed, ImageFeed, Measured, NewestFeed, Refusal
 from bridges.process import Bridge, BridgedSkin, BridgeError, Handed, openable
 from protocol.frames import InfoFrame, ShapeFrame
@@ -19,7 +18,7 @@ from protocol.sockets import AllReader
 from protocol.transport import Socket
 
 from .channels import FoxgloveChannels, Outlines
-from .door import Door
+from .front import Front, hidden_address
 from .orders import services
 
 BACKLOG = 64  # messages held for a viewer that does not read; the oldest go first
@@ -113,32 +112,34 @@ class FoxgloveBridge(Bridge):
         super().__init__("foxglove", handed)
         options = handed.options
         host, port = str(options.get("host", "127.0.0.1")), int(options.get("port", 8765))
-        self.token = secrets.token_urlsafe(16)
+        secret, hidden = kept_token("foxglove"), hidden_address()
         self._clock = WallClock()
         self._context = context = Context()  # channels are closed with it
         logging.getLogger("foxglove").setLevel(logging.WARNING)  # it tells of each viewer
         replay = bool(options.get("replay"))
         self._skins = {n: ShownSkin(n, skin, context, self._clock, replay) for n, skin in handed.skins.items()}
-        alone = _is_loopback(host)
         try:
             self._server = foxglove.start_server(
                 name="eitskin",
-                host=host if alone else "127.0.0.1",
-                port=port if alone else 0,
+                host=hidden,
+                port=0,
                 capabilities=[Capability.Services],
                 supported_encodings=["json"],
-                services=services(handed.skins, self.token),
+                services=services(handed.skins, secret),
                 context=context,
                 message_backlog_size=BACKLOG,
             )
         except Exception as why:  # the SDK has no exception of its own
-            raise BridgeError(f"no Foxglove server at {host}:{port}: {why}; see [foxglove] in skin.toml") from None
-        self._door = None if alone else Door(host, port, self._server.port, self.token)
-        self.port = self._server.port if self._door is None else self._door.port
-        suffix = "" if alone else f"/?token={self.token}"
+            raise BridgeError(f"no Foxglove server at {hidden}: {why}; start the bridge anew") from None
+        door = Door(host, map(str, options.get("names", ())), secret)
+        try:
+            self._front = Front(door, port, f"http://{hidden}:{self._server.port}")
+        except BridgeError:
+            self._server.stop()
+            raise
         print(
-            f"foxglove: open ws://{openable(host)}:{self.port}{suffix} in Foxglove (Open connection); "
-            f'services ask for "token": "{self.token}"',
+            f"foxglove: open ws://{openable(host)}:{door.port}/?token={secret} in Foxglove (Open connection); "
+            f'services ask for "token": "{secret}"',
             flush=True,
         )
         self._told = AllReader(["info"])
@@ -168,7 +169,9 @@ class FoxgloveBridge(Bridge):
             pulse.idle = not skin.wanted
             pulse.sent.update({k: n - pulse.sent[k] for k, n in skin.channels.sent.items()})
             pulse.drops["skipped"], pulse.drops["late"] = skin.contacts.skipped, skin.contacts.late
-            if pulse.idle:
+            if not self._front.alive:
+                pulse.level, pulse.messages = "ERROR", ["the server has stopped: start the bridge anew"]
+            elif pulse.idle:
                 pulse.level, pulse.messages = "OK", ["idle: nobody looks"]
             elif isinstance(skin.state, Refusal):
                 pulse.level, pulse.messages = "WARN", [f"not shown: {skin.state.why}"]
@@ -176,16 +179,8 @@ class FoxgloveBridge(Bridge):
                 pulse.level, pulse.messages = "OK", []
 
     def close(self) -> None:
-        if self._door is not None:
-            self._door.close()
+        self._front.close()
         self._server.stop()
         self._told.close()
         for skin in self._skins.values():
             skin.close()
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hmac
-import os
-import secrets
 import signal
 import subprocess
 import sys
@@ -17,14 +14,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from bridges.door import Door
 from protocol.control import ControlClient, ControlError
-from protocol.runtime import runtime_dir
 from protocol.topics import RECORDER
 
 from .feed import SkinFeed
 from .replays import REPLAY, Replay, ReplayRefused, listed
 
-TOKEN_FILE = "page.token"
 TIMEOUT_S = {"preprocessing": 10.0, "stub": 2.0, RECORDER: 10.0}
 THERE_S, BEGIN_S, STOP_S = 0.3, 8.0, 5.0
 """For a recorder to answer that runs, to begin, to end."""
@@ -55,40 +51,19 @@ BUTTONS = {
 }
 
 
-def token() -> str:
-    """What commands must come with: made once for a runtime folder, which nobody else may enter, and kept there, so
-    that the printed address goes on to hold when the page's process is started anew.
-    """
-    path = runtime_dir() / TOKEN_FILE
-    try:
-        if len(known := path.read_text().strip()) >= 16:
-            return known
-    except OSError:
-        pass
-    new = secrets.token_urlsafe(16)
-    path.unlink(missing_ok=True)
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-        file.write(new)
-    return new
-
-
 class Buttons:
     """Carries out what browsers ask for."""
 
-    def __init__(self, secret: str, feeds: dict[str, SkinFeed], recordings: str, tell: Callable[[bool], None]) -> None:
+    def __init__(self, door: Door, feeds: dict[str, SkinFeed], recordings: str, tell: Callable[[bool], None]) -> None:
         """tell: called when there is news of a replay."""
-        self._secret, self._feeds, self._tell = secret, feeds, tell
+        self._door, self._feeds, self._tell = door, feeds, tell
         self.recording = OwnRecorder(Path(recordings)) if recordings else None
         self._replay: Replay | None = None
-
-    def knows(self, given: str) -> bool:
-        """Whether somebody has the token."""
-        return hmac.compare_digest(given.encode(), self._secret.encode())
 
     async def press(self, skin: str, command: str, args: dict[str, Any], given: str) -> dict[str, Any]:
         """{ok, result} or {ok, error}, for the person at the page."""
         button, feed = BUTTONS.get(command), self._feeds.get(skin)
-        if not self.knows(given):
+        if not self._door.knows(given):
             return _no("commands need the token of the address that the service printed: open that address")
         if button is None or feed is None:
             return _no(f"there is no command {command[:32]!r}" if button is None else f"there is no skin {skin[:64]!r}")

@@ -1,11 +1,8 @@
-"""The page's server: its files, and one WebSocket for each browser. Asked by other names, or from other pages, it
-refuses.
-"""
+"""The page's server: its files, and one WebSocket for each browser. Who may ask is bridges/door.py's."""
 
 from __future__ import annotations
 
 import asyncio
-import errno
 import importlib.util
 import logging
 import socket
@@ -17,19 +14,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aiohttp import web
-from aiohttp.typedefs import Handler, Middleware
 
+from bridges.door import CLOSE_S, Door
 from bridges.process import BridgeError
 from protocol.advice import ADVICE
 from protocol.frame_types import ELECTRODE_STATES, REASONS
-from protocol.logs import foreign
 from protocol.runtime import host_id
 from protocol.topics import RECORDER
 
 from .commands import BUTTONS, Buttons
 from .feed import SkinFeed
 from .replays import REPLAY
-from .settings import LOOPBACK, PageSettings
+from .settings import PageSettings
 from .viewer import Viewer
 
 if TYPE_CHECKING:
@@ -38,7 +34,6 @@ if TYPE_CHECKING:
 WEB = Path(__file__).with_name("web")
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 TRIES = 20
-MOST_VIEWERS = 64
 HEARTBEAT_S = 10.0
 MOST_ASKED = 16 * 1024
 """Longest message of a browser, in bytes."""
@@ -53,9 +48,10 @@ class PageServer:
         """handed_on: called with the skin, and when it was measured, of each scan that goes to the browsers."""
         if settings.metrics and importlib.util.find_spec("prometheus_client") is None:
             raise BridgeError("[page] metrics needs the package prometheus-client, which is not installed: `make venv`")
-        self.settings, self.port, self._handed_on = settings, 0, handed_on
+        self.settings, self._handed_on = settings, handed_on
+        self.door = Door(settings.host, settings.names, secret)
         self.feeds = {skin: SkinFeed(skin, partial(self._tell, skin)) for skin in settings.skins}
-        self.buttons = Buttons(secret, self.feeds, settings.recordings, partial(self._tell, REPLAY))
+        self.buttons = Buttons(self.door, self.feeds, settings.recordings, partial(self._tell, REPLAY))
         self._viewers: set[Viewer] = set()
         self._metrics: SkinMetrics | None = None
         self._files = {f"/{path.name}": path.read_bytes() for path in WEB.iterdir() if path.suffix in TYPES}
@@ -63,46 +59,16 @@ class PageServer:
 
     def listen(self) -> socket.socket:
         """A socket at the first free port from the settings' on. Raises OSError where none of them is."""
-        family = socket.AF_INET6 if ":" in self.settings.host else socket.AF_INET
-        for port in range(self.settings.port, self.settings.port + TRIES):
-            found = socket.socket(family, socket.SOCK_STREAM)
-            found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                found.bind((self.settings.host, port))
-                found.listen(64)
-            except OSError as why:
-                found.close()
-                if why.errno != errno.EADDRINUSE:
-                    raise
-                continue
-            self.port = port
-            return found
-        last = self.settings.port + TRIES - 1
-        raise OSError(errno.EADDRINUSE, f"no free port from {self.settings.port} to {last} at {self.settings.host}")
+        return self.door.listen(self.settings.port, TRIES)
 
     def application(self) -> web.Application:
-        found = web.Application(middlewares=[self._guarded()])
+        found = web.Application(middlewares=[self.door.guard])
         found.router.add_get("/live", self._live)
         if self.settings.metrics:
             found.router.add_get("/metrics", self._measured)
             found.cleanup_ctx.append(self._measuring)
         found.router.add_get("/{path:.*}", self._file)
         return found
-
-    @property
-    def names(self) -> set[str]:
-        """What a browser may call us in its header Host."""
-        hosts = {*LOOPBACK, *self.settings.names, self.settings.host} - {"0.0.0.0", "::"}
-        return {f"[{host}]:{self.port}" if ":" in host else f"{host}:{self.port}" for host in hosts}
-
-    def _guarded(self) -> Middleware:
-        @web.middleware
-        async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
-            if request.host not in self.names:
-                raise web.HTTPMisdirectedRequest(text=f"asked for as {foreign(request.host, 80)!r}: that is not us\n")
-            return await handler(request)
-
-        return guard
 
     async def _file(self, request: web.Request) -> web.Response:
         content = self._files.get(request.path)
@@ -112,7 +78,9 @@ class PageServer:
         return web.Response(body=content, content_type=kind, charset="utf-8", headers=self._headers())
 
     def _headers(self) -> dict[str, str]:
-        sockets = " ".join(sorted(f"ws://{name}" for name in self.names if "[" not in name))  # which CSP cannot name
+        sockets = " ".join(
+            sorted(f"ws://{name}" for name in self.door.names if "[" not in name)
+        )  # which CSP cannot name
         return {
             "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: "
             f"blob:; connect-src 'self' {sockets}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -143,35 +111,29 @@ class PageServer:
 
     async def _measured(self, request: web.Request) -> web.Response:
         """For Prometheus. Who may look may read it; beyond this host the token is asked for, as for looking."""
-        origin = request.headers.get("Origin")
-        if origin is not None and origin.removeprefix("http://") not in self.names:
-            raise web.HTTPForbidden(text="asked by another page: refused\n")
-        given = request.headers.get("Authorization", "").removeprefix("Bearer ") or request.query.get("token", "")
-        if not self.settings.local and not self.buttons.knows(given):
-            raise web.HTTPForbidden(text="metrics need the token here: authorization with credentials, Bearer\n")
+        self.door.refuse_other_pages(request)
+        self.door.refuse_strangers(request)
         if self._metrics is None:
             raise web.HTTPServiceUnavailable(text="not yet\n")
         headers = {**self._headers(), "Content-Type": "text/plain; version=0.0.4; charset=utf-8"}
         return web.Response(body=self._metrics.text(), headers=headers)
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
-        origin = request.headers.get("Origin", "")
-        if origin.removeprefix("http://") not in self.names or not origin.startswith("http://"):
-            raise web.HTTPForbidden(text="a WebSocket of another page: refused\n")
-        if not self.settings.local and not self.buttons.knows(request.query.get("token", "")):
-            raise web.HTTPForbidden(text="open the address that the service printed, with its token\n")
-        if len(self._viewers) >= MOST_VIEWERS:
-            raise web.HTTPServiceUnavailable(text=f"{MOST_VIEWERS} browsers look already\n")
-        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=MOST_ASKED, compress=False)
-        await socket.prepare(request)
-        viewer = Viewer(socket, self.feeds, self.buttons.press)
-        self._viewers.add(viewer)
-        try:
-            await viewer.run(self._hello())
-        except ConnectionError:
-            pass
-        finally:
-            self._viewers.discard(viewer)
+        self.door.refuse_other_pages(request, pages_only=True)
+        self.door.refuse_strangers(request)
+        with self.door.place(request) as known:
+            socket = web.WebSocketResponse(
+                heartbeat=HEARTBEAT_S, max_msg_size=MOST_ASKED, compress=False, timeout=CLOSE_S
+            )
+            await socket.prepare(request)
+            viewer = Viewer(socket, self.feeds, self.buttons.press)
+            self._viewers.add(viewer)
+            try:
+                await viewer.run(self._hello(), hurried=not known)
+            except ConnectionError:
+                pass
+            finally:
+                self._viewers.discard(viewer)
         return socket
 
     def _hello(self) -> dict[str, object]:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from bridges.process import BridgeError, Handed
 
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
-
 
 @dataclass(frozen=True)
 class PageSettings:
@@ -22,11 +20,6 @@ class PageSettings:
     names: tuple[str, ...]
     recordings: str
     metrics: bool = False
-
-    @property
-    def local(self) -> bool:
-        """Whether only this host's browsers reach the page."""
-        return self.host in LOOPBACK
 
     @staticmethod
     def of(handed: Handed) -> PageSettings:

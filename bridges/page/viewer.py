@@ -12,6 +12,8 @@ from typing import Any
 import msgpack
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from bridges.door import hurry
+from protocol.errors import EitskinError
 from protocol.logs import foreign
 
 from .feed import NEWEST, Latest, Reconstruction, SkinFeed
@@ -26,8 +28,15 @@ AT_ONCE = 8
 
 log = logging.getLogger(__name__)
 
+LONGEST_REASON = 123
+"""Of a WebSocket's end, in bytes."""
+
 Command = Callable[[str, str, dict[str, Any], str], Awaitable[dict[str, Any]]]
 """(skin, command, arguments, token) -> the answer, as the browser gets it."""
+
+
+class NotUnderstood(EitskinError, ValueError):
+    """A browser says what the page's own does not. The text says what was found and what was expected."""
 
 
 class Viewer:
@@ -41,7 +50,7 @@ class Viewer:
         self._pictures: dict[str, Reconstruction | None] = {}  # that the browser has, by topic
         self._unread = 0
         self._news = False  # since the last message
-        self._go = asyncio.Event()
+        self._go, self._wants = asyncio.Event(), asyncio.Event()
         self._under_way: set[asyncio.Task[None]] = set()
 
     def tell(self) -> None:
@@ -49,18 +58,25 @@ class Viewer:
         self._news = True
         self._go.set()
 
-    async def run(self, hello: dict[str, Any]) -> None:
-        """Until the browser leaves."""
+    async def run(self, hello: dict[str, Any], hurried: bool) -> None:
+        """Until the browser leaves or is not understood; `hurried`: or does not soon say what it wants."""
         await self._socket.send_bytes(msgpack.packb(hello))
-        sending = asyncio.create_task(self._send())
+        tasks = [asyncio.create_task(self._send())]
+        if hurried:
+            tasks.append(asyncio.create_task(hurry(self._socket, self._wants)))
         try:
             async for message in self._socket:
                 if message.type is WSMsgType.TEXT:
-                    await self._asked(message.data)
+                    await self._asked(_understood(message.data))
+        except NotUnderstood as why:
+            log.warning("a browser is sent away: %s", why)
+            reason = str(why).encode("ascii", "replace")[:LONGEST_REASON]
+            await self._socket.close(code=WSCloseCode.INVALID_TEXT, message=reason)
         finally:
-            sending.cancel()
+            for task in tasks:
+                task.cancel()
             self._look_at(None, frozenset())
-            await asyncio.gather(sending, return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _send(self) -> None:
         while True:
@@ -94,21 +110,16 @@ class Viewer:
             new.append(latest)
         return [(latest.measured_ns, latest.message) for latest in sorted(new, key=lambda each: each.version)]
 
-    async def _asked(self, text: str) -> None:
+    async def _asked(self, said: dict[str, Any]) -> None:
         """What the browser says: {ack}, {ping}, {skin, want}, {command, args, id, token}."""
-        try:
-            said = json.loads(text)
-        except (ValueError, RecursionError):
-            said = None
-        if not isinstance(said, dict):
-            log.warning("a browser sent what is no map: %s", foreign(text, 80))
-        elif "ack" in said:
+        if "ack" in said:
             self._unread = max(0, self._unread - 1)
             if self._news:  # that had to wait
                 self._go.set()
         elif "ping" in said:
             await self._answer({"kind": "pong", "ping": said["ping"], "now": time.monotonic_ns()})
         elif "want" in said:
+            self._wants.set()
             topics = said["want"] if isinstance(said["want"], list) else []
             self.name = str(said.get("skin"))[:MOST_NAME]
             self._look_at(self._feeds.get(self.name), frozenset(t for t in NEWEST if t in topics), anew=True)
@@ -149,3 +160,15 @@ class Viewer:
         if anew:
             self._sent, self._pictures, self._unread = {}, {}, 0
             self._go.set()
+
+
+def _understood(text: str) -> dict[str, Any]:
+    """A message of a browser. Raises NotUnderstood, also for what msgpack could not send back."""
+    try:
+        said = json.loads(text)
+        msgpack.packb(said)  # half a surrogate pair, 2**70, thousands of levels
+    except (ValueError, OverflowError, RecursionError) as bad:
+        raise NotUnderstood(f"found {foreign(text, 30)} ({foreign(bad, 40)}), expected JSON of text, numbers") from None
+    if not isinstance(said, dict) or not said.keys() & {"ack", "ping", "want", "command"}:
+        raise NotUnderstood(f"found {foreign(text, 30)}, expected a map with ack, ping, want or command")
+    return said

@@ -4,17 +4,21 @@
 //   ./subscribe palm          (Debian: g++ cppzmq-dev libmsgpack-cxx-dev)
 //
 // Usage: subscribe SKIN [FRAMES [SILENCE_S [ENDPOINT]]]. Prints each new frame and its contacts, until FRAMES came.
-// Exit status: 0 all came, 1 no fresh frame for SILENCE_S (stop the robot), 2 wrong arguments or no such socket.
+// Exit status: 0 all came, 1 no fresh frame for SILENCE_S (stop the robot), 2 wrong arguments, no such socket, or a
+// folder that is not ours.
 
+#include <sys/stat.h>
 #include <time.h>
 #include <unistd.h>
 
 #include <algorithm>
+#include <cerrno>
 #include <chrono>
 #include <cstdarg>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 #include <fstream>
 #include <map>
 #include <stdexcept>
@@ -35,12 +39,38 @@ struct NoFrame : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
+struct NoFolder : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+[[gnu::format(printf, 1, 2)]] std::string text(const char* form, ...) {
+  char line[256];
+  va_list values;
+  va_start(values, form);
+  std::vsnprintf(line, sizeof line, form, values);
+  va_end(values);
+  return line;
+}
+
+std::string runtime_folder() {
+  if (const char* folder = std::getenv("EITSKIN_RUNTIME"); folder && *folder) return folder;
+  if (const char* folder = std::getenv("XDG_RUNTIME_DIR"); folder && *folder) return std::string(folder) + "/eitskin";
+  return "/tmp/eitskin-" + std::to_string(geteuid());
+}
+
+// The publisher's address. Whoever owns the folder can put forged contacts into it: it must be ours alone. Made where
+// it is not there yet, so that nobody else makes it while we wait for the service.
 std::string endpoint() {
-  if (const char* folder = std::getenv("EITSKIN_RUNTIME"); folder && *folder)
-    return "ipc://" + std::string(folder) + "/publisher.ipc";
-  if (const char* folder = std::getenv("XDG_RUNTIME_DIR"); folder && *folder)
-    return "ipc://" + std::string(folder) + "/eitskin/publisher.ipc";
-  return "ipc:///tmp/eitskin-" + std::to_string(geteuid()) + "/publisher.ipc";
+  std::string folder = runtime_folder();
+  while (folder.size() > 1 && folder.back() == '/') folder.pop_back();  // lstat would look behind a link
+  struct stat found {};
+  if ((mkdir(folder.c_str(), 0700) != 0 && errno != EEXIST) || lstat(folder.c_str(), &found) != 0)
+    throw NoFolder("runtime folder " + folder + ": " + std::strerror(errno) +
+                   "; expected a folder of your own: start the service, or set EITSKIN_RUNTIME");
+  if (!S_ISDIR(found.st_mode) || found.st_uid != geteuid() || (found.st_mode & 077) != 0)
+    throw NoFolder("runtime folder " + folder + text(": found user %u, mode %o", found.st_uid, found.st_mode) +
+                   text("; expected user %u, mode 40700: set EITSKIN_RUNTIME to your own", geteuid()));
+  return "ipc://" + folder + "/publisher.ipc";
 }
 
 // The boot id, which says whose monotonic clock the stamps are of.
@@ -78,15 +108,6 @@ bool is_fresh(const Map& frame, bool replay) {
     for (const auto& stamp : stamps) now = std::max(now, stamp.second);
   }
   return 1e-9 * static_cast<double>(now - sample->second) <= field(frame, "valid_for_s").as<double>();
-}
-
-[[gnu::format(printf, 1, 2)]] std::string text(const char* form, ...) {
-  char line[256];
-  va_list values;
-  va_start(values, form);
-  std::vsnprintf(line, sizeof line, form, values);
-  va_end(values);
-  return line;
 }
 
 std::string describe(const Map& contact) {
@@ -161,6 +182,9 @@ int main(int argc, char** argv) {
   try {
     return subscribe(argv[1], argc > 2 ? std::atol(argv[2]) : -1, argc > 3 ? std::atof(argv[3]) : kSilenceS,
                      argc > 4 ? argv[4] : endpoint());
+  } catch (const NoFolder& bad) {
+    std::fprintf(stderr, "%s\n", bad.what());
+    return 2;
   } catch (const zmq::error_t& bad) {
     std::fprintf(stderr, "cannot subscribe: %s; expected ipc://PATH or tcp://HOST:PORT\n", bad.what());
     return 2;

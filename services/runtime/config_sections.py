@@ -135,12 +135,15 @@ class RecorderSection(Section):
     keep_files: Annotated[Count, Field(ge=0)] = 0  # of one recording, the oldest are deleted; 0: all
 
 
+HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]{1,253}$")]
+
+
 class PageSection(Section):
     """The live page: bridges/page, docs/page.md."""
 
     host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
     port: Annotated[Count, Field(ge=1, le=65515)] = 8080  # or the first free one of the twenty from there
-    names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]{1,253}$")], ...] = ()  # further names it is asked for by
+    names: tuple[HostName, ...] = ()  # further names it is asked for by
     recordings: str = "recordings"  # folder of the button Record where there is no [recorder]; "": no button
     metrics: Switch = False  # /metrics, for Prometheus
 
@@ -159,4 +162,5 @@ class FoxgloveSection(Section):
 
     host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
     port: Annotated[Count, Field(ge=0, le=65535)] = 8765
+    names: tuple[HostName, ...] = ()  # further names it is asked for by
     replay: Switch = False  # replayed frames are shown too

@@ -6,8 +6,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
-from aiohttp import web
-
 from bridges.page.server import PageServer
 from bridges.page.settings import PageSettings
 
@@ -21,14 +19,11 @@ def settings(**changes: Any) -> PageSettings:
 
 @asynccontextmanager
 async def serving(**changes: Any) -> AsyncIterator[PageServer]:
-    """A server with these settings changed. It listens at `server.port`."""
+    """A server with these settings changed. It listens at `server.door.port`."""
     server = PageServer(settings(**changes), SECRET, lambda skin, measured_ns: None)
     listening = server.listen()
-    runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=0.1)
-    await runner.setup()
-    await web.SockSite(runner, listening).start()
-    try:
-        yield server
-    finally:
-        await server.close()
-        await runner.cleanup()
+    async with server.door.serve(server.application(), listening):
+        try:
+            yield server
+        finally:
+            await server.close()

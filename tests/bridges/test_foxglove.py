@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from tornado.httpclient import HTTPClientError
 
-from bridges.foxglove.door import brings
 from protocol.control import ControlServer
 from tests.bridges.conftest import FakeService, RunningBridge
 from tests.bridges.viewer import Viewer
@@ -184,20 +183,3 @@ def test_beyond_this_host_even_looking_needs_the_token(runtime: Path, fake: Fake
         asyncio.run(look())
     finally:
         bridge.close()
-
-
-@pytest.mark.parametrize(
-    ("head", "let_in"),
-    [
-        (b"GET /?token=abc HTTP/1.1\r\nHost: x\r\n\r\n", True),
-        (b"GET /x?y=1&token=abc HTTP/1.1\r\n\r\n", True),
-        (b"GET /?token=abcd HTTP/1.1\r\n\r\n", False),
-        (b"GET / HTTP/1.1\r\ntoken: abc\r\n\r\n", False),
-        (b"GET /?token= HTTP/1.1\r\n\r\n", False),
-        (b"POST /?token=abc HTTP/1.1\r\n\r\n", False),
-        (b"\xff\xfe\r\n\r\n", False),
-        (b"GET http://[/?token=abc HTTP/1.1\r\n\r\n", False),
-    ],
-)
-def test_the_door_reads_the_token_of_the_first_line_alone(head: bytes, let_in: bool) -> None:
-    assert brings(head, "abc") is let_in

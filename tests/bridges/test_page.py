@@ -17,6 +17,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from bridges.door import Door, kept_token
 from bridges.page.commands import OwnRecorder
 from bridges.page.replays import Replay, ReplayRefused, listed
 from bridges.page.server import PageServer
@@ -60,7 +61,7 @@ class Browser:
 
 @asynccontextmanager
 async def looking(server: PageServer, query: str = "", **headers: str) -> AsyncIterator[Browser]:
-    own = f"http://127.0.0.1:{server.port}"
+    own = f"http://127.0.0.1:{server.door.port}"
     async with aiohttp.ClientSession() as session:
         async with session.ws_connect(f"{own}/live{query}", headers={"Origin": own, **headers}) as socket:
             browser = Browser(socket)
@@ -93,7 +94,7 @@ def run(test: Callable[[], Awaitable[None]]) -> None:
 def test_asked_by_another_name_or_from_another_page_it_refuses(runtime: Path) -> None:
     async def test() -> None:
         async with serving() as server, aiohttp.ClientSession() as session:
-            own = f"http://127.0.0.1:{server.port}"
+            own = f"http://127.0.0.1:{server.door.port}"
 
             async def asked(path: str, **headers: str) -> tuple[int, aiohttp.typedefs.LooseHeaders]:
                 async with session.get(own + path, headers=headers) as answer:
@@ -103,10 +104,10 @@ def test_asked_by_another_name_or_from_another_page_it_refuses(runtime: Path) ->
             policy = headers["Content-Security-Policy"]  # type: ignore[index]
             assert status == 200 and "default-src 'none'" in policy and "unsafe" not in policy
             assert (await asked("/", Host="evil.example"))[0] == 421
-            assert (await asked("/", Host=f"evil.example:{server.port}"))[0] == 421
+            assert (await asked("/", Host=f"evil.example:{server.door.port}"))[0] == 421
             for path in ("/server.py", "/../server.py", "/%2e%2e/server.py", "/web/../main.js.map", "/etc/passwd"):
                 assert (await asked(path))[0] == 404, path
-            for origin in ("http://evil.example", f"https://127.0.0.1:{server.port}", "null", ""):
+            for origin in ("http://evil.example", f"https://127.0.0.1:{server.door.port}", "null", ""):
                 with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
                     async with session.ws_connect(f"{own}/live", headers={"Origin": origin}):
                         pass
@@ -126,7 +127,7 @@ def test_beyond_the_loopback_looking_needs_the_token_too(runtime: Path) -> None:
             assert refused.value.status == 403
             async with looking(server, f"?token={SECRET}"):
                 pass
-            named = {"Host": f"robot.lan:{server.port}", "Origin": f"http://robot.lan:{server.port}"}
+            named = {"Host": f"robot.lan:{server.door.port}", "Origin": f"http://robot.lan:{server.door.port}"}
             async with looking(server, f"?token={SECRET}", **named):
                 pass
 
@@ -136,7 +137,7 @@ def test_beyond_the_loopback_looking_needs_the_token_too(runtime: Path) -> None:
 def test_the_first_free_port_is_taken(runtime: Path) -> None:
     async def test() -> None:
         async with serving() as first, serving() as second:
-            assert settings().port <= first.port < second.port
+            assert settings().port <= first.door.port < second.door.port
 
     run(test)
 
@@ -326,13 +327,11 @@ def test_settings_that_say_too_little_are_refused() -> None:
 
 
 def test_the_token_is_kept_for_a_runtime_folder_and_for_its_owner_alone(runtime: Path) -> None:
-    from bridges.page.commands import TOKEN_FILE, token
-
-    first = token()
-    assert len(first) >= 16 and token() == first
-    assert (runtime / TOKEN_FILE).stat().st_mode & 0o777 == 0o600
-    (runtime / TOKEN_FILE).write_text("short")
-    assert token() not in ("short", first)
+    first = kept_token("page")
+    assert len(first) >= 16 and kept_token("page") == first != kept_token("foxglove")
+    assert (runtime / "page.token").stat().st_mode & 0o777 == 0o600
+    (runtime / "page.token").write_text("short")
+    assert kept_token("page") not in ("short", first)
 
 
 def test_only_recordings_of_the_folder_are_replayed(tmp_path: Path) -> None:
@@ -354,7 +353,7 @@ def test_the_settings_in_skin_toml_reach_it() -> None:
     from services.runtime.config import ROOT, load
 
     found = PageSettings.of(Handed.read(handed("page", load(ROOT / "skin.toml"))))
-    assert found.skins == ("palm",) and found.port == 8080 and found.local
+    assert found.skins == ("palm",) and found.port == 8080 and Door(found.host, (), "").local
     assert json.loads(handed("page", load(ROOT / "skin.toml")))["options"]["host"] == "127.0.0.1"
     inside = PageSettings.of(Handed.read(handed("page", load(ROOT / "skin.toml"), "0.0.0.0", 9000)))
     assert (inside.host, inside.port) == ("0.0.0.0", 9000), "what a container's command says"
@@ -366,7 +365,7 @@ def test_the_settings_in_skin_toml_reach_it() -> None:
 )
 def test_the_printed_address_is_one_that_the_page_answers_to(host: str, shown: str) -> None:
     assert openable(host) == shown
-    assert f"{shown}:0" in PageServer(settings(host=host), SECRET, lambda skin, measured_ns: None).names
+    assert f"{shown}:0" in PageServer(settings(host=host), SECRET, lambda skin, measured_ns: None).door.names
 
 
 def test_what_the_page_of_the_page_configures_is_understood() -> None:

@@ -29,7 +29,7 @@ def serving(**changes: Any) -> AbstractAsyncContextManager[PageServer]:
 
 async def asked(server: PageServer, query: str = "", **headers: str) -> tuple[int, str, str]:
     async with aiohttp.ClientSession() as session:
-        async with session.get(f"http://127.0.0.1:{server.port}/metrics{query}", headers=headers) as answer:
+        async with session.get(f"http://127.0.0.1:{server.door.port}/metrics{query}", headers=headers) as answer:
             return answer.status, answer.headers.get("Content-Type", ""), await answer.text()
 
 

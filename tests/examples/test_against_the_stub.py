@@ -24,11 +24,10 @@ from protocol.client import ContactSubscriber, Stale
 from protocol.control import ControlClient
 from protocol.frames import Contact, ContactFrame
 from protocol.sockets import AllReader
-from tests import needs
 from tests.docs.snippets import snippets
+from tests.examples.compiled import ROOT, cpp_subscriber
 
-ROOT = Path(__file__).resolve().parents[2]
-CPP = ROOT / "examples" / "cpp" / "subscribe.cpp"
+__all__ = ["cpp_subscriber"]
 PATIENT_S = "1.5"  # what counts as silence here: a busy machine that runs tests is no fault of the skin
 
 pytestmark = [
@@ -217,17 +216,6 @@ def test_follow_the_finger_follows_holds_still_and_goes_on(start: Start) -> None
     assert line_with(robot, "robot moves")
     stub("release")
     assert line_with(robot, "robot stands")
-
-
-@pytest.fixture(scope="module")
-def cpp_subscriber(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The C++ subscriber, compiled."""
-    needs.CPP.here()
-    program = tmp_path_factory.mktemp("cpp") / "subscribe"
-    flags = ["-std=c++17", "-Wall", "-Wextra", "-Werror", "-DMSGPACK_NO_BOOST"]
-    done = subprocess.run(["g++", *flags, str(CPP), "-lzmq", "-o", str(program)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return program
 
 
 def test_the_cpp_subscriber_sees_the_same_contacts(cpp_subscriber: Path, start: Start) -> None:
