@@ -6,7 +6,7 @@ from protocol.frames import TrueTouch, TruthFrame
 
 from .board import Scan
 from .sheet import Sheet
-from .world import NEWTON, Touch, World
+from .world import Touch, World
 
 
 def truth_frame(skin: str, sheet: Sheet, scan: Scan, world: World, stamps: dict[str, int]) -> TruthFrame:
@@ -32,6 +32,6 @@ def _touch(sheet: Sheet, touch: Touch) -> TrueTouch:
         rotation=touch.rotation,
         aspect=touch.aspect,
         drop=touch.drop,
-        force_n=touch.drop / NEWTON,
+        force_n=touch.force_n,
         outline=sheet.outline(touch).tolist(),
     )
