@@ -2,8 +2,9 @@
 
 Lengths are model units (half a side of the square skin), angles radians, drops S/m (positive where pressed). A shape
 is given by its circumscribed circle: every corner of a triangle, rectangle, square and of the square round an L lies on
-the circle of radius `radius` about (x, y); an L has arms 0.4 of its side thick; a Hertz contact is a circle whose drop
-is drop * sqrt(1 - (r / R)^2), the pressure under a ball. Kinds are numbered 1-6 in files (`ROW`), in this order.
+the circle of radius `radius` about (x, y); an L has arms 0.4 of its side thick; a Hertz contact is a circle whose
+pressure is that under a ball, sqrt(1 - (r / R)^2) of the middle's, and so is its drop as long as the foam does not
+saturate (models/pressure.py). Kinds are numbered 1-6 in files (`ROW`), in this order.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from models.pressure import FOAM
 
 Array = NDArray[np.float64]
 
@@ -145,7 +148,7 @@ class Shape:
     @property
     def integral(self) -> float:
         """Integrated drop, S/m times square model units: what survives when peak and area trade off."""
-        return self.drop * self.area * (2 / 3 if self.kind == "hertz" else 1.0)
+        return self.drop * self.area * (FOAM.ball_mean(self.drop) if self.kind == "hertz" else 1.0)
 
     @property
     def shape_class(self) -> int:
@@ -164,7 +167,7 @@ class Shape:
         if self.kind != "hertz":
             return self.contains(points).astype(float)
         r2 = ((points[..., 0] - self.x) ** 2 + (points[..., 1] - self.y) ** 2) / self.radius**2
-        return np.sqrt(np.maximum(0.0, 1.0 - r2))
+        return FOAM.ball(self.drop, np.sqrt(np.maximum(0.0, 1.0 - r2)))
 
     def fraction(self, n: int, *, covered: bool = False) -> Array:
         """Pixel means of `profile` on the square [-1, 1]^2: (n, n), row 0 at the lowest y.

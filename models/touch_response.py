@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from models.patterns import incidence
+from models.pressure import FOAM
 from models.shapes import ROUND, SUBPOINTS, Array, Shape, polygon_coverage
 
 CELLS = 14
@@ -72,7 +73,7 @@ class TouchGrid:
         if shape.kind == "hertz":
             axis = (np.arange(self.cells * SUBPOINTS) + 0.5) * self.side / SUBPOINTS
             x, y = self.low[0] + axis - shape.x, self.low[1] + axis[:, None] - shape.y
-            profile = np.sqrt(np.maximum(1 - (x**2 + y**2) / shape.radius**2, 0.0))
+            profile = FOAM.ball(shape.drop, np.sqrt(np.maximum(1 - (x**2 + y**2) / shape.radius**2, 0.0)))
             share = profile.reshape(self.cells, SUBPOINTS, self.cells, SUBPOINTS).mean(axis=(1, 3))
         else:
             outline = shape.outline(ROUND)
