@@ -31,7 +31,15 @@ def label(contact: Contact) -> str:
     if contact.force_n is None:
         return f"{contact.id} {contact.shape}"
     sigma = "" if contact.force_sigma_n is None else f" ± {contact.force_sigma_n:.1f}"
-    return f"{contact.id} {contact.force_n:.1f}{sigma} N {contact.shape}"
+    return f"{contact.id} {contact.force_n:.1f}{sigma} N{_pressure(contact)} {contact.shape}"
+
+
+def _pressure(contact: Contact) -> str:
+    """Where it is highest, for a person."""
+    if contact.pressure_pa is None:
+        return ""
+    sigma = contact.pressure_sigma_pa
+    return f" {contact.pressure_pa / 1e3:.1f}{'' if sigma is None else f' ± {sigma / 1e3:.1f}'} kPa"
 
 
 def tail(contact: Contact, metres_per_newton: float) -> list[float]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from models.pressure import MOST_DROP
 from models.shapes import SIMULATED
 from protocol.errors import EitskinError
 
 from .timeline import Cue, PiecewiseLinear, Script, TouchPath
-from .world import NEWTON, Touch
+from .world import Touch, pressed
 
 FOLDER = Path(__file__).with_name("scenes")
 POSE = {f.name for f in fields(Touch)} - {"kind", "drop", "crept"}
@@ -77,22 +79,34 @@ def touch(values: Mapping[str, Any]) -> Touch:
 
     Raises ValueError for what no skin could feel.
     """
-    if "drop" in values and values["drop"] is not None:
-        drop = float(values["drop"])
-    else:
-        drop = NEWTON * float(values["force"])
     kind = str(values.get("shape", "circle"))
     if kind not in SIMULATED:
         raise ValueError(f"shape {kind!r}: expected one of {', '.join(SIMULATED)}")
-    if not 0 <= drop < 1:
-        raise ValueError(f"a conductivity drop of {drop:g} S/m ({drop / NEWTON:g} N): expected 0 to below 1 S/m (10 N)")
     pose = {key: float(values[key]) for key in POSE & set(values)}
     pose.setdefault("radius", 0.01)
     if not 0 < pose["radius"] <= 0.1:
         raise ValueError(f"radius {pose['radius']:g} m: expected above 0, up to 0.1 m")
+    if not pose.get("aspect", 1.0) > 0:
+        raise ValueError(f"aspect {pose['aspect']:g}: expected above 0")
     if not all(abs(pose[key]) <= 1 for key in ("x", "y")):
         raise ValueError(f"position ({pose['x']:g}, {pose['y']:g}) m: not on any skin; positions are metres")
+    if values.get("drop") is None:
+        return _under_force(kind, float(values["force"]), pose)
+    drop = float(values["drop"])
+    if not 0 <= drop < 1:
+        raise ValueError(f"a conductivity drop of {drop:g} S/m: expected 0 to below 1 S/m")
     return Touch(kind=kind, drop=drop, **pose)
+
+
+def _under_force(kind: str, force_n: float, pose: Mapping[str, float]) -> Touch:
+    """Raises ValueError for a force that no foam answers to."""
+    made = pressed(kind, force_n=force_n, **pose) if 0 <= force_n < math.inf else None
+    if made is None or made.drop >= MOST_DROP:
+        most = Touch(kind=kind, drop=MOST_DROP, **pose).force_n
+        raise ValueError(
+            f"a force of {force_n:g} N: expected 0 to {most:.3g} N on this patch, where the foam conducts no more"
+        )
+    return made
 
 
 def _track(values: Mapping[str, Any]) -> TouchPath:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-NEWTON = 0.1  # S/m of conductivity drop a newton makes, unless a scene says otherwise
+from models.pressure import FOAM
+from models.shapes import Shape
 
 MOVING = ("x", "y", "radius", "drop", "rotation", "aspect", "crept")
 
@@ -29,8 +30,13 @@ class Touch:
 
     @property
     def force_n(self) -> float:
-        """Newtons that make `drop`."""
-        return self.drop / NEWTON
+        """Newtons: the foam's pressure, summed over the patch, that makes `drop`."""
+        return FOAM.force(self.kind, self.drop, _area(self.kind, self.radius, self.aspect))
+
+    @property
+    def pressure(self) -> float:
+        """Pascals, where it is highest."""
+        return float(FOAM.pressure(self.drop))
 
     @property
     def felt(self) -> float:
@@ -48,6 +54,19 @@ class WarmSpot:
     y: float
     radius: float
     share: float
+
+
+def pressed(
+    kind: str, x: float, y: float, radius: float, force_n: float, rotation: float = 0.0, aspect: float = 1.0
+) -> Touch:
+    """The touch of this force [N]: its drop is what the foam answers to the pressure under its patch."""
+    drop = FOAM.peak_drop(kind, force_n, _area(kind, radius, aspect))
+    return Touch(kind, x, y, radius, drop, rotation, aspect)
+
+
+def _area(kind: str, radius: float, aspect: float) -> float:
+    """Square metres."""
+    return Shape(kind, 0.0, 0.0, radius, 0.0, 0.0, aspect).area
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +135,7 @@ def _contacts(a: World, b: World) -> tuple[tuple[float, ...], tuple[float, ...]]
 def steps_between(a: World, b: World) -> int:
     """How many solved poses a path from a to b needs so that cubic interpolation stays below the noise of 80 dB.
 
-    A pose may move by a quarter of its radius, turn by a quarter of a radian, change its drop by 0.1 S/m (1 N),
+    A pose may move by a quarter of its radius, turn by a quarter of a radian, change its drop by 0.1 S/m,
     its size by a tenth; the background by 2 %, a contact impedance by 10 %.
     """
     need = [abs(a.background - b.background) / 0.02]

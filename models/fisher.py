@@ -26,6 +26,7 @@ from models import patterns
 from models.elements import Array
 from models.forward import ForwardModel, shared
 from models.prereconstruction import Drift
+from models.pressure import FOAM
 from models.shapes import Shape
 
 STEPS = (0.03, 0.03, 0.06, 0.06)  # of theta, for central differences: half or twice changes a floor by a few percent
@@ -95,6 +96,7 @@ class Floor:
     radius: float
     drop: float
     integral: float
+    force: float = 0.0  # of the foam's pressure summed over the patch (models/pressure.py)
 
     @property
     def position_percent(self) -> float:
@@ -170,8 +172,8 @@ def floors(
     fisher = information(seen, rows, noise, drift)
     prior = prior or SizePrior()
     return {
-        "cramer_rao": _floor(fisher + prior.information(known_only=True)),
-        "bayes": _floor(fisher + prior.information()),
+        "cramer_rao": _floor(fisher + prior.information(known_only=True), touch.drop),
+        "bayes": _floor(fisher + prior.information(), touch.drop),
     }
 
 
@@ -193,18 +195,20 @@ def information(seen: Sensitivity, rows: NDArray[np.int64], noise: MeasurementNo
 
 def mean_floor(each: Iterable[Floor]) -> Floor:
     """Root mean square over touches."""
-    table = np.array([[f.position, f.radius, f.drop, f.integral] for f in each])
+    table = np.array([[f.position, f.radius, f.drop, f.integral, f.force] for f in each])
     return Floor(*(float(v) for v in np.sqrt((table**2).mean(axis=0))))
 
 
-def _floor(fisher: Array) -> Floor:
+def _floor(fisher: Array, drop: float) -> Floor:
     covariance = np.linalg.pinv(fisher, rcond=1e-14, hermitian=True)
     area_and_drop = np.array([0, 0, 2, 1.0])
+    area_and_pressure = np.array([0, 0, 2, float(FOAM.gain(drop))])
     return Floor(
         position=float(np.sqrt(covariance[0, 0] + covariance[1, 1])),
         radius=float(np.sqrt(covariance[2, 2])),
         drop=float(np.sqrt(covariance[3, 3])),
         integral=float(np.sqrt(area_and_drop @ covariance @ area_and_drop)),
+        force=float(np.sqrt(area_and_pressure @ covariance @ area_and_pressure)),
     )
 
 

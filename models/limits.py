@@ -1,6 +1,7 @@
-"""What physics allows: floors of a touch's position, size and drop for a skin, a pattern and a noise; table and maps.
+"""What physics allows: floors of a touch's position, size, drop and force for a skin, a pattern and a noise.
 
     skin limits --skin square16 --snr 70 --map limits.png
+    skin limits --forces --snr 80                            the smallest forces, by radius
     skin limits --rank --snr inf --floor-ohm 1e-3
 
 The floors and what they mean: models/fisher.py.
@@ -19,18 +20,21 @@ from typing import Any
 import numpy as np
 
 from models import geometry, patterns
+from models.bundle import BundleError
 from models.command import real, whole
 from models.elements import Array
 from models.fisher import Floor, MeasurementNoise, SizePrior, floors, mean_floor
+from models.force_limits import RADII_MM, places, smallest
 from models.forward import shared
 from models.prereconstruction import Drift
+from models.pressure import FOAM, disc
 from models.shapes import Shape
 
 __all__ = ["Floor", "MeasurementNoise", "SizePrior", "floors", "map_floors", "mean_floor", "rank_patterns"]
 
 DEFAULT_RADIUS = 0.2  # of the skin's half width
 MAP_SIDE = 12  # positions along the side, at least, in a map
-DROPS = (0.1, 0.15, 0.3, 0.5)  # 1, 1.5, 3 and 5 N by the default force law
+DROPS = (0.1, 0.15, 0.3, 0.5)  # 1, 1.5, 3 and 5 N under a disc of 10 mm radius
 
 
 @dataclass(frozen=True)
@@ -48,17 +52,9 @@ class Case:
         return floors(self.skin, touch, self.noise, self.prior, self.pattern, self.drift)
 
 
-def positions(skin: str, radius: float, per_side: int) -> Array:
-    """(m, 2) grid points at which a touch of this radius lies wholly on the skin."""
-    line = (np.arange(per_side) + 0.5) * 2 / per_side - 1
-    points = np.array([(x, y) for y in line for x in line])
-    curve = shared(skin, "inverse").skin.curve
-    return np.asarray(points[curve.inside(points) & (curve.distance(points) >= radius)])
-
-
 def map_floors(case: Case, radius: float, drop: float, per_side: int = 9) -> tuple[Array, dict[str, list[Floor]]]:
     """Positions (m, 2) and at each of them the floors, by kind."""
-    points = positions(case.skin, radius, per_side)
+    points = places(case.skin, radius, per_side)
     if not len(points):
         raise ValueError(f"no touch of radius {_mm(case.skin, radius)} fits on skin '{case.skin}'")
     both = [case.floor(x, y, radius, drop) for x, y in points]
@@ -80,12 +76,16 @@ def rank_patterns(case: Case, radius: float = 0.2, drop: float = 0.15, per_side:
 def table(case: Case, radius: float, per_side: int) -> list[dict[str, Any]]:
     """A row a drop: floors over the skin, root mean square."""
     rows = []
+    area = disc(radius * shared(case.skin, "inverse").skin.metres_per_unit)
     for drop in DROPS:
         _, by_kind = map_floors(case, radius, drop, per_side)
         for kind, each in by_kind.items():
             mean = mean_floor(each)
             worst = max(each, key=lambda f: f.position).position_percent
-            rows.append({"drop": drop, "floor": kind, "worst_position_percent": worst} | _figures(mean))
+            newtons = FOAM.force("circle", drop, area)
+            rows.append(
+                {"newtons": newtons, "drop": drop, "floor": kind, "worst_position_percent": worst} | _figures(mean)
+            )
     return rows
 
 
@@ -95,6 +95,7 @@ def _figures(floor: Floor) -> dict[str, float]:
         "radius_percent": 100 * floor.radius,
         "drop_percent": 100 * floor.drop,
         "integral_percent": 100 * floor.integral,
+        "force_percent": 100 * floor.force,
     }
 
 
@@ -162,6 +163,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--drop", type=real(), default=0.15, help="S/m, for --map and --rank")
     parser.add_argument("--known-radius", action="store_true", help="the indenter's size is known")
     parser.add_argument("--grid", type=whole(), default=6, help="positions along the skin's side")
+    parser.add_argument("--forces", action="store_true", help="the smallest forces that are shown and measured instead")
     parser.add_argument("--rank", action="store_true", help="rank the drive patterns instead")
     parser.add_argument("--map", type=Path, metavar="PNG", help="draw the floors over the skin")
     parser.add_argument("--json", action="store_true")
@@ -181,20 +183,27 @@ def main(argv: Sequence[str] | None = None) -> int:
             SizePrior(radius=(radius, radius)) if options.known_radius else SizePrior(),
             Drift(options.drift, options.drift),
         )
-        if options.rank:
+        if options.forces:
+            rows = [asdict(smallest(case.skin, case.noise, mm, options.grid)) for mm in RADII_MM]
+        elif options.rank:
             ranked = rank_patterns(case, radius, options.drop, options.grid)
             rows = [{"pattern": name} | _figures(floor) for name, floor in ranked]
         else:
             rows = table(case, radius, options.grid)
         if options.map:
             draw(case, radius, options.drop, max(options.grid, MAP_SIDE), options.map)
-    except ValueError as error:
+    except (ValueError, BundleError) as error:
         print(f"skin limits: {error}", file=sys.stderr)
         return 2
     if options.json:
         given = json.loads(json.dumps(asdict(case)), parse_constant=str)  # infinities as words: JSON has none
         given["prior"]["radius"] = [each * metres_per_unit for each in case.prior.radius]
         print(json.dumps({"case": given, "radius_m": radius * metres_per_unit, "rows": rows}, indent=1))
+        return 0
+    if options.forces:
+        print(f"{options.skin}, {_noise(case.noise)}, one frame, size unknown; newtons, by radius:")
+        print("shown in 99.9 % of frames, and from where the force's standard deviation can be below a quarter of it")
+        _print(rows)
         return 0
     size = "known" if options.known_radius else "unknown"
     used = options.pattern or shared(options.skin, "inverse").skin.pattern_name

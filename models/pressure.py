@@ -1,4 +1,4 @@
-"""How foam answers to being pressed: conductivity drop from local pressure, and back (numpy only). The one place for it.
+"""How foam answers to being pressed: conductivity drop from local pressure, and back (numpy only).
 
     drop = g(p):    slope * p                                    up to `knee`
                     1 - (1 - knee) exp(-(slope p - knee) / (1 - knee))   beyond: no pressure takes all of it away
@@ -49,21 +49,22 @@ class Foam:
         """Drop [S/m] under pressures [Pa]; none under a pull."""
         linear = self.slope * np.maximum(np.asarray(pressure, dtype=float), 0.0)
         left = 1 - self.knee
-        return np.where(linear <= self.knee, linear, 1 - left * np.exp(np.minimum((self.knee - linear) / left, 0.0)))
+        beyond = 1 - left * np.exp(np.minimum((self.knee - linear) / left, 0.0))
+        return np.asarray(np.where(linear <= self.knee, linear, beyond))
 
     def pressure(self, drop: ArrayLike) -> Array:
         """Pressure [Pa] that makes a drop; of a drop beyond MOST_DROP, that of MOST_DROP."""
         seen = np.clip(np.asarray(drop, dtype=float), 0.0, MOST_DROP)
         left = 1 - self.knee
         beyond = self.knee - left * np.log((1 - np.maximum(seen, self.knee)) / left)
-        return np.where(seen <= self.knee, seen, beyond) / self.slope
+        return np.asarray(np.where(seen <= self.knee, seen, beyond) / self.slope)
 
     def gain(self, drop: ArrayLike) -> Array:
         """d log pressure / d log drop at a drop: by how much more uncertain the pressure is than its drop."""
         seen = np.clip(np.asarray(drop, dtype=float), 1e-9, MOST_DROP)
         left = 1 - self.knee
         steep = np.where(seen <= self.knee, 1.0, left / (1 - np.maximum(seen, self.knee)))
-        return steep * seen / (self.slope * self.pressure(seen))
+        return np.asarray(steep * seen / (self.slope * self.pressure(seen)))
 
     # -- flat contacts, and balls -----------------------------------------------------------------------------------
     def flat_drop(self, force: float, area: float) -> float:

@@ -150,6 +150,10 @@ class Shape:
         """Integrated drop, S/m times square model units: what survives when peak and area trade off."""
         return self.drop * self.area * (FOAM.ball_mean(self.drop) if self.kind == "hertz" else 1.0)
 
+    def force(self, metres_per_unit: float) -> float:
+        """Newtons that make this touch on a sheet of FOAM: its pressure summed over the patch."""
+        return FOAM.force(self.kind, self.drop, self.area * metres_per_unit**2)
+
     @property
     def shape_class(self) -> int:
         """Index into CLASSES; a Hertz contact and an ellipse count as circles."""

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from models.prereconstruction import Matrices
+from models.pressure import ANCHOR_DROP
 
 Array = npt.NDArray[np.floating]
 Rows = npt.NDArray[np.integer]
 
-NEWTON = 0.1  # S/m of drop
 RADIUS = 0.2  # model units, of the touches that parts are chosen by
 RADII = (0.1, 0.2, 0.4)  # model units, of the touches that are told apart
 SPACING = 0.1  # model units between grid positions
@@ -55,10 +55,10 @@ def touches(m: Matrices, half_width: float = 1.0, radii: tuple[float, ...] = RAD
 
 def slopes(grid: Touches, judged: npt.NDArray[np.bool_], sigma: float) -> Array:
     """(M, K, 3) of d over sigma, to x, y and the log of drop times area, which a linear touch changes d in proportion
-    to; of the judged touches of one newton.
+    to; of the judged touches of one newton (RADIUS is 10 mm on square16).
     """
     place = {(round(x, 6), round(y, 6)): k for k, (x, y) in enumerate(grid.position[judged])}
-    signal = NEWTON * grid.response[judged] / sigma
+    signal = ANCHOR_DROP * grid.response[judged] / sigma
     columns = []
     for axis in np.eye(2):
         ahead, behind, distance = np.arange(len(signal)), np.arange(len(signal)), np.zeros(len(signal))

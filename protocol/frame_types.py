@@ -351,6 +351,13 @@ class Contact:
     kind: str = wire(Text(32), "of a refined touch: likeliest of " + ", ".join(KINDS) + "; else empty", "")
     kind_probability: float | None = wire(Maybe(Float(0, 1)), "of `kind`, or nil", None)
     area_sigma_m2: float | None = wire(Maybe(Float(0, unit="m^2")), "standard uncertainty of `area_m2`, or nil", None)
+    pressure_pa: float | None = wire(
+        Maybe(Float(0, unit="Pa")),
+        "pressure on the skin where it is highest in the patch; nil where nobody knows; of a force that is "
+        "`extrapolated` because the foam gives way no more, a lower bound, as `force_n` is",
+        None,
+    )
+    pressure_sigma_pa: float | None = wire(Maybe(Float(0, unit="Pa")), "its standard uncertainty, or nil", None)
     sheet: list[float] | None = wire(
         Maybe(Vector(2, "m")), "x, y on the unrolled sheet, as images have it; nil: those of `position`", None
     )

@@ -160,7 +160,7 @@ class Publishing(Stage):
             add_reason(out.reasons, "changing")
         if frame.followed and out.valid:
             self._follow(frame, out)
-        if any((c.force_n or 0.0) > self.law.most_n for c in out.contacts):
+        if any((c.force_n or 0.0) > self.law.most_n or self.law.saturates(c.pressure_pa) for c in out.contacts):
             add_reason(out.reasons, "extrapolated")
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)

@@ -46,7 +46,7 @@ MESH = {"full": "reference", "quick": "stub"}
 LEVELS = ("none", "70")
 UNTOUCHED = 64
 SCORED_AT = 96
-NEWTONS_PER_SIEMENS = 10.0  # of the default force law
+METRES_PER_UNIT = 0.05  # of square16
 # mean IoU with calibration, noise-free and at 70 dB; None: no worse than without
 WANTED: dict[str, tuple[float | None, float | None]] = {
     "none": (0.93, 0.85),
@@ -83,7 +83,7 @@ def solved(mismatch: Mismatch, touches: int, seed: int, mesh: str) -> SkinFrames
 
 def truth(frames: SkinFrames, touch: list[Shape]) -> tuple[NDArray[np.bool_], float]:
     """Which pixels are touched, and the force [N]."""
-    force = NEWTONS_PER_SIEMENS * max(shape.drop for shape in touch)
+    force = max(shape.force(METRES_PER_UNIT) for shape in touch)
     if not frames.mismatch.blur_m:
         return np.any([s.fraction(SCORED_AT, covered=True) > 0.5 for s in touch], axis=0), force
     drop = soft_drop(touch, frames.mismatch.blur_m / frames.metres_per_unit, SCORED_AT)

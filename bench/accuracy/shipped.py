@@ -22,7 +22,7 @@ from services.recordings.npz_file import Input
 from services.recordings.reconstruction import reconstruct
 from services.runtime.config import Indenter, NetworkFile, Skin
 
-NEWTON_PER_DROP = 10.0  # the default force law: 0.1 S/m is 1 N
+METRES_PER_UNIT = 0.05  # of square16
 LARGE = 0.25  # radius from which on shape classes are scored
 VARIANTS: tuple[NetworkFile, ...] = ("full", "fast", "int8")
 RATE_HZ = 22.0  # the board's full scan
@@ -93,10 +93,10 @@ def contacts(found: dict[str, Array], frames: Frames) -> Row:
     position = [np.hypot(*(found["position"][k, 0] / 0.05 - frames.scene(k)[0].centroid)) for k in singles]
     distance = metrics.of_side(np.array(position + [metrics.SIDE / np.sqrt(2)] * missed))
     force = [k for k in frames.of("force") if np.isfinite(found["force"][k, 0])]
-    newton = [frames.scene(k)[0].drop * NEWTON_PER_DROP for k in force]
+    newton = [frames.scene(k)[0].force(METRES_PER_UNIT) for k in force]
     errors = metrics.relative_error([found["force"][k, 0] for k in force], newton)
     within = [
-        abs(found["force"][k, 0] - frames.scene(k)[0].drop * NEWTON_PER_DROP) <= found["force_sigma"][k, 0]
+        abs(found["force"][k, 0] - frames.scene(k)[0].force(METRES_PER_UNIT)) <= found["force_sigma"][k, 0]
         for k in singles
     ]
     wanted = {"two": 2, "three": 3}
@@ -138,7 +138,7 @@ def known_indenter(noisy: Frames, untouched: Array, skin: Skin, bundle: Bundle) 
     some = Frames(*(getattr(noisy, f)[index] for f in noisy.__dataclass_fields__))
     found, _ = reconstructed(some, untouched, skin.model_copy(update={"indenter": prior}), bundle)
     force, sigma = np.nan_to_num(found["force"][:, 0]), found["force_sigma"][:, 0]
-    newton = np.array([s.drop * NEWTON_PER_DROP for s in shapes])
+    newton = np.array([s.force(METRES_PER_UNIT) for s in shapes])
     errors = metrics.relative_error(force, newton)
     return {
         "known_force_%": float(errors.mean()),
@@ -194,8 +194,8 @@ def floors(frames: Frames, levels: Iterable[str]) -> dict[str, Row]:
         everywhere, force = mean(frames.of("shapes", "hertz", "force")), mean(frames.of("force"))
         found[level] = {
             "position_rms_%": float(metrics.of_side(everywhere.position)),
-            "force_rms_%": 100 * force.drop,
+            "force_rms_%": 100 * force.force,
             "integral_rms_%": 100 * force.integral,
-            "known_force_rms_%": 100 * indenter.drop,
+            "known_force_rms_%": 100 * indenter.force,
         }
     return found

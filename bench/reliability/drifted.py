@@ -17,11 +17,12 @@ from bench.reliability.direct import SNR_DB, DirectSkin
 from bench.reliability.scenes import METRES, SolvedSheet, circle
 from firmware_stub.analog import Analog, BoardNoise
 from firmware_stub.faults import Faults
-from firmware_stub.world import NEWTON, Touch, World
+from firmware_stub.world import Touch, World
 from models import limits
 from models.bundle import Bundle
 from models.fisher import mean_floor
 from models.prereconstruction import Drift
+from models.pressure import FOAM, disc
 from services.pipeline import Pipeline
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import reconstruct
@@ -83,7 +84,7 @@ def answer_of(touch: Touch, valid: bool, contacts: Sequence[tuple[float, float, 
     """contacts: x, y [m], force [N] of each; none of them counts where the row is not valid."""
     off = [math.hypot(x - touch.x, y - touch.y) for x, y, _ in contacts] if valid else []
     nearest = int(np.argmin(off)) if off else -1
-    newtons, near = touch.drop / NEWTON, nearest >= 0 and off[nearest] <= FAR_M
+    newtons, near = touch.force_n, nearest >= 0 and off[nearest] <= FAR_M
     error = contacts[nearest][2] / newtons - 1 if near and math.isfinite(contacts[nearest][2]) else -1.0
     return TouchEstimate(
         newtons,
@@ -170,14 +171,19 @@ def row(answers: Sequence[TouchEstimate], alarms: int, floor_percent: float | No
 
 
 def floor_percent(change: Change, per_side: int, radii: Sequence[float] = RADII) -> float:
-    """What `skin limits --snr 80 --drift SIZE --radius R` prints as the Bayesian floor of the drop, root mean square
+    """What `skin limits --snr 80 --drift SIZE --radius R` prints as the Bayesian floor of the force, root mean square
     over the touches of the table.
     """
     size = change.size
     case = limits.Case("square16", None, limits.MeasurementNoise(SNR_DB), drift=Drift(size, size))
     floors = [
-        mean_floor(limits.map_floors(case, radius, newtons * NEWTON, per_side)[1]["bayes"]).drop
+        mean_floor(limits.map_floors(case, radius, _drop(newtons, radius), per_side)[1]["bayes"]).force
         for radius in radii
         for newtons in FORCES
     ]
     return 100 * float(np.sqrt(np.mean(np.square(floors))))
+
+
+def _drop(newtons: float, radius: float) -> float:
+    """S/m; radius in model units."""
+    return FOAM.flat_drop(newtons, disc(radius * METRES))

@@ -212,7 +212,7 @@ def run_case(sheet: SolvedSheet, pipeline: Pipeline, row: Row, situation: str, t
     said = [text for at, text in session.problems if text and at >= FAULT_S]
     score = judged(row, moments, bool(said))
     if score.wrong:
-        where = f"({touch.x * 1e3:+.0f}, {touch.y * 1e3:+.0f}) mm, {touch.drop * 10:.1f} N"
+        where = f"({touch.x * 1e3:+.0f}, {touch.y * 1e3:+.0f}) mm, {touch.force_n:.1f} N"
         score.worst = [f"{row.title} {args or ''}, {situation} at {where}: {score.wrong} frames"]
     return score
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bench import ROOT
 from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import Cue, PiecewiseLinear, Script, TouchPath
-from firmware_stub.world import NEWTON, Touch, World
+from firmware_stub.world import Touch, World, pressed
 
 WORK = ROOT / "bench" / "work" / "reliability"
 SOLVED_BY = (
@@ -85,7 +85,7 @@ class SolvedSheet(Sheet):
 
 def circle(x: float, y: float, newtons: float, radius: float) -> Touch:
     """x, y in metres, radius in model units."""
-    return Touch("circle", x, y, radius * METRES, newtons * NEWTON)
+    return pressed("circle", x, y, radius * METRES, newtons)
 
 
 def press(

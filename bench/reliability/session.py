@@ -13,7 +13,7 @@ from bench.reliability.scenes import SolvedSheet
 from bench.tracking.host import Felt, Host
 from firmware_stub.rig import Rig
 from firmware_stub.timeline import Script, Timeline
-from firmware_stub.world import NEWTON, World
+from firmware_stub.world import World
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame
 from services.pipeline import Pipeline
@@ -78,7 +78,7 @@ def moment(read_s: float, middle_s: float, felt: Felt | None, delta: DeltaFrame,
 
 
 def _touches(world: World) -> tuple[PointForce, ...]:
-    return tuple(PointForce(t.x, t.y, t.drop / NEWTON) for t in world.touches if t.drop > 0)
+    return tuple(PointForce(t.x, t.y, t.force_n) for t in world.touches if t.drop > 0)
 
 
 class Session:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from bench.speed.reaction_events import HELD_S, NEAR, SIDE_M, UNIT_M, TouchEvent
 from models.bundle import Bundle
 from models.fisher import MeasurementNoise, SizePrior, floors, mean_floor
+from models.pressure import FOAM, disc
 from models.shapes import Shape
-from services.contacts.force import NEWTONS_PER_SIEMENS
 from services.estimation.circles import MODEL, TINY, Circles
 from services.estimation.part_image import INFORMATION
 from services.estimation.rolling import parts_of, rolling_order
@@ -31,7 +31,7 @@ PRIOR = SizePrior(radius=(0.05, 0.45))
 
 
 def held_floor(of: Sequence[TouchEvent], snr_db: float) -> tuple[float, float]:
-    """Root mean square over the touches: of place [m], of force [relative], which is as uncertain as the drop."""
+    """Root mean square over the touches: of place [m], of force [relative]."""
     bundle, found = Bundle.load("square16"), []
     for event in of[:MOST]:
         scans = 1 + int((HELD_S + event.released - event.onset) / 2 / SCAN_S)
@@ -41,12 +41,16 @@ def held_floor(of: Sequence[TouchEvent], snr_db: float) -> tuple[float, float]:
             event.x / UNIT_M,
             event.y / UNIT_M,
             event.radius_m / UNIT_M,
-            event.kind.force / NEWTONS_PER_SIEMENS,
+            _drop(event),
         )
         noise = MeasurementNoise(-20 * float(np.log10(relative)))
         found.append(floors("square16", touch, noise, PRIOR, bundle.pattern)["bayes"])
     floor = mean_floor(found)
-    return floor.position * UNIT_M, floor.drop
+    return floor.position * UNIT_M, floor.force
+
+
+def _drop(event: TouchEvent) -> float:
+    return FOAM.flat_drop(event.kind.force, disc(event.radius_m))
 
 
 def growing_floor(of: Sequence[TouchEvent], snr_db: float) -> NDArray[np.float64]:
@@ -56,7 +60,7 @@ def growing_floor(of: Sequence[TouchEvent], snr_db: float) -> NDArray[np.float64
     at_once, count = np.zeros(len(order)), len(order) // parts
     noise, found = 10 ** (-snr_db / 20), []
     for event in of:
-        size = np.log([event.radius_m / UNIT_M, event.kind.force / NEWTONS_PER_SIEMENS])
+        size = np.log([event.radius_m / UNIT_M, _drop(event)])
         touch = np.array([[event.x / UNIT_M, event.y / UNIT_M, *size, 0.0, 0.0]])
         slope = circles.expected(touch, circles.all, at_once)[1][:, :MODEL] / noise
         for first in range(parts):

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.tracking.scene import Recorded
-from firmware_stub.world import NEWTON
 from models import fisher
 from models.bundle import Bundle
+from models.pressure import FOAM, disc
 from models.shapes import Shape
 from services.estimation.touch_decision import MEANS
 from services.pipeline import Pipeline
@@ -36,7 +36,7 @@ def averaging(recorded: Recorded, bundle: Bundle, seed: int = 1) -> dict[str, di
     pressed = recorded.z[first + 2 : last - 1].mean(axis=0)  # the scans that the touch was there for all along
     _, _, x, y, newtons, radius, _ = recorded.touches[0]
     metres = bundle.metres_per_unit
-    shape = Shape("circle", x / metres, y / metres, radius / metres, newtons * NEWTON)
+    shape = Shape("circle", x / metres, y / metres, radius / metres, FOAM.flat_drop(newtons, disc(radius)))
     found: dict[str, dict[str, float]] = {}
     for name, hold in (("averaged", True), ("each alone", False)):
         rng = np.random.default_rng(seed)  # the same noise for both

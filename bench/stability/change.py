@@ -29,7 +29,8 @@ def pairs(setting: Setting) -> Iterator[Row]:
             clean = runner.once(baseline, scene.z)
             frames = noisy(scene.z, relative, rng, draws)
             moves = [_change(clean, runner.once(baseline, z), scene, z - scene.z) for z in frames]
-            row: Row = {"case": f"touch {k + 1}, {decibel:g} dB", "value": decibel, "newtons": 10 * scene.touch.drop}
+            newtons = scene.touch.force(METRES)
+            row: Row = {"case": f"touch {k + 1}, {decibel:g} dB", "value": decibel, "newtons": newtons}
             yield row | _worst(moves, draws, allowed(scene.touch, decibel))
 
 

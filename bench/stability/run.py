@@ -28,7 +28,6 @@ Row = dict[str, Any]
 SKIN = "square16"
 TARE_FRAMES = 64
 NOISE_FREE = 1e-6  # relative: what a float32 wire leaves
-NEWTONS_PER_DROP = 10.0  # the default force law
 METRES = 0.05  # per model unit
 FAR_M = 0.010  # a tenth of the side
 FRAME_NS = 45_000_000  # the board's full scan
@@ -236,7 +235,7 @@ def summary(answers: Iterable[tuple[Answer, Shape | None]], doubtful: bool = Fal
             continue
         position.append(100 * distance / (METRES * metrics.SIDE))
         if newtons is not None:
-            force.append(float(metrics.relative_error(newtons, NEWTONS_PER_DROP * touch.drop)))
+            force.append(float(metrics.relative_error(newtons, touch.force(METRES))))
         if answer.image.size:
             overlap.append(mean_iou(answer.image, touch))
     return {

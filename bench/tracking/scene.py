@@ -25,7 +25,7 @@ from firmware_stub import scene as scenes
 from firmware_stub.rig import Rig
 from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import Script
-from firmware_stub.world import NEWTON, World
+from firmware_stub.world import World
 from protocol.frames import RawFrame
 from services.runtime.config import ScanMode, Skin
 
@@ -211,7 +211,7 @@ class _Recorder:
             if touch.drop > 0:
                 shape, scale = self.rig.sheet.shape(touch), self.rig.sheet.skin.metres_per_unit
                 x, y = shape.centroid * scale
-                rows.append([k, n, x, y, touch.drop / NEWTON, touch.radius, shape.area * scale**2])
+                rows.append([k, n, x, y, touch.force_n, touch.radius, shape.area * scale**2])
         return rows
 
 

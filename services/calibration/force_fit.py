@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from protocol.errors import EitskinError
 from services.contacts.calibration_file import Calibration, Of
-from services.contacts.force import ForceLaw, Look
+from services.contacts.force import NAMES, ForceLaw, Look
 from services.contacts.force_curve import TERMS, Curve, columns
+from services.runtime.config import Skin
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,7 @@ NEARLY = 1.05  # times the best cross-validated error: the simpler one is taken
 SPREAD = 1.5  # ratio of the largest to the smallest force, at least
 MOST_ERROR = 0.5  # rms of log force, left out: beyond it nothing was learned
 LEAST_EXPONENT = 0.2
+APART = 1.4  # ratio of two tips' radii that are told apart
 
 
 class CalibrationError(EitskinError):
@@ -43,6 +45,7 @@ class Press:
     force_n: float
     look: Look
     where: str
+    tip_m: float | None = None  # radius of what pressed; None: nobody says
 
 
 @dataclass(frozen=True)
@@ -97,16 +100,38 @@ def fit(presses: Sequence[Press], laws: dict[Of, ForceLaw], most_n: float | None
     exponent = float(found[1]) if form.free_exponent else 1.0
     terms = tuple(float(v) for v in found[1 + form.free_exponent :])
     curve = Curve(float(np.exp(found[0])), exponent, form.correction, terms, table.reach)
-    images = np.array([laws[form.reads].quantity(p.look)[1] or 0.0 for p in presses])
+    images = np.array([laws[form.reads].quantity(p.look).relative or 0.0 for p in presses])
     own = float(np.sqrt(max(0.0, error**2 - float(np.mean((exponent * images) ** 2)))))
     forces = [p.force_n for p in presses]
     said = {
         "error": {"left_out_rms": error, "left_out_median": float(np.median(np.abs(np.expm1(left_out))))},
         "presses": len(presses),
+        "tips_m": tips(presses),
         "forces_n": [min(forces), max(forces)],
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     return Calibration(curve, form.reads, most_n or max(forces), own, said)
+
+
+def tips(presses: Sequence[Press]) -> list[float]:
+    """Radii [m] of the tips that are told apart, smallest first."""
+    found: list[float] = []
+    for radius in sorted(p.tip_m for p in presses if p.tip_m is not None):
+        if not found or radius > APART * found[-1]:
+            found.append(radius)
+    return found
+
+
+def unknown(found: Calibration, skin: Skin) -> str:
+    """What presses of one size of tip leave unknown, for a person; "" where there is nothing."""
+    sizes = found.said.get("tips_m", [])
+    if len(sizes) > 1 or (skin.indenter is not None and skin.indenter.radius_m is not None):
+        return ""
+    were = f"all presses were of one tip, radius {1e3 * sizes[0]:g} mm" if sizes else "nobody said what pressed"
+    return (
+        f"{were}: whether force follows the {NAMES[found.reads]} for other sizes too, these presses cannot tell; "
+        f"press with two tips, one at least {APART:g} times as wide, or name the tip as `indenter` in skin.toml"
+    )
 
 
 def _check(presses: Sequence[Press]) -> None:
@@ -134,7 +159,7 @@ def _check(presses: Sequence[Press]) -> None:
 def _table(presses: Sequence[Press], laws: dict[Of, ForceLaw]) -> Table:
     quantity: dict[Of, Array] = {}
     for reads, law in laws.items():
-        quantity[reads] = np.log([law.quantity(p.look)[0] for p in presses])
+        quantity[reads] = np.log([law.quantity(p.look).value for p in presses])
     x, y = (np.array([getattr(p.look, axis) for p in presses]) for axis in "xy")
     reach = max(float(np.max(np.abs([x, y]))), 1e-6)
     return Table(np.log([p.force_n for p in presses]), quantity, x, y, reach)

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, get_args
 
 import numpy as np
 
@@ -32,8 +32,7 @@ PATIENCE_S = 60.0
 def laws(skin: Skin, bundle: Bundle) -> dict[Of, ForceLaw]:
     """The force laws that give each quantity of a look, without a calibration that may be there already."""
     law = ForceLaw.of(skin.model_copy(update={"calibration": None}), bundle)
-    kinds: tuple[Of, ...] = ("peak", "integral")
-    return {reads: replace(law, reads=reads) for reads in kinds}
+    return {reads: replace(law, reads=reads) for reads in get_args(Of)}
 
 
 def looks(frame: ImageFrame) -> list[Look]:

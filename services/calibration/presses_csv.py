@@ -2,12 +2,14 @@
 
 A line of names, then one press a line. `force_n` [N] and either what an image showed of it
 
-    force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2,noise      (noise may be left out or empty)
+    force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2,noise,peak_sigma_s_per_m,whole_s_m,tip_m
+
+(from noise on, a column may be left out, a cell be empty),
 
 which is what `skin calibrate force --save` writes, or, with a file of measurements beside it (touched, untouched (n, k)
 or measurements, untouched, as `skin reconstruct` reads it), the row there that was measured under that force:
 
-    force_n,row                                                  (rows count from 0)
+    force_n,row,tip_m                                            (rows count from 0; tip_m may be left out)
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from services.calibration.force_fit import CalibrationError, Press
 from services.contacts.force import Look
 
 SHOWN = ("x_m", "y_m", "peak_s_per_m", "integral_s_m", "area_m2")
-COLUMNS = ("force_n", *SHOWN, "noise")
+MAY = ("noise", "peak_sigma_s_per_m", "whole_s_m", "tip_m")  # whole_s_m: integral with the faint rest of the image
+COLUMNS = ("force_n", *SHOWN, *MAY)
 
 
 def read(path: Path, look_of: Callable[[int], Look] | None = None) -> list[Press]:
@@ -65,17 +68,20 @@ def _press(path: Path, number: int, cells: dict[str, str], look_of: Callable[[in
             raise CalibrationError(f"{where}, column {name}: found {text!r}, expected a number{bound}")
         return found
 
-    force = value("force_n", 0.0)
+    def given(name: str) -> float | None:
+        return value(name, 0.0) if cells.get(name, "").strip() else None
+
+    force, tip = value("force_n", 0.0), given("tip_m")
     if look_of is not None:
         row = value("row", -1.0)
         try:
-            return Press(force, look_of(int(row)), where)
+            return Press(force, look_of(int(row)), where, tip)
         except ValueError as why:
             raise CalibrationError(f"{where}, column row: found {int(row)}: {why}") from None
     x, y = value("x_m"), value("y_m")
     peak, integral, area = (value(name, 0.0) for name in SHOWN[2:])
-    noise = value("noise", 0.0) if cells.get("noise", "").strip() else None
-    return Press(force, Look(peak, 0.0, integral, area, x, y, noise), where)
+    sigma, whole = given("peak_sigma_s_per_m") or 0.0, given("whole_s_m") or 0.0
+    return Press(force, Look(peak, sigma, integral, area, x, y, given("noise"), whole), where, tip)
 
 
 def write(path: Path, presses: Sequence[Press]) -> None:
@@ -85,5 +91,5 @@ def write(path: Path, presses: Sequence[Press]) -> None:
         lines.writerow(COLUMNS)
         for p in presses:
             k = p.look
-            noise = "" if k.noise is None else f"{k.noise:.6g}"
-            lines.writerow([p.force_n, *(f"{v:.6g}" for v in (k.x, k.y, k.peak, k.integral, k.area)), noise])
+            may = ("" if not v else f"{v:.6g}" for v in (k.noise, k.peak_sigma, k.whole, p.tip_m))
+            lines.writerow([p.force_n, *(f"{v:.6g}" for v in (k.x, k.y, k.peak, k.integral, k.area)), *may])

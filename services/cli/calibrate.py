@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from services.calibration.force_fit import Press
 
 PLAN = ((0, 0, 1), (0, 0, 3), (0, 0, 5), (1, 1, 2), (-1, 1, 4), (-1, -1, 2), (1, -1, 4))
-"""Where to press (halves of the way to the edge), and about how firmly [N]; then again from the first."""
+"""Where to press (halves of the way to the edge), and about how firmly [N]; then again from the first, another tip."""
 
 
 def register(app: typer.Typer) -> None:
@@ -51,12 +51,13 @@ def force(
 
     By prompts: type the force, press and hold still, release; an empty line ends. CSV: a line of names, then a press a
     line: force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2[,noise] as --save writes it; or, with --measurements:
-    force_n,row (from 0).
+    force_n,row (from 0). tip_m, the radius of what pressed, may stand beside either: two sizes tell whether force
+    follows pressure, peak or integral.
     """
     from models.bundle import Bundle
     from services.calibration import force_presses as calibration_presses
     from services.calibration import presses_csv as calibration_csv
-    from services.calibration.force_fit import CalibrationError, fit
+    from services.calibration.force_fit import CalibrationError, fit, unknown
     from services.contacts import calibration_file as calibration
     from services.runtime.config import load
 
@@ -89,7 +90,7 @@ def force(
             print(f"skin: the presses are kept in {save}", file=sys.stderr)
         raise
     report = {"file": str(out), "sha256": digest, "of": found.reads, "most_n": found.most_n, **found.said}
-    report["curve"] = found.curve.to_dict()
+    report |= {"curve": found.curve.to_dict(), "unknown": unknown(found, configured)}
     if as_json:
         emit(report)
         return
@@ -97,13 +98,17 @@ def force(
 
 
 def _say(report: dict[str, Any]) -> None:
-    curve, error, of = report["curve"], report["error"], "peak drop" if report["of"] == "peak" else "integrated drop"
+    from services.contacts.force import NAMES
+
+    curve, error, of = report["curve"], report["error"], NAMES[report["of"]]
     place = "" if curve["correction"] == "none" else f", corrected for the place ({curve['correction']})"
     print(f"force = {curve['scale']:.4g} * ({of})^{curve['exponent']:.3f}{place}, to {report['most_n']:g} N")
     print(
         f"each of the {report['presses']} presses foretold by the others: off by "
         f"{100 * error['left_out_median']:.1f} % (median), {100 * error['left_out_rms']:.1f} % (root mean square)"
     )
+    if report["unknown"]:
+        print(report["unknown"])
     print(
         f"wrote {report['file']} ({report['sha256'][:12]}): name it as `calibration` in skin.toml, restart the service"
     )
@@ -120,8 +125,11 @@ def _prompted(name: str, bundle: Any) -> list[Press]:
     use_configured_sockets()
     quarter = 0.25e3 * bundle.image_size * bundle.metres_per_pixel  # mm, half the way to the edge
     presses: list[Press] = []
+    tip: float | None = None
     print("type the force in newtons, then press and hold still until told; an empty line ends", file=sys.stderr)
     while True:
+        if len(presses) % len(PLAN) == 0:
+            tip = _tip(len(presses) // len(PLAN))
         x, y, about = PLAN[len(presses) % len(PLAN)]
         hint = f"press {len(presses) + 1}, say at ({x * quarter:+.0f}, {y * quarter:+.0f}) mm with about {about} N"
         try:
@@ -143,9 +151,20 @@ def _prompted(name: str, bundle: Any) -> list[Press]:
                 f"  {newton:g} N at ({look.x * 1e3:+.1f}, {look.y * 1e3:+.1f}) mm, peak {look.peak:.3f} S/m: release",
                 file=sys.stderr,
             )
-            presses.append(Press(newton, look, f"press {len(presses) + 1}"))
+            presses.append(Press(newton, look, f"press {len(presses) + 1}", tip))
             wait_for_release(reader, time.monotonic)
         except CalibrationError as why:
             print(f"  {why}; this press does not count", file=sys.stderr)
         finally:
             reader.close()
+
+
+def _tip(number: int) -> float | None:
+    """Radius [m] of the tip that the next presses are made with; None where it is not said."""
+    which = "the tip" if number == 0 else "another tip, of half or twice the size if there is one"
+    print(f"radius of {which} in millimetres (empty: not known)? ", end="", file=sys.stderr, flush=True)
+    try:
+        found = float(input().strip() or "nan")
+    except (EOFError, ValueError):
+        return None
+    return found * 1e-3 if 0 < found < 1e3 else None

@@ -47,6 +47,7 @@ def begun(
         area=area / m**2,
         orientation=0.0,
         reach=radius / m,
+        whole=touch.integral / m**2,
     )
     seen = Patch(x, y, touch.integral, radius)
     return [drawn], [seen], [LocatedTouch(position=touch.position, sigma=touch.sigma, amplitude=touch.integral)]

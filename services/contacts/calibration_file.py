@@ -3,8 +3,9 @@
     {"schema": "eitskin.force/1", "skin", "frame_id", "bundle", "bundle_hash", "indenter_radius_m", "of", "curve",
      "most_n", "own_error", "error", "presses", "made", "sha256"}
 
-`skin calibrate force` writes it (calibration/force_fit.py fits). A file written by hand may hold a linear law of the
-peak drop: {"newtons_per_siemens": 10.0, "most_n": 5.0}.
+`skin calibrate force` writes it (calibration/force_fit.py fits). `of` says what the curve takes: "pressure", newtons of
+the shipped foam; "peak" or "integral", of the drop. A file written by hand may hold a linear law of the peak drop,
+right for one fixed indenter: {"newtons_per_siemens": 10.0, "most_n": 5.0}.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from models.bundle import Bundle
 from models.files import FileError, read_text
@@ -26,7 +27,7 @@ SCHEMA = "eitskin.force/1"
 MOST_BYTES = 1024 * 1024
 MOST_N = 5.0
 
-Of = Literal["peak", "integral"]
+Of = Literal["pressure", "peak", "integral"]
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def load(path: Path, skin: Skin, bundle: Bundle, name: str = "") -> Calibration:
         if _digest(content) != found["sha256"]:
             raise ConfigError(f"{path}: its sha256 is not that of its content, so it was changed or damaged: {AGAIN}")
         _belongs(path, found, skin, bundle, name)
-        if found["of"] not in ("peak", "integral"):
+        if found["of"] not in get_args(Of):
             raise ValueError(f"of {found['of']!r}")
         numbers = float(found["most_n"]), float(found["own_error"])
         if not (0 < numbers[0] < math.inf and 0 <= numbers[1] < math.inf):

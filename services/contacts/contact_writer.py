@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import SHAPES, Contact, ImageFrame, LocatedTouch, RefinedTouch
-from services.contacts.force import ForceLaw, Look
+from services.contacts.force import Force, ForceLaw, Look
 from services.contacts.motion import Patch, Track
 from services.contacts.refined import agrees, refined, settled
 from services.contacts.registered import registered
@@ -31,9 +31,9 @@ class ContactWriter:
         frame: ImageFrame,
         touch: LocatedTouch | None,
     ) -> Contact:
-        force, sigma = self.law.force(Look.of(s, frame))
+        found = self.law.force(Look.of(s, frame))
         if touch is not None and not self.law.exists:
-            force, sigma = touch.force_n, None if touch.force_n is None else touch.value_sigma
+            found = Force(touch.force_n, None if touch.force_n is None else touch.value_sigma)
         best = int(np.argmax(classes)) if classes else -1
         at = self.place(seen.x, seen.y)
         return Contact(
@@ -44,9 +44,11 @@ class ContactWriter:
             normal=at.normal.tolist(),
             orientation=s.orientation,
             area_m2=s.area * frame.metres_per_pixel**2,
-            force_n=force,
-            force_sigma_n=sigma,
-            wrench=_wrench(at, force or 0.0),
+            force_n=found.newton,
+            force_sigma_n=found.sigma,
+            pressure_pa=found.pressure,
+            pressure_sigma_pa=found.pressure_sigma,
+            wrench=_wrench(at, found.newton or 0.0),
             shape=SHAPES[best] if classes else "unknown",  # how sure: its probability
             shape_probability=classes[best] if classes else None,
             confidence=confidence(s),

@@ -130,6 +130,8 @@ def _moved(contact: Contact, now: Motion, grown: float, sigma: list[float], plac
     at = place(now.x, now.y)
     force = None if contact.force_n is None else contact.force_n * grown
     sigma_n = None if contact.force_sigma_n is None else contact.force_sigma_n * grown
+    pressure = None if contact.pressure_pa is None else contact.pressure_pa * grown
+    pressure_sigma = None if contact.pressure_sigma_pa is None else contact.pressure_sigma_pa * grown
     if sigma_n is not None and (now.vx or now.vy):
         sigma_n = math.hypot(sigma_n, MOVES * (force or 0.0))
     pressed = -(force or 0.0) * at.normal
@@ -141,6 +143,8 @@ def _moved(contact: Contact, now: Motion, grown: float, sigma: list[float], plac
         sheet=None if place.flat else [now.x, now.y],
         force_n=force,
         force_sigma_n=sigma_n,
+        pressure_pa=pressure,
+        pressure_sigma_pa=pressure_sigma,
         wrench=[*pressed.tolist(), *np.cross(at.point, pressed).tolist()],
         position_sigma=sigma,
     )

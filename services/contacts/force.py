@@ -2,11 +2,12 @@
 
     force = curve(quantity) * correction(x, y)
 
-The quantity is the touch's peak conductivity drop [S/m] or its integral over the patch [S/m m^2]. The curve is the
-kind's default (0.1 to 0.5 S/m are 1 to 5 N), the bundle's own, or the one that a calibration of this very skin fitted
-(services/calibration/force_fit.py). An image confounds peak and area. Where the configuration knows the indenter, the
-peak follows from the integral and the known area instead (models/uncertainty.py). The quantity's uncertainty was found
-on presses that the bundle's network never saw; the bundle holds it.
+The quantity is the pressure that the foam's drops stand for, summed over the touch's patch, in newtons of the shipped
+foam (models/pressure.py; the default, whose curve changes nothing): an image confounds peak and area, so it is a mean
+over the sizes that the touch may have (patch_force.py), or follows from the integral and the area of a known indenter
+(models/uncertainty.py). Or it is the touch's peak drop [S/m], right for one fixed indenter, or its integral over the
+patch [S/m m^2], as a bundle or a calibration of this very skin says (services/calibration/force_fit.py). The
+quantity's uncertainty was found on presses that the bundle's network never saw; the bundle holds it.
 """
 
 from __future__ import annotations
@@ -19,18 +20,22 @@ import numpy as np
 
 from models import uncertainty
 from models.bundle import NETWORKS, Bundle
+from models.pressure import FOAM, Foam
 from models.uncertainty import Map
 from protocol.frames import ImageFrame, RefinedTouch
 from services.contacts import calibration_file as calibration
+from services.contacts import patch_force
 from services.contacts.calibration_file import Of
 from services.contacts.force_curve import Curve
 from services.contacts.segmentation import Segment
 from services.runtime.config import ConfigError, Skin
 
-NEWTONS_PER_SIEMENS = 10.0  # N per S/m: 0.1 to 0.5 S/m are 1 to 5 N
+NEWTONS_PER_SIEMENS = 10.0  # N per S/m, of a law that reads the peak: 0.1 to 0.5 S/m are 1 to 5 N
 MOST_N = calibration.MOST_N
 BACKGROUND = 1.0  # S/m, of the untouched sheet that the bundles' model has: no drop can be larger
 FAR_BEYOND = 2.0  # times most_n: what nobody measured at half of it is no force any more
+UNITS: dict[Of, str] = {"pressure": "N of pressure over the patch", "peak": "S/m", "integral": "S/m m^2"}
+NAMES: dict[Of, str] = {"pressure": "pressure over the patch", "peak": "peak drop", "integral": "integrated drop"}
 
 
 @dataclass(frozen=True)
@@ -44,20 +49,34 @@ class Look:
     x: float  # m, centroid
     y: float
     noise: float | None  # relative, of the measurements that the image was made of
+    whole: float = 0.0  # S/m m^2, the integral with the faint rest of the image; 0: nobody says
+    pixel: float = 0.0  # m, of the image
 
     @classmethod
     def of(cls, s: Segment, frame: ImageFrame) -> Look:
         m, (x, y) = frame.metres_per_pixel, frame.origin
         place = x + (s.x + 0.5) * m, y + (s.y + 0.5) * m
-        return cls(s.peak, s.peak_sigma, s.volume * m * m, s.area * m * m, *place, frame.noise)
+        area = m * m
+        return cls(s.peak, s.peak_sigma, s.volume * area, s.area * area, *place, frame.noise, s.whole * area, m)
 
 
 class Force(NamedTuple):
     newton: float | None
     sigma: float | None  # N
+    pressure: float | None = None  # Pa, where it is highest; None: nobody knows
+    pressure_sigma: float | None = None
 
 
 NOTHING = Force(None, None)
+
+
+class Quantity(NamedTuple):
+    """What a law's curve takes."""
+
+    value: float
+    relative: float | None  # standard uncertainty
+    pressure: float | None = None  # Pa, of the shipped foam
+    pressure_sigma: float | None = None
 
 
 @dataclass(frozen=True)
@@ -65,7 +84,7 @@ class ForceLaw:
     """The law of one skin. Where `curve` is None the skin has no law, and its forces are nil."""
 
     curve: Curve | None
-    reads: Of = "peak"
+    reads: Of = "pressure"
     most_n: float = MOST_N  # beyond it a force is extrapolated
     calibrated: bool = False  # of this very skin, not of its kind
     metres_per_unit: float = 1.0
@@ -73,10 +92,11 @@ class ForceLaw:
     indenter_area: float | None = None  # model units squared
     maps: dict[str, Map] = field(default_factory=dict)
     own_error: float = 0.0  # relative: what the calibration's own presses scatter by beyond what their images explain
+    foam: Foam = FOAM
 
     @classmethod
     def of(cls, skin: Skin, bundle: Bundle, name: str = "") -> ForceLaw:
-        """The law of a skin: its calibration file's, else its bundle's, else the default of bundles in S/m.
+        """The law of a skin: its calibration file's, else its bundle's, else the shipped foam's for bundles in S/m.
 
         name: what the skin is called, where that is known.
 
@@ -91,13 +111,7 @@ class ForceLaw:
         if law is None or bundle.manifest["normalisation"] == "measured":
             return cls(None, **surroundings)
         try:
-            reads: Of = "integral" if law.get("of", "peak") == "integral" else "peak"
-            slope = (
-                law["newtons_per_siemens_metre"]
-                if reads == "integral"
-                else law.get("newtons_per_siemens", NEWTONS_PER_SIEMENS)
-            )
-            return cls(Curve(float(slope)), reads, float(law.get("most_n", MOST_N)), **surroundings)
+            return cls(*_said(law), **surroundings)
         except (KeyError, TypeError, ValueError) as why:
             raise ConfigError(f"{bundle.path}/manifest.json: force_law cannot be used ({why!r})") from None
 
@@ -105,24 +119,32 @@ class ForceLaw:
     def exists(self) -> bool:
         return self.curve is not None
 
+    @property
+    def known(self) -> bool:
+        """Whether the size of what presses is known, and used."""
+        return self.indenter_area is not None and self.reads != "integral"
+
     def describe(self) -> dict[str, object] | None:
         """For info/<skin>."""
         if self.curve is None:
             return None
-        return {
-            "kind": f"{self.curve.kind} in the {'peak drop' if self.reads == 'peak' else 'integrated drop'}",
+        said: dict[str, object] = {
+            "kind": f"{self.curve.kind} in the {NAMES[self.reads]}",
             "of": self.reads,
             **self.curve.to_dict(),
             "most_n": self.most_n,
             "calibrated": self.calibrated,
-            "known_indenter": self.indenter_area is not None and self.reads == "peak",
+            "known_indenter": self.known,
         }
+        return {**said, "foam": self.foam.to_dict()} if self.reads == "pressure" else said
 
     def __str__(self) -> str:
         """For a person: `8.5 N per S/m, to 5 N`."""
         if self.curve is None:
             return "no force law"
-        unit = "S/m" if self.reads == "peak" else "S/m m^2"
+        if self.reads == "pressure" and self.curve == Curve(1.0):
+            return f"pressure summed over the patch, to {self.most_n:g} N"
+        unit = UNITS[self.reads]
         if self.curve.exponent != 1:
             unit = f"({unit})^{self.curve.exponent:.2f}"
         located = "" if self.curve.correction == "none" else ", corrected for the place"
@@ -130,14 +152,20 @@ class ForceLaw:
 
     def impossible(self, peak: float, newton: float | None) -> bool:
         """Whether no touch can have this peak drop [S/m] or force. Without a law drops have no scale, so nothing is
-        impossible.
+        impossible; a pressure summed over a broad patch may be any force.
         """
         if self.curve is None:
             return False
-        return peak >= BACKGROUND or (newton or 0.0) > FAR_BEYOND * self.most_n
+        return peak >= BACKGROUND or (self.reads != "pressure" and (newton or 0.0) > FAR_BEYOND * self.most_n)
 
-    def quantity(self, look: Look) -> tuple[float, float | None]:
-        """(value of the curve's quantity, its relative standard uncertainty or None)."""
+    def saturates(self, pressure: float | None) -> bool:
+        """Whether under this pressure [Pa] the foam tells no more: what presses so hard may press harder."""
+        if self.curve is None or self.reads != "pressure" or pressure is None:
+            return False
+        return pressure >= self.curve.scale * float(self.foam.pressure(patch_force.SATURATED))
+
+    def quantity(self, look: Look) -> Quantity:
+        """What the curve takes, of a touch with a peak above 0."""
         unit = self.metres_per_unit
         edge = self.half_width - max(abs(look.x), abs(look.y)) / unit
         seen = uncertainty.ImageFeatures(
@@ -148,37 +176,101 @@ class ForceLaw:
             np.array([edge]),
             np.array([look.noise or 0.0]),
         )
-        known = self.indenter_area is not None and self.reads == "peak"
-        name = "known" if known else self.reads
+        if self.reads == "pressure" and not self.known:
+            return self._over_sizes(look, seen)
+        name = "known" if self.known else self.reads
         value = float(uncertainty.estimate(name, seen, self.indenter_area)[0])
-        factor, relative = 1.0, None
-        if name in self.maps and look.noise is not None:
-            each = self.maps[name](uncertainty.features(name, seen, self.indenter_area))
-            factor, relative = float(each[0][0]), float(each[1][0])
-        elif look.peak_sigma > 0 and look.peak > 0:  # nothing better is known than what the network says
+        factor, relative = self._map(name, seen)
+        if relative is None and look.peak_sigma > 0:  # nothing better is known than what the network says
             relative = look.peak_sigma / look.peak
-        return value * factor * (unit**2 if self.reads == "integral" else 1.0), relative
+        value *= factor * (unit**2 if self.reads == "integral" else 1.0)
+        return self._of_disc(value, relative) if self.reads == "pressure" else Quantity(value, relative)
+
+    def _map(self, name: str, seen: uncertainty.ImageFeatures) -> tuple[float, float | None]:
+        """(factor, relative standard uncertainty or None) of an estimate."""
+        if name not in self.maps or not seen.noise[0] > 0:
+            return 1.0, None
+        factor, relative = self.maps[name](uncertainty.features(name, seen, self.indenter_area))
+        return float(factor[0]), float(relative[0])
+
+    def _over_sizes(self, look: Look, seen: uncertainty.ImageFeatures) -> Quantity:
+        whole = look.whole or look.integral
+        pixel = look.pixel or 2 * self.half_width * self.metres_per_unit / PIXELS
+        shown = patch_force.Shown(whole, look.peak, look.peak_sigma, self._map("integral", seen)[1], pixel)
+        found = patch_force.of_image(shown, self.foam)
+        relative = found.force_sigma / found.force
+        return Quantity(found.force, relative, found.pressure, found.pressure_sigma)
+
+    def _of_disc(self, drop: float, relative: float | None) -> Quantity:
+        """Under an indenter of known area."""
+        assert self.indenter_area is not None
+        drop = min(drop, patch_force.TOLD)
+        pressure = float(self.foam.pressure(drop))
+        spread = None if relative is None else relative * float(self.foam.gain(drop))
+        newton = pressure * self.indenter_area * self.metres_per_unit**2
+        sigma = None if spread is None else pressure * spread
+        return Quantity(newton, spread, pressure, sigma)
 
     def of_fit(self, touch: RefinedTouch) -> Force:
         """Force and standard uncertainty of a touch that was fitted to the measurements."""
-        peak = self.reads == "peak"
-        value, sigma = (touch.drop, touch.drop_sigma) if peak else (touch.integral, touch.integral_sigma)
-        if self.curve is None or not value > 0:
+        if self.curve is None or not (touch.drop > 0 and touch.integral > 0):
             return NOTHING
-        newton = self.curve(value, *touch.position)
-        spread = math.hypot(self.curve.exponent * sigma / value, self.own_error)
-        return Force(newton, newton * spread) if math.isfinite(newton) else NOTHING
+        if self.reads == "pressure":
+            return self._said(self._summed(touch), *touch.position)
+        value, sigma = (
+            (touch.drop, touch.drop_sigma) if self.reads == "peak" else (touch.integral, touch.integral_sigma)
+        )
+        return self._said(Quantity(value, sigma / value), *touch.position)
+
+    def _summed(self, touch: RefinedTouch) -> Quantity:
+        """Pressure summed over a fitted touch: its integrated drop, which is known best, by the foam at its peak."""
+        drop = min(touch.drop, patch_force.TOLD)
+        pressure, gain = float(self.foam.pressure(drop)), float(self.foam.gain(drop))
+        share = 2 / 3 / self.foam.ball_mean(drop) if touch.kind == "hertz" else 1.0
+        newton = touch.integral * share * pressure / drop
+        of_drop = touch.drop_sigma / drop
+        relative = touch.integral_sigma / touch.integral + (gain - 1) * of_drop
+        return Quantity(newton, relative, pressure, pressure * gain * of_drop)
 
     def force(self, look: Look) -> Force:
         """Force and standard uncertainty of one touch."""
-        if self.curve is None or not look.peak > 0:
+        if self.curve is None or not (look.peak > 0 and look.integral > 0):
             return NOTHING
-        value, relative = self.quantity(look)
-        newton = self.curve(value, look.x, look.y)
+        return self._said(self.quantity(look), look.x, look.y)
+
+    def _said(self, found: Quantity, x: float, y: float) -> Force:
+        """A quantity as a force, by the curve; the pressure goes with it."""
+        assert self.curve is not None
+        newton = self.curve(found.value, x, y)
         if not math.isfinite(newton):
             return NOTHING
-        spread = math.hypot(self.curve.exponent * (relative or 0.0), self.own_error)
-        return Force(newton, newton * spread if spread > 0 else None)
+        spread = math.hypot(self.curve.exponent * (found.relative or 0.0), self.own_error)
+        sigma = newton * spread if spread > 0 else None
+        if self.known and self.reads == "peak" and self.indenter_area is not None:
+            area = self.indenter_area * self.metres_per_unit**2
+            return Force(newton, sigma, newton / area, None if sigma is None else sigma / area)
+        if found.pressure is None or not found.value > 0:
+            return Force(newton, sigma)
+        grown = newton / found.value  # a foam of its own answers to the same drops by other pressures
+        own = None if found.pressure_sigma is None else found.pressure_sigma * grown
+        own = own if own is None else math.hypot(own, self.own_error * found.pressure * grown)
+        return Force(newton, sigma, found.pressure * grown, own)
+
+
+PIXELS = 96  # of an image's side, where nobody says
+
+
+def _said(law: dict[str, Any]) -> tuple[Curve, Of, float]:
+    """Curve, quantity and most newtons of what a manifest says. Raises KeyError, TypeError, ValueError."""
+    most = float(law.get("most_n", MOST_N))
+    reads = law.get("of", "peak" if "newtons_per_siemens" in law else "pressure")
+    if reads == "integral":
+        return Curve(float(law["newtons_per_siemens_metre"])), "integral", most
+    if reads == "peak":
+        return Curve(float(law.get("newtons_per_siemens", NEWTONS_PER_SIEMENS))), "peak", most
+    if reads != "pressure":
+        raise ValueError(f"of {reads!r}: expected pressure, peak or integral")
+    return Curve(float(law.get("scale", 1.0))), "pressure", most
 
 
 def known_radius(skin: Skin, bundle: Bundle, name: str = "") -> float | None:

@@ -51,7 +51,7 @@ def settled(contact: Contact, touch: RefinedTouch, force: Force) -> tuple[Force,
     if touch.between_kinds[0] > DIFFER[0] and force.newton is not None and contact.force_n is not None:
         mean = math.sqrt(force.newton * contact.force_n)
         sigma = None if force.sigma is None else math.hypot(force.sigma, mean - force.newton)
-        force = Force(mean, sigma)
+        force = force._replace(newton=mean, sigma=sigma)
     if area_of_image(touch):
         return force, contact.area_m2, math.hypot(touch.area_sigma_m2, touch.area_m2 - contact.area_m2)
     return force, touch.area_m2, touch.area_sigma_m2
@@ -73,6 +73,8 @@ def refined(
         area_sigma_m2=area_sigma,
         force_n=force.newton,
         force_sigma_n=force.sigma,
+        pressure_pa=force.pressure,
+        pressure_sigma_pa=force.pressure_sigma,
         wrench=wrench,
         shape=SHAPES[best],
         shape_probability=touch.probabilities[best],

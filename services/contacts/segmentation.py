@@ -39,6 +39,7 @@ class Segment:
     area: float  # pixels
     orientation: float  # rad, of the longest axis to x, -pi/2 to pi/2
     reach: float  # pixels from the centroid to the farthest of the mask
+    whole: float = 0.0  # volume, and its share of what the image has below the floor; 0: unknown
 
 
 def readable(image: Image) -> bool:
@@ -72,6 +73,9 @@ def segment(image: Image, sigma: Image, expected: Sequence[Place] = ()) -> list[
         whole = np.zeros(image.shape, dtype=bool)
         whole[rows, columns] = mask
         found.append(_measured(part, noise, own, mask, whole, (columns.start, rows.start), float(volumes[label])))
+    more = float(image.sum()) / max(float(volumes[1:].sum()), 1e-12)
+    for s in found:
+        s.whole = s.volume * more
     return sorted(found, key=lambda s: -s.peak)
 
 

@@ -31,7 +31,7 @@ def test_the_scene_plays_the_events_with_one_touch_at_a_time(tmp_path):
         for t in np.linspace(event.onset + 0.06, event.end - 0.06, 5).tolist():
             (touch,) = timeline.at(100.0 + t).touches
             assert (touch.x, touch.y) == pytest.approx(event.at(t), abs=1e-9)
-            assert touch.drop == pytest.approx(0.1 * event.kind.force)
+            assert touch.force_n == pytest.approx(event.kind.force)
             assert max(abs(touch.x), abs(touch.y)) + touch.radius <= SIDE_M / 2 + 1e-9
     phases = {round(event.onset % 0.0436, 3) for event in plan}
     assert len(phases) > len(plan) / 2

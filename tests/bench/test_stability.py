@@ -14,7 +14,6 @@ from bench.stability import late_bytes as held_up
 from bench.stability.matrices import solved_long
 from bench.stability.run import (
     METRES,
-    NEWTONS_PER_DROP,
     TOUCHES,
     Answer,
     InProcessStages,
@@ -201,7 +200,7 @@ def answer_at(x: float, y: float, force: float, valid: bool = True) -> Answer:
 def test_a_valid_contact_far_away_breaks_the_promise_and_fails_the_run() -> None:
     touch = TOUCHES[1]
     x, y = METRES * touch.centroid
-    right = answer_at(x + 0.001, y, NEWTONS_PER_DROP * touch.drop * 1.1)
+    right = answer_at(x + 0.001, y, touch.force(METRES) * 1.1)
     wrong = answer_at(x + 0.011, y, 3.0)
     assert not judged(right, touch) and judged(right, None) == ["valid on garbage, with contacts"]
     assert judged(wrong, touch) == ["valid contact far from the touch"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,9 @@ def test_markers_end_by_themselves_and_when_the_contact_does() -> None:
     arrow = next(marker for marker in put if marker.ns == "force")
     assert arrow.points[0].z == pytest.approx(0.02) and arrow.points[1].z == 0  # from outside onto the skin
     assert next(marker for marker in put if marker.ns == "label").text == "7 2.0 ± 0.1 N unknown"
+    hard = replace(contact(7, 0.02, 0, 2.0), pressure_pa=6400.0, pressure_sigma_pa=900.0)
+    found = read("visualization_msgs/MarkerArray", messages.markers(HEADER, contacts(hard), []))
+    assert next(m for m in found.markers if m.ns == "label").text == "7 2.0 ± 0.1 N 6.4 ± 0.9 kPa unknown"
 
 
 def test_cloud_and_image_say_the_same() -> None:

@@ -5,11 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from models import limits
+from models import force_limits, limits
+from models.bundle import Bundle
 from models.fisher import STEPS, MeasurementNoise, SizePrior, floors, information, mean_floor, sensitivity
 from models.forward import shared
 from models.patterns import pattern
 from models.prereconstruction import Drift
+from models.pressure import FOAM, disc
 from models.shapes import Shape
 from tests import needs
 
@@ -157,3 +159,41 @@ def test_a_touch_off_the_skin_is_refused():
     with pytest.raises(ValueError, match=r"a touch at \(0.9, 0.9\) is not on skin 'disc16'"):
         floors("disc16", Shape("circle", 0.9, 0.9, 0.1, 0.3))
     assert max(STEPS) < 0.1
+
+
+def test_a_force_is_known_as_its_integral_is_until_the_foam_saturates():
+    linear = floors("square16", Shape("circle", 0.3, 0.2, 0.2, 0.4), 80.0)["bayes"]
+    assert linear.force == pytest.approx(linear.integral)
+    hard = floors("square16", Shape("circle", 0.3, 0.2, 0.1, 0.9), 80.0)["bayes"]
+    assert hard.force > 1.5 * hard.integral
+
+
+def test_the_smallest_force_that_is_shown_is_shown():
+    """Frames of another mesh and other noise, at other places: nearly all are seen at that force, few at a third."""
+    noise, radius_mm = MeasurementNoise(80.0), 10.0
+    found = force_limits.smallest("square16", noise, radius_mm, per_side=3)
+    model, pre = shared("square16", "stub"), Bundle.load("square16").prereconstructor()
+    z0 = np.abs(model.solve(1.0).impedances())
+    norm, rng = pre.normaliser(z0), np.random.default_rng(7)
+    sigma = noise.sigma(z0) / norm
+    operator = pre.condition(sigma, drift=force_limits.SINCE_TARE)
+    limit = operator.threshold(force_limits.FALSE_ALARM)
+    seen = {}
+    for share in (1.0, 1 / 3):
+        drop = FOAM.flat_drop(share * found.shown_n, disc(radius_mm * 1e-3))
+        scores = []
+        for x, y in rng.uniform(-0.75, 0.75, (12, 2)):
+            z = np.abs(model.solve(model.touched([Shape("circle", x, y, 0.2, drop)])).impedances())
+            scores += [operator.score((z - z0) / norm + sigma * rng.standard_normal(len(z))) for _ in range(50)]
+        seen[share] = np.mean(np.array(scores) > limit)
+    assert seen[1.0] > 0.985 and seen[1 / 3] < 0.5
+    assert found.measured_n < found.shown_n
+    louder = force_limits.smallest("square16", MeasurementNoise(70.0), radius_mm, per_side=3)
+    assert 2 < louder.shown_n / found.shown_n < 4
+
+
+def test_command_line_of_the_smallest_forces(capsys):
+    assert limits.main(["--forces", "--skin", "hexagon6"]) == 2
+    assert limits.main(["--forces", "--snr", "80", "--grid", "2", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [row["radius_mm"] for row in rows] == [5.0, 10.0, 15.0, 20.0] and all(0 < r["shown_n"] < 0.3 for r in rows)

@@ -15,7 +15,7 @@ from bench.tracking.host import Host
 from firmware_stub.rig import Rig
 from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import Script, Timeline, TouchPath
-from firmware_stub.world import NEWTON, Touch
+from firmware_stub.world import Touch, pressed
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame, Frame, ImageFrame, PartFrame, RawFrame
 from services.pipeline import ALL, Pipeline
@@ -40,7 +40,7 @@ class Press:
     radius: float = 0.01
 
     def path(self) -> TouchPath:
-        full = Touch("circle", self.x, self.y, self.radius, self.force * NEWTON)
+        full = pressed("circle", self.x, self.y, self.radius, self.force)
         if not self.ramp:
             return TouchPath((self.start, self.end), (full, full))
         none = Touch("circle", self.x, self.y, self.radius, 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
+from models.pressure import FOAM
 from protocol.frames import ImageFrame
 from services.calibration import presses_csv as calibration_csv
-from services.calibration.force_fit import CalibrationError, Press, fit
+from services.calibration.force_fit import CalibrationError, Press, fit, unknown
 from services.calibration.force_presses import laws, wait_for_press, wait_for_release
 from services.contacts import calibration_file as calibration
 from services.contacts.force import ForceLaw, Look
@@ -239,3 +241,23 @@ def test_no_press_and_two_presses_are_told_apart() -> None:
     held = Images(lambda t: [0.3])
     with pytest.raises(CalibrationError, match="still touches"):
         wait_for_release(held, held.clock, 3.0)
+
+
+def of_foam(radius_mm: float, newton: float, stiffness: float, tip: bool) -> Press:
+    """A press of foam `stiffness` times as stiff as the shipped, as a sharp image shows it."""
+    area = math.pi * (radius_mm * 1e-3) ** 2
+    drop = FOAM.flat_drop(newton / stiffness, area)
+    shown = Look(drop, 0.03 * drop, drop * area, area, 0.0, 0.0, None)
+    return Press(newton, shown, f"{newton} N", radius_mm * 1e-3 if tip else None)
+
+
+def test_presses_of_two_tips_choose_pressure_and_one_says_what_it_cannot_know(skin: Skin, bundle: Bundle) -> None:
+    forces = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
+    two = fit([of_foam(mm, f, 1.4, True) for mm in (7.0, 14.0) for f in forces], laws(skin, bundle))
+    assert two.reads == "pressure" and two.curve.scale == pytest.approx(1.4, rel=0.08)
+    assert two.said["tips_m"] == pytest.approx([0.007, 0.014]) and unknown(two, skin) == ""
+    one = fit([of_foam(10.0, f, 1.4, True) for f in forces], laws(skin, bundle))
+    assert "one tip, radius 10 mm" in unknown(one, skin) and "press with two tips" in unknown(one, skin)
+    nobody = fit([of_foam(10.0, f, 1.4, False) for f in forces], laws(skin, bundle))
+    assert "nobody said what pressed" in unknown(nobody, skin)
+    assert unknown(one, skin.model_copy(update={"indenter": Indenter(radius_m=0.01)})) == ""

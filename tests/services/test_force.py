@@ -12,6 +12,7 @@ from models import geometry
 from models.bundle import Bundle
 from models.calibrate import SolvedPresses, solve
 from models.forward import shared
+from models.pressure import FOAM
 from models.shapes import Shape
 from protocol.frames import Contact, RawFrame
 from services.contacts.force import ForceLaw, Look
@@ -21,6 +22,7 @@ from services.pipeline import Pipeline
 from services.runtime.config import ConfigError, Indenter, Skin
 
 FRAME_NS = 45_000_000
+METRES = 0.05  # per model unit
 
 
 @pytest.fixture(scope="module")
@@ -73,21 +75,24 @@ def scored(skinny: Skinny, presses: SolvedPresses, frames: int = 1) -> tuple[np.
             c = skinny.press(d)
         if c is not None:
             assert c.force_n is not None and c.force_sigma_n is not None
-            z.append((c.force_n - 10 * shape.drop) / c.force_sigma_n)
-            errors.append(c.force_n / (10 * shape.drop) - 1)
+            true = shape.force(METRES)
+            z.append((c.force_n - true) / c.force_sigma_n)
+            errors.append(c.force_n / true - 1)
     return np.array(z), np.array(errors)
 
 
-def test_two_thirds_of_presses_fall_within_one_sigma(presses: SolvedPresses, bundle: Bundle) -> None:
-    z = np.concatenate([scored(Skinny(configured(), bundle, presses.z0, db), presses)[0] for db in (62.0, 75.0, 120.0)])
-    assert len(z) > 400 and 0.61 < (np.abs(z) < 1).mean() < 0.76
-    assert (np.abs(z) < 3).mean() > 0.9  # heavier tails than a normal distribution: soft presses among hard ones
+def test_most_presses_of_any_shape_fall_within_one_sigma(presses: SolvedPresses, bundle: Bundle) -> None:
+    found = [scored(Skinny(configured(), bundle, presses.z0, db), presses) for db in (62.0, 75.0, 120.0)]
+    z, errors = (np.concatenate(each) for each in zip(*found, strict=True))
+    assert len(z) > 400 and 0.61 < (np.abs(z) < 1).mean()
+    assert (np.abs(z) < 3).mean() > 0.985
+    assert abs(np.median(errors)) < 0.02 and np.sqrt(np.mean(errors**2)) < 0.08
 
 
 def test_held_presses_are_no_worse_than_they_say(presses: SolvedPresses, bundle: Bundle) -> None:
     some = SolvedPresses(presses.shapes[:60], presses.difference[:60], presses.z0)
     z, _ = scored(Skinny(configured(), bundle, presses.z0, 66.0, hold=True), some, frames=8)
-    assert 0.5 < (np.abs(z) < 1).mean() < 0.9
+    assert 0.5 < (np.abs(z) < 1).mean() and (np.abs(z) < 3).mean() > 0.96
 
 
 def test_a_known_indenter_takes_the_trade_off_away(bundle: Bundle) -> None:
@@ -100,8 +105,37 @@ def test_a_known_indenter_takes_the_trade_off_away(bundle: Bundle) -> None:
     prior = configured(indenter={"radius_m": 0.01})
     z, known = scored(Skinny(prior, bundle, z0, 70.0), presses)
     _, unknown = scored(Skinny(configured(), bundle, z0, 70.0), presses)
-    assert np.abs(known).mean() < 0.035 < 0.07 < np.abs(unknown).mean()
+    assert np.abs(known).mean() < 0.035 < np.abs(unknown).mean() < 0.06
     assert 0.45 < (np.abs(z) < 1).mean() < 0.9
+
+
+def test_the_force_of_a_press_is_told_whatever_its_size(bundle: Bundle) -> None:
+    """Sizes, places and a mesh that the estimate's constants were not measured on; the peak read alone as published."""
+    model, rng = shared("square16", "inverse"), np.random.default_rng(11)
+    z0, table = np.abs(model.solve(1.0).impedances()), []
+    cases = [(mm, newton) for mm in (6.0, 8.5, 12.0, 18.0) for newton in (1.0, 2.0, 4.0) for _ in range(4)]
+    default, peak = Skinny(configured(), bundle, z0, 80.0), Skinny(configured(), bundle, z0, 80.0)
+    peak.pipeline.publishing._writer.law = replace(peak.pipeline.publishing.law, reads="peak", curve=Curve(10.0))
+    for mm, newton in cases:
+        radius = mm * 1e-3
+        drop = FOAM.flat_drop(newton, np.pi * radius**2)
+        x, y = rng.uniform(-1 + radius / METRES, 1 - radius / METRES, 2)
+        press = Shape("circle", x, y, radius / METRES, drop)
+        d = np.abs(model.solve(model.touched([press])).impedances()) / z0 - 1
+        default.release()
+        peak.release()
+        for _ in range(6):
+            c, other = default.press(d), peak.press(d)
+        assert c is not None and other is not None and c.force_sigma_n is not None
+        assert c.pressure_pa is not None and c.pressure_sigma_pa is not None
+        hard = float(FOAM.pressure(drop))
+        table.append((mm, c.force_n / newton, (c.force_n - newton) / c.force_sigma_n, other.force_n / newton))
+        assert abs(c.pressure_pa - hard) < 4 * c.pressure_sigma_pa
+    found = np.array(table)
+    for mm in np.unique(found[:, 0]):
+        assert np.median(found[found[:, 0] == mm, 1]) == pytest.approx(1.0, abs=0.05), mm
+    assert np.sqrt(np.mean((found[:, 1] - 1) ** 2)) < 0.07 and (np.abs(found[:, 2]) < 3).all()
+    assert np.sqrt(np.mean((found[:, 3] - 1) ** 2)) > 0.5
 
 
 def look(**more: float | None) -> Look:
@@ -109,11 +143,40 @@ def look(**more: float | None) -> Look:
     return Look(**{**values, **more})  # type: ignore[arg-type]
 
 
-def test_the_kinds_law_is_ten_newtons_per_siemens_and_says_it_is_no_calibration(bundle: Bundle) -> None:
+def test_the_kinds_law_sums_pressure_and_says_it_is_no_calibration(bundle: Bundle) -> None:
     law = ForceLaw.of(configured(), bundle)
-    assert law.force(look()).newton == pytest.approx(3.0)
+    for radius, drop in ((0.01, 0.3), (0.005, 0.4), (0.02, 0.1)):
+        area = np.pi * radius**2
+        force = law.force(look(peak=drop, peak_sigma=0.03 * drop, integral=area * drop, area=area))
+        assert force.newton == pytest.approx(FOAM.force("circle", drop, area), rel=0.05)
+        assert force.pressure == pytest.approx(float(FOAM.pressure(drop)), rel=0.2)
+        assert force.sigma is not None and force.sigma < 0.12 * force.newton
     assert not law.calibrated and law.exists and law.describe()["calibrated"] is False  # type: ignore[index]
     assert not ForceLaw.of(Skin(port="stub", bundle="disc16"), Bundle.load("disc16")).exists
+
+
+def test_a_force_of_saturated_foam_is_a_lower_bound_that_says_so(bundle: Bundle) -> None:
+    law, area = ForceLaw.of(configured(), bundle), np.pi * 0.005**2
+    drop = FOAM.flat_drop(5.0, area)
+    force = law.force(look(peak=0.8, peak_sigma=0.12, integral=area * drop, area=1.2 * area))
+    assert force.newton < 5.0 < force.newton + 3 * force.sigma and law.saturates(force.pressure)  # type: ignore[operator]
+    assert not law.saturates(float(FOAM.pressure(0.5))) and not law.saturates(None)
+
+
+def test_a_known_indenter_is_a_prior_of_one_size(bundle: Bundle) -> None:
+    law = replace(ForceLaw.of(configured(indenter={"radius_m": 0.005}), bundle), maps={})
+    area, drop = np.pi * 0.005**2, FOAM.flat_drop(2.0, np.pi * 0.005**2)
+    force = law.force(look(peak=drop, peak_sigma=0.03, integral=area * drop, area=area))
+    assert force.newton == pytest.approx(2.0, rel=0.01)
+    assert force.pressure == pytest.approx(2.0 / area, rel=0.01)
+    assert force.sigma == pytest.approx(2.0 * float(FOAM.gain(drop)) * 0.03 / drop, rel=0.01)
+
+
+def test_a_law_may_read_the_peak(bundle: Bundle) -> None:
+    manifest = {**bundle.manifest, "force_law": {"of": "peak"}}
+    law = ForceLaw.of(configured(), replace(bundle, manifest=manifest))
+    force = law.force(look())
+    assert force.newton == pytest.approx(3.0) and force.pressure is None and str(law) == "10 N per S/m, to 5 N"
 
 
 def test_a_law_may_read_the_integral(bundle: Bundle) -> None:
@@ -126,13 +189,13 @@ def test_a_law_may_read_the_integral(bundle: Bundle) -> None:
 
 
 def test_without_figures_of_its_own_the_networks_word_is_passed_on(bundle: Bundle) -> None:
-    law = replace(ForceLaw.of(configured(), bundle), maps={})
+    law = replace(ForceLaw.of(configured(), bundle), maps={}, reads="peak", curve=Curve(10.0))
     assert law.force(look()).sigma == pytest.approx(0.3)
     assert law.force(look(peak_sigma=0.0)).sigma is None
 
 
 def test_the_calibrations_own_error_adds_to_the_images(bundle: Bundle) -> None:
-    law = replace(ForceLaw.of(configured(), bundle), maps={}, curve=Curve(10.0, 2.0), own_error=0.15)
+    law = replace(ForceLaw.of(configured(), bundle), maps={}, reads="peak", curve=Curve(10.0, 2.0), own_error=0.15)
     force = law.force(look())
     assert force.newton == pytest.approx(0.9) and force.sigma == pytest.approx(0.9 * 0.25)  # hypot(2 * 10 %, 15 %)
 

@@ -266,13 +266,15 @@ def test_forces_are_calibrated_on_the_images_that_a_tare_leads_to(
     noise = NOISE * np.random.default_rng(3).standard_normal((40, len(z)))
     np.savez(tmp_path / "presses.npz", measurements=z[None], untouched=z0 * (1 + noise))
 
-    def newton(**config: Any) -> float:
+    def seen(**config: Any) -> tuple[float, float]:
+        """Newtons, and the peak drop of the image."""
         skin = Skin(port="stub", bundle=BUNDLE, frame_id="palm", **config)
         look = of_file(tmp_path / "presses.npz", skin, bundle, lambda text: None)(0)
-        return ForceLaw.of(skin, bundle).force(look).newton
+        return ForceLaw.of(skin, bundle).force(look).newton, look.peak
 
-    assert newton() == pytest.approx(3.0, rel=0.06)
-    assert newton(tare=TareConfig(calibrate=False)) > 1.15 * 3.0
+    newton, peak = seen()
+    assert newton == pytest.approx(press.force(0.05), rel=0.06) and peak == pytest.approx(press.drop, rel=0.06)
+    assert seen(tare=TareConfig(calibrate=False))[1] > 1.15 * press.drop
 
 
 def test_a_calibration_of_another_bundle_or_a_damaged_one_is_refused(bundle: Bundle, sheet: MismatchedSheet) -> None:

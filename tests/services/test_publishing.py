@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
+from models.pressure import FOAM
 from protocol.frames import BegunTouch, ContactFrame, ForceFrame, Frame, ImageFrame, PartFrame, ShapeFrame, pack, unpack
 from services.contacts.outline import outline
 from services.contacts.tracking import LOST_FRAMES
@@ -71,9 +72,11 @@ def contacts(stage: Publishing, frame: Frame) -> ContactFrame:
 def test_position_force_area_and_wrench_of_a_touch(stage: Publishing) -> None:
     (c,) = contacts(stage, image_frame(discs((0.02, -0.01, 0.01, 0.3)))).contacts
     assert c.position == pytest.approx([0.02, -0.01, 0], abs=M / 10)
-    assert c.force_n == pytest.approx(3.0, rel=0.01)
+    assert c.force_n == pytest.approx(3.0, rel=0.04)  # a mean over the sizes that the image leaves open
+    assert c.pressure_pa is not None and c.pressure_sigma_pa is not None
+    assert abs(c.pressure_pa - float(FOAM.pressure(0.3))) < c.pressure_sigma_pa < 0.5 * c.pressure_pa
     assert c.area_m2 == pytest.approx(math.pi * 0.01**2, rel=0.03)
-    assert c.wrench == pytest.approx([0, 0, -3.0, 0.01 * 3.0, 0.02 * 3.0, 0], rel=0.02, abs=1e-9)
+    assert c.wrench == pytest.approx([0, 0, -c.force_n, 0.01 * c.force_n, 0.02 * c.force_n, 0], rel=0.02, abs=1e-9)
     assert c.normal == [0, 0, 1]
 
 
@@ -105,10 +108,10 @@ def test_a_force_far_beyond_the_calibration_is_not_valid(skin: Skin, bundle: Bun
 
 
 def test_each_touch_is_cut_at_half_its_own_peak(stage: Publishing) -> None:
-    """A 5 N and a 1 N touch side by side: one threshold for both would lose the weak one."""
+    """A 5 N touch and one of 0.36 N (6 mm) side by side: one threshold for both would lose the weak one."""
     frame = image_frame(discs((-0.02, 0.0, 0.01, 0.5), (0.02, 0.0, 0.006, 0.1)))
     strong, weak = settled(stage, frame).contacts
-    assert (strong.force_n, weak.force_n) == pytest.approx((5, 1), rel=0.02)
+    assert (strong.force_n, weak.force_n) == pytest.approx((5, 0.36), rel=0.06)
     assert weak.position[0] == pytest.approx(0.02, abs=M / 5)
     assert weak.area_m2 == pytest.approx(math.pi * 0.006**2, rel=0.06)
 
@@ -126,8 +129,8 @@ def test_noise_makes_no_contacts_and_moves_none(stage: Publishing) -> None:
 def test_uncertainty_of_force_and_confidence_come_from_the_images(stage: Publishing) -> None:
     image = discs((0, 0, 0.01, 0.1))
     (sure,) = contacts(stage, image_frame(image, sigma=np.full((N, N), 0.02, np.float32))).contacts
-    assert sure.force_sigma_n == pytest.approx(0.2)
     (unsure,) = contacts(stage, image_frame(image, 2, sigma=np.full((N, N), 0.1, np.float32))).contacts
+    assert 0.02 < sure.force_sigma_n < 0.1 < 0.3 < unsure.force_sigma_n
     assert unsure.confidence < 0.9 < 0.99 < sure.confidence
 
 
@@ -343,8 +346,8 @@ def test_force_and_shape_are_made_only_when_wanted(stage: Publishing) -> None:
     assert len(stage.process(frame, CONTACT)) == 1
     _, force, shape = stage.process(frame, ALL)
     assert isinstance(force, ForceFrame) and isinstance(shape, ShapeFrame)
-    assert force.force_n == pytest.approx(7.0, rel=0.01)
-    assert force.wrench[2] == pytest.approx(-7.0, rel=0.01)
+    assert force.force_n == pytest.approx(7.0, rel=0.05)
+    assert force.wrench[2] == pytest.approx(-force.force_n, rel=1e-6)
     assert len(shape.outlines) == len(shape.ids) == 2
     for polygon, area in zip(shape.outlines, (0.01, 0.01), strict=True):
         assert _shoelace(polygon) == pytest.approx(math.pi * area**2, rel=0.04)  # positive: counter-clockwise

@@ -56,7 +56,7 @@ def test_a_round_touch_is_refined_and_its_uncertainties_hold() -> None:
     off = np.array(contact.position[:2]) - UNIT * CIRCLE.centroid
     assert np.hypot(*off) < 4 * contact.position_sigma[0]
     assert contact.force_n is not None and contact.force_sigma_n is not None and contact.area_sigma_m2 is not None
-    assert abs(contact.force_n - 3.0) < 4 * contact.force_sigma_n < 1.5
+    assert abs(contact.force_n - CIRCLE.force(UNIT)) < 4 * contact.force_sigma_n < 1.5
     assert abs(contact.area_m2 - CIRCLE.area * UNIT**2) < 4 * contact.area_sigma_m2
     image = found.image
     assert image.refined is not None and image.refined.scan == found.delta.reconstructed
@@ -88,7 +88,7 @@ def test_a_soft_touch_is_told_from_a_hard_one() -> None:
     _, found = pressed("any", soft, frames=4, snr_db=95.0)
     contact = the_contact(found)
     assert contact.refined and contact.kind == "hertz" and contact.shape == "circle"
-    assert contact.force_n == pytest.approx(5.0, rel=0.1)
+    assert contact.force_n == pytest.approx(soft.force(UNIT), rel=0.1)
 
 
 def test_two_touches_keep_the_images_answer() -> None:

@@ -99,7 +99,9 @@ function fill(item, c) {
   bar.children[1].style.width = per(Math.min(2 * sigma, MOST_N));
   const [x, y] = c.position.map((v) => (v * 1e3).toFixed(1)), sure = c.shape_probability;
   const shape = c.shape === "unknown" ? "shape unknown" : `${c.shape}${sure === null ? "" : ` ${Math.round(100 * sure)} %`}`;
-  where.textContent = `at ${x}, ${y} mm · ${(c.area_m2 * 1e4).toFixed(1)} cm² · ${shape}`;
+  const hard = c.pressure_pa ?? null, unsure = c.pressure_sigma_pa ?? null;
+  const pressure = hard === null ? "" : ` · ${(hard / 1e3).toFixed(1)}${unsure === null ? "" : ` ± ${(unsure / 1e3).toFixed(1)}`} kPa`;
+  where.textContent = `at ${x}, ${y} mm · ${(c.area_m2 * 1e4).toFixed(1)} cm²${pressure} · ${shape}`;
 }
 
 /** For a screen reader, in a sentence. */
