@@ -51,6 +51,7 @@ SERVICES_USE_OF_MODELS = {
     "models.touch_grid",
     "models.touch_parameters",
     "models.touch_posterior",
+    "models.pressure",
     "models.uncertainty",
 }
 
