@@ -30,7 +30,7 @@ class Touch:
 
     @property
     def force_n(self) -> float:
-        """Newtons: the foam's pressure, summed over the patch."""
+        """Newtons: the foam's pressure, summed over the patch, that makes `drop`."""
         return FOAM.force(self.kind, self.drop, _area(self.kind, self.radius, self.aspect))
 
     @property
