@@ -16,13 +16,18 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from tests.needs import pytest_terminal_summary  # noqa: F401  (a hook of pytest)
+from tests.needs import pytest_make_collect_report, pytest_terminal_summary  # noqa: F401  (hooks of pytest)
 
 ROOT = Path(__file__).resolve().parents[1]
 START_S = 120
 
 # The same examples every time, so that nothing fails by chance; `make search` looks for others.
-hypothesis.settings.register_profile("fixed", derandomize=True, database=None)
+hypothesis.settings.register_profile(
+    "fixed",
+    derandomize=True,
+    database=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],  # says the load
+)
 if not os.environ.get("EITSKIN_SEARCH"):
     hypothesis.settings.load_profile("fixed")
 

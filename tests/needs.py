@@ -12,7 +12,7 @@ import importlib.util
 import os
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,6 +85,15 @@ def reference(name: str) -> Path:
     path = REFERENCE / name
     Need("$EITSKIN_REFERENCE names the folder of the reference data", "EITSKIN_REQUIRE_REFERENCE", files=[path]).here()
     return path
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, Any, Any]:
+    """A file that was skipped is named itself, not needs.py: tests in several processes count equal reports once."""
+    report = yield
+    if report.skipped:
+        report.longrepr = (str(collector.path), *report.longrepr[1:])
+    return report
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

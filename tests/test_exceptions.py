@@ -15,6 +15,7 @@ import pytest
 
 import protocol
 from protocol.errors import EitskinError
+from tests import needs
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 FOLDERS = ("protocol", "models", "services", "firmware_stub", "bridges", "bench", "examples")
@@ -55,6 +56,8 @@ def tree() -> dict[str, tuple[str, str]]:
 
 @pytest.fixture(scope="module")
 def classes() -> list[type[BaseException]]:
+    needs.TRAIN.here()  # whose modules have exceptions of their own
+    needs.PLOTS.here()
     return exception_classes()
 
 

@@ -36,9 +36,11 @@ def register(app: typer.Typer) -> None:
 
 def force(
     skin: SkinOption = "",
-    csv: Annotated[Path | None, typer.Option(help="Presses from a file instead of by prompts; see below.")] = None,
+    csv: Annotated[
+        Path | None, typer.Option(readable=False, help="Presses from a file instead of by prompts; see below.")
+    ] = None,
     measurements: Annotated[
-        Path | None, typer.Option(help="With --csv: FILE.npz whose rows its column `row` names.")
+        Path | None, typer.Option(readable=False, help="With --csv: FILE.npz whose rows its column `row` names.")
     ] = None,
     save: Annotated[Path | None, typer.Option(help="Also keep the presses, as a CSV that --csv reads.")] = None,
     out: Annotated[Path | None, typer.Option(help="The calibration; default: calibration/SKIN-force.json.")] = None,

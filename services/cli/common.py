@@ -26,7 +26,8 @@ LONGEST_S = 86400.0
 """For which a command waits or works, at most."""
 
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="Configuration; default: the running service's, else skin.toml.")
+    Path | None,
+    typer.Option("--config", readable=False, help="Configuration; default: the running service's, else skin.toml."),
 ]
 RuntimeOption = Annotated[
     Path | None, typer.Option("--runtime", help="Runtime folder of the service; default: as docs/clients.md says.")

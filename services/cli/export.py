@@ -24,7 +24,7 @@ def register(app: typer.Typer) -> None:
 
 
 def export(
-    file: Annotated[Path, typer.Argument(metavar="FILE.mcap")],
+    file: Annotated[Path, typer.Argument(metavar="FILE.mcap", readable=False)],
     foxglove: Annotated[bool, typer.Option("--foxglove", help="MCAP with Foxglove's schemas.")] = False,
     ros2: Annotated[bool, typer.Option("--ros2", help="MCAP as rosbag2 writes it.")] = False,
     table: Annotated[bool, typer.Option("--csv", help="CSV, and an npz beside it: a row per contact.")] = False,

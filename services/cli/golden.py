@@ -17,7 +17,7 @@ def register(app: typer.Typer) -> None:
 
 
 def golden(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE.mcap ...")],
+    files: Annotated[list[Path], typer.Argument(metavar="FILE.mcap ...", readable=False)],
     accept: Annotated[bool, typer.Option("--accept", help="Keep what comes out now as what is right.")] = False,
     everything: Annotated[bool, typer.Option("--all", help=f"All differences, not the first {ROWS}.")] = False,
 ) -> None:

@@ -22,7 +22,7 @@ def register(app: typer.Typer) -> None:
 
 
 def info(
-    file: Annotated[Path, typer.Argument(metavar="FILE.mcap")],
+    file: Annotated[Path, typer.Argument(metavar="FILE.mcap", readable=False)],
     png: Annotated[Path | None, typer.Option(help="Draw the session: force, contacts, faults, gaps.")] = None,
     everything: Annotated[bool, typer.Option("--all", help=f"All contacts and faults, not the first {ROWS}.")] = False,
     as_json: JsonOption = False,

@@ -27,7 +27,9 @@ def register(app: typer.Typer) -> None:
 def new(
     name: Annotated[str, typer.Argument(help="The skin's name: lower-case letters, digits, - and _.")],
     disc: Annotated[float, typer.Option(metavar="METRES", min=0, help="A disc of this diameter.")] = 0.0,
-    outline: Annotated[Path | None, typer.Option(metavar="FILE", help="A drawing, .dxf or .svg.")] = None,
+    outline: Annotated[
+        Path | None, typer.Option(metavar="FILE", readable=False, help="A drawing, .dxf or .svg.")
+    ] = None,
     unit: Annotated[str, typer.Option(help="Of the drawing, where it does not say: mm, cm, m, inch.")] = "",
     electrodes: Annotated[int, typer.Option(help="How many, evenly spaced; where the drawing has none.")] = 16,
     width: Annotated[float, typer.Option(metavar="METRES", help="Of an electrode; default: 0.3 of the spacing.")] = 0.0,

@@ -22,7 +22,7 @@ def register(app: typer.Typer) -> None:
 
 
 def reconstruct(
-    source: Annotated[Path, typer.Argument(metavar="IN.npz")],
+    source: Annotated[Path, typer.Argument(metavar="IN.npz", readable=False)],
     target: Annotated[Path, typer.Argument(metavar="OUT.npz")],
     skin: Annotated[str, typer.Option("--skin", metavar="NAME", help="A configured skin, or a bundle.")],
     sequence: Annotated[
@@ -97,6 +97,7 @@ def register_frame(
         Path,
         typer.Argument(
             metavar="FILE.npz",
+            readable=False,
             help="touched and untouched, or delta (n, k) in any unit; xy (n, 2) in metres; depth (n,) or force (n,).",
         ),
     ],

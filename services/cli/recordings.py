@@ -146,7 +146,7 @@ def snapshot(
 
 
 def replay(
-    file: Annotated[Path, typer.Argument(metavar="FILE.mcap")],
+    file: Annotated[Path, typer.Argument(metavar="FILE.mcap", readable=False)],
     speed: Annotated[float, typer.Option(help="So many times the recorded speed.")] = 1.0,
     fast: Annotated[bool, typer.Option("--fast", help="As fast as the stages can.")] = False,
     start: Annotated[float, typer.Option("--from", min=0, help="Begin so many seconds into the file.")] = 0.0,
@@ -189,7 +189,7 @@ def _bar(contacts: Iterator[ContactFrame], total: int) -> Iterator[ContactFrame]
 
 
 def import_file(
-    source: Annotated[Path, typer.Argument(metavar="FILE.npz")],
+    source: Annotated[Path, typer.Argument(metavar="FILE.npz", readable=False)],
     target: Annotated[Path, typer.Argument(metavar="OUT.mcap")],
     skin: Annotated[
         str,

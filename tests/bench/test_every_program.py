@@ -12,6 +12,7 @@ import pytest
 import bench
 from bench.all import BENCHMARKS
 from bench.json_file import write_json  # noqa: F401  (numerical libraries get one thread before they are loaded)
+from tests import needs
 
 MODULES = {**bench.commands(), "limits": "models.limits"}
 NEEDED = {"registered_network": ["presses.npz", "folder"], "estimation": ["start"]}
@@ -49,6 +50,8 @@ def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, list[str]], argpars
 
 @pytest.mark.parametrize("name", sorted(MODULES))
 def test_numbers_that_nobody_can_mean_are_refused(parse: Any, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    if name == "picture":
+        needs.PLOTS.here()
     needed = NEEDED.get(name, [])
     parser = parse(name, needed)
     for action in parser._actions:

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests import needs
+
 ROOT = Path(__file__).resolve().parents[2]
 LEFT = (130, -signal.SIGINT)
 RUNS = 0.7  # s before Ctrl-C: about when modules have been loaded, on a busy machine while they are
@@ -42,7 +44,7 @@ def interrupted(command: list[str], after_s: float, folder: Path) -> tuple[int, 
 @pytest.mark.parametrize(
     ("arguments", "codes"),
     [
-        (("top",), LEFT),
+        (("top", "--json"), LEFT),
         (("echo", "contact", "--timeout", "60"), LEFT),
         (("compare", "--seconds", "60"), LEFT),
         (("limits", "--rank"), LEFT),
@@ -74,6 +76,8 @@ def test_examples(runtime: Path, name: str) -> None:
 
 @pytest.mark.parametrize("module", ["bench.picture", "bench.tracking.__main__", "models.limits"])
 def test_offline_programs(runtime: Path, module: str) -> None:
+    if module == "bench.picture":
+        needs.PLOTS.here()
     code, out = interrupted([sys.executable, "-m", module], RUNS, runtime)
     assert code in LEFT and "Traceback" not in out, (code, out)
 

@@ -53,9 +53,9 @@ COMMANDS = (
     Row("cp docs/systemd/.*|systemctl .*|journalctl .*", "elsewhere", says="tests/docs/test_systemd.py"),
     Row(r"pip install (eitskin|\.)", "elsewhere", says="tests/protocol/test_client_wheel.py"),
     Row("make venv-dev", "ci", says="make test"),  # its first prerequisite
-    Row("make venv-dev EXTRAS=plots,peers", "ci", says="EXTRAS=train,plots,peers,ros2,foxglove"),
-    Row("make venv(-dev)? EXTRAS=(train|plots|peers)", "ci", says="EXTRAS=train,plots,peers,ros2,foxglove"),
-    Row("make test EXTRAS=train,plots,peers", "ci", says="EXTRAS=train,plots,peers,ros2,foxglove"),
+    Row("make venv-dev EXTRAS=plots,peers", "ci", says="make venv-dev EXTRAS=train,plots,peers"),
+    Row("make venv(-dev)? EXTRAS=(train|plots|peers)", "ci", says="make venv-dev EXTRAS=train,plots,peers"),
+    Row("make test EXTRAS=train,plots,peers", "ci", says="make venv-dev EXTRAS=train,plots,peers"),
     Row("make venv", "ci", says="make up"),  # whose first prerequisite it is
     Row(
         "(./)?skin bridge page",
@@ -73,7 +73,7 @@ COMMANDS = (
         instead="{line} && echo $EITSKIN_UID $EITSKIN_GID $EITSKIN_RUNTIME",
     ),
     Row("make ros-venv", "ends", says="rclpy", instead="make -n -B ros-venv"),
-    Row(r"make venv EXTRAS=(ros2|foxglove)", "ci", says="EXTRAS=train,plots,peers,ros2,foxglove"),
+    Row(r"make venv EXTRAS=(ros2|foxglove)", "ci", says="make venv-dev EXTRAS=.*,ros2,foxglove"),
     Row(r"docker compose --profile (ros2|foxglove) up", "ci", says=r"--profile ros2 --profile foxglove up"),
     Row(
         "docker compose --profile demo --profile page up",

@@ -23,8 +23,9 @@ def verified(text: str, folder: Path) -> str:
 
 
 def test_systemd_finds_nothing_wrong(tmp_path: Path) -> None:
-    """In a checkout elsewhere, since the unit's own is made by whoever installs it."""
-    assert verified(UNIT.read_text().replace(CHECKOUT, str(ROOT)), tmp_path) == ""
+    """In a checkout elsewhere, since the unit's own is made by whoever installs it; by a name without a blank."""
+    (tmp_path / "eitskin").symlink_to(ROOT)
+    assert verified(UNIT.read_text().replace(CHECKOUT, str(tmp_path / "eitskin")), tmp_path) == ""
 
 
 def test_systemd_would_say_what_is_wrong(tmp_path: Path) -> None:

@@ -14,11 +14,12 @@ import pytest
 from tests.docs.snippets import ROOT
 
 TESTS = """
-import os, sys
+import os, shlex, sys
 from pathlib import Path
 from tests.docs.world import World
 here = Path(sys.argv[1])
-with World(here, here, dict(os.environ)).started(f"{sys.executable} -c 'import time; time.sleep(600)'") as process:
+sleeps = shlex.join([sys.executable, "-c", "import time; time.sleep(600)"])
+with World(here, here, dict(os.environ)).started(sleeps) as process:
     print(process.pid, flush=True)
     process.wait()
 """

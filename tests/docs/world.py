@@ -7,6 +7,7 @@ import ctypes
 import os
 import re
 import select
+import shlex
 import shutil
 import signal
 import subprocess
@@ -42,11 +43,19 @@ class World:
 
     def typed(self, line: str, instead: str) -> str:
         """What is typed for a document's line."""
-        line = line.replace("FILE", self.files["presses"]).replace("/tmp/subscribe", str(self.folder / "subscribe"))
+        line = line.replace("FILE", shlex.quote(self.files["presses"])).replace(
+            "/tmp/subscribe", str(self.folder / "subscribe")
+        )
         text = re.sub(
             r"^(python|skin) ", lambda m: {"python": ".venv/bin/python ", "skin": "./skin "}[m[1]], instead or line
         )
-        return text.replace("{line}", line).format(folder=self.folder, **self.files) if instead else text
+        return (
+            text.replace("{line}", line).format(
+                folder=self.folder, **{k: shlex.quote(v) for k, v in self.files.items()}
+            )
+            if instead
+            else text
+        )
 
     def ends(self, command: str, timeout_s: float = END_S) -> Ran:
         """A command run to its end."""
