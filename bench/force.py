@@ -21,6 +21,7 @@ from bench import REPORTS
 from bench.json_file import write_json
 from bench.machine import provenance
 from bench.speed.simulated_host import SimulatedHost
+from models.command import real, whole
 from models.fisher import MeasurementNoise, floors, mean_floor
 from models.force_limits import SIZES
 from models.pressure import FOAM, disc
@@ -172,9 +173,9 @@ def draw(table: Sequence[dict[str, Any]], path: Path) -> None:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench force", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--scan", nargs="+", choices=get_args(ScanMode), default=["full", "rolling"])
-    parser.add_argument("--each", type=int, default=5, help="presses of every radius and force")
-    parser.add_argument("--snr", type=float, default=80.0, metavar="DB")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--each", type=whole(), default=5, help="presses of every radius and force")
+    parser.add_argument("--snr", type=real(infinite=True), default=80.0, metavar="DB")
+    parser.add_argument("--seed", type=whole(0), default=1)
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     rows: list[PressRow] = []

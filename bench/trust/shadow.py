@@ -21,6 +21,7 @@ from bench.reliability import report as reports
 from bench.speed.service import end_on_sigterm
 from bench.trust import candidate, kept, options, report, runs
 from firmware_stub.worlds.table import WORLDS
+from models.command import real
 
 COUNTED = ("phantom frames", "wrong counts", "hidden", "never shown", "ids", "refused", "aged", "force 6", "place 6")
 SHARES = ("valid untouched %", "valid touched %", "valid in faults %")
@@ -49,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench shadow", description=(__doc__ or "").split("\n\n")[0])
     options.add(parser, 10.0)
     parser.add_argument("--candidate", default=candidate.TODAY, metavar="MODULE:CLASS", help="default: %(default)s")
-    parser.add_argument("--session", type=float, default=runs.SESSION_S, help="seconds of one (default: 60)")
+    parser.add_argument("--session", type=real(), default=runs.SESSION_S, help="seconds of one (default: 60)")
     args = parser.parse_args(argv)
     if not 0 < args.minutes <= 1e5 or not 8 <= args.session <= 3600:
         parser.error(f"--minutes {args.minutes:g} --session {args.session:g}: expected above 0, and 8 to 3600")

@@ -86,7 +86,7 @@ class Tracker:
         ended = self._begin_frame(sample_ns)
         owners = self._assign(seen, sample_ns)
         if not watched:
-            ended += self._find_again(owners)
+            ended += self._find_again(owners, sample_ns)
         self._merge(owners, seen, sample_ns)
         self._part(owners, seen, sample_ns)
         steady = near and bool(seen) and all(t and is_same(t, entry) for t, entry in zip(owners, seen, strict=True))
@@ -180,9 +180,15 @@ class Tracker:
                 owners[k] = self.tracks[column]
         return owners
 
-    def _find_again(self, owners: Sequence[Track | None]) -> list[Track]:
-        """Keep what an image after a gap shows again -> what it does not, or hides in another one's patch."""
+    def _find_again(self, owners: Sequence[Track | None], sample_ns: int) -> list[Track]:
+        """Keep what an image after a gap shows again -> what it does not, or hides in another one's patch. After a gap
+        that is no longer than a touch may be unseen, those keep their ids: no contact is shown of them.
+        """
         found = [track for track in owners if track is not None]
+        if all(sample_ns - track.seen_ns <= UNSEEN_S * 1e9 for track in self.tracks):
+            for track in found:
+                track.vx, track.vy = 0.0, 0.0
+            return []
         lost = [t for t in self.tracks if not any(t is one for one in found)]
         gone = [one for t in lost for one in (t, *others(t))] + [one for t in found for one in others(t)]
         for track in found:

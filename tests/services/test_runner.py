@@ -128,7 +128,7 @@ def test_frames_commands_silence_and_a_crash(process: Process, board: Board, bun
     old = just_measured(board.frame(), ago_s=3.0)
     process.upstream.send(old)
     late = process.until(DeltaFrame, lambda f: f.scan == old.scan)
-    assert not late.valid and late.reasons == ["late"], "not silence, and not to be acted on"
+    assert not late.valid and "late" in late.reasons, "not silence, and not to be acted on"
     assert process.feed(board, 1)[0].valid
     status = process.until(StatusFrame, lambda f: f.counters["late"] == 1 and f.drops["malformed"] > 0)
     assert "3.0 s after they were measured" in " ".join(status.messages) and status.level != "OK"
