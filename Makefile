@@ -74,7 +74,7 @@ test-all: venv-dev lint
 
 # Goes on searching where tests and CI try the same inputs every time: random examples, and each decoder for a minute.
 search: venv-dev
-	EITSKIN_SEARCH=1 $(BIN)/python -m pytest -n 2 --dist loadfile $$(grep -rl --include="test_*.py" "from hypothesis" tests)
+	EITSKIN_SEARCH=1 $(BIN)/python -m pytest -n 2 -m "slow or not slow" $$(grep -rlE --include="test_*.py" "from hypothesis|EITSKIN_SEARCH" tests)
 	$(BIN)/python tests/fuzz/run.py --seconds 60
 
 # What recordings of tests/ give now is what they are to give from now on; git diff shows what changed.
