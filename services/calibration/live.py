@@ -68,12 +68,15 @@ class LivePresses:
         while self._reader.recv(0.0) is not None:  # what came while somebody was told of the last press
             pass
         since: float | None = None
+        asked = False
         for frame, now in self._frames("the skin did not become free: release it, or tare (`skin tare`)"):
             trouble = self.reference.trouble(now)
             if trouble or frame.touched:
                 if trouble:
                     self._tell(f"{self._unread() or trouble}; no press counts until then")
-                since = None
+                if frame.touched and not asked:
+                    self._tell("release", again=True)
+                since, asked = None, asked or frame.touched
             elif since is None:
                 since = now
             elif now - since >= FREE_S:

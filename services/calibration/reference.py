@@ -19,7 +19,7 @@ from protocol.frames import ReferenceFrame, as_sent
 
 Array = NDArray[np.float64]
 
-STALE_S = 0.5  # silence from which it counts as gone
+STALE_S = 1.0  # silence from which it counts as gone
 MOST_GAP_S = 0.25  # between two readings of what is averaged
 MOST_DELAY_S = 0.5
 LAGS_S = np.arange(-0.3, 1.001, 0.01)  # delays that are tried: images may be a little late themselves
@@ -86,7 +86,7 @@ class Reference:
         if self._heard == -np.inf:
             return f"no message of reference/{self._skin} has come: start what publishes it (docs/your-skin.md)"
         if now_s - self._heard > STALE_S:
-            return f"the reference has been silent for {now_s - self._heard:.1f} s: look at what publishes it"
+            return f"the reference has been silent for more than {STALE_S:g} s: look at what publishes it"
         if sum(now_s - heard < STALE_S for heard in self._sessions.values()) > 1:
             return f"two programs publish reference/{self._skin}: expected one, end the other"
         return self._wrong
@@ -101,7 +101,7 @@ class Reference:
         if len(zeros) < FEWEST_READINGS:
             raise Doubtful(
                 f"found {len(zeros)} readings of the reference in the {ZERO_S:g} s before the touch, expected "
-                f"{FEWEST_READINGS} for its zero: leave the skin free for a second before each press"
+                f"{FEWEST_READINGS} for its zero: it dropped out, or the skin was not free for a second"
             )
         begin, end = (t + self.delay_s for t in course.steady)
         during = (times >= begin) & (times <= end)

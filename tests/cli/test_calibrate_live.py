@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.control import ControlClient, ControlError
+from protocol.control import ControlClient
 from protocol.frames import ContactFrame
 from protocol.sockets import NewestReader
 from tests.conftest import serving
@@ -85,15 +85,11 @@ def program(*command: object) -> Iterator[Program]:
 
 
 def stub(command: str, **args: Any) -> None:
-    for _ in range(5):
-        with contextlib.suppress(ControlError):
-            ControlClient("stub", 10.0).call(command, skin="palm", **args)
-            return
-    raise AssertionError(f"the stub did not answer {command}")
+    ControlClient("stub", 10.0).call(command, skin="palm", **args)
 
 
 def place(rng: np.random.Generator) -> dict[str, float]:
-    x, y = rng.uniform(-0.055, 0.055, 2)
+    x, y = rng.uniform(-0.033, 0.033, 2)
     radius = rng.uniform(0.008, 0.015)
     return {"x": x, "y": y, "radius": radius, "force": rng.uniform(0.8, 4.5), "seconds": 60.0}
 
@@ -122,7 +118,8 @@ def test_twenty_presses_teach_the_law_to_three_percent(runtime: Path) -> None:
             elif line.startswith("release"):
                 stub("release")
         out, _ = skin.process.communicate(timeout=30)
-        assert skin.process.returncode == 0, skin.said
+        print("".join(skin.said), out)
+        assert skin.process.returncode == 0
         print("".join(skin.said), out)
     report = json.loads(out)
     assert report["presses"] <= 20 and report["error"]["law"] < 0.03
