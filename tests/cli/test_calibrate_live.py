@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import queue
+import re
 import subprocess
 import sys
 import threading
@@ -18,8 +19,10 @@ import numpy as np
 import pytest
 
 from protocol.control import ControlClient
-from protocol.frames import ContactFrame
-from protocol.sockets import NewestReader
+from protocol.frames import ContactFrame, ReferenceFrame
+from protocol.runtime import host_id
+from protocol.sockets import AllReader, NewestReader
+from services.calibration.reference import Reference
 from tests.conftest import serving
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,8 +30,6 @@ PUBLISHER = Path(__file__).with_name("reference_publisher.py")
 STIFFER = 1.4  # this skin's foam needs so much more force than the shipped one
 SCALE = {"scale": STIFFER, "offset": -7.0, "noise": 0.02, "delay_s": 0.03, "drop": 0.1, "silent_s": 0.6}
 PATIENCE_S = 240
-
-pytestmark = pytest.mark.slow
 
 
 class Program:
@@ -105,6 +106,7 @@ def config(folder: Path, more: str = "") -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_twenty_presses_teach_the_law_to_three_percent(runtime: Path) -> None:
     rng = np.random.default_rng(7)
     with (
@@ -146,10 +148,14 @@ def said_over_pressed(rng: np.random.Generator, presses: int) -> Iterator[float]
     reader.close()
 
 
+@pytest.mark.slow
 def test_a_reference_that_says_nothing_sure_makes_no_press(runtime: Path) -> None:
     """Each is told, none is a press; once it is mended the next press counts."""
     press = {"x": 0.02, "y": -0.01, "radius": 0.01, "force": 2.0, "seconds": 60.0}
-    with serving(runtime, "--config", str(config(runtime))), calibrating(runtime, "--presses", 1) as skin:
+    with (
+        serving(runtime, "--config", str(config(runtime))),
+        calibrating(runtime, "--presses", 1, "--tip", 0.01, "--save", runtime / "kept.csv") as skin,
+    ):
         skin.until("no message of reference/palm has come")
         with program(sys.executable, PUBLISHER, runtime, json.dumps({"say": "nan"})) as scale:
             skin.until("found a force of nan N in the reference, expected a number")
@@ -177,3 +183,24 @@ def test_a_reference_that_says_nothing_sure_makes_no_press(runtime: Path) -> Non
         assert skin.process.wait(30) == 2
         assert "1 presses: at least 5 are needed" in skin.until("presses: ") + "".join(skin.said)
     assert not (runtime / "palm.json").exists()
+    kept = (runtime / "kept.csv").read_text().splitlines()
+    assert len(kept) == 2 and kept[1].startswith("2.0") and kept[1].endswith(",0.01")
+
+
+def test_the_program_of_the_page_is_a_reference(runtime: Path) -> None:
+    """docs/your-skin.md's, as it is printed, in this runtime folder."""
+    text = (ROOT / "docs" / "your-skin.md").read_text()
+    code = re.search(r"```python\n(import secrets.*?)```", text, re.DOTALL)
+    assert code is not None
+    ours = code[1].replace("/tmp/eitskin-1000", str(runtime))
+    sensor = "import time\ndef your_sensor():\n    while True:\n        time.sleep(0.02)\n        yield 2.5\n"
+    reference, reader = Reference("mine"), AllReader(["reference"], "mine")
+    with program(sys.executable, "-c", sensor + ours):
+        for _ in range(3):
+            frame = reader.recv(30.0)
+            assert isinstance(frame, ReferenceFrame), reader.last_error
+            assert (frame.force_n, frame.valid, frame.host) == (2.5, True, host_id())
+            reference.take(frame, time.monotonic())
+            assert reference.trouble(time.monotonic()) == ""
+    reader.close()
+    reference.close()
