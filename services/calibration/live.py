@@ -17,7 +17,7 @@ from protocol.held import HeldImage
 from protocol.sockets import AllReader
 from services.calibration.force_fit import CalibrationError, Press
 from services.calibration.force_presses import PATIENCE_S, STEADY_S, Steady, looks
-from services.calibration.reference import AROUND_S, GUARD_S, SETTLE_S, ZERO_S, Course, Doubtful, Reference
+from services.calibration.reference import AROUND_S, GUARD_S, SETTLE_S, ZERO_S, PressCourse, Doubtful, ReferenceForce
 from services.contacts.calibration_file import Calibration
 from services.contacts.force import Look
 
@@ -34,7 +34,7 @@ class LivePresses:
     """The presses that are made from now on. tell: takes a line for who presses."""
 
     def __init__(self, skin: str, tell: Tell, tip_m: float | None = None, patience_s: float = PATIENCE_S) -> None:
-        self.reference = Reference(skin)
+        self.reference = ReferenceForce(skin)
         self._skin, self._tell_all, self._tip, self._patience_s = skin, tell, tip_m, patience_s
         self._reader = AllReader(["image", "reference"], skin)
         self._ages = Ages()
@@ -93,7 +93,7 @@ class LivePresses:
             if now - ended > SETTLE_S + STEADY_S / 10:
                 break
         times, shown = np.array(self._course).T
-        return self.reference.force(Course(times, shown, began, steady, ended)), look
+        return self.reference.force(PressCourse(times, shown, began, steady, ended)), look
 
     def _until(self, touched: bool, why: str) -> float:
         """When something touched first, or nothing any more. Raises Doubtful where the reference ends meanwhile."""

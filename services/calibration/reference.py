@@ -38,7 +38,7 @@ class Doubtful(EitskinError):
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class PressCourse:
     """One press as the skin saw it. Times [s] of the clock that the reference's are of."""
 
     times: Array  # (N,) of its images, from before the touch until after it
@@ -48,7 +48,7 @@ class Course:
     ended: float
 
 
-class Reference:
+class ReferenceForce:
     """Follows one skin's reference."""
 
     def __init__(self, skin: str) -> None:
@@ -91,7 +91,7 @@ class Reference:
             return f"two programs publish reference/{self._skin}: expected one, end the other"
         return self._wrong
 
-    def force(self, course: Course) -> float:
+    def force(self, course: PressCourse) -> float:
         """Force [N] of a press that is over since SETTLE_S. Raises Doubtful."""
         times, force = np.array(self._readings).reshape(-1, 2).T
         self._find_delay(course, times, force)
@@ -112,7 +112,7 @@ class Reference:
         rise = float(force[during].mean() - zeros.mean())
         return _judged(rise, float(force[during].std()), float(zeros.std()))
 
-    def _find_delay(self, course: Course, times: Array, force: Array) -> None:
+    def _find_delay(self, course: PressCourse, times: Array, force: Array) -> None:
         """From this press and those before it. Raises Doubtful where the reference does not follow this one."""
         rows = (times >= course.began - AROUND_S) & (times <= course.ended + SETTLE_S)
         if rows.sum() < FEWEST_READINGS:

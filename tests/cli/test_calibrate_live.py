@@ -22,7 +22,7 @@ from protocol.control import ControlClient
 from protocol.frames import ContactFrame, ReferenceFrame
 from protocol.runtime import host_id
 from protocol.sockets import AllReader, NewestReader
-from services.calibration.reference import Reference
+from services.calibration.reference import ReferenceForce
 from tests.conftest import serving
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -141,7 +141,7 @@ def said_over_pressed(rng: np.random.Generator, presses: int) -> Iterator[float]
         while time.monotonic() < end:
             frame = reader.recv(0.2)
             if isinstance(frame, ContactFrame) and frame.valid and len(frame.contacts) == 1:
-                said.append(frame.contacts[0].force_n)
+                said.append(frame.contacts[0].force_n or 0.0)
         stub("release")
         time.sleep(0.5)
         yield said[-1] / pressed["force"]
@@ -194,7 +194,7 @@ def test_the_program_of_the_page_is_a_reference(runtime: Path) -> None:
     assert code is not None
     ours = code[1].replace("/tmp/eitskin-1000", str(runtime))
     sensor = "import time\ndef your_sensor():\n    while True:\n        time.sleep(0.02)\n        yield 2.5\n"
-    reference, reader = Reference("mine"), AllReader(["reference"], "mine")
+    reference, reader = ReferenceForce("mine"), AllReader(["reference"], "mine")
     with program(sys.executable, "-c", sensor + ours):
         for _ in range(3):
             frame = reader.recv(30.0)

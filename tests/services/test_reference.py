@@ -11,7 +11,7 @@ import pytest
 
 from protocol.frames import ReferenceFrame
 from protocol.runtime import host_id
-from services.calibration.reference import MOST_GAP_S, Course, Doubtful, Reference
+from services.calibration.reference import MOST_GAP_S, PressCourse, Doubtful, ReferenceForce
 
 BEGAN, ENDED, STEADY = 2.0, 6.0, (3.5, 5.0)
 RAMP_S, NEWTON, RATE_HZ = 0.2, 3.0, 100
@@ -23,10 +23,10 @@ def pressed(t: np.ndarray) -> np.ndarray:
     return np.clip(np.minimum(t - BEGAN, ENDED - t) / RAMP_S, 0.0, 1.0)
 
 
-def course() -> Course:
+def course() -> PressCourse:
     t = np.arange(0.0, 8.0, 0.045)
     steady = (START_S + STEADY[0], START_S + STEADY[1])
-    return Course(START_S + t, 2e-5 * pressed(t), START_S + BEGAN, steady, START_S + ENDED)
+    return PressCourse(START_S + t, 2e-5 * pressed(t), START_S + BEGAN, steady, START_S + ENDED)
 
 
 def frames(
@@ -42,13 +42,13 @@ def frames(
 
 
 @pytest.fixture
-def reference() -> Iterator[Reference]:
-    made = Reference("palm")
+def reference() -> Iterator[ReferenceForce]:
+    made = ReferenceForce("palm")
     yield made
     made.close()
 
 
-def listen(reference: Reference, *args: object, **more: object) -> Reference:
+def listen(reference: ReferenceForce, *args: object, **more: object) -> ReferenceForce:
     for frame, arrived in frames(*args, **more):  # type: ignore[arg-type]
         reference.take(frame, arrived)
     return reference
@@ -59,13 +59,13 @@ def scale(t: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.03, 0.25, 0.45])
-def test_its_rise_is_the_force_whatever_its_zero_and_delay(reference: Reference, delay_s: float) -> None:
+def test_its_rise_is_the_force_whatever_its_zero_and_delay(reference: ReferenceForce, delay_s: float) -> None:
     listen(reference, scale, delay_s, lambda t: t * RATE_HZ % 10 > 7)  # three in ten are lost
     assert reference.force(course()) == pytest.approx(NEWTON, rel=0.01)
     assert reference.delay_s == pytest.approx(delay_s, abs=0.0101)
 
 
-def test_a_force_that_creeps_is_that_of_its_own_time(reference: Reference) -> None:
+def test_a_force_that_creeps_is_that_of_its_own_time(reference: ReferenceForce) -> None:
     """Half a second later it is another: with the delay left out the mean would be off by 4 %."""
     creeping = lambda t: NEWTON * pressed(t) * (1 + 0.04 * np.clip(t - BEGAN, 0, 4))  # noqa: E731
     listen(reference, creeping, 0.45)
@@ -87,7 +87,7 @@ def test_a_force_that_creeps_is_that_of_its_own_time(reference: Reference) -> No
         (lambda t: (1 + 0.3 * np.sin(9 * t)) * NEWTON * pressed(t), {}, "changed by .* %.*hold still"),
     ],
 )
-def test_what_is_doubtful_is_no_force(reference: Reference, force, more, why) -> None:  # type: ignore[no-untyped-def]
+def test_what_is_doubtful_is_no_force(reference: ReferenceForce, force, more, why) -> None:  # type: ignore[no-untyped-def]
     listen(reference, force, **more)
     with pytest.raises(Doubtful, match=why):
         reference.force(course())
@@ -102,7 +102,7 @@ def test_what_is_doubtful_is_no_force(reference: Reference, force, more, why) ->
         ({"stamps": {"sample": int((START_S - 3) * 1e9)}}, "3.0 s after its stamp `sample`"),
     ],
 )
-def test_what_cannot_be_used_is_said_and_is_no_reading(reference: Reference, change, why) -> None:  # type: ignore[no-untyped-def]
+def test_what_cannot_be_used_is_said_and_is_no_reading(reference: ReferenceForce, change, why) -> None:  # type: ignore[no-untyped-def]
     now = START_S
     good = {"skin": "palm", "host": host_id(), "stamps": {"sample": int(now * 1e9)}, "valid": True, "force_n": 1.0}
     assert "no message of reference/palm has come" in reference.trouble(now)
