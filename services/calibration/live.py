@@ -17,7 +17,7 @@ from protocol.held import HeldImage
 from protocol.sockets import AllReader
 from services.calibration.force_fit import CalibrationError, Press
 from services.calibration.force_presses import PATIENCE_S, STEADY_S, Steady, looks
-from services.calibration.reference import AROUND_S, GUARD_S, SETTLE_S, ZERO_S, PressCourse, Doubtful, ReferenceForce
+from services.calibration.reference import AROUND_S, GUARD_S, SETTLE_S, ZERO_S, Doubtful, PressCourse, ReferenceForce
 from services.contacts.calibration_file import Calibration
 from services.contacts.force import Look
 

@@ -11,7 +11,7 @@ import pytest
 
 from protocol.frames import ReferenceFrame
 from protocol.runtime import host_id
-from services.calibration.reference import MOST_GAP_S, PressCourse, Doubtful, ReferenceForce
+from services.calibration.reference import MOST_GAP_S, Doubtful, PressCourse, ReferenceForce
 
 BEGAN, ENDED, STEADY = 2.0, 6.0, (3.5, 5.0)
 RAMP_S, NEWTON, RATE_HZ = 0.2, 3.0, 100
