@@ -50,6 +50,7 @@ class EitskinError(Exception):
         ├── ImportRefused (ValueError)        a file cannot become a recording
         ├── RegistrationError (ValueError)    presses at known places do not register a skin
         ├── CalibrationError                  presses of known force make no force law
+        ├── Doubtful                          a press whose force another sensor does not tell
         ├── MissingExtra                      the packages that a bridge needs are not installed
         ├── NotOurs                           a folder that must not be handed over
         ├── BridgeError                       bridges: a bridge cannot start

@@ -497,3 +497,14 @@ class TruthFrame(Frame):
     """What really touches at the middle of the scan; only a stub knows. `publish`: the scan's last byte had left."""
 
     touches: list[TrueTouch] = wire(ListOf(Record(TrueTouch), 256), "the touches", list, always=True)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class ReferenceFrame(Frame):
+    """The force on the skin by an arm's force-torque sensor or a scale. `sample`: when that measured it, as well as its
+    reader knows; a constant delay is found. `source` is `board`. `valid` false: not to be used (saturated, starting).
+    """
+
+    force_n: float = wire(
+        Float(unit="N"), "normal force of all that touches the skin, above 0 where it presses; any constant offset"
+    )

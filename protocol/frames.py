@@ -40,6 +40,7 @@ from .frame_types import (
     LocatedTouch,
     PartFrame,
     RawFrame,
+    ReferenceFrame,
     RefinedTouch,
     ShapeFrame,
     StatusFrame,
@@ -53,8 +54,8 @@ __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "KINDS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
     "BegunTouch", "Contact", "ContactFrame", "DeltaFrame", "FollowedTouch", "ForceFrame", "Frame", "FrameError",
-    "ImageFrame", "InfoFrame", "LocatedTouch", "PartFrame", "RawFrame", "RefinedTouch", "ShapeFrame", "StatusFrame",
-    "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
+    "ImageFrame", "InfoFrame", "LocatedTouch", "PartFrame", "RawFrame", "ReferenceFrame", "RefinedTouch", "ShapeFrame",
+    "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
 ]  # fmt: skip
 
 MAX_MESSAGE = 4 * 1024 * 1024

@@ -15,8 +15,12 @@ BRIDGES = ("page", "ros2", "foxglove")
 """Processes that show contacts, or hand them on to other worlds. On our side they publish their status alone."""
 RECORDER = "recorder"
 """The process that records; it publishes its status alone, too."""
-PRODUCERS = ("acquisition", "preprocessing", "inference", "publisher", "stub", *BRIDGES, RECORDER)
-"""Processes that own a data socket `<producer>.ipc`. A replay stands in for acquisition and binds its socket."""
+REFERENCE = "reference"
+"""The user's program that reads a force-torque sensor or a scale; it publishes the topic of that name alone."""
+OUR_PROCESSES = ("acquisition", "preprocessing", "inference", "publisher", "stub", *BRIDGES, RECORDER)
+"""Our processes: each publishes its status."""
+PRODUCERS = (*OUR_PROCESSES, REFERENCE)
+"""Who owns a data socket `<producer>.ipc`. A replay stands in for acquisition and binds its socket."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +79,19 @@ TOPICS: dict[str, Topic] = {
         Topic(
             "shape", f.ShapeFrame, "publisher", 22, True, False, "newest", "outline, orientation, class probabilities"
         ),
-        Topic("status", f.StatusFrame, PRODUCERS, 1, False, True, "all", "diagnostics, also on change"),
+        Topic("status", f.StatusFrame, OUR_PROCESSES, 1, False, True, "all", "diagnostics, also on change"),
         Topic("info", f.InfoFrame, "preprocessing", 0, False, True, "all", "geometry, units, baseline, hashes"),
         Topic("truth", f.TruthFrame, "stub", 22, False, False, "newest", "what really touches (stub only)"),
+        Topic(
+            "reference",
+            f.ReferenceFrame,
+            (REFERENCE, "ros2"),
+            100,
+            False,
+            False,
+            "all",
+            "the force on the skin by another sensor, for `skin calibrate --live`",
+        ),
     )
 }
 

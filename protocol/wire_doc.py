@@ -41,7 +41,7 @@ def topic_table() -> str:
             (
                 f"`{t.name}/SKIN`",
                 t.frame.__name__,
-                t.producer if isinstance(t.producer, str) else "every process",
+                "every process" if t.producers == topics.OUR_PROCESSES else ", ".join(t.producers),
                 f"{t.rate_hz:g}" if t.rate_hz else "on change",
                 yes[t.lazy],
                 yes[t.latched],

@@ -18,13 +18,14 @@ from bridges.feeds import ContactFeed, ImageFeed, Measured, NewestFeed, Picture,
 from bridges.process import Bridge, BridgeError, Handed
 from protocol.control import ControlClient, ControlError
 from protocol.frame_types import ELECTRODE_STATES
-from protocol.frames import DeltaFrame, InfoFrame, StatusFrame
+from protocol.frames import DeltaFrame, Frame, InfoFrame, StatusFrame
 from protocol.sockets import AllReader
 from protocol.transport import Socket
 
 from . import dds, messages
 from .dds import RosWriter
 from .names import topic_base
+from .reference import references
 from .tare_service import Act, TareService
 
 DIAGNOSTICS_S = 1.0
@@ -159,6 +160,7 @@ class Ros2Bridge(Bridge):
         self._diagnostics = RosWriter(self._participant, "/diagnostics", "diagnostic_msgs/DiagnosticArray", "state")
         self._tf = RosWriter(self._participant, "/tf_static", "tf2_msgs/TFMessage", "latched")
         self._told = AllReader(["status", "info"])
+        self._references = references(options.get("reference", {}), handed.skins, self._participant, self._clock)
         self._tare: TareService | None = None
         if options.get("commands"):
             acts = {topic_base(name): tare(name) for name in handed.skins}
@@ -191,6 +193,10 @@ class Ros2Bridge(Bridge):
                 self._place(frame)
             elif frame is None:
                 break
+
+    def frames(self) -> Iterable[Frame]:
+        for reference in self._references:
+            yield from reference.frames()
 
     def _note(self, frame: StatusFrame) -> None:
         """A process says how it does."""

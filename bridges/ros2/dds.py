@@ -13,8 +13,10 @@ from typing import Any, Literal
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct, make_idl_struct, types
 from cyclonedds.idl.annotations import final
+from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from . import cdr
@@ -45,6 +47,10 @@ DATAGRAM, FRAGMENT = 65500, 65000
 a cloud of 184 kB is 14 datagrams, which overflow the receive buffer of a ROS node that does not read at once (208 kB
 with what the kernel adds to each): half of the clouds were lost. Of these 3 none is.
 """
+
+
+READ_AT_ONCE = 1000
+"""Messages of another node that are held for us: a second of a fast force-torque sensor."""
 
 
 def domain_id(given: int | None) -> int:
@@ -104,6 +110,24 @@ def idl_type(message: str) -> type[IdlStruct]:
 def _finished(sample: Any, **_: object) -> bytes:
     data: bytes = sample.finished
     return data
+
+
+class RosReader:
+    """Reads one ROS topic of another node, whether that sends reliably or not."""
+
+    def __init__(self, participant: DomainParticipant, name: str, message: str) -> None:
+        qos = Qos(
+            Policy.Reliability.BestEffort,
+            Policy.History.KeepLast(READ_AT_ONCE),
+            Policy.Durability.Volatile,
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+        )
+        topic: Topic[Any] = Topic(participant, f"rt{name}", idl_type(message))
+        self._reader: DataReader[Any] = DataReader(participant, topic, qos)
+
+    def take(self) -> list[Any]:
+        """The messages since the last call, oldest first, the newest READ_AT_ONCE of them."""
+        return [found for found in self._reader.take(READ_AT_ONCE) if not isinstance(found, InvalidSample)]
 
 
 class RosWriter:

@@ -104,7 +104,11 @@ def fit(presses: Sequence[Press], laws: dict[Of, ForceLaw], most_n: float | None
     own = float(np.sqrt(max(0.0, error**2 - float(np.mean((exponent * images) ** 2)))))
     forces = [p.force_n for p in presses]
     said = {
-        "error": {"left_out_rms": error, "left_out_median": float(np.median(np.abs(np.expm1(left_out))))},
+        "error": {
+            "left_out_rms": error,
+            "left_out_median": float(np.median(np.abs(np.expm1(left_out)))),
+            "law": error * float(np.sqrt(form.parameters / len(presses))),  # of the law itself: what more presses mend
+        },
         "presses": len(presses),
         "tips_m": tips(presses),
         "forces_n": [min(forces), max(forces)],

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+import typer.core
 
+from services.cli import calibrate_live
 from services.cli.common import (
     USAGE,
     JsonOption,
@@ -27,8 +29,16 @@ PLAN = ((0, 0, 1), (0, 0, 3), (0, 0, 5), (1, 1, 2), (-1, 1, 4), (-1, -1, 2), (1,
 """Where to press (halves of the way to the edge), and about how firmly [N]; then again from the first, another tip."""
 
 
+class ForceUnlessNamed(typer.core.TyperGroup):
+    """`skin calibrate --live` is `skin calibrate force --live`."""
+
+    def parse_args(self, context: Any, args: list[str]) -> list[str]:
+        named = not args or not args[0].startswith("-") or args[0] == "--help"
+        return super().parse_args(context, args if named else ["force", *args])
+
+
 def register(app: typer.Typer) -> None:
-    calibrate = typer.Typer(help="Teach a skin from what is known.", no_args_is_help=True)
+    calibrate = typer.Typer(cls=ForceUnlessNamed, help="Teach a skin from what is known.", no_args_is_help=True)
     calibrate.callback()(lambda: None)  # so that `force` stays a command of its own
     calibrate.command("force")(of_service(force))
     app.add_typer(calibrate, name="calibrate")
@@ -36,6 +46,9 @@ def register(app: typer.Typer) -> None:
 
 def force(
     skin: SkinOption = "",
+    live: Annotated[
+        bool, typer.Option("--live", help="Another sensor says each force, over the topic reference/SKIN.")
+    ] = False,
     csv: Annotated[
         Path | None, typer.Option(readable=False, help="Presses from a file instead of by prompts; see below.")
     ] = None,
@@ -44,6 +57,12 @@ def force(
     ] = None,
     save: Annotated[Path | None, typer.Option(help="Also keep the presses, as a CSV that --csv reads.")] = None,
     out: Annotated[Path | None, typer.Option(help="The calibration; default: calibration/SKIN-force.json.")] = None,
+    tip: Annotated[
+        float, typer.Option(min=0, max=1, metavar="METRES", help="With --live: radius of what presses; 0: not known.")
+    ] = 0.0,
+    presses: Annotated[
+        int, typer.Option(min=1, metavar="N", help="With --live: end after so many, enough or not.")
+    ] = 60,
     most: Annotated[
         float, typer.Option(min=0, help="Newtons beyond which it is extrapolated; default: the firmest.")
     ] = 0.0,
@@ -51,10 +70,11 @@ def force(
 ) -> None:
     """Fit the skin's force law to presses of known force and say how well it predicts each press from the others.
 
-    By prompts: type the force, press and hold still, release; an empty line ends. CSV: a line of names, then a press a
-    line: force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2[,noise] as --save writes it; or, with --measurements:
-    force_n,row (from 0). tip_m, the radius of what pressed, may stand beside either: two sizes tell whether force
-    follows pressure, peak or integral.
+    By prompts: type the force, press and hold still, release; an empty line ends. With --live nothing is typed: press
+    until it is enough; Ctrl-C ends before. CSV: a line of names, then a press a line:
+    force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2[,noise] as --save writes it; or, with --measurements: force_n,row
+    (from 0). With --live its presses count beside the new ones. tip_m, the radius of what pressed, may stand beside
+    either: two sizes tell whether force follows pressure, peak or integral.
     """
     from models.bundle import Bundle
     from services.calibration import force_presses as calibration_presses
@@ -70,19 +90,23 @@ def force(
         fail(
             "--measurements needs --csv FILE with columns force_n,row: which row was measured under which force", USAGE
         )
+    if not live and tip:
+        fail("--tip needs --live: by prompts it is asked for, in a CSV it is the column tip_m", USAGE)
     if csv is None:
-        presses = _prompted(name, bundle)
+        made = [] if live else _prompted(name, bundle)
     elif measurements is None:
-        presses = calibration_csv.read(csv)
+        made = calibration_csv.read(csv)
     else:
         warn = lambda text: print(f"skin: {text}", file=sys.stderr)  # noqa: E731
-        presses = calibration_csv.read(csv, calibration_presses.of_file(measurements, configured, bundle, warn))
+        made = calibration_csv.read(csv, calibration_presses.of_file(measurements, configured, bundle, warn))
+    if live:
+        made += calibrate_live.pressed(name, calibration_presses.laws(configured, bundle), made, tip, presses)
     out = out or Path("calibration", f"{name}-force.json")
     try:
         if save is not None:
             save.parent.mkdir(parents=True, exist_ok=True)
-            calibration_csv.write(save, presses)
-        found = fit(presses, calibration_presses.laws(configured, bundle), most or None)
+            calibration_csv.write(save, made)
+        found = fit(made, calibration_presses.laws(configured, bundle), most or None)
         out.parent.mkdir(parents=True, exist_ok=True)
         digest = calibration.save(out, found, name, configured, bundle)
     except OSError as why:
@@ -107,7 +131,8 @@ def _say(report: dict[str, Any]) -> None:
     print(f"force = {curve['scale']:.4g} * ({of})^{curve['exponent']:.3f}{place}, to {report['most_n']:g} N")
     print(
         f"each of the {report['presses']} presses foretold by the others: off by "
-        f"{100 * error['left_out_median']:.1f} % (median), {100 * error['left_out_rms']:.1f} % (root mean square)"
+        f"{100 * error['left_out_median']:.1f} % (median), {100 * error['left_out_rms']:.1f} % (root mean square); "
+        f"the law itself is known to {100 * error['law']:.1f} %"
     )
     if report["unknown"]:
         print(report["unknown"])

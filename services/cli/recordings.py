@@ -42,7 +42,9 @@ def register(app: typer.Typer) -> None:
 def record(
     file: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="With --trigger: a folder, a file for each event.")],
     seconds: Annotated[float, typer.Option(min=0, max=DAYS_S, help="Stop after so long; 0: at Ctrl-C.")] = 0.0,
-    topics: Annotated[str, typer.Option(help="Which topics; naming a lazy one wakes it.")] = "raw,contact,status,info",
+    topics: Annotated[
+        str, typer.Option(help="Which topics; naming a lazy one wakes it.")
+    ] = "raw,contact,status,info,reference",
     skin: RecordedSkin = "",
     file_mb: Annotated[float, typer.Option(min=0, help="Go on in FILE-2.mcap when FILE is so large; 0: never.")] = 0.0,
     file_minutes: Annotated[float, typer.Option(min=0, help="Likewise, when it is so long.")] = 0.0,

@@ -82,7 +82,7 @@ def _live(monitor: Monitor) -> None:
 
 def echo(
     topic: Annotated[
-        str, typer.Argument(help="raw, delta, part, image, contact, force, shape, status, info or truth.")
+        str, typer.Argument(help="raw, delta, part, image, contact, force, shape, status, info, truth or reference.")
     ],
     skin: SkinOption = "",
     count: Annotated[int, typer.Option("--count", "-n", min=0, help="Leave after so many frames; 0: never.")] = 0,
@@ -126,7 +126,7 @@ def plain(value: Any) -> Any:
 
 def line(name: str, frame: Any) -> str:
     """A frame for a person: what it says first, then where it comes from."""
-    number = f"frame {frame.seq:7d}" if name in ("status", "info") else f"scan {frame.scan:7d}"
+    number = f"frame {frame.seq:7d}" if name in ("status", "info", "reference") else f"scan {frame.scan:7d}"
     head = f"{name}/{frame.skin} {number} {'valid  ' if frame.valid else 'INVALID'}"
     reasons = f" [{', '.join(frame.reasons)}]" if frame.reasons else ""
     if name == "contact":

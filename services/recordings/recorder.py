@@ -27,7 +27,7 @@ from services.recordings.snapshots import STATE_EVERY_S, Keeping, Snapshots, fil
 from services.recordings.stage_states import StateReader
 from services.runtime.config import MOST_SKINS, ConfigError, load
 
-DEFAULT_TOPICS = ("raw", "contact", "status", "info")
+DEFAULT_TOPICS = ("raw", "contact", "status", "info", "reference")
 POLL_S = 0.05
 MOST_LATCHED = 1024
 

@@ -148,6 +148,13 @@ class PageSection(Section):
     metrics: Switch = False  # /metrics, for Prometheus
 
 
+class ReferenceSection(Section):
+    """A force-torque sensor of the robot, for `skin calibrate --live`: bridges/ros2/reference.py."""
+
+    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*){1,16}$", max_length=200)]  # WrenchStamped
+    axis: Literal["x", "y", "z", "-x", "-y", "-z"] = "-z"  # of its force, that is above 0 where something presses
+
+
 class Ros2Section(Section):
     """Topics for ROS 2: bridges/ros2, docs/ros.md."""
 
@@ -155,6 +162,7 @@ class Ros2Section(Section):
     interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:@-]{0,64}$")] = ""  # the only one; "lo": this host
     commands: Switch = False  # the service `tare`: anybody in the ROS domain may call it
     replay: Switch = False  # replayed frames are published too
+    reference: dict[str, ReferenceSection] = {}  # skin -> what says the force on it
 
 
 class FoxgloveSection(Section):

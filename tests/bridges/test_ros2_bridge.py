@@ -17,6 +17,8 @@ from cyclonedds.topic import Topic
 
 from bridges.process import INTERRUPTED, Bridge, BridgeError, Handed, main
 from bridges.ros2 import dds
+from protocol.frames import ReferenceFrame
+from protocol.sockets import AllReader
 from tests.bridges.conftest import FakeService, RunningBridge
 
 DOMAIN = 120 + os.getpid() % 80
@@ -112,6 +114,42 @@ def test_what_is_not_valid_is_not_published_and_valid_says_so(fake: FakeService,
     wait_for(lambda: len(wrench.poll()) > before)
     for each in (wrench, valid, cloud):
         each.close()
+
+
+def test_a_wrench_of_the_robot_becomes_the_reference_of_the_skin(runtime: Path, fake: FakeService) -> None:
+    """By its own stamps; a stamp of another clock is never a time."""
+    section = f'interface = "lo"\ndomain = {DOMAIN}\nreference.palm = {{ topic = "/ft/wrench", axis = "-z" }}'
+    running = RunningBridge("ros2", runtime, section)
+    reader = AllReader(["reference"], "palm")
+    try:
+        running.status()
+        Listener("/somewhere", "std_msgs/Bool").close()  # there is a participant
+        assert Listener.participant is not None
+        sensor = dds.RosWriter(Listener.participant, "/ft/wrench", "geometry_msgs/WrenchStamped", "state")
+        wait_for(lambda: sensor.wanted)
+
+        def heard(stamp_ns: int) -> ReferenceFrame:
+            header = {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": "ft"}
+            while reader.recv(0.3) is not None:  # what was sent before
+                pass
+            for _ in range(50):  # best effort: what comes before the two have found each other is lost
+                sensor.write({"header": header, "wrench": {"force": {"x": 1.0, "y": 2.0, "z": -2.5}}})
+                frame = reader.recv(0.4)
+                if isinstance(frame, ReferenceFrame):
+                    assert frame.force_n == 2.5
+                    return frame
+            raise AssertionError(f"no reference came: {running.said()}")
+
+        measured = time.monotonic_ns() - 40_000_000
+        stamped = heard(measured + time.time_ns() - time.monotonic_ns())
+        assert stamped.valid and stamped.stamps["sample"] == pytest.approx(measured, abs=2_000_000)
+        unstamped = heard(0)
+        assert unstamped.valid and 0 < time.monotonic_ns() - unstamped.stamps["sample"] < 5e9
+        simulated = heard(5 * 10**9)
+        assert not simulated.valid and simulated.reasons == ["clock"]
+    finally:
+        reader.close()
+        running.close()
 
 
 def test_the_pose_is_there_for_who_comes_late(bridge: RunningBridge) -> None:

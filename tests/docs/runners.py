@@ -18,7 +18,7 @@ How = Literal["ends", "runs", "help", "slow", "ci", "service", "walk", "elsewher
 be run at all; its program knows every option that is named (.ci/run runs benchmarks in short form). slow: as `ends`,
 but in .ci/run only. ci: .ci/run has this step, `says` is the line. service: it is how the service of these tests was
 started. walk: a test of the page's own types it, in the page's order (TRIED_ELSEWHERE). elsewhere: it changes the
-reader's system; the test file `says` tries what it installs.
+reader's system, or needs a sensor and hands; the test file `says` tries what it installs, or has both.
 """
 
 
@@ -44,6 +44,7 @@ COMMANDS = (
     Row("make train", "ends", says="models.build", instead="make -n train"),
     Row("skin --version", "ends", says="^eitskin [0-9]"),
     Row(r"\.venv/bin/python -m pytest tests/protocol", "ci", says="make test"),
+    Row(r"\.venv/bin/python -m pytest -m slow -s tests/cli/test_calibrate_live.py.*", "ci", says="make test-all"),
     Row(
         r"\.venv/bin/python -m tests\.bridges\.pictures ADDRESS",
         "ends",
@@ -225,6 +226,7 @@ COMMANDS = (
         says="2 rows",
         instead="./skin reconstruct {measurements} {folder}/out.npz --skin square16",
     ),
+    Row(r"(\./)?skin calibrate --live.*", "elsewhere", says="tests/cli/test_calibrate_live.py"),
     Row(
         "(./)?skin calibrate force",
         "ends",

@@ -33,6 +33,10 @@ SHORTER = {
     "./skin register presses.npz --skin my-skin --out my-registered": "",
     "make train SKIN=my-registered MINUTES=10": "",
 }
+LIVE = {  # with a sensor and somebody who presses: tests/cli/test_calibrate_live.py
+    "./skin calibrate --live --skin mine --tip 0.005 --save small.csv --out mine-force.json": "",
+    "./skin calibrate --live --skin mine --tip 0.012 --csv small.csv --out mine-force.json": "",
+}
 TRAINED = {
     "make train SKIN=my-skin QUICK=1": ".venv/bin/python -m models.build --skin my-skin --minutes 6 --anyway",
     "make train SKIN=my-registered MINUTES=10": ".venv/bin/python -m models.build --skin my-registered --minutes 3",
@@ -152,14 +156,14 @@ def check(somebody: Reader, most_mm: float) -> None:
 def test_the_page_is_followed_without_training() -> None:
     needs.TRAIN.here()  # the program that makes bundles is the one that trains
     with world() as place:
-        check(follow(place, SHORTER), most_mm=2.0)
+        check(follow(place, SHORTER | LIVE), most_mm=2.0)
 
 
 @pytest.mark.slow
 def test_the_page_is_followed_with_a_training() -> None:
     needs.TRAIN.here()
     with world() as place:
-        somebody = follow(place, TRAINED)
+        somebody = follow(place, TRAINED | LIVE)
         check(somebody, most_mm=2.0)
         assert "verdict: " in somebody.said["make train SKIN=my-skin QUICK=1"].out
         (register,) = (each for each in somebody.said if each.startswith("./skin register"))

@@ -16,7 +16,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from protocol.frames import ContactFrame, InfoFrame, RawFrame
+from protocol.frames import ContactFrame, InfoFrame, RawFrame, ReferenceFrame
 from protocol.sockets import ControlClient, ControlServer, Publisher
 from services.recordings import patient_file
 from services.recordings.patient_file import PatientFile
@@ -71,6 +71,21 @@ def record(path: Path, publish: list[object], producer: str, **options: object) 
         recorder.step(0.7)
     publisher.close()
     return sent
+
+
+def test_a_reference_is_recorded_like_all_others(runtime: Path, tmp_path: Path) -> None:
+    publisher = Publisher("reference")
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        end = time.monotonic() + 5
+        while not publisher.wanted("reference", "palm"):
+            recorder.step(0.01)
+            publisher.poll()
+            assert time.monotonic() < end
+        sent = publisher.send(ReferenceFrame(skin="palm", valid=True, force_n=2.5))
+        recorder.step(0.5)
+    publisher.close()
+    (got,) = RecordingReader(tmp_path / "a.mcap").messages({"reference"})
+    assert got.wire == sent
 
 
 def test_messages_are_recorded_byte_for_byte(runtime: Path, tmp_path: Path) -> None:

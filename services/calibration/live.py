@@ -1,0 +1,177 @@
+"""Presses for a force law while one presses and another sensor says the force: `skin calibrate force --live`.
+
+A press counts where one touch was held still, the skin was free before and after it, and the reference tells its force.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from protocol.ages import Ages
+from protocol.frames import Frame, ImageFrame, ReferenceFrame
+from protocol.held import HeldImage
+from protocol.sockets import AllReader
+from services.calibration.force_fit import CalibrationError, Press
+from services.calibration.force_presses import PATIENCE_S, STEADY_S, Steady, looks
+from services.calibration.reference import AROUND_S, GUARD_S, SETTLE_S, ZERO_S, Doubtful, PressCourse, ReferenceForce
+from services.contacts.calibration_file import Calibration
+from services.contacts.force import Look
+
+FREE_S = GUARD_S + ZERO_S + AROUND_S  # how long the skin is free before a press
+COURSE = 4096  # images of one press that are kept
+LEAST_PRESSES = 12
+ENOUGH = 0.015  # relative standard uncertainty of the law: with so much nobody needs to press on
+QUARTERS = {(1, 1): "upper right", (-1, 1): "upper left", (-1, -1): "lower left", (1, -1): "lower right"}
+
+Tell = Callable[[str], None]
+
+
+class LivePresses:
+    """The presses that are made from now on. tell: takes a line for who presses."""
+
+    def __init__(self, skin: str, tell: Tell, tip_m: float | None = None, patience_s: float = PATIENCE_S) -> None:
+        self.reference = ReferenceForce(skin)
+        self._skin, self._tell_all, self._tip, self._patience_s = skin, tell, tip_m, patience_s
+        self._reader = AllReader(["image", "reference"], skin)
+        self._ages = Ages()
+        self._told = ""
+        self._course: deque[tuple[float, float]] = deque(maxlen=COURSE)
+        self._images = 0
+        self._held = HeldImage()
+        self._held_up = ""
+
+    def __iter__(self) -> Iterator[Press]:
+        """Each press that counts. Raises CalibrationError where none comes within the patience."""
+        count = 0
+        while True:
+            self._free()
+            try:
+                force, look = self._press()
+            except Doubtful as why:
+                self._tell(f"{why}; this press does not count", again=True)
+                continue
+            count += 1
+            yield Press(force, look, f"press {count}", self._tip)
+
+    def close(self) -> None:
+        self._reader.close()
+        self.reference.close()
+        self._ages.close()
+
+    # -- one press --------------------------------------------------------------------------------------------------
+    def _free(self) -> None:
+        """Until the skin has been free for long enough while the reference was there."""
+        while self._reader.recv(0.0) is not None:  # what came while somebody was told of the last press
+            pass
+        since: float | None = None
+        asked = False
+        for frame, now in self._frames("the skin did not become free: release it, or tare (`skin tare`)"):
+            trouble = self.reference.trouble(now)
+            if trouble or frame.touched:
+                if trouble:
+                    self._tell(f"{self._unread() or trouble}; no press counts until then")
+                if frame.touched and not asked:
+                    self._tell("release", again=True)
+                since, asked = None, asked or frame.touched
+            elif since is None:
+                since = now
+            elif now - since >= FREE_S:
+                self._tell("press one place and hold still", again=True)
+                return
+
+    def _press(self) -> tuple[float, Look]:
+        """The next press. Raises Doubtful where it does not count."""
+        began = self._until(True, "no press came")
+        look, steady = self._steady()
+        self._tell("release", again=True)
+        ended = self._until(False, "something still touches: free the skin, or tare (`skin tare`)")
+        for _, now in self._frames("the images ended"):
+            if now - ended > SETTLE_S + STEADY_S / 10:
+                break
+        times, shown = np.array(self._course).T
+        return self.reference.force(PressCourse(times, shown, began, steady, ended)), look
+
+    def _until(self, touched: bool, why: str) -> float:
+        """When something touched first, or nothing any more. Raises Doubtful where the reference ends meanwhile."""
+        for frame, now in self._frames(why):
+            if trouble := self.reference.trouble(now):
+                raise Doubtful(self._unread() or trouble)
+            if frame.touched == touched:
+                return self._when(frame, now)
+        raise AssertionError("frames end by an exception")
+
+    def _steady(self) -> tuple[Look, tuple[float, float]]:
+        """What a press shows once it is steady, and from when to when that was. Raises Doubtful."""
+        steady = Steady()
+        self._held_up = "too short"
+        for frame, now in self._frames("no steady press"):
+            if trouble := self.reference.trouble(now):
+                raise Doubtful(self._unread() or trouble)
+            look = steady(frame)
+            if not frame.touched:
+                raise Doubtful(f"released before it was steady ({self._held_up}): hold still until told")
+            self._held_up = steady.trouble
+            if look is not None:
+                end = self._when(frame, now)
+                return look, (end - STEADY_S, end)
+        raise AssertionError("frames end by an exception")
+
+    # -- what comes ---------------------------------------------------------------------------------------------------
+    def _frames(self, why: str) -> Iterator[tuple[ImageFrame, float]]:
+        """Image frames, and when each came [s]; the reference is followed beside them. Raises CalibrationError."""
+        end = time.monotonic() + self._patience_s
+        while (now := time.monotonic()) < end:
+            frame: Frame | None = self._reader.recv(min(0.5, end - now))
+            arrived = time.monotonic()
+            if isinstance(frame, ReferenceFrame):
+                self.reference.take(frame, arrived)
+            elif isinstance(frame, ImageFrame):
+                self._images += 1
+                self._held.complete(frame)
+                self._note(frame, arrived)
+                yield frame, arrived
+        if not self._images:
+            why = "no image came: start the service with `skin up`"
+        elif trouble := self.reference.trouble(time.monotonic()):
+            why = self._unread() or trouble
+        raise CalibrationError(f"no press within {self._patience_s:g} s: {why}")
+
+    def _note(self, frame: ImageFrame, now: float) -> None:
+        """A point of the course: of frames that show something, or that nothing touches."""
+        found = looks(frame)
+        if found or not frame.touched:
+            self._course.append((self._when(frame, now), sum(k.integral for k in found)))
+
+    def _when(self, frame: ImageFrame, arrived_s: float) -> float:
+        measured = self._ages.measured_ns(frame, int(arrived_s * 1e9))
+        return arrived_s if measured is None else 1e-9 * measured
+
+    def _unread(self) -> str:
+        """What is wrong with messages that do not count as such; "" where there were none."""
+        bad = self._reader.last_error
+        if bad is not None and bad.topic == "reference":
+            return f"{self._reader.malformed} messages could not be read, the last one: {bad}"
+        if self._reader.repeated:
+            return f"{self._reader.repeated} messages came with a `seq` that had been there: it must count up"
+        return ""
+
+    def _tell(self, text: str, again: bool = False) -> None:
+        """Once, unless `again`."""
+        if again or text != self._told:
+            self._tell_all(text)
+        self._told = text
+
+
+def missing(presses: Sequence[Press], found: Calibration) -> str:
+    """What presses do not tell yet, for who presses; "" where they are enough."""
+    if len(presses) < LEAST_PRESSES:
+        return f"{LEAST_PRESSES - len(presses)} more presses at least"
+    pressed = {(1 if p.look.x > 0 else -1, 1 if p.look.y > 0 else -1) for p in presses}
+    if left := [name for quarter, name in QUARTERS.items() if quarter not in pressed]:
+        return f"presses in the {', '.join(left)} quarter"
+    law = found.said["error"]["law"]
+    return f"the law to {100 * ENOUGH:.1f} %" if law > ENOUGH else ""
