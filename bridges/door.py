@@ -162,6 +162,8 @@ class Door:
             yield known
         finally:
             self._seated[known] -= 1
+            if request.transport is not None and not request.transport.is_closing():
+                self.opened(request.transport)  # it did not become a viewer, or is one no more
 
     def opened(self, transport: asyncio.Transport) -> None:
         """A connection has come."""

@@ -193,6 +193,28 @@ def test_1135_half_sent_requests_do_not_keep_the_owner_out(doorway: Doorway) -> 
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
+def test_1135_requests_for_a_view_that_cannot_be_do_not_keep_the_owner_out(doorway: Doorway) -> None:
+    """They pass the door, are told what they should have asked for, and stay connected."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(max(soft, 4096), hard), hard))
+    head = f"GET /live HTTP/1.1\r\nHost: 127.0.0.1:{doorway.port}\r\nOrigin: http://127.0.0.1:{doorway.port}\r\n"
+    if not doorway.is_page:
+        head += "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+        head += "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: other\r\n"
+    try:
+        with ExitStack() as stack:
+            for _ in range(1135):
+                peer = stack.enter_context(socket.socket())
+                peer.settimeout(10)
+                peer.connect(("127.0.0.1", doorway.port))
+                peer.sendall(head.encode() + b"\r\n")
+                assert b" 400 " in peer.recv(4096)
+                assert len(list(Path(f"/proc/{doorway.bridge.process.pid}/fd").iterdir())) < 400
+            run(lambda: doorway.looks(doorway.token))
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
 MALFORMED = [
     '{"ping": "\\ud800"}',
     f'{{"ping": {2**70}}}',

@@ -278,6 +278,21 @@ def test_a_network_with_weights_in_another_file_is_refused(bundle: Bundle, tmp_p
         write(tmp_path / "b", manifest, bundle.matrices, {"full": with_weights_elsewhere(where)})
 
 
+def test_a_field_whose_number_only_other_readers_take_hides_no_weights(
+    skin: Skin, bundle: Bundle, tmp_path: Path
+) -> None:
+    """A tag of over 32 bits: ONNX Runtime drops those above, and reads the graph that it belongs to."""
+    from models.bundle import BundleError
+
+    plain = with_weights_elsewhere("initializer")
+    tag = plain.rindex(b"\x3a", 0, plain.index(onnx.load_from_string(plain).graph.SerializeToString()))
+    hidden = plain[:tag] + b"\xba\x80\x80\x80\x10" + plain[tag + 1 :]
+    manifest = {k: v for k, v in bundle.manifest.items() if k not in ("schema", "files")}
+    made = write(tmp_path / "b", manifest, bundle.matrices, {"full": hidden})
+    with pytest.raises(BundleError, match="network.onnx is no network that can be run .*a field's tag of over 32 bits"):
+        Inference("palm", skin.model_copy(update={"network": "full"}), made)
+
+
 @pytest.mark.parametrize("content", [b"", b"no network", network()[:200]])
 def test_a_file_that_is_no_network_is_an_error_of_the_bundle(
     skin: Skin, bundle: Bundle, tmp_path: Path, content: bytes
