@@ -20,6 +20,7 @@ class EitskinError(Exception):
         ├── AlreadyRunning (RuntimeError)     another service holds the runtime folder
         ├── LinkError (ValueError)            a message of the board link cannot be sent or does not fit
         ├── FileError                         models: a file cannot be read
+        ├── NotUnderstood (ValueError)        models: bytes that are no ONNX file
         ├── BundleError                       a bundle cannot be used
         ├── Wrong                             what is wrong in a bundle; a BundleError names the bundle
         ├── GeometryError (ValueError)        a skin that cannot exist
