@@ -20,7 +20,6 @@ class EitskinError(Exception):
         ├── AlreadyRunning (RuntimeError)     another service holds the runtime folder
         ├── LinkError (ValueError)            a message of the board link cannot be sent or does not fit
         ├── FileError                         models: a file cannot be read
-        ├── NotUnderstood (ValueError)        models: bytes that are no ONNX file
         ├── BundleError                       a bundle cannot be used
         ├── Wrong                             what is wrong in a bundle; a BundleError names the bundle
         ├── GeometryError (ValueError)        a skin that cannot exist
@@ -56,6 +55,7 @@ class EitskinError(Exception):
         ├── NotOurs                           a folder that must not be handed over
         ├── BridgeError                       bridges: a bridge cannot start
         ├── ReplayRefused                     the page does not record or replay now
+        ├── NotUnderstood (ValueError)        what a page sent is no message
         ├── Malformed (ValueError)            bytes that are no RTPS message, or not one that the bridge reads
         ├── CliError                          ends a command with one line and an exit code
         ├── Broken                            bench: a promise was broken under changed bytes
