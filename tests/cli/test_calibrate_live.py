@@ -29,6 +29,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PUBLISHER = Path(__file__).with_name("reference_publisher.py")
 STIFFER = 1.4  # this skin's foam needs so much more force than the shipped one
 SCALE = {"scale": STIFFER, "offset": -7.0, "noise": 0.02, "delay_s": 0.03, "drop": 0.1, "silent_s": 0.6}
+TIP_M = 0.01
 PATIENCE_S = 240
 
 
@@ -91,8 +92,7 @@ def stub(command: str, **args: Any) -> None:
 
 def place(rng: np.random.Generator) -> dict[str, float]:
     x, y = rng.uniform(-0.033, 0.033, 2)
-    radius = rng.uniform(0.008, 0.015)
-    return {"x": x, "y": y, "radius": radius, "force": rng.uniform(0.8, 4.5), "seconds": 60.0}
+    return {"x": x, "y": y, "radius": TIP_M, "force": rng.uniform(0.8, 4.5), "seconds": 60.0}
 
 
 def calibrating(folder: Path, *more: object) -> contextlib.AbstractContextManager[Program]:
@@ -112,7 +112,7 @@ def test_twenty_presses_teach_the_law_to_three_percent(runtime: Path) -> None:
     with (
         serving(runtime, "--config", str(config(runtime))),
         program(sys.executable, PUBLISHER, runtime, json.dumps(SCALE)),
-        calibrating(runtime, "--presses", 20) as skin,
+        calibrating(runtime, "--presses", 20, "--tip", TIP_M) as skin,
     ):
         while line := skin.line():
             if line.startswith("press one place"):
