@@ -204,6 +204,11 @@ class Faults:
             return {name: args for name, (until, args) in self._until.items() if now < until}
 
 
+def messages_of(listing: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What is the matter, for a person. listing: the faults in force, each with its arguments."""
+    return [f"on request, {FAULTS[name].said(args)}" for name, args in listing.items()]
+
+
 def _like(default: Any, value: Any, what: str) -> Any:
     """The value in the type of the default. Raises ValueError."""
     if default in MUXES and value not in MUXES:

@@ -19,7 +19,7 @@ import numpy as np
 from . import scene as scenes
 from .analog import Analog, BoardNoise
 from .board import Board, Scan, measurement_s
-from .faults import FAULTS, Faults
+from .faults import FAULTS, Faults, messages_of
 from .field import Field
 from .port import BAUD, Line
 from .sheet import Sheet
@@ -207,13 +207,15 @@ class Rig:
         return {"fault": name, "args": full, "what": row.what, "sticky": row.sticky, "seconds": seconds}
 
     def status(self, now: float) -> dict[str, Any]:
-        world = self.field.at(now)
+        world, faults = self.field.at(now), self.faults.listing(now)
         return {
+            "level": "WARN" if faults else "OK",
+            "messages": messages_of(faults),
             "scene": self.field.timeline.script.name,
             "touches": len(world.touches),
             "scanning": self.board.scanning,
             "plugged": self._unplugged is None,
-            "faults": self.faults.listing(now),
+            "faults": faults,
             "received": self.board.received,
             "solves": self.field.solves,
             "late_poses": self.field.late,

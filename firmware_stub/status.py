@@ -6,7 +6,7 @@ import time
 
 from protocol.frames import StatusFrame
 
-from .faults import FAULTS
+from .faults import messages_of
 from .port import BoardPort
 from .rig import Rig
 
@@ -27,7 +27,7 @@ class Status:
 
     def due(self, rig: Rig, port: BoardPort, now: float) -> StatusFrame | None:
         """The status frame that is due at `now` (the rig's seconds), or None."""
-        messages = [f"on request, {FAULTS[name].said(args)}" for name, args in rig.faults.listing(now).items()]
+        messages = messages_of(rig.faults.listing(now))
         clock = time.monotonic()
         passed = clock - self._since
         if passed < EVERY_S and messages == self._messages:

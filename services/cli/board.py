@@ -113,7 +113,7 @@ def fault(
         left = ", ".join(answer["faults"])
         print(f"faults that go on: {left}" if left else "no fault is in force")
     elif name:
-        given = " ".join(f"{key}={value}" for key, value in answer["args"].items())
+        given = " ".join(f"{key}={value}" for key, value in answer["args"].items() if value != "")
         print(f"{name} {given}".rstrip() + f": {answer['what']}")
         if name != "power_cycle":  # which happens at once
             print(f"{_lasts(answer)}, or until `skin fault {name} --clear`")

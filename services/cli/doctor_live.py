@@ -78,10 +78,13 @@ def configuration(path: Path) -> Iterator[Finding]:
 
 
 def port(name: str, skin: Skin) -> Iterator[Finding]:
-    """The port, as acquisition finds it."""
+    """The port, as acquisition finds it; of the stub, first what somebody has let go wrong with it."""
     what = "the stub board" if skin.port == "stub" else skin.port
     problem = _status("acquisition", name)
-    if problem.level == "FAIL":
+    if skin.port == "stub" and (stub := _status("stub", name)).level == "WARN":
+        level = "FAIL" if problem.level == "FAIL" else "WARN"
+        yield Finding(level, f"{name}: port", f"{what}: {stub.text}; `skin fault --clear` ends it")
+    elif problem.level == "FAIL":
         yield Finding("FAIL", f"{name}: port", f"{what}: {problem.text}")
     else:
         yield Finding("OK", f"{name}: port", f"{what}, in use by the service")

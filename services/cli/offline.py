@@ -21,8 +21,19 @@ def register(app: typer.Typer) -> None:
     app.command(context_settings=PASS_ON)(bench)
 
 
+def _no_recording(source: Path) -> Path:
+    """Refuses one before anything else that is missing on the line is asked for."""
+    if source.suffix == ".mcap":
+        fail(
+            f"found the recording {source}, expected IN.npz: `skin replay {source} --fast --private --out OUT.mcap` "
+            "runs the stages over a recording, and `skin export OUT.mcap --csv` makes a table of its contacts",
+            USAGE,
+        )
+    return source
+
+
 def reconstruct(
-    source: Annotated[Path, typer.Argument(metavar="IN.npz", readable=False)],
+    source: Annotated[Path, typer.Argument(metavar="IN.npz", readable=False, is_eager=True, callback=_no_recording)],
     target: Annotated[Path, typer.Argument(metavar="OUT.npz")],
     skin: Annotated[str, typer.Option("--skin", metavar="NAME", help="A configured skin, or a bundle.")],
     sequence: Annotated[
@@ -51,12 +62,6 @@ def reconstruct(
     from services.recordings.reconstruction import UNKNOWN_AGE_S, find_skin
     from services.recordings.reconstruction import reconstruct as run
 
-    if source.suffix == ".mcap":
-        fail(
-            f"found the recording {source}, expected IN.npz: `skin replay {source} --fast --private --out OUT.mcap` "
-            "runs the stages over a recording, and `skin export OUT.mcap --csv` makes a table of its contacts",
-            USAGE,
-        )
     found, bundle = find_skin(skin)
     try:
         data = read_scans(load_npz(source), bundle)
@@ -113,7 +118,7 @@ def register_frame(
     ] = None,
     first_electrode: Annotated[
         float | None,
-        typer.Option(metavar="DEGREES", min=-360, max=360, help="Angle of electrode 1 in the machine's frame."),
+        typer.Option(metavar="DEGREES", min=-360, max=360, help="Angle of electrode 0 in the machine's frame."),
     ] = None,
     numbering: Annotated[
         str | None, typer.Option(help="clockwise or counter-clockwise, seen in the machine's frame.")

@@ -669,6 +669,7 @@ def test_a_replay_says_where_it_is_and_when_it_is_over(page: Open) -> None:
         before = found.evaluate(COURSE)
         found.evaluate(TITLES)
         found.click("#play")
+        until(lambda: found.is_disabled("#tare") and found.is_disabled("#record"))  # of a skin, not of it
         places: list[float] = []
 
         def over() -> bool:

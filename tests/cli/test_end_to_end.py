@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -65,4 +66,8 @@ def test_the_demo(
     assert report["messages"]["contact/palm"] > 40 and report["messages"]["state/palm"] == 1
     refused = skin("replay", tmp_path / "demo.mcap")
     assert refused.returncode == 1 and "a board feeds the service" in refused.stderr
+    assert skin("fault", "unplug", "--seconds", 60).stdout.startswith("unplug: the device vanishes")
+    doctor = skin("doctor")
+    says = "the stub board: on request, the cable is out; `skin fault --clear` ends it"
+    assert doctor.returncode == 1 and re.search(f"FAIL +palm: port +{re.escape(says)}", doctor.stdout), doctor.stdout
     os.kill(service.pid, 0)

@@ -155,9 +155,9 @@ function look() {
   by("tools").disabled = !press.enabled;
   faults.enabled = Boolean(token) && link.connected && state.statuses.has("stub");
   const replaying = state.skin === REPLAY; // whose statuses are those of its own stages
-  for (const id of ["tare", "play"]) by(id).disabled = !(token && link.connected);
+  by("play").disabled = !(token && link.connected);
   const recorder = panels.recorder(state.statuses, link.clock, state.hello?.host);
-  by("record").disabled = !(token && link.connected && !replaying);
+  for (const id of ["tare", "record"]) by(id).disabled = by("play").disabled || replaying;
   by("snapshot").disabled = by("record").disabled || !recorder.there;
   by("record").setAttribute("aria-pressed", `${recorder.recording}`);
   panels.text("record", recorder.recording ? "Stop recording" : "Record");
