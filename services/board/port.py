@@ -32,7 +32,7 @@ class Port:
         self.url = url
         try:
             self._serial: Any = serial.serial_for_url(url, baudrate=BAUD, timeout=0, write_timeout=1, exclusive=True)
-        except (serial.SerialException, OSError, ValueError, re.error) as why:
+        except (serial.SerialException, OSError, ValueError, LookupError, re.error) as why:  # by the kind of URL
             raise PortError(explain(url, why)) from None
         try:
             self._serial.set_low_latency_mode(True)

@@ -501,8 +501,9 @@ def test_port_errors_are_their_own_kind(tmp_path: Path) -> None:
 
     with pytest.raises(PortError, match="is not there"):
         Port(str(tmp_path / "nothing"))
-    with pytest.raises(PortError):
-        Port("nonsense://x")
+    for url in ("nonsense://x", "loop://?logging=nonsense", "loop://?nonsense=1"):
+        with pytest.raises(PortError, match="cannot be opened"):
+            Port(url)
 
 
 def test_a_port_that_is_gone_says_so_without_the_systems_numbers() -> None:
