@@ -124,6 +124,8 @@ ROWS = (
     Row("mux_disabled", MEASUREMENT, ("multiplexer",), draw=_mux),
     Row("partial_frames", MEASUREMENT, ("gap",)),
     Row("sequence_gaps", MEASUREMENT, ("gap",)),
+    Row("late_frames", MEASUREMENT),
+    Row("repeated_frames", MEASUREMENT),
     Row("line_noise", MEASUREMENT, ("gap",)),
     Row("clock_jump", BOARD, ("clock",), board=True),
     Row("frozen", MEASUREMENT, ("frozen",)),

@@ -36,8 +36,8 @@ def test_the_table_names_every_topic_with_its_type() -> None:
 
 
 def test_the_settings_are_such_that_the_service_takes_them() -> None:
-    (block,) = re.findall(r"^```toml\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-    found: dict[str, Any] = tomllib.loads(block)
+    blocks = re.findall(r"^```toml\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    found: dict[str, Any] = tomllib.loads("".join(blocks))
     skins = {"palm": {"port": "stub", "bundle": "square16"}}
     config = parse({**found, "skins": skins})
     assert (
@@ -45,6 +45,7 @@ def test_the_settings_are_such_that_the_service_takes_them() -> None:
         and config.ros2.interface == "lo"
         and config.ros2.domain == 0
         and config.ros2.commands
+        and config.ros2.reference["palm"].axis == "-z"
     )
 
 

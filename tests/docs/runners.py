@@ -57,6 +57,9 @@ COMMANDS = (
     Row("make venv-dev EXTRAS=plots,peers", "ci", says="make venv-dev EXTRAS=train,plots,peers"),
     Row("make venv(-dev)? EXTRAS=(train|plots|peers)", "ci", says="make venv-dev EXTRAS=train,plots,peers"),
     Row("make test EXTRAS=train,plots,peers", "ci", says="make venv-dev EXTRAS=train,plots,peers"),
+    Row("make venv EXTRAS=train,plots,peers", "ci", says="make venv-dev EXTRAS=train,plots,peers"),
+    Row("make test-all", "ci", says="make test-all"),
+    Row("make search", "ends", says="hypothesis", instead="make -n search"),
     Row("make venv", "ci", says="make up"),  # whose first prerequisite it is
     Row(
         "(./)?skin bridge page",

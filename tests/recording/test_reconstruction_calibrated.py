@@ -7,6 +7,7 @@ import pytest
 
 from models.bundle import Bundle
 from models.mismatch import MismatchedSheet, named
+from models.pressure import FOAM, disc
 from models.shapes import Shape
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import mounted_bundle, reconstruct
@@ -32,7 +33,8 @@ def test_rows_of_an_anisotropic_skin_become_valid_and_right() -> None:
     out = reconstruct(data, SKIN, bundle, warn=said.append, age_s=1.0, calibrate=True)
     assert out["valid"].all() and out["count"][0] == 1
     assert np.hypot(*(out["position"][0, 0] - [0.015, -0.015])) < 1e-3
-    assert out["force"][0, 0] == pytest.approx(3.0, rel=0.15)
+    newtons = FOAM.force("circle", TOUCH[0].drop, disc(0.05 * TOUCH[0].radius))
+    assert out["force"][0, 0] == pytest.approx(newtons, rel=0.15)
     assert any("15 % better along" in text for text in said)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from models.pressure import FOAM, disc
 from models.shapes import Shape
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import reconstruct
@@ -40,7 +41,8 @@ def test_rows_of_a_skin_that_drifted_since_its_untouched_ones(background: float,
     assert out["valid"].all() and out["count"].tolist() == [0, 1, 1, 1]
     for k, touch in enumerate(TOUCHES):
         assert out["position"][k + 1, 0] == pytest.approx([0.05 * touch.x, 0.05 * touch.y], abs=0.003)
-    assert out["force"][2, 0] == pytest.approx(5.0, rel=0.15)
+    newtons = FOAM.force("circle", TOUCHES[1].drop, disc(0.05 * TOUCHES[1].radius))
+    assert out["force"][2, 0] == pytest.approx(newtons, rel=0.15)
 
 
 def test_a_service_that_comes_back_after_fifty_minutes_under_a_touch() -> None:
