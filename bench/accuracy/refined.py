@@ -72,7 +72,7 @@ SKIN, MESH, N = "square16", "stub", 96
 MOST = 64 * 2**20
 Row = dict[str, tuple[float, float]]
 COVERAGE_ALSO = ("60", "80")  # noise levels of which intervals alone are looked at
-WRITER = ContactWriter(ForceLaw(Curve(1.0)), Placement(Plane()), tells_force=True)
+WRITER = ContactWriter(ForceLaw(Curve(1.0), reads="peak"), Placement(Plane()), tells_force=True)
 METHODS = ("network", "found", "declared", "service", "stated", "symmetry")
 
 

@@ -28,7 +28,7 @@ from services.recordings.npz_file import Input
 from services.recordings.reconstruction import reconstruct
 from services.runtime.config import Skin
 
-FORCES = (1.0, 3.0, 5.0)
+DROPS = (0.1, 0.3, 0.5)  # S/m, what 1, 3 and 5 N make with a tip of 10 mm radius, whatever the radius
 RADII = (0.1, 0.2, 0.3)
 TARE_ROWS, UNTOUCHED_ROWS = 64, 16  # before the drift; untouched ones after it
 NEAR_M = 0.003  # 3 % of the side: found
@@ -107,7 +107,7 @@ def rows_alone(
 ) -> tuple[list[TouchEstimate], int]:
     """Answers to touches of this radius, and how many untouched rows had a valid contact."""
     rng = np.random.default_rng([seed, 21])
-    touches = [circle(*place, newtons, radius) for place in places for newtons in FORCES]
+    touches = [circle(*place, _newtons(drop, radius), radius) for place in places for drop in DROPS]
     worlds = [change.world([touch], rng.permutation(16).tolist()) for touch in touches]
     worlds += [change.world([], rng.permutation(16).tolist()) for _ in range(0 if indenter else UNTOUCHED_ROWS)]
     pattern = np.asarray(bundle.pattern, np.int64)
@@ -177,13 +177,13 @@ def floor_percent(change: Change, per_side: int, radii: Sequence[float] = RADII)
     size = change.size
     case = limits.Case("square16", None, limits.MeasurementNoise(SNR_DB), drift=Drift(size, size))
     floors = [
-        mean_floor(limits.map_floors(case, radius, _drop(newtons, radius), per_side)[1]["bayes"]).force
+        mean_floor(limits.map_floors(case, radius, drop, per_side)[1]["bayes"]).force
         for radius in radii
-        for newtons in FORCES
+        for drop in DROPS
     ]
     return 100 * float(np.sqrt(np.mean(np.square(floors))))
 
 
-def _drop(newtons: float, radius: float) -> float:
-    """S/m; radius in model units."""
-    return FOAM.flat_drop(newtons, disc(radius * METRES))
+def _newtons(drop: float, radius: float) -> float:
+    """Force of a disc of this drop [S/m]; radius in model units."""
+    return FOAM.force("circle", drop, disc(radius * METRES))
