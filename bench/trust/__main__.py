@@ -22,6 +22,7 @@ from bench.reliability import report as reports
 from bench.speed.service import end_on_sigterm
 from bench.trust import floor, kept, options, report, runs
 from firmware_stub.worlds.table import WORLDS
+from services.recordings.replay_session import private_runtime
 
 QUICK_SEED = "7"
 
@@ -44,14 +45,14 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(str(why))
     end_on_sigterm()
     if args.floor:
-        with runs.own_runtime():
+        with private_runtime():
             found = {scan: floor.measured(scan, kept.session_seed(args.seed, "floor", 0)) for scan in runs.SCANS}
         report.show_floor(found)
         return 0
     began, rows = time.perf_counter(), {}
     session_s = runs.QUICK_S if args.quick else runs.SESSION_S
     minutes = runs.QUICK_S / 60 if args.quick else args.minutes
-    with runs.own_runtime():
+    with private_runtime():
         for world in args.world or WORLDS:
             for scan in (args.scan,) if args.scan else runs.SCANS:
                 score = runs.run(

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -33,21 +30,6 @@ class SessionTask:
     bundle: str
     candidates: tuple[tuple[str, str], ...]
     recording: Path | None
-
-
-@contextmanager
-def own_runtime() -> Iterator[None]:
-    """A runtime folder of this run's own: a tare keeps there what it found, and finds nobody else's."""
-    before = os.environ.get("EITSKIN_RUNTIME")
-    with tempfile.TemporaryDirectory(prefix="eitskin-trust-") as folder:
-        os.environ["EITSKIN_RUNTIME"] = folder
-        try:
-            yield
-        finally:
-            if before is None:
-                del os.environ["EITSKIN_RUNTIME"]
-            else:
-                os.environ["EITSKIN_RUNTIME"] = before
 
 
 @lru_cache(maxsize=4)

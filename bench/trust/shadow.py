@@ -22,6 +22,7 @@ from bench.speed.service import end_on_sigterm
 from bench.trust import candidate, kept, options, report, runs
 from firmware_stub.worlds.table import WORLDS
 from models.command import real
+from services.recordings.replay_session import private_runtime
 
 COUNTED = ("phantom frames", "wrong counts", "hidden", "never shown", "ids", "refused", "aged", "force 6", "place 6")
 SHARES = ("valid untouched %", "valid touched %", "valid in faults %")
@@ -61,7 +62,7 @@ def main(argv: list[str] | None = None) -> int:
     end_on_sigterm()
     began, rows, goals = time.perf_counter(), dict[str, Any](), list[Goal]()
     both = (("today", candidate.TODAY), ("candidate", args.candidate))
-    with runs.own_runtime():
+    with private_runtime():
         for world in args.world or WORLDS:
             for scan in (args.scan,) if args.scan else runs.SCANS:
                 scores = runs.run(

@@ -54,7 +54,7 @@ def replay_file(
     wanted = {skin: skins[skin]} if skin else skins
     with contextlib.ExitStack() as cleanup:
         if private:
-            cleanup.enter_context(_private_runtime())
+            cleanup.enter_context(private_runtime())
         warnings = cleanup.enter_context(_stages(list(wanted), reader, bundle))
         writer = cleanup.enter_context(RecordingWriter(out, {"origin": "replay", "of": file.name})) if out else None
         replayer = Replayer(list(wanted), speed, writer)
@@ -69,7 +69,8 @@ def replay_file(
 
 
 @contextlib.contextmanager
-def _private_runtime() -> Iterator[None]:
+def private_runtime() -> Iterator[None]:
+    """A runtime folder of one run's own: what is kept there is nobody else's."""
     before = os.environ.get("EITSKIN_RUNTIME")
     with tempfile.TemporaryDirectory(prefix="eitskin-", dir="/tmp") as folder:
         os.environ["EITSKIN_RUNTIME"] = folder

@@ -19,14 +19,15 @@ from firmware_stub.world import World
 from firmware_stub.worlds import table
 from protocol.frames import Contact, ContactFrame, RawFrame, pack, unpack
 from services.recordings import golden
+from services.recordings.replay_session import private_runtime
 from tests.bench.trust_sessions import frames, played, press, scene, today
 
 FRAME_S = 0.0436
 
 
 @pytest.fixture(autouse=True)
-def _own_runtime() -> Iterator[None]:
-    with runs.own_runtime():
+def _private_runtime() -> Iterator[None]:
+    with private_runtime():
         yield
 
 

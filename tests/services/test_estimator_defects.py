@@ -17,6 +17,7 @@ from firmware_stub.timeline import PiecewiseLinear, TouchPath
 from firmware_stub.worlds import table
 from models.bundle import Bundle
 from models.mismatch import Mismatch
+from services.recordings.replay_session import private_runtime
 from services.runtime.config import Skin
 from tests.bench.trust_sessions import frames, played, scene, stronger, today
 
@@ -24,8 +25,8 @@ SCAN_S = 0.0436
 
 
 @pytest.fixture(autouse=True)
-def _own_runtime():
-    with runs.own_runtime():
+def _private_runtime():
+    with private_runtime():
         yield
 
 
