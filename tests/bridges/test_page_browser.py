@@ -646,16 +646,20 @@ COURSE = """async () => { const { timeline } = await import("/main.js");
     return JSON.stringify([...timeline.courses.get("palm").lines].map(([id, points]) => [id, points.length])); }"""
 
 
-def test_a_replay_says_where_it_is_and_when_it_is_over(page: Open) -> None:
-    found = page()
+def record_a_press(found: Any, seconds: float) -> None:
     found.click("#record")
     found.wait_for_selector("#record[aria-pressed=true]")
     found.mouse.move(*place(found, 15, 15))
     found.mouse.down()
     until(lambda: true_at(found, 15, 15))
-    time.sleep(1.5)
+    time.sleep(seconds)
     found.mouse.up()
     found.click("#record")
+
+
+def test_a_replay_says_where_it_is_and_when_it_is_over(page: Open) -> None:
+    found = page()
+    record_a_press(found, 1.5)
     until(lambda: found.inner_text("#said").startswith("Recorded "))
     until(lambda: nothing_touches(found))
     made = Path(found.inner_text("#said").removeprefix("Recorded "))
@@ -713,14 +717,7 @@ def test_a_recording_that_cannot_be_played_is_said(page: Open, shared_service: P
 
 def test_a_recording_is_made_and_replayed(page: Open) -> None:
     found = page()
-    found.click("#record")
-    found.wait_for_selector("#record[aria-pressed=true]")
-    found.mouse.move(*place(found, 15, 15))
-    found.mouse.down()
-    until(lambda: true_at(found, 15, 15))
-    time.sleep(2)
-    found.mouse.up()
-    found.click("#record")
+    record_a_press(found, 2)
     found.wait_for_selector("#record[aria-pressed=false]")
     until(lambda: nothing_touches(found))
     found.click("#recordings summary")
