@@ -175,9 +175,10 @@ def test_a_ros_node_hears_what_the_service_says_and_nothing_while_it_is_not_vali
     world.until("its pose", "/contacts/poses", began, lambda p: bool(p) and math.dist(p[0][:2], (0.02, -0.01)) < 0.003)
     marks = world.until("markers", "/contacts", began, lambda found: any("N" in m[4] for m in found))["value"]
     assert {mark[0] for mark in marks} == {"patch", "force", "label"}
-    cloud = world.until("a cloud with the touch", "/pressure", began, lambda c: c["peak"][3] > 0)["value"]
+    # by the time the wrench was right: an image of a scan in which the touch came is rough
+    cloud = world.until("a cloud with the touch", "/pressure", pressed["at"], lambda c: c["peak"][3] > 0)["value"]
     assert abs(cloud["peak"][0] - 0.02) < 0.01 and abs(cloud["peak"][1] + 0.01) < 0.01
-    picture = world.until("an image with the touch", "/image", began, lambda i: i["most"] > 0)["value"]
+    picture = world.until("an image with the touch", "/image", pressed["at"], lambda i: i["most"] > 0)["value"]
     rows, columns = picture["size"]
     assert picture["encoding"] == "32FC1" and picture["peak"][0] > rows / 2 and picture["peak"][1] > columns / 2
     time.sleep(seconds)
