@@ -20,6 +20,8 @@ class PatientFile:
 
     def __init__(self, path: Path, overwrite: bool = False) -> None:
         kind = os.O_TRUNC if overwrite else os.O_EXCL
+        if path.exists() and not (path.is_file() or path.is_dir()):  # its mode is not ours to change: /dev/null is one
+            raise OSError(errno.EINVAL, "it is a device, a pipe or a socket, expected a file")
         self._path = path
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | kind, 0o600)
         os.fchmod(self._fd, 0o600)  # one that is overwritten too: who pressed where is nobody else's business

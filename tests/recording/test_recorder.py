@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import signal
+import stat
 import subprocess
 import sys
 import threading
@@ -233,6 +234,16 @@ def test_what_does_not_fit_is_kept_up_to_a_bound_then_dropped_and_counted(
     reader = RecordingReader(tmp_path / "a.mcap")
     got = [message.data for message in reader.messages()]
     assert got == data[: 500 - lost] + data[500:] and str(reader.damage) == "whole"
+
+
+def test_what_is_no_file_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
+    os.mkfifo(pipe := tmp_path / "a.mcap")
+    pipe.chmod(0o666)
+    held = os.open(pipe, os.O_RDWR)  # somebody reads it: without that, opening it would wait
+    with pytest.raises(RecordingError, match="a device, a pipe or a socket, expected a file"):
+        RecordingWriter(pipe, overwrite=True)
+    assert stat.S_IMODE(pipe.stat().st_mode) == 0o666
+    os.close(held)
 
 
 def test_a_disk_that_is_broken_is_no_full_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
