@@ -5,9 +5,10 @@ from __future__ import annotations
 import io
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from protocol import __version__
 from protocol.errors import interrupted
@@ -27,8 +28,21 @@ from services.cli import (
 )
 from services.cli.common import FAILED, USAGE, expected_code, with_values
 
+
+class _Commands(TyperGroup):
+    def invoke(self, ctx: Any) -> Any:
+        """Runs the command that was typed. An option out of its range also says what was found."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as bad:
+            if (errors := getattr(bad.__cause__, "errors", None)) is not None:  # pydantic's: it checks for typer
+                bad.message += f", found {errors()[0]['input']!r}"
+            raise
+
+
 app = typer.Typer(
     name="skin",
+    cls=_Commands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

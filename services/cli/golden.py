@@ -28,6 +28,8 @@ def golden(
     for file in files:
         if not file.is_file():
             fail(f"no file {file}: expected a recording, FILE.mcap", USAGE)
+        if file.suffix != ".mcap":
+            fail(f"{file} is no recording: expected FILE.mcap", USAGE)
         before = _before(file, accept)
         now = recorded.run(file)
         found = recorded.compare(before, now) if before is not None else None

@@ -173,6 +173,8 @@ def _complaint(skin: Any, line: list[str], refused: bool, names: str) -> str:
         return f"{line}: exit status {ran.code} without a word"
     if refused and names and names not in said:
         return f"{line}: does not name {names}: {said[-200:]}"
+    if refused and names and "found" not in said and line[-1] not in said:
+        return f"{line}: does not say what was found: {said[-200:]}"
     if ran.code and len(said) > 1000:
         return f"{line}: {len(said)} characters: {said[:200]}"
     return ""

@@ -74,6 +74,7 @@ def test_a_configuration_that_is_no_toml_is_named(skin, runtime, tmp_path) -> No
         (("reconstruct", "touch.mcap", "out.npz", "--skin", "square16"), "`skin replay touch.mcap --fast"),
         (("reconstruct", "touch.mcap"), "`skin replay touch.mcap --fast"),
         (("golden", "nothing.mcap"), "no file nothing.mcap: expected a recording"),
+        (("golden", __file__), "test_newcomers_mistakes.py is no recording: expected FILE.mcap"),
         (("top",), "the output is no terminal, expected one to draw on: give --once"),
         (("record", "a.mcap", "--seconds", -1), "'--seconds'"),
         (("compare", "--seconds", -3), "'--seconds'"),
