@@ -109,6 +109,9 @@ class Frame(Heard):
     )
 
 
+AFTER = "of a scan in parts: scan of the delta frame before it, also where that was skipped; 0: not known"
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class FollowedTouch:
     """One touch as the newest part of a scan has it: how it moved and how its strength changed since the last image. By
@@ -195,6 +198,7 @@ class DeltaFrame(Frame):
         "of a scan in parts: where the touches are at `sample`; empty: nobody follows them",
         list,
     )
+    after: int = wire(_COUNT, AFTER, 0)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -306,6 +310,7 @@ class ImageFrame(Frame):
         "of a scan in parts: where the touches are at `sample`; empty: nobody follows them",
         list,
     )
+    after: int = wire(_COUNT, AFTER, 0)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

@@ -97,7 +97,7 @@ class Inference(Stage):
             self._counters["unwanted"] += 1
             self._unseen = frame if frame.stack.size else self._unseen
             return []
-        out = ImageFrame(**inherited(frame), touched=frame.touched, followed=frame.followed)
+        out = ImageFrame(**inherited(frame), touched=frame.touched, followed=frame.followed, after=frame.after)
         if frame.calibration != self.linearisation.name and not self._follow(frame.calibration):
             out.valid = False
             add_reason(out.reasons, "stale_baseline")

@@ -108,7 +108,8 @@ class Publishing(Stage):
         self._geometry = (0.0, [0.0, 0.0])  # metres per pixel, origin of the segments' image
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
-        if isinstance(frame, PartFrame) and not self.last_image.precedes(frame):
+        assert isinstance(frame, PartFrame | ImageFrame)
+        if not self.last_image.precedes(frame):
             self.after_gap.missed()
         if isinstance(frame, PartFrame) and frame.began is None:
             return self._say(self.last_image.held_by(frame), wanted, whole=False)
@@ -116,7 +117,6 @@ class Publishing(Stage):
             alone = without_image(frame, *self._grid)
             self.last_image.doubts(alone, frame.after)
             return self._say(alone, wanted, whole=False, began=frame.began)
-        assert isinstance(frame, ImageFrame)
         said, *rest = self._say(frame, wanted)
         assert isinstance(said, ContactFrame)
         self.last_image.take(frame, said)

@@ -60,7 +60,7 @@ class RollingScans:
     def reset(self) -> None:
         self._whole.last = -1
         self._seen = self._handed_on = -1  # scans of messages
-        self._delta_scan = 0  # of the last message that a delta frame was made of
+        self._delta_scan = 0  # of the last message that a delta frame was made of; 0: of none
         self._placed_scan = 0  # of the last message that said where a touch is that began
         self._sample_ns = 0  # of the last delta frame
         self.begin_anew()
@@ -127,7 +127,7 @@ class RollingScans:
         if not self._follows(frame, values):
             mean -= round(1e3 * float(frame.age_us.mean() - frame.age_us[new].mean()))
         stamps["sample"] = self._sample_ns = max(mean, min(self._sample_ns, sample))
-        self._handed_on = self._delta_scan = frame.scan
+        self._handed_on = frame.scan
         return True
 
     @property
@@ -164,6 +164,7 @@ class RollingScans:
         """Take what preprocessing said of a whole scan."""
         if frame.parts == 1:
             return
+        self._follows_last(out)
         known = len(out.difference) == len(frame.z) and bool(np.isfinite(out.sigma).all())
         well = known and out.valid and not out.electrodes.any() and "gain" not in out.reasons
         self._sound = well and "gap" not in out.reasons
@@ -297,9 +298,13 @@ class RollingScans:
     def _said(self, out: Frame) -> list[Frame]:
         self._handed_on = out.scan
         if isinstance(out, DeltaFrame):
-            self._delta_scan = out.scan
+            self._follows_last(out)
         self._sample_ns = out.stamps.get("sample", 0)
         return [out]
+
+    def _follows_last(self, out: DeltaFrame) -> None:
+        """Say which delta frame came before: a reader that skipped that one then knows."""
+        out.after, self._delta_scan = self._delta_scan, out.scan
 
     def _put_off(self, scan: int) -> None:
         """The next whole scan is of values newer than this message's: once between two whole scans."""

@@ -1,4 +1,6 @@
-"""What the newest image frame said of its touches, for the parts of scans between it and the next one."""
+"""What the newest image frame said of its touches, for the parts of scans between it and the next one, and which image
+the next one has to follow.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from services.runtime.stage import HARMLESS, add_reason, inherited
 
 
 class LastImage:
-    """Of one skin. A part that does not follow it, by the scan that it names, is of another image."""
+    """Of one skin. A part or an image that does not follow it, by the scan that it names, follows another image."""
 
     def __init__(self, skin: str) -> None:
         self._skin = skin
@@ -39,9 +41,13 @@ class LastImage:
             refined=frame.refined,
         )
 
-    def precedes(self, part: PartFrame) -> bool:
-        """Whether it is the image that a part follows; else that one was not seen."""
-        return self._last is not None and self._last.scan == part.after
+    def precedes(self, frame: PartFrame | ImageFrame) -> bool:
+        """Whether it is the image that a frame follows; else that one was not seen. An image of a whole scan names
+        none: those follow each other by their numbers.
+        """
+        if isinstance(frame, ImageFrame) and (self._last is None or not frame.after):
+            return True
+        return self._last is not None and self._last.scan == frame.after
 
     def doubts(self, part: ImageFrame, after: int) -> None:
         """Make a part doubted by what its image, of the scan `after`, was refused for."""
