@@ -1,6 +1,9 @@
 """Every method on the same frames in one run: run time per frame against each error.
 
     skin bench accuracy [--quick] [--levels none 50 60 70 80 70f] [--mesh stub] [--only NAMES] [--out bench/reports]
+    skin bench accuracy --reads peak --only --levels none 70 --out bench/work/published
+
+The second line is the published test: LDCI, and force from the peak drop of one indenter of 10 mm radius.
 
 Frames are solved on the reference mesh, which no training and no inverse uses, and read from bench/work where they are
 there (bench/accuracy/frames.py says what they are). Noise: |Z| 10^(-dB/20) on each measurement, and on the 64 untouched
@@ -14,6 +17,7 @@ import argparse
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +35,7 @@ from models.bundle import Bundle
 from models.command import whole
 from models.shapes import Array
 from services.recordings.reconstruction import resampled
+from services.runtime.config import Reads
 
 SINGLES = 100  # of each shape and for force in the full form: 500 frames give the mean IoU to 0.003
 LEVELS = ("none", "50", "60", "70", "80", "70f")
@@ -133,6 +138,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--only", nargs="*", default=None, help="methods whose name contains one of these; no name: what is shipped"
     )
+    parser.add_argument("--reads", choices=get_args(Reads), default="pressure", help="what forces are read from")
     parser.add_argument("--mesh", choices=("reference", "stub"), help="stub: the full form's frames in minutes")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
@@ -148,8 +154,9 @@ def main(argv: list[str] | None = None) -> int:
     began = time.perf_counter()
     slow = SLOW_SHARE["quick" if args.quick else "full"]
     rows = run(frames, tuning, wanted, levels, args.seed, slow)
-    rows += _shipped.run(frames, bundle, levels, args.seed, UNTOUCHED["quick" if args.quick else "full"])
-    report = _report.Report(rows, _shipped.floors(frames, levels), frames, mesh, args.seed, bundle)
+    rows += _shipped.run(frames, bundle, levels, args.seed, UNTOUCHED["quick" if args.quick else "full"], args.reads)
+    floors = _shipped.floors(frames, levels, args.reads)
+    report = _report.Report(rows, floors, frames, mesh, args.seed, bundle, args.reads)
     report.print()
     report.write(args.out)
     print(f"{time.perf_counter() - began:.0f} s; wrote {args.out / 'accuracy.json'} and {args.out / 'accuracy.png'}")

@@ -16,6 +16,7 @@ from bench.goals import Goal, table
 from bench.json_file import drawn, write_json
 from bench.machine import machine, provenance
 from models.bundle import Bundle
+from services.runtime.config import Reads
 
 COLUMNS = (  # heading, key, format
     ("ms", "ms", "{:.2f}"),
@@ -39,7 +40,7 @@ TARGETS = (
     ("mean_iou", "mean IoU, five shapes", ">= 0.955", ">= 0.882"),
     ("contact_iou", "contact IoU", ">= 0.91", ">= 0.775"),
     ("ldci-0.2-0.15", "LDCI, 0.85 S/m inside", "<= 0.012", ""),
-    ("force_%", "force from peak, size unknown, %", "<= 3", "1.3 floors"),
+    ("force_%", "force, size unknown, %", "<= 3", "1.3 floors"),
     ("known_force_%", "force, known indenter, %", "<= 2", "<= 3"),
     ("force_within_%", "presses within one sigma of force, %", "", ""),
     ("integral_%", "integrated drop, %", "<= 2", "1.3 floors"),
@@ -83,6 +84,7 @@ class Report:
     mesh: str
     seed: int
     bundle: Bundle
+    reads: Reads = "pressure"  # what the shipped rows' forces are read from; the others' from the peak drop
 
     @property
     def head(self) -> dict[str, object]:
@@ -92,6 +94,7 @@ class Report:
             "bundle": {"name": self.bundle.name, "hash": self.bundle.hash},
             "mesh": self.mesh,
             "seed": self.seed,
+            "reads": self.reads,
             "frames": {str(name): int(count) for name, count in zip(names, counts, strict=True)},
             "eidors": REFERENCE.exists(),
             "time": "CPU time of one thread per frame, median; shipped: the whole pipeline, mean",

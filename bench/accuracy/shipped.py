@@ -20,7 +20,7 @@ from services.estimation.tare import take
 from services.pipeline import Pipeline
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import reconstruct
-from services.runtime.config import Indenter, NetworkFile, Skin
+from services.runtime.config import Indenter, NetworkFile, Reads, Skin
 
 METRES_PER_UNIT = 0.05  # of square16
 LARGE = 0.25  # radius from which on shape classes are scored
@@ -60,7 +60,9 @@ def network_ms(bundle: Bundle, variant: str, runs: int = 200) -> float:
     return float(np.median(seconds) * 1e3)
 
 
-def run(frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int, untouched_frames: int) -> list[Row]:
+def run(
+    frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int, untouched_frames: int, reads: Reads = "pressure"
+) -> list[Row]:
     """One row a level and network file: figures of the image, and of the contacts a controller would get."""
     variants: list[NetworkFile] = [v for v in VARIANTS if bundle.network_path(v) is not None] or ["none"]
     alone: dict[NetworkFile, float] = {v: network_ms(bundle, v) for v in variants if v != "none"}
@@ -68,7 +70,7 @@ def run(frames: Frames, bundle: Bundle, levels: Iterable[str], seed: int, untouc
     for level in levels:
         noisy, untouched = _frames.noisy(frames, level, seed)
         for variant in variants:
-            skin = Skin(port="stub", bundle=str(bundle.path), network=variant)
+            skin = Skin(port="stub", bundle=str(bundle.path), network=variant, reads=reads)
             found, seconds = reconstructed(noisy, untouched, skin, bundle)
             row: Row = {"method": f"shipped, {variant}", "level": level, "value": None, "ms": seconds * 1e3}
             row["network_ms"] = alone.get(variant)
@@ -173,7 +175,7 @@ def false_touches(frames: Frames, level: str, seed: int, bundle: Bundle, n: int)
     return {"false_touches_h": metrics.false_touches_per_hour(touched, RATE_HZ), "untouched_frames": n}
 
 
-def floors(frames: Frames, levels: Iterable[str]) -> dict[str, Row]:
+def floors(frames: Frames, levels: Iterable[str], reads: Reads = "pressure") -> dict[str, Row]:
     """Bayesian floors (root mean square) of the same touches, size unknown, no drift; none where noise-free."""
     found = {}
     for level in levels:
@@ -194,8 +196,8 @@ def floors(frames: Frames, levels: Iterable[str]) -> dict[str, Row]:
         everywhere, force = mean(frames.of("shapes", "hertz", "force")), mean(frames.of("force"))
         found[level] = {
             "position_rms_%": float(metrics.of_side(everywhere.position)),
-            "force_rms_%": 100 * force.force,
+            "force_rms_%": 100 * (force.drop if reads == "peak" else force.force),
             "integral_rms_%": 100 * force.integral,
-            "known_force_rms_%": 100 * indenter.force,
+            "known_force_rms_%": 100 * (indenter.drop if reads == "peak" else indenter.force),
         }
     return found

@@ -98,6 +98,8 @@ def _skin(name: str, skin: Skin, running: bool, ours: bool) -> Iterator[Finding]
         yield from options(name, skin, {"refinement": refinement(skin, bundle), "symmetry": symmetry(skin, bundle)})
     if skin.calibration is not None:
         yield _calibration(name, skin, bundle)
+    if skin.reads is not None:
+        yield _reads(name, skin, bundle)
     if skin.surface is not None:
         yield _wrapped(name, skin, bundle)
     yield from _port(name, skin, bundle, running, ours)
@@ -171,6 +173,13 @@ def _calibration(name: str, skin: Skin, bundle: Bundle) -> Finding:
     except ConfigError as why:
         return Finding("FAIL", what, f'{why}; expected JSON such as {{"newtons_per_siemens": 10.0, "most_n": 5.0}}')
     return Finding("OK", what, f"{skin.calibration}: {law}")
+
+
+def _reads(name: str, skin: Skin, bundle: Bundle) -> Finding:
+    try:
+        return Finding("OK", f"{name}: reads", f"{skin.reads}: {ForceLaw.of(skin, bundle, name)}")
+    except ConfigError as why:
+        return Finding("FAIL", f"{name}: reads", str(why))
 
 
 def _device(name: str, skin: Skin, bundle: Bundle) -> Iterator[Finding]:

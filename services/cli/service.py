@@ -67,7 +67,7 @@ def _check_mismatches(config: ConfigFile) -> None:
 
 
 def _check_bundles(config: ConfigFile) -> None:
-    """Refuse a bundle, an indenter or a calibration of forces that cannot be used, likewise. Raises ConfigError."""
+    """Refuse a bundle, an indenter or a law of forces that cannot be used, likewise. Raises ConfigError."""
     from models.bundle import Bundle, BundleError
 
     for name, skin in config.skins.items():
@@ -75,7 +75,7 @@ def _check_bundles(config: ConfigFile) -> None:
             bundle = Bundle.load(skin.bundle)
         except BundleError as why:
             fail(f"{config.path}: skins.{name}.bundle: {why}", USAGE)
-        if skin.calibration is not None or skin.indenter is not None:
+        if (skin.calibration, skin.indenter, skin.reads) != (None, None, None):
             from services.contacts.force import ForceLaw
 
             ForceLaw.of(skin, bundle, name)

@@ -109,9 +109,15 @@ class ForceLaw:
             return cls(found.curve, found.reads, found.most_n, True, own_error=found.own_error, **surroundings)
         law = bundle.manifest.get("force_law", {})
         if law is None or bundle.manifest["normalisation"] == "measured":
+            if skin.reads is not None:
+                raise ConfigError(
+                    f"{_key(name, 'reads')}: found {skin.reads!r}, but drops of bundle {bundle.name} have no scale: "
+                    "take `reads` out, and calibrate with `skin calibrate force`"
+                )
             return cls(None, **surroundings)
         try:
-            return cls(*_said(law), **surroundings)
+            own = _said(law)
+            return cls(*(own if skin.reads in (None, own[1]) else _said({"of": skin.reads})), **surroundings)
         except (KeyError, TypeError, ValueError) as why:
             raise ConfigError(f"{bundle.path}/manifest.json: force_law cannot be used ({why!r})") from None
 
@@ -273,6 +279,10 @@ def _said(law: dict[str, Any]) -> tuple[Curve, Of, float]:
     return Curve(float(law.get("scale", 1.0))), "pressure", most
 
 
+def _key(name: str, key: str) -> str:
+    return f"skins.{name}.{key}" if name else key
+
+
 def known_radius(skin: Skin, bundle: Bundle, name: str = "") -> float | None:
     """Radius [m] of the indenter; None where it is not known. Raises ConfigError where no such indenter can press this
     skin, or an image of it show it.
@@ -284,10 +294,10 @@ def known_radius(skin: Skin, bundle: Bundle, name: str = "") -> float | None:
     half = float(np.ptp(outline, axis=0).min()) / 2 if len(outline) else float(bundle.skin.get("radius", 1.0))
     least, most = bundle.metres_per_pixel / 2, half * bundle.metres_per_unit
     if not least <= radius <= most * (1 + 1e-9):
-        key = f"skins.{name}.indenter.radius_m" if name else "indenter.radius_m"
         raise ConfigError(
-            f"{key}: found {radius:g} m; expected {least:.2g} to {most:.3g} m with bundle {bundle.name}, from half a "
-            "pixel of its images to half its shorter side: give the radius in metres, or take `radius_m` away"
+            f"{_key(name, 'indenter.radius_m')}: found {radius:g} m; expected {least:.2g} to {most:.3g} m with bundle "
+            f"{bundle.name}, from half a pixel of its images to half its shorter side: give the "
+            "radius in metres, or take `radius_m` away"
         )
     return radius
 

@@ -1,7 +1,7 @@
 """The part of the configuration that a recording carries: what the stages need to give the same contacts again.
 
     {"skins": {"palm": {"bundle": "square16", "bundle_hash": ..., "frame_id": ..., "pose": ..., "network": ...,
-     "indenter": ..., "dft_points": ..., "scan": ..., "rtia_ohm": ..., "tare": ..., "touch": ...,
+     "reads": ..., "indenter": ..., "dft_points": ..., "scan": ..., "rtia_ohm": ..., "tare": ..., "touch": ...,
      "calibration": {...}}}, "skip": {...}}
 
 It holds no address, key, port or path. A recording may come from anybody, so its settings are checked like a
@@ -28,6 +28,7 @@ from services.runtime.config import (
     ConfigFile,
     Indenter,
     Pose,
+    Reads,
     ScanMode,
     Skin,
     TareConfig,
@@ -38,7 +39,7 @@ from services.runtime.config_sections import Number, Section, Skip
 KEY = "settings"
 """The key of a recording's metadata."""
 MOST_BYTES = 1024 * 1024
-CARRIED = ("frame_id", "pose", "network", "indenter", "dft_points", "scan", "rtia_ohm", "tare", "touch")
+CARRIED = ("frame_id", "pose", "network", "reads", "indenter", "dft_points", "scan", "rtia_ohm", "tare", "touch")
 
 Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{0,256}$")]
 
@@ -55,6 +56,7 @@ class RecordedSkin(Section):
     frame_id: Name = ""
     pose: RecordedPose = RecordedPose()
     network: Literal["full", "fast", "int8", "none"] = "int8"
+    reads: Reads | None = None
     indenter: Indenter | None = None
     dft_points: Literal[128, 256, 512] = 128
     scan: ScanMode = "full"

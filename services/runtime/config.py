@@ -124,6 +124,7 @@ class Indenter(Section):
 
 NetworkFile = Literal["full", "fast", "int8", "none"]
 ScanMode = Literal["full", "rolling"]
+Reads = Literal["pressure", "peak"]
 
 
 class Skin(Section):
@@ -138,6 +139,7 @@ class Skin(Section):
     mismatch: str = "none"  # how the stub's sheet differs from the bundle: a name of models/mismatch.py
     world: str = ""  # what the stub's skin does beside, as real ones do: a name of firmware_stub/worlds/table.py
     calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
+    reads: Reads | None = None  # what forces are read from; None: as the bundle says, else "pressure"
     indenter: Indenter | None = None
     network: NetworkFile = "int8"
     dft_points: Literal[128, 256, 512] = 128
@@ -166,6 +168,15 @@ class Skin(Section):
         if scan == "adaptive":
             raise ValueError('"full" or "rolling": the adaptive scan is no more, write "rolling", which is quicker')
         return scan
+
+    @model_validator(mode="after")
+    def one_law(self) -> Skin:
+        if self.reads is not None and self.calibration is not None:
+            raise ValueError(
+                "`reads` or `calibration`: a calibration's file says itself what its law reads; leave one of them out "
+                f"(found {self.reads!r} and {str(self.calibration)!r})"
+            )
+        return self
 
     @model_validator(mode="after")
     def mismatch_of_a_stub(self) -> Skin:

@@ -23,7 +23,7 @@ from services.recordings.recorder import metadata
 from services.recordings.recording import RecordingError, RecordingReader, RecordingWriter
 from services.recordings.replay import ReplayError
 from services.recordings.replay_session import configuration_of, replay_file
-from services.runtime.config import ROOT, ConfigFile, load, parse
+from services.runtime.config import BUNDLES, ROOT, ConfigFile, Skin, load, parse
 
 HERE = Path("recording.mcap")
 
@@ -70,6 +70,15 @@ def carried(tmp_path: Path, text: str) -> RecordingReader:
         frame = RawFrame(skin="palm", z=np.ones(120, "c8"), status=np.zeros(120, "u1"))
         writer.write("raw/palm", pack(frame).partition(b"\0")[2], 10**18)
     return RecordingReader(path)
+
+
+def test_a_replay_reads_forces_as_they_were_recorded(tmp_path: Path) -> None:
+    skin = Skin(port="stub", bundle="square16", reads="peak")
+    found = settings.read(settings.text_of({"palm": skin}), HERE)
+    again = settings.configuration(
+        found, settings.Known({Bundle.load("square16").hash: BUNDLES / "square16"}), tmp_path
+    )
+    assert Skin.model_validate(again["skins"]["palm"]).reads == "peak"
 
 
 def test_the_stages_get_what_they_had_and_no_more(config: ConfigFile, tmp_path: Path) -> None:

@@ -52,6 +52,8 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         ({"skins": {"Palm one": PALM}}, "found 'Palm one'"),
         ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publsher": "tcp://*:1"}}}, "found 'publsher'"),
         ({"skins": {"palm": PALM}, "sockets": {"addresses": {"publisher": "here"}}}, "tcp://HOST:PORT"),
+        ({"skins": {"palm": PALM | {"reads": "integral"}}}, "reads: found 'integral'; allowed: 'pressure' or 'peak'"),
+        ({"skins": {"palm": PALM | {"reads": "peak", "calibration": "c.json"}}}, "`reads` or `calibration`: a calibra"),
         ({"skins": {"palm": PALM | {"rtia_ohm": NAN}}}, "skins.palm.rtia_ohm: found nan; allowed: a finite number"),
         ({"skins": {"palm": PALM | {"tare": {"max_age_s": INF}}}}, "tare.max_age_s: found inf; allowed: a finite"),
         ({"skins": {"palm": PALM | {"indenter": {"radius_m": NAN}}}}, "radius_m: found nan; allowed: a finite number"),
@@ -185,7 +187,10 @@ def test_every_key_of_the_shipped_file_is_one_that_exists() -> None:
     text = (ROOT / "skin.toml").read_text()
     with_all = re.sub(r"^# (?=[a-z_]+ = |\"|\[)", "", text, flags=re.MULTILINE)
     assert with_all.count("#") < text.count("#")
-    with pytest.raises(ConfigError, match="`world` and `mismatch`"):  # one of these two
+    with pytest.raises(ConfigError, match="`reads` or `calibration`"):  # one of these two
+        parse(tomllib.loads(with_all))
+    with_all = re.sub(r"^reads = ", "# reads = ", with_all, flags=re.MULTILINE)
+    with pytest.raises(ConfigError, match="`world` and `mismatch`"):  # and one of these
         parse(tomllib.loads(with_all))
     config = parse(tomllib.loads(re.sub(r"^mismatch = ", "# mismatch = ", with_all, flags=re.MULTILINE)))
     assert config.skin("palm").calibration == Path("palm.json") and config.sockets.addresses

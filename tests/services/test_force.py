@@ -84,7 +84,8 @@ def scored(skinny: Skinny, presses: SolvedPresses, frames: int = 1) -> tuple[np.
 def test_most_presses_of_any_shape_fall_within_one_sigma(presses: SolvedPresses, bundle: Bundle) -> None:
     found = [scored(Skinny(configured(), bundle, presses.z0, db), presses) for db in (62.0, 75.0, 120.0)]
     z, errors = (np.concatenate(each) for each in zip(*found, strict=True))
-    assert len(z) > 400 and 0.61 < (np.abs(z) < 1).mean()
+    # Two other draws of such presses have 78 and 79 %, with a standard error of 2: a sigma a fifth wider fails.
+    assert len(z) > 400 and 0.61 < (np.abs(z) < 1).mean() < 0.85
     assert (np.abs(z) < 3).mean() > 0.985
     assert abs(np.median(errors)) < 0.02 and np.sqrt(np.mean(errors**2)) < 0.08
 
@@ -92,7 +93,7 @@ def test_most_presses_of_any_shape_fall_within_one_sigma(presses: SolvedPresses,
 def test_held_presses_are_no_worse_than_they_say(presses: SolvedPresses, bundle: Bundle) -> None:
     some = SolvedPresses(presses.shapes[:60], presses.difference[:60], presses.z0)
     z, _ = scored(Skinny(configured(), bundle, presses.z0, 66.0, hold=True), some, frames=8)
-    assert 0.5 < (np.abs(z) < 1).mean() and (np.abs(z) < 3).mean() > 0.96
+    assert 0.5 < (np.abs(z) < 1).mean() < 0.9 and (np.abs(z) < 3).mean() > 0.96
 
 
 def test_a_known_indenter_takes_the_trade_off_away(bundle: Bundle) -> None:
@@ -135,6 +136,8 @@ def test_the_force_of_a_press_is_told_whatever_its_size(bundle: Bundle) -> None:
     for mm in np.unique(found[:, 0]):
         assert np.median(found[found[:, 0] == mm, 1]) == pytest.approx(1.0, abs=0.05), mm
     assert np.sqrt(np.mean((found[:, 1] - 1) ** 2)) < 0.07 and (np.abs(found[:, 2]) < 3).all()
+    # Errors over their sigma, root mean square; on other seeds 0.83 to 0.90: neither much too narrow nor too wide.
+    assert 0.65 < np.sqrt(np.mean(found[:, 2] ** 2)) < 1.2
     assert np.sqrt(np.mean((found[:, 3] - 1) ** 2)) > 0.5
 
 
@@ -177,6 +180,32 @@ def test_a_law_may_read_the_peak(bundle: Bundle) -> None:
     law = ForceLaw.of(configured(), replace(bundle, manifest=manifest))
     force = law.force(look())
     assert force.newton == pytest.approx(3.0) and force.pressure is None and str(law) == "10 N per S/m, to 5 N"
+
+
+def test_skin_toml_chooses_what_forces_are_read_from(bundle: Bundle) -> None:
+    said = {"of": "peak", "newtons_per_siemens": 8.0}
+    its_own = replace(bundle, manifest={**bundle.manifest, "force_law": said})
+    for reads, of, newton in (("peak", bundle, 3.0), ("peak", its_own, 2.4), (None, its_own, 2.4)):
+        assert ForceLaw.of(configured(reads=reads), of).force(look()).newton == pytest.approx(newton)
+    assert ForceLaw.of(configured(reads="pressure"), its_own).describe() == ForceLaw.of(configured(), bundle).describe()
+    with pytest.raises(ConfigError, match=r"skins\.sole\.reads: found 'peak', .* disc16 have no scale"):
+        ForceLaw.of(Skin(port="stub", bundle="disc16", reads="peak"), Bundle.load("disc16"), "sole")
+
+
+def test_the_peak_alone_is_right_for_the_published_indenter_and_wrong_for_others(bundle: Bundle) -> None:
+    """A scan to a contact: 3 N through 10 mm, which both laws are anchored at, and through 20 mm.
+
+    Noise of 90 dB lets a peak be known to a few per cent; the laws differ by a factor of 4 at 20 mm.
+    """
+    model = shared("square16", "stub")
+    z0 = np.abs(model.solve(1.0).impedances())
+    peak = Skinny(configured(reads="peak"), bundle, z0, 90.0)
+    for mm, expected in ((10.0, 3.0), (20.0, 0.75)):
+        drop = FOAM.flat_drop(3.0, np.pi * (1e-3 * mm) ** 2)
+        pressed = model.touched([Shape("circle", 0.1, 0.1, 1e-3 * mm / METRES, drop)])
+        peak.release()
+        c = peak.press(np.abs(model.solve(pressed).impedances()) / z0 - 1)
+        assert c is not None and c.force_n == pytest.approx(expected, rel=0.1) and c.pressure_pa is None
 
 
 def test_a_law_may_read_the_integral(bundle: Bundle) -> None:
