@@ -170,6 +170,9 @@ class Publishing(Stage):
         told = frame.held or (began is not None and bool(self._segments)) or self._alone(frame)
         if out.valid and frame.touched and changed and not told:
             add_reason(out.reasons, "changing")
+        if out.valid and began is None and self._hides(frame, whole):
+            out.valid = False
+            add_reason(out.reasons, "changing")
         if whole:
             self._changing = self._changing + 1 if "changing" in out.reasons else 0
         self._touched = frame.touched
@@ -263,6 +266,14 @@ class Publishing(Stage):
         deal is unexplained, or beside whose touches another one waits for a second image.
         """
         return self._changing > 0 or self.tracker.waits or (part.residual or 0.0) > NEARLY
+
+    def _hides(self, frame: ImageFrame, whole: bool) -> bool:
+        """Whether nothing is shown although something has touched for a frame: what waits for a second image, as where
+        one touch took another one's place, or what the image did not show whose touches a part follows.
+        """
+        if self._segments or not frame.touched or self._alone(frame):
+            return False
+        return not whole or (self._touched and self.tracker.waits)
 
     def _alone(self, frame: ImageFrame) -> bool:
         """Whether this frame follows no other."""
