@@ -101,7 +101,7 @@ def test_what_must_not_be_is_counted(says: dict[float, list[Contact]], counted: 
 @pytest.mark.parametrize(
     ("says", "frames", "none_shown", "hidden"),
     [
-        ({6.5: [], 7.13: None}, 0, 0, 0),  # it pressed fully from 7.1 s on, and these stand on a scan that begins before
+        ({6.5: [], 7.13: None}, 0, 0, 0),  # fully from 7.1 s on: their scans begin before
         ({6.5: [], 7.16: None}, 1, 1, 0),
         ({8.0: [], 8.09: None}, 2, 2, 0),
         ({8.0: [contact(0.02, 0.016, 3.0)], 8.09: None}, 2, 0, 0),
