@@ -101,6 +101,7 @@ class Publishing(Stage):
         self.following.forget()
         self.lasting.forget()
         self._changing = 0  # frames in a row that said so
+        self._replaced = False  # nothing is shown since a touch was whose place another one may have taken
         self._seen_in = (ANY, -1)  # session and scan of the image that the contacts were seen in
         self._contacts: list[Contact] = []  # of the frame made last, strongest first; those that ended come last
         self._segments: list[Segment] = []  # of the contacts that did not end, in their order
@@ -169,6 +170,11 @@ class Publishing(Stage):
         changed = not self._touched or not (self._segments or (_explained(frame) and not doubtful))
         told = frame.held or (began is not None and bool(self._segments)) or self._alone(frame)
         if out.valid and frame.touched and changed and not told:
+            add_reason(out.reasons, "changing")
+        told_of = self._replaced or bool(self._contacts) or self.tracker.remembers
+        self._replaced = told_of and self.tracker.waits and not self._segments
+        if out.valid and began is None and self._hides(frame, whole):
+            out.valid = False
             add_reason(out.reasons, "changing")
         if whole:
             self._changing = self._changing + 1 if "changing" in out.reasons else 0
@@ -264,6 +270,13 @@ class Publishing(Stage):
         """
         return self._changing > 0 or self.tracker.waits or (part.residual or 0.0) > NEARLY
 
+    def _hides(self, frame: ImageFrame, whole: bool) -> bool:
+        """Whether nothing is shown although something has touched for longer than a frame: what took the place of a
+        touch that was shown and waits for a second image, or what an image did not show whose touches a part follows.
+        """
+        goes_on = frame.touched and not self._segments and not self._alone(frame)
+        return goes_on and (self._replaced or not whole)
+
     def _alone(self, frame: ImageFrame) -> bool:
         """Whether this frame follows no other."""
         return self.each_alone or SEPARATE in frame.reasons
@@ -347,6 +360,7 @@ class Publishing(Stage):
             "changing": self._changing,
             "reconstructed": self._seen_in[1],
             "from_parts": self._from_parts,
+            "replaced": self._replaced,
             "held": None if self.held.last is None else _kept(self.held.last),
             "contacts": [asdict(c) for c in self._contacts],
             "segments": [{**asdict(s), "mask": s.mask.astype(np.uint8)} for s in self._segments],
@@ -362,6 +376,7 @@ class Publishing(Stage):
         self.after_gap.load(state.get("after_gap"))
         self._known, self._touched = bool(state["known"]), bool(state.get("touched", False))
         self._changing, self._from_parts = int(state.get("changing", 0)), bool(state.get("from_parts", False))
+        self._replaced = bool(state.get("replaced", False))
         self._seen_in = (ANY, int(state.get("reconstructed", -1)))  # older recordings have none
         kept = state.get("held")
         self.held.last = None if kept is None else _image_of(self.skin, kept)

@@ -18,7 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,9 @@ from protocol.sockets import ControlClient, ControlError
 from services.bridge import NEEDS
 
 LISTENED = ("ros2", "foxglove")  # those that bench/speed/bridge_listener.py can listen to
+PAST_FRONT = "foxglove, past its front"  # listens at the SDK's own server: the difference is what the front adds
+FRONT = "foxglove: what its front adds"
+LISTENS = "0A"  # state of a listening socket in /proc/net/tcp
 SETTLE_S = 3.0
 NEAR_NS = 5_000_000  # two times of one scan, by two readings of the clocks
 P99_MS, RATIO, GATE = 3.0, 1.1, 1.5
@@ -77,17 +80,15 @@ class Listened:
         with log.open("wb") as out:
             command = [sys.executable, "-m", "services.bridge", name]
             self.bridge = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=out, stderr=out)
-        self.listener: subprocess.Popen[str] | None = None
-        where = str(domain)
+        self.listeners: dict[str, subprocess.Popen[str]] = {}
+        where = {name: str(domain)}
         if name == "foxglove":
-            where = _said(r"open (ws://\S+)", log, self.bridge)
-        self.listener = subprocess.Popen(
-            [sys.executable, "-m", "bench.speed.bridge_listener", name, where],
-            cwd=ROOT,
-            env=environment,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+            where = {name: _said(r"open (ws://\S+)", log, self.bridge), PAST_FRONT: _inside(self.bridge.pid)}
+        for heard, place in where.items():
+            command = [sys.executable, "-m", "bench.speed.bridge_listener", name, place]
+            self.listeners[heard] = subprocess.Popen(
+                command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True
+            )
 
     def wait(self) -> None:
         """Until frames flow through it. Raises RuntimeError."""
@@ -106,19 +107,23 @@ class Listened:
         threads = Path(f"/proc/{self.bridge.pid}/task").iterdir()
         return sum(int((t / "schedstat").read_text().split()[0]) for t in threads) * 1e-9
 
-    def close(self) -> list[tuple[int, int]]:
-        """End both; (measured by the message's own time [Unix ns], came [monotonic ns]) of each message."""
-        assert self.listener is not None
-        self.listener.terminate()
-        said, _ = self.listener.communicate(timeout=10)
+    def close(self) -> dict[str, list[tuple[int, int]]]:
+        """End all; by who listened, (measured by the message's own time [Unix ns], came [monotonic ns]) of each
+        message.
+        """
+        found = {}
+        for heard, listener in self.listeners.items():
+            listener.terminate()
+            whole = [line.split() for line in listener.communicate(timeout=10)[0].splitlines()]
+            found[heard] = [(int(parts[0]), int(parts[1])) for parts in whole if len(parts) == 2]
         self.bridge.send_signal(signal.SIGTERM)
         self.bridge.wait(10)
-        whole = [line.split() for line in said.splitlines()]
-        return [(int(parts[0]), int(parts[1])) for parts in whole if len(parts) == 2]
+        return found
 
     def kill(self) -> None:
-        for process in (self.listener, self.bridge):
-            if process is not None and process.poll() is None:
+        processes: list[subprocess.Popen[Any]] = [*self.listeners.values(), self.bridge]
+        for process in processes:
+            if process.poll() is None:
                 process.kill()
                 process.wait()
 
@@ -130,6 +135,27 @@ def _said(pattern: str, log: Path, process: subprocess.Popen[bytes]) -> str:
             raise RuntimeError(f"the bridge did not start: {log.read_text()}")
         time.sleep(0.05)
     return found[1]
+
+
+def _inside(pid: int) -> str:
+    """Where the SDK's server listens, behind the bridge's front: another address of the loopback than 127.0.0.1."""
+    for line in Path(f"/proc/{pid}/net/tcp").read_text().splitlines()[1:]:
+        fields = line.split()
+        address, _, port = fields[1].partition(":")
+        host = ".".join(str(byte) for byte in reversed(bytes.fromhex(address)))
+        hidden = fields[3] == LISTENS and host.startswith("127.") and host != "127.0.0.1"
+        if hidden and _holds(pid, f"socket:[{fields[9]}]"):
+            return f"ws://{host}:{int(port, 16)}"
+    raise RuntimeError("the Foxglove bridge has no server behind its front")
+
+
+def _holds(pid: int, opened: str) -> bool:
+    """Whether a process has this file open."""
+    for each in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(OSError):  # closed meanwhile
+            if os.readlink(each) == opened:
+                return True
+    return False
 
 
 def watch(contacts: Outside, seconds: float) -> list[SeenContact]:
@@ -193,7 +219,8 @@ def _with_all(
     since: dict[str, list[float]],
     heard: dict[str, HandedOn],
 ) -> None:
-    with listened(list(heard), service.folder, 130 + (os.getpid() + number) % 90) as bridges:
+    names = [name for name in heard if name in LISTENED]
+    with listened(names, service.folder, 130 + (os.getpid() + number) % 90) as bridges:
         watch(contacts, SETTLE_S)  # whoever has just come finds the others
         before = {each.name: each.cpu_s() for each in bridges}
         seen = watch(contacts, seconds)
@@ -203,7 +230,13 @@ def _with_all(
         time.sleep(0.3)  # the last frame is on its way
         since["with all"] += [frame.since_read_ms for frame in seen]
         for each in bridges:
-            account(heard[each.name], seen, each.close())
+            said = each.close()
+            account(heard[each.name], seen, said[each.name])
+            if PAST_FRONT in said:
+                before_ns, front = dict(said[PAST_FRONT]), heard.setdefault(FRONT, HandedOn())
+                both = [(at, before_ns[ns]) for ns, at in said[each.name] if ns in before_ns]
+                front.added_ms += [(at - before) * 1e-6 for at, before in both]
+                front.sent += len(both)
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
@@ -218,7 +251,7 @@ def goals(since: dict[str, list[float]], heard: dict[str, HandedOn]) -> list[Goa
         Goal("pipeline's p99 with all bridges, over without", beside["p99"] / without["p99"], at_most=RATIO, gate=None),
         Goal("pipeline's p50 with all bridges, over without", beside["p50"] / without["p50"], at_most=RATIO, gate=GATE),
     ]
-    for name, each in heard.items():
+    for name, each in ((name, each) for name, each in heard.items() if name in LISTENED):
         share = each.lost / each.sent if each.sent else None
         found += [
             Goal(f"{name}: added to a contact's way, p99 [ms]", quantiles(each.added_ms)["p99"], at_most=P99_MS),
@@ -235,9 +268,9 @@ def table(since: dict[str, list[float]], heard: dict[str, HandedOn]) -> Table:
         q = quantiles(values)
         made.add_row(f"pipeline {name}: read to recv", str(len(values)), f"{q['p50']:.2f}", f"{q['p99']:.2f}", "", "")
     for name, each in heard.items():
-        q, cores = quantiles(each.added_ms), each.cpu_s / each.seconds if each.seconds else float("nan")
-        figures = (str(each.sent), f"{q['p50']:.2f}", f"{q['p99']:.2f}", str(each.lost), f"{cores:.3f}")
-        made.add_row(f"{name}: publish to its listener", *figures)
+        q, cores = quantiles(each.added_ms), f"{each.cpu_s / each.seconds:.3f}" if each.seconds else ""
+        figures = (str(each.sent), f"{q['p50']:.2f}", f"{q['p99']:.2f}", str(each.lost), cores)
+        made.add_row(f"{name}: publish to its listener" if name in LISTENED else name, *figures)
     return made
 
 

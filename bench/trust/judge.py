@@ -59,6 +59,7 @@ class Judge:
         way = self.truth.way(sample_s - SCAN_S, sample_s + SCAN_S / 2)
         self._phantoms(sample_s, lasting, way)
         self._number(sample_s, passed, lasting)
+        self._briefly(sample_s, lasting)
         self._missing(sample_s, passed, lasting)
         self._errors(sample_s, lasting, true)
 
@@ -129,6 +130,19 @@ class Judge:
             self.score.counts["wrong count"] += 1
             self._note(t, f"{len(lasting)} contacts of {least} to {len(lately)} touches for {WRONG_S} s")
 
+    def _briefly(self, t: float, lasting: list[Contact]) -> None:
+        """Does this frame hide a touch that pressed during all of the scan on which it stands, and not for so long that
+        `_missing` counts it?
+        """
+        for path in self.truth.around(t, t):
+            there = path.at(t)
+            if there is None or not self._fully(path, t, SCAN_S) or self._hidden_s.get(path.number, 0.0) >= HIDDEN_S:
+                continue
+            if min((_far(c, there) for c in lasting), default=np.inf) > FAR_M:
+                self.score.counts["hidden briefly"] += 1
+                self.score.counts["hidden briefly, none shown"] += not lasting
+                return
+
     def _missing(self, t: float, passed: float, lasting: list[Contact]) -> None:
         for path in self.truth.around(t, t):
             there = path.at(t)
@@ -145,8 +159,8 @@ class Judge:
                 self.score.counts["hidden"] += 1
                 self._note(t, f"{there.force_n:.1f} N at ({1e3 * there.x:+.0f}, {1e3 * there.y:+.0f}) mm hidden")
 
-    def _fully(self, path: TruePath, t: float) -> bool:
-        return all((there := path.at(at)) is not None and there.full >= FULL for at in (t - WRONG_S, t, t + SCAN_S / 2))
+    def _fully(self, path: TruePath, t: float, since_s: float = WRONG_S) -> bool:
+        return all((there := path.at(at)) is not None and there.full >= FULL for at in (t - since_s, t, t + SCAN_S / 2))
 
     def _errors(self, t: float, lasting: list[Contact], true: list[Pressed]) -> None:
         for contact, there in _pairs(lasting, true):

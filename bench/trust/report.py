@@ -18,6 +18,8 @@ WRONG = (  # heading, key, format
     ("incidents", "phantom incidents", "{:.0f}"),
     ("wrong counts", "wrong counts", "{:.0f}"),
     ("hidden", "hidden", "{:.0f}"),
+    ("briefly, frames", "hidden briefly", "{:.0f}"),
+    ("none shown", "none shown", "{:.0f}"),
     ("never shown", "never shown", "{:.0f}"),
     ("ids changed", "ids", "{:.0f}"),
     ("on a refused image", "refused", "{:.0f}"),

@@ -86,6 +86,8 @@ class TrustScore:
             "phantom incidents": said["phantom incidents"],
             "wrong counts": said["wrong count"],
             "hidden": said["hidden"],
+            "hidden briefly": said["hidden briefly"],
+            "none shown": said["hidden briefly, none shown"],
             "never shown": said["never shown"],
             "ids": said["id changed"],
             "refused": said["refused"],

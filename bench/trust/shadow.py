@@ -24,7 +24,10 @@ from firmware_stub.worlds.table import WORLDS
 from models.command import real
 from services.recordings.replay_session import private_runtime
 
-COUNTED = ("phantom frames", "wrong counts", "hidden", "never shown", "ids", "refused", "aged", "force 6", "place 6")
+COUNTED = (
+    "phantom frames", "wrong counts", "hidden", "hidden briefly", "never shown", "ids", "refused", "aged", "force 6",
+    "place 6",
+)  # fmt: skip
 SHARES = ("valid untouched %", "valid touched %", "valid in faults %")
 LESS_VALID = 0.1  # percentage points
 

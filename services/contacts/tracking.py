@@ -148,6 +148,11 @@ class Tracker:
         """Whether something waits to be confirmed."""
         return any(track.id == UNCONFIRMED for track in self.tracks)
 
+    @property
+    def remembers(self) -> bool:
+        """Whether a touch that was shown is there, or was a moment ago."""
+        return any(track.id != UNCONFIRMED for track in self.tracks)
+
     def forgotten(self, sample_ns: int) -> bool:
         """Whether so much time passed without a frame that no touch can be known to be the same."""
         return self._looked_ns is None or sample_ns - self._looked_ns > FORGOTTEN_S * 1e9

@@ -67,7 +67,7 @@ def contact(x: float, y: float, force: float, number: int = 1, sigma: float = 0.
 HELD = scene(12.0, press(7.0, 11.0, 3.0, 0.02, 0.0))
 WRONG = (
     "phantom", "phantom incidents", "wrong count", "hidden", "never shown", "id changed", "refused", "aged",
-    "named falsely", "named late", "changing", "coarse",
+    "named falsely", "named late", "changing", "coarse", "hidden briefly", "hidden briefly, none shown",
 )  # fmt: skip
 
 
@@ -96,6 +96,25 @@ def test_what_must_not_be_is_counted(says: dict[float, list[Contact]], counted: 
     score = judged(HELD, says)
     assert {key: score.counts[key] for key in counted} == counted
     assert bool(score.notes) == any(counted.values()) or set(counted) == {"id changed"}
+
+
+@pytest.mark.parametrize(
+    ("says", "frames", "none_shown", "hidden"),
+    [
+        ({6.5: [], 7.13: None}, 0, 0, 0),  # fully from 7.1 s on: their scans begin before
+        ({6.5: [], 7.16: None}, 1, 1, 0),
+        ({8.0: [], 8.09: None}, 2, 2, 0),
+        ({8.0: [contact(0.02, 0.016, 3.0)], 8.09: None}, 2, 0, 0),
+        ({8.0: [], 10.0: None}, 7, 7, 1),  # the first 0.3 s
+    ],
+)
+def test_valid_frames_that_hide_a_touch_for_less_than_an_incident_are_counted(
+    says: dict[float, list[Contact]], frames: int, none_shown: int, hidden: int
+) -> None:
+    counts = judged(HELD, says).counts
+    found = [counts[key] for key in ("hidden briefly", "hidden briefly, none shown", "hidden")]
+    assert found == [frames, none_shown, hidden]
+    assert judged(HELD, says, valid=False).counts["hidden briefly"] == 0
 
 
 def test_a_contact_on_the_way_of_a_slide_is_no_phantom() -> None:

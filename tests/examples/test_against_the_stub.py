@@ -26,6 +26,7 @@ from protocol.frames import Contact, ContactFrame
 from protocol.sockets import AllReader
 from tests.docs.snippets import snippets
 from tests.examples.compiled import ROOT, cpp_subscriber
+from tests.processes import pid_of
 
 __all__ = ["cpp_subscriber"]
 PATIENT_S = "1.5"  # what counts as silence here: a busy machine that runs tests is no fault of the skin
@@ -105,18 +106,6 @@ def moved_until_pressed(start: Start, at: tuple[float, float, float], *command: 
         if robot.returncode != 1:
             return robot.returncode, printed, before
     raise AssertionError(f"five times: {printed}")
-
-
-def pid_of(module: str) -> int:
-    """The process of this test's own service: the one with its runtime folder."""
-    wanted = f"EITSKIN_RUNTIME={os.environ['EITSKIN_RUNTIME']}".encode()
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            if module.encode() in (folder / "cmdline").read_bytes() and wanted in (folder / "environ").read_bytes():
-                return int(folder.name)
-        except OSError:
-            continue
-    raise AssertionError(f"no process of {module}")
 
 
 def test_the_newest_frame_is_there_right_after_connecting() -> None:

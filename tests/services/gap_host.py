@@ -5,7 +5,7 @@ contact frames out.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -141,20 +141,24 @@ class GapHost:
 
     def wrong(self, since: float) -> list[Wrong]:
         """Valid frames that show what is not there, or hide what is."""
-        return [Wrong(at, what, frame) for at, frame in self.valid(since) for what in self._wrong(frame)]
+        return [
+            Wrong(at, what, frame) for at, frame in self.valid(since) for what in what_is_wrong(frame, self.presses)
+        ]
 
-    def _wrong(self, frame: ContactFrame) -> Iterable[str]:
-        middle = frame.stamps["sample"] * 1e-9
-        first, last = middle - SCAN_S - GONE_S, middle + SCAN_S / 2 + GONE_S
-        may = [p for p in self.presses if p.start <= last and p.end >= first]
-        must = [p for p in self.presses if p.start + p.ramp <= first and p.end - p.ramp >= last]
-        shown = [c for c in frame.contacts if c.state != "end"]
-        for contact in shown:
-            if not any(np.hypot(contact.position[0] - p.x, contact.position[1] - p.y) <= FAR_M for p in may):
-                yield f"{contact.force_n} N at {contact.position[:2]}, where nothing is"
-        for p in must:
-            if not any(np.hypot(c.position[0] - p.x, c.position[1] - p.y) <= FAR_M for c in shown):
-                yield f"nothing at ({p.x}, {p.y}), where {p.force:g} N are"
+
+def what_is_wrong(frame: ContactFrame, presses: Sequence[Press], clocks_s: float = GONE_S) -> Iterator[str]:
+    """What a valid frame shows of what is not there, and hides of what is. clocks_s: by which `sample` may be off."""
+    middle = frame.stamps["sample"] * 1e-9
+    first, last = middle - SCAN_S - clocks_s, middle + SCAN_S / 2 + clocks_s
+    may = [p for p in presses if p.start <= last and p.end >= first]
+    must = [p for p in presses if p.start + p.ramp <= first and p.end - p.ramp >= last]
+    shown = [c for c in frame.contacts if c.state != "end"]
+    for contact in shown:
+        if not any(np.hypot(contact.position[0] - p.x, contact.position[1] - p.y) <= FAR_M for p in may):
+            yield f"{contact.force_n} N at {contact.position[:2]}, where nothing is"
+    for p in must:
+        if not any(np.hypot(c.position[0] - p.x, c.position[1] - p.y) <= FAR_M for c in shown):
+            yield f"nothing at ({p.x}, {p.y}), where {p.force:g} N are"
 
 
 @cache

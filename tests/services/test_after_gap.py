@@ -130,6 +130,24 @@ def test_in_parts_a_single_image_that_is_skipped_hides_nothing(stage: str) -> No
 
 
 @pytest.mark.parametrize("scan", ["full", "rolling"])
+@pytest.mark.parametrize("lag", [0.0, 0.005, 0.02])
+def test_touches_that_change_places_without_a_gap_are_not_hidden(scan: str, lag: float) -> None:
+    """Before: what took another one's place waited for a second image in valid frames that showed nothing."""
+    for seed in range(3):
+        rng = np.random.default_rng([seed, round(1e3 * lag)])
+        swap, (x, y) = GAP_S + SCAN_S * float(rng.random()), HELD
+        while np.hypot(x - HELD[0], y - HELD[1]) < 0.03:
+            x, y = rng.uniform(-0.034, 0.034, 2)
+        force, radius = float(rng.uniform(1.0, 4.0)), float(rng.uniform(0.006, 0.011))
+        began = Press(x, y, swap + lag, 20.0, force, radius=radius)
+        host = GapHost(scan, seed, [Press(*HELD, TOUCHED_S, swap), began])
+        host.until(swap + 0.4)
+        host.close()
+        assert not host.wrong(4.5), "\n".join(map(str, host.wrong(4.5)))
+        assert host.frames[-1][1].valid and [c.state for c in host.frames[-1][1].contacts] == ["hold"]
+
+
+@pytest.mark.parametrize("scan", ["full", "rolling"])
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_stage_that_skips_most_frames_says_nothing_wrong_and_still_something(stage: str, scan: str) -> None:
     """Each of its frames comes after a gap."""

@@ -22,6 +22,7 @@ from protocol.frames import ContactFrame
 from protocol.listener import ContactListener
 from services.runtime.config import ROOT
 from services.runtime.stage import PROCESSES
+from tests.processes import pid_of
 
 STOPS_S = (0.45, 2.0)  # not much longer than a frame may be acted on, and much longer
 TOLERANCE_S = 0.1  # between the client's judgement and its callback
@@ -71,19 +72,6 @@ def service(runtime: Path) -> Iterator[None]:
                 process.wait(20)
 
 
-def pid_of(process: str) -> int:
-    """Of this service's own process."""
-    wanted = f"EITSKIN_RUNTIME={os.environ['EITSKIN_RUNTIME']}".encode()
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            command, environment = (folder / "cmdline").read_bytes(), (folder / "environ").read_bytes()
-        except OSError:
-            continue
-        if f"services.{process}".encode() in command.split(b"\0") and wanted in environment.split(b"\0"):
-            return int(folder.name)
-    raise AssertionError(f"no process of {process}")
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("service")
 def test_no_stopped_process_makes_a_controller_act_on_an_old_frame() -> None:
@@ -91,7 +79,7 @@ def test_no_stopped_process_makes_a_controller_act_on_an_old_frame() -> None:
     with ContactListener("palm", robot.on_contact, robot.stale.append):
         robot.until(30)
         for process, stopped_s in product(PROCESSES, STOPS_S):
-            pid = pid_of(process)
+            pid = pid_of(f"services.{process}")
             ControlClient("stub", 5.0).call("press", x=0.02, y=-0.01, force=3.0, seconds=60.0)
             robot.until(10)
             robot.stale.clear()

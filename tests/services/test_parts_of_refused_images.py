@@ -27,7 +27,8 @@ def said_of(seen, *, valid: bool, reasons: list[str]):
     stage, last = seen
     image = unpack(pack(last))
     image.valid, image.reasons = valid, list(reasons)
-    image.scan = image.reconstructed = stage.last_image.state()["scan"] + 10
+    image.after = stage.last_image.state()["scan"]
+    image.scan = image.reconstructed = image.after + 10
     image.stamps["sample"] = last.stamps["sample"] + 4_360_000 * (image.scan - last.scan)
     (contact,) = stage.process(image, frozenset({"contact"}))
     part = PartFrame(skin="palm", session=image.session, scan=image.scan + 1, part=2, after=image.scan, valid=True)
