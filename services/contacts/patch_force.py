@@ -14,9 +14,9 @@ that may have saturated has a force from below only: its sigma reaches to where 
 The constants were measured on the mesh "stub" at 80 dB, on discs of 5, 10, 15 and 20 mm; those of the strength's error
 are near the likeliest of 3300 presses there (discs at 70, 80 and 90 dB, every kind of shape from 62 dB to none), and
 wide enough that each of these kinds has 99.5 % within three sigma: some 80 % then fall within one, since errors have
-heavier tails than a normal distribution. What keeps the sigma from the floor of `skin limits` is what a network makes of
-a touch: its strength errs by 4 to 5 % (root mean square), however little noise there is, and by another amount at each
-place.
+heavier tails than a normal distribution. What keeps the sigma from the floor of `skin limits` is what a network makes
+of a touch: its strength errs by 4 to 5 % (root mean square), however little noise there is, and by another amount at
+each place.
 """
 
 from __future__ import annotations
