@@ -1,5 +1,5 @@
-"""Every benchmark, one page: latency, skip rules, many skins, reaction, peers, tracking, false touches, faults, drift,
-stability, accuracy.
+"""Every benchmark, one page: latency, skip rules, many skins, reaction, peers, forces, tracking, false touches, faults,
+drift, stability, accuracy.
 
     skin bench all                      the page of README: about an hour on two idle cores
     skin bench all --quick              the short form of CI; exit status 1 where a gate is not met, or was not tried
@@ -128,6 +128,15 @@ BENCHMARKS = (
         limits="docs/reliability.md says of each world what is wrong today; tests/services/test_estimator_defects.py "
         "fails of it.",
         arguments=("--minutes", "3", "--cores", "1"),
+        beside=True,
+    ),
+    Benchmark(
+        "force",
+        "Forces of presses of unknown size",
+        ("--quick",),
+        ("force",),
+        "A network's strength of a touch errs by 4 to 5 %, by another amount at each place, however little noise there "
+        "is: the stated sigma covers that, and is several floors of the noise.",
         beside=True,
     ),
     Benchmark("untouched_parts", "False touches of scans in parts", ("--quick",), beside=True),

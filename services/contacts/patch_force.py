@@ -12,11 +12,11 @@ The standard deviation over the sizes is what the unknown size leaves open; the 
 that may have saturated has a force from below only: its sigma reaches to where the foam tells nothing any more.
 
 The constants were measured on the mesh "stub" at 80 dB, on discs of 5, 10, 15 and 20 mm; those of the strength's error
-are the likeliest of 3300 presses there (discs at 70, 80 and 90 dB, every kind of shape from 62 dB to none), BLIND
-apart, widened until each of these kinds has 99.5 % within three sigma. On the mesh "inverse", with sizes in between,
-73 to 77 % of presses fall within one sigma and 99.7 to 100 % within three. What keeps the sigma from the floor of
-`skin limits` is what a network makes of a touch: its strength errs by 4 to 5 % (root mean square), however little noise
-there is, and by another amount at each place.
+are near the likeliest of 3300 presses there (discs at 70, 80 and 90 dB, every kind of shape from 62 dB to none), and
+wide enough that each of these kinds has 99.5 % within three sigma: some 80 % then fall within one, since errors have
+heavier tails than a normal distribution. What keeps the sigma from the floor of `skin limits` is what a network makes
+of a touch: its strength errs by 4 to 5 % (root mean square), however little noise there is, and by another amount at
+each place.
 """
 
 from __future__ import annotations
@@ -41,8 +41,9 @@ MOST_TOWARDS = 0.8
 SMALL_M = 0.006  # what an image makes of a touch that noise hides the size of
 UNSURE, LEAST_UNSURE = 2.0, 0.1  # t over that square, and at least
 OWN = 0.9  # of the word of the bundle's map for the integral's error, which is of all shapes
-WEAK = 0.35  # of that square: relative error of the strength beyond the map
-FAINT, TRAINED = 0.1, 0.06  # more of it, the further the drop [S/m] is below the least that training shows
+WEAK = 0.4  # of that square: relative error of the strength beyond the map
+FAINT, TRAINED = 0.1, 0.075  # more of it, the further the drop [S/m] is below the least that training shows
+STRONG = 0.7  # of the drop times (blur / R)^2: relative error of the strength of a patch whose edge the image blurs
 UNMAPPED = 0.04  # relative error of the strength where nobody measured it
 UNTOLD = 0.3  # relative sigma of a peak where the network says none
 SATURATED = 0.76  # S/m: a touch of such a drop may press harder than it shows
@@ -84,7 +85,7 @@ def of_image(shown: Shown, foam: Foam = FOAM) -> PatchForce:
     weight /= weight.sum()
     own = UNMAPPED if shown.strength_sigma is None else OWN * shown.strength_sigma
     faint = FAINT * np.maximum(0.0, 1 - drop / TRAINED)
-    unsure = np.sqrt(own**2 + (WEAK * relative**2) ** 2 + faint**2)
+    unsure = np.sqrt(own**2 + (WEAK * relative**2) ** 2 + faint**2 + (STRONG * drop * blurred) ** 2)
     drops = np.array([_drop(strength * np.exp(z * unsure)) for z, _ in NODES])
     pressure = foam.pressure(drops)
     both = np.outer([share for _, share in NODES], weight)

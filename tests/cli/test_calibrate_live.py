@@ -90,9 +90,9 @@ def stub(command: str, **args: Any) -> None:
     ControlClient("stub", 10.0).call(command, skin="palm", **args)
 
 
-def place(rng: np.random.Generator) -> dict[str, float]:
+def place(rng: np.random.Generator, tip: float = TIP_M, newtons: tuple[float, float] = (0.8, 4.5)) -> dict[str, float]:
     x, y = rng.uniform(-0.033, 0.033, 2)
-    return {"x": x, "y": y, "radius": TIP_M, "force": rng.uniform(0.8, 4.5), "seconds": 60.0}
+    return {"x": x, "y": y, "radius": tip, "force": rng.uniform(*newtons), "seconds": 60.0}
 
 
 def calibrating(folder: Path, *more: object) -> contextlib.AbstractContextManager[Program]:
@@ -131,11 +131,48 @@ def test_twenty_presses_teach_the_law_to_three_percent(runtime: Path) -> None:
     assert float(np.median(ratios)) == pytest.approx(1.0, abs=0.03)
 
 
-def said_over_pressed(rng: np.random.Generator, presses: int) -> Iterator[float]:
+TIPS = {0.005: (0.5, 2.0), 0.012: (0.8, 4.5)}  # m: newtons
+
+
+@pytest.mark.slow
+def test_presses_of_two_tips_teach_a_law_that_covers_both(runtime: Path) -> None:
+    """The second run goes on from the presses of the first and ends by itself; what it claims is one standard error."""
+    rng, kept, more = (
+        np.random.default_rng(11),
+        runtime / "small.csv",
+        ["--presses", 10, "--save", runtime / "small.csv"],
+    )
+    with (
+        serving(runtime, "--config", str(config(runtime))),
+        program(sys.executable, PUBLISHER, runtime, json.dumps(SCALE)),
+    ):
+        for tip, newtons in TIPS.items():
+            with calibrating(runtime, "--tip", tip, *more) as skin:
+                while line := skin.line():
+                    if line.startswith("press one place"):
+                        stub("press", **place(rng, tip, newtons))
+                    elif line.startswith("release"):
+                        stub("release")
+                out, _ = skin.process.communicate(timeout=30)
+                assert skin.process.returncode == 0, skin.said
+            more = ["--csv", kept, "--presses", 30]
+    report = json.loads(out)
+    claim = report["error"]["law"]
+    assert report["presses"] >= 20 and claim < 0.02, report
+    with serving(runtime, "--config", str(config(runtime, f'calibration = "{runtime}/palm.json"\n'))):
+        for tip, newtons in TIPS.items():
+            ratios = [said / STIFFER for said in said_over_pressed(rng, 12, tip, newtons)]
+            print(tip, claim, report["presses"], ratios)
+            assert float(np.median(ratios)) == pytest.approx(1.0, abs=3 * claim)
+
+
+def said_over_pressed(
+    rng: np.random.Generator, presses: int, tip: float = TIP_M, newtons: tuple[float, float] = (0.8, 4.5)
+) -> Iterator[float]:
     """Said over the shipped foam's force, of presses at other places."""
     reader = NewestReader("contact", "palm")
     for _ in range(presses):
-        pressed = place(rng)
+        pressed = place(rng, tip, newtons)
         stub("press", **pressed)
         end, said = time.monotonic() + 1.5, []
         while time.monotonic() < end:
