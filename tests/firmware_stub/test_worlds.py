@@ -141,6 +141,7 @@ def test_slopes_of_contact_impedances_are_what_a_solution_finds(
     assert np.abs(four_terminal(slopes[4], rows) * 0.01 - changed).max() < 0.01 * np.abs(changed).max()
 
 
+@pytest.mark.slow
 def test_flicker_and_jumps_have_the_size_that_their_world_says(
     disturbed: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:

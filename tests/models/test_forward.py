@@ -49,6 +49,7 @@ def off(found, expected):
 # --- against EIDORS ---
 
 
+@pytest.mark.slow
 def test_reference_mesh_against_eidors(fine, eidors):
     untouched = fine.solve()
     for name in PATTERNS:

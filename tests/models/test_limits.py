@@ -168,6 +168,7 @@ def test_a_force_is_known_as_its_integral_is_until_the_foam_saturates():
     assert hard.force > 1.5 * hard.integral
 
 
+@pytest.mark.slow
 def test_the_smallest_force_that_is_shown_is_shown():
     """Frames of another mesh and other noise, at other places: nearly all are seen at that force, few at a third."""
     noise, radius_mm = MeasurementNoise(80.0), 10.0
@@ -192,6 +193,7 @@ def test_the_smallest_force_that_is_shown_is_shown():
     assert 2 < louder.shown_n / found.shown_n < 4
 
 
+@pytest.mark.slow
 def test_command_line_of_the_smallest_forces(capsys):
     assert limits.main(["--forces", "--skin", "hexagon6"]) == 2
     assert limits.main(["--forces", "--snr", "80", "--grid", "2", "--json"]) == 0

@@ -65,6 +65,7 @@ def directions(bundle: Bundle) -> Array:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.slow
 def test_no_false_alarm_in_three_hours_of_drift(skin: Skin, bundle: Bundle, seed: int) -> None:
     """2.4e5 untouched frames over both seeds, 80 dB, noise and baseline of 64 frames, new ones every half hour. The
     sheet and every contact drift, steadily and at random, as fast as the configuration says and as far as it allows.
@@ -176,6 +177,7 @@ def test_the_lightest_press_of_the_paper_is_seen_at_the_centre(time: Time, solve
 
 
 @pytest.mark.parametrize("drifts", [False, True])
+@pytest.mark.slow
 def test_a_touch_held_for_ten_minutes_does_not_fade(time: Time, solved: Callable[..., Array], drifts: bool) -> None:
     """The one-step image's integral, at the hold's begin and end; the drift is 3 % of every contact and 0.2 % of the
     sheet. A release after it leaves no touch behind.

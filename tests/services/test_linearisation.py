@@ -223,6 +223,7 @@ def test_a_calibration_that_inference_cannot_find_makes_frames_invalid(sheet: Mi
     assert not image.valid and "stale_baseline" in image.reasons
 
 
+@pytest.mark.slow
 def test_a_calibration_that_arrives_late_is_used(sheet: MismatchedSheet, bundle: Bundle) -> None:
     z0 = np.abs(sheet.solve().impedances())
     packed = calibrate(bundle, z0, 1e-5 * z0)
@@ -277,6 +278,7 @@ def test_forces_are_calibrated_on_the_images_that_a_tare_leads_to(
     assert seen(tare=TareConfig(calibrate=False))[1] > 1.15 * press.drop
 
 
+@pytest.mark.slow
 def test_a_calibration_of_another_bundle_or_a_damaged_one_is_refused(bundle: Bundle, sheet: MismatchedSheet) -> None:
     z0 = np.abs(sheet.solve().impedances())
     packed = calibrate(bundle, z0, 1e-5 * z0)

@@ -255,6 +255,7 @@ def test_a_contact_that_jumps_as_a_touch_begins_elsewhere_is_named():
     assert named and named[0] < 0.2
 
 
+@pytest.mark.slow
 def test_no_whole_scan_is_made_of_values_from_before_and_after_a_release():
     """Of a release within the newest values too: such a scan looks like a contact that jumped, asking takes 20 ms."""
     host = SimulatedHost("rolling", snr_db=80.0, seed=9)
