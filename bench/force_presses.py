@@ -47,7 +47,7 @@ class PressRow:
 
 
 @dataclass(frozen=True)
-class Press:
+class PlannedPress:
     radius_mm: float
     newtons: float
     x: float  # m
@@ -80,7 +80,7 @@ class Press:
         return float(np.hypot(contact["position"][0] - self.x, contact["position"][1] - self.y))
 
 
-def planned(each: int, seed: int) -> Iterator[Press]:
+def planned(each: int, seed: int) -> Iterator[PlannedPress]:
     """`each` presses of every radius and force, in random order at random places."""
     rng = np.random.default_rng([seed, 36])
     cases = [(r, f) for r in RADII_MM for f in NEWTONS for _ in range(each)]
@@ -88,7 +88,7 @@ def planned(each: int, seed: int) -> Iterator[Press]:
         radius, newtons = cases[k]
         half = SIDE_M / 2 - radius * 1e-3
         x, y = rng.uniform(-half, half, 2)
-        yield Press(radius, newtons, float(x), float(y))
+        yield PlannedPress(radius, newtons, float(x), float(y))
 
 
 def simulated(scan: ScanMode, snr_db: float, each: int, seed: int) -> Iterator[PressRow]:
@@ -119,7 +119,7 @@ def live(scan: ScanMode, each: int, seed: int) -> Iterator[PressRow]:
             contacts.close()
 
 
-def _pressed(service: Service, contacts: Outside, press: Press) -> dict[str, Any] | None:
+def _pressed(service: Service, contacts: Outside, press: PlannedPress) -> dict[str, Any] | None:
     service.stub("press", **press.values)  # answers once its physics are solved
     shown = _last(contacts, HELD_S)
     service.stub("release")
