@@ -174,13 +174,16 @@ def said_over_pressed(
     for _ in range(presses):
         pressed = place(rng, tip, newtons)
         stub("press", **pressed)
-        end, said = time.monotonic() + 1.5, []
-        while time.monotonic() < end:
+        begun, said, seen = time.monotonic(), [], set()
+        while (held := time.monotonic() - begun) < 1.5 or (not said and held < 10):
             frame = reader.recv(0.2)
             if isinstance(frame, ContactFrame) and frame.valid and len(frame.contacts) == 1:
                 said.append(frame.contacts[0].force_n or 0.0)
+            elif isinstance(frame, ContactFrame):
+                seen.add((frame.valid, len(frame.contacts), *frame.reasons))
         stub("release")
         time.sleep(0.5)
+        assert said, (pressed, seen)
         yield said[-1] / pressed["force"]
     reader.close()
 
