@@ -158,12 +158,13 @@ def test_presses_of_two_tips_teach_a_law_that_covers_both(runtime: Path) -> None
             more = ["--csv", kept, "--presses", 30]
     report = json.loads(out)
     claim = report["error"]["law"]
-    assert report["presses"] >= 20 and claim < 0.02, report
+    assert report["presses"] >= 20 and claim < 0.03, report
     with serving(runtime, "--config", str(config(runtime, f'calibration = "{runtime}/palm.json"\n'))):
         for tip, newtons in TIPS.items():
             ratios = [said / STIFFER for said in said_over_pressed(rng, 12, tip, newtons)]
             print(tip, claim, report["presses"], ratios)
-            assert float(np.median(ratios)) == pytest.approx(1.0, abs=3 * claim)
+            ours = 1.25 * np.std(ratios) / len(ratios) ** 0.5  # standard error of the median that it is held against
+            assert float(np.median(ratios)) == pytest.approx(1.0, abs=2 * float(np.hypot(claim, ours)))
 
 
 def said_over_pressed(
