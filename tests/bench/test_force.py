@@ -24,7 +24,9 @@ def rows(wide: float, off: float) -> list[PressRow]:
 
 def goals(wide: float, off: float) -> dict[str, Any]:
     cells = [
-        {"ratio": 1 + off, "sigma": off * wide, "floor": 0.01, "saturated": False} for _ in RADII_MM for _ in NEWTONS
+        {"ratio": 1 + off, "error": off, "sigma": off * wide, "floor": 0.01, "saturated": False}
+        for _ in RADII_MM
+        for _ in NEWTONS
     ]
     return {goal.figure.removeprefix("full: "): goal for goal in force.goals("full", rows(wide, off), cells)}
 
