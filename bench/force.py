@@ -59,6 +59,7 @@ def cells(rows: Sequence[PressRow], snr_db: float) -> list[dict[str, Any]]:
                 "shown": len(shown),
                 "ratio": float(np.median(ratio)) if len(shown) else None,
                 "spread": float(ratio.std()) if len(shown) else None,
+                "error": float(np.sqrt(np.mean((ratio - 1) ** 2))) if len(shown) else None,
                 "sigma": float(np.median(sigma)) if len(shown) else None,
                 "floor": floor,
                 "pressure_ratio": float(np.median([(r.pressure or 0.0) / pressure for r in shown])) if shown else None,
@@ -78,6 +79,7 @@ def goals(scan: str, rows: Sequence[PressRow], cells: Sequence[dict[str, Any]]) 
     sizes = [np.median([(r.said or 0) / r.newtons for r in plain if r.radius_mm == mm]) for mm in RADII_MM]
     bias = [abs(c["ratio"] - 1) / c["sigma"] for c in cells if c["ratio"] is not None]
     over = [c["sigma"] / c["floor"] for c in cells if c["sigma"] and not c["saturated"]]
+    erring = [c["error"] / c["floor"] for c in cells if c["error"] and not c["saturated"]]
     furthest = 100 * float(np.max(np.abs(np.array(sizes) - 1)))
     rms = 100 * float(np.sqrt(np.mean(firm**2)))
     least = [
@@ -90,6 +92,7 @@ def goals(scan: str, rows: Sequence[PressRow], cells: Sequence[dict[str, Any]]) 
         (f"root mean square error from {FROM_N:g} N on, %", rms, 7.0, 7.0),
         ("bias of a radius and force, over its sigma, at most", max(bias), 1.0, None),
         ("median sigma over the floor of one frame", float(np.median(over)), 1.3, 8.0),
+        ("median error (rms) over that floor: what an honest sigma is", float(np.median(erring)), None, None),
     ]
     found = [Goal(f"{scan}: {name}", value, at_least=target, gate=gate) for name, value, target, gate in least]
     return found + [Goal(f"{scan}: {name}", value, at_most=target, gate=gate) for name, value, target, gate in most]

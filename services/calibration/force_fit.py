@@ -10,6 +10,7 @@ that of presses that took no part in the fit or in the choice.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -103,11 +104,13 @@ def fit(presses: Sequence[Press], laws: dict[Of, ForceLaw], most_n: float | None
     images = np.array([laws[form.reads].quantity(p.look).relative or 0.0 for p in presses])
     own = float(np.sqrt(max(0.0, error**2 - float(np.mean((exponent * images) ** 2)))))
     forces = [p.force_n for p in presses]
+    scatter, between = error * math.sqrt(form.parameters / len(presses)), _between_tips(presses, left_out)
     said = {
         "error": {
             "left_out_rms": error,
             "left_out_median": float(np.median(np.abs(np.expm1(left_out)))),
-            "law": error * float(np.sqrt(form.parameters / len(presses))),  # of the law itself: what more presses mend
+            "law": math.hypot(scatter, between),  # of the law itself, for each of the tips
+            "scatter": scatter,  # of it: what more presses mend
         },
         "presses": len(presses),
         "tips_m": tips(presses),
@@ -124,6 +127,19 @@ def tips(presses: Sequence[Press]) -> list[float]:
         if not found or radius > APART * found[-1]:
             found.append(radius)
     return found
+
+
+def _between_tips(presses: Sequence[Press], left_out: Array) -> float:
+    """The largest mean error of log force of one tip, where there are several: one law for all of them errs by it
+    however many presses there are.
+    """
+    radii = np.array([np.nan if p.tip_m is None else p.tip_m for p in presses])
+    sizes = tips(presses)
+    if len(sizes) < 2:
+        return 0.0
+    edges = np.sqrt(np.array(sizes[:-1]) * np.array(sizes[1:]))
+    of = np.where(np.isnan(radii), -1, np.searchsorted(edges, radii))
+    return float(max(abs(left_out[of == k].mean()) for k in range(len(sizes))))
 
 
 def unknown(found: Calibration, skin: Skin) -> str:

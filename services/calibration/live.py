@@ -173,5 +173,5 @@ def missing(presses: Sequence[Press], found: Calibration) -> str:
     pressed = {(1 if p.look.x > 0 else -1, 1 if p.look.y > 0 else -1) for p in presses}
     if left := [name for quarter, name in QUARTERS.items() if quarter not in pressed]:
         return f"presses in the {', '.join(left)} quarter"
-    law = found.said["error"]["law"]
-    return f"the law to {100 * ENOUGH:.1f} %" if law > ENOUGH else ""
+    scatter = found.said["error"]["scatter"]
+    return f"the law to {100 * ENOUGH:.1f} %" if scatter > ENOUGH else ""

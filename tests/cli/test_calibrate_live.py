@@ -158,12 +158,13 @@ def test_presses_of_two_tips_teach_a_law_that_covers_both(runtime: Path) -> None
             more = ["--csv", kept, "--presses", 30]
     report = json.loads(out)
     claim = report["error"]["law"]
-    assert report["presses"] >= 20 and claim < 0.02, report
+    assert report["presses"] >= 20 and claim < 0.03, report
     with serving(runtime, "--config", str(config(runtime, f'calibration = "{runtime}/palm.json"\n'))):
         for tip, newtons in TIPS.items():
             ratios = [said / STIFFER for said in said_over_pressed(rng, 12, tip, newtons)]
             print(tip, claim, report["presses"], ratios)
-            assert float(np.median(ratios)) == pytest.approx(1.0, abs=3 * claim)
+            ours = 1.25 * np.std(ratios) / len(ratios) ** 0.5  # standard error of the median that it is held against
+            assert float(np.median(ratios)) == pytest.approx(1.0, abs=2 * float(np.hypot(claim, ours)))
 
 
 def said_over_pressed(
@@ -174,13 +175,16 @@ def said_over_pressed(
     for _ in range(presses):
         pressed = place(rng, tip, newtons)
         stub("press", **pressed)
-        end, said = time.monotonic() + 1.5, []
-        while time.monotonic() < end:
+        begun, said, seen = time.monotonic(), [], set()
+        while (held := time.monotonic() - begun) < 1.5 or (not said and held < 10):
             frame = reader.recv(0.2)
             if isinstance(frame, ContactFrame) and frame.valid and len(frame.contacts) == 1:
                 said.append(frame.contacts[0].force_n or 0.0)
+            elif isinstance(frame, ContactFrame):
+                seen.add((frame.valid, len(frame.contacts), *frame.reasons))
         stub("release")
         time.sleep(0.5)
+        assert said, (pressed, seen)
         yield said[-1] / pressed["force"]
     reader.close()
 

@@ -251,6 +251,17 @@ def of_foam(radius_mm: float, newton: float, stiffness: float, tip: bool) -> Pre
     return Press(newton, shown, f"{newton} N", radius_mm * 1e-3 if tip else None)
 
 
+def test_what_a_law_is_known_to_covers_how_much_tips_differ(skin: Skin, bundle: Bundle) -> None:
+    """A law of both errs by 3 % for each of two tips that differ by 6 %, however many presses there are."""
+    forces = np.linspace(0.5, 3.0, 40)
+    differ = [of_foam(mm, f, of, True) for mm, of in ((7.0, 1.03), (14.0, 0.97)) for f in forces]
+    error = fit(differ, laws(skin, bundle)).said["error"]
+    assert error["scatter"] < 0.01 < 0.02 < error["law"] < 0.04
+    alike = fit([of_foam(mm, f, 1.0, True) for mm in (7.0, 14.0) for f in forces], laws(skin, bundle)).said["error"]
+    one = fit([of_foam(7.0, f, 1.0, True) for f in forces], laws(skin, bundle)).said["error"]
+    assert alike["law"] < 0.02 and one["law"] == one["scatter"]
+
+
 def test_presses_of_two_tips_choose_pressure_and_one_says_what_it_cannot_know(skin: Skin, bundle: Bundle) -> None:
     forces = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
     two = fit([of_foam(mm, f, 1.4, True) for mm in (7.0, 14.0) for f in forces], laws(skin, bundle))
