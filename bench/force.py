@@ -31,11 +31,11 @@ from models.fisher import MeasurementNoise, floors, mean_floor
 from models.force_limits import SIZES
 from models.pressure import FOAM
 from models.shapes import Shape
+from services.contacts.patch_force import SATURATED
 from services.runtime.config import ScanMode
 
 METRES = SIDE_M / 2  # per model unit
 FROM_N = 1.0  # the root mean square is of presses from here on
-SATURATED = 0.76  # S/m: beyond it a force is a lower bound
 
 
 def cells(rows: Sequence[PressRow], snr_db: float) -> list[dict[str, Any]]:
@@ -71,31 +71,40 @@ def cells(rows: Sequence[PressRow], snr_db: float) -> list[dict[str, Any]]:
 
 
 def goals(scan: str, rows: Sequence[PressRow], cells: Sequence[dict[str, Any]]) -> list[Goal]:
-    """What is wanted of a scan mode's presses, and what they reach. Gates are of one press of each radius and force."""
+    """What is wanted of a scan mode's presses, and what they reach: None where too few were shown to say.
+
+    Gates are of one press of each radius and force.
+    """
     shown = [r for r in rows if r.said is not None and r.sigma]
     plain = [r for r in shown if r.drop <= SATURATED]
     z = np.array([abs((r.said or 0.0) - r.newtons) / (r.sigma or 1.0) for r in shown])
     firm = np.array([(r.said or 0.0) / r.newtons - 1 for r in plain if r.newtons >= FROM_N])
-    sizes = [np.median([(r.said or 0) / r.newtons for r in plain if r.radius_mm == mm]) for mm in RADII_MM]
+    by_size = [[(r.said or 0.0) / r.newtons for r in plain if r.radius_mm == mm] for mm in RADII_MM]
+    sizes = [float(np.median(ratios)) for ratios in by_size if ratios]
     bias = [abs(c["ratio"] - 1) / c["sigma"] for c in cells if c["ratio"] is not None]
     over = [c["sigma"] / c["floor"] for c in cells if c["sigma"] and not c["saturated"]]
     erring = [c["error"] / c["floor"] for c in cells if c["error"] and not c["saturated"]]
-    furthest = 100 * float(np.max(np.abs(np.array(sizes) - 1)))
-    rms = 100 * float(np.sqrt(np.mean(firm**2)))
+    furthest = 100 * max(abs(size - 1) for size in sizes) if len(sizes) == len(RADII_MM) else None
+    rms = 100 * float(np.sqrt(np.mean(firm**2))) if len(firm) else None
+    within = [100 * float(np.mean(z < k)) if len(z) else None for k in (1, 3)]
     least = [
         ("presses shown, %", 100 * len(shown) / len(rows), 100.0, 95.0),
-        ("within one sigma, %", 100 * float(np.mean(z < 1)), 68.0, 50.0),
-        ("within three sigma, %", 100 * float(np.mean(z < 3)), 99.5, 95.0),
+        ("within one sigma, %", within[0], 68.0, 50.0),
+        ("within three sigma, %", within[1], 99.5, 95.0),
     ]
     most = [
         ("median said / true by radius, furthest from 1, %", furthest, 5.0, 8.0),
         (f"root mean square error from {FROM_N:g} N on, %", rms, 7.0, 7.0),
-        ("bias of a radius and force, over its sigma, at most", max(bias), 1.0, None),
-        ("median sigma over the floor of one frame", float(np.median(over)), 1.3, 10.0),
-        ("median error (rms) over that floor: what an honest sigma is", float(np.median(erring)), None, None),
+        ("bias of a radius and force, over its sigma, at most", max(bias, default=None), 1.0, None),
+        ("median sigma over the floor of one frame", _median(over), 1.3, 10.0),
+        ("median error (rms) over that floor: what an honest sigma is", _median(erring), None, None),
     ]
     found = [Goal(f"{scan}: {name}", value, at_least=target, gate=gate) for name, value, target, gate in least]
     return found + [Goal(f"{scan}: {name}", value, at_most=target, gate=gate) for name, value, target, gate in most]
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if values else None
 
 
 def draw(table: Sequence[dict[str, Any]], path: Path) -> None:

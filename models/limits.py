@@ -167,7 +167,17 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--rank", action="store_true", help="rank the drive patterns instead")
     parser.add_argument("--map", type=Path, metavar="PNG", help="draw the floors over the skin")
     parser.add_argument("--json", action="store_true")
-    return parser.parse_args(argv)
+    options = parser.parse_args(argv)
+    if options.forces:
+        _refuse_beside_forces(parser, options)
+    return options
+
+
+def _refuse_beside_forces(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """What a table of every radius, of the skin's own bundle soon after a tare, has no use for."""
+    for name in ("rank", "map", "known_radius", "radius", "pattern", "drift"):
+        if getattr(options, name):
+            parser.error(f"found --forces and --{name.replace('_', '-')}, expected one of them: leave the other out")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

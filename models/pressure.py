@@ -13,10 +13,8 @@ Drops are of a sheet of 1 S/m, pressures Pa, lengths and areas metres unless a n
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,11 +99,6 @@ class Foam:
 
     def to_dict(self) -> dict[str, float]:
         return {"slope_s_per_m_pa": self.slope, "knee_s_per_m": self.knee}
-
-    @classmethod
-    def from_dict(cls, found: Mapping[str, Any]) -> Foam:
-        """Raises KeyError, TypeError or ValueError where `found` is no foam."""
-        return cls(float(found["slope_s_per_m_pa"]), float(found["knee_s_per_m"]))
 
 
 @lru_cache(maxsize=4096)

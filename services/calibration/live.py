@@ -5,6 +5,7 @@ A press counts where one touch was held still, the skin was free before and afte
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -17,13 +18,23 @@ from protocol.held import HeldImage
 from protocol.sockets import AllReader
 from services.calibration.force_fit import CalibrationError, Press
 from services.calibration.force_presses import PATIENCE_S, STEADY_S, Steady, looks
-from services.calibration.reference import AROUND_S, GUARD_S, SETTLE_S, ZERO_S, Doubtful, PressCourse, ReferenceForce
+from services.calibration.reference import (
+    AROUND_S,
+    GUARD_S,
+    SETTLE_S,
+    STALE_S,
+    ZERO_S,
+    Doubtful,
+    PressCourse,
+    ReferenceForce,
+)
 from services.contacts.calibration_file import Calibration
 from services.contacts.force import Look
 
 FREE_S = GUARD_S + ZERO_S + AROUND_S  # how long the skin is free before a press
 COURSE = 4096  # images of one press that are kept
 LEAST_PRESSES = 20  # with 12 a law of four parameters was off by 2.4 % and thought 0.8 %
+OF_A_TIP = LEAST_PRESSES // 2  # of the tip that presses: a law of two tips was measured with ten of each
 ENOUGH = 0.015  # relative standard uncertainty of the law: with so much nobody needs to press on
 QUARTERS = {(1, 1): "upper right", (-1, 1): "upper left", (-1, -1): "lower left", (1, -1): "lower right"}
 
@@ -39,6 +50,8 @@ class LivePresses:
         self._reader = AllReader(["image", "reference"], skin)
         self._ages = Ages()
         self._told = ""
+        self._counts = 0, 0  # of messages that could not be read, and that came again
+        self._unread = -math.inf, ""  # when such a message came last [s], and what was wrong with it
         self._course: deque[tuple[float, float]] = deque(maxlen=COURSE)
         self._images = 0
         self._held = HeldImage()
@@ -70,10 +83,10 @@ class LivePresses:
         since: float | None = None
         asked = False
         for frame, now in self._frames("the skin did not become free: release it, or tare (`skin tare`)"):
-            trouble = self.reference.trouble(now)
+            trouble = self._trouble(now)
             if trouble or frame.touched:
                 if trouble:
-                    self._tell(f"{self._unread() or trouble}; no press counts until then")
+                    self._tell(f"{trouble}; no press counts until then")
                 if frame.touched and not asked:
                     self._tell("release", again=True)
                 since, asked = None, asked or frame.touched
@@ -98,8 +111,8 @@ class LivePresses:
     def _until(self, touched: bool, why: str) -> float:
         """When something touched first, or nothing any more. Raises Doubtful where the reference ends meanwhile."""
         for frame, now in self._frames(why):
-            if trouble := self.reference.trouble(now):
-                raise Doubtful(self._unread() or trouble)
+            if trouble := self._trouble(now):
+                raise Doubtful(trouble)
             if frame.touched == touched:
                 return self._when(frame, now)
         raise AssertionError("frames end by an exception")
@@ -109,8 +122,8 @@ class LivePresses:
         steady = Steady()
         self._held_up = "too short"
         for frame, now in self._frames("no steady press"):
-            if trouble := self.reference.trouble(now):
-                raise Doubtful(self._unread() or trouble)
+            if trouble := self._trouble(now):
+                raise Doubtful(trouble)
             look = steady(frame)
             if not frame.touched:
                 raise Doubtful(f"released before it was steady ({self._held_up}): hold still until told")
@@ -127,6 +140,7 @@ class LivePresses:
         while (now := time.monotonic()) < end:
             frame: Frame | None = self._reader.recv(min(0.5, end - now))
             arrived = time.monotonic()
+            self._note_unread(arrived)
             if isinstance(frame, ReferenceFrame):
                 self.reference.take(frame, arrived)
             elif isinstance(frame, ImageFrame):
@@ -136,8 +150,8 @@ class LivePresses:
                 yield frame, arrived
         if not self._images:
             why = "no image came: start the service with `skin up`"
-        elif trouble := self.reference.trouble(time.monotonic()):
-            why = self._unread() or trouble
+        elif trouble := self._trouble(time.monotonic()):
+            why = trouble
         raise CalibrationError(f"no press within {self._patience_s:g} s: {why}")
 
     def _note(self, frame: ImageFrame, now: float) -> None:
@@ -150,14 +164,20 @@ class LivePresses:
         measured = self._ages.measured_ns(frame, int(arrived_s * 1e9))
         return arrived_s if measured is None else 1e-9 * measured
 
-    def _unread(self) -> str:
-        """What is wrong with messages that do not count as such; "" where there were none."""
-        bad = self._reader.last_error
-        if bad is not None and bad.topic == "reference":
-            return f"{self._reader.malformed} messages could not be read, the last one: {bad}"
-        if self._reader.repeated:
-            return f"{self._reader.repeated} messages came with a `seq` that had been there: it must count up"
-        return ""
+    def _trouble(self, now_s: float) -> str:
+        """Why the reference says nothing at present; "" where it does."""
+        trouble = self.reference.trouble(now_s)
+        noted_s, unread = self._unread
+        return unread if trouble and unread and now_s - noted_s < STALE_S else trouble
+
+    def _note_unread(self, now_s: float) -> None:
+        """What is wrong with messages that do not count as such. Without their number: each would be told anew."""
+        counts, bad = (self._reader.malformed, self._reader.repeated), self._reader.last_error
+        if counts[0] > self._counts[0] and bad is not None and bad.topic == "reference":
+            self._unread = now_s, f"messages cannot be read: {bad}"
+        elif counts[1] > self._counts[1]:
+            self._unread = now_s, "messages come with a `seq` that had been there: it must count up"
+        self._counts = counts
 
     def _tell(self, text: str, again: bool = False) -> None:
         """Once, unless `again`."""
@@ -170,6 +190,9 @@ def missing(presses: Sequence[Press], found: Calibration) -> str:
     """What presses do not tell yet, for who presses; "" where they are enough."""
     if len(presses) < LEAST_PRESSES:
         return f"{LEAST_PRESSES - len(presses)} more presses at least"
+    of_this = sum(p.tip_m == presses[-1].tip_m for p in presses)
+    if of_this < OF_A_TIP:
+        return f"{OF_A_TIP - of_this} more presses of this tip at least"
     pressed = {(1 if p.look.x > 0 else -1, 1 if p.look.y > 0 else -1) for p in presses}
     if left := [name for quarter, name in QUARTERS.items() if quarter not in pressed]:
         return f"presses in the {', '.join(left)} quarter"

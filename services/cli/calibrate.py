@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 PLAN = ((0, 0, 1), (0, 0, 3), (0, 0, 5), (1, 1, 2), (-1, 1, 4), (-1, -1, 2), (1, -1, 4))
 """Where to press (halves of the way to the edge), and about how firmly [N]; then again from the first, another tip."""
+MOST_TIP_MM = 1000.0  # as --tip: what is larger was no radius in millimetres
 
 
 class ForceUnlessNamed(typer.core.TyperGroup):
@@ -189,9 +191,18 @@ def _prompted(name: str, bundle: Any) -> list[Press]:
 def _tip(number: int) -> float | None:
     """Radius [m] of the tip that the next presses are made with; None where it is not said."""
     which = "the tip" if number == 0 else "another tip, of half or twice the size if there is one"
-    print(f"radius of {which} in millimetres (empty: not known)? ", end="", file=sys.stderr, flush=True)
-    try:
-        found = float(input().strip() or "nan")
-    except (EOFError, ValueError):
-        return None
-    return found * 1e-3 if 0 < found < 1e3 else None
+    while True:
+        print(f"radius of {which} in millimetres (empty: not known)? ", end="", file=sys.stderr, flush=True)
+        try:
+            text = input().strip()
+        except EOFError:
+            return None
+        if not text:
+            return None
+        try:
+            found = float(text)
+        except ValueError:
+            found = math.nan
+        if 0 < found <= MOST_TIP_MM:
+            return found * 1e-3
+        print(f"found {text!r}, expected millimetres above 0, {MOST_TIP_MM:g} at most, or nothing", file=sys.stderr)

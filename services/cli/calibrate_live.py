@@ -34,7 +34,7 @@ def pressed(name: str, laws: dict[Of, ForceLaw], before: Sequence[Press], tip: f
     except (CalibrationError, KeyboardInterrupt) as why:
         if len(before) + len(found) < FEWEST:
             raise
-        _tell(f"{why or 'ended'}; the law is that of the {len(found)} presses until then")
+        _tell(f"{why or 'ended'}; the law is that of the {len(before) + len(found)} presses until then")
     finally:
         presses.close()
     return found

@@ -33,6 +33,7 @@ from services.runtime.config import ConfigError, Skin
 NEWTONS_PER_SIEMENS = 10.0  # N per S/m, of a law that reads the peak: 0.1 to 0.5 S/m are 1 to 5 N
 MOST_N = calibration.MOST_N
 BACKGROUND = 1.0  # S/m, of the untouched sheet that the bundles' model has: no drop can be larger
+PIXELS = 96  # of an image's side, where nobody says
 FAR_BEYOND = 2.0  # times most_n: what nobody measured at half of it is no force any more
 UNITS: dict[Of, str] = {"pressure": "N of pressure over the patch", "peak": "S/m", "integral": "S/m m^2"}
 NAMES: dict[Of, str] = {"pressure": "pressure over the patch", "peak": "peak drop", "integral": "integrated drop"}
@@ -116,8 +117,8 @@ class ForceLaw:
                 )
             return cls(None, **surroundings)
         try:
-            own = _said(law)
-            return cls(*(own if skin.reads in (None, own[1]) else _said({"of": skin.reads})), **surroundings)
+            own = _of_manifest(law)
+            return cls(*(own if skin.reads in (None, own[1]) else _of_manifest({"of": skin.reads})), **surroundings)
         except (KeyError, TypeError, ValueError) as why:
             raise ConfigError(f"{bundle.path}/manifest.json: force_law cannot be used ({why!r})") from None
 
@@ -263,10 +264,7 @@ class ForceLaw:
         return Force(newton, sigma, found.pressure * grown, own)
 
 
-PIXELS = 96  # of an image's side, where nobody says
-
-
-def _said(law: dict[str, Any]) -> tuple[Curve, Of, float]:
+def _of_manifest(law: dict[str, Any]) -> tuple[Curve, Of, float]:
     """Curve, quantity and most newtons of what a manifest says. Raises KeyError, TypeError, ValueError."""
     most = float(law.get("most_n", MOST_N))
     reads = law.get("of", "peak" if "newtons_per_siemens" in law else "pressure")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,18 @@ def test_a_sigma_too_narrow_and_one_too_wide_both_fail_a_gate() -> None:
     assert not narrow["within one sigma, %"].passed and not narrow["within three sigma, %"].passed
     assert not goals(4.0, 0.03)["median sigma over the floor of one frame"].passed
     assert not goals(1.0, 0.1)["root mean square error from 1 N on, %"].passed
+
+
+def test_presses_that_nobody_saw_are_missed_goals_not_a_fault() -> None:
+    """Where noise hides them all."""
+    unseen = [replace(row, said=None, sigma=None, pressure=None, pressure_sigma=None) for row in rows(1.0, 0.03)]
+    nothing = {"ratio": None, "error": None, "sigma": None, "floor": 0.01, "saturated": False}
+    found = {goal.figure.removeprefix("full: "): goal for goal in force.goals("full", unseen, [nothing])}
+    assert found["presses shown, %"].value == 0 and not found["presses shown, %"].passed
+    assert {goal.value for name, goal in found.items() if name != "presses shown, %"} == {None}
+    half = [row if row.radius_mm < 12 else gone for row, gone in zip(rows(1.0, 0.03), unseen, strict=True)]
+    far = next(goal for goal in force.goals("full", half, [nothing]) if "furthest from 1" in goal.figure)
+    assert far.value is None and not far.passed
 
 
 def test_a_press_is_scored_by_the_nearest_contact_of_a_valid_frame() -> None:

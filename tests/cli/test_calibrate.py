@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from models.forward import shared
 from models.shapes import Shape
+from services.calibration.live import LivePresses
 
 PLACES = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.5)]
 LAW = 14.0  # N per S/m: this foam is stiffer than its kind's 10
@@ -75,3 +77,21 @@ def test_what_is_wrong_with_the_presses_is_one_line(skin, workplace) -> None:  #
     assert ran.code == 2 and "2 presses: at least 5 are needed" in ran.err
     assert skin("calibrate", "force", "--measurements", workplace / "presses.npz").code == 2
     assert not (workplace / "palm.json").exists()
+
+
+def test_a_radius_that_is_no_number_is_asked_for_again(skin, workplace, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """It must not pass for "not known": the law would then not be told apart by size."""
+    monkeypatch.setattr("sys.stdin", io.StringIO("5mm\n-3\n5\n"))
+    ran = skin("calibrate", "force", "--out", workplace / "palm.json")
+    for text in ("5mm", "-3"):
+        assert f"found '{text}', expected millimetres above 0" in ran.err
+    assert ran.err.count("radius of the tip in millimetres") == 3 and ran.code == 2
+
+
+def test_a_law_of_kept_presses_says_of_how_many(skin, workplace, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """Nobody presses any more, and nothing runs: the law is that of the file."""
+    kept = workplace / "kept.csv"
+    assert calibrated(skin, workplace, "--save", kept).code == 0
+    monkeypatch.setattr(LivePresses.__init__, "__defaults__", (None, 0.2))  # s of patience
+    ran = skin("calibrate", "--live", "--csv", kept, "--out", workplace / "b.json")
+    assert ran.code == 0 and "no image came" in ran.err and "the law is that of the 12 presses until then" in ran.err

@@ -193,6 +193,15 @@ def test_the_smallest_force_that_is_shown_is_shown():
     assert 2 < louder.shown_n / found.shown_n < 4
 
 
+@pytest.mark.parametrize(
+    "more", (["--known-radius"], ["--radius", "0.01"], ["--rank"], ["--pattern", "adjacent"], ["--map", "map.png"])
+)
+def test_the_smallest_forces_take_no_option_that_they_would_not_heed(capsys, more):
+    with pytest.raises(SystemExit) as ended:
+        limits.main(["--forces", *more])
+    assert ended.value.code == 2 and f"found --forces and {more[0]}" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_command_line_of_the_smallest_forces(capsys):
     assert limits.main(["--forces", "--skin", "hexagon6"]) == 2

@@ -78,4 +78,3 @@ def test_a_foam_that_is_none_is_refused() -> None:
     for slope, knee in ((0.0, 0.5), (float("nan"), 0.5), (1e-5, 0.0), (1e-5, 1.0)):
         with pytest.raises(ValueError, match="slope above 0"):
             Foam(slope, knee)
-    assert Foam.from_dict(Foam(1e-5, 0.3).to_dict()) == Foam(1e-5, 0.3)

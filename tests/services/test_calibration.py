@@ -17,6 +17,7 @@ from protocol.frames import ImageFrame
 from services.calibration import presses_csv as calibration_csv
 from services.calibration.force_fit import CalibrationError, Press, fit, unknown
 from services.calibration.force_presses import laws, wait_for_press, wait_for_release
+from services.calibration.live import missing
 from services.contacts import calibration_file as calibration
 from services.contacts.force import ForceLaw, Look
 from services.contacts.force_curve import Curve
@@ -272,3 +273,19 @@ def test_presses_of_two_tips_choose_pressure_and_one_says_what_it_cannot_know(sk
     nobody = fit([of_foam(10.0, f, 1.4, False) for f in forces], laws(skin, bundle))
     assert "nobody said what pressed" in unknown(nobody, skin)
     assert unknown(one, skin.model_copy(update={"indenter": Indenter(radius_m=0.01)})) == ""
+
+
+def test_a_second_tip_is_pressed_too_before_it_is_enough(skin: Skin, bundle: Bundle) -> None:
+    """The presses of the first tip are many; one of the second tells little of it."""
+
+    def all_over(mm: float, count: int) -> list[Press]:
+        made = (of_foam(mm, f, 1.0, True) for f in np.linspace(0.5, 3.0, count))
+        corners = ((0.01, 0.01), (-0.01, 0.01), (-0.01, -0.01), (0.01, -0.01))
+        return [replace(p, look=replace(p.look, x=x, y=y)) for p, (x, y) in zip(made, corners * count, strict=False)]
+
+    first = all_over(7.0, 20)
+    assert missing(first, fit(first, laws(skin, bundle))) == ""
+    second = all_over(14.0, 10)
+    one, every = first + second[:1], first + second
+    assert missing(one, fit(one, laws(skin, bundle))) == "9 more presses of this tip at least"
+    assert "of this tip" not in missing(every, fit(every, laws(skin, bundle)))

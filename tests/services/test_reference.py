@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq
 
-from protocol.frames import ReferenceFrame
+from protocol.frames import ImageFrame, ReferenceFrame, pack
 from protocol.runtime import host_id
+from services.calibration.force_fit import CalibrationError
+from services.calibration.live import LivePresses
 from services.calibration.reference import MOST_GAP_S, Doubtful, PressCourse, ReferenceForce
 
 BEGAN, ENDED, STEADY = 2.0, 6.0, (3.5, 5.0)
@@ -115,3 +120,35 @@ def test_what_cannot_be_used_is_said_and_is_no_reading(reference: ReferenceForce
     other = ReferenceFrame(**{**good, "session": "f" * 16, "stamps": {"sample": int((now + 6) * 1e9)}})
     reference.take(other, now + 6)
     assert "two programs publish reference/palm" in reference.trouble(now + 6)
+
+
+def test_messages_that_cannot_be_read_are_told_once_and_not_for_ever(runtime: Path) -> None:
+    """Unreadable ones for a second and a half, then none: each trouble is a line, and the newest is the one told."""
+    context, told = zmq.Context(), []
+    images, scale = context.socket(zmq.PUB), context.socket(zmq.PUB)
+    images.bind(f"ipc://{runtime}/inference.ipc")
+    scale.bind(f"ipc://{runtime}/reference.ipc")
+    done = threading.Event()
+
+    def publish() -> None:
+        began, seq = time.monotonic(), 0
+        while not done.wait(0.02):
+            seq += 1
+            images.send(pack(ImageFrame(skin="palm", host=host_id(), seq=seq, valid=True)))
+            if time.monotonic() - began < 1.5:
+                scale.send(b"reference/palm\0\xff\xff")
+
+    presses = LivePresses("palm", told.append, patience_s=4.0)
+    publisher = threading.Thread(target=publish)
+    publisher.start()
+    try:
+        with pytest.raises(CalibrationError, match="no message of reference/palm has come"):
+            next(iter(presses))
+    finally:
+        done.set()
+        publisher.join()
+        presses.close()
+        context.destroy(linger=0)
+    unread = [line for line in told if "cannot be read" in line or "could not be read" in line]
+    assert len(unread) == 1 and "expected a msgpack map" in unread[0], told
+    assert "no message of reference/palm has come" in told[-1]
