@@ -171,7 +171,8 @@ class Publishing(Stage):
         told = frame.held or (began is not None and bool(self._segments)) or self._alone(frame)
         if out.valid and frame.touched and changed and not told:
             add_reason(out.reasons, "changing")
-        told_of = self._replaced or bool(self._contacts) or self.tracker.remembers
+        # Where a frame in between said that nothing touches, nothing is replaced.
+        told_of = self._replaced or (self._touched and (bool(self._contacts) or self.tracker.remembers))
         self._replaced = told_of and self.tracker.waits and not self._segments
         if out.valid and began is None and self._hides(frame, whole):
             out.valid = False
