@@ -32,7 +32,7 @@ def measurement_s(points: int) -> float:
 
 
 @dataclass(frozen=True)
-class Scan:
+class MeasuredScan:
     """A scan, or a part of one, that was measured, whether or not it reached the host. Times in seconds since the stub
     started.
     """
@@ -62,7 +62,7 @@ class Board:
         unique_id: bytes = b"eitskin-stub",
         answers_time: bool = True,
         knows_parts: bool = True,
-        on_scan: Callable[[Scan], None] | None = None,
+        on_scan: Callable[[MeasuredScan], None] | None = None,
     ) -> None:
         self.field, self.analog, self.faults = field, analog, faults
         self.electrodes, self.speed, self.crystal_ppm, self.unique_id = electrodes, speed, crystal_ppm, unique_id
@@ -252,7 +252,7 @@ class Board:
         self._notice(start, end)
         self._send(seq, start, end, config, part, z, status)
         if self.on_scan is not None:
-            self.on_scan(Scan(seq, start, end))
+            self.on_scan(MeasuredScan(seq, start, end))
 
     def _send(
         self,

@@ -18,7 +18,7 @@ import numpy as np
 
 from . import scene as scenes
 from .analog import Analog, BoardNoise
-from .board import Board, Scan, measurement_s
+from .board import Board, MeasuredScan, measurement_s
 from .faults import FAULTS, Faults, messages_of
 from .field import Field
 from .port import BAUD, Line
@@ -69,7 +69,7 @@ class Rig:
         self.faults = Faults()
         timeline = self.timeline(script, 0.0)
         self.field = Field(self.sheet.transfer, timeline, threaded=threaded)
-        self.scans: deque[tuple[Scan, World, float]] = deque(maxlen=64)
+        self.scans: deque[tuple[MeasuredScan, World, float]] = deque(maxlen=64)
         self.line = Line(baud)
         self._rng = np.random.default_rng(seed)
         self._realtime = threaded
@@ -239,7 +239,7 @@ class Rig:
         kept_s = FELT_S if self.nature is None else REMEMBERED_S
         return tuple(p for p in cut if p is not None and p.times[-1] > now - kept_s)
 
-    def _scanned(self, scan: Scan) -> None:
+    def _scanned(self, scan: MeasuredScan) -> None:
         """Note what the scan felt: the world at its middle."""
         middle = (scan.start + scan.end) / 2
         self.scans.append((scan, self.field.at(middle), middle))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from protocol.frames import TrueTouch, TruthFrame
 
-from .board import Scan
+from .board import MeasuredScan
 from .sheet import Sheet
 from .world import Touch, World
 
 
-def truth_frame(skin: str, sheet: Sheet, scan: Scan, world: World, stamps: dict[str, int]) -> TruthFrame:
+def truth_frame(skin: str, sheet: Sheet, scan: MeasuredScan, world: World, stamps: dict[str, int]) -> TruthFrame:
     """The truth at the middle of a scan. stamps [ns] on the host's monotonic clock, where both are exact: `sample`, and
     `publish`, when the scan's last byte had left the board.
     """

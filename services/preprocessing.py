@@ -18,7 +18,7 @@ from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame, Frame, RawFrame, as_sent
 from services.estimation.baseline import believed
 from services.estimation.contact_drift import Reference
-from services.estimation.electrodes import Verdict
+from services.estimation.electrodes import ElectrodeVerdict
 from services.estimation.plausibility import impossible
 from services.estimation.status_bits import reasons_of
 from services.estimation.touch_decision import TouchDecision, sigma_of_mean
@@ -110,7 +110,9 @@ class Preprocessing(EstimatorStage):
             self.frame_averager.reset()  # a mean of the same scan again and again is no surer
         return self._compare(out, amplitude - found.shift, found, trusted, separate)
 
-    def _compare(self, out: DeltaFrame, amplitude: Array, found: Verdict, trusted: bool, separate: bool) -> DeltaFrame:
+    def _compare(
+        self, out: DeltaFrame, amplitude: Array, found: ElectrodeVerdict, trusted: bool, separate: bool
+    ) -> DeltaFrame:
         """Difference, decision, and the stack where one is needed."""
         measured = np.isfinite(self.baseline_estimator.sigma)
         live = found.live & measured & np.isfinite(amplitude)

@@ -40,6 +40,7 @@ SERVICES_USE_OF_MODELS = {
     "models.files",
     "models.locator",
     "models.locator_arrays",
+    "models.measurement",
     "models.npz",
     "models.prereconstruction",
     "models.patterns",
@@ -275,6 +276,28 @@ def test_estimation_imports_numerics_only() -> None:
         outside = {n.split(".")[0] for n in imports(path)} - FOLDERS - set(sys.stdlib_module_names) - {""}
         assert outside <= {"numpy", "scipy"}, f"{relative} imports {sorted(outside)}"
         assert not outside_world(path), f"{relative} imports {sorted(outside_world(path))}"
+
+
+NEW_HOUSE = ("filter", "touches", "hypotheses", "estimator")
+"""Rooms of the new estimator, each of which stands on those before it, on values and on models/measurement."""
+
+
+def test_the_new_estimator_stands_in_its_order() -> None:
+    graph = module_graph(ROOT, ("models", "services", "bench"))
+    rooms = [f"services.estimation.{name}" for name in NEW_HOUSE]
+    for place, room in enumerate(rooms):
+        assert not graph[room] & set(rooms[place + 1 :]), room
+    for name in (name for name in graph if name.startswith("services.estimation.values")):
+        ours = {other for other in graph[name] if other.startswith("services")}
+        assert all(other.startswith("services.estimation.values") for other in ours), name
+    asks = {name for name, others in graph.items() if rooms[-1] in others}
+    assert asks == {"bench.trust.anew"}
+
+
+def test_the_measurement_model_reads_no_file_but_through_the_bundle() -> None:
+    for path in sources("models/measurement"):
+        outside = {n.split(".")[0] for n in imports(path)} - set(sys.stdlib_module_names) - FOLDERS - {""}
+        assert outside <= {"numpy", "scipy"} and not outside_world(path), path
 
 
 def outside_world(path: pathlib.Path) -> set[str]:

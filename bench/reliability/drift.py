@@ -21,7 +21,7 @@ from typing import Any
 
 from bench import REPORTS
 from bench.reliability import drift_report, drifted, gain_steps, report, starts, workers
-from bench.reliability.drifted import CHANGES, Change, TouchEstimate
+from bench.reliability.drifted import CHANGES, Change, TouchAnswer
 from bench.reliability.scenes import grid, touches_at_random
 from bench.speed.service import end_on_sigterm
 from firmware_stub.world import Touch
@@ -100,7 +100,7 @@ def run_gains(setting: DriftSetting) -> dict[str, gain_steps.GainStepScore]:
 RowTask = tuple[str, Change, float, bool, int, int]
 
 
-def _rows(task: RowTask) -> tuple[Change, bool, list[TouchEstimate], int]:
+def _rows(task: RowTask) -> tuple[Change, bool, list[TouchAnswer], int]:
     bundle, change, radius, indenter, per_side, seed = task
     answers, alarms = drifted.rows_alone(
         workers.sheet(), Bundle.load(bundle), change, grid(per_side), seed, radius, indenter
@@ -116,7 +116,7 @@ def run_rows(setting: DriftSetting) -> dict[str, dict[str, Any]]:
         for radius in drifted.RADII
         for indenter in (False, True)
     ]
-    answers: dict[tuple[str, bool], list[TouchEstimate]] = {}
+    answers: dict[tuple[str, bool], list[TouchAnswer]] = {}
     alarms: dict[tuple[str, bool], int] = {}
     for change, indenter, some, false in workers.spread(_rows, tasks, setting.cores, "rows alone"):
         key = change.name, indenter
@@ -134,7 +134,7 @@ def run_rows(setting: DriftSetting) -> dict[str, dict[str, Any]]:
 HistoryTask = tuple[str, Change, Touch, int]
 
 
-def _history(task: HistoryTask) -> tuple[Change, TouchEstimate, int]:
+def _history(task: HistoryTask) -> tuple[Change, TouchAnswer, int]:
     bundle, change, touch, seed = task
     answer, alarms = drifted.with_history(workers.sheet(), workers.pipeline(bundle), change, touch, seed)
     return change, answer, alarms
@@ -145,7 +145,7 @@ def run_history(setting: DriftSetting) -> dict[str, dict[str, Any]]:
     tasks: list[HistoryTask] = [
         (setting.bundle, change, touch, setting.seed + k) for k, touch in enumerate(touches) for change in CHANGES
     ]
-    answers: dict[str, list[TouchEstimate]] = {}
+    answers: dict[str, list[TouchAnswer]] = {}
     alarms: dict[str, int] = {}
     for change, answer, false in workers.spread(_history, tasks, setting.cores, "drift with history"):
         answers.setdefault(change.name, []).append(answer)

@@ -69,7 +69,7 @@ CHANGES = (
 
 
 @dataclass(frozen=True)
-class TouchEstimate:
+class TouchAnswer:
     """What was said of one touch; of a valid frame or row. error: relative, of the force; -1 where it has none."""
 
     newtons: float
@@ -80,13 +80,13 @@ class TouchEstimate:
     extra: int  # contacts further than FAR_M
 
 
-def answer_of(touch: Touch, valid: bool, contacts: Sequence[tuple[float, float, float]]) -> TouchEstimate:
+def answer_of(touch: Touch, valid: bool, contacts: Sequence[tuple[float, float, float]]) -> TouchAnswer:
     """contacts: x, y [m], force [N] of each; none of them counts where the row is not valid."""
     off = [math.hypot(x - touch.x, y - touch.y) for x, y, _ in contacts] if valid else []
     nearest = int(np.argmin(off)) if off else -1
     newtons, near = touch.force_n, nearest >= 0 and off[nearest] <= FAR_M
     error = contacts[nearest][2] / newtons - 1 if near and math.isfinite(contacts[nearest][2]) else -1.0
-    return TouchEstimate(
+    return TouchAnswer(
         newtons,
         touch.radius / METRES,
         valid,
@@ -104,7 +104,7 @@ def rows_alone(
     seed: int,
     radius: float,
     indenter: bool,
-) -> tuple[list[TouchEstimate], int]:
+) -> tuple[list[TouchAnswer], int]:
     """Answers to touches of this radius, and how many untouched rows had a valid contact."""
     rng = np.random.default_rng([seed, 21])
     touches = [circle(*place, _newtons(drop, radius), radius) for place in places for drop in DROPS]
@@ -133,7 +133,7 @@ def rows_alone(
 
 def with_history(
     sheet: SolvedSheet, pipeline: Pipeline, change: Change, touch: Touch, seed: int
-) -> tuple[TouchEstimate, int]:
+) -> tuple[TouchAnswer, int]:
     """The answer of the touch's last frame, and how many valid frames before it had a contact."""
     electrodes = np.random.default_rng([seed, 22]).permutation(16).tolist()
     skin = DirectSkin(sheet, pipeline, seed)
@@ -150,7 +150,7 @@ def with_history(
     return answer_of(touch, last.valid, seen), sum(m.valid and bool(m.contacts) for m in moments)
 
 
-def row(answers: Sequence[TouchEstimate], alarms: int, floor_percent: float | None = None) -> dict[str, Any]:
+def row(answers: Sequence[TouchAnswer], alarms: int, floor_percent: float | None = None) -> dict[str, Any]:
     """Figures of a change. floor_percent: of the peak drop, root mean square over the same touches."""
     error = 100 * np.abs([a.error for a in answers])
     middle = [e for e, a in zip(error, answers, strict=True) if a.radius > 0.15]

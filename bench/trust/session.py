@@ -13,7 +13,7 @@ from bench.trust.judge import Judge
 from bench.trust.scene import APART_M, SceneDrawer, TrustScene
 from bench.trust.score import TrustScore
 from bench.trust.truth import SceneTruth
-from firmware_stub.board import Scan
+from firmware_stub.board import MeasuredScan
 from firmware_stub.rig import Rig
 from firmware_stub.sheet import Sheet
 from firmware_stub.truth import truth_frame
@@ -58,7 +58,7 @@ class PlayedSession:
                 packed = pack(raw)
                 self._keep("raw/palm", packed)
                 stamps = {"sample": round(felt.middle * 1e9), "publish": raw.stamps["read"]}
-                scan = Scan(raw.scan, felt.start, felt.middle)
+                scan = MeasuredScan(raw.scan, felt.start, felt.middle)
                 self._keep("truth/palm", pack(truth_frame("palm", self.sheet, scan, felt.world, stamps)))
                 yield raw
 

@@ -4,4 +4,8 @@
 
 Pure numerics: arrays in, arrays out; no configuration, no files, no sockets. The numbers of drift, touches, start and
 evidence for faults are in tuning.py; what one check alone uses stands at the top of its file.
+
+An estimator that is to take over stands beside it: estimator.py (the way of one scan), filter.py, touches.py,
+hypotheses.py, learning.py, quick_look.py, values/, first/, faults/, and models/measurement. No stage calls it;
+`skin bench shadow --candidate bench.trust.anew:Anew` holds it against this one (docs/reliability.md).
 """

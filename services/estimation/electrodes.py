@@ -35,7 +35,7 @@ WELL_AGAIN = 0.0005  # the same, where the contact drifted: it passes by its old
 
 
 @dataclass
-class Verdict:
+class ElectrodeVerdict:
     """The verdict on one frame, its measurements in `order`. live (K,): counts; failed (K,): no value for a baseline
     either; states (E,): ELECTRODE_STATES.
     """
@@ -61,7 +61,9 @@ class ElectrodeHealth:
         self._evidence: ContactEvidence | None = None  # made when it is first asked
         self._coverage: Coverage | None = None
         k, n = len(bundle.pattern), self.electrodes
-        self._all_well = Verdict(np.ones(k, bool), np.zeros(k, bool), np.zeros(n, "u1"), [], True, None, np.zeros(k))
+        self._all_well = ElectrodeVerdict(
+            np.ones(k, bool), np.zeros(k, bool), np.zeros(n, "u1"), [], True, None, np.zeros(k)
+        )
         for array in (v for v in vars(self._all_well).values() if isinstance(v, np.ndarray)):
             array.setflags(write=False)  # it is given out again and again
         self.reset()
@@ -96,14 +98,14 @@ class ElectrodeHealth:
 
     def __call__(
         self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None, now_s: float = 0.0
-    ) -> Verdict:
+    ) -> ElectrodeVerdict:
         """Judges a frame: (K,) |Z| and status bits. now_s: when it was measured; 0 where nobody says."""
         self._now_s = now_s
         found = self._judge(amplitude, status, untouched)
         self._contacts.follow(amplitude if found.order is None else amplitude[found.order], now_s)
         return found
 
-    def _judge(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> Verdict:
+    def _judge(self, amplitude: Array, status: NDArray[np.uint8], untouched: Reference | None) -> ElectrodeVerdict:
         if untouched is not None and self._unchanged(amplitude, status, untouched):
             return self._all_well
         seen = self.check(amplitude, status, untouched)
@@ -135,7 +137,9 @@ class ElectrodeHealth:
             reasons.append("degraded")
         if not usable and not reasons and not reasons_of(status):
             reasons.append("out_of_distribution")
-        return Verdict(live, seen.failed | wrong, states, reasons, usable, seen.order, self._shift(seen, untouched))
+        return ElectrodeVerdict(
+            live, seen.failed | wrong, states, reasons, usable, seen.order, self._shift(seen, untouched)
+        )
 
     def _sees_enough(self, seen: FrameFindings, live: Mask, all_of: Mask, untouched: Reference | None) -> bool:
         """Returns whether measurements that only this frame lacks leave enough of the skin in sight."""

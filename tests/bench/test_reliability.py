@@ -27,7 +27,7 @@ from bench.reliability import (
     starts,
     workers,
 )
-from bench.reliability.drifted import CHANGES, TouchEstimate
+from bench.reliability.drifted import CHANGES, TouchAnswer
 from bench.reliability.matrix import CONTACT_RISES, ROWS, SITUATIONS, FaultScore
 from bench.reliability.random_scene import RandomScene, TimedPress, random_scene
 from bench.reliability.session import Moment, PointForce
@@ -166,7 +166,7 @@ def test_an_answer_counts_only_where_it_is_valid_and_near():
     touch = scenes.circle(0.0, 0.0, 2.0, 0.2)
     found = drifted.answer_of(touch, True, [(0.001, 0.0, 2.2), (0.03, 0.0, 1.0)])
     assert found.found and found.extra == 1 and found.error == pytest.approx(0.1)
-    assert drifted.answer_of(touch, False, [(0.001, 0.0, 2.2)]) == TouchEstimate(
+    assert drifted.answer_of(touch, False, [(0.001, 0.0, 2.2)]) == TouchAnswer(
         2.0, pytest.approx(0.2), False, False, -1.0, 0
     )
     roughly = drifted.answer_of(touch, True, [(0.01, 0.0, 2.0)])
@@ -205,7 +205,7 @@ def test_every_gate_is_a_goals():
     assert set(faults_report.GATES) <= {key for key, _ in [*keyed, *faults_report._of_soak(found["soak"])]}
     assert len(faults_report.goals(found, True)) == 4 + 2 + 2 * 3 + 4
     faults_report.show(found)
-    answer = drifted.row([TouchEstimate(1.0, 0.2, True, True, 0.1, 0)], 0, 5.0) | {"known_force_%": 1.0}
+    answer = drifted.row([TouchAnswer(1.0, 0.2, True, True, 0.1, 0)], 0, 5.0) | {"known_force_%": 1.0}
     of_drift = {
         "starts": {state: starts.StartScore(starts=1).row() for state in starts.STATES},
         "gains": {situation: gain_steps.GainStepScore(steps=1).row() for situation in gain_steps.SITUATIONS},
@@ -219,7 +219,7 @@ def test_every_gate_is_a_goals():
 
 
 def test_what_was_not_found_at_all_misses_its_target():
-    answers = [TouchEstimate(1.0, 0.2, False, False, -1.0, 0)]
+    answers = [TouchAnswer(1.0, 0.2, False, False, -1.0, 0)]
     rows = {change.name: drifted.row(answers, 0, 5.0) | {"known_force_%": 100.0} for change in CHANGES}
     goals = {goal.figure: goal for goal in drift_report.goals({"rows": rows}, quick=False)}
     assert goals["force error, rms, all radii, times the floor"].met is False

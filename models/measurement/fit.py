@@ -1,0 +1,249 @@
+"""TouchTracks fitted to one scan by Gauss-Newton in the whitened space of everything that is no touch.
+
+    y = log(1 + m(states) + D shapes + K kinks) + e,        e ~ N(0, S + (misfit |m|)^2 M)
+
+Shapes and kinks are linear with Gaussian priors, so they are marginalised by being solved for. Evidence is Laplace's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.course import TouchColumns, TouchCourse
+from models.measurement.numbers import (
+    DAMPING,
+    DONE,
+    DONE_SHARE,
+    LEAST_ACTION,
+    LEAST_STEP,
+    MISFIT,
+    STEP_LOG,
+    STEP_SHARE,
+    TURNS,
+    TURNS_LOG,
+)
+from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, SHAPES, STATES, TouchPrior, X, Y, within_limits
+from models.measurement.whitening import Whitening
+
+Array = NDArray[np.float64]
+
+LEAST_MEAN = -0.9  # relative change: nothing takes all of an impedance away
+SIZE_CHANGED = (0.4, 2.5)  # of the squared change, beyond which its misfit is taken anew
+MOST_DAMPING = 1e4
+
+
+@dataclass(frozen=True)
+class FittedScan:
+    """One scan as a fit sees it."""
+
+    y: Array  # (K,) log of |Z| over what is predicted without touches; 0 where it does not count
+    covariance: Array  # (K, K) of y but for touches
+    course: TouchCourse
+    misfit: Array  # (K, K) of trace 1
+    live: int  # measurements that count
+
+
+@dataclass(frozen=True)
+class FoundTouches:
+    """Posterior of T touches."""
+
+    priors: tuple[TouchPrior, ...]
+    states: Array  # (T, 7)
+    covariance: Array  # (7 T, 7 T) shapes and kinks marginalised
+    shapes: Array  # (T, 9)
+    shape_variance: Array  # (T, 9)
+    chi2: float  # squared whitened residual a measurement
+    evidence: float  # log
+    white: Whitening
+    pulled: Array  # (K,) S^-1 of the residual
+    left: Array  # (K,) residual
+    design: Array  # (K, N) whitened slopes of all that was solved for
+    solved: Array  # (N, N) its posterior covariance
+    size: float  # |m|
+    steps: int
+
+    def __len__(self) -> int:
+        return len(self.priors)
+
+    def information(self, response: Array) -> float:
+        """Of a further touch of this response (K,), touches fitted: 1 / variance of its strength."""
+        column = self.white(response)
+        along = self.design.T @ column
+        whole = float(column @ column)
+        return max(whole - float(along @ self.solved @ along), 0.02 * whole)
+
+
+@dataclass
+class _Point:
+    """One linearisation."""
+
+    states: Array
+    rest: Array  # shapes and kinks
+    columns: TouchColumns
+    left: Array  # (K,) residual
+    residual: Array  # whitened
+    design: Array  # whitened
+    objective: float
+
+
+class TouchFitter:
+    def __init__(self, scene: FittedScan, priors: Sequence[TouchPrior], misfit: float = MISFIT) -> None:
+        self._scene, self._priors, self._misfit = scene, tuple(priors), misfit
+        self._count = len(self._priors)
+        self._mean = np.concatenate([prior.mean for prior in self._priors])
+        self._precision = np.concatenate([prior.sd for prior in self._priors]) ** -2.0
+        self._shape_mean = np.concatenate([prior.shape for prior in self._priors])
+        self._shape_precision = np.concatenate([prior.shape_sd for prior in self._priors]) ** -2.0
+        self.steps = 0
+
+    def fit(self, most_steps: int) -> FoundTouches:
+        """Raises ValueError where a covariance is none."""
+        states = within_limits(np.stack([prior.start for prior in self._priors]))
+        self._turn(states)
+        columns = self._columns(states)
+        self._whiten(columns)
+        states, columns = self._first_actions(states, columns)
+        rest = np.concatenate([self._shape_mean, np.zeros(self._kinks.shape[1])])
+        point = self._descend(self._point(states, rest, columns), most_steps)
+        grown = self._size2(point.columns) / self._size2_whitened
+        changed, moved = not SIZE_CHANGED[0] < grown < SIZE_CHANGED[1], self._moved(point.states)
+        if moved:
+            self._turn(point.states)
+        if changed:
+            self._whiten(point.columns)
+        if moved or changed:
+            point = self._descend(self._point(point.states, point.rest, self._columns(point.states)), most_steps)
+        return self._posterior(point)
+
+    def _columns(self, states: Array) -> TouchColumns:
+        return self._scene.course.columns(states, self._priors, self._directions)
+
+    def _turn(self, states: Array) -> None:
+        """Take the touches' own directions anew, and how their courses may bend."""
+        self._turned_at = states
+        course = self._scene.course
+        self._directions = course.directions(states)
+        self._kinks = course.kinks(states, self._priors)
+
+    def _moved(self, states: Array) -> bool:
+        """Whether their directions are others by now."""
+        away = np.abs(states - self._turned_at)
+        turned = (away[:, PLACE] > TURNS).any() or (away[:, LOG_RADIUS] > TURNS_LOG).any()
+        bends = self._scene.course.bends(states) != self._scene.course.bends(self._turned_at)
+        return bool(turned or bends)
+
+    def _descend(self, point: _Point, most_steps: int) -> _Point:
+        """Levenberg and Marquardt's steps until they gain nothing."""
+        damping = float(DAMPING)
+        for _ in range(most_steps):
+            self.steps += 1
+            tried = self._stepped(point, damping)
+            gained = point.objective - tried.objective
+            if gained > 0:
+                point, damping = tried, max(damping / 10, 1e-5)
+            else:
+                damping = max(damping * 20, 1e-2)
+            if abs(gained) < max(DONE, DONE_SHARE * point.objective) or damping > MOST_DAMPING:
+                break
+        return point
+
+    def _whiten(self, columns: TouchColumns) -> None:
+        self._size2_whitened = max(self._size2(columns), 1e-12)
+        wrong = self._misfit**2 * self._size2_whitened
+        self._white = Whitening.of(self._scene.covariance + wrong * self._scene.misfit)
+
+    def _size2(self, columns: TouchColumns) -> float:
+        return float(columns.mean @ columns.mean)
+
+    def _first_actions(self, states: Array, columns: TouchColumns) -> tuple[Array, TouchColumns]:
+        """TouchTracks whose action nobody knows yet begin with the likeliest."""
+        unknown = [n for n in range(self._count) if states[n, ACTION] == 0]
+        if not unknown:
+            return states, columns
+        states = states.copy()
+        states[unknown, ACTION] = LEAST_ACTION
+        columns = self._columns(states)
+        at = [STATES * n + ACTION for n in unknown]
+        response = self._white(columns.slopes[:, at])
+        known = columns.mean - columns.slopes[:, at].sum(axis=1) * LEAST_ACTION
+        seen = self._white(np.expm1(self._scene.y) - known)
+        found = np.linalg.lstsq(response, seen, rcond=None)[0]
+        states[unknown, ACTION] = np.maximum(found, LEAST_ACTION)
+        columns = self._columns(states)
+        self._whiten(columns)
+        return states, columns
+
+    def _point(self, states: Array, rest: Array, columns: TouchColumns) -> _Point:
+        linear = np.hstack([columns.shapes, self._kinks])
+        if linear.shape[1] != len(rest):  # kinks were taken anew
+            kept = rest[: columns.shapes.shape[1]]
+            rest = np.concatenate([kept, np.zeros(self._kinks.shape[1])])
+        change = np.maximum(columns.mean + linear @ rest, LEAST_MEAN)
+        live = self._scene.y != 0
+        share = np.where(live, 1 / (1 + change), 0.0)
+        left = np.where(live, self._scene.y - np.log1p(change), 0.0)
+        whitened = self._white(np.column_stack([left, np.hstack([columns.slopes, linear]) * share[:, None]]))
+        residual, design = whitened[:, 0], whitened[:, 1:]
+        off, precision = self._off(states, rest), self._precisions(len(rest))
+        return _Point(states, rest, columns, left, residual, design, float(residual @ residual + precision @ off**2))
+
+    def _precisions(self, rest: int) -> Array:
+        kinks = np.ones(rest - len(self._shape_precision))
+        return np.concatenate([self._precision, self._shape_precision, kinks])
+
+    def _off(self, states: Array, rest: Array) -> Array:
+        """From the priors' means."""
+        off = np.concatenate([states.ravel() - self._mean, rest])
+        off[self._mean.size : self._mean.size + self._shape_mean.size] -= self._shape_mean
+        return off
+
+    def _stepped(self, point: _Point, damping: float) -> _Point:
+        precision = self._precisions(len(point.rest))
+        normal = point.design.T @ point.design
+        slope = point.design.T @ point.residual - precision * self._off(point.states, point.rest)
+        diagonal = np.diag_indices_from(normal)
+        normal[diagonal] = normal[diagonal] * (1 + damping) + precision
+        step: Array = np.asarray(np.linalg.solve(normal, slope), float)
+        self._limit(point.states, step)
+        n = STATES * self._count
+        states = within_limits(point.states + step[:n].reshape(-1, STATES))
+        columns = self._columns(states)
+        return self._point(states, point.rest + step[n:], columns)
+
+    def _limit(self, states: Array, step: Array) -> None:
+        """Shorten each touch's step so that its disc stays near where it was."""
+        for n, state in enumerate(states):
+            own = step[STATES * n : STATES * (n + 1)]
+            way, most = float(np.hypot(own[X], own[Y])), max(STEP_SHARE * float(np.exp(state[LOG_RADIUS])), LEAST_STEP)
+            own *= min(1.0, most / max(way, 1e-9), STEP_LOG / max(abs(own[LOG_RADIUS]), 1e-9))
+
+    def _posterior(self, point: _Point) -> FoundTouches:
+        precision = self._precisions(len(point.rest))
+        normal = point.design.T @ point.design
+        normal[np.diag_indices_from(normal)] += precision
+        solved: Array = np.asarray(np.linalg.inv(normal), float)
+        _, log_det = np.linalg.slogdet(normal)
+        occam = 0.5 * (log_det - float(np.log(precision).sum()))
+        n, shapes = STATES * self._count, SHAPES * self._count
+        slope = point.design.T @ point.residual - precision * self._off(point.states, point.rest)
+        residual = point.residual - point.design @ (solved @ slope)  # what the linear optimum would leave
+        return FoundTouches(
+            priors=self._priors,
+            states=point.states,
+            covariance=solved[:n, :n],
+            shapes=point.rest[:shapes].reshape(self._count, SHAPES),
+            shape_variance=np.diag(solved)[n : n + shapes].reshape(self._count, SHAPES),
+            chi2=float(point.residual @ point.residual) / max(self._scene.live, 1),
+            evidence=self._white.log_density - 0.5 * point.objective - occam,
+            white=self._white,
+            pulled=self._white.w.T @ residual,
+            left=point.left,
+            design=point.design,
+            solved=solved,
+            size=self._size2(point.columns) ** 0.5,
+            steps=self.steps,
+        )

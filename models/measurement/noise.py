@@ -1,0 +1,168 @@
+"""Noise of log |Z|: white, of each contact impedance, and what disturbs several measurements; learnt from what models
+leave.
+
+Of a contact impedance some noise is common to a scan (flicker), some is new with each measurement (jitter). A line that
+disturbs has any phase, so of a scan it is two fixed columns, whatever its frequency and however strongly each electrode
+picks it up: the strongest eigenvectors of the residuals' covariance, beyond what chance makes of white noise
+(V. Marchenko and L. Pastur, 1967). After each part of a scan the columns are others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.numbers import (
+    FLICKER_FLOOR,
+    JITTER_FLOOR,
+    LEARNING,
+    LEARNING_LINES,
+    LEARNING_WHITE,
+    LINE,
+    LINES,
+    OUTLIER,
+    RESPONSE_FLOOR,
+    WHITE,
+)
+from models.measurement.tables import SkinTables
+from models.measurement.whitening import Whitening
+
+Array = NDArray[np.float64]
+Order = NDArray[np.intp]
+
+BURST_BLOCK = 12  # measurements that share one strength of a disturbance that comes and goes
+MEDIAN_OF_SQUARES = 0.455  # of a standard normal variable
+ROUNDS = 10  # of learning from the frames of a tare
+STEADY_CONTACTS = 40  # measurements whose contacts are quiet enough to tell the white noise
+
+
+@dataclass
+class LineState:
+    """Of scans that end with one part."""
+
+    scatter: Array  # (K, K) mean square of residuals
+    columns: Array  # (K, n)
+    heard: int = 0  # scans
+
+
+@dataclass
+class NoiseState:
+    """All that changes. Variances are relative to |Z|, squared."""
+
+    white: float
+    flicker: Array  # (E,) of a contact impedance, common to a scan
+    jitter: Array  # (E,) of a contact impedance, new with each measurement
+    lines: dict[int, LineState] = field(default_factory=dict)  # by the part measured last, 0: whole scans
+
+
+class NoiseModel:
+    """Of one skin."""
+
+    def __init__(self, tables: SkinTables) -> None:
+        self._contact = tables.contact
+        self._squares = tables.contact**2
+        self._weight = np.maximum((self._squares**2).sum(axis=0), 1e-12)
+        e = tables.electrodes
+        self.now = NoiseState(float(WHITE**2), np.full(e, FLICKER_FLOOR**2), np.zeros(e))
+
+    def begin(self, residuals: Array, part: int) -> None:
+        """Learn from untouched frames (n, K) less their mean, all of which end with this part."""
+        steps = np.diff(residuals, axis=0)
+        self.now.white = max(float(np.median(steps**2)) / 2 / MEDIAN_OF_SQUARES, float(RESPONSE_FLOOR**2))
+        for n in range(ROUNDS):
+            white = Whitening.of(self.covariance(part))
+            pulled = white.solve(residuals.T).T  # (n, K) S^-1 e
+            self._follow_contacts(pulled, white, 1 / 2)
+            energy = float(np.median(pulled**2 / white.conditional_precisions())) / MEDIAN_OF_SQUARES
+            self.now.white *= min(max(energy, 0.5), 2.0)
+            if n >= ROUNDS // 2:
+                self._hear_anew(pulled, part)
+
+    def variances(self) -> Array:
+        """(K,) of what is independent from measurement to measurement."""
+        now = self.now
+        return np.asarray(now.white + RESPONSE_FLOOR**2 + self._squares @ now.jitter)
+
+    def disturbing(self, part: int) -> Array:
+        """(K, n) columns of the lines."""
+        known = self.now.lines.get(part)
+        return np.zeros((len(self._contact), 0)) if known is None else known.columns
+
+    def covariance(self, part: int) -> Array:
+        """(K, K) of a scan that ends with this part."""
+        columns = np.column_stack([self._contact * np.sqrt(self.now.flicker), self.disturbing(part)])
+        made: Array = columns @ columns.T
+        made[np.diag_indices_from(made)] += self.variances()
+        return made
+
+    def learn(self, pulled: Array, white: Whitening) -> None:
+        """Follow the noise of one untouched frame that was explained: pulled = S^-1 y (K,)."""
+        self._follow_contacts(pulled[None], white, LEARNING)
+        excess = self._excess(pulled, white.conditional_precisions())
+        steady = self._squares @ self.now.jitter < 0.2 * self.now.white
+        if steady.sum() >= STEADY_CONTACTS:
+            change = LEARNING_WHITE * float(excess[steady].mean())
+            self.now.white = float(np.clip(self.now.white + change, 0.8 * self.now.white, 1.25 * self.now.white))
+
+    def learn_contacts(self, pulled: Array, white: Whitening) -> None:
+        """Follow the contacts' noise alone, as far as a touch that is there leaves it to be seen."""
+        self._follow_contacts(pulled[None], white, LEARNING)
+
+    def hear(self, pulled: Array, part: int) -> None:
+        """Take note of what several measurements of a frame have in common beside drift and contacts: pulled (K,) is
+        S^-1 of its residual, so this is the likeliest white noise and disturbance.
+        """
+        k = len(pulled)
+        known = self.now.lines.setdefault(part, LineState(np.zeros((k, k)), np.zeros((k, 0))))
+        left = self.variances() * pulled + known.columns @ (known.columns.T @ pulled)
+        share = max(1 / (known.heard + 1), float(LEARNING_LINES))
+        known.scatter *= 1 - share
+        known.scatter += np.outer(share * left, left)
+        known.heard += 1
+
+    def _hear_anew(self, pulled: Array, part: int) -> None:
+        if part in self.now.lines:
+            self.now.lines[part].heard = 0  # the first that is heard replaces all
+        for row in pulled:
+            self.hear(row, part)
+        self.find_lines(part)
+
+    def find_lines(self, part: int) -> None:
+        """Make the lines of such scans anew."""
+        known = self.now.lines.get(part)
+        if known is None or not known.heard:
+            return
+        k = len(known.scatter)
+        values, vectors = np.linalg.eigh(known.scatter)
+        scans = min(known.heard, 1 / LEARNING_LINES)
+        chance = self.now.white * LINE * (1 + np.sqrt(k / scans)) ** 2
+        strong = values > chance
+        strong[: -int(LINES)] = False
+        known.columns = vectors[:, strong] * np.sqrt(values[strong] - self.now.white)
+
+    def _follow_contacts(self, pulled: Array, white: Whitening, share: float) -> None:
+        """Unbiased moments: the generalised least squares estimate of a contact's change has variance v + 1 / n, with
+        n its information.
+        """
+        columns = white(self._contact)
+        information = np.maximum((columns**2).sum(axis=0), 1e-12)
+        moved = (pulled @ self._contact / information) ** 2
+        flicker = np.minimum(moved, OUTLIER / information + OUTLIER * self.now.flicker).mean(axis=0) - 1 / information
+        self.now.flicker = np.maximum(FLICKER_FLOOR**2, self.now.flicker + share * flicker)
+        excess = self._excess(pulled, white.conditional_precisions()).mean(axis=0)
+        jitter = self.now.jitter + share * (self._squares * excess[:, None]).sum(axis=0) / self._weight
+        self.now.jitter = np.where(jitter > JITTER_FLOOR**2, jitter, 0.0)
+
+    def _excess(self, pulled: Array, precision: Array) -> Array:
+        """By how much each measurement's squared residual, given all others, exceeds its variance."""
+        return np.asarray(np.minimum((pulled / precision) ** 2, OUTLIER / precision) - 1 / precision)
+
+
+def in_blocks(columns: Array, order: Order, times: float) -> Array:
+    """(K, K) covariance of a disturbance that is `times` as strong and comes and goes within a scan: each block of
+    measurements has its own.
+    """
+    block = order // BURST_BLOCK
+    return np.asarray((columns @ columns.T) * (times**2 * (block[:, None] == block)))

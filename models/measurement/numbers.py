@@ -1,0 +1,61 @@
+"""Every number of models/measurement that decides something. Lengths in model units unless a unit is said."""
+
+from __future__ import annotations
+
+from models.measurement.number import Number
+
+MISFIT = Number(0.004, "-", "what the linear disc leaves of a touch's change", "measured: 0.05 to 0.6 % on both meshes")
+MISFIT_WIDE = Number(0.03, "-", "the same near electrodes and at deep touches", "measured: 3.4 % at most")
+MISFIT_FAR = Number(
+    0.015, "-", "MISFIT of coarse tables, or where others sense than drive", "measured: 0.2 to 1.5 %, near electrodes 4"
+)
+MISFIT_POWER = Number(0.3, "-", "of the Gram matrix: colour of that misfit", "measured: as the bundles' own misfit")
+"""How wrong a response is."""
+
+TYPICAL_RADIUS = Number(0.18, "unit", "of a touch of unknown size", "derived: 9 mm, geometric mean of 4 and 20 mm")
+AREA_LOG_SD = Number(0.55, "-", "of its radius's logarithm", "derived: 4 and 20 mm are 1.5 of it away")
+LEAST_RADIUS = Number(0.05, "unit", "of a touch", "derived: a pixel of the tables is 0.042")
+MOST_RADIUS = Number(0.6, "unit", "of a touch", "chosen: 30 mm, beyond the 25 mm that skins are made for")
+SHEET = Number(0.98, "unit", "places lie within, along each axis", "derived: half a pixel from the edge")
+LEAST_ACTION = Number(1e-4, "unit^2", "of a touch: a search begins there", "derived: a tenth of a sigma")
+MOST_ACTION = Number(1.0, "unit^2", "standard deviation of a touch's action", "derived: 20 mm radius, drop 0.6")
+BEGINS_WITHIN = Number(2.0, "-", "of a touch's action: its change within a scan", "derived: begins at its middle")
+MOST_STRENGTH = Number(2.0, "-", "action over area, where nothing conducts", "derived: drop 1 over 1 - 1 / 2")
+NEW_WAY = Number(0.04, "unit", "way of a touch within the scan in which it begins", "derived: 2 mm, 50 mm/s")
+MOST_WAY = Number(0.16, "unit", "way of a touch within any scan", "derived: 0.3 m/s is 0.26")
+HARMONIC_SDS = (
+    Number(0.1, "-", "second harmonic of an outline, of the radius", "measured: ellipse of aspect 2.2 to square"),
+    Number(0.05, "-", "third harmonic", "measured: triangles"),
+    Number(0.03, "-", "fourth harmonic", "measured: squares"),
+)
+EDGE_WIDTH = Number(0.03, "unit", "width of an edge that EDGE_SD is in squares of", "chosen: 1.5 mm")
+EDGE_SD = Number(1.0, "-", "square of an edge's width", "chosen: soft by as much as EDGE_WIDTH")
+TENSOR_SD = Number(0.15, "-", "drop along a touch less that across", "measured: rectangles leave 5 to 7 % without")
+"""What a touch looks like."""
+
+DAMPING = Number(1e-3, "-", "of the first step, Levenberg's", "chosen: any small one")
+DONE = Number(0.5, "nat", "a step that gains less ends the search", "derived: a tenth of what decides between two")
+DONE_SHARE = Number(3e-3, "-", "the same of what is left", "derived: of 120, as DONE")
+LEAST_STEP = Number(0.06, "unit", "that a touch moves in one step at least", "derived: 1.5 pixels")
+STEP_SHARE = Number(0.6, "-", "of a radius that one step moves a touch at most", "chosen: the disc still overlaps")
+STEP_LOG = Number(0.5, "-", "of log radius in one step at most", "chosen: the disc still overlaps")
+MOVES = Number(0.02, "unit", "way within a scan from which on a touch's motion bends", "derived: half a pixel")
+TURNS = Number(0.02, "unit", "way after which a touch's own directions are taken anew", "derived: half a pixel")
+TURNS_LOG = Number(0.1, "-", "the same of log radius", "derived: a tenth of them")
+SUDDEN_S = Number(0.004, "s", "steps of the course of a touch that begins or ends at once", "derived: a part of a scan")
+SUDDEN_SD = Number(0.5, "-", "of its action, by which each step may differ", "derived: from none to all")
+BENDS_BY = Number(0.15, "-", "and of its radius", "derived: its square over 8 is 0.3 %, below MISFIT")
+KINK = Number(0.8, "-", "of a change within a scan: what of it may be no straight line", "derived: a ramp's half")
+"""How a touch is fitted."""
+
+WHITE = Number(1e-4, "-", "noise of log |Z| before anything is known", "data sheet: AD5940, 80 dB")
+RESPONSE_FLOOR = Number(2e-6, "-", "rounding of the tables", "derived: of float32")
+FLICKER_FLOOR = Number(3e-4, "-", "noise of a good contact impedance", "measured: at 80 dB none is seen below")
+JITTER_FLOOR = Number(5e-4, "-", "noise of a contact anew each time that counts as none", "measured: at 80 dB")
+LEARNING = Number(0.05, "-", "share of a variance that one scan replaces", "derived: 20 scans, a second")
+LEARNING_WHITE = Number(0.03, "-", "the same of the white noise", "derived: as LEARNING, of all rows at once")
+LEARNING_LINES = Number(0.005, "-", "the same of what they have in common", "derived: 200 scans, more than it has rows")
+LINE = Number(1.3, "-", "times what chance makes of white noise, from which on it is a line", "derived: Tracy-Widom")
+LINES = Number(6.0, "-", "eigenvectors of lines at most", "chosen: three frequencies")
+OUTLIER = Number(9.0, "-", "squared sigmas beyond which a residual counts no further", "derived: 3 sigmas")
+"""What noise is."""

@@ -1,0 +1,93 @@
+"""What a touch is to the measurements: a disc that acts, moves and changes, with its outline's, edge's and direction's
+own ways to differ from one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.numbers import (
+    AREA_LOG_SD,
+    BEGINS_WITHIN,
+    EDGE_SD,
+    HARMONIC_SDS,
+    LEAST_ACTION,
+    LEAST_RADIUS,
+    MOST_ACTION,
+    MOST_RADIUS,
+    MOST_STRENGTH,
+    NEW_WAY,
+    SHEET,
+    TENSOR_SD,
+    TYPICAL_RADIUS,
+)
+
+Array = NDArray[np.float64]
+
+# Numbers of a disc's state. X, Y: centre at the reference instant [unit]. LOG_RADIUS. ACTION: drop / (1 - drop / 2)
+# times the area [unit^2]: the measurements are linear in it, and tell it best. RATE: of ACTION [unit^2/s]. VX, VY
+# [unit/s].
+X, Y, LOG_RADIUS, ACTION, RATE, VX, VY = range(7)
+STATES = 7
+PLACE, VELOCITY = slice(X, Y + 1), slice(VX, VY + 1)
+
+# Directions in which a touch of that area differs from a disc, as multiples of its action: outline's harmonics 2, 3
+# and 4 (cosine and sine, relative to the radius), the square of the edge's width, the drop along x less that along y,
+# and the drop that turns x into y.
+SHAPES = 9
+EDGE = 6
+PLAIN = 1e-3  # of what shapes differ by
+SHAPE_SDS: Array = np.array([sd for sd in HARMONIC_SDS for _ in range(2)] + [EDGE_SD, TENSOR_SD, TENSOR_SD])
+
+
+@dataclass(frozen=True)
+class TouchPrior:
+    """What is known of a touch before a scan: a Gaussian of its state and of its shape, and its course.
+
+    It acts from `since_s` to `until_s` only, in seconds from the reference instant.
+    """
+
+    start: Array  # (7,) where the search begins
+    mean: Array  # (7,)
+    sd: Array  # (7,)
+    shape: Array = field(default_factory=lambda: np.zeros(SHAPES))
+    shape_sd: Array = field(default_factory=lambda: SHAPE_SDS)
+    since_s: float = -np.inf
+    until_s: float = np.inf
+
+
+def anywhere(x: float, y: float, action: float, span_s: float) -> TouchPrior:
+    """A touch that may be anywhere on the sheet, of any size, begin and move as touches do. span_s: of the scan."""
+    start = np.array([x, y, np.log(TYPICAL_RADIUS), action, 0.0, 0.0, 0.0])
+    mean = np.array([0.0, 0.0, np.log(TYPICAL_RADIUS), 0.0, 0.0, 0.0, 0.0])
+    rate_sd = BEGINS_WITHIN * max(action, LEAST_ACTION) / span_s
+    sd = np.array([2.0, 2.0, AREA_LOG_SD, MOST_ACTION, rate_sd, NEW_WAY / span_s, NEW_WAY / span_s])
+    return TouchPrior(start, mean, sd)
+
+
+def plain(prior: TouchPrior) -> TouchPrior:
+    """The same of a touch that is a disc, or whatever outline is known of it, and nothing else."""
+    return replace(prior, shape_sd=PLAIN * SHAPE_SDS)
+
+
+def within_limits(states: Array) -> Array:
+    """(T, 7) states moved to where touches can be."""
+    limited = states.copy()
+    limited[:, PLACE] = np.minimum(np.maximum(limited[:, PLACE], -SHEET), SHEET)
+    acts = np.maximum(limited[:, ACTION], LEAST_ACTION)
+    least = np.maximum(0.5 * np.log(acts / (np.pi * MOST_STRENGTH)), np.log(LEAST_RADIUS))
+    limited[:, LOG_RADIUS] = np.minimum(np.maximum(limited[:, LOG_RADIUS], least), np.log(MOST_RADIUS))
+    return limited
+
+
+def area_of(log_radius: float) -> float:
+    return float(np.pi * np.exp(2 * log_radius))
+
+
+def drop_of(action: float, log_radius: float) -> float:
+    """Drop of a disc that acts so."""
+    strength = action / area_of(log_radius)
+    return strength / (1 + strength / 2)

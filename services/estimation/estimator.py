@@ -1,0 +1,390 @@
+"""The way of one scan, or of the newest values after a part of one: predicted, asked, settled, learnt from, judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.disc import DiscResponse
+from models.measurement.noise import NoiseModel
+from models.measurement.tables import SkinTables
+from models.measurement.touch import SHAPE_SDS
+from models.measurement.whitening import Whitening
+from services.estimation.faults import advice
+from services.estimation.faults.asking import AskedScan, FaultAsking
+from services.estimation.faults.board import BoardFaults, BoardView
+from services.estimation.faults.gap import judged_by_itself
+from services.estimation.faults.table import any_touches
+from services.estimation.faults.wires import WireFault
+from services.estimation.filter import Prediction, SkinFilter
+from services.estimation.first.tare import AgreedScans, TareRefused, Taring
+from services.estimation.hypotheses import AS_IT_IS, BURST, DRIFT, MEMORY, NOISE, Hypotheses, Question, ScoredAnswer
+from services.estimation.learning import Learning, Waiting
+from services.estimation.quick_look import QuickLook, Seen
+from services.estimation.touches import TouchTracks, estimate_of, roughly
+from services.estimation.values import numbers as n
+from services.estimation.values.estimate import Estimate, TouchEstimate
+from services.estimation.values.judgement import Judgement, judge
+from services.estimation.values.scan import Scan
+
+Array = NDArray[np.float64]
+
+AGES_OF_DOUBT = (1, 2, 4, 8)  # whole scans of a touch, at which its outline is asked whether it is one
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """A scan as the estimator looks at it."""
+
+    scan: Scan
+    log_z: Array  # (K,) 0 where a measurement does not count
+    live: NDArray[np.bool_]  # (K,)
+    whole: bool  # it shares no value with the last one that was whole
+
+    @property
+    def span_s(self) -> float:
+        return self.scan.duration_s
+
+    @property
+    def middle_s(self) -> float:
+        return self.scan.at_ns * 1e-9 - self.scan.duration_s / 2
+
+    @cached_property
+    def order(self) -> NDArray[np.intp]:
+        """(K,) rank in time, 0 the oldest."""
+        return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
+
+
+@dataclass
+class EstimatorState:
+    """All that changes beside what the learners keep."""
+
+    before: Scan | None = None
+    whole_us: float = -np.inf  # board's clock at the end of the last whole scan
+    wholes: int = 0  # whole scans since the tare
+    unexplained_s: float = 0.0  # for how long nothing has explained the scans
+    information: NDArray[np.float32] | None = None  # of the grid's discs
+    informed: int = 0  # `wholes` then
+    informed_live: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    informed_wire: WireFault | None = None
+    said: tuple[TouchEstimate, ...] = ()
+
+
+class TaredSkin:
+    """What stands on one baseline."""
+
+    def __init__(self, tables: SkinTables, scans: AgreedScans, next_id: int) -> None:
+        self.log_z0, self.live = scans.log_z0, scans.live
+        self.tables = tables.relative_to(np.exp(scans.log_z0))
+        self.response = DiscResponse(self.tables)
+        self.noise, self.drift = NoiseModel(self.tables), SkinFilter(self.tables)
+        self.noise.begin(scans.residuals, scans.part)
+        self.noise.now.white = max(self.noise.now.white, scans.least_white)
+        count = len(scans.residuals)
+        self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / count)
+        self.touches = TouchTracks(self.response)
+        self.touches.now.next_id = next_id
+        self.hypotheses = Hypotheses(self.tables, self.response, self.noise, self.drift)
+        self.learning = Learning(self.drift, self.noise)
+        self.quick = QuickLook(self.hypotheses.grid)
+        self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
+        self.asking = FaultAsking(self.tables, self.response, self.noise, self.touches, self.hypotheses, self.faults)
+
+
+class Estimator:
+    """Of one skin; tables: of its bundle."""
+
+    def __init__(self, tables: SkinTables) -> None:
+        self._tables = tables
+        self.now = EstimatorState()
+        self.taring = Taring(tables)
+        self.skin: TaredSkin | None = None
+
+    def tare(self, force: bool = False) -> None:
+        """Take the latest scans for the untouched skin. Raises TareRefused, while something touches unless forced."""
+        if not force and self.skin is not None and self.skin.faults.now.wire is not None:
+            raise TareRefused("wires of the board are wrong, expected all as they belong: mend them and try again")
+        self._begin(self.taring.by_command(force))
+
+    def _begin(self, scans: AgreedScans) -> None:
+        next_id = 1 if self.skin is None else self.skin.touches.now.next_id
+        self.skin = TaredSkin(self._tables, scans, next_id)
+        self.now.information, self.now.wholes, self.now.unexplained_s = None, 0, 0.0
+
+    # --- one scan ---
+
+    def step(self, scan: Scan) -> Estimate:
+        """What touches, by this scan and those before it."""
+        now = self.now
+        oldest_us = scan.end_us - 1e6 * scan.duration_s
+        whole = oldest_us >= now.whole_us - 1.0 or scan.end_us < now.whole_us
+        gap_s = 0.0 if now.before is None else (scan.at_ns - now.before.at_ns) * 1e-9
+        now.before = scan
+        if whole:
+            now.whole_us = scan.end_us
+        measurable = np.isfinite(scan.values) & (scan.values > 0) & (scan.status == 0)
+        live = measurable if self.skin is None else measurable & self.skin.live
+        measured = LookedAt(scan, np.log(np.where(live, scan.values, 1.0)), live, whole)
+        if whole:
+            self.taring.offer(scan, measurable, measured.middle_s)
+        judgements = [judge("believed", float(not scan.believed), 1.0)]
+        judgements += self.taring.judgements(self.skin is not None)
+        if self.skin is None:
+            if (scans := self.taring.first()) is not None:
+                self._begin(scans)
+            return self._unknown(measured, judgements)
+        if not 0 <= gap_s <= n.GAP_S:
+            self.skin.touches.lose()
+            self.skin.learning.doubt()
+        seen = self._glanced(self.skin, measured)
+        if seen is not None:
+            return self._quiet(self.skin, measured, seen, judgements)
+        return self._asked(self.skin, measured, max(gap_s, 0.0), judgements)
+
+    def _glanced(self, skin: TaredSkin, measured: LookedAt) -> Seen | None:
+        """What a first look sees where nothing touched before and all is quiet; else None."""
+        now, scan = self.now, measured.scan
+        oldest_s = measured.middle_s - measured.span_s / 2
+        may = not len(skin.touches) and measured.live.all() and now.information is not None
+        if not may or not skin.faults.plain(oldest_s) or (measured.whole and skin.drift.remembers(measured.middle_s)):
+            return None
+        assert now.information is not None
+        y = skin.faults.taken_off(measured.log_z - skin.log_z0 - skin.drift.shift(measured.middle_s))
+        seen = skin.quick.look(scan.part, measured.middle_s, y, now.information)
+        return seen if seen is not None and seen.quiet else None
+
+    def _quiet(self, skin: TaredSkin, measured: LookedAt, seen: Seen, judgements: list[Judgement]) -> Estimate:
+        self._explained(skin, AS_IT_IS)
+        measured = replace(measured, log_z=skin.log_z0 + skin.faults.taken_off(measured.log_z - skin.log_z0))
+        self._learn_untouched(skin, measured, seen.pulled, AS_IT_IS)
+        self.now.said = ()
+        y = measured.log_z - skin.log_z0
+        return self._estimate(measured, y, np.zeros(len(y)), judgements, seen.z2, 0.0)
+
+    def _asked(self, skin: TaredSkin, measured: LookedAt, passed_s: float, judgements: list[Judgement]) -> Estimate:
+        skin.touches.drop_the_past(measured.middle_s - measured.span_s / 2)
+        skin.touches.drop_the_vague()
+        predicted = skin.drift.ahead(measured.middle_s, skin.noise.now.flicker)
+        scan, untouched = measured.scan, skin.log_z0 + predicted.shift
+        asked = skin.asking(
+            AskedScan(
+                values=scan.values,
+                status=scan.status,
+                untouched=untouched,
+                predicted=predicted,
+                part=scan.part,
+                times_s=measured.span_s / 2 - scan.ages_s,
+                span_s=measured.span_s,
+                middle_s=measured.middle_s,
+                whole=measured.whole,
+            ),
+            lambda hypotheses, view, covariance: self._question(hypotheses, skin, view, covariance, measured),
+            lambda hypotheses, question: self._answer(skin, hypotheses, question, predicted, measured),
+        )
+        question, answer = asked.question, asked.answer
+        measured = replace(measured, log_z=untouched + asked.view.y, live=asked.view.live)
+        explained = answer.quiet if answer.fit is None else answer.explained
+        rough = answer.fit is not None and answer.chi2 < n.MOST
+        if explained or rough:
+            self._settle(skin, question, answer, measured)
+            self._explained(skin, answer.cause)
+        else:
+            self._refused(skin, measured)
+        skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
+        if explained and skin.faults.sound and not asked.changed:
+            self._learn(skin, measured, answer)
+        judgements += advice.judgements_of(skin.faults.states(), scan.status, float(asked.view.failed.mean()))
+        judgements.append(judge("gap", float(skin.touches.lost), 1.0))
+        judgements.append(judge("gain", float(skin.faults.gain_named(measured.middle_s)), 1.0))
+        judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
+        return self._said(skin, measured, question, answer, judgements, explained, rough)
+
+    def _question(
+        self, hypotheses: Hypotheses, skin: TaredSkin, view: BoardView, covariance: Array, measured: LookedAt
+    ) -> Question:
+        now = self.now
+        new = not np.array_equal(now.informed_live, view.live) or now.informed_wire != skin.faults.now.wire
+        if now.information is None or new or now.wholes - now.informed >= n.LINE_SCANS:
+            now.information = hypotheses.grid.information(Whitening.of(covariance))
+            now.informed, now.informed_live, now.informed_wire = now.wholes, view.live, skin.faults.now.wire
+        part = measured.scan.part
+        return Question(view.y, covariance, view.live, view.times_s, view.span_s, measured.order, part, now.information)
+
+    def _answer(
+        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
+    ) -> ScoredAnswer:
+        if self.now.unexplained_s > n.LOST_S:
+            return self._answer_of_lost(skin, hypotheses, question, measured)
+        if len(skin.touches):
+            standing = skin.touches.expected(measured.middle_s, measured.span_s)
+            loose = skin.touches.expected(measured.middle_s, measured.span_s, loose=True)
+            if skin.touches.lost:
+                return judged_by_itself(hypotheses, question, standing, loose)
+            return hypotheses.ask(question, standing, loose)
+        quiet = hypotheses.untouched(question)
+        assert quiet is not None
+        if question.live.all() and skin.faults.plain(measured.middle_s - measured.span_s / 2):
+            skin.quick.keep(measured.scan.part, measured.middle_s, question.white, measured.order)
+        memory = skin.drift.beyond_memory(predicted, quiet.pulled, quiet.white)
+        if memory is not None and skin.faults.now.wire is None:
+            pressed = hypotheses.at(question, memory.x, memory.y)
+            if pressed.explained:
+                return pressed
+        return quiet if quiet.quiet else hypotheses.ask(question, (), ())
+
+    def _answer_of_lost(
+        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, measured: LookedAt
+    ) -> ScoredAnswer:
+        """While nothing has explained the skin for long: a search now and then, from nothing."""
+        skin.touches.forget()
+        found = hypotheses.glance(question)
+        refused = round(self.now.unexplained_s / measured.span_s)
+        if found.quiet or not measured.whole or refused % n.LOST_SCANS:
+            return found
+        return hypotheses.ask(question, (), ())
+
+    # --- what follows ---
+
+    def _settle(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
+        touches, middle_s, span_s = skin.touches, measured.middle_s, measured.span_s
+        kept = answer.kept if answer.fit is None else touches.recognised(answer.fit, answer.kept)
+        gone = [k for k in range(len(touches)) if k not in kept]
+        memories = [memory for k in gone for memory in touches.released(k, middle_s - span_s / 2)]
+        if answer.fit is None:
+            touches.forget()
+        else:
+            memories += touches.settle(answer.fit, kept, middle_s, span_s, measured.whole)
+            self._make_sure(skin, answer)
+            if measured.whole and not self._apart(skin, question, measured):
+                self._doubt(skin, question, answer, measured)
+        for memory in memories:
+            skin.drift.remember(memory)
+        if memories:
+            skin.quick.forget()
+
+    def _make_sure(self, skin: TaredSkin, answer: ScoredAnswer) -> None:
+        steady = answer.explained and answer.cause == AS_IT_IS
+        for track in skin.touches.now.tracks:
+            track.sure = track.sure or track.z2 > (n.SURE_Z2 if steady else n.DOUBT_Z2)
+
+    def _apart(self, skin: TaredSkin, question: Question, measured: LookedAt) -> bool:
+        """Whether a young touch of an odd outline is rather several: evidence decides, while the outline is learnt."""
+        young = [t for t in skin.touches.now.tracks if t.scans in AGES_OF_DOUBT and not t.ended]
+        if not any(float((track.shape**2 / SHAPE_SDS**2).sum()) > n.ODD_OUTLINE for track in young):
+            return False
+        found = skin.hypotheses.anew(question)
+        if found is None or not found.explained or found.fit is None or len(found.fit) <= len(skin.touches):
+            return False
+        kept = skin.touches.recognised(found.fit, found.kept)
+        skin.touches.settle(found.fit, kept, measured.middle_s, measured.span_s, whole=True)
+        self._make_sure(skin, found)
+        return True
+
+    def _doubt(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
+        """Is one of the touches drift? What was shown once must not stay because nothing is learnt under it."""
+        touches = skin.touches
+        for k in reversed(range(len(touches))):
+            track = touches.now.tracks[k]
+            often = track.z2 < n.DOUBT_Z2 or not track.sure
+            if track.ended or not (often or track.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1):
+                continue
+            standing = touches.expected(measured.middle_s, measured.span_s)
+            other = skin.hypotheses.without(question, standing, k)
+            if other.quiet and other.score > answer.score:
+                touches.remove(k)
+                return
+            track.sure = track.sure or track.scans >= n.SURE_SCANS
+
+    def _explained(self, skin: TaredSkin, cause: str) -> None:
+        self.now.unexplained_s = 0.0
+        if cause == AS_IT_IS:
+            skin.hypotheses.adrift = 1.0
+
+    def _refused(self, skin: TaredSkin, measured: LookedAt) -> None:
+        """Nothing explains it: the longer that lasts, the further the skin may have drifted."""
+        skin.learning.doubt()
+        if not measured.whole:
+            return
+        self.now.unexplained_s += measured.span_s
+        if self.now.unexplained_s > n.CHANGING_S:
+            skin.hypotheses.adrift = min(n.MOST_ADRIFT, skin.hypotheses.adrift * n.ADRIFT)
+
+    def _learn(self, skin: TaredSkin, measured: LookedAt, answer: ScoredAnswer) -> None:
+        """From untouched scans all, while touched of the contacts' noise alone."""
+        if answer.fit is None:
+            self._learn_untouched(skin, measured, answer.pulled, answer.cause)
+            return
+        skin.learning.doubt()
+        if measured.whole:
+            self.now.wholes += 1
+            if answer.cause == AS_IT_IS and measured.scan.believed:
+                skin.noise.learn_contacts(answer.pulled, answer.white)
+
+    def _learn_untouched(self, skin: TaredSkin, measured: LookedAt, pulled: Array, cause: str) -> None:
+        if not measured.scan.believed:
+            return
+        if cause == MEMORY and measured.whole:
+            skin.drift.widen_memories()
+            skin.quick.forget()
+        if measured.live.all():
+            skin.learning.hear(pulled, measured.scan.part, cause in (BURST, NOISE))
+        if not measured.whole:
+            return
+        self.now.wholes += 1
+        if cause in (AS_IT_IS, DRIFT, MEMORY):
+            over = measured.log_z - skin.log_z0
+            drifts = skin.hypotheses.adrift if cause == DRIFT else 0.0
+            if drifts:
+                skin.quick.forget()
+            waiting = Waiting(measured.middle_s, over, measured.live, measured.scan.part, drifts)
+            skin.learning.untouched(waiting)
+
+    # --- what is said ---
+
+    def _said(
+        self,
+        skin: TaredSkin,
+        measured: LookedAt,
+        question: Question,
+        answer: ScoredAnswer,
+        judgements: list[Judgement],
+        explained: bool,
+        rough: bool,
+    ) -> Estimate:
+        if explained or rough:
+            unexplained = float(np.linalg.norm(answer.left)) / max(float(np.linalg.norm(question.y)), 1e-12)
+            sample_s = measured.scan.sample_ns * 1e-9
+            lasting = [track for track in skin.touches.lasting if track.sure]
+            self.now.said = tuple(estimate_of(track, sample_s, measured.span_s, unexplained) for track in lasting)
+        else:
+            self.now.said = tuple(roughly(touch) for touch in self.now.said)
+        unsure = any(not track.sure for track in skin.touches.now.tracks)
+        sigma = np.sqrt(np.diag(question.covariance))
+        changing = float(unsure or not explained)
+        return self._estimate(measured, question.y, sigma, judgements, answer.left_z2, changing)
+
+    def _estimate(
+        self,
+        measured: LookedAt,
+        difference: Array,
+        sigma: Array,
+        judgements: list[Judgement],
+        z2: float,
+        changing: float,
+    ) -> Estimate:
+        said = self.now.said
+        if measured.whole:
+            self.taring.saw(bool(said) or z2 >= n.FALSE_ALARM_Z2)
+        judgements.append(judge("touch", max([z2, *(touch.z2 for touch in said)]), n.FALSE_ALARM_Z2))
+        judgements.append(judge("changing", changing, 1.0))
+        judgements.append(judge("explained", self.now.unexplained_s, n.CHANGING_S))
+        electrodes = np.zeros(self._tables.electrodes, np.uint8) if self.skin is None else self.skin.faults.states()
+        return Estimate(measured.scan, said, electrodes, measured.live, difference, sigma, tuple(judgements))
+
+    def _unknown(self, measured: LookedAt, judgements: list[Judgement]) -> Estimate:
+        """There is no baseline."""
+        nothing, electrodes = np.zeros(self._tables.measurements), np.zeros(self._tables.electrodes, np.uint8)
+        return Estimate(measured.scan, (), electrodes, measured.live, nothing, nothing, tuple(judgements))

@@ -1,0 +1,1 @@
+"""What can be wrong with a board, in the one model: maps of the values, values left out, columns with a prior."""

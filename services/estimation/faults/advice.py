@@ -1,0 +1,55 @@
+"""What faults of the board are to a frame: states of electrodes, judgements, and what a bundle cannot tell."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frame_types import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA
+from services.estimation.faults.wires import WireFault, WireKind
+from services.estimation.values import numbers as n
+from services.estimation.values.judgement import Judgement, Verdict, judge
+
+OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(7)  # protocol.frame_types.ELECTRODE_STATES
+STATE_OF = {WireKind.EXCHANGED: SWAPPED, WireKind.SHORT: SHORT, WireKind.STUCK: STUCK}
+ROW_OF = {OPEN: "open", SHORT: "short", DRIFTING: "impedance", SWAPPED: "exchanged", STUCK: "stuck"}
+
+
+def states_of(electrodes: int, wire: WireFault | None, opens: tuple[int, ...], contact: int) -> NDArray[np.uint8]:
+    """(E,) of the wire format. contact: electrode whose impedance is changed; -1: none."""
+    states = np.zeros(electrodes, np.uint8)
+    if contact >= 0:
+        states[contact] = DRIFTING
+    states[list(opens)] = OPEN
+    if wire is not None:
+        states[list(wire.electrodes)] = STATE_OF[wire.kind]
+    return states
+
+
+def judgements_of(states: NDArray[np.uint8], status: NDArray[np.uint8], failed: float) -> list[Judgement]:
+    """Of electrodes' states (E,), status bits (K,) and the share of measurements that failed."""
+    found = [judge("silent", failed, n.SILENT)]
+    for state, row in ROW_OF.items():
+        named = np.flatnonzero(states == state)
+        found.append(judge(row, len(named), 1.0, int(named[0]) if len(named) else -1))
+    found.append(judge("saturated", float(np.mean(status & (STATUS_CLIPPED | STATUS_RTIA) != 0)), ANY))
+    found.append(judge("fifo", float(np.mean(status & STATUS_FIFO != 0)), ANY))
+    lost = int(np.isin(states, (OPEN, SHORT, DRIFTING, SWAPPED)).sum())
+    found.append(judge("degraded", lost, n.DEGRADED))
+    found.append(judge("too_many", lost, n.TOO_MANY))
+    return found
+
+
+ANY = 1e-6  # share of measurements: one is enough
+
+
+def cannot(knows_wires: bool, own: bool, predicted: bool) -> list[Judgement]:
+    """Rows that a bundle has no means to tell. knows_wires: all pairs are measured; own: each senses where it drives;
+    predicted: its impedances are known to a model.
+    """
+    rows = list[str]()
+    if not (knows_wires and predicted):
+        rows += ["exchanged", "stuck", "short"]
+    if not (own and predicted):
+        rows += ["impedance"]
+    return [Judgement(row, float("nan"), 1.0, float("nan"), Verdict.CANNOT) for row in rows]

@@ -1,0 +1,155 @@
+"""The order in which a scan is asked about the board: its wires, what touches, contact impedances and gain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.course import TouchCourse
+from models.measurement.disc import DiscResponse
+from models.measurement.fit import LEAST_MEAN
+from models.measurement.noise import NoiseModel
+from models.measurement.tables import SkinTables
+from models.measurement.touch import ACTION, TouchPrior
+from services.estimation.faults.board import BoardFaults, BoardView, as_they_stand
+from services.estimation.faults.wires import WireFault
+from services.estimation.filter import Prediction
+from services.estimation.hypotheses import AS_IT_IS, Hypotheses, Question, ScoredAnswer
+from services.estimation.touches import TouchTracks
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+MakeQuestion = Callable[[Hypotheses, BoardView, Array], Question]
+Answering = Callable[[Hypotheses, Question], ScoredAnswer]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What explains a scan."""
+
+    view: BoardView
+    question: Question
+    answer: ScoredAnswer
+    changed: bool = False  # a fault was found: the next scan is the first that it is taken off
+
+
+@dataclass(frozen=True)
+class AskedScan:
+    """One scan that is asked about."""
+
+    values: Array  # (K,) |Z|
+    status: NDArray[np.uint8]
+    untouched: Array  # (K,) log |Z| as the filter predicts it
+    predicted: Prediction
+    part: int
+    times_s: Array  # (K,) from the middle of the scan
+    span_s: float
+    middle_s: float
+    whole: bool  # it shares no value with the last whole one
+
+
+class FaultAsking:
+    """Of one skin."""
+
+    def __init__(
+        self,
+        tables: SkinTables,
+        response: DiscResponse,
+        noise: NoiseModel,
+        touches: TouchTracks,
+        hypotheses: Hypotheses,
+        faults: BoardFaults,
+    ) -> None:
+        self._tables, self._response, self._noise, self._touches = tables, response, noise, touches
+        self._hypotheses, self._faults = hypotheses, faults
+        self._through: tuple[WireFault, Hypotheses] | None = None
+
+    def __call__(self, at: AskedScan, question_of: MakeQuestion, answering: Answering) -> Asked:
+        """question_of: of hypotheses, a view and a covariance; answering: the likeliest touches of a question."""
+        faults = self._faults
+        contact = self._tables.contact
+        flicker = (contact * self._noise.now.flicker) @ contact.T
+        skin, own = at.predicted.covariance + flicker, self._noise.covariance(at.part) - flicker
+        wide = skin + self._hypotheses.faster_drift()
+        touched, nearby = self._change(self._touches.expected(at.middle_s, at.span_s), at)
+
+        def look() -> BoardView:
+            return faults.look(at.values, at.status, at.untouched, at.times_s, at.span_s, at.middle_s)
+
+        def asked(view: BoardView) -> Asked:
+            hypotheses = self._seen(view)
+            question = question_of(hypotheses, view, view.covariance(skin, own))
+            return Asked(view, question, answering(hypotheses, question))
+
+        view = look()
+        if faults.now.wire is None and faults.wires_changed(view, touched, wide, own):
+            view = look()
+        found = asked(view)
+        if faults.now.wire is not None and _doubtful(found.answer) and faults.wires_changed(view, touched, wide, own):
+            found = asked(look())
+        if faults.asks(found.answer):
+            found = self._changed(found, touched, nearby, answering)
+        return self._doubted(found, at)
+
+    def _changed(self, found: Asked, touched: Array, nearby: Array, answering: Answering) -> Asked:
+        def ask(other: Question) -> ScoredAnswer:
+            return answering(self._hypotheses, other)
+
+        other = self._faults.explained_by_fault(found.view, found.question, found.answer, touched, nearby, ask)
+        return found if other is None else Asked(found.view, *other, changed=True)
+
+    def _doubted(self, found: Asked, at: AskedScan) -> Asked:
+        """Is a touch on an electrode its contact impedance? Asked at some ages, and when it has become weak."""
+        if self._faults.now.wire is not None or not at.whole:
+            return found
+        for k, track in enumerate(self._touches.now.tracks):
+            weak = track.state[ACTION] < n.WEAK * track.peak
+            asked = track.scans in n.CONTACT_DOUBTS or weak
+            if not asked or track.ended or not self._faults.on_electrode(track.state):
+                continue
+            standing = self._touches.expected(at.middle_s, at.span_s)
+            loose = self._touches.expected(at.middle_s, at.span_s, loose=True)
+            del standing[k], loose[k]
+            touched, nearby = self._change(standing, at)
+            ask = partial(self._with, standing, loose)
+            other = self._faults.explained_by_fault(
+                found.view, found.question, found.answer, touched, nearby, ask, doubted=True
+            )
+            if other is not None:
+                self._touches.remove(k)
+                return Asked(found.view, *other, changed=True)
+        return found
+
+    def _with(self, standing: list[TouchPrior], loose: list[TouchPrior], question: Question) -> ScoredAnswer:
+        if standing:
+            return self._hypotheses.ask(question, standing, loose)
+        quiet = self._hypotheses.untouched(question)
+        assert quiet is not None
+        return quiet
+
+    def _change(self, priors: Sequence[TouchPrior], at: AskedScan) -> tuple[Array, Array]:
+        """(K,) what touches that stand do to each |Z|, and (K, K) the covariance of what they may have changed by."""
+        k = len(at.times_s)
+        if not priors:
+            return np.zeros(k), np.zeros((k, k))
+        states = np.stack([prior.start for prior in priors])
+        columns = TouchCourse(self._response, at.times_s, at.span_s).columns(states, priors, ())
+        return np.maximum(columns.mean, LEAST_MEAN), as_they_stand(columns.slopes, states)
+
+    def _seen(self, view: BoardView) -> Hypotheses:
+        """The skin through what is wrong with the board's wires."""
+        wire = self._faults.now.wire
+        if wire is None or view.slopes is None:
+            self._through = None
+            return self._hypotheses
+        if self._through is None or self._through[0] != wire:
+            self._through = wire, self._hypotheses.through(view.slopes)
+        return self._through[1]
+
+
+def _doubtful(answer: ScoredAnswer) -> bool:
+    return answer.cause != AS_IT_IS or not (answer.quiet or answer.explained)

@@ -1,0 +1,412 @@
+"""What is wrong with the board of one skin, from scan to scan: what it makes of the values, and how it is found out.
+
+Wires show what a map makes of the sound skin; a changed contact impedance and the gain are part of the prediction, with
+columns for what is not known of them. Each has a way back: the wires are asked again whenever a scan is not explained,
+a contact walks, and a fault that explains nothing is dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.tables import SkinTables
+from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, VELOCITY
+from models.measurement.whitening import Whitening
+from services.estimation.faults import advice, wires
+from services.estimation.faults.impedance import (
+    ContactChange,
+    ContactColumns,
+    GainChange,
+    Unexplained,
+    gain_change,
+    gain_onset,
+)
+from services.estimation.faults.table import BoardScan, WireTable
+from services.estimation.faults.wires import WireFault, WireMaps
+from services.estimation.hypotheses import AS_IT_IS, Question, ScoredAnswer
+from services.estimation.learning import leave_out
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Ask = Callable[[Question], ScoredAnswer]
+
+LEAST = -0.95  # relative: nothing takes all of an impedance away
+SCAN_S = 0.044
+
+
+@dataclass
+class FaultState:
+    """All that changes. Times are seconds of the host's clock."""
+
+    settled: Array  # (E,) changes of contact impedances that the skin has for good
+    wire: WireFault | None = None
+    wire_since_s: float = -np.inf
+    opens: tuple[int, ...] = ()
+    contact: int = -1  # electrode whose contact impedance is changed
+    size: float = 0.0
+    variance: float = 0.0
+    size_before: float = 0.0  # of what was measured before
+    contact_since_s: float = -np.inf
+    still_s: float = 0.0
+    back_scans: int = 0
+    log_gain: float = 0.0  # since the tare
+    log_gain_before: float = 0.0  # of what was measured before
+    gain_since_s: float = -np.inf
+    gain_said_until_s: float = -np.inf
+    unexplained_scans: int = 0
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """One scan through the board."""
+
+    log_z: Array  # (K,) 0 where it failed
+    sound: Array  # (K,) what a board with sound wires would show, untouched
+    failed: Mask
+    live: Mask
+    shown: Array  # (K,) what this one shows
+    slopes: Array | None  # (K, K) of that to `sound`; None: the same
+    mean: Array  # (K,) relative change by contact impedances
+    spread: Array  # (K, n) columns of unit variance of what is not known of it
+    times_s: Array  # (K,) from the middle of the scan
+    span_s: float
+    middle_s: float
+
+    @property
+    def y(self) -> Array:
+        """(K,) log |Z| over what is predicted without touches."""
+        left = self.log_z - self.shown
+        if self.slopes is None:
+            left = np.log1p(np.maximum(np.expm1(np.minimum(left, 3.0)) - self.mean, LEAST))
+        return np.where(self.live, left, 0.0)
+
+    def covariance(self, skin: Array, own: Array) -> Array:
+        """(K, K) of y. skin: of what changes with the skin; own: of what the measurements add."""
+        if self.slopes is None:
+            scale = 1 + self.mean
+            made: Array = (skin + own) * scale[:, None] * scale + self.spread @ self.spread.T
+            made[np.diag_indices_from(made)] += (n.CONTACT_MISFIT * self.mean) ** 2
+        else:
+            made = self.slopes @ skin @ self.slopes.T + own
+        leave_out(made, self.live)
+        return made
+
+
+class BoardFaults:
+    """Of one skin."""
+
+    def __init__(self, tables: SkinTables, any_touch: Array, known: Mask) -> None:
+        """any_touch (K, K): covariance of log |Z| over touches that may be anywhere. known (K,): measurements that the
+        baseline has; the others count not, whatever they show.
+        """
+        self._any_touch, self._known = any_touch, known
+        self.member = wires.members(tables.pattern)
+        self.maps = WireMaps(tables.pattern)
+        self._table = WireTable(self.maps)
+        self._columns = ContactColumns.of(tables)
+        self._places = tables.places
+        self.now = FaultState(np.zeros(tables.electrodes))
+
+    @property
+    def columns(self) -> ContactColumns:
+        return replace(self._columns, settled=self.now.settled)
+
+    @property
+    def _columns_now(self) -> ContactColumns:
+        """About the contact that stands changed."""
+        now = self.now
+        return self.columns if now.contact < 0 else self.columns.with_change(now.contact, now.size)
+
+    def plain(self, oldest_s: float) -> bool:
+        """Whether nothing is wrong but what the skin has for good, since the oldest value of a scan."""
+        now = self.now
+        return self.sound and not self.gain_named(oldest_s) and oldest_s > max(now.gain_since_s, now.wire_since_s)
+
+    def taken_off(self, over: Array) -> Array:
+        """(K,) log |Z| over an untouched skin without what the board and contacts have for good. over (K,)."""
+        now = self.now
+        left = over - now.log_gain
+        if now.settled.any():
+            left = np.log1p(np.maximum(np.expm1(left) - self.columns.settled_mean(), LEAST))
+        return np.asarray(left)
+
+    # --- what it makes of a scan ---
+
+    def look(
+        self, values: Array, status: NDArray[np.uint8], untouched: Array, times_s: Array, span_s: float, middle_s: float
+    ) -> BoardView:
+        """values (K,) |Z|, untouched (K,) log |Z| as the filter predicts it."""
+        now = self.now
+        at_s = middle_s + times_s
+        sound = untouched + np.where(at_s >= now.gain_since_s, now.log_gain, now.log_gain_before)
+        mean, spread = self._contacts(at_s, 2 * times_s / span_s)
+        readable = np.isfinite(values) & (values > 0) & (status == 0)
+        log_z = np.log(np.where(readable, values, 1.0))
+        failed = self._known & (~readable | (np.abs(log_z - sound - np.log1p(mean)) > np.log(n.FAR)))
+        if now.wire is None:
+            return self._seen(log_z, sound, failed, failed, sound, None, mean, spread, times_s, span_s, middle_s)
+        found = self.maps.one(now.wire, np.exp(sound + np.log1p(mean)))
+        dead = ~readable | found.blind | (at_s < now.wire_since_s)
+        shown = np.log(np.maximum(found.values, 1e-9))
+        failed = self._known & ~readable
+        return self._seen(log_z, sound, failed, dead, shown, found.slopes, mean, spread, times_s, span_s, middle_s)
+
+    def _seen(
+        self,
+        log_z: Array,
+        sound: Array,
+        failed: Mask,
+        dead: Mask,
+        shown: Array,
+        slopes: Array | None,
+        mean: Array,
+        spread: Array,
+        times_s: Array,
+        span_s: float,
+        middle_s: float,
+    ) -> BoardView:
+        unexpected = failed if slopes is None else failed & ~dead
+        self.now.opens, _ = wires.open_electrodes(unexpected, self.member)
+        live = self._known & ~dead & ~self.member[:, list(self.now.opens)].any(axis=1)
+        return BoardView(log_z, sound, failed, live, shown, slopes, mean, spread, times_s, span_s, middle_s)
+
+    def _contacts(self, at_s: Array, course: Array) -> tuple[Array, Array]:
+        now, columns = self.now, self.columns
+        mean = columns.settled_mean()
+        if now.contact < 0:
+            return mean, np.zeros((len(mean), 0))
+        since = at_s >= now.contact_since_s
+        after, before = columns.mean(now.contact, now.size), columns.mean(now.contact, now.size_before)
+        spread = columns.spread(now.contact, now.size, np.sqrt(now.variance), course)
+        return mean + np.where(since, after, before), spread * since[:, None]
+
+    # --- wires ---
+
+    def wires_changed(self, view: BoardView, touched: Array, skin: Array, own: Array) -> bool:
+        """Whether the wires are otherwise than they were. touched (K,): relative change by touches that stand; skin and
+        own as for `covariance`.
+        """
+        now = self.now
+        sound = view.sound + np.log1p(view.mean)
+        failed = view.failed | (np.abs(view.log_z - sound) > np.log(n.FAR)) if now.wire is None else view.failed
+        untouched = BoardScan(view.log_z, sound, failed, view.times_s, view.span_s)
+        if not self._table.suspicious(untouched, now.wire):
+            return False
+        scan = replace(untouched, predicted=sound + np.log1p(touched), failed=view.failed)
+        found = self._table.guesses(scan, now.wire, skin + self._any_touch, own)
+        best, stands = found[0], next(guess for guess in found if guess.fault == now.wire)
+        rival = max(guess.score for guess in found if guess.fault != best.fault)
+        if best.fault == now.wire or best.score < max(stands.score + n.WIRE_SURE, rival + n.WIRE_APART):
+            return False
+        now.wire, now.wire_since_s = best.fault, view.middle_s + best.since_s
+        now.unexplained_scans = 0
+        return True
+
+    # --- contact impedances and gain ---
+
+    def asks(self, answer: ScoredAnswer) -> bool:
+        """Whether what explains a scan may as well be a fault."""
+        if self.now.wire is not None:
+            return False
+        new = answer.fit is not None and any(place < 0 for place in answer.kept)
+        explained = answer.quiet if answer.fit is None else answer.explained
+        return new or not explained or answer.cause != AS_IT_IS
+
+    def explained_by_fault(
+        self,
+        view: BoardView,
+        question: Question,
+        answer: ScoredAnswer,
+        touched: Array,
+        nearby: Array,
+        ask: Ask,
+        doubted: bool = False,
+    ) -> tuple[Question, ScoredAnswer] | None:
+        """A contact or the gain that has changed, if that is likelier. touched (K,): relative change by touches that
+        stand; nearby (K, K): covariance of what they may have changed by; ask: the likeliest touches of a question.
+        doubted: without one that stands and lies on an electrode.
+        """
+        best, sure = None, answer.score + (n.COST_TOUCH + n.COST_SMALL if doubted else self._sure(answer))
+        unexplained = not (answer.quiet if answer.fit is None else answer.explained)
+        for change in self._likeliest(question, touched, nearby, unexplained):
+            asked, column = self._with(question, change)
+            found = ask(asked)
+            cost = _cost(change)
+            if found.score + cost < sure or not self._apart(change, found):
+                continue
+            explained = found.quiet if found.fit is None else found.explained
+            plainly = found.chi2 < n.MOST and found.score + cost > answer.score + n.WIRE_SURE
+            if not (explained or plainly):
+                continue
+            best, sure = (change, column, asked, found), found.score + cost
+        if best is None:
+            return None
+        change, column, asked, found = best
+        self._take(view, change, float(column @ found.pulled))
+        return asked, found
+
+    def _sure(self, answer: ScoredAnswer) -> float:
+        """By how much a fault must be likelier than an answer: small new touches on electrodes are seldom touches."""
+        if answer.fit is None:
+            return n.FAULT_SURE
+        doubtful = [
+            place < 0 and self.on_electrode(state) for state, place in zip(answer.fit.states, answer.kept, strict=True)
+        ]
+        if any(doubtful):
+            return n.COST_SMALL * sum(doubtful)
+        return n.FAULT_SURE
+
+    def on_electrode(self, state: Array) -> bool:
+        """Whether a touch (7,) is small and lies on an electrode."""
+        nearest = float(np.hypot(*(state[PLACE] - self._places).T).min())
+        return bool(state[LOG_RADIUS] < np.log(n.SMALL) and nearest < n.ON_ELECTRODE)
+
+    def _likeliest(
+        self, question: Question, touched: Array, nearby: Array, unexplained: bool
+    ) -> list[ContactChange | GainChange]:
+        """At most two changes that may explain a scan: with the touches as they stand, or with any touches; where
+        nothing explains it, whatever touches: a gain changes all measurements alike.
+        """
+        found = list[ContactChange | GainChange]()
+        y = np.where(question.live, question.y - np.log1p(touched), 0.0)
+        for more, most_chi2 in ((nearby, n.MOST), (nearby + self._any_touch, np.inf)):
+            white = Whitening.of(question.covariance + more)
+            scan = Unexplained(y, 1 / (1 + touched), question.live, question.times_s, question.span_s, white)
+            nothing = white.log_density - 0.5 * float(np.sum(white(y) ** 2))
+            best = max(self._every(scan), key=lambda change: change.score + _cost(change))
+            known = [_what(change) for change in found]
+            if int(scan.since(best.since_s).sum()) < n.TOLD_BY:
+                continue
+            if best.score + _cost(best) > nothing and best.chi2 < most_chi2 and _what(best) not in known:
+                found.append(best)
+        if unexplained and len(found) < 2 and not any(isinstance(change, GainChange) for change in found):
+            found.append(gain_change(scan, -np.inf))
+        return found
+
+    def _every(self, scan: Unexplained) -> list[ContactChange | GainChange]:
+        columns = self._columns_now
+        always = np.full(len(self._places), -np.inf)
+        gains = [gain_change(scan, -np.inf), gain_change(scan, gain_onset(scan))]
+        found: list[ContactChange | GainChange] = [gain for gain in gains if abs(gain.log_factor) > n.GAIN_LEAST]
+        found += columns.likeliest(scan, always)
+        found += columns.likeliest(scan, columns.onsets(scan))
+        return found
+
+    def _with(self, question: Question, change: ContactChange | GainChange) -> tuple[Question, Array]:
+        """The question with a change of any size, and its column (K,) of unit variance."""
+        acts = np.asarray(question.live & (question.times_s >= change.since_s), float)
+        if isinstance(change, GainChange):
+            column = n.GAIN_CHANGES * acts
+            return replace(question, covariance=question.covariance + np.outer(column, column)), column
+        course = 2 * question.times_s / question.span_s
+        y, columns = self._columns_now.taken_off(question.y, acts, course, change)
+        wider = question.covariance + columns @ columns.T
+        misfit = n.CONTACT_MISFIT * acts * self._columns_now.mean(change.electrode, change.size)
+        wider[np.diag_indices_from(wider)] += misfit**2
+        return replace(question, y=np.where(question.live, y, 0.0), covariance=wider), columns[:, 0]
+
+    def _apart(self, change: ContactChange | GainChange, answer: ScoredAnswer) -> bool:
+        """An electrode under a touch that changes is not named: what it does is the touch's."""
+        if isinstance(change, GainChange) or answer.fit is None:
+            return True
+        for state, place, prior in zip(answer.fit.states, answer.kept, answer.fit.priors, strict=True):
+            away = float(np.hypot(*(state[PLACE] - self._places[change.electrode])))
+            still = place >= 0 and float(prior.sd[VELOCITY].max()) * SCAN_S <= 2 * n.STILL_WAY
+            if away < np.exp(state[LOG_RADIUS]) + n.ON_ELECTRODE and not still:
+                return False
+        return True
+
+    def _take(self, view: BoardView, change: ContactChange | GainChange, told: float) -> None:
+        """told: of the change, in sigmas of its prior."""
+        now = self.now
+        since_s = view.middle_s + change.since_s
+        if isinstance(change, GainChange):
+            now.log_gain_before, now.gain_since_s = now.log_gain, since_s
+            now.log_gain += n.GAIN_CHANGES * told
+            now.gain_said_until_s = view.middle_s + n.GAIN_NAMED_S
+            return
+        before = now.size if change.electrode == now.contact else 0.0
+        if now.contact not in (-1, change.electrode):
+            self._settle()
+        now.contact, now.contact_since_s, now.size_before = change.electrode, since_s, before
+        now.size = max(before + n.CONTACT_CHANGES * told, LEAST)
+        now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
+        now.still_s, now.back_scans = 0.0, 0
+
+    # --- what follows ---
+
+    def follow(self, view: BoardView, answer: ScoredAnswer, explained: bool, passed_s: float, whole: bool) -> None:
+        """A changed contact goes on changing, is well again, or is the skin's own; what explains nothing goes."""
+        now = self.now
+        if not explained:
+            now.unexplained_scans += whole
+            if now.unexplained_scans >= n.UNEXPLAINED_SCANS:
+                now.wire, now.contact, now.unexplained_scans = None, -1, 0
+            return
+        now.unexplained_scans = 0
+        if now.contact < 0:
+            return
+        step = self._stepped(view, answer)
+        now.still_s = now.still_s + passed_s if abs(step) < n.CONTACT_STILL * (1 + now.size) else 0.0
+        unsure = n.CONTACT_BACK + 3 * float(np.sqrt(now.variance))
+        nearest = min(abs(now.size), abs(now.size + now.settled[now.contact]))
+        now.back_scans = (now.back_scans + whole) if nearest < unsure else 0
+        now.variance += (n.CONTACT_WALK_CHANGED * (1 + now.size)) ** 2 * min(passed_s / SCAN_S, 1.0)
+        if now.still_s > n.CONTACT_SETTLES_S or now.back_scans >= n.BACK_SCANS:
+            self._settle()
+
+    def _stepped(self, view: BoardView, answer: ScoredAnswer) -> float:
+        now = self.now
+        if view.spread.shape[1] == 0:
+            return 0.0
+        column = view.spread[:, 0]
+        sd = float(np.sqrt(now.variance))
+        step = sd * float(column @ answer.pulled)
+        told = answer.fit.information(column) if answer.fit is not None else float(np.sum(answer.white(column) ** 2))
+        now.size = max(now.size + step, LEAST)
+        now.variance *= max(1 - told, 1e-4)
+        return step
+
+    def _settle(self) -> None:
+        """A changed contact is the skin's own from now on, be it as it was at the tare."""
+        now = self.now
+        now.settled = now.settled.copy()
+        now.settled[now.contact] += now.size
+        now.contact, now.size, now.variance = -1, 0.0, 0.0
+
+    def states(self) -> NDArray[np.uint8]:
+        """(E,) of the wire format."""
+        return advice.states_of(len(self.now.settled), self.now.wire, self.now.opens, self.now.contact)
+
+    def gain_named(self, middle_s: float) -> bool:
+        return middle_s < self.now.gain_said_until_s
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is wrong but what the skin has for good."""
+        return self.now.wire is None and self.now.contact < 0 and not self.now.opens
+
+
+def _cost(change: ContactChange | GainChange) -> float:
+    return float(n.COST_GAIN if isinstance(change, GainChange) else n.COST_CONTACT)
+
+
+def _what(change: ContactChange | GainChange) -> int:
+    return change.electrode if isinstance(change, ContactChange) else -1
+
+
+def as_they_stand(slopes: Array, states: Array) -> Array:
+    """(K, K) covariance of what touches that stand may have changed by since; slopes (K, 7 T), states (T, 7)."""
+    sds = np.zeros_like(states)
+    sds[:, PLACE] = n.STANDS_WAY
+    sds[:, LOG_RADIUS] = n.STANDS_SHARE
+    sds[:, ACTION] = n.STANDS_SHARE * np.abs(states[:, ACTION])
+    sds[:, RATE] = n.STANDS_SHARE * np.abs(states[:, ACTION]) / SCAN_S
+    sds[:, VELOCITY] = n.STANDS_WAY / SCAN_S
+    scaled = slopes * sds.ravel()
+    return np.asarray(scaled @ scaled.T)

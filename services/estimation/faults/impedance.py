@@ -1,0 +1,237 @@
+"""Contact impedances that change by more than the filter follows, and the board's gain.
+
+An electrode's contact is a resistance along its width. Of its change by a share `a` the part in series with the sheet
+grows by a; the rest, by which current spreads along the electrode, by b = a / (1 + a / SHORT_WAY), give or take. While
+a scan is measured the change may grow. With U and N the columns of the two (K, E), u from -1 to 1 over the scan:
+
+    log z = log z0 + log(1 + touches + U a + N (b + e) + u U s)
+
+Every electrode's likeliest (a, e, s) and its log evidence come from a few Gauss-Newton steps, all electrodes at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.tables import SkinTables
+from models.measurement.whitening import Whitening
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+
+STEPS = 3
+LEAST = -0.9  # relative change of an impedance: nothing takes all of it away
+MOST_LOG = 3.0  # of an impedance over its prediction
+SIZE, REST, COURSE = range(3)  # of a change: a, e and s
+
+
+@dataclass(frozen=True)
+class ContactChange:
+    """Of one electrode, in one scan."""
+
+    electrode: int
+    size: float  # a
+    variance: float  # of it
+    since_s: float  # it acts from then on, from the middle of the scan
+    score: float  # log evidence, without a prior of the fault
+    chi2: float  # squared whitened residual a measurement that counts
+
+
+@dataclass(frozen=True)
+class GainChange:
+    """Of the board, in one scan: log of the factor."""
+
+    log_factor: float
+    variance: float
+    since_s: float
+    score: float
+    chi2: float
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """One scan as faults are asked about it."""
+
+    y: Array  # (K,) log |Z| over what is predicted, touches that stand included; 0 where a measurement does not count
+    share: Array  # (K,) of the prediction that is the untouched skin: 1 / (1 + touches)
+    live: NDArray[np.bool_]
+    times_s: Array  # (K,) from the middle of the scan
+    span_s: float
+    white: Whitening
+
+    def since(self, begins_s: float) -> Array:
+        """(K,) 1 where a value was measured since then, and counts."""
+        return np.asarray(self.live & (self.times_s >= begins_s), float)
+
+
+@dataclass(frozen=True)
+class ContactColumns:
+    """What changed contacts do to the measurements of one skin, relative to its |Z| at the tare. A change is what is
+    beside those that the skin has for good by now.
+    """
+
+    layer: Array  # (K, E) of the contacts' part in series with the sheet
+    rest: Array  # (K, E) of the rest
+    settled: Array  # (E,) changes that the skin has for good
+
+    @classmethod
+    def of(cls, tables: SkinTables) -> ContactColumns:
+        return cls(tables.layer, tables.contact - tables.layer, np.zeros(tables.electrodes))
+
+    def with_change(self, electrode: int, size: float) -> ContactColumns:
+        """The same of the skin whose contact has changed for good."""
+        settled = self.settled.copy()
+        settled[electrode] += size
+        return ContactColumns(self.layer, self.rest, settled)
+
+    def settled_mean(self) -> Array:
+        """(K,) relative change of |Z| since the tare."""
+        return np.asarray(self.layer @ self.settled + self.rest @ _rest(self.settled))
+
+    def mean(self, electrode: int, size: float) -> Array:
+        """(K,) relative change of |Z|."""
+        rest = _rest_of(size, self.settled[electrode])
+        return np.asarray(self.layer[:, electrode] * size + self.rest[:, electrode] * rest)
+
+    def spread(self, electrode: int, size: float, sd: float, course: Array) -> Array:
+        """(K, 3) columns of unit variance of what is not known of a change; course (K,): -1 to 1 over the scan."""
+        layer, rest = self.layer[:, electrode], self.rest[:, electrode]
+        settled = self.settled[electrode]
+        moved = (layer + rest * _rest_slope(size, settled)) * sd
+        return np.column_stack([moved, rest * _rest_sd(size, settled), moved * course])
+
+    def taken_off(self, y: Array, acts: Array, course: Array, change: ContactChange) -> tuple[Array, Array]:
+        """log |Z| without a change, whatever touches, (K,); and (K, 3) columns of unit variance of the prior: as wide
+        as a change can be, about none. acts (K,): 1 where it acts; course (K,): -1 to 1 over the scan.
+        """
+        k, size = change.electrode, change.size
+        left = np.log1p(np.maximum(np.expm1(np.minimum(y, MOST_LOG)) - self.mean(k, size) * acts, LEAST))
+        columns = self.spread(k, size, n.CONTACT_CHANGES, course)
+        columns[:, 2] *= max(n.COURSE_FLOOR, abs(size)) / n.CONTACT_CHANGES
+        columns *= (acts * np.exp(-left))[:, None]
+        return left + columns[:, 0] * size / n.CONTACT_CHANGES, columns
+
+    def onsets(self, scan: Unexplained) -> Array:
+        """(E,) since when a change would explain most, each measurement by itself [s]."""
+        own = (self.layer + self.rest) * scan.share[:, None]
+        return _onsets(scan, own)
+
+    def likeliest(self, scan: Unexplained, begin_s: Array) -> list[ContactChange]:
+        """Of each electrode the likeliest change since then (E,), with its evidence."""
+        acts = np.stack([scan.since(at_s) for at_s in begin_s]) * scan.share  # (E, K)
+        layer, rest = self.layer.T * acts, self.rest.T * acts
+        columns = np.stack([layer, rest, layer * (2 * scan.times_s / scan.span_s)], axis=-1)  # (E, K, 3)
+        x = self._first(scan, columns)
+        for _ in range(STEPS):
+            residual, design = self._linearised(scan, columns, x)
+            precision = self._precision(x)
+            normal = np.einsum("eki,ekj->eij", design, design) + _diagonal(precision)
+            slope = np.einsum("eki,ek->ei", design, residual) - precision * x
+            x = x + np.linalg.solve(normal, slope[:, :, None])[:, :, 0]
+            x[:, SIZE] = np.maximum(x[:, SIZE], LEAST - self.settled)
+        residual, design = self._linearised(scan, columns, x)
+        precision = self._precision(x)
+        normal = np.einsum("eki,ekj->eij", design, design) + _diagonal(precision)
+        chi2 = (residual**2).sum(axis=1)
+        occam = np.linalg.slogdet(normal)[1] - np.log(precision).sum(axis=1)
+        score = scan.white.log_density - 0.5 * (chi2 + (precision * x**2).sum(axis=1) + occam)
+        variance = np.linalg.inv(normal)[:, SIZE, SIZE]
+        forgiven = self._forgiven(scan, x)
+        count = max(int(scan.live.sum()), 1)
+        return [
+            ContactChange(k, float(x[k, SIZE]), float(variance[k]), float(begin_s[k]), float(score[k]), float(c))
+            for k, c in enumerate(chi2 / count / forgiven)
+        ]
+
+    def _first(self, scan: Unexplained, columns: Array) -> Array:
+        """(E, 3) of a change that is no logarithm's: linear in the impedance itself."""
+        change = np.expm1(np.minimum(scan.y, np.log(n.FAR)))
+        weighted = columns[:, :, [SIZE]] + columns[:, :, [REST]]
+        design = _whitened(scan.white, weighted / (1 + change)[None, :, None])[:, :, 0]
+        seen = scan.white(change / (1 + change))
+        x = np.zeros((len(columns), 3))
+        x[:, SIZE] = (design @ seen) / ((design**2).sum(axis=1) + n.CONTACT_CHANGES**-2)
+        x[:, SIZE] = np.maximum(x[:, SIZE], LEAST - self.settled)
+        return x
+
+    def _linearised(self, scan: Unexplained, columns: Array, x: Array) -> tuple[Array, Array]:
+        """Whitened residuals (E, K) and slopes (E, K, 3) at x (E, 3)."""
+        rest = _rest_of(x[:, SIZE], self.settled)
+        law = np.stack([x[:, SIZE], rest + x[:, REST], x[:, COURSE]], axis=-1)
+        mean = np.maximum(np.einsum("eki,ei->ek", columns, law), LEAST)
+        slopes = columns.copy()
+        slopes[:, :, SIZE] += columns[:, :, REST] * _rest_slope(x[:, SIZE], self.settled)[:, None]
+        slopes /= (1 + mean)[:, :, None]
+        left = np.where(scan.live, scan.y - np.log1p(mean), 0.0)
+        both = _whitened(scan.white, np.concatenate([left[:, :, None], slopes], axis=2))
+        return both[:, :, 0], both[:, :, 1:]
+
+    def _precision(self, x: Array) -> Array:
+        """(E, 3) of the priors, at these sizes."""
+        size = np.full(len(x), n.CONTACT_CHANGES**-2)
+        course = np.maximum(n.COURSE_FLOOR, np.abs(x[:, SIZE])) ** -2
+        return np.stack([size, _rest_sd(x[:, SIZE], self.settled) ** -2, course], axis=-1)
+
+    def _forgiven(self, scan: Unexplained, x: Array) -> Array:
+        """(E,) by how much chi^2 may be larger, as columns are not exact."""
+        wrong = (n.CONTACT_MISFIT * self.layer * x[:, SIZE]) ** 2 * scan.live[:, None]
+        return np.asarray(1 + (wrong * scan.white.conditional_precisions()[:, None]).sum(axis=0) / len(scan.live))
+
+
+def gain_onset(scan: Unexplained) -> float:
+    """Since when a step of the gain would explain most, each measurement by itself [s]."""
+    return float(_onsets(scan, np.ones((len(scan.y), 1)))[0])
+
+
+def gain_change(scan: Unexplained, begins_s: float) -> GainChange:
+    """The likeliest step of the board's gain since then, with its evidence."""
+    acts = scan.white(scan.since(begins_s))
+    seen = scan.white(scan.y)
+    precision = float(acts @ acts) + n.GAIN_CHANGES**-2
+    found = float(acts @ seen) / precision
+    chi2 = float(seen @ seen) - found * float(acts @ seen)
+    score = scan.white.log_density - 0.5 * (chi2 + np.log(precision * n.GAIN_CHANGES**2))
+    return GainChange(found, 1 / precision, begins_s, float(score), chi2 / max(int(scan.live.sum()), 1))
+
+
+def _onsets(scan: Unexplained, columns: Array) -> Array:
+    """(n,) of columns (K, n) that act from then on."""
+    order = np.argsort(-scan.times_s)
+    weight = np.where(scan.live, scan.white.conditional_precisions(), 0.0)[order, None]
+    column = columns[order]
+    along = np.cumsum(weight * column * scan.y[order, None], axis=0)
+    information = np.cumsum(weight * column**2, axis=0)
+    explains = np.where(information > 0, along**2 / np.maximum(information, 1e-12), 0.0)
+    return np.asarray(scan.times_s[order[explains.argmax(axis=0)]])
+
+
+def _whitened(white: Whitening, values: Array) -> Array:
+    """values (E, K, c)"""
+    count, k, columns = values.shape
+    flat = np.moveaxis(values, 1, 0).reshape(k, -1)
+    return np.moveaxis(white(flat).reshape(k, count, columns), 0, 1)
+
+
+def _rest_of(size: Array | float, settled: Array | float) -> Array:
+    """b of a contact whose change goes from `settled` on by `size`."""
+    return _rest(settled + size) - _rest(settled)
+
+
+def _rest(size: Array | float) -> Array:
+    return np.asarray(size / (1 + np.asarray(size) / n.SHORT_WAY))
+
+
+def _rest_slope(size: Array | float, settled: Array | float) -> Array:
+    return np.asarray((1 + np.asarray(size + settled) / n.SHORT_WAY) ** -2)
+
+
+def _rest_sd(size: Array | float, settled: Array | float) -> Array:
+    return np.asarray(n.SHORT_WAY_SD * np.abs(_rest_of(size, settled)) + n.REST_FLOOR)
+
+
+def _diagonal(values: Array) -> Array:
+    """(E, 3, 3) of (E, 3)."""
+    return np.asarray(values[:, :, None] * np.eye(values.shape[1]))

@@ -1,0 +1,209 @@
+"""Wires and multiplexers: what each fault makes of a frame, predicted from the untouched pairs themselves.
+
+Pairs of electrodes that drive and sense themselves tell the whole impedance matrix between them: with z_ii = 0,
+
+    V(p) - V(q) while current goes from r to s  =  1/2 (z_ps + z_qr - z_pr - z_qs)
+
+so what exchanged wires, a stuck address bit or a short show is a closed form of the K values, with K x K slopes.
+Touches and drift go through the slopes, so that they are found under the fault as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+SIDES = ("+", "-")  # by reciprocity a drive multiplexer does to |Z| what the sense multiplexer of its side does
+
+
+class WireKind(Enum):
+    """What a fault of the wires may be."""
+
+    EXCHANGED = "exchanged"
+    STUCK = "stuck"
+    SHORT = "short"
+
+
+@dataclass(frozen=True)
+class WireFault:
+    """One of them. electrodes: 0-based, those exchanged, joined, or never reached."""
+
+    kind: WireKind
+    electrodes: tuple[int, ...]
+    side: str = ""  # of a stuck multiplexer
+    bit: int = 0
+    value: int = 0
+
+
+@dataclass(frozen=True)
+class WireMap:
+    """A frame through a fault, about one untouched frame."""
+
+    fault: WireFault
+    values: Array  # (K,) |Z| of the untouched skin
+    slopes: Array  # (K, K) of log |Z| through the fault to log |Z| without it; rows of 0: they see nothing
+    blind: Mask  # (K,) measurements that the fault leaves next to nothing of
+
+
+class WireMaps:
+    """All faults that one pattern (K, 4) can tell; none where not every pair of electrodes drives and senses itself."""
+
+    def __init__(self, pattern: NDArray[np.integer]) -> None:
+        self.faults: list[WireFault] = []
+        self.knows = _all_pairs(pattern)
+        if not self.knows:
+            return
+        first, second = (pattern[:, column].astype(np.intp) for column in (0, 1))
+        electrodes = int(pattern.max()) + 1
+        self._place = np.full((electrodes + 1, electrodes + 1), len(pattern), np.intp)  # K: no value, 0 ohm
+        self._place[first, second] = self._place[second, first] = np.arange(len(pattern))
+        couples = list(combinations(range(electrodes), 2))
+        self._exchanged = np.array([self._of_exchanged(first, second, couple) for couple in couples])
+        self._joined = np.array([self._place[couple] for couple in couples])
+        between = [self._terms(first, second, np.full_like(first, a), np.full_like(second, b)) for a, b in couples]
+        self._between = np.array(between)
+        stuck = _stuck_bits(electrodes)
+        self._routed = np.array([self._of_stuck(first, second, fault) for fault in stuck])
+        self.faults = [WireFault(WireKind.EXCHANGED, couple) for couple in couples]
+        self.faults += [WireFault(WireKind.SHORT, couple) for couple in couples]
+        self.faults += stuck
+
+    @cached_property
+    def at(self) -> dict[WireFault, int]:
+        """Place of each fault in `faults`."""
+        return {fault: k for k, fault in enumerate(self.faults)}
+
+    def every(self, z0: Array) -> Array:
+        """(N, K) |Z| through each of the N faults, of a skin that has z0 (K,) without them."""
+        values = np.append(z0, 0.0)
+        passed = _combined(values, self._between)
+        short = z0 - passed**2 / (z0[self._joined, None] + n.SHORT_OHM)
+        return np.concatenate([values[self._exchanged], short, np.abs(_combined(values, self._routed))])
+
+    def one(self, fault: WireFault, z0: Array) -> WireMap:
+        """Raises KeyError for a fault that this pattern cannot tell."""
+        k, couples = self.at[fault], len(self._joined)
+        if k < couples:
+            values, slopes = self._exchange(self._exchanged[k], z0)
+        elif k < 2 * couples:
+            values, slopes = self._short(k - couples, z0)
+        else:
+            values, slopes = self._stuck(self._routed[k - 2 * couples], z0)
+        blind = blinded(values[None], z0)[0]
+        relative = slopes * z0 / np.where(blind, 1.0, values)[:, None]
+        relative[blind] = 0.0
+        return WireMap(fault, values, relative, blind)
+
+    def _exchange(self, places: Indices, z0: Array) -> tuple[Array, Array]:
+        slopes = np.zeros((len(z0), len(z0)))
+        slopes[np.arange(len(z0)), places] = 1.0
+        return z0[places], slopes
+
+    def _short(self, k: int, z0: Array) -> tuple[Array, Array]:
+        passed = _combined(np.append(z0, 0.0), self._between[k])
+        joined = self._joined[k]
+        ohm = z0[joined] + n.SHORT_OHM
+        slopes = np.eye(len(z0)) - 2 * (passed / ohm)[:, None] * _slopes(self._between[k])
+        slopes[:, joined] += (passed / ohm) ** 2
+        return z0 - passed**2 / ohm, slopes
+
+    def _stuck(self, terms: Indices, z0: Array) -> tuple[Array, Array]:
+        signed = _combined(np.append(z0, 0.0), terms)
+        return np.abs(signed), _slopes(terms) * np.sign(signed)[:, None]
+
+    def _of_exchanged(self, first: Indices, second: Indices, couple: tuple[int, int]) -> Indices:
+        wires = np.arange(int(second.max()) + 1)
+        wires[list(couple)] = couple[::-1]
+        return self._place[wires[first], wires[second]]
+
+    def _of_stuck(self, first: Indices, second: Indices, fault: WireFault) -> Indices:
+        """The pair is driven, and sensed, as it is meant, by one of them from another electrode."""
+        mask = 1 << fault.bit
+        driven = [first.copy(), second.copy()]
+        column = SIDES.index(fault.side)
+        driven[column] = driven[column] | mask if fault.value else driven[column] & ~mask
+        electrodes = len(self._place) - 1
+        reached = np.minimum(driven[column], electrodes)  # beyond the last one nothing is connected
+        driven[column] = reached
+        terms = self._terms(first, second, driven[0], driven[1])
+        terms[reached == electrodes] = len(first)
+        return terms
+
+    def _terms(self, p: Indices, q: Indices, r: Indices, s: Indices) -> Indices:
+        """(K, 4) places of z_ps, z_qr, z_pr and z_qs."""
+        place = self._place
+        return np.stack([place[p, s], place[q, r], place[p, r], place[q, s]], axis=1)
+
+
+SIGNS: Array = np.array([0.5, 0.5, -0.5, -0.5])
+
+
+def _combined(values: Array, terms: Indices) -> Array:
+    """(..., K) of values (K + 1,) at terms (..., K, 4)."""
+    return np.asarray(values[terms] @ SIGNS)
+
+
+def _slopes(terms: Indices) -> Array:
+    """(K, K) of `_combined` to the values, at terms (K, 4)."""
+    count = len(terms)
+    slopes = np.zeros((count, count + 1))
+    for column, sign in enumerate(SIGNS):
+        np.add.at(slopes, (np.arange(count), terms[:, column]), sign)
+    return slopes[:, :count]
+
+
+def blinded(values: Array, z0: Array) -> Mask:
+    """(N, K) measurements that faults leave next to nothing of; values (N, K)."""
+    return np.asarray(values < n.NEXT_TO_NOTHING * np.median(z0))
+
+
+def open_electrodes(failed: Mask, member: Mask) -> tuple[tuple[int, ...], Mask]:
+    """Electrodes by which most failed measurements are explained, the one that explains most first, and what is left
+    of the failures (K,). failed (K,), member (K, E): the measurement uses the electrode.
+    """
+    left, gone, found = failed.copy(), np.zeros_like(failed), list[int]()
+    while left.any():
+        share = (member & left[:, None]).sum(axis=0)
+        whole = (member & ~gone[:, None]).sum(axis=0)
+        worst = int(share.argmax())
+        if share[worst] < max(2, n.OPEN_SHARE * whole[worst]):
+            break
+        found.append(worst)
+        gone |= member[:, worst]
+        left &= ~gone
+    return tuple(sorted(found)), left
+
+
+def members(pattern: NDArray[np.integer]) -> Mask:
+    """(K, E) whether a measurement uses an electrode."""
+    electrodes = np.arange(int(pattern.max()) + 1)
+    return np.asarray((pattern[:, :, None] == electrodes).any(axis=1))
+
+
+def _all_pairs(pattern: NDArray[np.integer]) -> bool:
+    electrodes = int(pattern.max()) + 1
+    themselves = bool((pattern[:, 0] == pattern[:, 2]).all() and (pattern[:, 1] == pattern[:, 3]).all())
+    pairs = {frozenset(row) for row in pattern[:, :2].tolist()}
+    return themselves and len(pairs) == len(pattern) == electrodes * (electrodes - 1) // 2
+
+
+def _stuck_bits(electrodes: int) -> Sequence[WireFault]:
+    found = list[WireFault]()
+    for side in SIDES:
+        for bit in range((electrodes - 1).bit_length()):
+            for value in (0, 1):
+                missed = tuple(e for e in range(electrodes) if (e >> bit & 1) != value)
+                found.append(WireFault(WireKind.STUCK, missed, side, bit, value))
+    return found

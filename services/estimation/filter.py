@@ -1,0 +1,236 @@
+"""The untouched skin over time: the sheet's slow field with its rates, contact impedances, what foam remembers of
+touches, and each measurement's own remainder. A Kalman filter of log |Z|; touches are no part of it.
+
+    y = H x + r + e,    x = (field, its rates, contact impedances, memories),    r: each measurement's own walk
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.tables import FIELD_DEGREES, SkinTables
+from models.measurement.whitening import Whitening
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+
+MODES = len(FIELD_DEGREES)
+FIELD, RATES = slice(0, MODES), slice(MODES, 2 * MODES)
+FADES_S: Array = np.array(n.MEMORY_FADES_S, float)
+STATES_OF_MEMORY = len(FADES_S)
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a touch left: one column, with a state for each time constant."""
+
+    column: Array  # (K,) of unit action
+    action: float  # when it went
+    at_s: float
+    x: float
+    y: float
+    log_radius: float
+
+
+@dataclass
+class FilterState:
+    """All that changes."""
+
+    at_s: float
+    x: Array  # (N,)
+    p: Array  # (N, N)
+    remainder: Array  # (K,)
+    remainder_variance: Array  # (K,)
+    memories: list[Memory] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The untouched skin at one instant."""
+
+    at_s: float
+    x: Array
+    p: Array
+    columns: Array  # (K, S) of the states that are seen
+    seen: NDArray[np.intp]  # (S,) their places in x
+    reach: Array  # (N, K) P H^T
+    shift: Array  # (K,) log |Z| over the baseline
+    covariance: Array  # (K, K) of it
+
+
+class SkinFilter:
+    def __init__(self, tables: SkinTables) -> None:
+        self._tables = tables
+        self.contacts = slice(2 * MODES, 2 * MODES + tables.electrodes)
+        self._fixed = self.contacts.stop
+        self._value_walk = _by_degree(n.FIELD_WALK, n.SLOPE_WALK)
+        self._rate_walk = _by_degree(n.FIELD_RATE_WALK, n.SLOPE_RATE_WALK)
+        self._faster = _by_degree(n.FIELD_FASTER, n.SLOPE_FASTER)
+        self.begin(0.0, np.full(tables.electrodes, n.CONTACT_START**2))
+
+    def begin(self, at_s: float, contact_variance: Array) -> None:
+        """A baseline was taken; contact_variance (E,): what its frames leave open of each contact impedance."""
+        k = self._tables.measurements
+        rates = _by_degree(n.FIELD_RATE, n.SLOPE_RATE)
+        variance = np.concatenate([np.full(MODES, n.FIELD_START**2), rates, contact_variance])
+        start = np.full(k, n.REMAINDER_START**2)
+        self.now = FilterState(at_s, np.zeros(self._fixed), np.diag(variance), np.zeros(k), start)
+
+    def ahead(self, at_s: float, flicker: Array) -> Prediction:
+        """flicker (E,): variances of the contact impedances' noise, of which a share is slow."""
+        now = self.now
+        passed_s = max(0.0, at_s - now.at_s)
+        x, p = self._moved(passed_s, flicker)
+        columns, seen = self._columns()
+        reach = p[:, seen] @ columns.T
+        covariance = columns @ reach[seen]
+        covariance[np.diag_indices_from(covariance)] += now.remainder_variance + n.REMAINDER_WALK**2 * passed_s
+        return Prediction(at_s, x, p, columns, seen, reach, columns @ x[seen] + now.remainder, covariance)
+
+    def shift(self, at_s: float) -> Array:
+        """(K,) log |Z| over the baseline, predicted: the mean of `ahead` alone."""
+        now, passed_s = self.now, max(0.0, at_s - self.now.at_s)
+        x = now.x.copy()
+        x[FIELD] += passed_s * x[RATES]
+        x[self._fixed :] *= np.tile(np.exp(-passed_s / FADES_S), len(now.memories))
+        columns, seen = self._columns()
+        return np.asarray(columns @ x[seen] + now.remainder)
+
+    def faster(self, times: float = 1.0) -> Array:
+        """(K, K) covariance of drift faster than the filter's own; times: that variance, beyond 1 contacts move too."""
+        columns = self._tables.field
+        covariance = np.asarray(times * (columns * self._faster) @ columns.T)
+        if times > 1:
+            contact = self._tables.contact * n.CONTACT_FASTER
+            covariance += (times - 1) * contact @ contact.T
+        return covariance
+
+    def widen(self, times: float) -> None:
+        """It drifts faster than it did: by what `faster` says, of which a share stays."""
+        p, modes = self.now.p, np.arange(MODES)
+        p[modes, modes] += n.FASTER_STAYS * times * self._faster
+        p[modes + MODES, modes + MODES] += n.FASTER_STAYS * self._faster
+        contacts = np.arange(self.contacts.start, self.contacts.stop)
+        p[contacts, contacts] += n.FASTER_STAYS * (times - 1) * n.CONTACT_FASTER**2
+
+    def take_in(self, predicted: Prediction, y: Array, white: Whitening) -> Array:
+        """Learn from an untouched frame: y (K,) log |Z| over the prediction, white: of its covariance. Returns
+        S^-1 y (K,).
+        """
+        now = self.now
+        passed_s = max(0.0, predicted.at_s - now.at_s)
+        pulled = white.solve(y)
+        gathered = white(predicted.reach.T)  # (K, N)
+        now.x = predicted.x + predicted.reach @ pulled
+        now.p = predicted.p - gathered.T @ gathered
+        variance = now.remainder_variance + n.REMAINDER_WALK**2 * passed_s
+        now.remainder = now.remainder + variance * pulled
+        now.remainder_variance = variance * (1 - variance * white.conditional_precisions())
+        now.at_s = predicted.at_s
+        self._forget_the_faint()
+        return pulled
+
+    def more_memory(self) -> Array | None:
+        """(K, K) covariance of memories that are as large as foam's may be; None where there is none."""
+        memories = self.now.memories
+        if not memories:
+            return None
+        columns = np.array([n.MEMORY_MOST * memory.action * memory.column for memory in memories]).T
+        return np.asarray(columns @ columns.T)
+
+    def widen_memories(self) -> None:
+        """They were larger than was expected."""
+        now = self.now
+        for place, memory in enumerate(now.memories):
+            own = self._own(place)
+            states = np.arange(own.start, own.stop)
+            now.p[states, states] += (n.MEMORY_SD * memory.action) ** 2
+
+    def remembers(self, at_s: float) -> bool:
+        """Whether a touch went so lately that what it left may be one still."""
+        return any(at_s - memory.at_s <= n.MEMORY_DOUBT_S for memory in self.now.memories)
+
+    def remember(self, memory: Memory) -> None:
+        """A touch went, or moved away."""
+        now, size = self.now, len(self.now.x)
+        grown = np.exp(np.minimum(max(0.0, memory.at_s - now.at_s) / FADES_S, 20.0))  # the filter stands before that
+        now.x = np.concatenate([now.x, memory.action * n.MEMORY_SHARE * grown])
+        p = np.zeros((size + STATES_OF_MEMORY, size + STATES_OF_MEMORY))
+        p[:size, :size] = now.p
+        own = np.arange(size, size + STATES_OF_MEMORY)
+        p[own, own] = (memory.action * n.MEMORY_SD * grown) ** 2
+        now.p = p
+        now.memories.append(memory)
+
+    def beyond_memory(self, predicted: Prediction, pulled: Array, white: Whitening) -> Memory | None:
+        """The memory that would have to be more than any foam's; pulled (K,): S^-1 y."""
+        for place, memory in enumerate(self.now.memories):
+            age_s = predicted.at_s - memory.at_s
+            if age_s > n.MEMORY_DOUBT_S:
+                continue
+            own = self._own(place)
+            reach = predicted.reach[own].sum(axis=0)
+            left = float(predicted.x[own].sum() + reach @ pulled)
+            whitened = white(reach)
+            variance = float(predicted.p[own, own].sum() - whitened @ whitened)
+            most = n.MEMORY_MOST * memory.action * float(np.exp(-age_s / FADES_S).mean())
+            if left > most + n.MEMORY_SIGMAS * np.sqrt(max(variance, 0.0)):
+                return memory
+        return None
+
+    def _own(self, place: int) -> slice:
+        first = self._fixed + STATES_OF_MEMORY * place
+        return slice(first, first + STATES_OF_MEMORY)
+
+    def _moved(self, passed_s: float, flicker: Array) -> tuple[Array, Array]:
+        x, p = self.now.x.copy(), self.now.p.copy()
+        if not passed_s:
+            return x, p
+        x[FIELD] += passed_s * x[RATES]
+        p[FIELD] += passed_s * p[RATES]
+        p[:, FIELD] += passed_s * p[:, RATES]
+        modes = np.arange(MODES)
+        p[modes, modes + MODES] += self._rate_walk * passed_s**2 / 2
+        p[modes + MODES, modes] += self._rate_walk * passed_s**2 / 2
+        grown = np.zeros(len(x))
+        grown[FIELD] = self._value_walk * passed_s + self._rate_walk * passed_s**3 / 3
+        grown[RATES] = self._rate_walk * passed_s
+        grown[self.contacts] = (n.CONTACT_WALK**2 + n.CONTACT_FOLLOWS * flicker) * passed_s
+        if count := len(self.now.memories):
+            kept = np.tile(np.exp(-passed_s / FADES_S), count)
+            memories = slice(self._fixed, None)
+            x[memories] *= kept
+            p[memories] *= kept[:, None]
+            p[:, memories] *= kept
+            grown[memories] = (n.MEMORY_WALK * x[memories]) ** 2 * passed_s / np.tile(FADES_S, count)
+        p[np.diag_indices_from(p)] += grown
+        return x, p
+
+    def _columns(self) -> tuple[Array, NDArray[np.intp]]:
+        memories = [memory.column for memory in self.now.memories for _ in range(STATES_OF_MEMORY)]
+        parts = [self._tables.field, self._tables.contact]
+        columns = np.hstack([*parts, np.array(memories).T]) if memories else np.hstack(parts)
+        return columns, np.concatenate([np.arange(MODES), np.arange(2 * MODES, len(self.now.x))])
+
+    def _forget_the_faint(self) -> None:
+        """Memories that no scan shows any more, and the oldest of too many, become each measurement's own remainder."""
+        now = self.now
+        for place in reversed(range(len(now.memories))):
+            memory, own = now.memories[place], self._own(place)
+            share, variance = float(now.x[own].sum()), max(0.0, float(now.p[own, own].sum()))
+            size = float(np.linalg.norm(memory.column)) / n.MEMORY_UNIT * np.sqrt(max(share**2, variance))
+            if size >= n.MEMORY_FAINT and place >= len(now.memories) - n.MEMORIES:
+                continue
+            now.remainder = now.remainder + memory.column * share
+            now.remainder_variance = now.remainder_variance + memory.column**2 * variance
+            kept = np.r_[0 : own.start, own.stop : len(now.x)]
+            now.x, now.p = now.x[kept], now.p[np.ix_(kept, kept)]
+            del now.memories[place]
+
+
+def _by_degree(even: float, sloped: float) -> Array:
+    """(M,) variances of the field's modes: a mode of degree d has a d-th of what a slope has."""
+    return np.array([even if not degree else sloped / degree for degree in FIELD_DEGREES]) ** 2

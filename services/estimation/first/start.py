@@ -1,0 +1,219 @@
+"""Is the skin untouched when nothing is known of it yet? Its first scans, judged by evidence.
+
+Their mean is held against what the bundle predicts, with the gain, the sheet's slow shape and every contact impedance
+free. No skin is quite its bundle's: what they differ by has a known form and an unknown size, which is summed over a
+ladder of factors of two. Either that explains the scans, or a touch explains what it leaves; and where the difference
+is so large that a touch may hide in it, nothing is said.
+
+With an earlier baseline of this very skin both have that difference, and only what drifts meanwhile is free.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from math import gcd
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.course import TouchCourse
+from models.measurement.disc import DiscResponse
+from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
+from models.measurement.grid import DiscGrid
+from models.measurement.tables import SkinTables
+from models.measurement.touch import PLACE, RATE, TouchPrior, anywhere
+from models.measurement.whitening import Whitening
+from services.estimation.values import numbers as n
+from services.estimation.values.judgement import Judgement, Verdict, judge
+
+Array = NDArray[np.float64]
+
+LADDER: Array = 2.0 ** np.arange(n.START_RUNGS)  # of the difference between bundle and skin
+COARSE = 12  # pixels along each side of the sheet, that a smooth field is made of
+SPAN_S = 1.0  # of a mean of scans, in which nothing changes: any
+HELD = 1e-6  # rates and velocities of a touch that lasts through all scans
+
+
+class StartSays(Enum):
+    UNTOUCHED = "untouched"
+    TOUCHED = "touched"
+    UNKNOWN = "unknown"  # the difference between bundle and skin may hide a touch
+
+
+class Rung(NamedTuple):
+    """The scans with a difference of one size."""
+
+    times: float  # of the least difference
+    even: bool  # whether the sheet is as even as the bundle's
+    untouched: float  # log evidence and prior
+    touched: float
+    seen: float  # z^2 of the weakest touch that must not hide in the difference
+    fit: FoundTouches | None  # None: no disc stands out
+
+
+@dataclass(frozen=True)
+class JudgedStart:
+    """What the first scans say."""
+
+    says: StartSays
+    odds: float  # nat: log evidence of touched against untouched
+    sure: bool  # whether a touch explains the scans, not only better than a difference alone
+    bare: Rung | None  # the likeliest of an untouched skin; None: nothing is predicted
+    fit: FoundTouches | None  # where touched, under the likeliest difference
+
+    @property
+    def judgements(self) -> list[Judgement]:
+        """Whether something touches, and whether something may without being seen."""
+        if self.bare is None:
+            return [
+                Judgement("start", 0.0, float(n.START_NATS), 0.0, Verdict.CANNOT),
+                judge("hidden", 1.0, 1.0),
+            ]
+        touched = judge("start", self.odds, n.START_NATS)
+        if self.says is StartSays.TOUCHED:
+            return [touched]
+        hides = float(n.FALSE_ALARM_Z2) / max(self.bare.seen, 1e-9)
+        return [touched, judge("hidden", max(hides, 1 + self.odds / n.START_NATS), 1.0)]
+
+
+CANNOT = JudgedStart(StartSays.UNKNOWN, 0.0, False, None, None)
+
+
+@dataclass(frozen=True)
+class EarlierBaseline:
+    """Of this skin and board, untouched."""
+
+    log_z0: Array  # (K,)
+    covariance: Array  # (K, K) of what has drifted since
+
+
+class StartJudge:
+    """Of one skin; tables: of its bundle."""
+
+    def __init__(self, tables: SkinTables) -> None:
+        self._tables = tables
+
+    def __call__(
+        self, log_z: Array, variance: Array, live: NDArray[np.bool_], earlier: EarlierBaseline | None = None
+    ) -> JudgedStart:
+        """log_z (K,): mean of the first scans; variance (K,): of that mean; live (K,): what of it counts."""
+        if live.mean() < n.LEAST_LIVE or (earlier is None and not self._tables.predicted):
+            return CANNOT
+        log_expected = np.log(self._tables.z0) if earlier is None else earlier.log_z0
+        y = log_z - log_expected
+        gain = float(np.median(y[live]))
+        y = np.where(live, y - gain, 0.0)
+        tables = self._tables.relative_to(np.exp(log_expected + gain))
+        base = np.diag(variance + n.START_ABSOLUTE**2) + n.START_GAIN**2
+        dead = np.flatnonzero(~live)
+        base[dead, dead] += n.START_LEFT_OUT
+        ladder = StartLadder(tables, y, live)
+        rest = n.START_ABSOLUTE**2 * np.eye(len(y))
+        if earlier is not None:
+            return decided(ladder.rungs(base + earlier.covariance, rest, 0.0))
+        contact = tables.contact * n.START_CONTACT
+        base += contact @ contact.T
+        form = n.START_LAYER**2 * tables.layer @ tables.layer.T + rest
+        wide = base + n.START_FIELD**2 * smooth_field(tables) + n.START_GRAIN**2 * grain(tables)
+        return decided(ladder.rungs(base, form, 0.0) + ladder.rungs(wide, form, float(n.START_COST_WIDE)))
+
+
+class StartLadder:
+    """One mean of scans, explained with differences of each size."""
+
+    def __init__(self, tables: SkinTables, y: Array, live: NDArray[np.bool_]) -> None:
+        self._y, self._live = y, live
+        response = DiscResponse(tables)
+        self._grid = DiscGrid(response)
+        self._course = TouchCourse(response, np.zeros(len(y)), SPAN_S)
+        self._misfit, self._error = tables.misfit, tables.wrong
+
+    def rungs(self, base: Array, form: Array, cost: float) -> list[Rung]:
+        """base (K, K): covariance but for the difference, whose form (K, K) is. Up to beyond the likeliest of an
+        untouched skin.
+        """
+        covariances = [base + times**2 * form for times in LADDER]
+        whites = [Whitening.of(covariance) for covariance in covariances]
+        density = [self._density(white) for white in whites]
+        last = min(len(LADDER), int(np.argmax(density)) + 2)
+        found = list[Rung]()
+        most = -np.inf
+        for k in range(last):
+            nothing = bool(found) and found[-1].touched < most - n.START_PAST
+            found.append(self._rung(float(LADDER[k]), covariances[k], whites[k], density[k], cost, nothing))
+            most = max(most, found[-1].touched)
+        return found
+
+    def _density(self, white: Whitening) -> float:
+        residual = white(self._y)
+        return white.log_density - 0.5 * float(residual @ residual)
+
+    def _rung(
+        self, times: float, covariance: Array, white: Whitening, density: float, cost: float, nothing: bool
+    ) -> Rung:
+        """nothing: whether no touch is worth looking for any more."""
+        log_prior = cost - float(np.log(times))  # the larger, the less likely
+        information = self._grid.information(white)
+        least = float(n.START_SEEN**2 * np.quantile(information, n.START_SEEN_SHARE))
+        scene = FittedScan(self._y, covariance, self._course, self._misfit, int(self._live.sum()))
+        fit = None if nothing else self._touched(scene, white, information)
+        touched = -np.inf if fit is None else fit.evidence + n.COST_TOUCH * len(fit) + log_prior
+        return Rung(times, cost == 0, density + log_prior, touched, least, fit)
+
+    def _touched(self, scene: FittedScan, white: Whitening, information: NDArray[np.float32]) -> FoundTouches | None:
+        """Touches one after the other, each found as a disc, while they add evidence."""
+        pulled = white.solve(self._y)
+        best: FoundTouches | None = None
+        priors = list[TouchPrior]()
+        for _ in range(int(n.START_TOUCHES)):
+            z2, disc, action = self._grid.likeliest(pulled, information)
+            if z2 < n.FALSE_ALARM_Z2:
+                break
+            x, y = self._grid.discs[disc, PLACE]
+            priors = [*priors, held(float(x), float(y), action)]
+            fit = TouchFitter(scene, priors, self._error).fit(int(n.STEPS_COLD))
+            if best is not None and fit.evidence < best.evidence + n.ANOTHER:
+                break
+            best, pulled = fit, fit.pulled
+        return best
+
+
+def smooth_field(tables: SkinTables) -> Array:
+    """(K, K) covariance of what a smooth random log conductivity of unit variance does."""
+    side = len(tables.jacobian)
+    block = side // gcd(side, COARSE)
+    coarse = tables.jacobian.reshape(side // block, block, side // block, block, -1).sum(axis=(1, 3)).astype(float)
+    axis = (np.arange(len(coarse)) + 0.5) * 2 / len(coarse) - 1
+    near = np.exp(-((axis[:, None] - axis) ** 2) / (2 * n.START_FIELD_LENGTH**2))
+    smoothed = np.einsum("ab,bck->ack", near, np.einsum("cd,bdk->bck", near, coarse))
+    return np.asarray(np.einsum("yxk,yxl->kl", coarse, smoothed, optimize=True))
+
+
+def grain(tables: SkinTables) -> Array:
+    """(K, K) covariance of what a sheet does that conducts better one way than across it; zero where unknown."""
+    columns = np.stack([tables.along.sum(axis=(0, 1)), tables.turned.sum(axis=(0, 1))], axis=1).astype(float)
+    return np.asarray(columns @ columns.T)
+
+
+def held(x: float, y: float, action: float) -> TouchPrior:
+    """A touch anywhere that stays as it is."""
+    prior = anywhere(x, y, action, SPAN_S)
+    prior.sd[RATE:] = HELD
+    return prior
+
+
+def decided(rungs: list[Rung]) -> JudgedStart:
+    untouched = np.array([rung.untouched for rung in rungs])
+    touched = np.array([rung.touched for rung in rungs])
+    whole = float(np.logaddexp.reduce(touched))
+    odds = whole - float(np.logaddexp.reduce(untouched))
+    bare = rungs[int(untouched.argmax())]
+    best = rungs[int(touched.argmax())]
+    if odds > n.START_NATS and best.fit is not None:
+        sure = best.even and best.times <= n.START_SURE and best.fit.chi2 < n.START_SURE_CHI2
+        return JudgedStart(StartSays.TOUCHED, odds, sure, bare, best.fit)
+    if odds < 0 and bare.seen > n.FALSE_ALARM_Z2:
+        return JudgedStart(StartSays.UNTOUCHED, odds, False, bare, None)
+    return JudgedStart(StartSays.UNKNOWN, odds, False, bare, None)

@@ -1,0 +1,267 @@
+"""The latest whole scans, and when they make a baseline: they agree, their noise is one that touches are told from, and
+nothing touches. The first is taken as soon as that holds, others by the command `tare`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.tables import FIELD_DEGREES, SkinTables
+from protocol.errors import EitskinError
+from services.estimation.first.start import EarlierBaseline, JudgedStart, StartJudge, StartSays
+from services.estimation.values import numbers as n
+from services.estimation.values.judgement import Judgement, judge
+from services.estimation.values.scan import Scan
+
+Array = NDArray[np.float64]
+
+UNSURE = (
+    "this skin differs from its bundle by as much as a touch may make: see that nothing touches it and run `skin tare` "
+    "once"
+)
+PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare{}`"
+
+
+class TareRefused(EitskinError, ValueError):
+    """The latest scans make no baseline. The text says why and what to do; with ": wait" in it, time alone helps."""
+
+
+class AgreedScans(NamedTuple):
+    """Scans of an untouched skin."""
+
+    log_z0: Array  # (K,) mean; where a measurement failed, what the bundle predicts
+    live: NDArray[np.bool_]  # (K,) measurements that none of the scans lacks: the others count not before the next tare
+    residuals: Array  # (n, K) less that and an even trend
+    at_s: float  # of the mean
+    part: int  # that they end with
+    least_white: float  # variance of the noise that is assumed at least
+    judgements: tuple[Judgement, ...]
+
+
+class Agreement(NamedTuple):
+    """Whether scans are the same but for their noise."""
+
+    statistic: float
+    limit: float  # that quiet scans keep to
+
+
+@dataclass
+class LatestScansState:
+    """All that changes."""
+
+    log_z: list[Array] = field(default_factory=list)  # each (K,), NaN where a measurement failed
+    at_s: list[float] = field(default_factory=list)
+    part: int = 0
+    seen: int = 0  # scans that came
+    tried: int = 0  # `seen` when a first baseline was tried
+
+
+class LatestScans:
+    """Scans that follow each other."""
+
+    def __init__(self) -> None:
+        self.now = LatestScansState()
+
+    def __len__(self) -> int:
+        return len(self.now.log_z)
+
+    def add(self, log_z: Array, at_s: float, part: int) -> None:
+        now = self.now
+        if part != now.part:  # scans that end otherwise have other noise
+            self.clear()
+            now.part = part
+        now.log_z.append(log_z)
+        now.at_s.append(at_s)
+        now.seen += 1
+        del now.log_z[: -int(n.TARE_SCANS)], now.at_s[: -int(n.TARE_SCANS)]
+
+    def clear(self) -> None:
+        """What comes does not follow on what came."""
+        self.now.log_z, self.now.at_s = [], []
+
+    @property
+    def due(self) -> bool:
+        """Whether a first baseline is to be tried with this scan."""
+        now = self.now
+        return len(self) == int(n.TARE_SCANS) and now.seen % n.TARE_RETRIES == 0 and now.seen != now.tried
+
+    def agreed(self, tables: SkinTables) -> AgreedScans:
+        """Raises TareRefused where there are too few, or they do not agree."""
+        needed = int(n.TARE_SCANS)
+        if len(self) < needed:
+            raise TareRefused(f"only {len(self)} of {needed} frames came so far: wait, or look at `skin top`")
+        scans = np.stack(self.now.log_z)
+        live: NDArray[np.bool_] = np.asarray(np.isfinite(scans).all(axis=0))
+        if live.mean() < n.LEAST_LIVE:
+            raise TareRefused(
+                f"only {int(live.sum())} of {len(live)} measurements give values: check the cable and the electrodes"
+            )
+        good = scans[:, live]
+        noise = float(np.median(good.std(axis=0, ddof=1)))
+        if noise > n.TARE_NOISY:
+            raise TareRefused(
+                f"the frames scatter by {100 * noise:.1f} % (at most {100 * n.TARE_NOISY:.0f} %): check grounding and "
+                "cable"
+            )
+        slopes = np.array(FIELD_DEGREES) <= 1
+        found = agreement(good, tables.field[np.ix_(live, slopes)])
+        if found.statistic > found.limit:
+            raise TareRefused(
+                f"the frames disagree (statistic {found.statistic:.0f}, limit {found.limit:.0f}): something touched or "
+                "moved meanwhile"
+            )
+        judgements = [judge("agrees", *found), judge("identical", n.TARE_IDENTICAL, max(noise, 1e-300))]
+        if tables.predicted:  # a measured bundle knows its own noise
+            judgements.append(judge("noise_trained", noise, n.TARE_UNTRAINED))
+        white = n.TARE_ASSUMED**2 if noise < n.TARE_IDENTICAL else 0.0
+        return self._made(scans, live, tables, float(white), tuple(judgements))
+
+    def _made(
+        self,
+        scans: Array,
+        live: NDArray[np.bool_],
+        tables: SkinTables,
+        white: float,
+        judgements: tuple[Judgement, ...],
+    ) -> AgreedScans:
+        mean = np.where(live, scans, 0.0).mean(axis=0)
+        predicted = np.log(tables.z0)
+        log_z0 = np.where(live, mean, predicted + float(np.median((mean - predicted)[live])))
+        slope = np.linspace(-1, 1, len(scans))
+        off = np.where(live, scans - log_z0, 0.0)
+        residuals = off - slope[:, None] * (slope @ off / (slope @ slope))
+        return AgreedScans(log_z0, live, residuals, float(np.mean(self.now.at_s)), self.now.part, white, judgements)
+
+
+def without_drift(scans: Array, field: Array) -> Array:
+    """(n, K) scans less what the sheet drifts evenly over their time, up to TARE_DRIFTS; field (K, n): its columns."""
+    slope = np.linspace(-1, 1, len(scans))
+    each = slope @ (scans - scans.mean(axis=0)) / (slope @ slope)
+    drift = np.linalg.lstsq(field, each, rcond=None)[0]
+    drift *= min(1.0, n.TARE_DRIFTS / max(float(np.linalg.norm(drift)), 1e-12))
+    return np.asarray(scans - slope[:, None] * (field @ drift))
+
+
+def agreement(scans: Array, field: Array) -> Agreement:
+    """Chi-square of the quarters' means of (n, K) log |Z| against the noise within them; field (K, n): the columns of
+    what may drift.
+    """
+    scans = without_drift(scans, field)
+    quarters = int(n.TARE_QUARTERS)
+    size = len(scans) // quarters
+    parts = scans[-quarters * size :].reshape(quarters, size, -1)
+    # Presses that come and go make the quarters scatter within as well; from scan to scan they seldom do.
+    steps = 0.5 * (np.diff(scans, axis=0) ** 2).mean(axis=0)
+    noise = np.minimum(parts.var(axis=1, ddof=1).mean(axis=0), steps)
+    within = noise / size + n.TARE_HARMLESS**2
+    means = parts.mean(axis=1)
+    statistic = float((((means - means.mean(axis=0)) ** 2).sum(axis=0) / within).sum())
+    dof_within = quarters * (size - 1)
+    dof = (quarters - 1) * scans.shape[1]
+    quantile = NormalDist().inv_cdf(1 - n.TARE_DISAGREES)
+    chi_square = dof * (1 - 2 / (9 * dof) + quantile * (2 / (9 * dof)) ** 0.5) ** 3  # Wilson-Hilferty
+    estimated = dof_within / (dof_within - 2) * (1 + 2 / dof_within)  # the noise within is estimated too
+    return Agreement(statistic, float(chi_square * estimated))
+
+
+@dataclass
+class TaringState:
+    """All that changes beside the scans."""
+
+    untouched: int = 0  # whole scans since the last touch
+    touched: bool = False  # by the latest one
+    judgements: tuple[Judgement, ...] = ()  # of the baseline, or of why there is none
+    doubted: bool = False  # the baseline's word against a touch counts for nothing
+    surely: bool = False  # a touch explains the first scans
+    problem: str = ""  # what stands in the way of valid frames, for a person
+
+
+class Taring:
+    """Of one skin; tables: of its bundle."""
+
+    def __init__(self, tables: SkinTables) -> None:
+        self._tables, self._start = tables, StartJudge(tables)
+        self.latest, self.now = LatestScans(), TaringState()
+
+    def offer(self, scan: Scan, live: NDArray[np.bool_], middle_s: float) -> None:
+        """A whole scan; live (K,): what of it was measured; middle_s: when. One that is not believed interrupts."""
+        if not scan.believed:
+            self.latest.clear()
+            return
+        self.latest.add(np.log(np.where(live, scan.values, np.nan)), middle_s, scan.part)
+
+    def saw(self, touched: bool) -> None:
+        """Whether something touched in the latest whole scan."""
+        self.now.touched = touched
+        self.now.untouched = 0 if touched else self.now.untouched + 1
+
+    def first(self, earlier: EarlierBaseline | None = None) -> AgreedScans | None:
+        """The scans of a first baseline as soon as there is one. earlier: a baseline without doubt, if one is known."""
+        if not self.latest.due:
+            return None
+        self.latest.now.tried = self.latest.now.seen
+        try:
+            scans = self.latest.agreed(self._tables)
+        except TareRefused as why:
+            self.now.problem = f"no baseline yet: {why}"
+            return None
+        size = len(scans.residuals)
+        variance = (scans.residuals**2).mean(axis=0) / size
+        start = self._start(scans.log_z0, variance, scans.live, earlier)
+        self.now.judgements = (*scans.judgements, *start.judgements)
+        self.now.surely = start.sure
+        if start.says is StartSays.TOUCHED:
+            self.now.problem = PRESSED.format(" --force" * start.sure)
+            return None
+        self._taken(scans, start)
+        return scans
+
+    def by_command(self, force: bool) -> AgreedScans:
+        """The latest scans, whatever the baseline was. Raises TareRefused, while something touches unless forced."""
+        now, needed = self.now, int(n.TARE_SCANS)
+        if now.surely and not force:
+            raise TareRefused(PRESSED.format(" --force"))
+        if now.judgements and not (now.doubted or force) and len(self.latest) == needed:
+            if now.touched:
+                raise TareRefused("the skin is touched: free it and try again (or --force, if nothing touches it)")
+            if now.untouched < needed:
+                few = f"only {now.untouched} of {needed} untouched frames since the last touch"
+                raise TareRefused(f"{few}: wait and try again")
+        scans = self.latest.agreed(self._tables)
+        # Whoever gives the command has looked: no doubt, but that of noise, which looking does not mend.
+        now.judgements = tuple(each for each in scans.judgements if each.name != "identical")
+        self._taken(scans, None)
+        return scans
+
+    def judgements(self, tared: bool) -> list[Judgement]:
+        """Rows of every scan; tared: whether there is a baseline."""
+        touched = any(each.name == "start" and each.ratio >= 1 for each in self.now.judgements)
+        rows = list(self.now.judgements)
+        if not tared and not touched:
+            rows.insert(0, judge("baseline", n.TARE_SCANS, max(len(self.latest), 1)))
+        return rows
+
+    def _taken(self, scans: AgreedScans, start: JudgedStart | None) -> None:
+        now = self.now
+        now.surely, now.untouched, now.touched = False, 0, False
+        turned = {each.name for each in now.judgements if each.ratio >= 1}
+        now.doubted = bool(turned)
+        now.problem = ""
+        if "identical" in turned:
+            now.problem = (
+                f"the {len(scans.residuals)} untouched frames are identical, as measured ones never are: a noise of "
+                f"{n.TARE_ASSUMED:g} of each measurement is assumed; check the source and run `skin tare`"
+            )
+        if "noise_trained" in turned:
+            noise = next(each.statistic for each in now.judgements if each.name == "noise_trained")
+            now.problem = (
+                f"the frames scatter by {100 * noise:.1f} %, networks were trained for {100 * n.TARE_UNTRAINED:.2f} % "
+                "at most: check grounding and cable, then run `skin tare`"
+            )
+        elif not now.problem and start is not None and start.says is StartSays.UNKNOWN:
+            now.problem = UNSURE

@@ -1,0 +1,403 @@
+"""What may explain a scan, in order, all scored in one table of log evidence: nothing new; a touch that ended, moved or
+began; faster drift; a disturbance; a response that is wrong by more. Each owns something wider than the filter's own
+walk, so that none of them can be locked out. The likeliest of those that explain the scan is taken.
+
+The order is a budget in solver steps, never in time: a replay decides as the session did.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.course import TouchCourse
+from models.measurement.disc import DiscResponse
+from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
+from models.measurement.grid import DiscGrid
+from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
+from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
+from models.measurement.tables import SkinTables
+from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anywhere, plain
+from models.measurement.whitening import Whitening
+from services.estimation.filter import SkinFilter
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+
+ONSETS = (0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a touch may begin or end at once
+AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
+WIDER = (MEMORY, DRIFT, BURST, NOISE)
+COSTS = {
+    AS_IT_IS: 0.0,
+    MEMORY: float(n.COST_MEMORY),
+    DRIFT: float(n.COST_DRIFT),
+    BURST: float(n.COST_BURST),
+    NOISE: float(n.COST_NOISE),
+}
+
+
+@dataclass(frozen=True)
+class Question:
+    """One scan, with what is predicted of it without touches."""
+
+    y: Array  # (K,) log |Z| over the prediction; 0 where a measurement does not count
+    covariance: Array  # (K, K)
+    live: NDArray[np.bool_]
+    times_s: Array  # (K,) from the middle of the scan
+    span_s: float
+    order: NDArray[np.intp]  # (K,) rank in time, 0 the oldest
+    part: int  # that it ends with
+    information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
+
+    @cached_property
+    def white(self) -> Whitening:
+        return Whitening.of(self.covariance)
+
+
+@dataclass(frozen=True)
+class ScoredAnswer:
+    """One hypothesis, scored."""
+
+    cause: str
+    fit: FoundTouches | None  # None: nothing touches
+    kept: tuple[int, ...]  # for each touch of the fit the standing one that it continues; -1: new
+    chi2: float
+    left_z2: float  # of the best further disc
+    score: float  # log evidence and prior
+    white: Whitening
+    pulled: Array  # (K,) S^-1 of the residual
+    left: Array  # (K,)
+
+    @property
+    def explained(self) -> bool:
+        return self.chi2 < n.GOOD and self.left_z2 < n.FALSE_ALARM_Z2
+
+    @property
+    def quiet(self) -> bool:
+        return self.chi2 < n.QUIET and self.left_z2 < n.FALSE_ALARM_Z2 * max(1.0, self.chi2)
+
+
+class Hypotheses:
+    """Of one skin."""
+
+    def __init__(self, tables: SkinTables, response: DiscResponse, noise: NoiseModel, drift: SkinFilter) -> None:
+        self.grid = DiscGrid(response)
+        self._tables, self._response, self._noise, self._drift = tables, response, noise, drift
+        self._slopes: Array | None = None
+        self.steps = 0
+        self.adrift = 1.0  # times the faster drift: grows while nothing explains the skin
+
+    def through(self, slopes: Array) -> Hypotheses:
+        """The same of a skin that is seen through a fault of the wires; slopes (K, K)."""
+        seen = copy(self)
+        seen._tables, seen.grid = self._tables.through(slopes), self.grid.through(slopes)
+        seen._response = DiscResponse(seen._tables)
+        seen._slopes = slopes
+        return seen
+
+    def faster_drift(self) -> Array:
+        """(K, K)"""
+        faster = self._drift.faster(self.adrift)
+        return faster if self._slopes is None else np.asarray(self._slopes @ faster @ self._slopes.T)
+
+    # --- nothing touches ---
+
+    def untouched(self, question: Question, cause: str = AS_IT_IS) -> ScoredAnswer | None:
+        """The answer that nothing touches; None where this skin has no such cause."""
+        white = question.white
+        if cause:
+            more = self._more(question, cause, question.y)
+            if more is None:
+                return None
+            white = Whitening.of(question.covariance + more)
+        residual = white(question.y)
+        pulled = white.w.T @ residual
+        z2 = max(self._left(question, pulled, white, None, ())[0], self._fresh(question, pulled, white))
+        score = white.log_density - 0.5 * float(residual @ residual) + COSTS[cause]
+        chi2 = float(residual @ residual) / max(int(question.live.sum()), 1)
+        return ScoredAnswer(cause, None, (), chi2, z2, score, white, pulled, question.y)
+
+    # --- something does ---
+
+    def glance(self, question: Question) -> ScoredAnswer:
+        """The likeliest answer that nothing touches, without a search."""
+        found = [answer for cause in (AS_IT_IS, *WIDER) if (answer := self.untouched(question, cause)) is not None]
+        return _likeliest(found)
+
+    def ask(self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]) -> ScoredAnswer:
+        """The likeliest answer. standing, loose: what is known of the touches that there were, as they were and where
+        they may have begun to move or to change.
+        """
+        self.steps = 0
+        answers = self._of_standing(question, standing, loose) if len(standing) else self._of_none(question)
+        if not self._settled(answers):
+            answers += self._of_anything(question, standing, answers)
+        return _likeliest(answers)
+
+    def at(self, question: Question, x: float, y: float) -> ScoredAnswer:
+        """The answer that something touches there."""
+        return self._fitted(question, [anywhere(x, y, 0.0, question.span_s)], (-1,), n.STEPS_COLD)
+
+    def anew(self, question: Question) -> ScoredAnswer | None:
+        """The likeliest touches, as if there had been none before; None where there are none."""
+        self.steps = 0
+        found = self._search(question, (), None)
+        return _likeliest(found) if found else None
+
+    def without(self, question: Question, standing: Sequence[TouchPrior], place: int) -> ScoredAnswer:
+        """The answer that one of the touches is none, but drift."""
+        kept = tuple(k for k in range(len(standing)) if k != place)
+        if not kept:
+            answer = self.untouched(question, DRIFT)
+            assert answer is not None
+            return answer
+        wider = replace(question, covariance=question.covariance + self.faster_drift())
+        return self._fitted(wider, [standing[k] for k in kept], kept, n.STEPS_WARM, DRIFT)
+
+    def _settled(self, answers: Sequence[ScoredAnswer]) -> bool:
+        return any(answer.explained for answer in answers) or self.steps > n.MOST_STEPS
+
+    def _of_none(self, question: Question) -> list[ScoredAnswer]:
+        found = [answer for cause in (AS_IT_IS, *WIDER) if (answer := self.untouched(question, cause)) is not None]
+        return [*found, *self._search(question, (), None)]
+
+    def _of_standing(
+        self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]
+    ) -> list[ScoredAnswer]:
+        everyone = tuple(range(len(standing)))
+        answers = [self._fitted(question, standing, everyone, n.STEPS_WARM)]
+        if self._settled(answers):
+            return answers
+        if (released := self._released(question, standing, answers[0])) is not None:
+            answers.append(released)
+            if self._settled(answers):
+                return answers
+        answers.append(self._fitted(question, loose, everyone, n.STEPS_COLD))
+        if self._settled(answers):
+            return answers
+        expected = self._fitted(question, standing, everyone, 0)
+        answers += self._search(question, everyone, expected.fit)
+        best = _likeliest(answers)
+        for cause in WIDER:
+            answers += self._with_cause(question, loose, everyone, cause, best.left)
+        return answers
+
+    def _of_anything(
+        self, question: Question, standing: Sequence[TouchPrior], before: Sequence[ScoredAnswer]
+    ) -> list[ScoredAnswer]:
+        """Where what was known does not help: touches from nothing, beside a disturbance, by a wrong response."""
+        found = self._search(question, (), None) if standing else []
+        if self._settled(found):
+            return found
+        touched = [answer for answer in [*before, *found] if answer.fit is not None]
+        if not touched:
+            return found
+        best = _likeliest(touched)
+        assert best.fit is not None
+        again = _from(best.fit)
+        for cause in WIDER:
+            found += self._with_cause(question, again, best.kept, cause, best.left)
+        found.append(self._fitted(question, again, best.kept, n.STEPS_COLD, wide=True))
+        return found
+
+    def _with_cause(
+        self, question: Question, priors: Sequence[TouchPrior], kept: tuple[int, ...], cause: str, left: Array
+    ) -> list[ScoredAnswer]:
+        more = self._more(question, cause, left)
+        if more is None or self.steps > n.MOST_STEPS:
+            return []
+        wider = replace(question, covariance=question.covariance + more)
+        return [self._fitted(wider, priors, kept, n.STEPS_COLD, cause)]
+
+    def _more(self, question: Question, cause: str, left: Array) -> Array | None:
+        """(K, K) what a cause adds to the covariance; left (K,): the residual that it is to explain."""
+        if cause == DRIFT:
+            return self.faster_drift()
+        if cause == MEMORY:
+            return self._drift.more_memory()
+        if cause == BURST:
+            lines = self._noise.disturbing(question.part)
+            return in_blocks(lines, question.order, n.BURST) if lines.shape[1] else None
+        return self._grown(question, left)
+
+    def _grown(self, question: Question, left: Array) -> Array | None:
+        """Each block of measurements with a noise of its own."""
+        block = question.order // BURST_BLOCK
+        count = np.bincount(block)
+        expected = np.bincount(block, np.diag(question.covariance)) / count
+        excess = np.maximum(np.bincount(block, left**2) / count - expected, 0.0)
+        excess[excess < 2 * expected] = 0.0
+        if not excess.any() or excess.max() > n.MOST_NOISE**2:  # under more nothing would be seen
+            return None
+        return np.diag(excess[block])
+
+    # --- fits ---
+
+    def _fitted(
+        self,
+        question: Question,
+        priors: Sequence[TouchPrior],
+        kept: tuple[int, ...],
+        most_steps: float,
+        cause: str = AS_IT_IS,
+        wide: bool = False,
+    ) -> ScoredAnswer:
+        course = TouchCourse(self._response, question.times_s, question.span_s)
+        live = int(question.live.sum())
+        misfit = max(float(MISFIT_WIDE), 2 * self._tables.wrong) if wide else self._tables.wrong
+        scene = FittedScan(question.y, question.covariance, course, self._tables.misfit, live)
+        fit = TouchFitter(scene, priors, misfit).fit(int(most_steps))
+        self.steps += (fit.steps + 1) * len(fit)
+        z2 = self._left(question, fit.pulled, fit.white, fit, ())[0]
+        cost = n.COST_WIDE if wide else COSTS[cause]
+        score = fit.evidence + cost + n.COST_TOUCH * sum(place < 0 for place in kept)
+        return ScoredAnswer(cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left)
+
+    def _search(self, question: Question, kept: tuple[int, ...], fit: FoundTouches | None) -> list[ScoredAnswer]:
+        """Further touches, one after the other: plain discs find them, their own outlines and evidence decide."""
+        found = list[ScoredAnswer]()
+        pulled, white = question.white.solve(question.y), question.white
+        if fit is not None:
+            pulled, white = fit.pulled, fit.white
+        score, full = -np.inf, _from(fit)
+        while (len(fit) if fit else 0) < n.MOST_TOUCHES and self.steps <= n.MOST_STEPS:
+            z2, disc, action, since_s = self._left(question, pulled, white, fit, ONSETS)
+            if z2 < n.FALSE_ALARM_Z2:
+                break
+            x, y = self.grid.discs[disc, PLACE]
+            new = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
+            full, kept = [*full, new], (*kept, -1)
+            disc_alone = self._fitted(question, [*_from(fit), plain(new)], kept, n.STEPS_COLD)
+            if disc_alone.score < score + n.ANOTHER:
+                break
+            score, fit = disc_alone.score, disc_alone.fit
+            pulled, white = disc_alone.pulled, disc_alone.white
+            outlined = self._fitted(question, _started(full, fit), kept, n.STEPS_COLD)
+            found.append(outlined)
+            if (pair := _neighbours(outlined.fit, kept)) is not None:
+                found.append(self._merged(question, outlined, *pair))
+            if disc_alone.explained:
+                break
+        return found
+
+    def _merged(self, question: Question, answer: ScoredAnswer, a: int, b: int) -> ScoredAnswer:
+        """One outlined touch for two discs."""
+        assert answer.fit is not None
+        states = answer.fit.states
+        acts = np.maximum(states[[a, b], ACTION], LEAST_ACTION)
+        x, y = acts @ states[[a, b], PLACE] / acts.sum()
+        one = anywhere(float(x), float(y), float(acts.sum()), question.span_s)
+        one.start[LOG_RADIUS] = 0.5 * np.logaddexp(2 * states[a, LOG_RADIUS], 2 * states[b, LOG_RADIUS])
+        priors = _from(answer.fit)
+        priors[a] = replace(one, since_s=min(priors[a].since_s, priors[b].since_s))
+        del priors[b]
+        kept = tuple(place for k, place in enumerate(answer.kept) if k != b)
+        return self._fitted(question, priors, kept, n.STEPS_COLD)
+
+    def _left(
+        self, question: Question, pulled: Array, white: Whitening, fit: FoundTouches | None, onsets: Sequence[float]
+    ) -> tuple[float, int, float, float]:
+        """z^2 of the disc that would explain most of a residual, its number, action, and since when it acts [s].
+        onsets: shares of the scan after which it may have begun.
+        """
+        best = (-1.0, 0, 0.0, -np.inf)
+        precision = white.conditional_precisions() if onsets else np.zeros(0)
+        for share in (0.0, *onsets):
+            weight, since_s = None, -np.inf
+            information = question.information
+            if share:
+                since_s = (share - 0.5) * question.span_s
+                weight = (question.times_s >= since_s).astype(float)
+                information = information * self._grid_share(weight, precision)
+            _, disc, _ = self.grid.likeliest(pulled, information, weight)
+            column = self.grid.responses[disc].astype(float)
+            column = column if weight is None else column * weight
+            along = max(float(column @ pulled), 0.0)
+            if fit is None:
+                whitened = white(column)
+                exact = float(whitened @ whitened)
+            else:
+                exact = fit.information(column)
+            z2 = along**2 / exact - (n.ONSET_Z2 if share else 0.0)
+            if z2 > best[0]:
+                best = (z2, disc, along / exact, since_s)
+        return best
+
+    def _fresh(self, question: Question, pulled: Array, white: Whitening) -> float:
+        """Energy of the newest block of measurements beyond what it is expected to have, all others given."""
+        newest = question.order >= len(question.y) - BURST_BLOCK
+        own = white.w[:, newest]
+        energy = pulled[newest] @ np.linalg.solve(own.T @ own, pulled[newest])
+        return float(energy) - BURST_BLOCK
+
+    def _grid_share(self, weight: Array, precision: Array) -> NDArray[np.float32]:
+        """(A,) share of each disc's information that some measurements have, by their own precisions."""
+        squares = self.grid.responses**2
+        each = precision.astype(np.float32)
+        return np.asarray(squares @ (each * weight.astype(np.float32)) / (squares @ each) + 1e-3)
+
+    def _released(
+        self, question: Question, standing: Sequence[TouchPrior], answer: ScoredAnswer
+    ) -> ScoredAnswer | None:
+        """One of the touches ended at once within the scan, or before it: whichever leaves least."""
+        course = TouchCourse(self._response, question.times_s, question.span_s)
+        starts = np.stack([prior.start for prior in standing])
+        each = [course.columns(starts[k : k + 1], [prior]).mean for k, prior in enumerate(standing)]
+        whole = np.sum(each, axis=0)
+        best, least = None, 0.5 * answer.chi2 * max(int(question.live.sum()), 1)
+        for k, prior in enumerate(standing):
+            if prior.until_s < np.inf:
+                continue
+            for share in (0.0, *ONSETS):
+                until_s = (share - 0.5) * question.span_s
+                change = whole - each[k] * (question.times_s >= until_s)
+                residual = answer.white(np.where(question.live, question.y - np.log1p(np.maximum(change, -0.9)), 0.0))
+                if (chi2 := float(residual @ residual)) < least:
+                    best, least = (k, share, until_s), chi2
+        if best is None:
+            return None
+        k, share, until_s = best
+        priors, kept = list(standing), list(range(len(standing)))
+        if share:
+            priors[k] = replace(priors[k], until_s=until_s)
+        else:
+            del priors[k], kept[k]
+        if not priors:
+            return self.untouched(question)
+        return self._fitted(question, priors, tuple(kept), n.STEPS_COLD)
+
+
+def _likeliest(answers: Sequence[ScoredAnswer]) -> ScoredAnswer:
+    explained = [answer for answer in answers if answer.explained]
+    return max(explained or answers, key=lambda answer: answer.score)
+
+
+def _started(priors: Sequence[TouchPrior], fit: FoundTouches | None) -> list[TouchPrior]:
+    """The same priors, searched from where a fit ended."""
+    states = fit.states if fit is not None else [prior.start for prior in priors]
+    return [replace(prior, start=state.copy()) for prior, state in zip(priors, states, strict=True)]
+
+
+def _from(fit: FoundTouches | None) -> list[TouchPrior]:
+    """The priors of a fit, to be searched from where it ended."""
+    if fit is None:
+        return []
+    return [replace(prior, start=state.copy()) for prior, state in zip(fit.priors, fit.states, strict=True)]
+
+
+def _neighbours(fit: FoundTouches | None, kept: tuple[int, ...]) -> tuple[int, int] | None:
+    """Two touches, at most one of which there was before, whose edges are near each other."""
+    if fit is None:
+        return None
+    radius = np.exp(fit.states[:, LOG_RADIUS])
+    for a in range(len(fit)):
+        for b in range(a + 1, len(fit)):
+            gap = float(np.hypot(*(fit.states[a, PLACE] - fit.states[b, PLACE]))) - radius[a] - radius[b]
+            if gap < n.NEIGHBOURS and (kept[a] < 0 or kept[b] < 0):
+                return (a, b) if kept[b] < 0 else (b, a)
+    return None

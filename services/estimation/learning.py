@@ -1,0 +1,79 @@
+"""What untouched scans teach filter and noise, two scans later: until then a touch may show that began slowly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.noise import NoiseModel
+from models.measurement.whitening import Whitening
+from services.estimation.filter import SkinFilter
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+
+FIRST_LINES = (16, 32, 64)  # scans heard, at which lines are made for the first times
+LEFT_OUT = 1e4  # variance of a measurement that does not count
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """An untouched scan that waits to be believed."""
+
+    at_s: float
+    over: Array  # (K,) log |Z| over the baseline
+    live: NDArray[np.bool_]
+    part: int
+    drifts: float  # times faster drift; 0: as slowly as before
+
+
+@dataclass
+class LearningState:
+    """All that changes."""
+
+    waiting: list[Waiting] = field(default_factory=list)
+
+
+class Learning:
+    def __init__(self, drift: SkinFilter, noise: NoiseModel) -> None:
+        self._drift, self._noise = drift, noise
+        self.now = LearningState()
+
+    def doubt(self) -> None:
+        """Something touches, or may: what waits is not believed."""
+        self.now.waiting = []
+
+    def untouched(self, scan: Waiting) -> None:
+        """A scan on which nothing touches, by all that is known."""
+        self.now.waiting.append(scan)
+        if scan.drifts > 1:  # it was lost: what explains it now is the skin
+            self._take_in(self.now.waiting.pop())
+        if len(self.now.waiting) > n.LAG_SCANS:
+            self._take_in(self.now.waiting.pop(0))
+
+    def hear(self, pulled: Array, part: int, odd: bool) -> None:
+        """What several measurements have in common; odd: more than was known."""
+        self._noise.hear(pulled, part)
+        heard = self._noise.now.lines[part].heard
+        if odd or heard in FIRST_LINES or heard % n.LINE_SCANS == 0:
+            self._noise.find_lines(part)
+
+    def _take_in(self, scan: Waiting) -> None:
+        if scan.drifts:
+            self._drift.widen(scan.drifts)
+        predicted = self._drift.ahead(scan.at_s, self._noise.now.flicker)
+        covariance = self._noise.covariance(scan.part) + predicted.covariance
+        leave_out(covariance, scan.live)
+        white = Whitening.of(covariance)
+        y = np.where(scan.live, scan.over - predicted.shift, 0.0)
+        pulled = self._drift.take_in(predicted, y, white)
+        if not scan.drifts and scan.live.all():
+            self._noise.learn(pulled, white)
+
+
+def leave_out(covariance: Array, live: NDArray[np.bool_]) -> None:
+    """Give measurements that do not count no weight."""
+    dead = np.flatnonzero(~live)
+    covariance[dead, dead] += LEFT_OUT

@@ -1,0 +1,329 @@
+"""TouchTracks from scan to scan: what is expected of each, what a fit made of it, when it has ended, and its number.
+
+A window of a scan in parts holds values that were fitted before, so a touch carries no place nor force from fit to fit,
+but where to start. What it carries as knowledge, its radius and its outline, it learns from scans that share no value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.disc import DiscResponse
+from models.measurement.fit import FoundTouches
+from models.measurement.numbers import MOST_WAY
+from models.measurement.touch import (
+    ACTION,
+    LOG_RADIUS,
+    PLACE,
+    RATE,
+    SHAPE_SDS,
+    STATES,
+    VELOCITY,
+    TouchPrior,
+    X,
+    Y,
+    anywhere,
+    drop_of,
+    within_limits,
+)
+from services.estimation.filter import Memory
+from services.estimation.values import numbers as n
+from services.estimation.values.estimate import TouchEstimate
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class TrackedTouch:
+    """One touch. Times are seconds of the host's clock; `state` is of `at_s`."""
+
+    id: int
+    began: bool
+    born_s: float
+    at_s: float
+    state: Array  # (7,)
+    covariance: Array  # (7, 7)
+    log_radius: float  # as known from scans that share no value
+    log_radius_sd: float
+    shape: Array  # (9,)
+    shape_variance: Array  # (9,)
+    since_s: float = -np.inf  # it acts from then on
+    until_s: float = np.inf  # it acted until then: it has ended, and the window still holds values of before
+    scans: int = 0  # that it was fitted to and that share no value
+    still: int = 0  # of them, in a row: it neither moved nor changed
+    moves: bool = False
+    z2: float = 0.0  # how much it explains: squared sigmas of its action, in the middle of the scan or at its end
+    sure: bool = False
+    lost: bool = False  # scans were lost since: it may be anywhere
+    peak: float = 0.0  # action that it surely had
+    held: float = 0.0  # action before it began to go
+    held_at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y, log radius then
+    stayed_since_s: float = 0.0  # at held_at
+
+    @property
+    def ended(self) -> bool:
+        return self.until_s < np.inf
+
+
+@dataclass
+class TouchesState:
+    """All that changes."""
+
+    tracks: list[TrackedTouch] = field(default_factory=list)
+    next_id: int = 1
+
+
+class TouchTracks:
+    """Of one skin."""
+
+    def __init__(self, response: DiscResponse) -> None:
+        self._response = response
+        self.now = TouchesState()
+
+    def __len__(self) -> int:
+        return len(self.now.tracks)
+
+    @property
+    def lasting(self) -> list[TrackedTouch]:
+        return [track for track in self.now.tracks if not track.ended]
+
+    @property
+    def lost(self) -> bool:
+        """Whether scans were lost, and none has been explained since."""
+        return any(track.lost for track in self.now.tracks)
+
+    def lose(self) -> None:
+        """Scans were lost: touches may be anywhere, or gone."""
+        for track in self.now.tracks:
+            track.lost, track.still = True, 0
+
+    def drop_the_vague(self) -> None:
+        """Forget what one part of a scan made of a touch that begins, and is not sure: the next one looks anew."""
+        self.now.tracks = [track for track in self.now.tracks if track.sure or track.scans]
+
+    def forget(self) -> None:
+        self.now.tracks = []
+
+    def drop_the_past(self, oldest_s: float) -> None:
+        """Forget what ended before the oldest value that a window holds."""
+        self.now.tracks = [track for track in self.now.tracks if track.until_s > oldest_s]
+
+    def expected(self, at_s: float, span_s: float, loose: bool = False) -> list[TouchPrior]:
+        """What is known of each before a scan whose middle is at_s. loose: it may have begun to move or to change."""
+        return [_expected(track, at_s, span_s, loose) for track in self.now.tracks]
+
+    def recognised(self, fit: FoundTouches, kept: Sequence[int]) -> tuple[int, ...]:
+        """kept, where touches that were found anew are those that were there before in the same places."""
+        free = [k for k, track in enumerate(self.now.tracks) if k not in kept and not track.ended]
+        found = list(kept)
+        for k, place in enumerate(kept):
+            near = [(float(np.hypot(*(self.now.tracks[f].state[PLACE] - fit.states[k, PLACE]))), f) for f in free]
+            if place < 0 and near and min(near)[0] < max(n.SAME_TOUCH, float(np.exp(fit.states[k, LOG_RADIUS]))):
+                found[k] = min(near)[1]
+                free.remove(found[k])
+        return tuple(found)
+
+    def settle(self, fit: FoundTouches, kept: Sequence[int], at_s: float, span_s: float, whole: bool) -> list[Memory]:
+        """Take over a fit. kept: of each of its touches the track that it continues; -1: it is new. whole: no value of
+        the scan was fitted before. Returns what touches that ended or moved away leave in the foam.
+        """
+        before = self.now.tracks
+        self.now.tracks = [
+            before[place] if place >= 0 else self._new(fit, k, at_s, span_s) for k, place in enumerate(kept)
+        ]
+        memories = list[Memory]()
+        for k, track in enumerate(self.now.tracks):
+            own = slice(STATES * k, STATES * (k + 1))
+            _update(track, fit.states[k], fit.covariance[own, own], at_s, span_s, whole)
+            if whole:
+                _learn(track, fit, k)
+            memories += self._left_behind(track, at_s + span_s / 2)
+            if not track.ended and fit.priors[k].until_s < np.inf:
+                memories += self.released(k, at_s + fit.priors[k].until_s)
+            if not track.ended and _has_ended(track, span_s):
+                track.until_s = at_s + span_s / 2
+                memories += self._memory(track, track.until_s, 1.0)
+        self.now.tracks = [track for track in self.now.tracks if track.sure or not track.ended]
+        return memories
+
+    def released(self, place: int, at_s: float) -> list[Memory]:
+        """A touch ended at an instant within the scan; what it leaves."""
+        track = self.now.tracks[place]
+        if track.ended:
+            return []
+        track.until_s = at_s
+        return self._memory(track, at_s, 1.0)
+
+    def remove(self, place: int) -> None:
+        """It was none."""
+        del self.now.tracks[place]
+
+    def _new(self, fit: FoundTouches, k: int, at_s: float, span_s: float) -> TrackedTouch:
+        prior, state = fit.priors[k], fit.states[k]
+        track = TrackedTouch(
+            id=self.now.next_id,
+            began=True,
+            born_s=at_s,
+            at_s=at_s,
+            state=state,
+            covariance=np.eye(STATES),
+            log_radius=float(prior.mean[LOG_RADIUS]),
+            log_radius_sd=float(prior.sd[LOG_RADIUS]),
+            shape=np.zeros(len(SHAPE_SDS)),
+            shape_variance=SHAPE_SDS**2,
+            since_s=at_s + prior.since_s,
+            held_at=(float(state[X]), float(state[Y]), float(state[LOG_RADIUS])),
+            stayed_since_s=at_s,
+        )
+        self.now.next_id += 1
+        return track
+
+    def _memory(self, track: TrackedTouch, at_s: float, share: float) -> list[Memory]:
+        if not track.sure or track.held <= 0:
+            return []
+        x, y, log_radius = track.held_at
+        return [Memory(self._response(x, y, log_radius), share * track.held, at_s, x, y, log_radius)]
+
+    def _left_behind(self, track: TrackedTouch, now_s: float) -> list[Memory]:
+        """Of a touch that slides: what the place where it stayed remembers."""
+        x, y, log_radius = track.held_at
+        away = float(np.hypot(track.state[X] - x, track.state[Y] - y))
+        if away < n.MEMORY_APART * float(np.exp(log_radius)):
+            return []
+        stayed_s = max(0.0, now_s - track.stayed_since_s)
+        track.stayed_since_s = now_s
+        memories = self._memory(track, now_s, 1 - float(np.exp(-stayed_s / n.MEMORY_FADES_S[0])))
+        track.held_at = (float(track.state[X]), float(track.state[Y]), track.log_radius)
+        return memories
+
+
+def _expected(track: TrackedTouch, at_s: float, span_s: float, loose: bool) -> TouchPrior:
+    passed_s = at_s - track.at_s
+    state = track.state.copy()
+    steady = track.still >= n.STILL_SCANS and not loose
+    if track.moves:
+        state[PLACE] += state[VELOCITY] * min(passed_s, 2 * span_s)
+    else:
+        state[VELOCITY] = 0.0
+    if passed_s > span_s / 2:  # how a ramp goes on after a whole scan nobody knows
+        state[ACTION] += state[RATE] * span_s / 2
+        state[RATE] = 0.0
+    else:
+        state[ACTION] += state[RATE] * passed_s
+    state[ACTION] = max(state[ACTION], 0.02 * track.peak, 1e-4)
+    free = anywhere(0.0, 0.0, max(float(state[ACTION]), track.peak), span_s)
+    mean, sd = free.mean.copy(), free.sd.copy()
+    if not track.lost:
+        known = 3 * float(np.sqrt(track.covariance[X, X] + track.covariance[Y, Y]))
+        mean[PLACE], sd[PLACE] = state[PLACE], max(n.PLACE_MOVES * (1 + 3 * loose), known)
+    sd[VELOCITY] = MOST_WAY / span_s
+    if steady:
+        sd[VELOCITY] = n.STILL_WAY / span_s
+        sd[RATE] = n.STILL_CHANGE * max(float(state[ACTION]), 1e-3) / span_s
+    mean[LOG_RADIUS], sd[LOG_RADIUS] = track.log_radius, track.log_radius_sd
+    shape_sd = np.sqrt(np.minimum(track.shape_variance + (n.SHAPE_WALK * SHAPE_SDS) ** 2, SHAPE_SDS**2))
+    state = within_limits(state[None])[0]
+    return TouchPrior(state, mean, sd, track.shape, shape_sd, track.since_s - at_s, track.until_s - at_s)
+
+
+def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, span_s: float, whole: bool) -> None:
+    track.state, track.covariance, track.at_s, track.lost = state, covariance, at_s, False
+    acts = [_action_at(state, covariance, after_s) for after_s in (0.0, span_s / 2)]
+    track.z2 = max((max(action, 0.0) / sd) ** 2 for action, sd in acts)
+    if track.ended:
+        return
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    way, change = np.hypot(*state[VELOCITY]) * span_s, abs(state[RATE]) * span_s
+    moves = way > max(n.STILL_WAY, 3 * float(np.hypot(*sd[VELOCITY])) * span_s)
+    changes = change > max(n.STILL_CHANGE * abs(state[ACTION]), 3 * sd[RATE] * span_s)
+    track.moves = bool(moves)
+    if moves or changes:
+        track.still = 0
+    elif whole:
+        track.still += 1
+    track.scans += whole
+    track.peak = max(track.peak, float(state[ACTION] - 2 * sd[ACTION]))
+    at_end = float(state[ACTION] + state[RATE] * span_s / 2)
+    if min(state[ACTION], at_end) > n.GOES * track.held or not track.held:
+        track.held = float(state[ACTION])
+        x, y, log_radius = track.held_at
+        if np.hypot(state[X] - x, state[Y] - y) < n.MEMORY_APART * np.exp(log_radius):
+            track.held_at = (float(state[X]), float(state[Y]), float(state[LOG_RADIUS]))
+
+
+def _learn(track: TrackedTouch, fit: FoundTouches, k: int) -> None:
+    """Radius and outline, of a scan that shares no value with the one before."""
+    sd = float(np.sqrt(max(fit.covariance[STATES * k + LOG_RADIUS, STATES * k + LOG_RADIUS], 0.0)))
+    track.log_radius = float(fit.states[k, LOG_RADIUS])
+    track.log_radius_sd = float(np.hypot(sd, n.RADIUS_WALK))
+    track.shape, track.shape_variance = fit.shapes[k].copy(), fit.shape_variance[k].copy()
+
+
+def _action_at(state: Array, covariance: Array, after_s: float) -> tuple[float, float]:
+    """Action and its standard deviation at an instant."""
+    to_then = np.array([1.0, after_s])
+    both = covariance[np.ix_([ACTION, RATE], [ACTION, RATE])]
+    return float(to_then @ state[[ACTION, RATE]]), float(np.sqrt(max(to_then @ both @ to_then, 1e-18)))
+
+
+def _has_ended(track: TrackedTouch, span_s: float) -> bool:
+    """By what acts at the scan's end, never by the drop alone: its sigma is that of the radius."""
+    left, sd = _action_at(track.state, track.covariance, span_s / 2)
+    return left < n.ENDED * track.peak + (sd if left < 4 * n.ENDED * track.peak else 0.0)
+
+
+def _bends(track: TrackedTouch, span_s: float) -> Array:
+    """(7, 7) variance of what was linear in the fit and may have bent within the scan."""
+    variance = np.zeros(STATES)
+    if track.still < n.STILL_SCANS:
+        variance[PLACE] = (n.BENDS * track.state[VELOCITY] * span_s) ** 2
+        variance[ACTION] = (n.BENDS * track.state[RATE] * span_s) ** 2
+    return np.diag(variance)
+
+
+def estimate_of(track: TrackedTouch, sample_s: float, span_s: float, unexplained: float) -> TouchEstimate:
+    """A touch as it is said: at the instant sample_s, with the covariance of that instant."""
+    passed_s = sample_s - track.at_s
+    carry = np.eye(STATES)
+    carry[X, VELOCITY.start], carry[Y, VELOCITY.start + 1], carry[ACTION, RATE] = passed_s, passed_s, passed_s
+    state, covariance = carry @ track.state, carry @ (track.covariance + _bends(track, span_s)) @ carry.T
+    log_radius, action = float(state[LOG_RADIUS]), max(float(state[ACTION]), 0.0)
+    strength = action / (np.pi * np.exp(2 * log_radius))
+    drop = drop_of(action, log_radius)
+    by_action = drop / max(action, 1e-12) / (1 + strength / 2)
+    to_said = np.zeros((4, STATES))
+    to_said[0, X] = to_said[1, Y] = to_said[2, LOG_RADIUS] = 1.0
+    to_said[3, ACTION], to_said[3, LOG_RADIUS] = by_action, -2 * drop / (1 + strength / 2)
+    area = float(np.pi * np.exp(2 * log_radius))
+    said = to_said @ covariance @ to_said.T
+    to_integral = area * (to_said[3] + np.eye(STATES)[LOG_RADIUS] * 2 * drop)
+    return TouchEstimate(
+        id=track.id,
+        began=track.began,
+        age_s=sample_s - track.born_s,
+        x=float(state[X]),
+        y=float(state[Y]),
+        vx=0.0 if track.still >= n.STILL_SCANS else float(state[VELOCITY][0]),
+        vy=0.0 if track.still >= n.STILL_SCANS else float(state[VELOCITY][1]),
+        log_radius=log_radius,
+        drop=drop,
+        covariance=said,
+        z2=track.z2,
+        integral=area * drop,
+        integral_sd=float(np.sqrt(max(to_integral @ covariance @ to_integral, 0.0))),
+        strength=action,
+        strength_sd=float(np.sqrt(max(covariance[ACTION, ACTION], 0.0))),
+        unexplained=unexplained,
+    )
+
+
+def roughly(touch: TouchEstimate) -> TouchEstimate:
+    """One that a scan changed so that nothing explains it: that it is there, where roughly, and not how strongly."""
+    covariance = touch.covariance.copy()
+    covariance[0, 0] += n.ROUGH**2
+    covariance[1, 1] += n.ROUGH**2
+    return replace(touch, covariance=covariance, strength_sd=touch.strength, integral_sd=touch.integral)

@@ -1,0 +1,212 @@
+"""Every number of the estimator that decides something, with unit, meaning and origin; `table()` prints them all."""
+
+from __future__ import annotations
+
+import sys
+
+from models.measurement import number
+from models.measurement import numbers as measurement
+from models.measurement.number import Number
+
+FALSE_ALARM_Z2 = Number(44.0, "-", "z^2 of the best disc that is a touch", "derived: 2 (ln 650 discs + ln 1e6) + 3")
+GLANCE_Z2 = Number(36.0, "-", "the same at a first look", "derived: the whitening is 0.5 s old, 10 % of z")
+GLANCE_S = Number(0.5, "s", "for which a whitening does for a first look", "derived: drift beyond is 1e-5")
+QUIET = Number(1.6, "-", "chi^2 a measurement of what nothing needs to explain", "derived: 4.6 sigmas of 120")
+GOOD = Number(1.45, "-", "the same of a fit that explains its scan", "derived: 3.5 sigmas of 120")
+MOST = Number(2.5, "-", "the same of a fit that is roughly right: places hold", "chosen: 60 % more than the noise")
+"""Is something there, and is it explained?"""
+
+FIELD_WALK = Number(
+    1e-5, "1/sqrt(s)", "log conductivity, even: its own walk", "measured: drift of 4 %/min, 459 phantoms"
+)
+SLOPE_WALK = Number(3e-6, "1/sqrt(s)", "the same across the sheet", "derived: a third of FIELD_WALK")
+FIELD_RATE = Number(2e-4, "1/s", "log conductivity, even: its rate at the tare", "derived: half a degree a minute")
+SLOPE_RATE = Number(1e-4, "1/s", "the same across the sheet", "derived: half of FIELD_RATE")
+FIELD_RATE_WALK = Number(2e-5, "1/s/sqrt(s)", "its walk", "measured: half a degree a minute is followed in 3 s")
+SLOPE_RATE_WALK = Number(8e-6, "1/s/sqrt(s)", "the same across the sheet", "derived: 0.4 of FIELD_RATE_WALK")
+FIELD_FASTER = Number(1e-3, "-", "faster drift than that, in one scan", "derived: ten sigmas of one measurement")
+SLOPE_FASTER = Number(5e-4, "-", "the same across the sheet", "derived: half of FIELD_FASTER")
+FASTER_STAYS = Number(0.05, "-", "of that variance, in value and rate from then on", "chosen: 20 such scans")
+CONTACT_FASTER = Number(2e-3, "-", "faster change of a contact impedance in one scan", "derived: ten of CONTACT_WALK")
+FIELD_START = Number(1e-5, "-", "the field at the tare", "derived: 64 frames at 80 dB")
+CONTACT_START = Number(1e-3, "-", "a contact impedance at the tare", "derived: 64 frames at 80 dB")
+CONTACT_WALK = Number(2e-4, "1/sqrt(s)", "a contact impedance", "measured: drifts of 0.1 to 1 %/s, 0 to 1 phantom")
+CONTACT_FOLLOWS = Number(0.1, "1/s", "of its flicker's variance that is slow", "measured: 1/f noise of 0.1 %")
+REMAINDER_START = Number(1e-5, "-", "each measurement's own rest at the tare", "derived: 64 frames at 80 dB")
+REMAINDER_WALK = Number(2e-6, "1/sqrt(s)", "its walk", "chosen: a tenth of the noise in half a minute")
+"""What drifts."""
+
+MEMORY_FADES_S = (
+    Number(2.0, "s", "fast time constant of foam's recovery", "measured: needed to a factor of 4 only"),
+    Number(40.0, "s", "slow one", "measured: needed to a factor of 4 only"),
+)
+MEMORY_SHARE = Number(
+    0.01, "-", "of a touch that stays at first, each state", "measured: 1 to 8 % (van der Schuur 2004)"
+)
+MEMORY_SD = Number(0.012, "-", "its standard deviation", "derived: of that range")
+MEMORY_WALK = Number(0.5, "-", "of itself in a time constant", "chosen: no foam is exponential")
+MEMORY_MOST = Number(0.05, "-", "share above which it is a touch, not memory", "chosen: the promise, below 1 to 8 %")
+MEMORY_SIGMAS = Number(3.0, "-", "sigmas above that share", "derived: one in a thousand")
+MEMORY_DOUBT_S = Number(3.0, "s", "after which a memory is not doubted any more", "derived: beyond the fast recovery")
+MEMORY_UNIT = Number(1e-4, "-", "noise that a memory is held against", "data sheet: AD5940, 80 dB")
+MEMORY_FAINT = Number(0.5, "-", "of that noise: less is forgotten", "derived: half a sigma of a whole scan")
+MEMORIES = Number(12.0, "-", "memories that are kept", "chosen: cost; more were never alive at once")
+"""What foam remembers."""
+
+MEMORY_APART = Number(
+    0.7, "-", "of a radius that a touch slides, until the place it left remembers by itself", "chosen: half its area"
+)
+PLACE_MOVES = Number(
+    0.08, "unit", "by which a place differs from where it was expected", "derived: 4 mm, 0.3 m/s for 13 ms"
+)
+SAME_TOUCH = Number(
+    0.15, "unit", "within which a touch that is found anew is the one before", "derived: 0.3 m/s, a scan"
+)
+BENDS = Number(0.13, "-", "of a change within a scan: error of its middle where it bent", "derived: KINK / 2 / 3")
+ROUGH = Number(
+    0.1, "unit", "place of a touch that changed so that nothing explains it", "derived: 5 mm in a scan, 0.1 m/s"
+)
+STILL_SCANS = Number(3.0, "-", "scans without motion or change, after which a touch stays", "derived: of one in 1000")
+STILL_WAY = Number(0.01, "unit", "way within a scan of one that stays", "derived: 0.5 mm, 12 mm/s")
+STILL_CHANGE = Number(0.1, "-", "change of its action within a scan", "derived: as the kinks' threshold")
+RADIUS_WALK = Number(0.05, "-", "log radius from scan to scan", "chosen: a finger that rolls")
+SHAPE_WALK = Number(0.3, "-", "of what shapes differ by, from scan to scan", "chosen: a finger that rolls")
+GOES = Number(0.7, "-", "of its action, below which a touch is going", "chosen: above any relaxation")
+ENDED = Number(0.05, "-", "of its greatest action, below which it has ended", "derived: MEMORY_MOST")
+SURE_Z2 = Number(44.0, "-", "z^2 of a new touch that is shown", "derived: FALSE_ALARM_Z2")
+"""What touches do from scan to scan."""
+
+ONSET_Z2 = Number(7.0, "-", "z^2 that a touch which began within a scan must have beyond", "derived: 2 ln of 33 onsets")
+ANOTHER = Number(15.0, "nat", "evidence that a further touch adds", "derived: 650 discs in 1e4 frames, and 2")
+COST_TOUCH = Number(-3.5, "nat", "log prior of a touch that begins in a scan", "derived: one in 30 scans")
+COST_DRIFT = Number(-7.0, "nat", "of faster drift", "derived: one in 1000 scans")
+COST_MEMORY = Number(-1.0, "nat", "of memories as large as foam's may be", "derived: one touch in three leaves more")
+COST_BURST = Number(-3.0, "nat", "of a known disturbance that grew", "derived: one in 20 scans")
+COST_NOISE = Number(-20.0, "nat", "of blocks with a noise of their own", "derived: 2 nats for each of ten figures")
+COST_WIDE = Number(-2.0, "nat", "of a response that is wrong by MISFIT_WIDE", "derived: one touch in 7")
+BURST = Number(8.0, "-", "times a known disturbance's strength", "chosen: a drive that switches on is 10 times")
+MOST_NOISE = Number(4e-3, "-", "noise of a block under which a touch would still be seen", "derived: 1 N changes 1e-2")
+NEIGHBOURS = Number(
+    0.06, "unit", "gap below which two discs may be one touch", "derived: 3 mm, no nearer are told apart"
+)
+MOST_TOUCHES = Number(4.0, "-", "touches at once", "chosen: cost; image and contact frames hold more")
+MOST_STEPS = Number(100.0, "-", "steps times touches of one scan, beyond which nothing new is asked", "chosen: 15 ms")
+STEPS_WARM = Number(4.0, "-", "steps of a fit from the scan before", "measured: 2 or 3 are used")
+STEPS_COLD = Number(10.0, "-", "steps of a fit from a grid's disc", "measured: 4 to 10 are used")
+ADRIFT = Number(
+    1.5, "-", "by which faster drift grows with each scan that nothing explains", "derived: 2 s to a per cent"
+)
+MOST_ADRIFT = Number(1e4, "-", "at most, of its variance", "derived: ten per cent of the field")
+"""What may explain a scan: log priors, and the budget."""
+
+START_RUNGS = Number(9.0, "-", "sizes of a difference between skin and bundle", "derived: up to 256 times the least")
+START_GAIN = Number(1.0, "-", "log of an unknown board's gain", "chosen: free")
+START_FIELD = Number(0.05, "-", "log conductivity of an unknown sheet, uneven", "chosen: sheets dry by 5 %")
+START_FIELD_LENGTH = Number(1.0, "unit", "over which it is even", "chosen: half a side")
+START_GRAIN = Number(0.05, "-", "by which it conducts better one way", "chosen: as START_FIELD")
+START_CONTACT = Number(0.3, "-", "a contact impedance of an unknown skin", "derived: as the networks were trained")
+START_LAYER = Number(0.03, "-", "a contact's part in series, against its rest", "measured: skin bench estimation start")
+START_ABSOLUTE = Number(3e-5, "-", "what no model of |Z| gets right", "measured: two meshes of one skin")
+START_COST_WIDE = Number(-2.3, "nat", "of a sheet that is uneven", "derived: one skin in ten")
+START_SEEN = Number(0.0063, "unit^2", "action of the touch that must not hide", "derived: half a newton on 10 mm")
+START_SEEN_SHARE = Number(0.2, "-", "of the places and sizes where it may", "chosen: four of five are seen")
+START_PAST = Number(10.0, "nat", "of a touch's evidence lost, beyond which none is sought", "derived: less than e^-10")
+START_LEFT_OUT = Number(1e4, "-", "variance of a measurement that does not count", "derived: nothing is as large")
+START_TOUCHES = Number(3.0, "-", "touches at a start at most", "chosen: as networks were trained")
+START_NATS = Number(30.0, "nat", "by which a touch explains the first scans better", "measured: tests of the start")
+START_MOST = Number(4.0, "-", "times the least difference, beyond which it may hide a touch", "measured: as START_NATS")
+START_SURE = Number(16.0, "-", "the same beside a touch that surely is one", "measured: as START_NATS")
+START_SURE_CHI2 = Number(3.0, "-", "chi^2 a measurement that such a touch leaves at most", "measured: as START_NATS")
+"""What a skin may be before its first baseline."""
+
+TARE_SCANS = Number(64.0, "-", "scans of a baseline", "derived: an eighth of one scan's noise")
+TARE_RETRIES = Number(8.0, "-", "scans after which a first baseline is tried again", "chosen: cost")
+TARE_QUARTERS = Number(4.0, "-", "parts of them that must agree", "chosen: a press of a second is one")
+TARE_DISAGREES = Number(1e-5, "-", "probability that quiet scans are refused", "chosen: once in a year of starts")
+TARE_HARMLESS = Number(5e-5, "-", "change within them that does no harm", "derived: half of one scan's noise")
+TARE_NOISY = Number(
+    0.05, "-", "noise beyond which no touch could be told", "chosen: the weakest touches change as much"
+)
+TARE_UNTRAINED = Number(
+    0.0056, "-", "noise beyond which no network was trained", "derived: 45 dB, models/augmentation.py"
+)
+TARE_DRIFTS = Number(3e-3, "-", "log conductivity, change while they come", "derived: a degree in 3 s")
+TARE_IDENTICAL = Number(1e-12, "-", "noise below which scans are the same", "derived: arithmetic of their mean")
+TARE_ASSUMED = Number(1e-3, "-", "noise where scans tell none", "chosen: 60 dB, ten times the board's")
+LAG_SCANS = Number(
+    2.0, "-", "scans for which one waits to be believed untouched", "derived: a ramp of 150 ms shows in 2"
+)
+CHANGING_S = Number(0.1, "s", "for which what nothing explains is said to be changing", "derived: two whole scans")
+LOST_S = Number(1.0, "s", "of nothing that explains it, after which no touch is vouched for", "derived: half of 2 s")
+LOST_SCANS = Number(8.0, "-", "whole scans from search to search then", "chosen: cost, three searches a second")
+GAP_S = Number(0.13, "s", "without a scan, after which touches may be anywhere", "derived: three whole scans")
+DOUBT_Z2 = Number(400.0, "-", "z^2 of a touch that every whole scan asks whether it is drift", "derived: 20 sigmas")
+DOUBT_SCANS = Number(10.0, "-", "whole scans after which every touch is asked that", "derived: twice a second")
+ODD_OUTLINE = Number(
+    12.0, "-", "squared sigmas of an outline that may be several touches", "derived: 9 figures, 1.5 sd"
+)
+SURE_SCANS = Number(2.0, "-", "whole scans that need a weak touch, after which it is shown", "derived: a chance twice")
+LEAST_LIVE = Number(0.5, "-", "share of the measurements that must count", "chosen: half, to see a touch anywhere")
+LINE_SCANS = Number(100.0, "-", "untouched scans after which lines are made anew", "derived: half of LEARNING_LINES")
+"""The way of one scan."""
+
+SHORT_OHM = Number(1e-3, "ohm", "between electrodes whose wires touch, of a sheet of 1 S", "chosen: any small one")
+NEXT_TO_NOTHING = Number(0.05, "-", "of the median |Z|: a fault leaves nothing to see", "derived: 20 times the noise")
+OPEN_SHARE = Number(
+    0.8, "-", "of an electrode's measurements that fail where it is open", "chosen: half again of any other's"
+)
+FAR = Number(
+    10.0, "-", "times its prediction, or its inverse: a measurement that fails", "derived: no touch, no contact"
+)
+FALLS = Number(0.03, "-", "relative fall that no touch, warmth or noise makes", "measured: as the wiring of before")
+MISFIT_MOST = Number(10.0, "-", "times FALLS, beyond which a misfit counts no more", "chosen: a third")
+ANY_DROP = Number(0.5, "-", "drop of touches of which nothing is known", "derived: half of what foam can")
+COST_WIRE = Number(-16.3, "nat", "log prior of a fault of the wires", "derived: one in 1e5 scans, 120 couples")
+COST_FAILURE = Number(-14.5, "nat", "of a measurement that fails for no reason", "derived: one in 2e6")
+COST_EXPECTED_FAILURE = Number(-3.0, "nat", "of one that a fault leaves nothing of", "derived: one in 20")
+WIRE_SURE = Number(30.0, "nat", "by which a fault of the wires must be likelier", "chosen: true ones win by hundreds")
+WIRE_APART = Number(10.0, "nat", "by which it must be likelier than another one", "derived: one error in 2e4")
+"""Wires."""
+
+SHORT_WAY = Number(4.7, "-", "rest of a contact against its series part: b = a / (1 + a / 4.7)", "measured: square16")
+SHORT_WAY_SD = Number(0.12, "-", "of b, relative", "measured: 1 to 6 % on the stub's mesh, 12 % on another board's")
+REST_FLOOR = Number(0.01, "-", "of b, where nothing changes", "derived: a tenth of what is named")
+CONTACT_CHANGES = Number(1.5, "-", "change of a contact impedance, one sigma", "derived: up to 9 times is 5 of it")
+COURSE_FLOOR = Number(0.02, "-", "its change within a scan, at least", "derived: 10 % a second, and 0.5")
+CONTACT_MISFIT = Number(2e-3, "-", "what its columns get wrong, relative", "measured: 0.5e-3 at 8 times, stub's mesh")
+GAIN_CHANGES = Number(0.1, "-", "log of a gain's step, one sigma", "data sheet: AD5940, RTIA and PGA")
+GAIN_LEAST = Number(5e-4, "-", "log of a gain's step that is one", "derived: five sigmas; drift explains smaller ones")
+COST_CONTACT = Number(-14.3, "nat", "log prior of a contact that changes", "derived: one in 1e5 scans, 16 electrodes")
+COST_GAIN = Number(-9.2, "nat", "of a gain that steps", "derived: one in 1e4 scans")
+FAULT_SURE = Number(8.0, "nat", "by which such a fault must be likelier than touches", "derived: one error in 3000")
+CONTACT_WALK_CHANGED = Number(0.1, "-", "walk of a changed contact in a scan, of itself", "measured: 9 times in 6.5 s")
+CONTACT_STILL = Number(
+    0.01, "-", "step in a scan, of itself, of a contact that has settled", "derived: a tenth of that"
+)
+CONTACT_SETTLES_S = Number(10.0, "s", "still for so long it is the skin's own", "chosen: named long enough to be read")
+CONTACT_BACK = Number(0.004, "-", "change below which a contact is well again", "derived: ten sigmas of the filter's")
+BACK_SCANS = Number(3.0, "-", "whole scans for which it must be", "chosen: a loose wire flaps no faster")
+GAIN_NAMED_S = Number(0.3, "s", "for which a step of the gain is said", "chosen: seen by a person's tool at 5 Hz")
+CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itself", "derived: a fifth of its walk")
+ON_ELECTRODE = Number(0.2, "unit", "gap below which a touch changes an electrode's contact", "derived: its width")
+SMALL = Number(0.2, "unit", "radius of a touch that may be an electrode's contact", "derived: an electrode's width")
+COST_SMALL = Number(-8.0, "nat", "log prior of such a touch on an electrode", "derived: share of the sheet that it is")
+CONTACT_DOUBTS = (1, 2, 8, 24, 72)  # whole scans of a touch on an electrode, at which it is asked whether it is one
+WEAK = Number(0.3, "-", "of its greatest action, below which a touch on an electrode is doubted", "chosen: it goes")
+TOLD_BY = Number(24.0, "-", "measurements since a change began, at least", "derived: two parts; one is as well a touch")
+STANDS_WAY = Number(0.02, "unit", "way of a touch that stands, in a scan", "derived: 1 mm")
+STANDS_SHARE = Number(0.2, "-", "its change of size and of action", "derived: a finger that presses harder for a scan")
+UNEXPLAINED_SCANS = Number(3.0, "-", "scans after which a fault that explains nothing goes", "measured: six lock-ins")
+"""Contact impedances and gain."""
+
+SILENT = Number(0.7, "-", "share of measurements that fail where it is not electrodes", "derived: more than any bit's")
+DEGRADED = Number(2.0, "-", "electrodes at fault that a frame says", "chosen: as the service before")
+TOO_MANY = Number(3.0, "-", "electrodes at fault with which no frame is valid", "chosen: as the service before")
+SEEN_DROP = Number(0.05, "-", "drop of a disc that must be seen", "measured: of the lightest touches, 0.1 N")
+UNSEEN = Number(0.02, "-", "share of discs that may be seen worse", "measured: of a sound skin none")
+"""What a board's faults leave."""
+
+
+def table() -> str:
+    """All numbers as text, those of models/measurement first."""
+    return number.table(measurement, sys.modules[__name__])

@@ -1,0 +1,97 @@
+"""The estimator's one input: a scan of the board, or the newest values after a part of one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import RawFrame, as_sent
+
+Array = NDArray[np.float64]
+
+SCAN_S = 0.0437  # a whole scan of 120 measurements: where a board's clock says nothing yet
+SHORTEST_S, LONGEST_S = 0.005, 2.0  # of a scan that any board measures
+
+
+@dataclass(frozen=True)
+class Scan:
+    """K measurements in the pattern's order. Made once, at the door; nobody changes it."""
+
+    values: Array  # (K,) |Z|, ohm or counts
+    ages_s: Array  # (K,) by how much each value is older than the newest one's end
+    new: NDArray[np.bool_]  # (K,) measured after the scan that was stepped before
+    status: NDArray[np.uint8]  # (K,) bits, protocol.frame_types.STATUS_*
+    number: int  # the board's
+    part: int  # of a scan in parts: the part measured last, from 1 on; 0: a whole scan
+    end_us: float  # board's clock at the end of the newest value
+    at_ns: int  # the same by the host's monotonic clock
+    sample_ns: int  # for when what is said of this scan stands: the frame's stamp `sample`
+    duration_s: float  # in which all K values were measured
+    board: str
+    source: str
+    separate: bool  # stands by itself: it does not follow the scan before it in time
+    reference: bool  # known to be untouched
+    believed: bool  # acquisition's word
+    reasons: tuple[str, ...]  # as they came
+
+    @property
+    def complete(self) -> bool:
+        """Whether every value was measured since the scan before: the only difference between boards."""
+        return bool(self.new.all())
+
+    @property
+    def times_s(self) -> Array:
+        """(K,) when each value was measured, from `sample_ns` on (below 0: before)."""
+        return (self.at_ns - self.sample_ns) * 1e-9 - self.ages_s
+
+    @classmethod
+    def of(cls, frame: RawFrame, before: Scan | None = None) -> Scan:
+        """The scan of a raw frame. before: the one that was stepped last; values are new by their instants, so what a
+        message that was skipped brought is new too.
+        """
+        count = len(frame.z)
+        if frame.parts > 1:
+            ages_s = frame.age_us.astype(float) * 1e-6
+            newest_s, duration_s = _spanned_s(ages_s[frame.new != 0]), _spanned_s(ages_s)
+        else:
+            duration_s = newest_s = _duration_s(frame, before)
+            ages_s = duration_s * (1 - (np.arange(count) + 0.5) / max(count, 1))
+        end_us = frame.device_us + 1e6 * newest_s
+        sample_ns = frame.stamps.get("sample", 0)
+        valid, _ = as_sent(frame)
+        follows = before is not None and before.board == frame.board and end_us > before.end_us
+        new = end_us - 1e6 * ages_s > before.end_us if before is not None and follows else np.ones(count, bool)
+        return cls(
+            values=np.abs(frame.z.astype(np.complex128)),
+            ages_s=ages_s,
+            new=new,
+            status=frame.status,
+            number=frame.scan,
+            part=frame.part,
+            end_us=end_us,
+            at_ns=sample_ns + round(0.5e9 * newest_s),
+            sample_ns=sample_ns,
+            duration_s=duration_s,
+            board=frame.board,
+            source=frame.source,
+            separate="separate" in frame.reasons,
+            reference=frame.kind == "reference",
+            believed=valid,
+            reasons=tuple(frame.reasons),
+        )
+
+
+def _spanned_s(ages_s: Array) -> float:
+    """In which values were measured one after the other; each age is that of its middle."""
+    count = len(ages_s)
+    return float(ages_s.max()) * count / (count - 0.5) if count else 0.0
+
+
+def _duration_s(frame: RawFrame, before: Scan | None) -> float:
+    """Of a whole scan: what passed since the one before it, as boards measure one after the other."""
+    if before is None or before.part or frame.scan != before.number + 1:
+        return SCAN_S if before is None or before.part else before.duration_s
+    passed_s = (frame.device_us - before.end_us) * 1e-6 + before.duration_s
+    return passed_s if SHORTEST_S < passed_s < LONGEST_S else before.duration_s
