@@ -173,7 +173,7 @@ class Publishing(Stage):
             add_reason(out.reasons, "changing")
         # Where a frame in between said that nothing touches, nothing is replaced.
         told_of = self._replaced or (self._touched and (bool(self._contacts) or self.tracker.remembers))
-        self._replaced = told_of and self.tracker.waits and not self._segments
+        self._replaced = told_of and self.tracker.replaces and not self._segments
         if out.valid and began is None and self._hides(frame, whole):
             out.valid = False
             add_reason(out.reasons, "changing")

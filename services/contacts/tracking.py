@@ -15,6 +15,7 @@ twentieth for as long as it is held, a contact that rose with a touch a tenth an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -28,6 +29,7 @@ LOST_FRAMES = 2  # frames a touch may be missing in before it ends; bad images d
 UNSEEN_S = 0.25  # it ends after so long at the latest, however bad the images
 FORGOTTEN_S = 1.0  # after so long without a frame, nobody knows whether a touch is the same
 NEVER = 1e6  # cost of what is out of reach
+REST = 0.1  # of a touch's size, below which what an image shows may be left of one that went
 UNCONFIRMED = 0  # id of what was seen once, beside others
 BELIEVED = ((2, 0.92), (3, 0.85))  # images and confidence in each, of either, with which a touch begins beside others
 # The same while an electrode is at fault: a strong touch leaves faint patches where the skin is then nearly blind.
@@ -149,6 +151,13 @@ class Tracker:
         return any(track.id == UNCONFIRMED for track in self.tracks)
 
     @property
+    def replaces(self) -> bool:
+        """Whether what waits may have taken the place of touches that were shown: it is no rest of one that goes."""
+        shown = [track for track in self.tracks if track.id != UNCONFIRMED]
+        waiting = [track for track in self.tracks if track.id == UNCONFIRMED]
+        return any(all(_is_other(new, old) for old in shown) for new in waiting)
+
+    @property
     def remembers(self) -> bool:
         """Whether a touch that was shown is there, or was a moment ago."""
         return any(track.id != UNCONFIRMED for track in self.tracks)
@@ -268,6 +277,11 @@ def _believed(track: Track, well: bool) -> bool:
     """Whether what appears beside others is a touch. well: no electrode is at fault."""
     enough = BELIEVED if well else BELIEVED_DOUBTED
     return any(track.sure_frames >= n and min(track.confidences[-n:], default=0.0) >= least for n, least in enough)
+
+
+def _is_other(new: Track, old: Track) -> bool:
+    """Whether a patch is not what is left of a touch that goes."""
+    return math.hypot(new.x - old.x, new.y - old.y) > STAYS_M and new.size > REST * old.size
 
 
 def _new(number: int, seen: Patch, sample_ns: int, begins: bool = True, sure: bool = True) -> Track:
