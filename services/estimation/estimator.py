@@ -186,7 +186,7 @@ class Estimator:
         )
         question, answer = asked.question, asked.answer
         measured = replace(measured, log_z=untouched + asked.view.y, live=asked.view.live)
-        explained = answer.quiet if answer.fit is None else answer.explained
+        explained = answer.holds
         rough = answer.fit is not None and answer.chi2 < n.MOST
         if explained or rough:
             self._settle(skin, question, answer, measured)

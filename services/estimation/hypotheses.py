@@ -81,6 +81,11 @@ class ScoredAnswer:
     def quiet(self) -> bool:
         return self.chi2 < n.QUIET and self.left_z2 < n.FALSE_ALARM_Z2 * max(1.0, self.chi2)
 
+    @property
+    def holds(self) -> bool:
+        """Whether it explains its scan, with touches or without."""
+        return self.quiet if self.fit is None else self.explained
+
 
 class Hypotheses:
     """Of one skin."""

@@ -1,4 +1,4 @@
-"""What faults of the board are to a frame: states of electrodes, judgements, and what a bundle cannot tell."""
+"""What faults of the board are to a frame: states of electrodes, and judgements."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from protocol.frame_types import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA
 from services.estimation.faults.wires import WireFault, WireKind
 from services.estimation.values import numbers as n
-from services.estimation.values.judgement import Judgement, Verdict, judge
+from services.estimation.values.judgement import Judgement, judge
 
 OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(7)  # protocol.frame_types.ELECTRODE_STATES
 STATE_OF = {WireKind.EXCHANGED: SWAPPED, WireKind.SHORT: SHORT, WireKind.STUCK: STUCK}
+ANY = 1e-6  # share of measurements: one is enough
 ROW_OF = {OPEN: "open", SHORT: "short", DRIFTING: "impedance", SWAPPED: "exchanged", STUCK: "stuck"}
 
 
@@ -38,18 +39,3 @@ def judgements_of(states: NDArray[np.uint8], status: NDArray[np.uint8], failed: 
     found.append(judge("degraded", lost, n.DEGRADED))
     found.append(judge("too_many", lost, n.TOO_MANY))
     return found
-
-
-ANY = 1e-6  # share of measurements: one is enough
-
-
-def cannot(knows_wires: bool, own: bool, predicted: bool) -> list[Judgement]:
-    """Rows that a bundle has no means to tell. knows_wires: all pairs are measured; own: each senses where it drives;
-    predicted: its impedances are known to a model.
-    """
-    rows = list[str]()
-    if not (knows_wires and predicted):
-        rows += ["exchanged", "stuck", "short"]
-    if not (own and predicted):
-        rows += ["impedance"]
-    return [Judgement(row, float("nan"), 1.0, float("nan"), Verdict.CANNOT) for row in rows]

@@ -147,32 +147,16 @@ class BoardFaults:
         mean, spread = self._contacts(at_s, 2 * times_s / span_s)
         readable = np.isfinite(values) & (values > 0) & (status == 0)
         log_z = np.log(np.where(readable, values, 1.0))
-        failed = self._known & (~readable | (np.abs(log_z - sound - np.log1p(mean)) > np.log(n.FAR)))
+        shown, slopes = sound, None
         if now.wire is None:
-            return self._seen(log_z, sound, failed, failed, sound, None, mean, spread, times_s, span_s, middle_s)
-        found = self.maps.one(now.wire, np.exp(sound + np.log1p(mean)))
-        dead = ~readable | found.blind | (at_s < now.wire_since_s)
-        shown = np.log(np.maximum(found.values, 1e-9))
-        failed = self._known & ~readable
-        return self._seen(log_z, sound, failed, dead, shown, found.slopes, mean, spread, times_s, span_s, middle_s)
-
-    def _seen(
-        self,
-        log_z: Array,
-        sound: Array,
-        failed: Mask,
-        dead: Mask,
-        shown: Array,
-        slopes: Array | None,
-        mean: Array,
-        spread: Array,
-        times_s: Array,
-        span_s: float,
-        middle_s: float,
-    ) -> BoardView:
-        unexpected = failed if slopes is None else failed & ~dead
-        self.now.opens, _ = wires.open_electrodes(unexpected, self.member)
-        live = self._known & ~dead & ~self.member[:, list(self.now.opens)].any(axis=1)
+            failed = dead = self._known & (~readable | (np.abs(log_z - sound - np.log1p(mean)) > np.log(n.FAR)))
+            now.opens, _ = wires.open_electrodes(failed, self.member)
+        else:
+            found = self.maps.one(now.wire, np.exp(sound + np.log1p(mean)))
+            failed, dead = self._known & ~readable, ~readable | found.blind | (at_s < now.wire_since_s)
+            shown, slopes = np.log(np.maximum(found.values, 1e-9)), found.slopes
+            now.opens = ()  # what fails is left out: a wire that is wrong may be why
+        live = self._known & ~dead & ~self.member[:, list(now.opens)].any(axis=1)
         return BoardView(log_z, sound, failed, live, shown, slopes, mean, spread, times_s, span_s, middle_s)
 
     def _contacts(self, at_s: Array, course: Array) -> tuple[Array, Array]:
@@ -214,8 +198,7 @@ class BoardFaults:
         if self.now.wire is not None:
             return False
         new = answer.fit is not None and any(place < 0 for place in answer.kept)
-        explained = answer.quiet if answer.fit is None else answer.explained
-        return new or not explained or answer.cause != AS_IT_IS
+        return new or not answer.holds or answer.cause != AS_IT_IS
 
     def explained_by_fault(
         self,
@@ -232,16 +215,14 @@ class BoardFaults:
         doubted: without one that stands and lies on an electrode.
         """
         best, sure = None, answer.score + (n.COST_TOUCH + n.COST_SMALL if doubted else self._sure(answer))
-        unexplained = not (answer.quiet if answer.fit is None else answer.explained)
-        for change in self._likeliest(question, touched, nearby, unexplained):
+        for change in self._likeliest(question, touched, nearby, unexplained=not answer.holds):
             asked, column = self._with(question, change)
             found = ask(asked)
             cost = _cost(change)
             if found.score + cost < sure or not self._apart(change, found):
                 continue
-            explained = found.quiet if found.fit is None else found.explained
             plainly = found.chi2 < n.MOST and found.score + cost > answer.score + n.WIRE_SURE
-            if not (explained or plainly):
+            if not (found.holds or plainly):
                 continue
             best, sure = (change, column, asked, found), found.score + cost
         if best is None:

@@ -18,8 +18,4 @@ def judged_by_itself(
     before = hypotheses.ask(question, standing, loose)
     kept = sum(place >= 0 for place in before.kept)
     vouched = replace(before, score=before.score + n.COST_TOUCH * kept)
-    return max((anew, vouched), key=lambda answer: (explains(answer), answer.score))
-
-
-def explains(answer: ScoredAnswer) -> bool:
-    return answer.quiet if answer.fit is None else answer.explained
+    return max((anew, vouched), key=lambda answer: (answer.holds, answer.score))

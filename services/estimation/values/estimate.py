@@ -65,7 +65,3 @@ class Estimate:
     @property
     def touched(self) -> bool:
         return any(each.name == "touch" and each.verdict is Verdict.NOTE for each in self.judgements)
-
-    @property
-    def complete(self) -> bool:
-        return self.scan.complete

@@ -114,8 +114,9 @@ START_PAST = Number(10.0, "nat", "of a touch's evidence lost, beyond which none 
 START_LEFT_OUT = Number(1e4, "-", "variance of a measurement that does not count", "derived: nothing is as large")
 START_TOUCHES = Number(3.0, "-", "touches at a start at most", "chosen: as networks were trained")
 START_NATS = Number(30.0, "nat", "by which a touch explains the first scans better", "measured: tests of the start")
-START_MOST = Number(4.0, "-", "times the least difference, beyond which it may hide a touch", "measured: as START_NATS")
-START_SURE = Number(16.0, "-", "the same beside a touch that surely is one", "measured: as START_NATS")
+START_SURE = Number(
+    16.0, "-", "times the least difference that a touch may stand beside, and surely is one", "measured: as START_NATS"
+)
 START_SURE_CHI2 = Number(3.0, "-", "chi^2 a measurement that such a touch leaves at most", "measured: as START_NATS")
 """What a skin may be before its first baseline."""
 
@@ -202,8 +203,6 @@ UNEXPLAINED_SCANS = Number(3.0, "-", "scans after which a fault that explains no
 SILENT = Number(0.7, "-", "share of measurements that fail where it is not electrodes", "derived: more than any bit's")
 DEGRADED = Number(2.0, "-", "electrodes at fault that a frame says", "chosen: as the service before")
 TOO_MANY = Number(3.0, "-", "electrodes at fault with which no frame is valid", "chosen: as the service before")
-SEEN_DROP = Number(0.05, "-", "drop of a disc that must be seen", "measured: of the lightest touches, 0.1 N")
-UNSEEN = Number(0.02, "-", "share of discs that may be seen worse", "measured: of a sound skin none")
 """What a board's faults leave."""
 
 
