@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from models.measurement.numbers import LEFT_OUT
+
 Array = NDArray[np.float64]
 
 
@@ -38,3 +40,9 @@ class Whitening:
     def conditional_precisions(self) -> Array:
         """(K,) of each measurement given all others: the diagonal of S^-1."""
         return np.asarray((self.w**2).sum(axis=0))
+
+
+def leave_out(covariance: Array, live: NDArray[np.bool_]) -> None:
+    """Give measurements that do not count no weight; covariance (K, K) is changed."""
+    dead = np.flatnonzero(~live)
+    covariance[dead, dead] += LEFT_OUT

@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.noise import NoiseModel
-from models.measurement.whitening import Whitening
+from models.measurement.whitening import Whitening, leave_out
 from services.estimation.filter import SkinFilter
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 
 FIRST_LINES = (16, 32, 64)  # scans heard, at which lines are made for the first times
-LEFT_OUT = 1e4  # variance of a measurement that does not count
 
 
 @dataclass(frozen=True)
@@ -71,9 +70,3 @@ class Learning:
         pulled = self._drift.take_in(predicted, y, white)
         if not scan.drifts and scan.live.all():
             self._noise.learn(pulled, white)
-
-
-def leave_out(covariance: Array, live: NDArray[np.bool_]) -> None:
-    """Give measurements that do not count no weight."""
-    dead = np.flatnonzero(~live)
-    covariance[dead, dead] += LEFT_OUT

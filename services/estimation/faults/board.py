@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, VELOCITY
-from models.measurement.whitening import Whitening
+from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice, wires
 from services.estimation.faults.impedance import (
     ContactChange,
@@ -28,7 +28,6 @@ from services.estimation.faults.impedance import (
 from services.estimation.faults.table import BoardScan, WireTable
 from services.estimation.faults.wires import WireFault, WireMaps
 from services.estimation.hypotheses import AS_IT_IS, Question, ScoredAnswer
-from services.estimation.learning import leave_out
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]

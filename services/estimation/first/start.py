@@ -24,7 +24,7 @@ from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
 from models.measurement.grid import DiscGrid
 from models.measurement.tables import SkinTables
 from models.measurement.touch import PLACE, RATE, TouchPrior, anywhere
-from models.measurement.whitening import Whitening
+from models.measurement.whitening import Whitening, leave_out
 from services.estimation.values import numbers as n
 from services.estimation.values.judgement import Judgement, Verdict, judge
 
@@ -107,8 +107,7 @@ class StartJudge:
         y = np.where(live, y - gain, 0.0)
         tables = self._tables.relative_to(np.exp(log_expected + gain))
         base = np.diag(variance + n.START_ABSOLUTE**2) + n.START_GAIN**2
-        dead = np.flatnonzero(~live)
-        base[dead, dead] += n.START_LEFT_OUT
+        leave_out(base, live)
         ladder = StartLadder(tables, y, live)
         rest = n.START_ABSOLUTE**2 * np.eye(len(y))
         if earlier is not None:
