@@ -30,7 +30,9 @@ def shown(rig: Rig, script: Script) -> Rig:
     return rig
 
 
-@pytest.mark.parametrize("name", ["creep", "creep-power", "all"])
+@pytest.mark.parametrize(
+    "name", ["all", *(pytest.param(name, marks=pytest.mark.slow) for name in ("creep", "creep-power"))]
+)
 def test_what_is_interpolated_between_solutions_is_within_a_fifth_of_the_noise(name: str) -> None:
     script = Script("test", tracks=(track(1.0, 2.0), track(2.5, 3.0, (-0.02, 0.01))))
     rig = shown(Rig(world=name, seed=3), script)

@@ -210,7 +210,7 @@ def test_a_touch_surely_explains_a_start_under_it(
 
 
 @pytest.mark.parametrize("name", ["mild", "field5", "field10", "shift1", "shift3", "anisotropy15", "contacts"])
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_no_touch_surely_explains_a_skin_that_is_not_as_in_its_file(
     evidence: TouchEvidence, name: str, seed: int
 ) -> None:

@@ -180,7 +180,7 @@ def test_a_slide_keeps_its_id_and_its_place(parts: int) -> None:
         assert abs(frame.contacts[0].position[0] - there) < 3e-3
 
 
-@pytest.mark.parametrize("parts", [1, PARTS])
+@pytest.mark.parametrize("parts", [1, pytest.param(PARTS, marks=pytest.mark.slow)])
 def test_what_a_touch_leaves_in_the_foam_is_no_touch(parts: int) -> None:
     touch = pressed("circle", 0.012, -0.018, 9e-3, 3.0)
     frames = run(press(touch, until_s=FREE_S + 1.0, left=0.03), FREE_S + 3.5, parts)
@@ -203,7 +203,9 @@ BREAKS = pytest.mark.xfail(
 )
 
 
-@pytest.mark.parametrize("refused_s", [4.0, pytest.param(60.0, marks=[pytest.mark.slow, BREAKS])])
+@pytest.mark.parametrize(
+    "refused_s", [pytest.param(4.0, marks=pytest.mark.slow), pytest.param(60.0, marks=[pytest.mark.slow, BREAKS])]
+)
 def test_after_refused_frames_the_skin_is_valid_again_within_two_seconds(refused_s: float) -> None:
     """Noise that no model has, and meanwhile the sheet has come to conduct 1 % better."""
     rng = np.random.default_rng(9)

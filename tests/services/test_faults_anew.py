@@ -137,7 +137,7 @@ def test_a_touch_is_found_under_a_fault_of_the_wires(
 
 
 @pytest.mark.parametrize("held", [False, True])
-@pytest.mark.parametrize("times", [0.4, 1.15, 4.0, 20.0])
+@pytest.mark.parametrize("times", [1.15, 4.0, *(pytest.param(times, marks=pytest.mark.slow) for times in (0.4, 20.0))])
 def test_a_contact_that_changes_is_named_and_makes_no_touch(times: float, held: bool) -> None:
     skin, touch = tared(), PRESS if held else ()
     for _ in range(8):

@@ -171,7 +171,7 @@ def test_no_calibration_is_adopted_while_something_touches(sheet: MismatchedShee
 
 
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.6, 0.55), (-0.7, 0.1)])
-@pytest.mark.parametrize("newtons", [1.0, 5.0])
+@pytest.mark.parametrize("newtons", [1.0, pytest.param(5.0, marks=pytest.mark.slow)])
 def test_a_start_under_a_touch_fits_nothing(x: float, y: float, newtons: float) -> None:
     for name in ("none", "mild"):
         bench = Bench(MismatchedSheet(BUNDLE, named(name), "inverse"))

@@ -224,6 +224,7 @@ def test_a_touch_reaches_a_controller_within_three_parts_and_so_does_its_end(hos
     assert samples == sorted(samples)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x, y", [(0.037, -0.044), (-0.0137, 0.0436)])
 def test_a_touch_on_an_electrode_is_not_taken_for_its_contact_after_parts_had_told_them_apart(x, y):
     """The two whole scans after its beginning were of a contact that jumped, by what they show alone."""

@@ -70,6 +70,7 @@ def test_a_held_touch_stays_where_the_whole_scan_shows_it(bundle):
         assert off(seen, lambda t: (0.3, -0.2)).max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_held_touch_is_known_better_with_every_image_of_more_scans(bundle):
     off, stated = [], []
     for seed in range(6):

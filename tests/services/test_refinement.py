@@ -188,6 +188,7 @@ class SlowFits(RefineHere):
             self._next()
 
 
+@pytest.mark.slow
 def test_a_slide_is_refined_as_far_as_there_is_time_and_what_is_skipped_is_counted() -> None:
     """At 20 mm/s a touch is elsewhere when a fit from nothing is done: the next one begins where that ended."""
     stub, fits = StubSkin(80.0, skin=configured()), SlowFits()
@@ -262,6 +263,7 @@ def test_the_process_fits_the_newest_of_each_skin_and_counts_the_others(process:
     assert answered(process, "sole").number == 5
 
 
+@pytest.mark.slow
 def test_a_job_that_knows_the_answer_goes_before_one_that_did_not(process: RefineProcess, bundle: Bundle) -> None:
     process.offer(job(bundle, 1))
     process.offer(job(bundle, 2))  # made while the first is fitted
