@@ -132,7 +132,8 @@ def _differs(before: Array, now: Array) -> bool:
 
 def _common(before: Array, now: Array, baseline: Baseline, earlier: Array | None = None) -> float | None:
     """now / before of two frames' |Z| (K,), where it is common to the measurements that count in all."""
-    live = (baseline.z0 > 0) & np.isfinite(now) & np.isfinite(baseline.sigma)
+    # A reading of zero has no gain to it: taken over, it would leave a baseline that nothing can follow any more.
+    live = (baseline.z0 > 0) & np.isfinite(now) & (now > 0) & np.isfinite(baseline.sigma)
     for row in (before,) if earlier is None else (before, earlier):
         live &= np.isfinite(row) & (row > 0)
     sigma = np.where(live, baseline.sigma / np.where(live, baseline.z0, 1.0), np.inf)

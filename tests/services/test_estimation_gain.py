@@ -113,6 +113,17 @@ def test_a_gross_gain_that_was_taken_over_ends_at_once_and_names_no_electrode() 
     assert not any(r.delta.electrodes.any() for r in seen)
 
 
+def test_a_board_that_reads_zero_for_a_while_is_valid_again_afterwards() -> None:
+    """All measurements times zero are no gain: the baseline that took it over was zero, and stayed so until a tare."""
+    skin = StubSkin(80.0)
+    skin.faults.inject("gain", {"factor": 0.0}, 0.0, 1e9)
+    assert not any(skin.rest(1).contact.valid for _ in range(60))
+    skin.faults.clear("gain")
+    after = [skin.rest(1).contact for _ in range(100)]
+    assert not any(c.valid and c.contacts for c in after)
+    assert all(c.valid for c in after[80:]), after[-1].reasons
+
+
 @pytest.mark.parametrize("situation", ["untouched", "held", "sliding"])
 @pytest.mark.parametrize("gain", [-0.04, -0.003, 0.003, 0.04])
 def test_a_gain_step_in_the_midst_of_a_scan_is_taken_over_by_the_next(gain: float, situation: str) -> None:
