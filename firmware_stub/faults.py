@@ -159,6 +159,25 @@ FAULTS: dict[str, Fault] = {
     "power_cycle": Fault("the board restarts, and forgets what it was told and what was sticky", "the board restarts"),
 }
 
+BOUNDS: dict[str, tuple[float, float]] = {
+    "fraction": (0, 1),
+    "garbage": (0, 1),
+    "flips": (0, 1),
+    "bit": (0, 3),
+    "value": (0, 1),
+    "words": (1, 65535),
+    "id": (0, 0xFFFF),
+    "schema": (0, 0xFFFFFFFF),
+    "gain": (0, 1e6),
+    "factor": (-1e6, 1e6),
+    "phase": (-7, 7),
+    "late_frames by": (0, 60),
+    "clock_jump by": (-1e6, 1e6),
+}
+"""From and to which an argument makes sense, by its name, after the fault's where others call theirs so; electrodes are
+bounded by the sheet. What lies beyond asks for more bytes or longer times than the stub has.
+"""
+
 
 class Faults:
     """The faults in force. Used by the board's thread and by the control socket's."""
@@ -169,9 +188,7 @@ class Faults:
 
     def inject(self, name: str, args: Mapping[str, Any], now: float, seconds: float = 5.0) -> dict[str, Any]:
         """Start a fault at `now` (s); returns its arguments. Raises ValueError for what is not in the table."""
-        if name not in FAULTS:
-            raise ValueError(f"no fault {name!r}: expected one of {', '.join(FAULTS)}")
-        row = FAULTS[name]
+        row = _row(name)
         if unknown := set(args) - set(row.args):
             allowed = ", ".join(row.args) or "no arguments"
             raise ValueError(f"fault {name}: unknown argument {', '.join(sorted(unknown))}, expected {allowed}")
@@ -180,6 +197,9 @@ class Faults:
         full = dict(row.args)
         for key, value in args.items():
             full[key] = _like(row.args[key], value, f"fault {name}: {key}")
+            least, most = BOUNDS.get(f"{name} {key}") or BOUNDS.get(key, (-math.inf, math.inf))
+            if isinstance(full[key], int | float) and not least <= full[key] <= most:
+                raise ValueError(f"fault {name}: {key} = {value!r}: expected {least:.10g} to {most:.10g}")
         with self._lock:
             self._until[name] = (math.inf if row.sticky else now + seconds, full)
         return full
@@ -191,7 +211,9 @@ class Faults:
             return args if now < until else None
 
     def clear(self, *names: str) -> None:
-        """End the named faults, or all."""
+        """End the named faults, or all. Raises ValueError for what is not in the table."""
+        for name in names:
+            _row(name)
         with self._lock:
             for name in names or list(self._until):
                 self._until.pop(name, None)
@@ -202,6 +224,12 @@ class Faults:
     def listing(self, now: float) -> dict[str, dict[str, Any]]:
         with self._lock:
             return {name: args for name, (until, args) in self._until.items() if now < until}
+
+
+def _row(name: str) -> Fault:
+    if name not in FAULTS:
+        raise ValueError(f"no fault {name!r}: expected one of {', '.join(FAULTS)}")
+    return FAULTS[name]
 
 
 def messages_of(listing: Mapping[str, Mapping[str, Any]]) -> list[str]:

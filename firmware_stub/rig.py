@@ -196,13 +196,15 @@ class Rig:
 
     def fault(self, name: str, args: Mapping[str, Any], now: float, seconds: float = 5.0) -> dict[str, Any]:
         """Let something go wrong, see FAULTS. Raises ValueError."""
-        for key in ("electrode", "electrodes"):
+        for key, least in (("electrode", 0), ("electrodes", 0), ("second", -1)):  # -1: there is no second one
             given = args.get(key, 0)
             for electrode in given if isinstance(given, list) else [given]:
-                if electrode not in range(self.sheet.electrodes):
+                if electrode not in range(least, self.sheet.electrodes):
                     raise ValueError(
-                        f"fault {name}: electrode {electrode!r}, expected 0 to {self.sheet.electrodes - 1}"
+                        f"fault {name}: electrode {electrode!r}, expected {least} to {self.sheet.electrodes - 1}"
                     )
+            if isinstance(given, list) and len(set(given)) < len(given):
+                raise ValueError(f"fault {name}: {key} = {given!r}: expected different ones")
         full, row = self.faults.inject(name, args, now, seconds), FAULTS[name]
         return {"fault": name, "args": full, "what": row.what, "sticky": row.sticky, "seconds": seconds}
 

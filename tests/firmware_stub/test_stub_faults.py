@@ -304,6 +304,14 @@ def test_unplug_forgets_the_configuration_and_starts_the_clock_anew(running):
         ("electrode_open", {"electrode": "five"}, "expected 0 to 15"),
         ("electrodes_swapped", {"electrodes": [1]}, "a list like"),
         ("mux_stuck", {"mux": "front"}, "one of drive"),
+        ("electrode_open", {"electrode": 0, "second": 16}, "expected -1 to 15"),
+        ("electrodes_swapped", {"electrodes": [2, 2]}, "expected different ones"),
+        ("mux_stuck", {"bit": 4}, "bit = 4: expected 0 to 3"),
+        ("missed_interrupt", {"fraction": 2}, "fraction = 2: expected 0 to 1"),
+        ("fifo_overflow", {"words": -1}, "words = -1: expected 1 to 65535"),
+        ("late_frames", {"by": -5}, "by = -5: expected 0 to 60"),
+        ("clock_jump", {"by": 1e30}, r"expected -1000000 to 1000000"),  # ended the stub's process
+        ("line_noise", {"garbage": 1e9}, "expected 0 to 1"),  # did so too
         ("line_noise", {"garbage": float("inf")}, "something like"),
         ("unplug", {"name": "../board"}, "a short name"),
         ("hang", {"hard": True}, "unknown argument hard"),
@@ -312,6 +320,11 @@ def test_unplug_forgets_the_configuration_and_starts_the_clock_anew(running):
 def test_a_fault_that_makes_no_sense_is_refused(host, name, args, says):
     with pytest.raises(ValueError, match=says):
         host().rig.fault(name, args, 0.0)
+
+
+def test_only_a_fault_of_the_table_can_be_cleared(host):
+    with pytest.raises(ValueError, match="no fault 'gremlins': expected one of wrong_chip_id"):
+        host().rig.faults.clear("gremlins")
 
 
 def test_clipping_is_the_describing_function_of_a_saturation():
