@@ -130,6 +130,7 @@ def _port(name: str, skin: Skin, bundle: Bundle, running: bool, ours: bool) -> I
 
 def _live(name: str, skin: Skin, bundle: Bundle) -> Iterator[Finding]:
     """What the service that runs this configuration says of a skin."""
+    live.wait_for_baseline(name)
     yield from live.processes(name)
     yield from live.contacts(name)
     info = live.info(name)
@@ -230,6 +231,8 @@ def electrode_order(name: str, z0: NDArray[np.float64] | None, bundle: Bundle) -
         return Finding("SKIP", what, "no baseline yet to see their order by")
     if pre.m.normalisation != "model":
         return Finding("SKIP", what, f"bundle {bundle.name} does not predict impedances, so their order cannot be seen")
+    if not (z0 > 0).any():
+        return Finding("FAIL", what, "every impedance of the baseline is zero: free the skin and run `skin tare`")
     misfit = implausibility(z0, pre)
     if misfit <= GOOD_FIT:
         return Finding("OK", what, f"in order: the baseline is {100 * misfit:.2f} % off the bundle's prediction")

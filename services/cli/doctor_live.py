@@ -21,11 +21,13 @@ from protocol.frame_types import REASONS
 from protocol.frames import ContactFrame, InfoFrame, RawFrame
 from protocol.runtime import CONFIG_LINK, AlreadyRunning, lock, runtime_dir
 from protocol.sockets import AllReader, ControlClient, ControlError, NewestReader
+from services.estimation.baseline import TAKING
 from services.runtime.config import Skin
 from services.runtime.stage import PROCESSES
 
 ANSWER_S = 1.0
 FRAME_S = 1.5
+BASELINE_S = 4.0  # at most: the first baseline takes three, in which every frame says stale_baseline
 LISTEN_S = 3.0  # to contact frames: what is judged is the skin as it is, not a moment of it
 WELL, BADLY = 0.95, 0.5
 """Share of valid frames: less than the first is warned of, less than the second stops whoever acts on contacts."""
@@ -105,6 +107,17 @@ def processes(name: str) -> Iterator[Finding]:
         yield Finding(level, f"{name}: frames", text)
     else:
         yield Finding("FAIL", f"{name}: frames", f"no raw frame came within {FRAME_S:g} s: see the lines above")
+
+
+def wait_for_baseline(name: str) -> None:
+    """While the first baseline is being taken, wait: until then no frame is valid, and nothing is the matter."""
+    end, before = time.monotonic() + BASELINE_S, ""
+    while time.monotonic() < end:
+        said = _status("preprocessing", name).text
+        if TAKING not in said or said == before:  # taken, or it does not come on: no board, a touch
+            return
+        before = said
+        time.sleep(1.0)  # twenty frames
 
 
 def contacts(name: str) -> Iterator[Finding]:

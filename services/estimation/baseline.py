@@ -22,6 +22,7 @@ from services.estimation.tare_window import TareWindow
 
 Array = NDArray[np.float64]
 
+TAKING = "taking the baseline"  # what the status says until there is one
 SAVE_EVERY = 512  # untouched frames after which the tracked baseline is worth keeping again
 STEADY_S = 0.25  # what is known not to have drifted is as good as a baseline of this age
 DRIFT_KNOWN_S = 4.0  # a drift that was found under a touch leaves as much open as a baseline of this age
@@ -217,7 +218,7 @@ class BaselineEstimator:
         return baseline
 
     def progress(self) -> str:
-        return f"taking the baseline: {len(self.window)} of {self.window.frames} frames"
+        return f"{TAKING}: {len(self.window)} of {self.window.frames} frames"
 
     def _move(self, z0: Array) -> None:
         """The same baseline, moved by what drifted."""

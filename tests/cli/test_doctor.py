@@ -9,8 +9,9 @@ import pty
 import re
 import threading
 import tty
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +19,12 @@ import pytest
 from models.bundle import Bundle
 from protocol import link
 from protocol.advice import ADVICE
+from protocol.control import ControlServer
 from protocol.frames import ContactFrame
 from protocol.runtime import CONFIG_LINK, lock
 from protocol.sockets import Publisher
 from services.cli.doctor import _key, electrode_order
+from services.estimation.baseline import TAKING
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +81,7 @@ def test_an_indenter_larger_than_the_skin_stops_doctor_and_service(skin, tmp_pat
 
 
 @contextlib.contextmanager
-def service(runtime: Path, config: Path, frames: Sequence[ContactFrame]) -> Iterator[None]:
+def service(runtime: Path, config: Path, frames: Iterable[ContactFrame]) -> Iterator[None]:
     """What `skin up` holds of a runtime folder; its publisher sends these frames again and again."""
     over = threading.Event()
 
@@ -127,6 +130,36 @@ def test_contacts_are_judged_by_the_share_of_valid_frames(  # type: ignore[no-un
     assert ("not valid" in out) == (level != "OK")
 
 
+def test_while_the_first_baseline_is_taken_it_waits(skin, runtime, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """For three seconds after the start frames are `stale_baseline`: nothing is the matter, a tare no help."""
+    config, asked, over = configured(tmp_path, "stub", ""), [], threading.Event()
+
+    def status(_: dict[str, Any]) -> dict[str, Any]:
+        asked.append(1)
+        taken = len(asked) > 2
+        return {
+            "level": "OK" if taken else "WARN",
+            "messages": [] if taken else [f"{TAKING}: {len(asked)} of 64 frames"],
+        }
+
+    def answer() -> None:
+        server = ControlServer("preprocessing", {"status": status})
+        while not over.is_set():
+            server.serve_once(0.05)
+        server.close()
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    frames = (contact() if len(asked) > 2 else contact("stale_baseline") for _ in itertools.count())
+    try:
+        with service(runtime, config, frames):
+            out = skin("doctor", "--config", config).out
+    finally:
+        over.set()
+        thread.join()
+    assert re.search(r"OK +palm: preprocessing", out) and "stale_baseline" not in out, out
+
+
 def test_no_contact_frame_is_a_failure(skin, runtime, tmp_path) -> None:  # type: ignore[no-untyped-def]
     config = configured(tmp_path, "stub", "")
     other = ContactFrame(skin="sole", valid=True)
@@ -157,6 +190,11 @@ def test_exchanged_wires_are_named(bundle: Bundle, i: int, j: int) -> None:
     swapped = [place[_key([{i: j, j: i}.get(e, e) for e in row])] for row in rows]
     finding = electrode_order("palm", bundle.z0[swapped], bundle)
     assert finding.level == "FAIL" and f"electrodes {i} and {j} look exchanged" in finding.text
+
+
+def test_a_baseline_of_zeros_is_said(bundle: Bundle) -> None:
+    finding = electrode_order("palm", np.zeros(120), bundle)
+    assert finding.level == "FAIL" and "zero" in finding.text and "nan" not in finding.text
 
 
 def test_another_skin_is_no_exchange(bundle: Bundle) -> None:
