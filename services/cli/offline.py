@@ -25,7 +25,7 @@ def _no_recording(source: Path) -> Path:
     """Refuses one before anything else that is missing on the line is asked for."""
     if source.suffix == ".mcap":
         fail(
-            f"found {source}, expected IN.npz. Of a recording `skin replay {source} --fast --private --out OUT.mcap` "
+            f"found {source}, expected IN.npz: `skin replay {source} --fast --private --out OUT.mcap` "
             "runs the stages over a recording, and `skin export OUT.mcap --csv` makes a table of its contacts",
             USAGE,
         )
