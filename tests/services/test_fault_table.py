@@ -83,3 +83,11 @@ def test_sound_wires(touch: int) -> None:
     z, status = measured({}, TOUCHES[touch])
     for factor in (1.0, 0.8):
         assert guessed(factor * z, status).fault is None
+
+
+def test_the_covariance_of_any_touches_is_one_seen_through_every_fault() -> None:
+    """Slopes of a fault reach 40: what rounding leaves below 0 in it must stay far below the noise that is added."""
+    for fault in MAPS.faults:
+        slopes = MAPS.one(fault, np.exp(untouched())).slopes
+        seen = slopes @ any_touch() @ slopes.T
+        assert np.linalg.eigvalsh(seen)[0] > -1e-3 * NOISE**2

@@ -48,8 +48,9 @@ class WireGuess:
 def any_touches(grid: DiscGrid) -> Array:
     """(K, K) covariance of log |Z| over touches that may be anywhere."""
     areas = np.array([area_of(log_radius) for log_radius in grid.discs[:, 2]])
-    weighted = grid.responses * (n.ANY_DROP * areas)[:, None].astype(np.float32)
-    return np.asarray(weighted.T @ weighted, float) * (n.MOST_TOUCHES / len(areas))
+    double = grid.responses.astype(float)  # a map's slopes make what rounding leaves 1000 times larger
+    weighted = double * (n.ANY_DROP * areas)[:, None]
+    return np.asarray(weighted.T @ weighted * (n.MOST_TOUCHES / len(areas)))
 
 
 class WireTable:
