@@ -284,7 +284,9 @@ class Estimator:
         return True
 
     def _doubt(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
-        """Is one of the touches drift? What was shown once must not stay because nothing is learnt under it."""
+        """Is one of the touches drift, or nothing? What was shown once must not stay because nothing is learnt under
+        it, nor because it costs nothing: a touch that is doubted counts as a new one.
+        """
         touches = skin.touches
         for k in reversed(range(len(touches))):
             track = touches.now.tracks[k]
@@ -293,7 +295,7 @@ class Estimator:
                 continue
             standing = touches.expected(measured.middle_s, measured.span_s)
             other = skin.hypotheses.without(question, standing, k)
-            if other.quiet and other.score > answer.score:
+            if other.quiet and other.score > answer.score + n.COST_TOUCH:
                 touches.remove(k)
                 return
             track.sure = track.sure or track.scans >= n.SURE_SCANS

@@ -155,14 +155,24 @@ class Hypotheses:
         return _likeliest(found) if found else None
 
     def without(self, question: Question, standing: Sequence[TouchPrior], place: int) -> ScoredAnswer:
-        """The answer that one of the touches is none, but drift."""
+        """The answer that one of the touches is none: there is nothing, or it is drift."""
         kept = tuple(k for k in range(len(standing)) if k != place)
         if not kept:
-            answer = self.untouched(question, DRIFT)
-            assert answer is not None
-            return answer
+            return _likeliest([self._nothing(question, cause) for cause in (AS_IT_IS, DRIFT)])
+        priors = [standing[k] for k in kept]
         wider = replace(question, covariance=question.covariance + self.faster_drift())
-        return self._fitted(wider, [standing[k] for k in kept], kept, n.STEPS_WARM, DRIFT)
+        return _likeliest(
+            [
+                self._fitted(question, priors, kept, n.STEPS_WARM),
+                self._fitted(wider, priors, kept, n.STEPS_WARM, DRIFT),
+            ]
+        )
+
+    def _nothing(self, question: Question, cause: str) -> ScoredAnswer:
+        """As `untouched`, of a cause that every skin has."""
+        answer = self.untouched(question, cause)
+        assert answer is not None
+        return answer
 
     def _settled(self, answers: Sequence[ScoredAnswer]) -> bool:
         return any(answer.explained for answer in answers) or self.steps > n.MOST_STEPS

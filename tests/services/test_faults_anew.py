@@ -210,3 +210,22 @@ def test_after_a_gap_the_first_scan_is_judged_by_itself(scans: int, after: tuple
         places = sorted((round(touch.x, 1), round(touch.y, 1)) for touch in each.touches)
         assert places == sorted((shape.x, shape.y) for shape in after) and each.valid
     assert all(len(each.touches) <= len(after) for each in felt if each.valid)
+
+
+@pytest.mark.parametrize(
+    ("electrode", "inward", "radius", "drop", "times"),
+    [(3, 0.9, 0.15, 0.4, 4.0), (9, 0.92, 0.1, 0.5, 3.0), (12, 0.85, 0.2, 0.6, 2.0), (6, 0.85, 0.2, 0.6, 2.0)],
+)
+def test_a_contact_that_drifts_under_a_touch_is_no_touch_when_that_goes(
+    electrode: int, inward: float, radius: float, drop: float, times: float
+) -> None:
+    skin = tared()
+    x, y = inward * np.asarray(Bundle.load("square16").skin["electrodes"]["centre"], float)[electrode]
+    shape = (Shape("circle", float(x), float(y), radius, drop),)
+    for _ in range(20):
+        skin.feel(shape)
+    for k in range(60):
+        skin.feel(shape, ((electrode, 1 + (times - 1) * k / 60),))
+    left = [skin.feel((), ((electrode, times),)) for _ in range(12)]
+    assert all(each.valid and not each.touches for each in left[2:])
+    assert states(left[-1]) == {"drifting": [electrode]}

@@ -103,12 +103,14 @@ class FaultAsking:
         return found if other is None else Asked(found.view, *other, changed=True)
 
     def _doubted(self, found: Asked, at: AskedScan) -> Asked:
-        """Is a touch on an electrode its contact impedance? Asked at some ages, and when it has become weak."""
+        """Is a touch on an electrode its contact impedance? Asked at some ages, when it has become weak, and when it
+        does not plainly explain a scan: a contact that changes under a touch is left when the touch goes.
+        """
         if self._faults.now.wire is not None or not at.whole:
             return found
         for k, track in enumerate(self._touches.now.tracks):
             weak = track.state[ACTION] < n.WEAK * track.peak
-            asked = track.scans in n.CONTACT_DOUBTS or weak
+            asked = track.scans in n.CONTACT_DOUBTS or weak or _doubtful(found.answer)
             if not asked or track.ended or not self._faults.on_electrode(track.state):
                 continue
             standing = self._touches.expected(at.middle_s, at.span_s)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.tables import SkinTables
-from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, VELOCITY
+from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
 from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice, wires
 from services.estimation.faults.impedance import (
@@ -294,10 +294,12 @@ class BoardFaults:
         """An electrode under a touch that changes is not named: what it does is the touch's."""
         if isinstance(change, GainChange) or answer.fit is None:
             return True
-        for state, place, prior in zip(answer.fit.states, answer.kept, answer.fit.priors, strict=True):
+        acts = answer.fit.states[:, ACTION] ** 2 > n.ACTS_Z2 * np.diag(answer.fit.covariance)[ACTION::STATES]
+        priors = answer.fit.priors
+        for state, place, prior, there in zip(answer.fit.states, answer.kept, priors, acts, strict=True):
             away = float(np.hypot(*(state[PLACE] - self._places[change.electrode])))
             still = place >= 0 and float(prior.sd[VELOCITY].max()) * SCAN_S <= 2 * n.STILL_WAY
-            if away < np.exp(state[LOG_RADIUS]) + n.ON_ELECTRODE and not still:
+            if there and away < np.exp(state[LOG_RADIUS]) + n.ON_ELECTRODE and not still:
                 return False
         return True
 

@@ -189,6 +189,7 @@ BACK_SCANS = Number(3.0, "-", "whole scans for which it must be", "chosen: a loo
 GAIN_NAMED_S = Number(0.3, "s", "for which a step of the gain is said", "chosen: seen by a person's tool at 5 Hz")
 CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itself", "derived: a fifth of its walk")
 ON_ELECTRODE = Number(0.2, "unit", "gap below which a touch changes an electrode's contact", "derived: its width")
+ACTS_Z2 = Number(9.0, "-", "squared sigmas of a touch's action, below which it is none to a fault", "derived: 3 sigmas")
 SMALL = Number(0.2, "unit", "radius of a touch that may be an electrode's contact", "derived: an electrode's width")
 COST_SMALL = Number(-8.0, "nat", "log prior of such a touch on an electrode", "derived: share of the sheet that it is")
 CONTACT_DOUBTS = (1, 2, 8, 24, 72)  # whole scans of a touch on an electrode, at which it is asked whether it is one
