@@ -298,7 +298,7 @@ class Estimator:
             if other.quiet and other.score > answer.score + n.COST_TOUCH:
                 touches.remove(k)
                 return
-            track.sure = track.sure or track.scans >= n.SURE_SCANS
+            track.sure = track.sure or (track.scans >= n.SURE_SCANS and track.z2 > n.ACTS_Z2)
 
     def _explained(self, skin: TaredSkin, cause: str) -> None:
         self.now.unexplained_s = 0.0
