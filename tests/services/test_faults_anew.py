@@ -229,3 +229,14 @@ def test_a_contact_that_drifts_under_a_touch_is_no_touch_when_that_goes(
     left = [skin.feel((), ((electrode, times),)) for _ in range(12)]
     assert all(each.valid and not each.touches for each in left[2:])
     assert states(left[-1]) == {"drifting": [electrode]}
+
+
+@pytest.mark.parametrize("seed", [1, 9])
+def test_a_second_disc_that_may_be_none_is_not_shown(seed: int) -> None:
+    """A broad L is better explained by two discs, the second of which is as large as its own uncertainty."""
+    skin, rng = tared(), np.random.default_rng(seed)
+    x, y = rng.uniform(-0.6, 0.6, 2)
+    radius, drop = rng.uniform(0.2, 0.36), rng.uniform(0.2, 0.6)
+    shape = (Shape("L", x, y, radius, drop, rotation=float(rng.uniform(0, 6.28))),)
+    felt = [skin.feel(shape) for _ in range(20)]
+    assert all(each.valid and len(each.touches) == 1 for each in felt)
