@@ -298,7 +298,8 @@ class Estimator:
             if other.quiet and other.score > answer.score + n.COST_TOUCH:
                 touches.remove(k)
                 return
-            track.sure = track.sure or (track.scans >= n.SURE_SCANS and track.z2 > n.ACTS_Z2)
+            alone = len(touches) == 1  # then something touches, be its strength known or not
+            track.sure = track.sure or (track.scans >= n.SURE_SCANS and (alone or track.z2 > n.ACTS_Z2))
 
     def _explained(self, skin: TaredSkin, cause: str) -> None:
         self.now.unexplained_s = 0.0
