@@ -37,6 +37,29 @@ MOST_DAMPING = 1e4
 
 
 @dataclass(frozen=True)
+class KnownWhitening:
+    """Of a scan's covariance and the misfit of touches whose squared change is size2."""
+
+    white: Whitening
+    size2: float
+
+
+@dataclass(frozen=True)
+class Turned:
+    """The touches' own directions, (9, K) each, about their states (T, 7)."""
+
+    states: Array
+    directions: list[Array]
+
+    def near(self, states: Array) -> bool:
+        """Whether those of other states are the same."""
+        if states.shape != self.states.shape:
+            return False
+        away = np.abs(states - self.states)
+        return not ((away[:, PLACE] > TURNS).any() or (away[:, LOG_RADIUS] > TURNS_LOG).any())
+
+
+@dataclass(frozen=True)
 class FittedScan:
     """One scan as a fit sees it."""
 
@@ -45,6 +68,8 @@ class FittedScan:
     course: TouchCourse
     misfit: Array  # (K, K) of trace 1
     live: int  # measurements that count
+    known: KnownWhitening | None = None  # of a moment ago, as good as this covariance's own
+    turned: Turned | None = None  # of a moment ago
 
 
 @dataclass(frozen=True)
@@ -65,6 +90,8 @@ class FoundTouches:
     solved: Array  # (N, N) its posterior covariance
     size: float  # |m|
     steps: int
+    known: KnownWhitening
+    turned: Turned
 
     def __len__(self) -> int:
         return len(self.priors)
@@ -109,8 +136,7 @@ class TouchFitter:
         states, columns = self._first_actions(states, columns)
         rest = np.concatenate([self._shape_mean, np.zeros(self._kinks.shape[1])])
         point = self._descend(self._point(states, rest, columns), most_steps)
-        grown = self._size2(point.columns) / self._size2_whitened
-        changed, moved = not SIZE_CHANGED[0] < grown < SIZE_CHANGED[1], self._moved(point.states)
+        changed, moved = _changed(self._size2(point.columns), self._known), self._moved(point.states)
         if moved:
             self._turn(point.states)
         if changed:
@@ -120,21 +146,20 @@ class TouchFitter:
         return self._posterior(point)
 
     def _columns(self, states: Array) -> TouchColumns:
-        return self._scene.course.columns(states, self._priors, self._directions)
+        return self._scene.course.columns(states, self._priors, self._turned.directions)
 
     def _turn(self, states: Array) -> None:
         """Take the touches' own directions anew, and how their courses may bend."""
-        self._turned_at = states
-        course = self._scene.course
-        self._directions = course.directions(states)
+        course, known = self._scene.course, self._scene.turned
+        self._bends = course.bends(states)
+        if known is None or not known.near(states):
+            known = Turned(states, course.directions(states))
+        self._turned = known
         self._kinks = course.kinks(states, self._priors)
 
     def _moved(self, states: Array) -> bool:
         """Whether their directions are others by now."""
-        away = np.abs(states - self._turned_at)
-        turned = (away[:, PLACE] > TURNS).any() or (away[:, LOG_RADIUS] > TURNS_LOG).any()
-        bends = self._scene.course.bends(states) != self._scene.course.bends(self._turned_at)
-        return bool(turned or bends)
+        return not self._turned.near(states) or self._scene.course.bends(states) != self._bends
 
     def _descend(self, point: _Point, most_steps: int) -> _Point:
         """Levenberg and Marquardt's steps until they gain nothing."""
@@ -152,9 +177,17 @@ class TouchFitter:
         return point
 
     def _whiten(self, columns: TouchColumns) -> None:
-        self._size2_whitened = max(self._size2(columns), 1e-12)
-        wrong = self._misfit**2 * self._size2_whitened
-        self._white = Whitening.of(self._scene.covariance + wrong * self._scene.misfit)
+        size2, known = max(self._size2(columns), 1e-12), self._scene.known
+        if known is not None and not _changed(size2, known):
+            self._known = known
+            return
+        self._known = KnownWhitening(
+            Whitening.of(self._scene.covariance + self._misfit**2 * size2 * self._scene.misfit), size2
+        )
+
+    @property
+    def _white(self) -> Whitening:
+        return self._known.white
 
     def _size2(self, columns: TouchColumns) -> float:
         return float(columns.mean @ columns.mean)
@@ -246,4 +279,11 @@ class TouchFitter:
             solved=solved,
             size=self._size2(point.columns) ** 0.5,
             steps=self.steps,
+            known=self._known,
+            turned=self._turned,
         )
+
+
+def _changed(size2: float, known: KnownWhitening) -> bool:
+    """Whether the misfit of touches of this squared change is another."""
+    return not SIZE_CHANGED[0] < size2 / known.size2 < SIZE_CHANGED[1]

@@ -170,17 +170,16 @@ class BoardFaults:
 
     # --- wires ---
 
+    def suspects_wires(self, view: BoardView) -> bool:
+        """Whether it is worth asking if the wires have changed."""
+        return self._table.suspicious(self._untouched(view), self.now.wire)
+
     def wires_changed(self, view: BoardView, touched: Array, skin: Array, own: Array) -> bool:
         """Whether the wires are otherwise than they were. touched (K,): relative change by touches that stand; skin and
         own as for `covariance`.
         """
-        now = self.now
-        sound = view.sound + np.log1p(view.mean)
-        failed = view.failed | (np.abs(view.log_z - sound) > np.log(n.FAR)) if now.wire is None else view.failed
-        untouched = BoardScan(view.log_z, sound, failed, view.times_s, view.span_s)
-        if not self._table.suspicious(untouched, now.wire):
-            return False
-        scan = replace(untouched, predicted=sound + np.log1p(touched), failed=view.failed)
+        now, untouched = self.now, self._untouched(view)
+        scan = replace(untouched, predicted=untouched.predicted + np.log1p(touched), failed=view.failed)
         found = self._table.guesses(scan, now.wire, skin + self._any_touch, own)
         best, stands = found[0], next(guess for guess in found if guess.fault == now.wire)
         rival = max(guess.score for guess in found if guess.fault != best.fault)
@@ -189,6 +188,13 @@ class BoardFaults:
         now.wire, now.wire_since_s = best.fault, view.middle_s + best.since_s
         now.unexplained_scans = 0
         return True
+
+    def _untouched(self, view: BoardView) -> BoardScan:
+        sound = view.sound + np.log1p(view.mean)
+        failed = view.failed
+        if self.now.wire is None:
+            failed = failed | (np.abs(view.log_z - sound) > np.log(n.FAR))
+        return BoardScan(view.log_z, sound, failed, view.times_s, view.span_s)
 
     # --- contact impedances and gain ---
 
@@ -213,9 +219,13 @@ class BoardFaults:
         stand; nearby (K, K): covariance of what they may have changed by; ask: the likeliest touches of a question.
         doubted: without one that stands and lies on an electrode.
         """
+        if question.budget.left <= 0:  # what is left open is asked again with the scans that follow
+            return None
         best, sure = None, answer.score + (n.COST_TOUCH + n.COST_SMALL if doubted else self._sure(answer))
-        for change in self._likeliest(question, touched, nearby, unexplained=not answer.holds):
-            asked, column = self._with(question, change)
+        changes = self._likeliest(question, touched, nearby, unexplained=not answer.holds)
+        question = replace(question, keeps=0.0)
+        for k, change in enumerate(changes, 1):
+            asked, column = self._with(question.leaving(1 - k / len(changes)), change)
             found = ask(asked)
             cost = _cost(change)
             if found.score + cost < sure or not self._apart(change, found):
