@@ -20,13 +20,27 @@ from models.measurement.numbers import (
     DONE_SHARE,
     LEAST_ACTION,
     LEAST_STEP,
+    LINEAR,
     MISFIT,
     STEP_LOG,
     STEP_SHARE,
     TURNS,
     TURNS_LOG,
 )
-from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, SHAPES, STATES, TouchPrior, X, Y, within_limits
+from models.measurement.touch import (
+    ACTION,
+    LOG_RADIUS,
+    PLACE,
+    RATE,
+    SHAPES,
+    STATES,
+    VX,
+    VY,
+    TouchPrior,
+    X,
+    Y,
+    within_limits,
+)
 from models.measurement.whitening import Whitening
 
 Array = NDArray[np.float64]
@@ -112,9 +126,21 @@ class _Point:
     rest: Array  # shapes and kinks
     columns: TouchColumns
     left: Array  # (K,) residual
+    sloped: Array  # (K, N) slopes of log |Z|
     residual: Array  # whitened
     design: Array  # whitened
     objective: float
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """A linearisation solved: its posterior, and the step to its optimum."""
+
+    solved: Array  # (N, N)
+    log_det: float
+    precision: Array  # (N,) of the priors
+    step: Array  # (N,)
+    gains: float  # of the objective, by that step
 
 
 class TouchFitter:
@@ -162,11 +188,14 @@ class TouchFitter:
         return not self._turned.near(states) or self._scene.course.bends(states) != self._bends
 
     def _descend(self, point: _Point, most_steps: int) -> _Point:
-        """Levenberg and Marquardt's steps until they gain nothing."""
+        """Levenberg and Marquardt's steps until they gain nothing, or what is left to go is linear."""
         damping = float(DAMPING)
         for _ in range(most_steps):
+            step = self._step(point, damping)
+            if self._is_linear(point.states, step):
+                break
             self.steps += 1
-            tried = self._stepped(point, damping)
+            tried = self._stepped(point, step)
             gained = point.objective - tried.objective
             if gained > 0:
                 point, damping = tried, max(damping / 10, 1e-5)
@@ -219,10 +248,12 @@ class TouchFitter:
         live = self._scene.y != 0
         share = np.where(live, 1 / (1 + change), 0.0)
         left = np.where(live, self._scene.y - np.log1p(change), 0.0)
-        whitened = self._white(np.column_stack([left, np.hstack([columns.slopes, linear]) * share[:, None]]))
+        sloped = np.hstack([columns.slopes, linear]) * share[:, None]
+        whitened = self._white(np.column_stack([left, sloped]))
         residual, design = whitened[:, 0], whitened[:, 1:]
         off, precision = self._off(states, rest), self._precisions(len(rest))
-        return _Point(states, rest, columns, left, residual, design, float(residual @ residual + precision @ off**2))
+        objective = float(residual @ residual + precision @ off**2)
+        return _Point(states, rest, columns, left, sloped, residual, design, objective)
 
     def _precisions(self, rest: int) -> Array:
         kinks = np.ones(rest - len(self._shape_precision))
@@ -234,18 +265,33 @@ class TouchFitter:
         off[self._mean.size : self._mean.size + self._shape_mean.size] -= self._shape_mean
         return off
 
-    def _stepped(self, point: _Point, damping: float) -> _Point:
+    def _step(self, point: _Point, damping: float) -> Array:
         precision = self._precisions(len(point.rest))
         normal = point.design.T @ point.design
         slope = point.design.T @ point.residual - precision * self._off(point.states, point.rest)
         diagonal = np.diag_indices_from(normal)
         normal[diagonal] = normal[diagonal] * (1 + damping) + precision
-        step: Array = np.asarray(np.linalg.solve(normal, slope), float)
+        return np.asarray(np.linalg.solve(normal, slope), float)
+
+    def _stepped(self, point: _Point, step: Array) -> _Point:
         self._limit(point.states, step)
         n = STATES * self._count
         states = within_limits(point.states + step[:n].reshape(-1, STATES))
         columns = self._columns(states)
         return self._point(states, point.rest + step[n:], columns)
+
+    def _is_linear(self, states: Array, step: Array) -> bool:
+        """Whether a step is so small that slopes hold: nothing new would be seen where it ends."""
+        n, half_s = STATES * self._count, self._scene.course.span_s / 2
+        moved = np.abs(step[:n].reshape(-1, STATES))
+        radius, acts = np.exp(states[:, LOG_RADIUS]), np.abs(states[:, ACTION])
+        way = np.hypot(moved[:, X], moved[:, Y]) + half_s * np.hypot(moved[:, VX], moved[:, VY])
+        if (way > LINEAR * radius).any() or (moved[:, LOG_RADIUS] > LINEAR).any():
+            return False
+        if (moved[:, ACTION] + half_s * moved[:, RATE] > LINEAR * acts).any():
+            return False
+        there = states + step[:n].reshape(-1, STATES)
+        return bool((within_limits(there) == there).all())
 
     def _limit(self, states: Array, step: Array) -> None:
         """Shorten each touch's step so that its disc stays near where it was."""
@@ -254,29 +300,38 @@ class TouchFitter:
             way, most = float(np.hypot(own[X], own[Y])), max(STEP_SHARE * float(np.exp(state[LOG_RADIUS])), LEAST_STEP)
             own *= min(1.0, most / max(way, 1e-9), STEP_LOG / max(abs(own[LOG_RADIUS]), 1e-9))
 
-    def _posterior(self, point: _Point) -> FoundTouches:
+    def _solve(self, point: _Point) -> _Linear:
         precision = self._precisions(len(point.rest))
         normal = point.design.T @ point.design
         normal[np.diag_indices_from(normal)] += precision
         solved: Array = np.asarray(np.linalg.inv(normal), float)
         _, log_det = np.linalg.slogdet(normal)
-        occam = 0.5 * (log_det - float(np.log(precision).sum()))
-        n, shapes = STATES * self._count, SHAPES * self._count
         slope = point.design.T @ point.residual - precision * self._off(point.states, point.rest)
-        residual = point.residual - point.design @ (solved @ slope)  # what the linear optimum would leave
+        step = solved @ slope
+        return _Linear(solved, float(log_det), precision, step, float(slope @ step))
+
+    def _posterior(self, point: _Point) -> FoundTouches:
+        linear = self._solve(point)
+        occam = 0.5 * (linear.log_det - float(np.log(linear.precision).sum()))
+        n, shapes = STATES * self._count, SHAPES * self._count
+        best = point.residual - point.design @ linear.step  # what the linear optimum would leave
+        states, rest, left, residual, objective = point.states, point.rest, point.left, point.residual, point.objective
+        if self._is_linear(states, linear.step):
+            states, rest = states + linear.step[:n].reshape(-1, STATES), rest + linear.step[n:]
+            left, residual, objective = left - point.sloped @ linear.step, best, objective - linear.gains
         return FoundTouches(
             priors=self._priors,
-            states=point.states,
-            covariance=solved[:n, :n],
-            shapes=point.rest[:shapes].reshape(self._count, SHAPES),
-            shape_variance=np.diag(solved)[n : n + shapes].reshape(self._count, SHAPES),
-            chi2=float(point.residual @ point.residual) / max(self._scene.live, 1),
-            evidence=self._white.log_density - 0.5 * point.objective - occam,
+            states=states,
+            covariance=linear.solved[:n, :n],
+            shapes=rest[:shapes].reshape(self._count, SHAPES),
+            shape_variance=np.diag(linear.solved)[n : n + shapes].reshape(self._count, SHAPES),
+            chi2=float(residual @ residual) / max(self._scene.live, 1),
+            evidence=self._white.log_density - 0.5 * objective - occam,
             white=self._white,
-            pulled=self._white.w.T @ residual,
-            left=point.left,
+            pulled=self._white.w.T @ best,
+            left=left,
             design=point.design,
-            solved=solved,
+            solved=linear.solved,
             size=self._size2(point.columns) ** 0.5,
             steps=self.steps,
             known=self._known,

@@ -1,5 +1,5 @@
-"""A look at a part of a scan under touches that stay as they are: by the whitening of a moment ago, so that it costs one
-warm fit. It only says that all goes on; what does not goes the whole way.
+"""A look at a part of a scan under touches that stay as they are: by the whitening of a moment ago, so that it costs
+one warm fit. It only says that all goes on; what does not goes the whole way.
 """
 
 from __future__ import annotations

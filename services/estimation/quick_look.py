@@ -55,7 +55,7 @@ class Seen:
 
 
 class QuickLook:
-    """Keeps a whitening for all parts that are disturbed alike; nothing that a replay would miss: it is made anew from what a scan knows."""
+    """Keeps a whitening for all parts that are disturbed alike; nothing that a replay would miss."""
 
     def __init__(self, grid: DiscGrid) -> None:
         self._grid = grid

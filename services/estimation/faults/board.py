@@ -152,9 +152,10 @@ class BoardFaults:
             now.opens, _ = wires.open_electrodes(failed, self.member)
         else:
             found = self.maps.one(now.wire, np.exp(sound + np.log1p(mean)))
-            failed, dead = self._known & ~readable, ~readable | found.blind | (at_s < now.wire_since_s)
+            failed, dead = self._known & ~readable, ~readable | found.blind
             shown, slopes = np.log(np.maximum(found.values, 1e-9)), found.slopes
             now.opens = ()  # what fails is left out: a wire that is wrong may be why
+        dead = dead | (at_s < now.wire_since_s)  # measured by wires that were otherwise
         live = self._known & ~dead & ~self.member[:, list(now.opens)].any(axis=1)
         return BoardView(log_z, sound, failed, live, shown, slopes, mean, spread, times_s, span_s, middle_s)
 

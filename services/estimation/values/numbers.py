@@ -94,7 +94,7 @@ MOST_STEPS = Number(200.0, "-", "steps times touches of one scan, beyond which n
 LEAST_BUDGET = Number(0.4, "-", "of them, for a part of a scan", "chosen: the parts after it are asked as well")
 FOR_FAULTS = Number(0.4, "-", "of them, for what the board may have done", "derived: two changes, two fits each")
 STEPS_WARM = Number(4.0, "-", "steps of a fit from the scan before", "measured: 2 or 3 are used")
-STEPS_HELD = Number(1.0, "-", "the same of touches that stay as they are", "derived: what is left is linear")
+STEPS_HELD = Number(1.0, "-", "the same of touches that stay as they are", "measured: seldom one is needed")
 STEPS_COLD = Number(10.0, "-", "steps of a fit from a grid's disc", "measured: 4 to 10 are used")
 ADRIFT = Number(
     1.5, "-", "by which faster drift grows with each scan that nothing explains", "derived: 2 s to a per cent"
