@@ -201,6 +201,10 @@ class Hypotheses:
         answers = [self._fitted(question, standing, everyone, n.STEPS_WARM)]
         if _settled(question, answers):
             return answers
+        if (nothing := self.untouched(question)) is not None:  # costs no step
+            answers.append(nothing)
+            if _settled(question, answers):
+                return answers
         if (released := self._released(question, standing, answers[0])) is not None:
             answers.append(released)
             if _settled(question, answers):

@@ -260,12 +260,15 @@ class BoardFaults:
     def _likeliest(
         self, question: Question, touched: Array, nearby: Array, unexplained: bool
     ) -> list[ContactChange | GainChange]:
-        """At most two changes that may explain a scan: with the touches as they stand, or with any touches; where
-        nothing explains it, whatever touches: a gain changes all measurements alike.
+        """At most three changes that may explain a scan: with the touches as they stand, with any touches, or, where
+        nothing explains it, without those that stood; and whatever touches: a gain changes all measurements alike.
         """
         found = list[ContactChange | GainChange]()
-        y = np.where(question.live, question.y - np.log1p(touched), 0.0)
-        for more, most_chi2 in ((nearby, n.MOST), (nearby + self._any_touch, np.inf)):
+        tried = [(touched, nearby, float(n.MOST)), (touched, nearby + self._any_touch, np.inf)]
+        if unexplained and touched.any():
+            tried.insert(0, (np.zeros_like(touched), np.zeros_like(nearby), float(n.MOST)))
+        for touched, more, most_chi2 in tried:
+            y = np.where(question.live, question.y - np.log1p(touched), 0.0)
             white = Whitening.of(question.covariance + more)
             scan = Unexplained(y, 1 / (1 + touched), question.live, question.times_s, question.span_s, white)
             nothing = white.log_density - 0.5 * float(np.sum(white(y) ** 2))
