@@ -343,9 +343,12 @@ class Estimator:
             skin.forget_looks()
 
     def _make_sure(self, skin: TaredSkin, answer: ScoredAnswer) -> None:
-        steady = answer.explained and answer.cause == AS_IT_IS
+        """A touch is shown at once where its scan is explained with it: a rough start may be anything."""
+        if not answer.explained:
+            return
+        least = n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2
         for track in skin.touches.now.tracks:
-            track.sure = track.sure or track.z2 > (n.SURE_Z2 if steady else n.DOUBT_Z2)
+            track.sure = track.sure or track.z2 > least
 
     def _apart(self, skin: TaredSkin, question: Question, measured: LookedAt) -> bool:
         """Whether a young touch of an odd outline is rather several: evidence decides, while the outline is learnt."""
