@@ -195,7 +195,7 @@ class BoardFaults:
         failed = view.failed
         if self.now.wire is None:
             failed = failed | (np.abs(view.log_z - sound) > np.log(n.FAR))
-        return BoardScan(view.log_z, sound, failed, view.times_s, view.span_s)
+        return BoardScan(view.log_z, sound, failed & self._known, self._known, view.times_s, view.span_s)
 
     # --- contact impedances and gain ---
 
