@@ -32,7 +32,7 @@ class TouchCourse:
     """Of one scan. times_s (K,): when each value was measured, from its middle on; span_s: how long it took."""
 
     def __init__(self, response: TouchModel, times_s: Array, span_s: float) -> None:
-        self._response, self._times_s, self._span_s = response, times_s, span_s
+        self._response, self._times_s, self.span_s = response, times_s, span_s
         u = 2 * times_s / span_s
         self._lagrange = np.stack([(u**2 - u) / 2, 1 - u**2, (u**2 + u) / 2])
         self._bends = u**2 - 1 / 3, u**3 - 0.6 * u
@@ -82,11 +82,11 @@ class TouchCourse:
         the velocity.
         """
         x, y, log_radius = state[X], state[Y], state[LOG_RADIUS]
-        moves = np.hypot(state[VX], state[VY]) * self._span_s > max(MOVES, BENDS_BY * np.exp(log_radius))
+        moves = np.hypot(state[VX], state[VY]) * self.span_s > max(MOVES, BENDS_BY * np.exp(log_radius))
         middle = self._response.with_slopes(x, y, log_radius)
         if not moves:
             return np.vstack([middle, middle[1:3] * self._times_s])
-        half_s = self._span_s / 2
+        half_s = self.span_s / 2
         first = self._response.with_slopes(x - state[VX] * half_s, y - state[VY] * half_s, log_radius)
         last = self._response.with_slopes(x + state[VX] * half_s, y + state[VY] * half_s, log_radius)
         before, at, after = self._lagrange
@@ -96,10 +96,10 @@ class TouchCourse:
 
     def _sudden(self, state: Array, prior: TouchPrior) -> list[Array]:
         """About the instant at which a touch begins or ends at once: any course for some milliseconds."""
-        instants = [t for t in (prior.since_s, prior.until_s) if abs(t) < self._span_s]
+        instants = [t for t in (prior.since_s, prior.until_s) if abs(t) < self.span_s]
         if not instants:
             return []
-        most = abs(state[ACTION]) + abs(state[RATE]) * self._span_s / 2
+        most = abs(state[ACTION]) + abs(state[RATE]) * self.span_s / 2
         column = SUDDEN_SD * most * self._response(state[X], state[Y], state[LOG_RADIUS])
         centres = [instant + step * SUDDEN_S for instant in instants for step in SUDDEN_STEPS]
         hats = [np.maximum(0.0, 1 - np.abs(self._times_s - centre) / SUDDEN_S) for centre in centres]
@@ -107,15 +107,15 @@ class TouchCourse:
 
     def bends(self, states: Array) -> list[tuple[bool, bool]]:
         """Of each touch whether its action changes, and whether it moves, by enough to do so unevenly."""
-        rise = np.abs(states[:, RATE]) * self._span_s / 2
-        way = np.hypot(states[:, VX], states[:, VY]) * self._span_s / 2
+        rise = np.abs(states[:, RATE]) * self.span_s / 2
+        way = np.hypot(states[:, VX], states[:, VY]) * self.span_s / 2
         return list(zip(rise > CHANGES * np.abs(states[:, ACTION]), way > MOVES / 2, strict=True))
 
     def _bent(self, state: Array, prior: TouchPrior) -> list[Array]:
         found = list[Array]()
         square, cube = self._bends
-        rise = abs(state[RATE]) * self._span_s / 2
-        way = np.hypot(state[VX], state[VY]) * self._span_s / 2
+        rise = abs(state[RATE]) * self.span_s / 2
+        way = np.hypot(state[VX], state[VY]) * self.span_s / 2
         ((changes, moves),) = self.bends(state[None])
         if not (changes or moves):
             return found

@@ -20,13 +20,27 @@ from models.measurement.numbers import (
     DONE_SHARE,
     LEAST_ACTION,
     LEAST_STEP,
+    LINEAR,
     MISFIT,
     STEP_LOG,
     STEP_SHARE,
     TURNS,
     TURNS_LOG,
 )
-from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, SHAPES, STATES, TouchPrior, X, Y, within_limits
+from models.measurement.touch import (
+    ACTION,
+    LOG_RADIUS,
+    PLACE,
+    RATE,
+    SHAPES,
+    STATES,
+    VX,
+    VY,
+    TouchPrior,
+    X,
+    Y,
+    within_limits,
+)
 from models.measurement.whitening import Whitening
 
 Array = NDArray[np.float64]
@@ -34,6 +48,29 @@ Array = NDArray[np.float64]
 LEAST_MEAN = -0.9  # relative change: nothing takes all of an impedance away
 SIZE_CHANGED = (0.4, 2.5)  # of the squared change, beyond which its misfit is taken anew
 MOST_DAMPING = 1e4
+
+
+@dataclass(frozen=True)
+class KnownWhitening:
+    """Of a scan's covariance and the misfit of touches whose squared change is size2."""
+
+    white: Whitening
+    size2: float
+
+
+@dataclass(frozen=True)
+class Turned:
+    """The touches' own directions, (9, K) each, about their states (T, 7)."""
+
+    states: Array
+    directions: list[Array]
+
+    def near(self, states: Array) -> bool:
+        """Whether those of other states are the same."""
+        if states.shape != self.states.shape:
+            return False
+        away = np.abs(states - self.states)
+        return not ((away[:, PLACE] > TURNS).any() or (away[:, LOG_RADIUS] > TURNS_LOG).any())
 
 
 @dataclass(frozen=True)
@@ -45,6 +82,8 @@ class FittedScan:
     course: TouchCourse
     misfit: Array  # (K, K) of trace 1
     live: int  # measurements that count
+    known: KnownWhitening | None = None  # of a moment ago, as good as this covariance's own
+    turned: Turned | None = None  # of a moment ago
 
 
 @dataclass(frozen=True)
@@ -65,6 +104,8 @@ class FoundTouches:
     solved: Array  # (N, N) its posterior covariance
     size: float  # |m|
     steps: int
+    known: KnownWhitening
+    turned: Turned
 
     def __len__(self) -> int:
         return len(self.priors)
@@ -85,9 +126,21 @@ class _Point:
     rest: Array  # shapes and kinks
     columns: TouchColumns
     left: Array  # (K,) residual
+    sloped: Array  # (K, N) slopes of log |Z|
     residual: Array  # whitened
     design: Array  # whitened
     objective: float
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """A linearisation solved: its posterior, and the step to its optimum."""
+
+    solved: Array  # (N, N)
+    log_det: float
+    precision: Array  # (N,) of the priors
+    step: Array  # (N,)
+    gains: float  # of the objective, by that step
 
 
 class TouchFitter:
@@ -109,8 +162,7 @@ class TouchFitter:
         states, columns = self._first_actions(states, columns)
         rest = np.concatenate([self._shape_mean, np.zeros(self._kinks.shape[1])])
         point = self._descend(self._point(states, rest, columns), most_steps)
-        grown = self._size2(point.columns) / self._size2_whitened
-        changed, moved = not SIZE_CHANGED[0] < grown < SIZE_CHANGED[1], self._moved(point.states)
+        changed, moved = _changed(self._size2(point.columns), self._known), self._moved(point.states)
         if moved:
             self._turn(point.states)
         if changed:
@@ -120,28 +172,30 @@ class TouchFitter:
         return self._posterior(point)
 
     def _columns(self, states: Array) -> TouchColumns:
-        return self._scene.course.columns(states, self._priors, self._directions)
+        return self._scene.course.columns(states, self._priors, self._turned.directions)
 
     def _turn(self, states: Array) -> None:
         """Take the touches' own directions anew, and how their courses may bend."""
-        self._turned_at = states
-        course = self._scene.course
-        self._directions = course.directions(states)
+        course, known = self._scene.course, self._scene.turned
+        self._bends = course.bends(states)
+        if known is None or not known.near(states):
+            known = Turned(states, course.directions(states))
+        self._turned = known
         self._kinks = course.kinks(states, self._priors)
 
     def _moved(self, states: Array) -> bool:
         """Whether their directions are others by now."""
-        away = np.abs(states - self._turned_at)
-        turned = (away[:, PLACE] > TURNS).any() or (away[:, LOG_RADIUS] > TURNS_LOG).any()
-        bends = self._scene.course.bends(states) != self._scene.course.bends(self._turned_at)
-        return bool(turned or bends)
+        return not self._turned.near(states) or self._scene.course.bends(states) != self._bends
 
     def _descend(self, point: _Point, most_steps: int) -> _Point:
-        """Levenberg and Marquardt's steps until they gain nothing."""
+        """Levenberg and Marquardt's steps until they gain nothing, or what is left to go is linear."""
         damping = float(DAMPING)
         for _ in range(most_steps):
+            step = self._step(point, damping)
+            if self._is_linear(point.states, step):
+                break
             self.steps += 1
-            tried = self._stepped(point, damping)
+            tried = self._stepped(point, step)
             gained = point.objective - tried.objective
             if gained > 0:
                 point, damping = tried, max(damping / 10, 1e-5)
@@ -152,9 +206,17 @@ class TouchFitter:
         return point
 
     def _whiten(self, columns: TouchColumns) -> None:
-        self._size2_whitened = max(self._size2(columns), 1e-12)
-        wrong = self._misfit**2 * self._size2_whitened
-        self._white = Whitening.of(self._scene.covariance + wrong * self._scene.misfit)
+        size2, known = max(self._size2(columns), 1e-12), self._scene.known
+        if known is not None and not _changed(size2, known):
+            self._known = known
+            return
+        self._known = KnownWhitening(
+            Whitening.of(self._scene.covariance + self._misfit**2 * size2 * self._scene.misfit), size2
+        )
+
+    @property
+    def _white(self) -> Whitening:
+        return self._known.white
 
     def _size2(self, columns: TouchColumns) -> float:
         return float(columns.mean @ columns.mean)
@@ -186,10 +248,12 @@ class TouchFitter:
         live = self._scene.y != 0
         share = np.where(live, 1 / (1 + change), 0.0)
         left = np.where(live, self._scene.y - np.log1p(change), 0.0)
-        whitened = self._white(np.column_stack([left, np.hstack([columns.slopes, linear]) * share[:, None]]))
+        sloped = np.hstack([columns.slopes, linear]) * share[:, None]
+        whitened = self._white(np.column_stack([left, sloped]))
         residual, design = whitened[:, 0], whitened[:, 1:]
         off, precision = self._off(states, rest), self._precisions(len(rest))
-        return _Point(states, rest, columns, left, residual, design, float(residual @ residual + precision @ off**2))
+        objective = float(residual @ residual + precision @ off**2)
+        return _Point(states, rest, columns, left, sloped, residual, design, objective)
 
     def _precisions(self, rest: int) -> Array:
         kinks = np.ones(rest - len(self._shape_precision))
@@ -201,18 +265,33 @@ class TouchFitter:
         off[self._mean.size : self._mean.size + self._shape_mean.size] -= self._shape_mean
         return off
 
-    def _stepped(self, point: _Point, damping: float) -> _Point:
+    def _step(self, point: _Point, damping: float) -> Array:
         precision = self._precisions(len(point.rest))
         normal = point.design.T @ point.design
         slope = point.design.T @ point.residual - precision * self._off(point.states, point.rest)
         diagonal = np.diag_indices_from(normal)
         normal[diagonal] = normal[diagonal] * (1 + damping) + precision
-        step: Array = np.asarray(np.linalg.solve(normal, slope), float)
+        return np.asarray(np.linalg.solve(normal, slope), float)
+
+    def _stepped(self, point: _Point, step: Array) -> _Point:
         self._limit(point.states, step)
         n = STATES * self._count
         states = within_limits(point.states + step[:n].reshape(-1, STATES))
         columns = self._columns(states)
         return self._point(states, point.rest + step[n:], columns)
+
+    def _is_linear(self, states: Array, step: Array) -> bool:
+        """Whether a step is so small that slopes hold: nothing new would be seen where it ends."""
+        n, half_s = STATES * self._count, self._scene.course.span_s / 2
+        moved = np.abs(step[:n].reshape(-1, STATES))
+        radius, acts = np.exp(states[:, LOG_RADIUS]), np.abs(states[:, ACTION])
+        way = np.hypot(moved[:, X], moved[:, Y]) + half_s * np.hypot(moved[:, VX], moved[:, VY])
+        if (way > LINEAR * radius).any() or (moved[:, LOG_RADIUS] > LINEAR).any():
+            return False
+        if (moved[:, ACTION] + half_s * moved[:, RATE] > LINEAR * acts).any():
+            return False
+        there = states + step[:n].reshape(-1, STATES)
+        return bool((within_limits(there) == there).all())
 
     def _limit(self, states: Array, step: Array) -> None:
         """Shorten each touch's step so that its disc stays near where it was."""
@@ -221,29 +300,45 @@ class TouchFitter:
             way, most = float(np.hypot(own[X], own[Y])), max(STEP_SHARE * float(np.exp(state[LOG_RADIUS])), LEAST_STEP)
             own *= min(1.0, most / max(way, 1e-9), STEP_LOG / max(abs(own[LOG_RADIUS]), 1e-9))
 
-    def _posterior(self, point: _Point) -> FoundTouches:
+    def _solve(self, point: _Point) -> _Linear:
         precision = self._precisions(len(point.rest))
         normal = point.design.T @ point.design
         normal[np.diag_indices_from(normal)] += precision
         solved: Array = np.asarray(np.linalg.inv(normal), float)
         _, log_det = np.linalg.slogdet(normal)
-        occam = 0.5 * (log_det - float(np.log(precision).sum()))
-        n, shapes = STATES * self._count, SHAPES * self._count
         slope = point.design.T @ point.residual - precision * self._off(point.states, point.rest)
-        residual = point.residual - point.design @ (solved @ slope)  # what the linear optimum would leave
+        step = solved @ slope
+        return _Linear(solved, float(log_det), precision, step, float(slope @ step))
+
+    def _posterior(self, point: _Point) -> FoundTouches:
+        linear = self._solve(point)
+        occam = 0.5 * (linear.log_det - float(np.log(linear.precision).sum()))
+        n, shapes = STATES * self._count, SHAPES * self._count
+        best = point.residual - point.design @ linear.step  # what the linear optimum would leave
+        states, rest, left, residual, objective = point.states, point.rest, point.left, point.residual, point.objective
+        if self._is_linear(states, linear.step):
+            states, rest = states + linear.step[:n].reshape(-1, STATES), rest + linear.step[n:]
+            left, residual, objective = left - point.sloped @ linear.step, best, objective - linear.gains
         return FoundTouches(
             priors=self._priors,
-            states=point.states,
-            covariance=solved[:n, :n],
-            shapes=point.rest[:shapes].reshape(self._count, SHAPES),
-            shape_variance=np.diag(solved)[n : n + shapes].reshape(self._count, SHAPES),
-            chi2=float(point.residual @ point.residual) / max(self._scene.live, 1),
-            evidence=self._white.log_density - 0.5 * point.objective - occam,
+            states=states,
+            covariance=linear.solved[:n, :n],
+            shapes=rest[:shapes].reshape(self._count, SHAPES),
+            shape_variance=np.diag(linear.solved)[n : n + shapes].reshape(self._count, SHAPES),
+            chi2=float(residual @ residual) / max(self._scene.live, 1),
+            evidence=self._white.log_density - 0.5 * objective - occam,
             white=self._white,
-            pulled=self._white.w.T @ residual,
-            left=point.left,
+            pulled=self._white.w.T @ best,
+            left=left,
             design=point.design,
-            solved=solved,
+            solved=linear.solved,
             size=self._size2(point.columns) ** 0.5,
             steps=self.steps,
+            known=self._known,
+            turned=self._turned,
         )
+
+
+def _changed(size2: float, known: KnownWhitening) -> bool:
+    """Whether the misfit of touches of this squared change is another."""
+    return not SIZE_CHANGED[0] < size2 / known.size2 < SIZE_CHANGED[1]

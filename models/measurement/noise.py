@@ -90,6 +90,10 @@ class NoiseModel:
         known = self.now.lines.get(part)
         return np.zeros((len(self._contact), 0)) if known is None else known.columns
 
+    def alike(self, part: int) -> int:
+        """The same number for all parts whose scans are disturbed alike: 0 where nothing disturbs them."""
+        return part if self.disturbing(part).shape[1] else 0
+
     def covariance(self, part: int) -> Array:
         """(K, K) of a scan that ends with this part."""
         columns = np.column_stack([self._contact * np.sqrt(self.now.flicker), self.disturbing(part)])

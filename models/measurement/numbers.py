@@ -36,6 +36,9 @@ TENSOR_SD = Number(0.15, "-", "drop along a touch less that across", "measured: 
 DAMPING = Number(1e-3, "-", "of the first step, Levenberg's", "chosen: any small one")
 DONE = Number(0.5, "nat", "a step that gains less ends the search", "derived: a tenth of what decides between two")
 DONE_SHARE = Number(3e-3, "-", "the same of what is left", "derived: of 120, as DONE")
+LINEAR = Number(
+    0.05, "-", "of radius and action: a step within which slopes hold", "derived: its square, 0.25 %, is below MISFIT"
+)
 LEAST_STEP = Number(0.06, "unit", "that a touch moves in one step at least", "derived: 1.5 pixels")
 STEP_SHARE = Number(0.6, "-", "of a radius that one step moves a touch at most", "chosen: the disc still overlaps")
 STEP_LOG = Number(0.5, "-", "of log radius in one step at most", "chosen: the disc still overlaps")

@@ -21,7 +21,18 @@ from services.estimation.faults.table import any_touches
 from services.estimation.faults.wires import WireFault
 from services.estimation.filter import Prediction, SkinFilter
 from services.estimation.first.tare import AgreedScans, TareRefused, Taring
-from services.estimation.hypotheses import AS_IT_IS, BURST, DRIFT, MEMORY, NOISE, Hypotheses, Question, ScoredAnswer
+from services.estimation.held_look import HeldLook
+from services.estimation.hypotheses import (
+    AS_IT_IS,
+    BURST,
+    DRIFT,
+    MEMORY,
+    NOISE,
+    Hypotheses,
+    Question,
+    ScoredAnswer,
+    StepBudget,
+)
 from services.estimation.learning import Learning, Waiting
 from services.estimation.quick_look import QuickLook, Seen
 from services.estimation.touches import TouchTracks, estimate_of, roughly
@@ -43,6 +54,7 @@ class LookedAt:
     log_z: Array  # (K,) 0 where a measurement does not count
     live: NDArray[np.bool_]  # (K,)
     whole: bool  # it shares no value with the last one that was whole
+    budget: StepBudget
 
     @property
     def span_s(self) -> float:
@@ -56,6 +68,22 @@ class LookedAt:
     def order(self) -> NDArray[np.intp]:
         """(K,) rank in time, 0 the oldest."""
         return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
+
+    def question(
+        self, y: Array, covariance: Array, live: NDArray[np.bool_], times_s: Array, information: NDArray[np.float32]
+    ) -> Question:
+        """About this scan."""
+        return Question(
+            y=y,
+            covariance=covariance,
+            live=live,
+            times_s=times_s,
+            span_s=self.span_s,
+            order=self.order,
+            part=self.scan.part,
+            information=information,
+            budget=self.budget,
+        )
 
 
 @dataclass
@@ -89,9 +117,14 @@ class TaredSkin:
         self.touches.now.next_id = next_id
         self.hypotheses = Hypotheses(self.tables, self.response, self.noise, self.drift)
         self.learning = Learning(self.drift, self.noise)
-        self.quick = QuickLook(self.hypotheses.grid)
+        self.quick, self.held = QuickLook(self.hypotheses.grid), HeldLook()
         self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
         self.asking = FaultAsking(self.tables, self.response, self.noise, self.touches, self.hypotheses, self.faults)
+
+    def forget_looks(self) -> None:
+        """The untouched skin is another than at the last scans."""
+        self.quick.forget()
+        self.held.forget()
 
 
 class Estimator:
@@ -127,7 +160,8 @@ class Estimator:
             now.whole_us = scan.end_us
         measurable = np.isfinite(scan.values) & (scan.values > 0) & (scan.status == 0)
         live = measurable if self.skin is None else measurable & self.skin.live
-        measured = LookedAt(scan, np.log(np.where(live, scan.values, 1.0)), live, whole)
+        budget = StepBudget.of(len(scan.new), int(scan.new.sum()))
+        measured = LookedAt(scan, np.log(np.where(live, scan.values, 1.0)), live, whole, budget)
         if whole:
             self.taring.offer(scan, measurable, measured.middle_s)
         judgements = [judge("believed", float(not scan.believed), 1.0)]
@@ -142,19 +176,29 @@ class Estimator:
         seen = self._glanced(self.skin, measured)
         if seen is not None:
             return self._quiet(self.skin, measured, seen, judgements)
+        if (goes_on := self._going_on(self.skin, measured)) is not None:
+            return self._held(self.skin, measured, *goes_on, judgements)
         return self._asked(self.skin, measured, max(gap_s, 0.0), judgements)
 
     def _glanced(self, skin: TaredSkin, measured: LookedAt) -> Seen | None:
         """What a first look sees where nothing touched before and all is quiet; else None."""
         now, scan = self.now, measured.scan
         oldest_s = measured.middle_s - measured.span_s / 2
-        may = not len(skin.touches) and measured.live.all() and now.information is not None
+        may = not len(skin.touches) and self._complete(skin, measured.live) and now.information is not None
         if not may or not skin.faults.plain(oldest_s) or (measured.whole and skin.drift.remembers(measured.middle_s)):
             return None
         assert now.information is not None
-        y = skin.faults.taken_off(measured.log_z - skin.log_z0 - skin.drift.shift(measured.middle_s))
-        seen = skin.quick.look(scan.part, measured.middle_s, y, now.information)
+        y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
+        seen = skin.quick.look(skin.noise.alike(scan.part), scan, measured.middle_s, y, now.information)
         return seen if seen is not None and seen.quiet else None
+
+    def _complete(self, skin: TaredSkin, live: NDArray[np.bool_]) -> bool:
+        """Whether every measurement that the baseline has counts."""
+        return bool((live == skin.live).all())
+
+    def _over(self, skin: TaredSkin, measured: LookedAt) -> Array:
+        """(K,) log |Z| over what the filter predicts of the untouched skin."""
+        return measured.log_z - skin.log_z0 - skin.drift.shift(measured.middle_s)
 
     def _quiet(self, skin: TaredSkin, measured: LookedAt, seen: Seen, judgements: list[Judgement]) -> Estimate:
         self._explained(skin, AS_IT_IS)
@@ -163,6 +207,34 @@ class Estimator:
         self.now.said = ()
         y = measured.log_z - skin.log_z0
         return self._estimate(measured, y, np.zeros(len(y)), judgements, seen.z2, 0.0)
+
+    def _going_on(self, skin: TaredSkin, measured: LookedAt) -> tuple[Question, ScoredAnswer] | None:
+        """That touches which stayed as they are do so in a further part of a scan; else None."""
+        now, middle_s, span_s = self.now, measured.middle_s, measured.span_s
+        if measured.whole or now.information is None or not skin.touches.steady or now.unexplained_s:
+            return None
+        if not skin.faults.plain(middle_s - span_s / 2) or not self._complete(skin, measured.live):
+            return None
+        known = skin.held.known(skin.noise.alike(measured.scan.part), middle_s, skin.touches.ids)
+        if known is None:
+            return None
+        y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
+        times_s = span_s / 2 - measured.scan.ages_s
+        question = measured.question(y, known.covariance, measured.live, times_s, now.information)
+        answer = skin.hypotheses.goes_on(question, skin.touches.expected(middle_s, span_s), known.white, known.turned)
+        return (question, answer) if answer.explained and answer.left_z2 < n.GLANCE_Z2 else None
+
+    def _held(
+        self,
+        skin: TaredSkin,
+        measured: LookedAt,
+        question: Question,
+        answer: ScoredAnswer,
+        judgements: list[Judgement],
+    ) -> Estimate:
+        self._settle(skin, question, answer, measured)
+        self._explained(skin, answer.cause)
+        return self._said(skin, measured, question, answer, judgements, explained=True, rough=False)
 
     def _asked(self, skin: TaredSkin, measured: LookedAt, passed_s: float, judgements: list[Judgement]) -> Estimate:
         skin.touches.drop_the_past(measured.middle_s - measured.span_s / 2)
@@ -193,6 +265,9 @@ class Estimator:
             self._explained(skin, answer.cause)
         else:
             self._refused(skin, measured)
+        plain = explained and not asked.changed and skin.faults.plain(measured.middle_s - measured.span_s / 2)
+        if plain and self._complete(skin, measured.live):
+            skin.held.keep(skin.noise.alike(scan.part), measured.middle_s, skin.touches.ids, question, answer)
         skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
         if explained and skin.faults.sound and not asked.changed:
             self._learn(skin, measured, answer)
@@ -210,8 +285,8 @@ class Estimator:
         if now.information is None or new or now.wholes - now.informed >= n.LINE_SCANS:
             now.information = hypotheses.grid.information(Whitening.of(covariance))
             now.informed, now.informed_live, now.informed_wire = now.wholes, view.live, skin.faults.now.wire
-        part = measured.scan.part
-        return Question(view.y, covariance, view.live, view.times_s, view.span_s, measured.order, part, now.information)
+        question = measured.question(view.y, covariance, view.live, view.times_s, now.information)
+        return question.leaving(n.FOR_FAULTS)
 
     def _answer(
         self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
@@ -226,8 +301,9 @@ class Estimator:
             return hypotheses.ask(question, standing, loose)
         quiet = hypotheses.untouched(question)
         assert quiet is not None
-        if question.live.all() and skin.faults.plain(measured.middle_s - measured.span_s / 2):
-            skin.quick.keep(measured.scan.part, measured.middle_s, question.white, measured.order)
+        plain = skin.faults.plain(measured.middle_s - measured.span_s / 2)
+        if plain and self._complete(skin, question.live):
+            skin.quick.keep(skin.noise.alike(measured.scan.part), measured.middle_s, question.white)
         memory = skin.drift.beyond_memory(predicted, quiet.pulled, quiet.white)
         if memory is not None and skin.faults.now.wire is None:
             pressed = hypotheses.at(question, memory.x, memory.y)
@@ -258,17 +334,21 @@ class Estimator:
         else:
             memories += touches.settle(answer.fit, kept, middle_s, span_s, measured.whole)
             self._make_sure(skin, answer)
-            if measured.whole and not self._apart(skin, question, measured):
-                self._doubt(skin, question, answer, measured)
+            rest = replace(question, keeps=0.0)
+            if measured.whole and not self._apart(skin, rest, measured):
+                self._doubt(skin, rest, answer, measured)
         for memory in memories:
             skin.drift.remember(memory)
         if memories:
-            skin.quick.forget()
+            skin.forget_looks()
 
     def _make_sure(self, skin: TaredSkin, answer: ScoredAnswer) -> None:
-        steady = answer.explained and answer.cause == AS_IT_IS
+        """A touch is shown at once where its scan is explained with it: a rough start may be anything."""
+        if not answer.explained:
+            return
+        least = n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2
         for track in skin.touches.now.tracks:
-            track.sure = track.sure or track.z2 > (n.SURE_Z2 if steady else n.DOUBT_Z2)
+            track.sure = track.sure or track.z2 > least
 
     def _apart(self, skin: TaredSkin, question: Question, measured: LookedAt) -> bool:
         """Whether a young touch of an odd outline is rather several: evidence decides, while the outline is learnt."""
@@ -331,8 +411,8 @@ class Estimator:
             return
         if cause == MEMORY and measured.whole:
             skin.drift.widen_memories()
-            skin.quick.forget()
-        if measured.live.all():
+            skin.forget_looks()
+        if self._complete(skin, measured.live):
             skin.learning.hear(pulled, measured.scan.part, cause in (BURST, NOISE))
         if not measured.whole:
             return
@@ -341,7 +421,7 @@ class Estimator:
             over = measured.log_z - skin.log_z0
             drifts = skin.hypotheses.adrift if cause == DRIFT else 0.0
             if drifts:
-                skin.quick.forget()
+                skin.forget_looks()
             waiting = Waiting(measured.middle_s, over, measured.live, measured.scan.part, drifts)
             skin.learning.untouched(waiting)
 

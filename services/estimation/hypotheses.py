@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from models.measurement.course import TouchCourse
 from models.measurement.disc import DiscResponse
-from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
+from models.measurement.fit import FittedScan, FoundTouches, KnownWhitening, TouchFitter, Turned
 from models.measurement.grid import DiscGrid
 from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
 from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
@@ -41,6 +41,18 @@ COSTS = {
 }
 
 
+@dataclass
+class StepBudget:
+    """Solver steps, times touches, that one scan may cost: handed along with all that is asked about it."""
+
+    left: float
+
+    @classmethod
+    def of(cls, values: int, new: int) -> StepBudget:
+        """Of a scan of which so many values are new: the next comes the sooner, the fewer there are."""
+        return cls(n.MOST_STEPS * max(float(n.LEAST_BUDGET), new / values))
+
+
 @dataclass(frozen=True)
 class Question:
     """One scan, with what is predicted of it without touches."""
@@ -53,6 +65,16 @@ class Question:
     order: NDArray[np.intp]  # (K,) rank in time, 0 the oldest
     part: int  # that it ends with
     information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
+    budget: StepBudget
+    keeps: float = 0.0  # steps that are left to who asks next
+
+    @property
+    def spent(self) -> bool:
+        return self.budget.left <= self.keeps
+
+    def leaving(self, share: float) -> Question:
+        """The same, which leaves so much of its steps to the next."""
+        return replace(self, keeps=self.keeps + share * max(0.0, self.budget.left - self.keeps))
 
     @cached_property
     def white(self) -> Whitening:
@@ -94,7 +116,6 @@ class Hypotheses:
         self.grid = DiscGrid(response)
         self._tables, self._response, self._noise, self._drift = tables, response, noise, drift
         self._slopes: Array | None = None
-        self.steps = 0
         self.adrift = 1.0  # times the faster drift: grows while nothing explains the skin
 
     def through(self, slopes: Array) -> Hypotheses:
@@ -138,11 +159,17 @@ class Hypotheses:
         """The likeliest answer. standing, loose: what is known of the touches that there were, as they were and where
         they may have begun to move or to change.
         """
-        self.steps = 0
         answers = self._of_standing(question, standing, loose) if len(standing) else self._of_none(question)
-        if not self._settled(answers):
+        if not _settled(question, answers):
             answers += self._of_anything(question, standing, answers)
         return _likeliest(answers)
+
+    def goes_on(
+        self, question: Question, standing: Sequence[TouchPrior], known: KnownWhitening, turned: Turned
+    ) -> ScoredAnswer:
+        """The answer that touches stay as they are; known, turned: of a moment ago, when they did."""
+        everyone = tuple(range(len(standing)))
+        return self._fitted(question, standing, everyone, n.STEPS_HELD, known=known, turned=turned)
 
     def at(self, question: Question, x: float, y: float) -> ScoredAnswer:
         """The answer that something touches there."""
@@ -150,7 +177,6 @@ class Hypotheses:
 
     def anew(self, question: Question) -> ScoredAnswer | None:
         """The likeliest touches, as if there had been none before; None where there are none."""
-        self.steps = 0
         found = self._search(question, (), None)
         return _likeliest(found) if found else None
 
@@ -174,9 +200,6 @@ class Hypotheses:
         assert answer is not None
         return answer
 
-    def _settled(self, answers: Sequence[ScoredAnswer]) -> bool:
-        return any(answer.explained for answer in answers) or self.steps > n.MOST_STEPS
-
     def _of_none(self, question: Question) -> list[ScoredAnswer]:
         found = [answer for cause in (AS_IT_IS, *WIDER) if (answer := self.untouched(question, cause)) is not None]
         return [*found, *self._search(question, (), None)]
@@ -186,14 +209,18 @@ class Hypotheses:
     ) -> list[ScoredAnswer]:
         everyone = tuple(range(len(standing)))
         answers = [self._fitted(question, standing, everyone, n.STEPS_WARM)]
-        if self._settled(answers):
+        if _settled(question, answers):
             return answers
+        if (nothing := self.untouched(question)) is not None:  # costs no step
+            answers.append(nothing)
+            if _settled(question, answers):
+                return answers
         if (released := self._released(question, standing, answers[0])) is not None:
             answers.append(released)
-            if self._settled(answers):
+            if _settled(question, answers):
                 return answers
         answers.append(self._fitted(question, loose, everyone, n.STEPS_COLD))
-        if self._settled(answers):
+        if _settled(question, answers):
             return answers
         expected = self._fitted(question, standing, everyone, 0)
         answers += self._search(question, everyone, expected.fit)
@@ -207,7 +234,7 @@ class Hypotheses:
     ) -> list[ScoredAnswer]:
         """Where what was known does not help: touches from nothing, beside a disturbance, by a wrong response."""
         found = self._search(question, (), None) if standing else []
-        if self._settled(found):
+        if _settled(question, found):
             return found
         touched = [answer for answer in [*before, *found] if answer.fit is not None]
         if not touched:
@@ -224,7 +251,7 @@ class Hypotheses:
         self, question: Question, priors: Sequence[TouchPrior], kept: tuple[int, ...], cause: str, left: Array
     ) -> list[ScoredAnswer]:
         more = self._more(question, cause, left)
-        if more is None or self.steps > n.MOST_STEPS:
+        if more is None or question.spent:
             return []
         wider = replace(question, covariance=question.covariance + more)
         return [self._fitted(wider, priors, kept, n.STEPS_COLD, cause)]
@@ -261,13 +288,16 @@ class Hypotheses:
         most_steps: float,
         cause: str = AS_IT_IS,
         wide: bool = False,
+        known: KnownWhitening | None = None,
+        turned: Turned | None = None,
     ) -> ScoredAnswer:
         course = TouchCourse(self._response, question.times_s, question.span_s)
         live = int(question.live.sum())
         misfit = max(float(MISFIT_WIDE), 2 * self._tables.wrong) if wide else self._tables.wrong
-        scene = FittedScan(question.y, question.covariance, course, self._tables.misfit, live)
-        fit = TouchFitter(scene, priors, misfit).fit(int(most_steps))
-        self.steps += (fit.steps + 1) * len(fit)
+        scene = FittedScan(question.y, question.covariance, course, self._tables.misfit, live, known, turned)
+        may = max(0.0, question.budget.left - question.keeps) / len(priors)
+        fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(may)))
+        question.budget.left -= (fit.steps + 1) * len(fit)
         z2 = self._left(question, fit.pulled, fit.white, fit, ())[0]
         cost = n.COST_WIDE if wide else COSTS[cause]
         score = fit.evidence + cost + n.COST_TOUCH * sum(place < 0 for place in kept)
@@ -280,7 +310,7 @@ class Hypotheses:
         if fit is not None:
             pulled, white = fit.pulled, fit.white
         score, full = -np.inf, _from(fit)
-        while (len(fit) if fit else 0) < n.MOST_TOUCHES and self.steps <= n.MOST_STEPS:
+        while (len(fit) if fit else 0) < n.MOST_TOUCHES and not question.spent:
             z2, disc, action, since_s = self._left(question, pulled, white, fit, ONSETS)
             if z2 < n.FALSE_ALARM_Z2:
                 break
@@ -385,6 +415,10 @@ class Hypotheses:
         if not priors:
             return self.untouched(question)
         return self._fitted(question, priors, tuple(kept), n.STEPS_COLD)
+
+
+def _settled(question: Question, answers: Sequence[ScoredAnswer]) -> bool:
+    return question.spent or any(answer.explained for answer in answers)
 
 
 def _likeliest(answers: Sequence[ScoredAnswer]) -> ScoredAnswer:

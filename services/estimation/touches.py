@@ -92,6 +92,16 @@ class TouchTracks:
         return [track for track in self.now.tracks if not track.ended]
 
     @property
+    def ids(self) -> tuple[int, ...]:
+        return tuple(track.id for track in self.now.tracks)
+
+    @property
+    def steady(self) -> bool:
+        """Whether there are touches, and all stay as they are."""
+        tracks = self.now.tracks
+        return bool(tracks) and all(t.sure and t.still >= n.STILL_SCANS and not (t.ended or t.lost) for t in tracks)
+
+    @property
     def lost(self) -> bool:
         """Whether scans were lost, and none has been explained since."""
         return any(track.lost for track in self.now.tracks)

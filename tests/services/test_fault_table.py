@@ -37,7 +37,7 @@ def any_touch() -> Array:
 def guessed(z: Array, status: NDArray[np.uint8], standing: WireFault | None = None) -> WireGuess:
     """The first guess; it is likelier than the next by what true faults are."""
     failed = ~np.isfinite(z) | (z <= 0) | (status != 0)
-    scan = BoardScan(np.log(np.where(failed, 1.0, z)), untouched(), failed, MEASURED_S, SPAN_S)
+    scan = BoardScan(np.log(np.where(failed, 1.0, z)), untouched(), failed, np.ones(len(z), bool), MEASURED_S, SPAN_S)
     if not WireTable(MAPS).suspicious(scan, standing):
         return WireGuess(None, -np.inf, 0.0, 0.0)
     found = WireTable(MAPS).guesses(scan, standing, any_touch(), 2 * NOISE**2 * np.eye(len(PATTERN)))

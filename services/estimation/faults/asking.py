@@ -74,8 +74,13 @@ class FaultAsking:
         contact = self._tables.contact
         flicker = (contact * self._noise.now.flicker) @ contact.T
         skin, own = at.predicted.covariance + flicker, self._noise.covariance(at.part) - flicker
-        wide = skin + self._hypotheses.faster_drift()
-        touched, nearby = self._change(self._touches.expected(at.middle_s, at.span_s), at)
+        standing = self._touches.expected(at.middle_s, at.span_s)
+
+        def rewired(view: BoardView) -> bool:
+            if not faults.suspects_wires(view):
+                return False
+            touched, _ = self._change(standing, at)
+            return faults.wires_changed(view, touched, skin + self._hypotheses.faster_drift(), own)
 
         def look() -> BoardView:
             return faults.look(at.values, at.status, at.untouched, at.times_s, at.span_s, at.middle_s)
@@ -86,13 +91,13 @@ class FaultAsking:
             return Asked(view, question, answering(hypotheses, question))
 
         view = look()
-        if faults.now.wire is None and faults.wires_changed(view, touched, wide, own):
+        if faults.now.wire is None and rewired(view):
             view = look()
         found = asked(view)
-        if faults.now.wire is not None and _doubtful(found.answer) and faults.wires_changed(view, touched, wide, own):
+        if faults.now.wire is not None and _doubtful(found.answer) and rewired(view):
             found = asked(look())
         if faults.asks(found.answer):
-            found = self._changed(found, touched, nearby, answering)
+            found = self._changed(found, *self._change(standing, at), answering)
         return self._doubted(found, at)
 
     def _changed(self, found: Asked, touched: Array, nearby: Array, answering: Answering) -> Asked:

@@ -152,9 +152,10 @@ class BoardFaults:
             now.opens, _ = wires.open_electrodes(failed, self.member)
         else:
             found = self.maps.one(now.wire, np.exp(sound + np.log1p(mean)))
-            failed, dead = self._known & ~readable, ~readable | found.blind | (at_s < now.wire_since_s)
+            failed, dead = self._known & ~readable, ~readable | found.blind
             shown, slopes = np.log(np.maximum(found.values, 1e-9)), found.slopes
             now.opens = ()  # what fails is left out: a wire that is wrong may be why
+        dead = dead | (at_s < now.wire_since_s)  # measured by wires that were otherwise
         live = self._known & ~dead & ~self.member[:, list(now.opens)].any(axis=1)
         return BoardView(log_z, sound, failed, live, shown, slopes, mean, spread, times_s, span_s, middle_s)
 
@@ -170,17 +171,16 @@ class BoardFaults:
 
     # --- wires ---
 
+    def suspects_wires(self, view: BoardView) -> bool:
+        """Whether it is worth asking if the wires have changed."""
+        return self._table.suspicious(self._untouched(view), self.now.wire)
+
     def wires_changed(self, view: BoardView, touched: Array, skin: Array, own: Array) -> bool:
         """Whether the wires are otherwise than they were. touched (K,): relative change by touches that stand; skin and
         own as for `covariance`.
         """
-        now = self.now
-        sound = view.sound + np.log1p(view.mean)
-        failed = view.failed | (np.abs(view.log_z - sound) > np.log(n.FAR)) if now.wire is None else view.failed
-        untouched = BoardScan(view.log_z, sound, failed, view.times_s, view.span_s)
-        if not self._table.suspicious(untouched, now.wire):
-            return False
-        scan = replace(untouched, predicted=sound + np.log1p(touched), failed=view.failed)
+        now, untouched = self.now, self._untouched(view)
+        scan = replace(untouched, predicted=untouched.predicted + np.log1p(touched), failed=view.failed)
         found = self._table.guesses(scan, now.wire, skin + self._any_touch, own)
         best, stands = found[0], next(guess for guess in found if guess.fault == now.wire)
         rival = max(guess.score for guess in found if guess.fault != best.fault)
@@ -189,6 +189,13 @@ class BoardFaults:
         now.wire, now.wire_since_s = best.fault, view.middle_s + best.since_s
         now.unexplained_scans = 0
         return True
+
+    def _untouched(self, view: BoardView) -> BoardScan:
+        sound = view.sound + np.log1p(view.mean)
+        failed = view.failed
+        if self.now.wire is None:
+            failed = failed | (np.abs(view.log_z - sound) > np.log(n.FAR))
+        return BoardScan(view.log_z, sound, failed & self._known, self._known, view.times_s, view.span_s)
 
     # --- contact impedances and gain ---
 
@@ -213,9 +220,13 @@ class BoardFaults:
         stand; nearby (K, K): covariance of what they may have changed by; ask: the likeliest touches of a question.
         doubted: without one that stands and lies on an electrode.
         """
+        if question.budget.left <= 0:  # what is left open is asked again with the scans that follow
+            return None
         best, sure = None, answer.score + (n.COST_TOUCH + n.COST_SMALL if doubted else self._sure(answer))
-        for change in self._likeliest(question, touched, nearby, unexplained=not answer.holds):
-            asked, column = self._with(question, change)
+        changes = self._likeliest(question, touched, nearby, unexplained=not answer.holds)
+        question = replace(question, keeps=0.0)
+        for k, change in enumerate(changes, 1):
+            asked, column = self._with(question.leaving(1 - k / len(changes)), change)
             found = ask(asked)
             cost = _cost(change)
             if found.score + cost < sure or not self._apart(change, found):
@@ -249,12 +260,15 @@ class BoardFaults:
     def _likeliest(
         self, question: Question, touched: Array, nearby: Array, unexplained: bool
     ) -> list[ContactChange | GainChange]:
-        """At most two changes that may explain a scan: with the touches as they stand, or with any touches; where
-        nothing explains it, whatever touches: a gain changes all measurements alike.
+        """At most three changes that may explain a scan: with the touches as they stand, with any touches, or, where
+        nothing explains it, without those that stood; and whatever touches: a gain changes all measurements alike.
         """
         found = list[ContactChange | GainChange]()
-        y = np.where(question.live, question.y - np.log1p(touched), 0.0)
-        for more, most_chi2 in ((nearby, n.MOST), (nearby + self._any_touch, np.inf)):
+        tried = [(touched, nearby, float(n.MOST)), (touched, nearby + self._any_touch, np.inf)]
+        if unexplained and touched.any():
+            tried.insert(0, (np.zeros_like(touched), np.zeros_like(nearby), float(n.MOST)))
+        for touched, more, most_chi2 in tried:
+            y = np.where(question.live, question.y - np.log1p(touched), 0.0)
             white = Whitening.of(question.covariance + more)
             scan = Unexplained(y, 1 / (1 + touched), question.live, question.times_s, question.span_s, white)
             nothing = white.log_density - 0.5 * float(np.sum(white(y) ** 2))

@@ -14,7 +14,7 @@ def judged_by_itself(
     hypotheses: Hypotheses, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]
 ) -> ScoredAnswer:
     """The likeliest of: the touches that there were, which count as new ones; others, or none."""
-    anew = hypotheses.ask(question, (), ())
+    anew = hypotheses.ask(question.leaving(0.5), (), ())
     before = hypotheses.ask(question, standing, loose)
     kept = sum(place >= 0 for place in before.kept)
     vouched = replace(before, score=before.score + n.COST_TOUCH * kept)

@@ -31,6 +31,7 @@ class BoardScan:
     log_z: Array  # (K,) as measured; 0 where it failed
     predicted: Array  # (K,) log |Z| with sound wires, touches that stand included
     failed: Mask  # (K,) no value, or one that is none
+    known: Mask  # (K,) the baseline has it: the others tell nothing
     times_s: Array  # (K,) from the middle of the scan
     span_s: float
 
@@ -63,7 +64,7 @@ class WireTable:
         """Whether measurements fell, or failed, as no touch makes them."""
         if not self._maps.knows:
             return False
-        fell = ~scan.failed & (scan.log_z - scan.predicted < -n.FALLS)
+        fell = scan.known & ~scan.failed & (scan.log_z - scan.predicted < -n.FALLS)
         return standing is not None or int((fell | scan.failed).sum()) > 1
 
     def guesses(self, scan: BoardScan, standing: WireFault | None, skin: Array, own: Array) -> list[WireGuess]:
@@ -74,10 +75,11 @@ class WireTable:
         values = np.vstack([z0, self._maps.every(z0)])
         blind = blinded(values, z0)
         blind[0] = False
-        left = np.where(scan.failed | blind, 0.0, scan.log_z - np.log(np.maximum(values, 1e-9)))
+        left = np.where(scan.failed | blind | ~scan.known, 0.0, scan.log_z - np.log(np.maximum(values, 1e-9)))
         left = np.clip(left, -MOST_LOG, MOST_LOG)
         told = np.where(scan.failed & blind, n.COST_EXPECTED_FAILURE, 0.0)
         told += np.where(scan.failed ^ blind, n.COST_FAILURE, 0.0)
+        told[:, ~scan.known] = 0.0
         before = 0 if standing is None else 1 + self._maps.at[standing]
         found = list[WireGuess]()
         slopes_before = self._slopes(before, z0)

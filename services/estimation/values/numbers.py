@@ -90,8 +90,11 @@ NEIGHBOURS = Number(
     0.06, "unit", "gap below which two discs may be one touch", "derived: 3 mm, no nearer are told apart"
 )
 MOST_TOUCHES = Number(4.0, "-", "touches at once", "chosen: cost; image and contact frames hold more")
-MOST_STEPS = Number(100.0, "-", "steps times touches of one scan, beyond which nothing new is asked", "chosen: 15 ms")
+MOST_STEPS = Number(200.0, "-", "steps times touches of one scan, beyond which nothing new is asked", "chosen: 30 ms")
+LEAST_BUDGET = Number(0.4, "-", "of them, for a part of a scan", "chosen: the parts after it are asked as well")
+FOR_FAULTS = Number(0.4, "-", "of them, for what the board may have done", "derived: two changes, two fits each")
 STEPS_WARM = Number(4.0, "-", "steps of a fit from the scan before", "measured: 2 or 3 are used")
+STEPS_HELD = Number(1.0, "-", "the same of touches that stay as they are", "measured: seldom one is needed")
 STEPS_COLD = Number(10.0, "-", "steps of a fit from a grid's disc", "measured: 4 to 10 are used")
 ADRIFT = Number(
     1.5, "-", "by which faster drift grows with each scan that nothing explains", "derived: 2 s to a per cent"
