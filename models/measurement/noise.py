@@ -10,6 +10,7 @@ picks it up: the strongest eigenvectors of the residuals' covariance, beyond wha
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +43,8 @@ STEADY_CONTACTS = 40  # measurements whose contacts are quiet enough to tell the
 class LineState:
     """Of scans that end with one part."""
 
-    scatter: Array  # (K, K) mean square of residuals
-    columns: Array  # (K, n)
+    scatter: Annotated[Array, "K", "K"]  # mean square of residuals
+    columns: Annotated[Array, "K", "n"]
     heard: int = 0  # scans
 
 
@@ -52,8 +53,8 @@ class NoiseState:
     """All that changes. Variances are relative to |Z|, squared."""
 
     white: float
-    flicker: Array  # (E,) of a contact impedance, common to a scan
-    jitter: Array  # (E,) of a contact impedance, new with each measurement
+    flicker: Annotated[Array, "E"]  # of a contact impedance, common to a scan
+    jitter: Annotated[Array, "E"]  # of a contact impedance, new with each measurement
     lines: dict[int, LineState] = field(default_factory=dict)  # by the part measured last, 0: whole scans
 
 

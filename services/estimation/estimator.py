@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.disc import DiscResponse
-from models.measurement.noise import NoiseModel
 from models.measurement.tables import SkinTables
-from models.measurement.touch import SHAPE_SDS
+from models.measurement.touch import SHAPE_SDS, SHAPES, STATES
 from models.measurement.whitening import Whitening
 from services.estimation.faults import advice
-from services.estimation.faults.asking import AskedScan, FaultAsking
-from services.estimation.faults.board import BoardFaults, BoardView
+from services.estimation.faults.asking import AskedScan
+from services.estimation.faults.board import BoardView
 from services.estimation.faults.gap import judged_by_itself
-from services.estimation.faults.table import any_touches
 from services.estimation.faults.wires import WireFault
-from services.estimation.filter import Prediction, SkinFilter
-from services.estimation.first.tare import AgreedScans, TareRefused, Taring
-from services.estimation.held_look import HeldLook
+from services.estimation.filter import Prediction
+from services.estimation.first.tare import AgreedScans, LatestScansState, TareRefused, Taring, TaringState
 from services.estimation.hypotheses import (
     AS_IT_IS,
     BURST,
@@ -33,16 +31,19 @@ from services.estimation.hypotheses import (
     ScoredAnswer,
     StepBudget,
 )
-from services.estimation.learning import Learning, Waiting
-from services.estimation.quick_look import QuickLook, Seen
-from services.estimation.touches import TouchTracks, estimate_of, roughly
+from services.estimation.learning import Waiting
+from services.estimation.quick_look import Seen
+from services.estimation.tared import TaredSkin, TaredState
+from services.estimation.touches import estimate_of, roughly
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, TouchEstimate
 from services.estimation.values.judgement import Judgement, judge
 from services.estimation.values.scan import Scan
+from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
+LAYOUT = 1  # of a kept state
 AGES_OF_DOUBT = (1, 2, 4, 8)  # whole scans of a touch, at which its outline is asked whether it is one
 
 
@@ -94,37 +95,21 @@ class EstimatorState:
     whole_us: float = -np.inf  # board's clock at the end of the last whole scan
     wholes: int = 0  # whole scans since the tare
     unexplained_s: float = 0.0  # for how long nothing has explained the scans
-    information: NDArray[np.float32] | None = None  # of the grid's discs
+    information: Annotated[NDArray[np.float32] | None, "A"] = None  # of the grid's discs
     informed: int = 0  # `wholes` then
-    informed_live: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    informed_live: Annotated[NDArray[np.bool_], "L"] = field(default_factory=lambda: np.zeros(0, bool))
     informed_wire: WireFault | None = None
     said: tuple[TouchEstimate, ...] = ()
 
 
-class TaredSkin:
-    """What stands on one baseline."""
+@dataclass
+class WholeState:
+    """All that changes of an estimator."""
 
-    def __init__(self, tables: SkinTables, scans: AgreedScans, next_id: int) -> None:
-        self.log_z0, self.live = scans.log_z0, scans.live
-        self.tables = tables.relative_to(np.exp(scans.log_z0))
-        self.response = DiscResponse(self.tables)
-        self.noise, self.drift = NoiseModel(self.tables), SkinFilter(self.tables)
-        self.noise.begin(scans.residuals, scans.part)
-        self.noise.now.white = max(self.noise.now.white, scans.least_white)
-        count = len(scans.residuals)
-        self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / count)
-        self.touches = TouchTracks(self.response)
-        self.touches.now.next_id = next_id
-        self.hypotheses = Hypotheses(self.tables, self.response, self.noise, self.drift)
-        self.learning = Learning(self.drift, self.noise)
-        self.quick, self.held = QuickLook(self.hypotheses.grid), HeldLook()
-        self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
-        self.asking = FaultAsking(self.tables, self.response, self.noise, self.touches, self.hypotheses, self.faults)
-
-    def forget_looks(self) -> None:
-        """The untouched skin is another than at the last scans."""
-        self.quick.forget()
-        self.held.forget()
+    scans: EstimatorState
+    taring: TaringState
+    latest: LatestScansState
+    tared: TaredState | None
 
 
 class Estimator:
@@ -144,8 +129,33 @@ class Estimator:
 
     def _begin(self, scans: AgreedScans) -> None:
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
-        self.skin = TaredSkin(self._tables, scans, next_id)
+        self.skin = TaredSkin(self._tables, scans.log_z0, scans.live)
+        self.skin.begin(scans, next_id)
         self.now.information, self.now.wholes, self.now.unexplained_s = None, 0, 0.0
+
+    def state(self) -> dict[str, Any]:
+        """All that changes, to be kept; who loads it goes on bit by bit as this one does."""
+        self.now.information = None  # as whitenings of a moment ago
+        tared = None if self.skin is None else self.skin.state()
+        return {"layout": LAYOUT, **saved(WholeState(self.now, self.taring.now, self.taring.latest.now, tared))}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state. Raises ValueError where it is of another layout or skin, or damaged: nothing changes."""
+        if state.get("layout") != LAYOUT:
+            raise ValueError(f"a state of layout {state.get('layout')!r}, expected {LAYOUT}")
+        sizes = {
+            "K": self._tables.measurements,
+            "E": self._tables.electrodes,
+            "states": STATES,
+            "shapes": SHAPES,
+            "said": 4,
+        }
+        known = loaded(WholeState, {name: value for name, value in state.items() if name != "layout"}, sizes)
+        skin = None
+        if known.tared is not None:
+            skin = TaredSkin(self._tables, known.tared.log_z0, known.tared.live)
+            skin.load(known.tared)
+        self.skin, self.now, self.taring.now, self.taring.latest.now = skin, known.scans, known.taring, known.latest
 
     # --- one scan ---
 

@@ -7,6 +7,7 @@ touches, and each measurement's own remainder. A Kalman filter of log |Z|; touch
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ STATES_OF_MEMORY = len(FADES_S)
 class Memory:
     """What a touch left: one column, with a state for each time constant."""
 
-    column: Array  # (K,) of unit action
+    column: Annotated[Array, "K"]  # of unit action
     action: float  # when it went
     at_s: float
     x: float
@@ -40,10 +41,10 @@ class FilterState:
     """All that changes."""
 
     at_s: float
-    x: Array  # (N,)
-    p: Array  # (N, N)
-    remainder: Array  # (K,)
-    remainder_variance: Array  # (K,)
+    x: Annotated[Array, "N"]
+    p: Annotated[Array, "N", "N"]
+    remainder: Annotated[Array, "K"]
+    remainder_variance: Annotated[Array, "K"]
     memories: list[Memory] = field(default_factory=list)
 
 

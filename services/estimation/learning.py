@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,8 @@ class Waiting:
     """An untouched scan that waits to be believed."""
 
     at_s: float
-    over: Array  # (K,) log |Z| over the baseline
-    live: NDArray[np.bool_]
+    over: Annotated[Array, "K"]  # log |Z| over the baseline
+    live: Annotated[NDArray[np.bool_], "K"]
     part: int
     drifts: float  # times faster drift; 0: as slowly as before
 

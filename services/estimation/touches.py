@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,12 +46,12 @@ class TrackedTouch:
     began: bool
     born_s: float
     at_s: float
-    state: Array  # (7,)
-    covariance: Array  # (7, 7)
+    state: Annotated[Array, "states"]
+    covariance: Annotated[Array, "states", "states"]
     log_radius: float  # as known from scans that share no value
     log_radius_sd: float
-    shape: Array  # (9,)
-    shape_variance: Array  # (9,)
+    shape: Annotated[Array, "shapes"]
+    shape_variance: Annotated[Array, "shapes"]
     since_s: float = -np.inf  # it acts from then on
     until_s: float = np.inf  # it acted until then: it has ended, and the window still holds values of before
     scans: int = 0  # that it was fitted to and that share no value

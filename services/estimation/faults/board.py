@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,7 @@ SCAN_S = 0.044
 class FaultState:
     """All that changes. Times are seconds of the host's clock."""
 
-    settled: Array  # (E,) changes of contact impedances that the skin has for good
+    settled: Annotated[Array, "E"]  # changes of contact impedances that the skin has for good
     wire: WireFault | None = None
     wire_since_s: float = -np.inf
     opens: tuple[int, ...] = ()

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,7 @@ class Agreement(NamedTuple):
 class LatestScansState:
     """All that changes."""
 
-    log_z: list[Array] = field(default_factory=list)  # each (K,), NaN where a measurement failed
+    log_z: list[Annotated[Array, "K", "gaps"]] = field(default_factory=list)  # NaN where a measurement failed
     at_s: list[float] = field(default_factory=list)
     part: int = 0
     seen: int = 0  # scans that came

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ class TouchEstimate:
     vy: float
     log_radius: float  # of the disc of its area
     drop: float  # of conductivity, mean over the disc
-    covariance: Array  # (4, 4) of x, y, log radius, drop
+    covariance: Annotated[Array, "said", "said"]  # (4, 4) of x, y, log radius, drop
     z2: float  # of the disc: how much it explains, in squared sigmas
     integral: float  # drop over the touch
     integral_sd: float

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,10 @@ SHORTEST_S, LONGEST_S = 0.005, 2.0  # of a scan that any board measures
 class Scan:
     """K measurements in the pattern's order. Made once, at the door; nobody changes it."""
 
-    values: Array  # (K,) |Z|, ohm or counts
-    ages_s: Array  # (K,) by how much each value is older than the newest one's end
-    new: NDArray[np.bool_]  # (K,) measured after the scan that was stepped before
-    status: NDArray[np.uint8]  # (K,) bits, protocol.frame_types.STATUS_*
+    values: Annotated[Array, "K", "gaps"]  # |Z|, ohm or counts
+    ages_s: Annotated[Array, "K"]  # by how much each value is older than the newest one's end
+    new: Annotated[NDArray[np.bool_], "K"]  # measured after the scan that was stepped before
+    status: Annotated[NDArray[np.uint8], "K"]  # bits, protocol.frame_types.STATUS_*
     number: int  # the board's
     part: int  # of a scan in parts: the part measured last, from 1 on; 0: a whole scan
     end_us: float  # board's clock at the end of the newest value

@@ -1,0 +1,94 @@
+"""What stands on one baseline: the skin's tables, what is learnt of it, and who asks; kept and gone on from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.disc import DiscResponse
+from models.measurement.noise import NoiseModel, NoiseState
+from models.measurement.tables import SkinTables
+from services.estimation.faults.asking import FaultAsking
+from services.estimation.faults.board import BoardFaults, FaultState
+from services.estimation.faults.table import any_touches
+from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, SkinFilter
+from services.estimation.first.tare import AgreedScans
+from services.estimation.held_look import HeldLook
+from services.estimation.hypotheses import Hypotheses
+from services.estimation.learning import Learning, LearningState
+from services.estimation.quick_look import QuickLook
+from services.estimation.touches import TouchesState, TouchTracks
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class TaredState:
+    """All that changes of what stands on one baseline, and the baseline."""
+
+    log_z0: Annotated[Array, "K"]
+    live: Annotated[NDArray[np.bool_], "K"]
+    noise: NoiseState
+    drift: FilterState
+    touches: TouchesState
+    learning: LearningState
+    faults: FaultState
+    adrift: float
+
+
+class TaredSkin:
+    """What stands on one baseline."""
+
+    def __init__(self, tables: SkinTables, log_z0: Array, live: NDArray[np.bool_]) -> None:
+        self.log_z0, self.live = log_z0, live
+        self.tables = tables.relative_to(np.exp(log_z0))
+        self.response = DiscResponse(self.tables)
+        self.noise, self.drift = NoiseModel(self.tables), SkinFilter(self.tables)
+        self.touches = TouchTracks(self.response)
+        self.hypotheses = Hypotheses(self.tables, self.response, self.noise, self.drift)
+        self.learning = Learning(self.drift, self.noise)
+        self.quick, self.held = QuickLook(self.hypotheses.grid), HeldLook()
+        self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
+        self.asking = FaultAsking(self.tables, self.response, self.noise, self.touches, self.hypotheses, self.faults)
+
+    def begin(self, scans: AgreedScans, next_id: int) -> None:
+        """scans: those of the baseline."""
+        self.noise.begin(scans.residuals, scans.part)
+        self.noise.now.white = max(self.noise.now.white, scans.least_white)
+        count = len(scans.residuals)
+        self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / count)
+        self.touches.now.next_id = next_id
+
+    def forget_looks(self) -> None:
+        """The untouched skin is another than at the last scans."""
+        self.quick.forget()
+        self.held.forget()
+
+    def state(self) -> TaredState:
+        """What a whitening of a moment ago told is forgotten: who goes on from this state does not have it."""
+        self.forget_looks()
+        return TaredState(
+            log_z0=self.log_z0,
+            live=self.live,
+            noise=self.noise.now,
+            drift=self.drift.now,
+            touches=self.touches.now,
+            learning=self.learning.now,
+            faults=self.faults.now,
+            adrift=self.hypotheses.adrift,
+        )
+
+    def load(self, state: TaredState) -> None:
+        """Raises ValueError where the drift's covariance is none."""
+        spread = np.linalg.eigvalsh(state.drift.p)
+        size = 2 * MODES + self.tables.electrodes + STATES_OF_MEMORY * len(state.drift.memories)
+        if len(spread) != size or spread[0] < -1e-9 * spread[-1]:
+            raise ValueError(
+                f"the drift's covariance: found {len(spread)} states, {spread[0]:.1g}, expected {size}, >= 0"
+            )
+        self.noise.now, self.drift.now, self.touches.now = state.noise, state.drift, state.touches
+        self.learning.now, self.faults.now, self.hypotheses.adrift = state.learning, state.faults, state.adrift

@@ -1,0 +1,125 @@
+"""A state, saved and loaded one way: a dataclass of arrays, numbers, texts, lists and further dataclasses.
+
+Its fields' types say what may be loaded. An array of a state names its dimensions, `Annotated[Array, "K", "E"]`: K
+measurements, E electrodes, any other letter one size within its dataclass. "gaps" after them: it may hold NaN.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cache
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+T = TypeVar("T")
+Sizes = dict[str, int]
+
+GAPS = "gaps"
+PLAIN = {int: (int,), float: (float, int), str: (str,), bool: (bool,)}
+
+
+def saved(state: Any) -> Any:
+    """As free content of a message: maps, lists, arrays, numbers and texts."""
+    if is_dataclass(state):
+        return {each.name: saved(getattr(state, each.name)) for each in fields(state)}
+    if isinstance(state, Enum):
+        return state.value
+    if isinstance(state, Mapping):
+        return [[saved(key), saved(value)] for key, value in state.items()]
+    if isinstance(state, (list, tuple)):
+        return [saved(each) for each in state]
+    if isinstance(state, (np.generic, int, float)) and not isinstance(state, bool):
+        return state.item() if isinstance(state, np.generic) else int(state) if isinstance(state, int) else float(state)
+    return state
+
+
+def loaded(kind: type[T], found: Any, sizes: Sizes) -> T:
+    """What `saved` made, as `kind`; sizes: K and E. Raises ValueError, which says where it does not fit."""
+    return _read(kind, found, sizes, kind.__name__)  # type: ignore[no-any-return]
+
+
+def _read(kind: Any, found: Any, sizes: Sizes, where: str) -> Any:
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _array(arguments[0], found, sizes, arguments[1:], where)
+    if origin in (Union, types.UnionType):
+        rest = [each for each in arguments if each is not type(None)]
+        return None if found is None else _read(rest[0], found, sizes, where)
+    if origin in (list, tuple, dict):
+        return _several(origin, arguments, found, sizes, where)
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return kind(found)
+    if is_dataclass(kind) or hasattr(kind, "_fields"):
+        return _record(kind, found, dict(sizes), where)
+    if not isinstance(found, PLAIN[kind]) or isinstance(found, bool) != (kind is bool):
+        raise _misfit(where, found, kind.__name__)
+    return kind(found)
+
+
+def _record(kind: Any, found: Any, sizes: Sizes, where: str) -> Any:
+    hints = _hints(kind)
+    if is_dataclass(kind):
+        if not isinstance(found, dict) or found.keys() != hints.keys():
+            raise _misfit(where, found, f"a map of {', '.join(hints)}")
+        values = [found[name] for name in hints]
+    else:
+        values = _list(found, where)
+        if len(values) != len(hints):
+            raise _misfit(where, found, f"{len(hints)} values")
+    read = [
+        _read(hint, value, sizes, f"{where}.{name}") for (name, hint), value in zip(hints.items(), values, strict=True)
+    ]
+    return kind(*read)
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    hints = get_type_hints(kind, include_extras=True)
+    names = [each.name for each in fields(kind)] if is_dataclass(kind) else kind._fields
+    return {name: hints[name] for name in names}
+
+
+def _several(origin: Any, arguments: tuple[Any, ...], found: Any, sizes: Sizes, where: str) -> Any:
+    values = _list(found, where)
+    if origin is dict:
+        pairs = [_list(each, where) for each in values]
+        if any(len(pair) != 2 for pair in pairs):
+            raise _misfit(where, found, "pairs of key and value")
+        return {_read(arguments[0], k, sizes, where): _read(arguments[1], v, sizes, f"{where}[{k}]") for k, v in pairs}
+    if origin is list or arguments[-1] is Ellipsis:
+        return origin(_read(arguments[0], each, sizes, f"{where}[{n}]") for n, each in enumerate(values))
+    if len(values) != len(arguments):
+        raise _misfit(where, found, f"{len(arguments)} values")
+    return tuple(_read(kind, each, sizes, where) for kind, each in zip(arguments, values, strict=True))
+
+
+def _list(found: Any, where: str) -> list[Any]:
+    if not isinstance(found, list):
+        raise _misfit(where, found, "a list")
+    return found
+
+
+def _array(kind: Any, found: Any, sizes: Sizes, dimensions: tuple[str, ...], where: str) -> Any:
+    if get_origin(kind) in (Union, types.UnionType):
+        if found is None:
+            return None
+        kind = next(each for each in get_args(kind) if each is not type(None))
+    dtype = get_args(get_args(kind)[1])[0]
+    named = [each for each in dimensions if each != GAPS]
+    if not isinstance(found, np.ndarray) or found.dtype != dtype or found.ndim != len(named):
+        raise _misfit(where, found, f"an array of {np.dtype(dtype)} with {len(named)} dimensions")
+    for name, size in zip(named, found.shape, strict=True):
+        if sizes.setdefault(name, size) != size:
+            raise _misfit(where, found, f"{name} = {sizes[name]}")
+    if GAPS not in dimensions and found.dtype.kind == "f" and not np.isfinite(found).all():
+        raise _misfit(where, "NaN or infinity", "finite numbers")
+    return found.copy()
+
+
+def _misfit(where: str, found: Any, expected: str) -> ValueError:
+    what = f"an array of {found.dtype}, {found.shape}" if isinstance(found, np.ndarray) else repr(found)[:60]
+    return ValueError(f"{where}: found {what}, expected {expected}")
