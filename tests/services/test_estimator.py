@@ -157,26 +157,22 @@ def test_a_press_is_shown_where_it_is_and_as_strong_as_it_is(parts: int, radius:
     assert np.median(away) < 3 and np.max(away) < 6
 
 
-@pytest.mark.parametrize(
-    ("kind", "radius", "force"), [("ellipse", 4e-3, 3.0), ("L", 4e-3, 3.0), ("rectangle", 4e-3, 2.4), ("L", 11e-3, 4.0)]
-)
+@pytest.mark.parametrize(("kind", "radius", "force"), [("L", 5e-3, 2.0), ("L", 6e-3, 3.0)])
 def test_the_force_of_a_patch_that_is_no_disc_lies_within_its_sigma(kind: str, radius: float, force: float) -> None:
-    """Small ones saturate: how large they are decides, and an outline spreads further than a disc of its area."""
+    """How large a patch is that saturates decides its force, and an outline spreads further than a disc of its area."""
     values = {"shape": kind, "x": 0.012, "y": -0.018, "radius": radius, "force": force, "rotation": 0.4}
     touch = scenes.touch({**values, "aspect": 1.0 if kind == "L" else 2.0})
     for contact in held(press(touch)):
         assert contact.force_n and contact.force_sigma_n
-        assert abs(contact.force_n - force) < 4 * contact.force_sigma_n
+        assert abs(contact.force_n - force) < 3 * contact.force_sigma_n
 
 
 @pytest.mark.parametrize(("radius", "force"), [(4.5e-3, 2.0), (5e-3, 2.5), (8e-3, 3.0), (15e-3, 5.0)])
 def test_the_force_on_foam_of_soft_edges_lies_within_its_sigma(radius: float, force: float) -> None:
     soft = table.sheet("soft-3", 1)
-    read = [
-        np.abs(soft.model.read(soft.transfer(world)))
-        for world in (World(), World((pressed("circle", 0.012, -0.018, radius, force),)))
-    ]
-    for contact in held(between((0, read[0]), (FREE_S, read[0]), (FREE_S + 0.1, read[1]), (60, read[1]))):
+    touch = pressed("circle", 0.012, -0.018, radius, force)
+    free, full = (np.abs(soft.model.read(soft.transfer(World(touches)))) for touches in ((), (touch,)))
+    for contact in held(between((0, free), (FREE_S, free), (FREE_S + 0.1, full), (60, full))):
         assert contact.force_n and contact.force_sigma_n
         assert abs(contact.force_n - force) < 4 * contact.force_sigma_n
 
