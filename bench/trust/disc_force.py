@@ -22,7 +22,7 @@ from services.estimation.values.estimate import TouchEstimate
 Array = NDArray[np.float64]
 
 
-class Patch(NamedTuple):
+class PatchKind(NamedTuple):
     """What a touch may be."""
 
     share: float  # of touches
@@ -31,9 +31,9 @@ class Patch(NamedTuple):
 
 
 PATCHES = (
-    Patch(0.67, 1.0, 0.0),  # discs
-    Patch(0.22, 1.25, 0.15),  # triangles, rectangles and ellipses of aspect 2: 1.21 to 1.31, 0.12 to 0.17
-    Patch(0.11, 1.53, 0.3),  # an L
+    PatchKind(0.67, 1.0, 0.0),  # discs
+    PatchKind(0.22, 1.25, 0.15),  # triangles, rectangles and ellipses of aspect 2: 1.21 to 1.31, 0.12 to 0.17
+    PatchKind(0.11, 1.53, 0.3),  # an L
 )
 EDGES = ((0.85, 0.0), (0.05, 1.5e-3), (0.05, 2.2e-3), (0.05, 3e-3))  # share of skins, and how soft [m]
 ACTION_SIGMA = 0.025  # relative: of the response of discs, 0.98 to 1.04 on another mesh
@@ -75,7 +75,7 @@ def force_of(touch: TouchEstimate, metres_per_unit: float) -> tuple[float, float
     return mean, math.sqrt(spread + (creeps * mean) ** 2)
 
 
-def _seen_as(touch: TouchEstimate, patch: Patch) -> Discs:
+def _seen_as(touch: TouchEstimate, patch: PatchKind) -> Discs:
     """Patches of sharp edges that spread and act as the touch does."""
     radius_sd = math.sqrt(max(touch.covariance[2, 2], 0.0))
     action_sd = math.hypot(touch.strength_sd, ACTION_SIGMA * touch.strength)
