@@ -8,11 +8,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.trust.disc_force import force_of
 from models.bundle import Bundle
 from models.measurement.tables import tables_of
-from models.pressure import FOAM
 from protocol.frames import Contact, ContactFrame, RawFrame
-from services.contacts import patch_force
 from services.contacts.lasting import LastingStates
 from services.estimation.estimator import Estimator
 from services.estimation.first.tare import TareRefused
@@ -23,11 +22,6 @@ from services.runtime.config import Skin
 Array = NDArray[np.float64]
 
 VALID_SCANS = 3.0  # for which a frame may be acted on
-ACTION_SIGMA = 0.03  # relative: of the response, 0.91 to 1.09 over all shapes
-MOST_ACTS = 2.2  # action over area: 2 where nothing conducts, and that response's error
-SPREAD = np.linspace(-2.4, 2.4, 9)  # sigmas of radius and action that are summed over
-WEIGHT = np.exp(-(SPREAD**2) / 2) / np.exp(-(SPREAD**2) / 2).sum()
-CREEPS, CREEPS_S = 0.05, 20.0  # relative: foam that yields while it is pressed, of a minute, and when
 PLACE_SIGMA_M = 1e-4  # where no touch is known better: the tables' own
 
 
@@ -100,26 +94,3 @@ class Anew:
             force_sigma_n=sigma,
             position_sigma=[float(long), float(short), math.atan2(vectors[1, 1], vectors[0, 1])],
         )
-
-
-def force_of(touch: TouchEstimate, metres_per_unit: float) -> tuple[float, float]:
-    """Newtons and their sigma: the foam's pressure at the disc's drop over its area, a mean over the radii and actions
-    that it may have. What the measurements tell, drop / (1 - drop / 2) times the area, is the same for all radii. A
-    patch that may have saturated has a force from below only: its sigma reaches to where the foam tells nothing more.
-    """
-    radius_sd = math.sqrt(max(touch.covariance[2, 2], 0.0))
-    action_sd = math.hypot(touch.strength_sd / max(touch.strength, 1e-12), ACTION_SIGMA)
-    log_radius = touch.log_radius + radius_sd * SPREAD[:, None]
-    area = math.pi * np.exp(2 * log_radius)
-    acts = touch.strength * np.maximum(1 + action_sd * SPREAD, 0.0) / area
-    weight = WEIGHT[:, None] * WEIGHT * (acts < MOST_ACTS)
-    weight = weight / weight.sum() if weight.any() else WEIGHT[:, None] * WEIGHT
-    drop = np.minimum(acts / (1 + acts / 2), patch_force.FULL)
-    square_metres = area * metres_per_unit**2
-    pressure = FOAM.pressure(drop)
-    forces = square_metres * pressure
-    beyond = square_metres * (FOAM.pressure(patch_force.FULL) - pressure) * (drop > patch_force.BLIND)
-    mean = float((weight * forces).sum())
-    spread = float((weight * ((forces - mean) ** 2 + beyond**2 / 3)).sum())
-    creeps = CREEPS * (1 - math.exp(-touch.age_s / CREEPS_S))
-    return mean, math.sqrt(spread + (creeps * mean) ** 2)

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from bench.trust.anew import Anew
+from firmware_stub import scene as scenes
 from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World, pressed
 from firmware_stub.worlds import table
 from models.bundle import Bundle
 from models.mismatch import Mismatch
 from models.rolling import order
-from protocol.frames import ContactFrame, RawFrame
+from protocol.frames import Contact, ContactFrame, RawFrame
 from services.runtime.config import Skin
 
 SCAN_S, PARTS, NOISE = 0.0437, 10, 1e-4
@@ -118,6 +119,13 @@ def press(*touches: Touch, ramp_s: float = 0.1, until_s: float = 60.0, left: flo
     )
 
 
+def held(curve: Curve) -> list[Contact]:
+    """The one contact of each whole scan, from 0.3 s after FREE_S on."""
+    shown = between_s(run(curve, FREE_S + 0.8), FREE_S + 0.3, 99)
+    assert shown and all(frame.valid and lasting(frame) == 1 for frame in shown)
+    return [frame.contacts[0] for frame in shown]
+
+
 @pytest.mark.parametrize("parts", [1, PARTS])
 def test_an_untouched_skin_that_warms_stays_untouched(parts: int) -> None:
     """Half a degree a minute: 1 % of the conductivity in a minute."""
@@ -147,6 +155,26 @@ def test_a_press_is_shown_where_it_is_and_as_strong_as_it_is(parts: int, radius:
         assert contact.force_sigma_n < 0.25 * force
         assert contact.position_sigma[0] < (1e-3 if force > 1 else 2e-3)
     assert np.median(away) < 3 and np.max(away) < 6
+
+
+@pytest.mark.parametrize(("kind", "radius", "force"), [("L", 5e-3, 2.0), ("L", 6e-3, 3.0)])
+def test_the_force_of_a_patch_that_is_no_disc_lies_within_its_sigma(kind: str, radius: float, force: float) -> None:
+    """How large a patch is that saturates decides its force, and an outline spreads further than a disc of its area."""
+    values = {"shape": kind, "x": 0.012, "y": -0.018, "radius": radius, "force": force, "rotation": 0.4}
+    touch = scenes.touch({**values, "aspect": 1.0 if kind == "L" else 2.0})
+    for contact in held(press(touch)):
+        assert contact.force_n and contact.force_sigma_n
+        assert abs(contact.force_n - force) < 3 * contact.force_sigma_n
+
+
+@pytest.mark.parametrize(("radius", "force"), [(4.5e-3, 2.0), (5e-3, 2.5), (8e-3, 3.0), (15e-3, 5.0)])
+def test_the_force_on_foam_of_soft_edges_lies_within_its_sigma(radius: float, force: float) -> None:
+    soft = table.sheet("soft-3", 1)
+    touch = pressed("circle", 0.012, -0.018, radius, force)
+    free, full = (np.abs(soft.model.read(soft.transfer(World(touches)))) for touches in ((), (touch,)))
+    for contact in held(between((0, free), (FREE_S, free), (FREE_S + 0.1, full), (60, full))):
+        assert contact.force_n and contact.force_sigma_n
+        assert abs(contact.force_n - force) < 4 * contact.force_sigma_n
 
 
 def test_a_press_that_begins_at_once_is_shown_within_half_a_scan() -> None:
