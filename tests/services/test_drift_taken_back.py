@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
 
@@ -15,28 +13,16 @@ TOUCHES = [
     ("circle", 0, 0.82, 0.4),
     ("circle", 0, 0.88, 0.4),
     ("L", 0, 0.82, 0.4),
-    ("triangle", 2, 0.82, 0.4),
+    ("triangle", 2, 0.86, 0.4),
     ("circle", 5, 0.82, 0.4),
 ]
 
 
-@pytest.fixture(scope="module")
-def untouched() -> tuple[StubSkin, list[dict[str, object]]]:
-    stub = StubSkin(80.0)
-    return stub, [stage.state() for stage in _stages(stub)]
-
-
-def _stages(stub: StubSkin):  # type: ignore[no-untyped-def]
-    return stub.pipeline.pre, stub.pipeline.inference, stub.pipeline.publishing
-
-
 @pytest.mark.parametrize(("kind", "electrode", "inward", "drop"), TOUCHES)
 def test_a_touch_beside_an_electrode_that_was_read_as_drift_leaves_nothing(
-    untouched, kind: str, electrode: int, inward: float, drop: float
+    kind: str, electrode: int, inward: float, drop: float
 ) -> None:
-    stub, states = untouched
-    for stage, state in zip(_stages(stub), states, strict=True):
-        stage.load(copy.deepcopy(state))
+    stub = StubSkin(80.0)  # its own, as its noise goes on from test to test
     estimator = stub.pipeline.pre.touch_estimator.baseline_estimator
     stub.rest(3)
     estimator.drift_filter.begin(stub.scan * 45_000_000, LONG_S)

@@ -64,7 +64,12 @@ def test_after_a_gap_nothing_from_before_it_is_handed_on():
     assert newest.frame(header, part(11)).reasons == []
 
 
-def test_a_board_sends_parts_and_whole_scans_are_made_of_them(host):
+def test_a_board_sends_parts_and_whole_scans_are_made_of_them():
+    with rolling_host(seed=2) as host:
+        _sends_parts(host)
+
+
+def _sends_parts(host):
     assert host.link.scanning.parts == 10
     seconds = 1e-9 * (host.raws[-1].stamps["sample"] - host.raws[0].stamps["sample"])
     assert len(host.raws) / seconds == pytest.approx(229, rel=0.03)
