@@ -119,7 +119,8 @@ class Circles:
         expected, slope = self.expected(touches, self.all, tau)
         slope = slope[:, columns] / width[:, None]
         chi2 = float((((d - expected) / width) ** 2).sum())
-        prior = np.diag(np.tile([TINY, TINY, *SD**-2.0], len(touches)))
+        # Somewhere on the skin: what has slid to where no measurement sees it would have no covariance otherwise.
+        prior = np.diag(np.tile([self._half**-2.0, self._half**-2.0, *SD**-2.0], len(touches)))
         covariance = spread_of(chi2, len(d) - len(columns)) * np.linalg.inv(slope.T @ slope + prior)
         return Fit(touches, np.asarray(covariance, dtype=np.float64), chi2 / len(d))
 

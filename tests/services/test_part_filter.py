@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from protocol.frames import DeltaFrame
+from services.estimation.circles import Circles
 from services.estimation.part_filter import PartFilter
 from services.estimation.part_image import PartImage
 from services.estimation.rolling import measured_at
@@ -291,3 +292,12 @@ def test_a_touch_that_a_whole_scan_does_not_see_any_more_is_not_followed_into_th
     sigma = estimator.sigma.astype(np.float32)
     after.judged(DeltaFrame(skin="palm", difference=np.zeros(120, np.float32), sigma=sigma), raw, estimator)
     assert not after._models.filter.moves and not after._models.filter.knows
+
+
+def test_two_touches_in_one_place_lie_on_the_skin_still(bundle):
+    """No value tells one from the other: their covariance was singular, which ended preprocessing."""
+    circles = Circles(bundle)
+    one = np.array([[0.1, 0.2, np.log(0.2), np.log(0.3), 0.0, 0.0]])
+    fit = circles.fitted(circles.still(one), NOISE, np.vstack([one, one]))
+    assert fit.misfit < 1
+    assert (np.diag(fit.covariance).reshape(2, -1)[:, :2] < bundle.half_width**2).all()
