@@ -22,7 +22,6 @@ from models.measurement.numbers import (
     LEAST_STEP,
     LINEAR,
     MISFIT,
-    PROMISED,
     STEP_LOG,
     STEP_SHARE,
     TURNS,
@@ -193,7 +192,7 @@ class TouchFitter:
         damping = float(DAMPING)
         for _ in range(most_steps):
             whole = self._step(point, 0.0)
-            if self._is_linear(point.states, whole) and self._explains(point, whole):
+            if self._is_linear(point.states, whole):
                 break
             step = self._step(point, damping)
             self.steps += 1
@@ -302,11 +301,6 @@ class TouchFitter:
             way, most = float(np.hypot(own[X], own[Y])), max(STEP_SHARE * float(np.exp(state[LOG_RADIUS])), LEAST_STEP)
             own *= min(1.0, most / max(way, 1e-9), STEP_LOG / max(abs(own[LOG_RADIUS]), 1e-9))
 
-    def _explains(self, point: _Point, step: Array) -> bool:
-        """Whether what slopes promise at a step's end is no more than noise: else they may not hold that far."""
-        left = point.residual - point.design @ step
-        return float(left @ left) < PROMISED * max(self._scene.live, 1)
-
     def _solve(self, point: _Point) -> _Linear:
         precision = self._precisions(len(point.rest))
         normal = point.design.T @ point.design
@@ -323,7 +317,7 @@ class TouchFitter:
         n, shapes = STATES * self._count, SHAPES * self._count
         best = point.residual - point.design @ linear.step  # what the linear optimum would leave
         states, rest, left, residual, objective = point.states, point.rest, point.left, point.residual, point.objective
-        if self._is_linear(states, linear.step) and self._explains(point, linear.step):
+        if self._is_linear(states, linear.step):
             states, rest = states + linear.step[:n].reshape(-1, STATES), rest + linear.step[n:]
             left, residual, objective = left - point.sloped @ linear.step, best, objective - linear.gains
         return FoundTouches(

@@ -39,7 +39,6 @@ DONE_SHARE = Number(3e-3, "-", "the same of what is left", "derived: of 120, as 
 LINEAR = Number(
     0.05, "-", "of radius and action: a step within which slopes hold", "derived: its square, 0.25 %, is below MISFIT"
 )
-PROMISED = Number(1.45, "-", "chi^2 a measurement that a step within LINEAR may leave", "derived: 3.5 sigmas of 120")
 LEAST_STEP = Number(0.06, "unit", "that a touch moves in one step at least", "derived: 1.5 pixels")
 STEP_SHARE = Number(0.6, "-", "of a radius that one step moves a touch at most", "chosen: the disc still overlaps")
 STEP_LOG = Number(0.5, "-", "of log radius in one step at most", "chosen: the disc still overlaps")
