@@ -133,6 +133,25 @@ class _Point:
 
 
 @dataclass(frozen=True)
+class _Normal:
+    """Normal equations of one linearisation."""
+
+    measured: Array  # (N, N) of the measurements alone
+    precision: Array  # (N,) of the priors
+    slope: Array  # (N,) of the objective, downhill
+
+    def damped(self, damping: float) -> Array:
+        """(N, N) with the priors, the measurements' diagonal raised as Levenberg does."""
+        normal = self.measured.copy()
+        diagonal = np.diag_indices_from(normal)
+        normal[diagonal] = normal[diagonal] * (1 + damping) + self.precision
+        return normal
+
+    def step(self, damping: float) -> Array:
+        return np.asarray(np.linalg.solve(self.damped(damping), self.slope), float)
+
+
+@dataclass(frozen=True)
 class _Linear:
     """A linearisation solved: its posterior, and the step to its optimum."""
 
@@ -191,10 +210,10 @@ class TouchFitter:
         """Levenberg and Marquardt's steps until they gain nothing, or what is left to go is linear."""
         damping = float(DAMPING)
         for _ in range(most_steps):
-            whole = self._step(point, 0.0)
-            if self._is_linear(point.states, whole):
+            normal = self._normal(point)
+            if self._is_linear(point.states, normal.step(0.0)):
                 break
-            step = self._step(point, damping)
+            step = normal.step(damping)
             self.steps += 1
             tried = self._stepped(point, step)
             gained = point.objective - tried.objective
@@ -266,13 +285,10 @@ class TouchFitter:
         off[self._mean.size : self._mean.size + self._shape_mean.size] -= self._shape_mean
         return off
 
-    def _step(self, point: _Point, damping: float) -> Array:
+    def _normal(self, point: _Point) -> _Normal:
         precision = self._precisions(len(point.rest))
-        normal = point.design.T @ point.design
         slope = point.design.T @ point.residual - precision * self._off(point.states, point.rest)
-        diagonal = np.diag_indices_from(normal)
-        normal[diagonal] = normal[diagonal] * (1 + damping) + precision
-        return np.asarray(np.linalg.solve(normal, slope), float)
+        return _Normal(point.design.T @ point.design, precision, slope)
 
     def _stepped(self, point: _Point, step: Array) -> _Point:
         self._limit(point.states, step)
@@ -302,14 +318,12 @@ class TouchFitter:
             own *= min(1.0, most / max(way, 1e-9), STEP_LOG / max(abs(own[LOG_RADIUS]), 1e-9))
 
     def _solve(self, point: _Point) -> _Linear:
-        precision = self._precisions(len(point.rest))
-        normal = point.design.T @ point.design
-        normal[np.diag_indices_from(normal)] += precision
-        solved: Array = np.asarray(np.linalg.inv(normal), float)
-        _, log_det = np.linalg.slogdet(normal)
-        slope = point.design.T @ point.residual - precision * self._off(point.states, point.rest)
-        step = solved @ slope
-        return _Linear(solved, float(log_det), precision, step, float(slope @ step))
+        normal = self._normal(point)
+        whole = normal.damped(0.0)
+        solved: Array = np.asarray(np.linalg.inv(whole), float)
+        _, log_det = np.linalg.slogdet(whole)
+        step = solved @ normal.slope
+        return _Linear(solved, float(log_det), normal.precision, step, float(normal.slope @ step))
 
     def _posterior(self, point: _Point) -> FoundTouches:
         linear = self._solve(point)
