@@ -126,6 +126,28 @@ class FollowedTouch:
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
+class EstimatedTouch:
+    """One touch at `sample`, as the measurements tell it: a disc of as much area and action."""
+
+    id: int = wire(_COUNT, "stays the same while the touch lasts; unique in a session of preprocessing")
+    began: bool = wire(Bool(), "seen to begin; false: it may have been there for long", True)
+    age_s: float = wire(Float(unit="s"), "since it was first seen", 0.0)
+    position: list[float] = wire(Vector(2, "m"), "x, y on the sheet")
+    velocity: list[float] = wire(Vector(2, "m/s"), "of `position`; 0 where it is steady", lambda: [0.0, 0.0])
+    sigma: list[float] = wire(Vector(3), "as a contact's `position_sigma`")
+    radius_m: float = wire(Float(0, unit="m"), "of the disc")
+    radius_sigma: float = wire(Float(0), "standard uncertainty of the radius's logarithm")
+    drop: float = wire(Float(0, unit="S/m"), "conductivity drop, mean over the disc")
+    drop_sigma: float = wire(Float(0, unit="S/m"), "its standard uncertainty")
+    strength: float = wire(
+        Float(0, unit="S/m m^2"), "drop / (1 - drop / 2) summed over the touch: what the measurements tell best"
+    )
+    strength_sigma: float = wire(Float(0, unit="S/m m^2"), "its standard uncertainty")
+    z2: float = wire(Float(0), "how much it explains: squared sigmas of its strength", 0.0)
+    unexplained: float = wire(Float(0), "share of the measured change that is left", 0.0)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
 class RawFrame(Frame):
     """One scan of the board, in the pattern's order. Of a scan in parts: the newest value of each measurement, after
     each part; `sample` is the middle of the newest one.
@@ -199,6 +221,9 @@ class DeltaFrame(Frame):
         list,
     )
     after: int = wire(_COUNT, AFTER, 0)
+    estimates: list[EstimatedTouch] = wire(
+        ListOf(Record(EstimatedTouch), 16), "the touches at `sample`, as the measurements tell them", list
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -223,6 +248,9 @@ class PartFrame(Frame):
     followed: list[FollowedTouch] = wire(ListOf(Record(FollowedTouch), 16), "the touches", list)
     began: BegunTouch | None = wire(
         Maybe(Record(BegunTouch)), "the only touch, of which there is no image yet; nil: none began", None
+    )
+    estimates: list[EstimatedTouch] = wire(
+        ListOf(Record(EstimatedTouch), 16), "the touches at `sample`, as the measurements tell them", list
     )
 
 
@@ -311,6 +339,9 @@ class ImageFrame(Frame):
         list,
     )
     after: int = wire(_COUNT, AFTER, 0)
+    estimates: list[EstimatedTouch] = wire(
+        ListOf(Record(EstimatedTouch), 16), "the touches at `sample`, as the measurements tell them", list
+    )
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

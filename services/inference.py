@@ -53,6 +53,7 @@ class Inference(Stage):
         self.image_check = ImageCheck(bundle, refuses)
         self.linearisation = Linearisation(name, bundle)
         self._tells_shapes = tells_shapes(bundle)
+        self.judges = True  # whether an image may refuse its frame: not where the measurements have been explained
         self.each_alone = False  # offline: frames that do not follow each other; each waits for its fit
         self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
@@ -97,7 +98,13 @@ class Inference(Stage):
             self._counters["unwanted"] += 1
             self._unseen = frame if frame.stack.size else self._unseen
             return []
-        out = ImageFrame(**inherited(frame), touched=frame.touched, followed=frame.followed, after=frame.after)
+        out = ImageFrame(
+            **inherited(frame),
+            touched=frame.touched,
+            followed=frame.followed,
+            after=frame.after,
+            estimates=frame.estimates,
+        )
         if frame.calibration != self.linearisation.name and not self._follow(frame.calibration):
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
@@ -193,7 +200,9 @@ class Inference(Stage):
             quantity = self._locator.quantity
             out.touches = [_touch(each, quantity) for each in self._locator.locate(frame.difference, frame.sigma)]
         self._counters["networks_run"] += 1
-        if not self.image_check.examine(frame, out, self.each_alone):
+        if not self.judges:
+            out.residual = self.image_check.residual(frame.difference, frame.sigma, out.image)
+        elif not self.image_check.examine(frame, out, self.each_alone):
             return self._changed(frame, out)
         self._judge(out)
         self._shows(frame, out)

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame, Frame, ImageFrame, RawFrame
+from services.estimating import Estimating
 from services.inference import Inference
 from services.preprocessing import Preprocessing
 from services.publishing import Publishing
 from services.runtime.config import Skin
 from services.runtime.stage import Stage
+from services.touch_publishing import TouchPublishing
 
 ALL = frozenset({"delta", "part", "image", "contact"})
+
+
+Stages = tuple[Preprocessing | Estimating, Inference, Publishing | TouchPublishing]
 
 
 class Result(NamedTuple):
@@ -28,21 +34,29 @@ def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> tuple[P
     return Preprocessing(name, skin, bundle), Inference(name, skin, bundle), Publishing(name, skin, bundle)
 
 
+def build_anew(name: str, skin: Skin, bundle: Bundle) -> tuple[Estimating, Inference, TouchPublishing]:
+    """Those that are to take over: what touches is told by the measurements, what it looks like by the image."""
+    inference = Inference(name, skin, bundle)
+    inference.judges = False
+    return Estimating(name, skin, bundle), inference, TouchPublishing(name, skin, bundle)
+
+
 class Pipeline:
     """raw -> delta -> image -> contact, one frame at a time, by the very objects that the processes run."""
 
     def __init__(
-        self, skin: Skin | str, name: str = "skin", bundle: Bundle | None = None, always_reconstruct: bool = False
+        self, skin: Skin | str, name: str = "skin", bundle: Bundle | None = None, always_reconstruct: bool = False,
+        build: Callable[[str, Skin, Bundle], Stages] = build_stages,
     ):
         """skin: a configured one, or the name or path of a bundle. always_reconstruct: each frame by itself, an
-        image of untouched ones too.
+        image of untouched ones too. build: makes the stages.
         """
         if isinstance(skin, str):
             skin = Skin(port="stub", bundle=skin, frame_id=name)
         self.name = name
         self.delta: DeltaFrame | None = None  # the newest one; parts of scans come between two of them
         self.image: ImageFrame | None = None  # the newest one
-        self.pre, self.inference, self.publishing = build_stages(name, skin, bundle)
+        self.pre, self.inference, self.publishing = build(name, skin, bundle or Bundle.load(skin.bundle))
         self.pre.always_reconstruct = self.inference.each_alone = self.publishing.each_alone = always_reconstruct
 
     def run(self, raw: RawFrame) -> Result:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.frames import SHAPES, Contact, ImageFrame, LocatedTouch, RefinedTouch
+from protocol.frames import SHAPES, Contact, EstimatedTouch, ImageFrame, LocatedTouch, RefinedTouch
 from services.contacts.force import Force, ForceLaw, Look
 from services.contacts.motion import Patch, Track
 from services.contacts.refined import agrees, refined, settled
 from services.contacts.registered import registered
 from services.contacts.segmentation import Segment
 from services.contacts.surface import Placed, Placement
+
+if TYPE_CHECKING:
+    from services.contacts.reading import Appearance
 
 
 class ContactWriter:
@@ -55,6 +60,47 @@ class ContactWriter:
             sheet=None if self.place.flat else [seen.x, seen.y],
             **({} if touch is None else registered(touch)),
         )
+
+    def of_estimate(self, number: int, state: str, touch: EstimatedTouch, look: Appearance) -> Contact:
+        """A touch as the measurements tell it, and as it looks."""
+        found = self.law.of_touch(touch)
+        best = int(np.argmax(look.classes)) if look.classes else -1
+        at, (vx, vy) = self.place(*touch.position), touch.velocity
+        return Contact(
+            id=number,
+            state=state,
+            position=at.point.tolist(),
+            velocity=(vx * at.along_x + vy * at.along_y).tolist(),
+            normal=at.normal.tolist(),
+            orientation=look.orientation,
+            area_m2=look.area_m2,
+            force_n=found.newton,
+            force_sigma_n=found.sigma,
+            pressure_pa=found.pressure,
+            pressure_sigma_pa=found.pressure_sigma,
+            wrench=_wrench(at, found.newton or 0.0),
+            shape=SHAPES[best] if look.classes else "unknown",
+            shape_probability=look.classes[best] if look.classes else None,
+            confidence=0.5 * (1 + math.erf(math.sqrt(touch.z2 / 2))),
+            position_sigma=list(touch.sigma),
+            sheet=None if self.place.flat else list(touch.position),
+        )
+
+    def gone(self, contacts: Sequence[Contact]) -> list[Contact]:
+        """The last contacts of touches that were shown so."""
+        force = 0.0 if self.tells_force else None
+        return [
+            Contact(
+                id=c.id,
+                state="end",
+                position=c.position,
+                normal=c.normal,
+                force_n=force,
+                confidence=0.0,
+                sheet=c.sheet,
+            )
+            for c in contacts
+        ]
 
     def fitted(self, contact: Contact, touch: RefinedTouch) -> Contact | None:
         """The contact as a fit has it; None where image and fit do not mean the same touch."""

@@ -22,9 +22,9 @@ from models import uncertainty
 from models.bundle import NETWORKS, Bundle
 from models.pressure import FOAM, Foam
 from models.uncertainty import Map
-from protocol.frames import ImageFrame, RefinedTouch
+from protocol.frames import EstimatedTouch, ImageFrame, RefinedTouch
 from services.contacts import calibration_file as calibration
-from services.contacts import patch_force
+from services.contacts import disc_force, patch_force
 from services.contacts.calibration_file import Of
 from services.contacts.force_curve import Curve
 from services.contacts.segmentation import Segment
@@ -228,6 +228,24 @@ class ForceLaw:
             (touch.drop, touch.drop_sigma) if self.reads == "peak" else (touch.integral, touch.integral_sigma)
         )
         return self._said(Quantity(value, sigma / value), *touch.position)
+
+    def of_touch(self, touch: EstimatedTouch) -> Force:
+        """Force and standard uncertainty of a touch as the estimator has it."""
+        if self.curve is None or not touch.strength > 0:
+            return NOTHING
+        return self._said(self._of_estimate(touch), *touch.position)
+
+    def _of_estimate(self, touch: EstimatedTouch) -> Quantity:
+        area = None if self.indenter_area is None else self.indenter_area * self.metres_per_unit**2
+        if self.reads == "pressure":
+            found = disc_force.force_of(touch, self.foam, area)
+            return Quantity(found.force, found.force_sigma / found.force, found.pressure, found.pressure_sigma)
+        acts = touch.strength / (math.pi * touch.radius_m**2 if area is None else area)
+        drop = acts / (1 + acts / 2)
+        relative = touch.strength_sigma / touch.strength
+        if self.reads == "integral":
+            return Quantity(touch.strength * (1 - min(touch.drop, 1.0) / 2), relative)
+        return Quantity(drop, relative if area is not None else touch.drop_sigma / max(drop, 1e-9))
 
     def _summed(self, touch: RefinedTouch) -> Quantity:
         """Pressure summed over a fitted touch: its integrated drop, which is known best, by the foam at its peak."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from protocol.frames import ELECTRODE_STATES
+from services.estimation.faults.wires import WireFault
 from services.estimation.wiring import StuckBit
 
 OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(len(ELECTRODE_STATES))
@@ -31,7 +32,7 @@ NO_ANSWER = (
 )
 
 
-def stuck_bit(fault: StuckBit) -> str:
+def stuck_bit(fault: StuckBit | WireFault) -> str:
     return (
         f"an address bit of a multiplexer is stuck: bit {fault.bit} of drive{fault.side} or sense{fault.side} stays "
         f"{fault.value}, so electrodes {listed(fault.electrodes)} (numbered from 0) are never reached; look at the "

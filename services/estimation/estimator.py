@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 1  # of a kept state
+LAYOUT = 2  # of a kept state
 AGES_OF_DOUBT = (1, 2, 4, 8)  # whole scans of a touch, at which its outline is asked whether it is one
 
 
@@ -100,6 +100,16 @@ class EstimatorState:
     informed_live: Annotated[NDArray[np.bool_], "L"] = field(default_factory=lambda: np.zeros(0, bool))
     informed_wire: WireFault | None = None
     said: tuple[TouchEstimate, ...] = ()
+    adopted_age_s: float | None = None  # of a baseline that was adopted, before the next scan
+
+
+class KnownBaseline(NamedTuple):
+    """Of this skin, taken earlier."""
+
+    log_z0: Array  # (K,)
+    live: NDArray[np.bool_]  # (K,)
+    scatter: Array  # (K,) of log |Z| from scan to scan
+    frames: int
 
 
 @dataclass
@@ -127,9 +137,17 @@ class Estimator:
             raise TareRefused("wires of the board are wrong, expected all as they belong: mend them and try again")
         self._begin(self.taring.by_command(force))
 
+    def adopt(self, baseline: KnownBaseline, age_s: float) -> None:
+        """Go on from a baseline that is age_s older than the next scan; nobody watched meanwhile."""
+        next_id = 1 if self.skin is None else self.skin.touches.now.next_id
+        self.skin = TaredSkin(self._tables, baseline.log_z0, baseline.live, baseline.scatter, baseline.frames)
+        self.skin.adopt(next_id)
+        self.now = EstimatorState(adopted_age_s=min(max(age_s, 0.0), n.OLDEST_S))
+        self.taring.adopted()
+
     def _begin(self, scans: AgreedScans) -> None:
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
-        self.skin = TaredSkin(self._tables, scans.log_z0, scans.live)
+        self.skin = TaredSkin(self._tables, scans.log_z0, scans.live, scans.scatter, len(scans.residuals))
         self.skin.begin(scans, next_id)
         self.now.information, self.now.wholes, self.now.unexplained_s = None, 0, 0.0
 
@@ -153,8 +171,9 @@ class Estimator:
         known = loaded(WholeState, {name: value for name, value in state.items() if name != "layout"}, sizes)
         skin = None
         if known.tared is not None:
-            skin = TaredSkin(self._tables, known.tared.log_z0, known.tared.live)
-            skin.load(known.tared)
+            tared = known.tared
+            skin = TaredSkin(self._tables, tared.log_z0, tared.live, tared.scatter, tared.frames)
+            skin.load(tared)
         self.skin, self.now, self.taring.now, self.taring.latest.now = skin, known.scans, known.taring, known.latest
 
     # --- one scan ---
@@ -176,6 +195,9 @@ class Estimator:
             self.taring.offer(scan, measurable, measured.middle_s)
         judgements = [judge("believed", float(not scan.believed), 1.0)]
         judgements += self.taring.judgements(self.skin is not None)
+        if self.skin is not None and now.adopted_age_s is not None:
+            self.skin.drift.now.at_s = measured.middle_s - now.adopted_age_s
+            now.adopted_age_s = None
         if self.skin is None:
             if (scans := self.taring.first()) is not None:
                 self._begin(scans)
@@ -215,7 +237,7 @@ class Estimator:
         measured = replace(measured, log_z=skin.log_z0 + skin.faults.taken_off(measured.log_z - skin.log_z0))
         self._learn_untouched(skin, measured, seen.pulled, AS_IT_IS)
         self.now.said = ()
-        y = measured.log_z - skin.log_z0
+        y = np.where(measured.live, self._over(skin, measured), 0.0)
         return self._estimate(measured, y, np.zeros(len(y)), judgements, seen.z2, 0.0)
 
     def _going_on(self, skin: TaredSkin, measured: LookedAt) -> tuple[Question, ScoredAnswer] | None:
@@ -393,6 +415,7 @@ class Estimator:
 
     def _explained(self, skin: TaredSkin, cause: str) -> None:
         self.now.unexplained_s = 0.0
+        skin.touches.now.watched = True
         if cause == AS_IT_IS:
             skin.hypotheses.adrift = 1.0
 
@@ -475,9 +498,9 @@ class Estimator:
         judgements.append(judge("changing", changing, 1.0))
         judgements.append(judge("explained", self.now.unexplained_s, n.CHANGING_S))
         electrodes = np.zeros(self._tables.electrodes, np.uint8) if self.skin is None else self.skin.faults.states()
-        return Estimate(measured.scan, said, electrodes, measured.live, difference, sigma, tuple(judgements))
+        return Estimate(measured.scan, measured.whole, said, electrodes, measured.live, difference, sigma, tuple(judgements))
 
     def _unknown(self, measured: LookedAt, judgements: list[Judgement]) -> Estimate:
         """There is no baseline."""
         nothing, electrodes = np.zeros(self._tables.measurements), np.zeros(self._tables.electrodes, np.uint8)
-        return Estimate(measured.scan, (), electrodes, measured.live, nothing, nothing, tuple(judgements))
+        return Estimate(measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements))

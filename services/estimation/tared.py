@@ -32,6 +32,8 @@ class TaredState:
 
     log_z0: Annotated[Array, "K"]
     live: Annotated[NDArray[np.bool_], "K"]
+    scatter: Annotated[Array, "K"]
+    frames: int
     noise: NoiseState
     drift: FilterState
     touches: TouchesState
@@ -43,8 +45,13 @@ class TaredState:
 class TaredSkin:
     """What stands on one baseline."""
 
-    def __init__(self, tables: SkinTables, log_z0: Array, live: NDArray[np.bool_]) -> None:
-        self.log_z0, self.live = log_z0, live
+    def __init__(
+        self, tables: SkinTables, log_z0: Array, live: NDArray[np.bool_], scatter: Array, frames: int
+    ) -> None:
+        """log_z0, live (K,): the baseline, and what of it counts; scatter (K,): of log |Z| from scan to scan, of which
+        the baseline is the mean of `frames`.
+        """
+        self.log_z0, self.live, self.scatter, self.frames = log_z0, live, scatter, frames
         self.tables = tables.relative_to(np.exp(log_z0))
         self.response = DiscResponse(self.tables)
         self.noise, self.drift = NoiseModel(self.tables), SkinFilter(self.tables)
@@ -59,9 +66,14 @@ class TaredSkin:
         """scans: those of the baseline."""
         self.noise.begin(scans.residuals, scans.part)
         self.noise.now.white = max(self.noise.now.white, scans.least_white)
-        count = len(scans.residuals)
-        self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / count)
+        self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / self.frames)
         self.touches.now.next_id = next_id
+
+    def adopt(self, next_id: int) -> None:
+        """The baseline was taken earlier, and nobody watched since."""
+        self.noise.now.white = float(np.median(self.scatter[self.live] ** 2))
+        self.drift.begin(0.0, np.full(self.tables.electrodes, n.CONTACT_START**2))
+        self.touches.now.next_id, self.touches.now.watched = next_id, False
 
     def forget_looks(self) -> None:
         """The untouched skin is another than at the last scans."""
@@ -74,6 +86,8 @@ class TaredSkin:
         return TaredState(
             log_z0=self.log_z0,
             live=self.live,
+            scatter=self.scatter,
+            frames=self.frames,
             noise=self.noise.now,
             drift=self.drift.now,
             touches=self.touches.now,

@@ -76,6 +76,7 @@ class TouchesState:
 
     tracks: list[TrackedTouch] = field(default_factory=list)
     next_id: int = 1
+    watched: bool = True  # the scan before was looked at: what a scan shows now began meanwhile
 
 
 class TouchTracks:
@@ -109,6 +110,7 @@ class TouchTracks:
 
     def lose(self) -> None:
         """Scans were lost: touches may be anywhere, or gone."""
+        self.now.watched = False
         for track in self.now.tracks:
             track.lost, track.still = True, 0
 
@@ -177,7 +179,7 @@ class TouchTracks:
         prior, state = fit.priors[k], fit.states[k]
         track = TrackedTouch(
             id=self.now.next_id,
-            began=True,
+            began=self.now.watched,
             born_s=at_s,
             at_s=at_s,
             state=state,

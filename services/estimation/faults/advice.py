@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frame_types import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA
+from services.estimation.advice import ADVICE, NO_ANSWER, listed, stuck_bit
 from services.estimation.faults.wires import WireFault, WireKind
 from services.estimation.values import numbers as n
 from services.estimation.values.judgement import Judgement, judge
@@ -38,4 +39,18 @@ def judgements_of(states: NDArray[np.uint8], status: NDArray[np.uint8], failed: 
     lost = int(np.isin(states, (OPEN, SHORT, DRIFTING, SWAPPED)).sum())
     found.append(judge("degraded", lost, n.DEGRADED))
     found.append(judge("too_many", lost, n.TOO_MANY))
+    return found
+
+
+def sentences(states: NDArray[np.uint8], wire: WireFault | None, silent: bool) -> list[str]:
+    """To a person: which electrodes (E,) are at fault, and what to do. silent: none of them answers."""
+    if silent:
+        return [NO_ANSWER]
+    if wire is not None and wire.kind is WireKind.STUCK:
+        return [stuck_bit(wire)]
+    found = []
+    for state, text in ADVICE.items():
+        named = np.flatnonzero(states == state).tolist()
+        if named:
+            found.append(text.format(listed(named)) + " (electrodes are numbered from 0)")
     return found

@@ -20,6 +20,9 @@ from services.estimation.values.scan import Scan
 
 Array = NDArray[np.float64]
 
+SHARED = 32  # scans that the scatter of all measurements counts as beside each one's own
+LEAST_SCATTER = 2e-6  # about half a step of the board's 18 bits
+
 UNSURE = (
     "this skin differs from its bundle by as much as a touch may make: see that nothing touches it and run `skin tare` "
     "once"
@@ -41,6 +44,15 @@ class AgreedScans(NamedTuple):
     part: int  # that they end with
     least_white: float  # variance of the noise that is assumed at least
     judgements: tuple[Judgement, ...]
+
+    @property
+    def scatter(self) -> Array:
+        """(K,) standard deviation from scan to scan: each measurement's own and that of all, as few scans tell it."""
+        own = self.residuals.var(axis=0, ddof=1)
+        n_own = len(self.residuals)
+        together = float(np.median(own[self.live])) if self.live.any() else 0.0
+        shrunk = (n_own * own + SHARED * together) / (n_own + SHARED)
+        return np.sqrt(np.maximum(shrunk, max(self.least_white, LEAST_SCATTER**2)))
 
 
 class Agreement(NamedTuple):
@@ -194,6 +206,10 @@ class Taring:
             self.latest.clear()
             return
         self.latest.add(np.log(np.where(live, scan.values, np.nan)), middle_s, scan.part)
+
+    def adopted(self) -> None:
+        """A baseline of before is used."""
+        self.now, self.latest = TaringState(), LatestScans()
 
     def saw(self, touched: bool) -> None:
         """Whether something touched in the latest whole scan."""

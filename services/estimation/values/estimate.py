@@ -47,6 +47,7 @@ class Estimate:
     """Of one scan. `valid` and `reasons` are computed from the judgements and what came with the scan."""
 
     scan: Scan
+    whole: bool  # it shares no value with the last one that was whole
     touches: tuple[TouchEstimate, ...]
     electrodes: NDArray[np.uint8]  # (E,) protocol.frame_types.ELECTRODE_STATES
     live: NDArray[np.bool_]  # (K,) measurements that count
@@ -63,6 +64,11 @@ class Estimate:
         said = judgement.reasons(self.judgements)
         return tuple(dict.fromkeys([*self.scan.reasons, *said]))
 
+    @cached_property
+    def touch(self) -> Judgement | None:
+        """Whether something touches; None before there is a baseline."""
+        return next((each for each in self.judgements if each.name == "touch"), None)
+
     @property
     def touched(self) -> bool:
-        return any(each.name == "touch" and each.verdict is Verdict.NOTE for each in self.judgements)
+        return self.touch is not None and self.touch.verdict is Verdict.NOTE

@@ -15,9 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.pressure import FOAM
+from models.pressure import Foam
+from protocol.frames import EstimatedTouch
 from services.contacts import patch_force
-from services.estimation.values.estimate import TouchEstimate
+from services.contacts.patch_force import PatchForce
 
 Array = NDArray[np.float64]
 
@@ -40,6 +41,7 @@ ACTION_SIGMA = 0.025  # relative: of the response of discs, 0.98 to 1.04 on anot
 MOST_ACTS = 2.2  # action over area: 2 where nothing conducts, and that response's error
 SPREAD = np.linspace(-2.4, 2.4, 9)  # sigmas of radius and action that are summed over
 WEIGHT = np.exp(-(SPREAD**2) / 2) / np.exp(-(SPREAD**2) / 2).sum()
+LEAST_RADIUS_M, LEAST_AREA = 1e-4, 1e-8  # m, m^2: no touch is smaller
 CREEPS, CREEPS_S = 0.05, 20.0  # relative: foam that yields while it is pressed, of a minute, and when
 
 
@@ -47,39 +49,51 @@ class Discs(NamedTuple):
     """Patches as the fit allows, flat."""
 
     weight: Array
-    area: Array  # unit^2
+    area: Array  # m^2
     drop: Array
 
 
-def force_of(touch: TouchEstimate, metres_per_unit: float) -> tuple[float, float]:
-    """Newtons and their sigma: the foam's pressure at a patch's drop over its area, a mean over the radii and actions
-    that the fit leaves, and over PATCHES and EDGES. A patch that may have saturated has a force from below only: its
-    sigma reaches to where the foam tells nothing more.
+def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None) -> PatchForce:
+    """The foam's pressure at a patch's drop over its area, a mean over the radii and actions that the fit leaves, and
+    over PATCHES and EDGES. A patch that may have saturated has a force from below only: its sigma reaches to where the
+    foam tells nothing more. area [m^2]: of what presses, where it is known.
     """
-    found = [
-        _through(_seen_as(touch, patch), edge / metres_per_unit, share) for patch in PATCHES for share, edge in EDGES
-    ]
-    weight = np.concatenate([each.weight for each in found])
-    if not weight.any():  # more than any patch does: a disc that conducts nothing
-        disc = _seen_as(touch, PATCHES[0])
-        found, weight = [disc], np.ones(disc.area.size) / disc.area.size
+    if area is not None:
+        weight, each = _of_area(touch, area)
+    else:
+        found = [_through(_seen_as(touch, patch), edge, share) for patch in PATCHES for share, edge in EDGES]
+        weight = np.concatenate([one.weight for one in found])
+        if not weight.any():  # more than any patch does: a disc that conducts nothing
+            disc = _seen_as(touch, PATCHES[0])
+            found, weight = [disc], np.ones(disc.area.size) / disc.area.size
+        each = Discs(weight, np.concatenate([one.area for one in found]), np.concatenate([one.drop for one in found]))
     weight = weight / weight.sum()
-    square_metres = np.concatenate([each.area for each in found]) * metres_per_unit**2
-    drop = np.minimum(np.concatenate([each.drop for each in found]), patch_force.FULL)
-    pressure = FOAM.pressure(drop)
-    forces = square_metres * pressure
-    most = square_metres * (FOAM.pressure(patch_force.FULL) - pressure) * (drop > patch_force.BLIND)
-    mean = float(weight @ forces)
-    spread = float(weight @ ((forces - mean) ** 2 + most**2 / 3))
-    creeps = CREEPS * (1 - math.exp(-touch.age_s / CREEPS_S))
-    return mean, math.sqrt(spread + (creeps * mean) ** 2)
+    drop = np.minimum(each.drop, patch_force.FULL)
+    pressure = foam.pressure(drop)
+    beyond = (float(foam.pressure(patch_force.FULL)) - pressure) * (drop > patch_force.BLIND)
+    creeps = CREEPS * (1 - math.exp(-max(touch.age_s, 0.0) / CREEPS_S))
+    return PatchForce(*_moments(each.area * pressure, weight, each.area * beyond, creeps), *_moments(pressure, weight, beyond, creeps))
 
 
-def _seen_as(touch: TouchEstimate, patch: PatchKind) -> Discs:
+def _moments(values: Array, weight: Array, beyond: Array, creeps: float) -> tuple[float, float]:
+    """Mean and standard deviation; beyond: by how much more each may be; creeps: relative, of them all."""
+    mean = float(weight @ values)
+    variance = float(weight @ ((values - mean) ** 2 + beyond**2 / 3))
+    return mean, math.sqrt(variance + (creeps * mean) ** 2)
+
+
+def _of_area(touch: EstimatedTouch, area: float) -> tuple[Array, Discs]:
+    """Under an indenter of known area: only how strongly it acts is open."""
+    action_sd = math.hypot(touch.strength_sigma, ACTION_SIGMA * touch.strength)
+    seen = np.maximum(touch.strength + action_sd * SPREAD, 0.0) / area
+    drop = np.minimum(_drop(seen), patch_force.TOLD)
+    return WEIGHT, Discs(WEIGHT, np.full(drop.shape, area), drop)
+
+
+def _seen_as(touch: EstimatedTouch, patch: PatchKind) -> Discs:
     """Patches of sharp edges that spread and act as the touch does."""
-    radius_sd = math.sqrt(max(touch.covariance[2, 2], 0.0))
-    action_sd = math.hypot(touch.strength_sd, ACTION_SIGMA * touch.strength)
-    log_radius = touch.log_radius + radius_sd * SPREAD[:, None]
+    action_sd = math.hypot(touch.strength_sigma, ACTION_SIGMA * touch.strength)
+    log_radius = math.log(max(touch.radius_m, LEAST_RADIUS_M)) + touch.radius_sigma * SPREAD[:, None]
     area = math.pi * np.exp(2 * log_radius) / patch.spread
     seen = np.maximum(touch.strength + action_sd * SPREAD, 0.0) / area
     acts = seen
@@ -90,10 +104,10 @@ def _seen_as(touch: TouchEstimate, patch: PatchKind) -> Discs:
 
 
 def _through(seen: Discs, edge: float, share: float) -> Discs:
-    """The same whose edges are soft by `edge` [unit]: patches that are smaller, of as much drop in all."""
+    """The same whose edges are soft by `edge` [m]: patches that are smaller, of as much drop in all."""
     if not edge:
         return seen._replace(weight=share * seen.weight)
-    area = np.maximum(seen.area - 4 * math.pi * edge**2, 1e-9)
+    area = np.maximum(seen.area - 4 * math.pi * edge**2, LEAST_AREA)
     drop = seen.drop * seen.area / area
     return Discs(share * seen.weight * (drop < 1.0), area, np.minimum(drop, 1.0))
 
