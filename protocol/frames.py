@@ -54,7 +54,8 @@ from .topics import TOPIC_OF, TOPICS
 __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "KINDS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
-    "BegunTouch", "Contact", "ContactFrame", "DeltaFrame", "EstimatedTouch", "FollowedTouch", "ForceFrame", "Frame", "FrameError",
+    "BegunTouch", "Contact", "ContactFrame", "DeltaFrame", "EstimatedTouch", "FollowedTouch", "ForceFrame",
+    "Frame", "FrameError",
     "ImageFrame", "InfoFrame", "LocatedTouch", "PartFrame", "RawFrame", "ReferenceFrame", "RefinedTouch", "ShapeFrame",
     "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
 ]  # fmt: skip

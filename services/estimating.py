@@ -1,7 +1,7 @@
 """Preprocessing by one model: from impedances to the touches that explain them, and to what an image is made of.
 
-    scan -> Estimator (services/estimation/estimator.py) -> Estimate: touches, what is left, judgements
-    difference -> stack of images, where something touches and changed: the network's input
+scan -> Estimator (services/estimation/estimator.py) -> Estimate: touches, what is left, judgements
+difference -> stack of images, where something touches and changed: the network's input
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ class Estimating(Stage):
         """What stands on the bundle in use."""
         self.bundle, skin = self.linearisation.bundle, self.config
         self.estimator = Estimator(skin_tables(self.bundle))
-        self._pre = self.bundle.prereconstructor()
+        self.pre = self.bundle.prereconstructor()
         allowed = Drift(skin.tare.scale_per_s * REST_S, skin.tare.contact_per_s * REST_S)
-        self._reconstruction = Reconstruction(self._pre, allowed, skin.touch.false_alarms)
+        self._reconstruction = Reconstruction(self.pre, allowed, skin.touch.false_alarms)
 
     def reset(self) -> None:
         self.estimator = Estimator(skin_tables(self.bundle))
@@ -97,7 +97,7 @@ class Estimating(Stage):
 
     def _sigma(self, baseline: Baseline) -> Array:
         """(K,) of the difference, one scan."""
-        return np.asarray(baseline.sigma / self._pre.normaliser(baseline.z0))
+        return np.asarray(baseline.sigma / self.pre.normaliser(baseline.z0))
 
     # --- one scan, or the newest values after a part of one ---
 
@@ -152,7 +152,7 @@ class Estimating(Stage):
         self._counters["touched"] += out.touched
         live = estimate.live & np.isfinite(self._reconstruction.sigma)
         z0 = baseline.z0 * np.exp(self._shift(estimate.scan))
-        d = np.where(live, z0 * np.expm1(estimate.difference) / self._pre.normaliser(z0), 0.0)
+        d = np.where(live, z0 * np.expm1(estimate.difference) / self.pre.normaliser(z0), 0.0)
         out.difference = d.astype(np.float32)
         out.sigma = np.where(live, self._reconstruction.sigma, np.inf).astype(np.float32)
         if not out.touched:
@@ -258,7 +258,7 @@ class Estimating(Stage):
     def set_baseline(self, baseline: Baseline, age_s: float = 0.0) -> None:
         """Use this baseline, which is age_s older than the next scan, from that scan on."""
         live = np.isfinite(baseline.sigma) & (baseline.z0 > 0)
-        z0 = np.where(live, baseline.z0, self._pre.m.z0)
+        z0 = np.where(live, baseline.z0, self.pre.m.z0)
         scatter = np.where(live, baseline.sigma / z0, 0.0)
         self.estimator.adopt(KnownBaseline(np.log(z0), live, scatter, baseline.frames), age_s)
         self._use(baseline)

@@ -59,6 +59,10 @@ class EstimatorStage(Stage):
         self.touch_detector = self.touch_estimator.touch_detector
         self.pre = self.baseline_estimator.pre
 
+    @property
+    def baseline(self) -> Baseline | None:
+        return self.baseline_estimator.baseline
+
     def between_frames(self) -> None:
         """A calibration that is ready is adopted while nothing touches."""
         if not self.linearisation.follows(self.touch_estimator.touched):

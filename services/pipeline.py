@@ -45,7 +45,11 @@ class Pipeline:
     """raw -> delta -> image -> contact, one frame at a time, by the very objects that the processes run."""
 
     def __init__(
-        self, skin: Skin | str, name: str = "skin", bundle: Bundle | None = None, always_reconstruct: bool = False,
+        self,
+        skin: Skin | str,
+        name: str = "skin",
+        bundle: Bundle | None = None,
+        always_reconstruct: bool = False,
         build: Callable[[str, Skin, Bundle], Stages] = build_stages,
     ):
         """skin: a configured one, or the name or path of a bundle. always_reconstruct: each frame by itself, an

@@ -139,7 +139,8 @@ class TouchPublishing(Stage):
         if frame.refined is None or len(frame.estimates) != 1:
             self._fit = None
         elif self._fit is None or self._fit[0].scan != frame.refined.scan:
-            self._fit = frame.refined, *frame.estimates[0].position
+            x, y = frame.estimates[0].position
+            self._fit = frame.refined, x, y
 
     def _contacts(self, frame: ImageFrame | PartFrame, valid: bool) -> list[Contact]:
         """Those that are there, strongest first, then those that ended."""

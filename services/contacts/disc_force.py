@@ -72,7 +72,9 @@ def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None) -> Pa
     pressure = foam.pressure(drop)
     beyond = (float(foam.pressure(patch_force.FULL)) - pressure) * (drop > patch_force.BLIND)
     creeps = CREEPS * (1 - math.exp(-max(touch.age_s, 0.0) / CREEPS_S))
-    return PatchForce(*_moments(each.area * pressure, weight, each.area * beyond, creeps), *_moments(pressure, weight, beyond, creeps))
+    return PatchForce(
+        *_moments(each.area * pressure, weight, each.area * beyond, creeps), *_moments(pressure, weight, beyond, creeps)
+    )
 
 
 def _moments(values: Array, weight: Array, beyond: Array, creeps: float) -> tuple[float, float]:

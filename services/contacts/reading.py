@@ -76,5 +76,7 @@ class Appearances:
 
 def _round(x: float, y: float, radius: float) -> list[list[float]]:
     angle = 2 * np.pi * np.arange(CORNERS) / CORNERS
-    corners: Sequence[Sequence[float]] = np.column_stack([x + radius * np.cos(angle), y + radius * np.sin(angle)]).tolist()
+    corners: Sequence[Sequence[float]] = np.column_stack(
+        [x + radius * np.cos(angle), y + radius * np.sin(angle)]
+    ).tolist()
     return [list(corner) for corner in corners]

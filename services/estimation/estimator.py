@@ -498,9 +498,13 @@ class Estimator:
         judgements.append(judge("changing", changing, 1.0))
         judgements.append(judge("explained", self.now.unexplained_s, n.CHANGING_S))
         electrodes = np.zeros(self._tables.electrodes, np.uint8) if self.skin is None else self.skin.faults.states()
-        return Estimate(measured.scan, measured.whole, said, electrodes, measured.live, difference, sigma, tuple(judgements))
+        return Estimate(
+            measured.scan, measured.whole, said, electrodes, measured.live, difference, sigma, tuple(judgements)
+        )
 
     def _unknown(self, measured: LookedAt, judgements: list[Judgement]) -> Estimate:
         """There is no baseline."""
         nothing, electrodes = np.zeros(self._tables.measurements), np.zeros(self._tables.electrodes, np.uint8)
-        return Estimate(measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements))
+        return Estimate(
+            measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements)
+        )

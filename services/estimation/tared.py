@@ -45,9 +45,7 @@ class TaredState:
 class TaredSkin:
     """What stands on one baseline."""
 
-    def __init__(
-        self, tables: SkinTables, log_z0: Array, live: NDArray[np.bool_], scatter: Array, frames: int
-    ) -> None:
+    def __init__(self, tables: SkinTables, log_z0: Array, live: NDArray[np.bool_], scatter: Array, frames: int) -> None:
         """log_z0, live (K,): the baseline, and what of it counts; scatter (K,): of log |Z| from scan to scan, of which
         the baseline is the mean of `frames`.
         """

@@ -163,7 +163,7 @@ def _beside_references(
             pipeline.pre.process(frame, ALL)
         frame.scan += 1
         _store(out, row, pipeline.run(frame))
-        lost += pipeline.pre.baseline_estimator.baseline is None
+        lost += pipeline.pre.baseline is None
     if lost:
         warn(f"{lost} of {len(out['valid'])} rows are not valid: their `reference` gives too few measurements")
 

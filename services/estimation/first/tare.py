@@ -52,7 +52,7 @@ class AgreedScans(NamedTuple):
         n_own = len(self.residuals)
         together = float(np.median(own[self.live])) if self.live.any() else 0.0
         shrunk = (n_own * own + SHARED * together) / (n_own + SHARED)
-        return np.sqrt(np.maximum(shrunk, max(self.least_white, LEAST_SCATTER**2)))
+        return np.asarray(np.sqrt(np.maximum(shrunk, max(self.least_white, LEAST_SCATTER**2))))
 
 
 class Agreement(NamedTuple):
