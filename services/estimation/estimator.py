@@ -182,7 +182,7 @@ class Estimator:
         """What touches, by this scan and those before it."""
         now = self.now
         oldest_us = scan.end_us - 1e6 * scan.duration_s
-        whole = oldest_us >= now.whole_us - 1.0 or scan.end_us < now.whole_us
+        whole = not scan.part or oldest_us >= now.whole_us - 1.0 or scan.end_us < now.whole_us
         gap_s = 0.0 if now.before is None else (scan.at_ns - now.before.at_ns) * 1e-9
         now.before = scan
         if whole:

@@ -232,6 +232,8 @@ class BoardFaults:
             cost = _cost(change)
             if found.score + cost < sure or not self._apart(change, found):
                 continue
+            if isinstance(change, GainChange) and abs(float(column @ found.pulled)) * n.GAIN_CHANGES < n.GAIN_LEAST:
+                continue  # the touches of the answer explain all of it
             plainly = found.chi2 < n.MOST and found.score + cost > answer.score + n.WIRE_SURE
             if not (found.holds or plainly):
                 continue
