@@ -34,6 +34,11 @@ def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> tuple[P
     return Preprocessing(name, skin, bundle), Inference(name, skin, bundle), Publishing(name, skin, bundle)
 
 
+def explains(bundle: Bundle) -> bool:
+    """Whether the response of this bundle's skins is known well enough for the measurements to tell the touches."""
+    return bundle.has_response and bundle.matrices.normalisation == "model"
+
+
 def build_anew(name: str, skin: Skin, bundle: Bundle) -> tuple[Estimating, Inference, TouchPublishing]:
     """Those that are to take over: what touches is told by the measurements, what it looks like by the image."""
     inference = Inference(name, skin, bundle)
@@ -50,16 +55,17 @@ class Pipeline:
         name: str = "skin",
         bundle: Bundle | None = None,
         always_reconstruct: bool = False,
-        build: Callable[[str, Skin, Bundle], Stages] = build_stages,
+        build: Callable[[str, Skin, Bundle], Stages] | None = None,
     ):
         """skin: a configured one, or the name or path of a bundle. always_reconstruct: each frame by itself, an
-        image of untouched ones too. build: makes the stages.
+        image of untouched ones too. build: makes the stages; None: `build_stages`.
         """
         if isinstance(skin, str):
             skin = Skin(port="stub", bundle=skin, frame_id=name)
         self.name = name
         self.delta: DeltaFrame | None = None  # the newest one; parts of scans come between two of them
         self.image: ImageFrame | None = None  # the newest one
+        build = build or build_stages
         self.pre, self.inference, self.publishing = build(name, skin, bundle or Bundle.load(skin.bundle))
         self.pre.always_reconstruct = self.inference.each_alone = self.publishing.each_alone = always_reconstruct
 
