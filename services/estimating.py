@@ -17,6 +17,7 @@ from models.bundle import Bundle
 from models.measurement.tables import SkinTables, tables_of
 from models.prereconstruction import Drift
 from protocol.frames import DeltaFrame, EstimatedTouch, Frame, PartFrame, RawFrame, as_sent
+from services.contacts.lasting import LASTS_NS
 from services.describe import BaselineNews, FrameRate, describe, force, refinement, symmetry
 from services.estimation import checks
 from services.estimation.by_bundle import ByBundle
@@ -81,7 +82,8 @@ class Estimating(Stage):
         self._foreign = self._problem = self._source = self._board = ""
         self._before: Scan | None = None
         self._electrodes = np.zeros(0, np.uint8)
-        self._touched = self._told = self._keep = self._silent = False
+        self._touched = self._keep = self._silent = False
+        self._told_ns = -LASTS_NS  # `sample` of the last message that said something of touches
         self._part = (-1, -1)  # messages last seen, and last handed on
         self._delta = 0  # scan of the last delta frame
         self._sample_ns, self._since_saved = 0, 0
@@ -132,12 +134,19 @@ class Estimating(Stage):
 
     def _part_of(self, out: DeltaFrame, estimate: Estimate) -> list[Frame]:
         """Of parts in which nothing touches none travels on."""
-        touches = self._said(estimate)
-        told, self._told = self._told, bool(touches) or (self._told and not estimate.valid)
-        if not (touches or told):
+        if not self._tells(out, estimate):
             return []
         self._part = (out.scan, out.scan)
-        return [PartFrame(**inherited(out), after=self._delta, estimates=touches)]
+        return [PartFrame(**inherited(out), after=self._delta, estimates=self._said(estimate))]
+
+    def _tells(self, out: DeltaFrame, estimate: Estimate) -> bool:
+        """Whether something is to be said of touches; an end for as long as readers are to see it."""
+        now_ns = out.stamps.get("sample", 0)
+        if estimate.touches:
+            self._told_ns = now_ns
+        elif not estimate.valid and now_ns - self._told_ns < LASTS_NS:
+            self._told_ns = now_ns
+        return 0 <= now_ns - self._told_ns < LASTS_NS
 
     def _delta_of(self, out: DeltaFrame, estimate: Estimate) -> DeltaFrame:
         baseline, touch = self.baseline, estimate.touch
@@ -147,7 +156,7 @@ class Estimating(Stage):
             return _blank(out, len(self.bundle.pattern))
         out.estimates = self._said(estimate)
         out.touched = self._touched = estimate.touched or bool(out.estimates)
-        self._told = bool(out.estimates)
+        self._tells(out, estimate)
         out.score, out.threshold = touch.statistic, touch.expected
         self._counters["touched"] += out.touched
         live = estimate.live & np.isfinite(self._reconstruction.sigma)
@@ -247,7 +256,7 @@ class Estimating(Stage):
         self._use(self._taken("command"))
         assert self.baseline is not None
         self._keep = True
-        self._touched = self._told = False
+        self._touched = False
         relative = float(np.median(self.baseline.sigma / np.maximum(self.baseline.z0, 1e-12)))
         wanted = self.config.tare.calibrate and args.get("calibrate", True)
         calibrating = wanted and self.linearisation.tared(self.baseline)
@@ -318,7 +327,7 @@ class Estimating(Stage):
         baseline = self.baseline
         return {
             "touched": self._touched,
-            "told": self._told,
+            "told_ns": self._told_ns,
             "continuity": self.continuity.state(),
             "hold": self._reconstruction.state(),
             "estimator": self.estimator.state(),
@@ -356,7 +365,7 @@ class Estimating(Stage):
         self._before = self.estimator.now.before
         self._reconstruction.load(state["hold"])
         self.continuity.load(state["continuity"])
-        self._touched, self._told = bool(state["touched"]), bool(state["told"])
+        self._touched, self._told_ns = bool(state["touched"]), int(state["told_ns"])
         seen, handed, self._delta = (int(each) for each in state["parts"])
         self._part = (seen, handed)
         self._source, self._board = (str(each) for each in state["source"])

@@ -26,7 +26,7 @@ from protocol.frames import (
 from protocol.held import ANY, HeldImage
 from services.contacts.after_gap import AfterGap
 from services.contacts.begun import begun, possible, without_image
-from services.contacts.contact_writer import ContactWriter, class_probabilities, confidence
+from services.contacts.contact_writer import ContactWriter, confidence
 from services.contacts.following import Following
 from services.contacts.force import ForceLaw
 from services.contacts.invalid_spell import InvalidSpell
@@ -37,7 +37,7 @@ from services.contacts.outline import outline
 from services.contacts.placing import placement
 from services.contacts.refined import area_of_image, both, refined_outline
 from services.contacts.registered import measures_force, patches
-from services.contacts.segmentation import Segment, readable, segment
+from services.contacts.segmentation import Segment, class_probabilities, readable, segment
 from services.contacts.tracking import Tracker
 from services.describe import geometry
 from services.estimation.quality import NEARLY, SURE

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from protocol.frames import SHAPES, Contact, EstimatedTouch, ImageFrame, LocatedTouch, RefinedTouch
 from services.contacts.force import Force, ForceLaw, Look
 from services.contacts.motion import Patch, Track
+from services.contacts.reading import Appearance
 from services.contacts.refined import agrees, refined, settled
 from services.contacts.registered import registered
 from services.contacts.segmentation import Segment
 from services.contacts.surface import Placed, Placement
-
-if TYPE_CHECKING:
-    from services.contacts.reading import Appearance
 
 
 class ContactWriter:
@@ -121,19 +117,6 @@ class ContactWriter:
                 Contact(id=t.id, state="end", position=where, normal=normal, force_n=force, confidence=0.0, sheet=sheet)
             )
         return ends
-
-
-def class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float]:
-    """Mean over the touch of the per-pixel class probabilities (5, h, w), which are on a coarser grid; [] where there
-    are none.
-    """
-    if not classes.size or not (classes.min() >= 0 and classes.max() <= 1.001):  # NaN compares false
-        return []
-    y, x = np.nonzero(s.mask)
-    count, h, w = classes.shape
-    pixels = np.bincount(y * h // s.mask.shape[0] * w + x * w // s.mask.shape[1], minlength=h * w)
-    total = classes.reshape(count, h * w) @ pixels.astype(np.float32)
-    return [min(1.0, float(p)) for p in total / max(float(total.sum()), 1e-9)]
 
 
 def _wrench(at: Placed, force: float) -> list[float]:

@@ -99,6 +99,19 @@ def divided(image: Image, sigma: Image, places: Sequence[Place]) -> list[Segment
     return found
 
 
+def class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float]:
+    """Mean over the touch of the per-pixel class probabilities (5, h, w), which are on a coarser grid; [] where there
+    are none.
+    """
+    if not classes.size or not (classes.min() >= 0 and classes.max() <= 1.001):  # NaN compares false
+        return []
+    y, x = np.nonzero(s.mask)
+    count, h, w = classes.shape
+    pixels = np.bincount(y * h // s.mask.shape[0] * w + x * w // s.mask.shape[1], minlength=h * w)
+    total = classes.reshape(count, h * w) @ pixels.astype(np.float32)
+    return [min(1.0, float(p)) for p in total / max(float(total.sum()), 1e-9)]
+
+
 def _box(high: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Rows and columns round all high pixels, with a margin: empty pixels cost time too."""
     spans = []

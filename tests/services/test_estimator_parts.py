@@ -59,9 +59,8 @@ def costs(
     for raw in Board(curve, PARTS, 1).frames(seconds):
         raw.status[list(dead)] = 1
         with counted(patch) as found:
-            frame = candidate.step(raw)
-        assert frame is not None
-        made.append((at_s(frame), found["steps"], found["factors"]))
+            candidate.step(raw)
+        made.append((at_s(raw), found["steps"], found["factors"]))
     return made
 
 
@@ -116,8 +115,7 @@ def test_measurements_that_the_baseline_lacks_are_no_fault_of_the_wires(parts: i
     made = []
     for raw in Board(press(TOUCH), parts, 1).frames(FREE_S + 0.6):
         raw.status[[3, 40]] = 1
-        frame = candidate.step(raw)
-        assert frame is not None
-        made.append(frame)
+        if (frame := candidate.step(raw)) is not None:  # a part in which nothing touches makes none
+            made.append(frame)
     assert all(frame.valid and lasting(frame) == 1 for frame in between_s(made, FREE_S + 0.3, 99))
     assert all(frame.valid and not frame.contacts for frame in between_s(made, FREE_S - 0.3, FREE_S))
