@@ -1,22 +1,28 @@
-"""The estimator built anew as a candidate for the shadow: contact frames of its estimates alone, without an image."""
+"""The estimator built anew as a candidate for the shadow: contact frames of its estimates alone, without an image. A tare
+by command calibrates the mounting as the service's does.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import math
+import os
+import time
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.trust.candidate import FIT_S
 from bench.trust.disc_force import force_of
 from models.bundle import Bundle
 from models.measurement.tables import tables_of
 from protocol.frames import Contact, ContactFrame, RawFrame
 from services.contacts.lasting import LastingStates
 from services.estimation.estimator import Estimator
-from services.estimation.first.tare import TareRefused
+from services.estimation.first.tare import AgreedScans, TareRefused
+from services.estimation.tare import Baseline
 from services.estimation.values.estimate import Estimate, TouchEstimate
 from services.estimation.values.scan import Scan
+from services.linearisation import Linearisation
 from services.runtime.config import Skin
 
 Array = NDArray[np.float64]
@@ -29,19 +35,29 @@ class Anew:
     """Of one skin; see bench.trust.candidate.Candidate."""
 
     def __init__(self, skin: Skin, bundle: Bundle) -> None:
-        self._skin, self._metres = skin, bundle.metres_per_unit
+        self._skin, self._bundle, self._metres = skin, bundle, bundle.metres_per_unit
         self._tables = tables_of(bundle)
         self.reset()
 
     def reset(self) -> None:
         self.estimator = Estimator(self._tables)
+        self.linearisation = Linearisation(f"anew-{os.getpid()}", self._bundle)  # others keep what theirs found
         self._lasting = LastingStates()
         self._before: Scan | None = None
         self._shown: dict[int, Contact] = {}
 
     def tare(self) -> None:
-        with contextlib.suppress(TareRefused):
-            self.estimator.tare()
+        try:
+            scans = self.estimator.tare()
+        except TareRefused:
+            return
+        if not self._skin.tare.calibrate or not self.linearisation.tared(baseline_of(scans)):
+            return
+        waited = time.monotonic() + FIT_S
+        while self.linearisation.busy and time.monotonic() < waited:
+            if self.linearisation.follows(self.estimator.touched):
+                self.estimator.use(tables_of(self.linearisation.bundle))
+            time.sleep(0.02)
 
     @property
     def refused(self) -> bool:
@@ -50,6 +66,8 @@ class Anew:
     def step(self, raw: RawFrame) -> ContactFrame | None:
         if not len(raw.z):
             return None
+        if self.linearisation.follows(self.estimator.touched):
+            self.estimator.use(tables_of(self.linearisation.bundle))
         scan = Scan.of(raw, self._before)
         self._before = scan
         estimate = self.estimator.step(scan)
@@ -94,3 +112,11 @@ class Anew:
             force_sigma_n=sigma,
             position_sigma=[float(long), float(short), math.atan2(vectors[1, 1], vectors[0, 1])],
         )
+
+
+def baseline_of(scans: AgreedScans) -> Baseline:
+    """As a fit of the mounting takes it."""
+    z0 = np.exp(scans.log_z0)
+    noise = z0 * scans.residuals.std(axis=0, ddof=1)
+    sigma = np.where(scans.live, np.maximum(noise, z0 * scans.least_white**0.5), np.inf)
+    return Baseline(z0, sigma, len(scans.residuals), board="", taken_ns=0, taken_by="command")
