@@ -8,8 +8,8 @@ The hash covers the bundle's hash and every byte of the piece. The network files
 
 from __future__ import annotations
 
-import hashlib
 import dataclasses
+import hashlib
 import io
 import json
 from collections.abc import Mapping

@@ -1,5 +1,6 @@
-"""The estimator built anew as a candidate for the shadow: contact frames of its estimates alone, without an image. A tare
-by command calibrates the mounting as the service's does.
+"""The estimator built anew as a candidate for the shadow: contact frames of its estimates alone, without an image.
+
+A tare by command calibrates the mounting, as the service's does.
 """
 
 from __future__ import annotations

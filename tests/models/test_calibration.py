@@ -9,8 +9,15 @@ import pytest
 
 from models import geometry
 from models.bundle import Bundle
-from models.calibration import TooFewMeasured, calibrated, fit
+from models.calibration import TooFewMeasured, calibrated, fields_as_mounted, fit
+from models.calibration_file import CalibrationFileError, pack, unpack
 from models.forward import ForwardModel
+from models.measurement.course import TouchCourse
+from models.measurement.disc import DiscResponse
+from models.measurement.fit import FittedScan, TouchFitter
+from models.measurement.numbers import MISFIT, MISFIT_FAR
+from models.measurement.tables import SkinTables, tables_of
+from models.measurement.touch import anywhere, plain
 from models.mismatch import Mismatch, MismatchedSheet, mounted, named
 from models.mounted import FieldModes, Mounting, Predicted, most_shift
 from models.prereconstruction import Matrices, PreReconstructor
@@ -142,3 +149,52 @@ def test_a_pixel_knows_its_elements_without_a_plotting_library(skin: geometry.Sk
         sides = np.stack([left(a, b), left(b, c), left(c, a)])
         inside = np.flatnonzero((sides >= 0).all(axis=0) | (sides <= 0).all(axis=0))
         assert (found[k] == -1) if not len(inside) else (found[k] in inside)
+
+
+@pytest.mark.slow
+def test_fields_about_the_file_are_those_of_its_response_tables(skin: geometry.SkinGeometry) -> None:
+    made, shipped = fields_as_mounted(skin, Mounting.nominal(skin, FieldModes(skin).count)), Bundle.load("square16")
+    np.testing.assert_allclose(made, shipped.response().fields, rtol=2e-3, atol=2e-3)
+
+
+def left_of_touches(tables: SkinTables, mismatch: Mismatch) -> float:
+    """Median share of a touch's change that the best disc leaves."""
+    found, z0 = [], measured(mismatch)
+    own = tables.relative_to(z0)
+    course = TouchCourse(DiscResponse(own), np.zeros(len(z0)), 0.04)
+    for x, y in ((0.0, 0.0), (0.5, 0.3), (-0.4, 0.6), (0.2, -0.7), (-0.6, -0.5)):
+        y_seen = np.log(measured(mismatch, (Shape("circle", x, y, 0.2, 0.3),)) / z0)
+        scene = FittedScan(y_seen, 1e-8 * np.eye(len(z0)), course, own.misfit, len(z0))
+        prior = anywhere(x, y, 0.0, 0.04)
+        prior.sd[4:] = 1e-6
+        fit_of_it = TouchFitter(scene, [plain(prior)]).fit(30)
+        found.append(np.linalg.norm(fit_of_it.left) / np.linalg.norm(y_seen))
+    return float(np.median(found))
+
+
+@pytest.mark.slow
+def test_discs_of_a_calibrated_skin_leave_what_its_tables_say(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
+    """Of a skin that its file describes a few per cent wrong."""
+    bundle, mismatch = Bundle.load("square16"), named("mild")
+    z0 = measured(mismatch)
+    mounting = fit(skin, matrices, z0, 1e-5 * z0).mounting
+    as_mounted = mounting.skin(skin).to_dict()
+    said = {"bundle_hash": bundle.hash}
+    whole = pack(calibrated(matrices, skin, mounting), as_mounted, said, fields_as_mounted(skin, mounting))
+    tables = tables_of(unpack(whole, bundle)).relative_to(z0)
+    assert tables.wrong < 1.5 * MISFIT
+    left, of_the_file = (left_of_touches(each, mismatch) for each in (tables, tables_of(bundle)))
+    assert left < 2 * tables.wrong and left < 0.3 * of_the_file
+    older = tables_of(unpack(pack(calibrated(matrices, skin, mounting), as_mounted, said), bundle))
+    assert older.wrong == MISFIT_FAR and left_of_touches(older, mismatch) < 0.5 * of_the_file
+
+
+@pytest.mark.parametrize("shape", [(2, 2304, 15), (2, 2303, 16), (2, 2304)])
+def test_fields_of_another_skin_are_refused(matrices: Matrices, shape: tuple[int, ...]) -> None:
+    bundle = Bundle.load("square16")
+    packed = pack(matrices, bundle.skin, {"bundle_hash": bundle.hash}, np.ones(shape, np.float32))
+    with pytest.raises(CalibrationFileError, match="fields"):
+        unpack(packed, bundle)
+    packed = pack(matrices, bundle.skin, {"bundle_hash": bundle.hash}, np.full((2, 2304, 16), np.nan, np.float32))
+    with pytest.raises(CalibrationFileError, match="NaN"):
+        unpack(packed, bundle)
