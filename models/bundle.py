@@ -66,6 +66,7 @@ class Bundle:
     matrices: Matrices
     hash: str  # of the whole: sha256 of manifest.json, which holds the hashes of everything else; as SHA256 says
     locator: LocatorArrays | None = None  # of a registered skin: what finds touches by the measured response map
+    mounted_fields: npt.NDArray[np.float32] | None = None  # of a calibrated one: its response tables' as it is mounted
 
     @property
     def name(self) -> str:

@@ -2,6 +2,7 @@
 
     found = fit(skin, bundle.matrices, z0, sigma)      # a few guarded Gauss-Newton steps; seconds
     matrices = calibrated(bundle.matrices, skin, found.mounting)
+    fields = fields_as_mounted(skin, found.mounting)     # those of the response tables
 
 |Z0| is explained by contact impedances, electrode shifts, a smooth field and anisotropy (models/mounted.py), each held
 by its prior. A step is computed from four fifths of the measurements and counts only if the misfit of the fifth that it
@@ -20,6 +21,7 @@ from models.geometry import SkinGeometry
 from models.linearise import linearise
 from models.mounted import FieldModes, Mounting, Predicted, most_shift
 from models.prereconstruction import Matrices
+from models.response_tables import mounted_fields
 from protocol.errors import EitskinError
 
 Array = NDArray[np.float64]
@@ -112,6 +114,12 @@ def calibrated(matrices: Matrices, skin: SkinGeometry, mounting: Mounting, mesh:
         level=matrices.level,
         scale_index=matrices.scale_index,
     )
+
+
+def fields_as_mounted(skin: SkinGeometry, mounting: Mounting, mesh: str = MESH) -> NDArray[np.float32]:
+    """(2, F * F, E) fields of the bundle's response tables, of the skin as it is mounted."""
+    now = Predicted(skin, replace(mounting, log_gain=0.0), FieldModes(skin), mesh)
+    return mounted_fields(now.model, now.tensors, now.solution.potentials)
 
 
 def _step(derivative: Array, left: Array, variance: Array, used: NDArray[np.bool_], state: Mounting) -> Array:

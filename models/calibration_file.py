@@ -8,11 +8,12 @@ The hash covers the bundle's hash and every byte of the piece. The network files
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,18 +28,25 @@ from protocol.errors import EitskinError
 SCHEMA = 1
 MOST_BYTES = 32 * 1024 * 1024  # unpacked
 KEY = "calibration"  # in the manifest: what the fit found, as `said`
+FIELDS = "fields"  # older calibrations have none
 
 
 class CalibrationFileError(EitskinError):
     """A calibration that cannot be used; says what was found and what to do."""
 
 
-def pack(matrices: Matrices, skin: Mapping[str, Any], said: Mapping[str, Any]) -> bytes:
-    """skin: the geometry as mounted (`SkinGeometry.to_dict`); said: what the fit found, with `bundle_hash`."""
-    arrays: dict[str, Any] = {f.name: np.asarray(getattr(matrices, f.name)) for f in fields(Matrices)}
+def pack(
+    matrices: Matrices, skin: Mapping[str, Any], said: Mapping[str, Any], fields: NDArray[np.float32] | None = None
+) -> bytes:
+    """skin: the geometry as mounted (`SkinGeometry.to_dict`); said: what the fit found, with `bundle_hash`; fields: as
+    `Bundle.mounted_fields`.
+    """
+    arrays: dict[str, Any] = {f.name: np.asarray(getattr(matrices, f.name)) for f in dataclasses.fields(Matrices)}
     lower = np.tril_indices(len(matrices.gram))  # it is symmetric: a state with the whole would be too large to send
     arrays["gram"] = np.asarray(matrices.gram)[lower]
     text = json.dumps({"schema": SCHEMA, "skin": dict(skin), **said}, allow_nan=False)
+    if fields is not None:
+        arrays[FIELDS] = fields.astype(np.float16)  # as response.npz has them
     out = io.BytesIO()
     np.savez_compressed(out, said=np.frombuffer(text.encode(), np.uint8), **arrays)
     return out.getvalue()
@@ -51,6 +59,7 @@ def unpack(packed: bytes, bundle: Bundle) -> Bundle:
         said = json.loads(arrays.pop("said").tobytes())
         schema, made_for, skin = said.pop("schema"), said["bundle_hash"], dict(said.pop("skin"))
         arrays["gram"] = _whole(arrays["gram"], len(arrays["z0"]))
+        fields = _fields(arrays.pop(FIELDS), arrays["contact"].shape[1]) if FIELDS in arrays else None
         matrices = matrices_of(arrays)
     except (EitskinError, ValueError, KeyError, TypeError, OSError, AttributeError) as wrong:
         raise CalibrationFileError(f"no calibration ({str(wrong)[:120]}): run `skin tare` again") from None
@@ -66,7 +75,7 @@ def unpack(packed: bytes, bundle: Bundle) -> Bundle:
     except Wrong as why:
         raise CalibrationFileError(f"the calibration: {why}: run `skin tare` again") from None
     digest = hashlib.sha256(bundle.hash.encode() + packed).hexdigest()
-    return replace(bundle, manifest=manifest, matrices=matrices, hash=digest)
+    return replace(bundle, manifest=manifest, matrices=matrices, hash=digest, mounted_fields=fields)
 
 
 def _whole(lower: NDArray[np.float64], k: int) -> NDArray[np.float64]:
@@ -74,6 +83,16 @@ def _whole(lower: NDArray[np.float64], k: int) -> NDArray[np.float64]:
     made = np.zeros((k, k))
     made[np.tril_indices(k)] = lower
     return made + np.tril(made, -1).T
+
+
+def _fields(values: NDArray[Any], electrodes: int) -> NDArray[np.float32]:
+    """(2, F * F, E), F of any size. Raises ValueError where it is nothing like it."""
+    side = round(values.shape[1] ** 0.5) if values.ndim == 3 else 0
+    if values.dtype.kind != "f" or not side or values.shape != (2, side**2, electrodes):
+        raise ValueError(f"fields: {values.dtype} {values.shape}, expected floats (2, F F, {electrodes})")
+    if not np.isfinite(values).all():
+        raise ValueError("fields: NaN or infinity, expected finite numbers")
+    return values.astype(np.float32)
 
 
 def found_by(bundle: Bundle) -> dict[str, Any] | None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from models import geometry
 from models.bundle import Bundle
-from models.calibration import CalibrationFit, TooFewMeasured, calibrated, fit
+from models.calibration import CalibrationFit, TooFewMeasured, calibrated, fields_as_mounted, fit
 from models.calibration_file import pack
 from models.geometry import SkinGeometry
 from models.mounted import FieldModes
@@ -53,7 +53,7 @@ def calibrate(bundle: Bundle, z0: Array, sigma: Array, baseline_hash: str = "") 
     found = fit(skin, bundle.matrices, z0, sigma)
     matrices = calibrated(bundle.matrices, skin, found.mounting)
     said = {"bundle_hash": bundle.hash, "baseline_hash": baseline_hash, **describe(skin, found)}
-    return pack(matrices, found.mounting.skin(skin).to_dict(), said)
+    return pack(matrices, found.mounting.skin(skin).to_dict(), said, fields_as_mounted(skin, found.mounting))
 
 
 def describe(skin: SkinGeometry, found: CalibrationFit) -> dict[str, Any]:

@@ -41,13 +41,41 @@ def response_tables(model: ForwardModel, coarse: int = COARSE, fine: int = FINE)
     return ResponseTables(fields.astype(np.float32), regular.astype(np.float32), inside.reshape(coarse, coarse))
 
 
+def mounted_fields(model: ForwardModel, tensors: Array, potentials: Array, n: int = FINE) -> npt.NDArray[np.float32]:
+    """(2, n * n, E) `ResponseTables.fields` of a sheet of any conductivity, by whose square root they are multiplied:
+    a drop takes a share of what conducts, so their products are to such a sheet what those of fields are to an even
+    one. tensors (elements, 3): xx, xy, yy; potentials (nodes, E): of a unit current at each electrode.
+    """
+    means = _pixel_means(model, n, _rooted(tensors, _gradients(model, potentials)))
+    return _filled(means, _known(model, n)).astype(np.float32)
+
+
+def _rooted(tensors: Array, field: Array) -> Array:
+    """Fields (2, elements, c) times the square root of symmetric tensors (elements, 3)."""
+    xx, xy, yy = tensors.T[:, :, None]
+    root_det = np.sqrt(xx * yy - xy**2)
+    scale = np.sqrt(xx + yy + 2 * root_det)
+    along_x = ((xx + root_det) * field[0] + xy * field[1]) / scale
+    along_y = (xy * field[0] + (yy + root_det) * field[1]) / scale
+    return np.stack([along_x, along_y])
+
+
 def _mean_gradients(model: ForwardModel, n: int, potentials: Array) -> Array:
     """(2, n * n, c) mean field of each pixel, of potentials (nodes, c); 0 where a pixel has no element."""
+    return _pixel_means(model, n, _gradients(model, potentials))
+
+
+def _gradients(model: ForwardModel, potentials: Array) -> Array:
+    """(2, elements, c)"""
+    corner = potentials[model.mesh.t.T]
+    return np.stack([np.einsum("ek,ekc->ec", model.gradients[..., a], corner) for a in range(2)])
+
+
+def _pixel_means(model: ForwardModel, n: int, values: Array) -> Array:
+    """(2, n * n, c) of values (2, elements, c)."""
     share = sparse.csr_array(model.element_map(n, 64).T * model.areas)
     total = np.maximum(np.asarray(share.sum(axis=1)).ravel(), 1e-12)
-    corner = potentials[model.mesh.t.T]
-    means = [share @ np.einsum("ek,ekc->ec", model.gradients[..., a], corner) / total[:, None] for a in range(2)]
-    return np.array(means)
+    return np.array([share @ part / total[:, None] for part in values])
 
 
 def _known(model: ForwardModel, n: int) -> npt.NDArray[np.bool_]:

@@ -276,9 +276,10 @@ class Estimating(Stage):
         """A calibration that is ready is adopted while nothing touches."""
         if not self.linearisation.follows(self._touched):
             return
-        before, baseline = self.estimator.state(), self.baseline
+        estimator, baseline = self.estimator, self.baseline
         self._build()
-        self.estimator.load(before)
+        estimator.use(skin_tables(self.bundle))
+        self.estimator = estimator
         self._use(baseline)
         self._news = BaselineNews()
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from models.bundle import Bundle
+from models.calibration_file import found_by
 from models.measurement.numbers import MISFIT, MISFIT_FAR, MISFIT_POWER
 from models.patterns import incidence
 
@@ -100,7 +101,9 @@ class SkinTables:
 
 
 def tables_of(bundle: Bundle) -> SkinTables:
-    """Of a bundle as it ships: its response tables where it has them, else its coarser Jacobian without directions.
+    """Of a bundle as it ships, or as it was calibrated to a skin: its response tables where it has them, else its
+    coarser Jacobian without directions. The response tables of the file are those of a skin that is mounted as the file
+    says: a calibrated bundle without fields of its own has none.
 
     Raises BundleError where a file of the bundle cannot be read.
     """
@@ -108,11 +111,12 @@ def tables_of(bundle: Bundle) -> SkinTables:
     z0, contact = np.asarray(matrices.z0, float), np.asarray(matrices.contact, float)
     coarse = _from_pixels(matrices.jacobian)
     jacobian, along, turned = coarse, np.zeros_like(coarse), np.zeros_like(coarse)
-    if bundle.has_response:
+    fine = bundle.has_response and (found_by(bundle) is None or bundle.mounted_fields is not None)
+    if fine:
         jacobian, along, turned = _from_fields(bundle, z0, coarse)
     pattern = np.asarray(bundle.pattern)
     self_sensing = bool((pattern[:, :2] == pattern[:, 2:]).all())
-    near = bundle.has_response and self_sensing
+    near = fine and self_sensing
     times = len(jacobian) // len(matrices.inside)
     values, vectors = np.linalg.eigh(matrices.gram)
     misfit = vectors * np.maximum(values, 0.0) ** MISFIT_POWER @ vectors.T
@@ -153,7 +157,7 @@ def _from_fields(bundle: Bundle, z0: Array, coarse: Single) -> tuple[Single, Sin
     """
     tables = bundle.response()
     pattern = np.asarray(bundle.pattern, np.int64)
-    fields = tables.fields.astype(float)
+    fields = (tables.fields if bundle.mounted_fields is None else bundle.mounted_fields).astype(float)
     side, electrodes = round(fields.shape[1] ** 0.5), fields.shape[2]
     inside = np.kron(tables.inside, np.ones((2, 2), bool)) if side == 2 * len(tables.inside) else None
     driven, sensed = (fields @ incidence(pattern[:, k : k + 2], electrodes).T for k in (0, 2))

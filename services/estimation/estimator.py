@@ -131,11 +131,28 @@ class Estimator:
         self.taring = Taring(tables)
         self.skin: TaredSkin | None = None
 
-    def tare(self, force: bool = False) -> None:
-        """Take the latest scans for the untouched skin. Raises TareRefused, while something touches unless forced."""
+    def tare(self, force: bool = False) -> AgreedScans:
+        """Take the latest scans for the untouched skin: these. Raises TareRefused, while something touches unless
+        forced.
+        """
         if not force and self.skin is not None and self.skin.faults.now.wire is not None:
             raise TareRefused("wires of the board are wrong, expected all as they belong: mend them and try again")
-        self._begin(self.taring.by_command(force))
+        scans = self.taring.by_command(force)
+        self._begin(scans)
+        return scans
+
+    @property
+    def touched(self) -> bool:
+        """Whether something touches, or may."""
+        return self.skin is not None and (len(self.skin.touches) > 0 or self.now.unexplained_s > 0)
+
+    def use(self, tables: SkinTables) -> None:
+        """Of the same skin from the next scan on, as a calibration of its mounting knows it; while nothing touches."""
+        self._tables = tables
+        self.taring.use(tables)
+        self.now.information = None
+        if self.skin is not None:
+            self.skin = self.skin.with_tables(tables)
 
     def adopt(self, baseline: KnownBaseline, age_s: float) -> None:
         """Go on from a baseline that is age_s older than the next scan; nobody watched meanwhile."""

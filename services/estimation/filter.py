@@ -80,6 +80,14 @@ class SkinFilter:
         start = np.full(k, n.REMAINDER_START**2)
         self.now = FilterState(at_s, np.zeros(self._fixed), np.diag(variance), np.zeros(k), start)
 
+    def succeed(self, before: SkinFilter) -> None:
+        """Go on from the filter of other tables of the same skin: what those columns explained otherwise is each
+        measurement's own from now on, so that what is predicted stays.
+        """
+        self.now = before.now
+        then = before.shift(self.now.at_s)
+        self.now.remainder = self.now.remainder + then - self.shift(self.now.at_s)
+
     def ahead(self, at_s: float, flicker: Array) -> Prediction:
         """flicker (E,): variances of the contact impedances' noise, of which a share is slow."""
         now = self.now

@@ -73,6 +73,14 @@ class TaredSkin:
         self.drift.begin(0.0, np.full(self.tables.electrodes, n.CONTACT_START**2))
         self.touches.now.next_id, self.touches.now.watched = next_id, False
 
+    def with_tables(self, tables: SkinTables) -> TaredSkin:
+        """The same baseline and all that was learnt, with other tables of the same skin."""
+        made = TaredSkin(tables, self.log_z0, self.live, self.scatter, self.frames)
+        made.noise.now, made.touches.now, made.learning.now = self.noise.now, self.touches.now, self.learning.now
+        made.faults.now, made.hypotheses.adrift = self.faults.now, self.hypotheses.adrift
+        made.drift.succeed(self.drift)
+        return made
+
     def forget_looks(self) -> None:
         """The untouched skin is another than at the last scans."""
         self.quick.forget()

@@ -6,15 +6,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from models import geometry
 from models.bundle import Bundle
-from models.calibration import TooFewMeasured, calibrated, fit
+from models.calibration import TooFewMeasured, calibrated, fields_as_mounted, fit
+from models.calibration_file import CalibrationFileError, pack, unpack
 from models.forward import ForwardModel
+from models.measurement.course import TouchCourse
+from models.measurement.disc import DiscResponse
+from models.measurement.fit import FittedScan, TouchFitter
+from models.measurement.numbers import MISFIT, MISFIT_FAR
+from models.measurement.tables import SkinTables, tables_of
+from models.measurement.touch import anywhere, plain
 from models.mismatch import Mismatch, MismatchedSheet, mounted, named
 from models.mounted import FieldModes, Mounting, Predicted, most_shift
 from models.prereconstruction import Matrices, PreReconstructor
 from models.shapes import Shape
+
+Array = NDArray[np.float64]
 
 MESH = "inverse"  # the fit's steps are taken on it; the sheets are of the mesh "stub"
 
@@ -142,3 +152,50 @@ def test_a_pixel_knows_its_elements_without_a_plotting_library(skin: geometry.Sk
         sides = np.stack([left(a, b), left(b, c), left(c, a)])
         inside = np.flatnonzero((sides >= 0).all(axis=0) | (sides <= 0).all(axis=0))
         assert (found[k] == -1) if not len(inside) else (found[k] in inside)
+
+
+@pytest.mark.slow
+def test_fields_about_the_file_are_those_of_its_response_tables(skin: geometry.SkinGeometry) -> None:
+    made, shipped = fields_as_mounted(skin, Mounting.nominal(skin, FieldModes(skin).count)), Bundle.load("square16")
+    np.testing.assert_allclose(made, shipped.response().fields, rtol=2e-3, atol=2e-3)
+
+
+def left_of_touches(tables: SkinTables, mismatch: Mismatch, z0: Array) -> float:
+    """Median share of a touch's change that the best disc leaves."""
+    found, own = [], tables.relative_to(z0)
+    course = TouchCourse(DiscResponse(own), np.zeros(len(z0)), 0.04)
+    for x, y in ((0.5, 0.3), (0.2, -0.7), (-0.6, -0.5)):
+        seen = np.log(measured(mismatch, (Shape("circle", x, y, 0.2, 0.3),)) / z0)
+        scene = FittedScan(seen, 1e-8 * np.eye(len(z0)), course, own.misfit, len(z0))
+        prior = anywhere(x, y, 0.0, 0.04)
+        prior.sd[4:] = 1e-6
+        best = TouchFitter(scene, [plain(prior)]).fit(30)
+        found.append(np.linalg.norm(best.left) / np.linalg.norm(seen))
+    return float(np.median(found))
+
+
+@pytest.mark.slow
+def test_discs_of_a_calibrated_skin_leave_what_its_tables_say(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
+    """Of a skin that its file describes a few per cent wrong."""
+    bundle, mismatch = Bundle.load("square16"), named("mild")
+    z0 = measured(mismatch)
+    mounting = fit(skin, matrices, z0, 1e-5 * z0).mounting
+    made, as_mounted = calibrated(matrices, skin, mounting), mounting.skin(skin).to_dict()
+    said = {"bundle_hash": bundle.hash}
+    tables = tables_of(unpack(pack(made, as_mounted, said, fields_as_mounted(skin, mounting)), bundle))
+    assert tables.relative_to(z0).wrong < 1.5 * MISFIT
+    left, of_the_file = (left_of_touches(each, mismatch, z0) for each in (tables, tables_of(bundle)))
+    assert left < 2 * MISFIT and left < 0.3 * of_the_file
+    without_fields = tables_of(unpack(pack(made, as_mounted, said), bundle))
+    assert without_fields.wrong == MISFIT_FAR and without_fields.jacobian.shape[0] == bundle.matrices.inside.shape[0]
+
+
+@pytest.mark.parametrize("shape", [(2, 2304, 15), (2, 2303, 16), (2, 2304)])
+def test_fields_of_another_skin_are_refused(matrices: Matrices, shape: tuple[int, ...]) -> None:
+    bundle = Bundle.load("square16")
+    packed = pack(matrices, bundle.skin, {"bundle_hash": bundle.hash}, np.ones(shape, np.float32))
+    with pytest.raises(CalibrationFileError, match="fields"):
+        unpack(packed, bundle)
+    packed = pack(matrices, bundle.skin, {"bundle_hash": bundle.hash}, np.full((2, 2304, 16), np.nan, np.float32))
+    with pytest.raises(CalibrationFileError, match="NaN"):
+        unpack(packed, bundle)

@@ -1,6 +1,7 @@
 """The new estimator: raw frames in, contact frames out, of a skin solved by finite elements on a mesh of its own."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +13,7 @@ from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World, pressed
 from firmware_stub.worlds import table
 from models.bundle import Bundle
+from models.measurement.tables import tables_of
 from models.mismatch import Mismatch
 from models.rolling import order
 from protocol.frames import Contact, ContactFrame, RawFrame
@@ -265,3 +267,26 @@ def test_measurements_that_the_board_marks_are_left_out() -> None:
             shown.append(frame)
     assert all(frame.valid and lasting(frame) == 1 for frame in shown)
     assert all(np.hypot(f.contacts[0].position[0] - 0.012, f.contacts[0].position[1] + 0.018) < 2e-3 for f in shown)
+
+
+def test_other_tables_of_the_same_skin_change_nothing_of_what_is_expected_untouched() -> None:
+    """As a calibration of the mounting gives them, while the sheet warms: then a touch is shown as it is."""
+    warm_s, until_s = FREE_S + 1.0, FREE_S + 2.0
+    touch = pressed("circle", 0.01, -0.01, 0.01, 2.0)
+    warm, full = impedance(background=1.002), impedance(touch, background=1.002)
+    curve = between((0, impedance()), (FREE_S, impedance()), (warm_s, warm), (until_s, warm), (until_s + 0.1, full))
+    candidate = Anew(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle())
+    tables = tables_of(bundle())
+    row = np.exp(0.02 * np.random.default_rng(3).standard_normal(120))
+    frames = []
+    for raw in Board(curve, 1, 1).frames(until_s + 1.0):
+        if 0 <= raw.stamps["sample"] * 1e-9 - warm_s < SCAN_S:
+            assert not candidate.estimator.touched
+            candidate.estimator.use(replace(tables, z0=tables.z0 * row))
+        if (frame := candidate.step(raw)) is not None:
+            frames.append(frame)
+    free = between_s(frames, FREE_S, until_s - SCAN_S)
+    assert all(frame.valid and not lasting(frame) for frame in free)
+    shown = between_s(frames, until_s + 0.3, 99)
+    assert shown and all(frame.valid and lasting(frame) == 1 for frame in shown)
+    assert all(np.hypot(*np.subtract(frame.contacts[0].position[:2], (0.01, -0.01))) < 2e-3 for frame in shown)

@@ -197,8 +197,12 @@ class Taring:
     """Of one skin; tables: of its bundle."""
 
     def __init__(self, tables: SkinTables) -> None:
-        self._tables, self._start = tables, StartJudge(tables)
+        self.use(tables)
         self.latest, self.now = LatestScans(), TaringState()
+
+    def use(self, tables: SkinTables) -> None:
+        """Of the same skin, known better."""
+        self._tables, self._start = tables, StartJudge(tables)
 
     def offer(self, scan: Scan, live: NDArray[np.bool_], middle_s: float) -> None:
         """A whole scan; live (K,): what of it was measured; middle_s: when. One that is not believed interrupts."""
