@@ -134,7 +134,7 @@ def test_an_untouched_skin_that_warms_stays_untouched(parts: int) -> None:
     seconds = 25.0 if parts == 1 else 8.0
     warm = between((0, impedance()), (FREE_S, impedance()), (60, impedance(background=1.01)))
     frames = between_s(run(warm, seconds, parts), FREE_S, 99)
-    assert len(frames) > 0.9 * (seconds - FREE_S) / SCAN_S * parts
+    assert len(frames) > 0.9 * (seconds - FREE_S) / SCAN_S  # a part in which nothing touches makes none
     assert all(frame.valid for frame in frames)
     assert not any(frame.contacts for frame in frames)
 
