@@ -139,13 +139,20 @@ class FaultAsking:
         return quiet
 
     def _change(self, priors: Sequence[TouchPrior], at: AskedScan) -> tuple[Array, Array]:
-        """(K,) what touches that stand do to each |Z|, and (K, K) the covariance of what they may have changed by."""
+        """(K,) what touches that stand do to each |Z|, and (K, K) the covariance of what they may have changed by: a
+        strong one's outline and misfit are more than a contact impedance that begins to change.
+        """
         k = len(at.times_s)
         if not priors:
             return np.zeros(k), np.zeros((k, k))
         states = np.stack([prior.start for prior in priors])
-        columns = TouchCourse(self._response, at.times_s, at.span_s).columns(states, priors, ())
-        return np.maximum(columns.mean, LEAST_MEAN), as_they_stand(columns.slopes, states)
+        course = TouchCourse(self._response, at.times_s, at.span_s)
+        columns = course.columns(states, priors, course.directions(states))
+        outlines = columns.shapes * np.concatenate([prior.shape_sd for prior in priors])
+        change = columns.mean + columns.shapes @ np.concatenate([prior.shape for prior in priors])
+        nearby = as_they_stand(columns.slopes, states) + outlines @ outlines.T
+        nearby += self._tables.wrong**2 * float(change @ change) * self._tables.misfit
+        return np.maximum(change, LEAST_MEAN), nearby
 
     def _seen(self, view: BoardView) -> Hypotheses:
         """The skin through what is wrong with the board's wires."""
