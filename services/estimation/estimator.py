@@ -254,7 +254,6 @@ class Estimator:
         asked, untouched = self._explaining(skin, measured)
         if asked.answer.holds and (pressed := skin.refused.explained(measured.middle_s - measured.span_s / 2)):
             self._remember(skin, pressed)
-            measured = replace(measured, budget=StepBudget.of(len(scan.new), int(scan.new.sum())))
             asked, untouched = self._explaining(skin, measured)  # again: what is left may be memory
         question, answer = asked.question, asked.answer
         measured = replace(measured, log_z=untouched + asked.view.y, live=asked.view.live)
