@@ -20,9 +20,9 @@ from models.measurement.disc import DiscResponse
 from models.measurement.fit import FittedScan, FoundTouches, KnownWhitening, TouchFitter, Turned
 from models.measurement.grid import DiscGrid
 from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
-from models.measurement.numbers import AREA_LOG_SD, LEAST_ACTION, MISFIT_WIDE, TYPICAL_RADIUS
+from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
 from models.measurement.tables import SkinTables
-from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, SHAPE_SDS, TouchPrior, anywhere, plain
+from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anywhere, plain
 from models.measurement.whitening import Whitening
 from services.estimation.filter import SkinFilter
 from services.estimation.values import numbers as n
@@ -181,9 +181,7 @@ class Hypotheses:
         return _likeliest(found) if found else None
 
     def without(self, question: Question, standing: Sequence[TouchPrior], place: int) -> ScoredAnswer:
-        """The answer that one of the touches is none: there is nothing, or it is drift, or what foam remembers, or the
-        others' own outlines.
-        """
+        """The answer that one of the touches is none: there is nothing, or it is drift, or what foam remembers."""
         kept = tuple(k for k in range(len(standing)) if k != place)
         priors = [standing[k] for k in kept]
         answers = list[ScoredAnswer]()
@@ -195,9 +193,6 @@ class Hypotheses:
             answer = self._fitted(wider, priors, kept, n.STEPS_WARM, cause) if kept else self._nothing(question, cause)
             if cause != MEMORY or self._drift.may_remember(answer.pulled):
                 answers.append(answer)
-        if kept:  # what was learnt of their outlines was learnt beside it
-            wide = [_unlearnt(prior) for prior in priors]
-            answers.append(self._fitted(question, wide, kept, n.STEPS_COLD))
         return _likeliest(answers)
 
     def _nothing(self, question: Question, cause: str) -> ScoredAnswer:
@@ -443,13 +438,6 @@ def _from(fit: FoundTouches | None) -> list[TouchPrior]:
     if fit is None:
         return []
     return [replace(prior, start=state.copy()) for prior, state in zip(fit.priors, fit.states, strict=True)]
-
-
-def _unlearnt(prior: TouchPrior) -> TouchPrior:
-    """Of any outline and radius."""
-    mean, sd = prior.mean.copy(), prior.sd.copy()
-    mean[LOG_RADIUS], sd[LOG_RADIUS] = np.log(TYPICAL_RADIUS), AREA_LOG_SD
-    return replace(prior, mean=mean, sd=sd, shape=np.zeros(len(SHAPE_SDS)), shape_sd=SHAPE_SDS)
 
 
 def _neighbours(fit: FoundTouches | None, kept: tuple[int, ...]) -> tuple[int, int] | None:
