@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any, NamedTuple
@@ -14,11 +14,11 @@ from models.measurement.tables import SkinTables
 from models.measurement.touch import SHAPE_SDS, SHAPES, STATES
 from models.measurement.whitening import Whitening
 from services.estimation.faults import advice
-from services.estimation.faults.asking import AskedScan
+from services.estimation.faults.asking import Asked, AskedScan
 from services.estimation.faults.board import BoardView
 from services.estimation.faults.gap import judged_by_itself
 from services.estimation.faults.wires import WireFault
-from services.estimation.filter import Prediction
+from services.estimation.filter import Memory, Prediction
 from services.estimation.first.tare import AgreedScans, LatestScansState, TareRefused, Taring, TaringState
 from services.estimation.hypotheses import (
     AS_IT_IS,
@@ -251,6 +251,7 @@ class Estimator:
 
     def _quiet(self, skin: TaredSkin, measured: LookedAt, seen: Seen, judgements: list[Judgement]) -> Estimate:
         self._explained(skin, AS_IT_IS)
+        self._remember(skin, skin.refused.explained(measured.middle_s - measured.span_s / 2))
         measured = replace(measured, log_z=skin.log_z0 + skin.faults.taken_off(measured.log_z - skin.log_z0))
         self._learn_untouched(skin, measured, seen.pulled, AS_IT_IS)
         self.now.said = ()
@@ -288,6 +289,34 @@ class Estimator:
     def _asked(self, skin: TaredSkin, measured: LookedAt, passed_s: float, judgements: list[Judgement]) -> Estimate:
         skin.touches.drop_the_past(measured.middle_s - measured.span_s / 2)
         skin.touches.drop_the_vague()
+        scan = measured.scan
+        asked, untouched = self._explaining(skin, measured)
+        if asked.answer.holds and (pressed := skin.refused.explained(measured.middle_s - measured.span_s / 2)):
+            self._remember(skin, pressed)
+            asked, untouched = self._explaining(skin, measured)  # again: what is left may be memory
+        question, answer = asked.question, asked.answer
+        measured = replace(measured, log_z=untouched + asked.view.y, live=asked.view.live)
+        explained = answer.holds
+        rough = answer.fit is not None and answer.chi2 < n.MOST
+        if explained or rough:
+            self._settle(skin, question, answer, measured)
+            self._explained(skin, answer.cause)
+        else:
+            self._refused(skin, measured, question.y)
+        plain = explained and not asked.changed and skin.faults.plain(measured.middle_s - measured.span_s / 2)
+        if plain and self._complete(skin, measured.live):
+            skin.held.keep(skin.noise.alike(scan.part), measured.middle_s, skin.touches.ids, question, answer)
+        skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
+        if explained and skin.faults.sound and not asked.changed:
+            self._learn(skin, measured, answer)
+        judgements += advice.judgements_of(skin.faults.states(), scan.status, float(asked.view.failed.mean()))
+        judgements.append(judge("gap", float(skin.touches.lost), 1.0))
+        judgements.append(judge("gain", float(skin.faults.gain_named(measured.middle_s)), 1.0))
+        judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
+        return self._said(skin, measured, question, answer, judgements, explained, rough)
+
+    def _explaining(self, skin: TaredSkin, measured: LookedAt) -> tuple[Asked, Array]:
+        """What explains a scan, and log |Z| (K,) as the filter predicts it untouched."""
         predicted = skin.drift.ahead(measured.middle_s, skin.noise.now.flicker)
         scan, untouched = measured.scan, skin.log_z0 + predicted.shift
         asked = skin.asking(
@@ -305,26 +334,7 @@ class Estimator:
             lambda hypotheses, view, covariance: self._question(hypotheses, skin, view, covariance, measured),
             lambda hypotheses, question: self._answer(skin, hypotheses, question, predicted, measured),
         )
-        question, answer = asked.question, asked.answer
-        measured = replace(measured, log_z=untouched + asked.view.y, live=asked.view.live)
-        explained = answer.holds
-        rough = answer.fit is not None and answer.chi2 < n.MOST
-        if explained or rough:
-            self._settle(skin, question, answer, measured)
-            self._explained(skin, answer.cause)
-        else:
-            self._refused(skin, measured)
-        plain = explained and not asked.changed and skin.faults.plain(measured.middle_s - measured.span_s / 2)
-        if plain and self._complete(skin, measured.live):
-            skin.held.keep(skin.noise.alike(scan.part), measured.middle_s, skin.touches.ids, question, answer)
-        skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
-        if explained and skin.faults.sound and not asked.changed:
-            self._learn(skin, measured, answer)
-        judgements += advice.judgements_of(skin.faults.states(), scan.status, float(asked.view.failed.mean()))
-        judgements.append(judge("gap", float(skin.touches.lost), 1.0))
-        judgements.append(judge("gain", float(skin.faults.gain_named(measured.middle_s)), 1.0))
-        judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
-        return self._said(skin, measured, question, answer, judgements, explained, rough)
+        return asked, untouched
 
     def _question(
         self, hypotheses: Hypotheses, skin: TaredSkin, view: BoardView, covariance: Array, measured: LookedAt
@@ -364,7 +374,7 @@ class Estimator:
         self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, measured: LookedAt
     ) -> ScoredAnswer:
         """While nothing has explained the skin for long: a search now and then, from nothing."""
-        skin.touches.forget()
+        self._remember(skin, skin.touches.forget(measured.middle_s - measured.span_s / 2))
         found = hypotheses.glance(question)
         refused = round(self.now.unexplained_s / measured.span_s)
         if found.quiet or not measured.whole or refused % n.LOST_SCANS:
@@ -379,13 +389,18 @@ class Estimator:
         gone = [k for k in range(len(touches)) if k not in kept]
         memories = [memory for k in gone for memory in touches.released(k, middle_s - span_s / 2)]
         if answer.fit is None:
-            touches.forget()
+            touches.forget(middle_s - span_s / 2)
         else:
-            memories += touches.settle(answer.fit, kept, middle_s, span_s, measured.whole)
+            memories += touches.settle(
+                answer.fit, kept, middle_s, span_s, whole=measured.whole, explained=answer.explained
+            )
             self._make_sure(skin, answer)
             rest = replace(question, keeps=0.0)
             if measured.whole and not self._apart(skin, rest, measured):
                 self._doubt(skin, rest, answer, measured)
+        self._remember(skin, memories)
+
+    def _remember(self, skin: TaredSkin, memories: Sequence[Memory]) -> None:
         for memory in memories:
             skin.drift.remember(memory)
         if memories:
@@ -408,7 +423,11 @@ class Estimator:
         if found is None or not found.explained or found.fit is None or len(found.fit) <= len(skin.touches):
             return False
         kept = skin.touches.recognised(found.fit, found.kept)
-        skin.touches.settle(found.fit, kept, measured.middle_s, measured.span_s, whole=True)
+        gone = [k for k in range(len(skin.touches)) if k not in kept]
+        began_s = measured.middle_s - measured.span_s / 2
+        memories = [memory for k in gone for memory in skin.touches.released(k, began_s)]
+        memories += skin.touches.settle(found.fit, kept, measured.middle_s, measured.span_s, whole=True)
+        self._remember(skin, memories)
         self._make_sure(skin, found)
         return True
 
@@ -436,11 +455,14 @@ class Estimator:
         if cause == AS_IT_IS:
             skin.hypotheses.adrift = 1.0
 
-    def _refused(self, skin: TaredSkin, measured: LookedAt) -> None:
-        """Nothing explains it: the longer that lasts, the further the skin may have drifted."""
+    def _refused(self, skin: TaredSkin, measured: LookedAt, y: Array) -> None:
+        """Nothing explains it: the longer that lasts, the further the skin may have drifted. y (K,): log |Z| over what
+        is predicted of the untouched skin.
+        """
         skin.learning.doubt()
         if not measured.whole:
             return
+        skin.refused.refuse(y, measured.span_s)
         self.now.unexplained_s += measured.span_s
         if self.now.unexplained_s > n.CHANGING_S:
             skin.hypotheses.adrift = min(n.MOST_ADRIFT, skin.hypotheses.adrift * n.ADRIFT)

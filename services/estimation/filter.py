@@ -34,6 +34,7 @@ class Memory:
     x: float
     y: float
     log_radius: float
+    mixed: bool = False  # of whatever pressed while nothing explained the scans: it has no place
 
 
 @dataclass
@@ -150,6 +151,15 @@ class SkinFilter:
         columns = np.array([n.MEMORY_MOST * memory.action * memory.column for memory in memories]).T
         return np.asarray(columns @ columns.T)
 
+    def may_remember(self, pulled: Array) -> bool:
+        """Whether foam may remember as much as a residual says; pulled (K,): S^-1 of it, S with `more_memory`."""
+        for place, memory in enumerate(self.now.memories):
+            own, most = self._own(place), n.MEMORY_MOST * memory.action
+            variance = float(self.now.p[own, own].sum()) + most**2
+            if float(self.now.x[own].sum()) + variance * float(memory.column @ pulled) > most:
+                return False
+        return True
+
     def widen_memories(self) -> None:
         """They were larger than was expected."""
         now = self.now
@@ -178,7 +188,7 @@ class SkinFilter:
         """The memory that would have to be more than any foam's; pulled (K,): S^-1 y."""
         for place, memory in enumerate(self.now.memories):
             age_s = predicted.at_s - memory.at_s
-            if age_s > n.MEMORY_DOUBT_S:
+            if age_s > n.MEMORY_DOUBT_S or memory.mixed:
                 continue
             own = self._own(place)
             reach = predicted.reach[own].sum(axis=0)

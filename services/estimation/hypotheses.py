@@ -181,21 +181,22 @@ class Hypotheses:
         return _likeliest(found) if found else None
 
     def without(self, question: Question, standing: Sequence[TouchPrior], place: int) -> ScoredAnswer:
-        """The answer that one of the touches is none: there is nothing, or it is drift."""
+        """The answer that one of the touches is none: there is nothing, or it is drift, or what foam remembers."""
         kept = tuple(k for k in range(len(standing)) if k != place)
-        if not kept:
-            return _likeliest([self._nothing(question, cause) for cause in (AS_IT_IS, DRIFT)])
         priors = [standing[k] for k in kept]
-        wider = replace(question, covariance=question.covariance + self.faster_drift())
-        return _likeliest(
-            [
-                self._fitted(question, priors, kept, n.STEPS_WARM),
-                self._fitted(wider, priors, kept, n.STEPS_WARM, DRIFT),
-            ]
-        )
+        answers = list[ScoredAnswer]()
+        for cause in (AS_IT_IS, DRIFT, MEMORY):
+            more = self._more(question, cause, question.y) if cause else 0.0
+            if more is None:
+                continue
+            wider = replace(question, covariance=question.covariance + more)
+            answer = self._fitted(wider, priors, kept, n.STEPS_WARM, cause) if kept else self._nothing(question, cause)
+            if cause != MEMORY or self._drift.may_remember(answer.pulled):
+                answers.append(answer)
+        return _likeliest(answers)
 
     def _nothing(self, question: Question, cause: str) -> ScoredAnswer:
-        """As `untouched`, of a cause that every skin has."""
+        """As `untouched`, of a cause that this skin has."""
         answer = self.untouched(question, cause)
         assert answer is not None
         return answer

@@ -20,6 +20,7 @@ from services.estimation.held_look import HeldLook
 from services.estimation.hypotheses import Hypotheses
 from services.estimation.learning import Learning, LearningState
 from services.estimation.quick_look import QuickLook
+from services.estimation.refused import RefusedChange, RefusedState
 from services.estimation.touches import TouchesState, TouchTracks
 from services.estimation.values import numbers as n
 
@@ -39,6 +40,7 @@ class TaredState:
     touches: TouchesState
     learning: LearningState
     faults: FaultState
+    refused: RefusedState
     adrift: float
 
 
@@ -56,6 +58,7 @@ class TaredSkin:
         self.touches = TouchTracks(self.response)
         self.hypotheses = Hypotheses(self.tables, self.response, self.noise, self.drift)
         self.learning = Learning(self.drift, self.noise)
+        self.refused = RefusedChange(tables.measurements)
         self.quick, self.held = QuickLook(self.hypotheses.grid), HeldLook()
         self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
         self.asking = FaultAsking(self.tables, self.response, self.noise, self.touches, self.hypotheses, self.faults)
@@ -99,6 +102,7 @@ class TaredSkin:
             touches=self.touches.now,
             learning=self.learning.now,
             faults=self.faults.now,
+            refused=self.refused.now,
             adrift=self.hypotheses.adrift,
         )
 
@@ -111,4 +115,5 @@ class TaredSkin:
                 f"the drift's covariance: found {len(spread)} states, {spread[0]:.1g}, expected {size}, >= 0"
             )
         self.noise.now, self.drift.now, self.touches.now = state.noise, state.drift, state.touches
-        self.learning.now, self.faults.now, self.hypotheses.adrift = state.learning, state.faults, state.adrift
+        self.learning.now, self.faults.now, self.refused.now = state.learning, state.faults, state.refused
+        self.hypotheses.adrift = state.adrift

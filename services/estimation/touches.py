@@ -118,8 +118,11 @@ class TouchTracks:
         """Forget what one part of a scan made of a touch that begins, and is not sure: the next one looks anew."""
         self.now.tracks = [track for track in self.now.tracks if track.sure or track.scans]
 
-    def forget(self) -> None:
+    def forget(self, at_s: float) -> list[Memory]:
+        """Nobody knows any more what touches. Returns what those that there were may have left in the foam."""
+        memories = [memory for place in range(len(self)) for memory in self.released(place, at_s)]
         self.now.tracks = []
+        return memories
 
     def drop_the_past(self, oldest_s: float) -> None:
         """Forget what ended before the oldest value that a window holds."""
@@ -140,9 +143,19 @@ class TouchTracks:
                 free.remove(found[k])
         return tuple(found)
 
-    def settle(self, fit: FoundTouches, kept: Sequence[int], at_s: float, span_s: float, whole: bool) -> list[Memory]:
+    def settle(
+        self,
+        fit: FoundTouches,
+        kept: Sequence[int],
+        at_s: float,
+        span_s: float,
+        *,
+        whole: bool,
+        explained: bool = True,
+    ) -> list[Memory]:
         """Take over a fit. kept: of each of its touches the track that it continues; -1: it is new. whole: no value of
-        the scan was fitted before. Returns what touches that ended or moved away leave in the foam.
+        the scan was fitted before. explained: by the fit; else it is only roughly right. Returns what touches that
+        ended or moved away leave in the foam.
         """
         before = self.now.tracks
         self.now.tracks = [
@@ -154,7 +167,8 @@ class TouchTracks:
             _update(track, fit.states[k], fit.covariance[own, own], at_s, span_s, whole)
             if whole:
                 _learn(track, fit, k)
-            memories += self._left_behind(track, at_s + span_s / 2)
+            if explained and not track.ended:
+                memories += self._held(track, at_s, span_s, whole)
             if not track.ended and fit.priors[k].until_s < np.inf:
                 memories += self.released(k, at_s + fit.priors[k].until_s)
             if not track.ended and _has_ended(track, span_s):
@@ -201,17 +215,33 @@ class TouchTracks:
         x, y, log_radius = track.held_at
         return [Memory(self._response(x, y, log_radius), share * track.held, at_s, x, y, log_radius)]
 
-    def _left_behind(self, track: TrackedTouch, now_s: float) -> list[Memory]:
-        """Of a touch that slides: what the place where it stayed remembers."""
-        x, y, log_radius = track.held_at
-        away = float(np.hypot(track.state[X] - x, track.state[Y] - y))
-        if away < n.MEMORY_APART * float(np.exp(log_radius)):
-            return []
+    def _held(self, track: TrackedTouch, at_s: float, span_s: float, whole: bool) -> list[Memory]:
+        """Take note of what presses, and where. Of a touch that slid away returns what the place remembers where it
+        stayed. A fit that does not explain its scan must not get here: it is anywhere while a touch is released.
+        """
+        acts, now_s = float(track.state[ACTION]), at_s + span_s / 2
+        goes = min(acts, float(acts + track.state[RATE] * span_s / 2)) <= n.GOES * track.held
         stayed_s = max(0.0, now_s - track.stayed_since_s)
-        track.stayed_since_s = now_s
-        memories = self._memory(track, now_s, 1 - float(np.exp(-stayed_s / n.MEMORY_FADES_S[0])))
-        track.held_at = (float(track.state[X]), float(track.state[Y]), track.log_radius)
+        x, y, log_radius = track.held_at
+        if np.hypot(track.state[X] - x, track.state[Y] - y) < n.MEMORY_APART * np.exp(log_radius):
+            if not goes:
+                track.held = acts
+                _stay(track, span_s / (stayed_s + span_s) if whole else 0.0)
+            return []
+        share = 1.0 if goes else 1 - float(np.exp(-stayed_s / n.MEMORY_FADES_S[0]))
+        memories = self._memory(track, now_s, share)
+        track.stayed_since_s, track.held = now_s, acts
+        _stay(track, 1.0)
         return memories
+
+
+def _stay(track: TrackedTouch, share: float) -> None:
+    """The place where it stays is the mean of where it was since it came: one that followed it would never be left."""
+    if track.scans <= 1:  # it has just come: places of before were rough
+        share = 1.0
+    here = (float(track.state[X]), float(track.state[Y]), float(track.state[LOG_RADIUS]))
+    x, y, log_radius = (then + share * (now - then) for then, now in zip(track.held_at, here, strict=True))
+    track.held_at = x, y, log_radius
 
 
 def _expected(track: TrackedTouch, at_s: float, span_s: float, loose: bool) -> TouchPrior:
@@ -260,12 +290,6 @@ def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, s
         track.still += 1
     track.scans += whole
     track.peak = max(track.peak, float(state[ACTION] - 2 * sd[ACTION]))
-    at_end = float(state[ACTION] + state[RATE] * span_s / 2)
-    if min(state[ACTION], at_end) > n.GOES * track.held or not track.held:
-        track.held = float(state[ACTION])
-        x, y, log_radius = track.held_at
-        if np.hypot(state[X] - x, state[Y] - y) < n.MEMORY_APART * np.exp(log_radius):
-            track.held_at = (float(state[X]), float(state[Y]), float(state[LOG_RADIUS]))
 
 
 def _learn(track: TrackedTouch, fit: FoundTouches, k: int) -> None:

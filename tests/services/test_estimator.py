@@ -219,6 +219,41 @@ def test_what_a_touch_leaves_in_the_foam_is_no_touch(parts: int) -> None:
     assert not any(lasting(frame) for frame in gone)
 
 
+def test_where_a_touch_stayed_before_it_slid_the_foam_remembers_it() -> None:
+    """It stays for 2 s, slides 25 mm away in 0.5 s and goes: 3 % stay where it was, and 1 % where it went."""
+    instants = np.linspace(0, 1, 9)
+    ways = [pressed("circle", -0.006 - 0.025 * u, 0.01, 9e-3, 3.0) for u in instants]
+    free, begin = impedance(), FREE_S + 2.0
+    points = [(0.0, free), (FREE_S, free), (FREE_S + 0.05, impedance(ways[0]))]
+    points += [(begin + 0.5 * float(u), impedance(way)) for u, way in zip(instants, ways, strict=True)]
+    rest = free + 0.03 * (impedance(ways[0]) - free) + 0.01 * (impedance(ways[-1]) - free)
+    points += [(begin + 0.9, impedance(ways[-1])), (begin + 1.0, rest), (begin + 20.0, free)]
+    gone = between_s(run(between(*points), begin + 2.0), begin + 1.2, 99)
+    assert all(frame.valid for frame in gone)
+    assert not any(lasting(frame) for frame in gone)
+
+
+def test_what_something_unknown_leaves_in_the_foam_is_no_touch() -> None:
+    """For 1.5 s every measurement is wrong in a way that no touch is; of what pressed meanwhile 3 % stay."""
+    rng = np.random.default_rng(3)
+    free, full = impedance(), impedance(pressed("circle", 0.012, -0.018, 9e-3, 3.0))
+    begin = FREE_S + 1.5
+
+    def curve(t: np.ndarray) -> np.ndarray:
+        if t.max() < FREE_S:
+            return free
+        if t.max() < begin:
+            return np.asarray(full * (1 + 0.02 * rng.standard_normal(120)))
+        return np.asarray(free + 0.03 * np.exp(-(t.max() - begin) / 5) * (full - free))
+
+    frames = run(curve, begin + 1.5)
+    wrong = between_s(frames, FREE_S + 0.3, begin)
+    assert not any(frame.valid for frame in wrong)
+    gone = between_s(frames, begin + 0.2, 99)
+    assert all(frame.valid for frame in gone)
+    assert not any(lasting(frame) for frame in gone)
+
+
 def test_a_touch_that_ends_says_so_for_fifty_milliseconds_and_is_gone() -> None:
     touch = pressed("circle", 0.012, -0.018, 9e-3, 3.0)
     frames = run(press(touch, ramp_s=0.02, until_s=FREE_S + 0.6), FREE_S + 1.5, PARTS)

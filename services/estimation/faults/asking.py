@@ -121,7 +121,7 @@ class FaultAsking:
             standing = self._touches.expected(at.middle_s, at.span_s)
             loose = self._touches.expected(at.middle_s, at.span_s, loose=True)
             del standing[k], loose[k]
-            touched, nearby = self._change(standing, at)
+            touched, nearby = self._change(standing, at, but=k)
             ask = partial(self._with, standing, loose)
             other = self._faults.explained_by_fault(
                 found.view, found.question, found.answer, touched, nearby, ask, doubted=True
@@ -138,14 +138,25 @@ class FaultAsking:
         assert quiet is not None
         return quiet
 
-    def _change(self, priors: Sequence[TouchPrior], at: AskedScan) -> tuple[Array, Array]:
-        """(K,) what touches that stand do to each |Z|, and (K, K) the covariance of what they may have changed by."""
+    def _change(self, priors: Sequence[TouchPrior], at: AskedScan, but: int = -1) -> tuple[Array, Array]:
+        """(K,) what touches that stand do to each |Z|, and (K, K) the covariance of what they may have changed by: a
+        strong one's outline and misfit are more than a contact impedance that begins to change. But: a track that is
+        left out. The outline of a touch that has just come is not known: what is odd about it is no contact.
+        """
         k = len(at.times_s)
         if not priors:
             return np.zeros(k), np.zeros((k, k))
         states = np.stack([prior.start for prior in priors])
-        columns = TouchCourse(self._response, at.times_s, at.span_s).columns(states, priors, ())
-        return np.maximum(columns.mean, LEAST_MEAN), as_they_stand(columns.slopes, states)
+        course = TouchCourse(self._response, at.times_s, at.span_s)
+        columns = course.columns(states, priors, course.directions(states))
+        known = [t.scans >= n.DOUBT_SCANS for k, t in enumerate(self._touches.now.tracks) if k != but]
+        nearby = as_they_stand(columns.slopes, states)
+        if not all(known):
+            return np.maximum(columns.mean, LEAST_MEAN), nearby
+        outlines = columns.shapes * np.concatenate([prior.shape_sd for prior in priors])
+        change = columns.mean + columns.shapes @ np.concatenate([prior.shape for prior in priors])
+        nearby += outlines @ outlines.T + self._tables.wrong**2 * float(change @ change) * self._tables.misfit
+        return np.maximum(change, LEAST_MEAN), nearby
 
     def _seen(self, view: BoardView) -> Hypotheses:
         """The skin through what is wrong with the board's wires."""

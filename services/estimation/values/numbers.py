@@ -50,6 +50,7 @@ MEMORY_SIGMAS = Number(3.0, "-", "sigmas above that share", "derived: one in a t
 MEMORY_DOUBT_S = Number(3.0, "s", "after which a memory is not doubted any more", "derived: beyond the fast recovery")
 MEMORY_UNIT = Number(1e-4, "-", "noise that a memory is held against", "data sheet: AD5940, 80 dB")
 MEMORY_FAINT = Number(0.5, "-", "of that noise: less is forgotten", "derived: half a sigma of a whole scan")
+REFUSED_MOST = Number(0.5, "-", "change of |Z| that a touch makes at most", "derived: a drop of 1 under an electrode")
 MEMORIES = Number(12.0, "-", "memories that are kept", "chosen: cost; more were never alive at once")
 """What foam remembers."""
 
