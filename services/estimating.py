@@ -25,6 +25,7 @@ from services.estimation.estimator import Estimator, KnownBaseline
 from services.estimation.faults.advice import sentences
 from services.estimation.first.tare import TareRefused
 from services.estimation.reconstruct import Reconstruction
+from services.estimation.references import References
 from services.estimation.tare import Baseline, NoBaseline
 from services.estimation.touch_decision import sigma_of_mean
 from services.estimation.values import numbers as n
@@ -33,7 +34,7 @@ from services.estimation.values.scan import Scan
 from services.linearisation import Linearisation
 from services.runtime.config import Skin
 from services.runtime.continuity import Continuity
-from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
+from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
 
 Array = NDArray[np.float64]
 
@@ -78,6 +79,7 @@ class Estimating(Stage):
     def reset(self) -> None:
         self.estimator = Estimator(skin_tables(self.bundle))
         self.continuity.forget()
+        self.references = References(len(self.bundle.pattern))
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
         self._foreign = self._problem = self._source = self._board = ""
         self._before: Scan | None = None
@@ -118,6 +120,11 @@ class Estimating(Stage):
             return [self._no_scan(out, frame)]
         self._foreign = ""
         self._follow(frame)
+        if frame.kind == "reference":
+            return [self._refer(out, frame)]
+        self.references.interrupted()
+        if SEPARATE in frame.reasons and not self._beside_reference(frame):
+            return [_unusable(out, "stale_baseline", len(self.bundle.pattern))]
         scan = Scan.of(frame, self._before)
         self._before = scan
         estimate = self.estimator.step(scan)
@@ -194,6 +201,34 @@ class Estimating(Stage):
     def _said(self, estimate: Estimate) -> list[EstimatedTouch]:
         return [on_the_wire(touch, self.bundle.metres_per_unit) for touch in estimate.touches]
 
+    # --- scans that stand in a file ---
+
+    def _refer(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
+        """A scan that is untouched, as the file says: the baseline until the next one."""
+        amplitude = np.where(frame.status == 0, np.abs(frame.z.astype(np.complex128)), np.nan)
+        found = self.references.baseline(amplitude, frame.scan, frame.board, self._sample_ns)
+        if found is None:
+            self._forget_baseline()
+            self._problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"
+            return _unusable(out, "stale_baseline", len(self.bundle.pattern))
+        self.set_baseline(found)
+        self._reconstruction.begin(self.references.sigma(found, self.pre), found.frames)
+        out.difference = np.zeros(len(amplitude), np.float32)
+        out.sigma = self._reconstruction.sigma.astype(np.float32)
+        return out
+
+    def _beside_reference(self, frame: RawFrame) -> bool:
+        """A scan that stands by itself is compared with the reference just before it, and with no other."""
+        if self.baseline is None or frame.scan != self.references.scan + 1:
+            self._forget_baseline()
+            self._problem = f"the reference of scan {frame.scan} did not come: it cannot be compared"
+            return False
+        return True
+
+    def _forget_baseline(self) -> None:
+        self.estimator = Estimator(skin_tables(self.bundle))
+        self._use(None)
+
     # --- the baseline ---
 
     def _follow(self, frame: RawFrame) -> None:
@@ -203,8 +238,7 @@ class Estimating(Stage):
             self.reset()
         elif self.baseline is not None and not replayed and self.baseline.board != frame.board:
             problem = f"the baseline was of board {self.baseline.board}, this is {frame.board}: taking a new one"
-            self.estimator = Estimator(skin_tables(self.bundle))
-            self._use(None)
+            self._forget_baseline()
             self._problem = problem
         self._source, self._board = frame.source, frame.board
         if as_sent(frame)[0]:
@@ -334,6 +368,7 @@ class Estimating(Stage):
             "estimator": self.estimator.state(),
             "bundle": self.bundle.hash,
             "baseline": baseline.to_dict() if baseline else None,
+            "references": self.references.state(),
             "parts": [*self._part, self._delta],
             "source": [self._source, self._board],
             "last_sample_ns": self._sample_ns,
@@ -366,6 +401,7 @@ class Estimating(Stage):
         self._before = self.estimator.now.before
         self._reconstruction.load(state["hold"])
         self.continuity.load(state["continuity"])
+        self.references.load(state["references"])
         self._touched, self._told_ns = bool(state["touched"]), int(state["told_ns"])
         seen, handed, self._delta = (int(each) for each in state["parts"])
         self._part = (seen, handed)

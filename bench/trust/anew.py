@@ -12,8 +12,8 @@ class Anew(Today):
     """Of one skin; see bench.trust.candidate.Candidate."""
 
     def reset(self) -> None:
-        self._stages = Pipeline(self._skin, f"palm-{os.getpid()}", self._bundle, build=build_anew)
-        self._stages.pre.warm_up()
+        self.stages = Pipeline(self._skin, f"palm-{os.getpid()}", self._bundle, build=build_anew)
+        self.stages.pre.warm_up()
 
     @property
     def refused(self) -> bool:

@@ -44,26 +44,26 @@ class Today:
         self.reset()
 
     def reset(self) -> None:
-        self._stages = Pipeline(self._skin, f"palm-{os.getpid()}", self._bundle)  # others keep what theirs found
-        self._stages.pre.warm_up()
+        self.stages = Pipeline(self._skin, f"palm-{os.getpid()}", self._bundle)  # others keep what theirs found
+        self.stages.pre.warm_up()
 
     def step(self, raw: RawFrame) -> ContactFrame | None:
-        self._stages.prepare()
-        return self._stages.step(raw)
+        self.stages.prepare()
+        return self.stages.step(raw)
 
     def tare(self) -> None:
         try:
-            self._stages.pre.command("tare", {})
+            self.stages.pre.command("tare", {})
         except Refused:  # something touches, or too few frames agree
             return
         waited = time.monotonic() + FIT_S
-        while self._stages.pre.linearisation.busy and time.monotonic() < waited:
-            self._stages.prepare()
+        while self.stages.pre.linearisation.busy and time.monotonic() < waited:
+            self.stages.prepare()
             time.sleep(0.02)
 
     @property
     def refused(self) -> bool:
-        return self._stages.image is not None and not self._stages.image.valid
+        return self.stages.image is not None and not self.stages.image.valid
 
 
 def made(name: str, skin: Skin, bundle: Bundle) -> Candidate:

@@ -74,6 +74,7 @@ class TaredSkin:
         """The baseline was taken earlier, and nobody watched since."""
         self.noise.now.white = float(np.median(self.scatter[self.live] ** 2))
         self.drift.begin(0.0, np.full(self.tables.electrodes, n.CONTACT_START**2))
+        self.drift.now.remainder_variance += self.scatter**2 / self.frames
         self.touches.now.next_id, self.touches.now.watched = next_id, False
 
     def with_tables(self, tables: SkinTables) -> TaredSkin:

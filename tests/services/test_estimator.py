@@ -17,6 +17,8 @@ from models.measurement.tables import tables_of
 from models.mismatch import Mismatch
 from models.rolling import order
 from protocol.frames import Contact, ContactFrame, RawFrame
+from services.estimating import Estimating
+from services.estimation.estimator import Estimator
 from services.runtime.config import Skin
 
 SCAN_S, PARTS, NOISE = 0.0437, 10, 1e-4
@@ -93,6 +95,12 @@ def run(curve: Curve, seconds: float, parts: int = 1, seed: int = 1, tare_s: flo
     candidate = Anew(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle())
     made = [candidate.step(raw) for raw in Board(curve, parts, seed).frames(seconds)]
     return [frame for frame in made if frame is not None]
+
+
+def estimator_of(candidate: Anew) -> Estimator:
+    stage = candidate.stages.pre
+    assert isinstance(stage, Estimating)
+    return stage.estimator
 
 
 def at_s(frame: ContactFrame) -> float:
@@ -316,8 +324,9 @@ def test_other_tables_of_the_same_skin_change_nothing_of_what_is_expected_untouc
     frames = []
     for raw in Board(curve, 1, 1).frames(until_s + 1.0):
         if 0 <= raw.stamps["sample"] * 1e-9 - warm_s < SCAN_S:
-            assert not candidate.estimator.touched
-            candidate.estimator.use(replace(tables, z0=tables.z0 * row))
+            estimator = estimator_of(candidate)
+            assert not estimator.touched
+            estimator.use(replace(tables, z0=tables.z0 * row))
         if (frame := candidate.step(raw)) is not None:
             frames.append(frame)
     free = between_s(frames, FREE_S, until_s - SCAN_S)
