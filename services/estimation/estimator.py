@@ -43,7 +43,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 2  # of a kept state
+LAYOUT = 3  # of a kept state
 AGES_OF_DOUBT = (1, 2, 4, 8)  # whole scans of a touch, at which its outline is asked whether it is one
 
 
@@ -273,18 +273,19 @@ class Estimator:
         skin.touches.drop_the_vague()
         predicted = skin.drift.ahead(measured.middle_s, skin.noise.now.flicker)
         scan, untouched = measured.scan, skin.log_z0 + predicted.shift
+        at = AskedScan(
+            values=scan.values,
+            status=scan.status,
+            untouched=untouched,
+            predicted=predicted,
+            part=scan.part,
+            times_s=measured.span_s / 2 - scan.ages_s,
+            span_s=measured.span_s,
+            middle_s=measured.middle_s,
+            whole=measured.whole,
+        )
         asked = skin.asking(
-            AskedScan(
-                values=scan.values,
-                status=scan.status,
-                untouched=untouched,
-                predicted=predicted,
-                part=scan.part,
-                times_s=measured.span_s / 2 - scan.ages_s,
-                span_s=measured.span_s,
-                middle_s=measured.middle_s,
-                whole=measured.whole,
-            ),
+            at,
             lambda hypotheses, view, covariance: self._question(hypotheses, skin, view, covariance, measured),
             lambda hypotheses, question: self._answer(skin, hypotheses, question, predicted, measured),
         )
@@ -301,9 +302,13 @@ class Estimator:
         if plain and self._complete(skin, measured.live):
             skin.held.keep(skin.noise.alike(scan.part), measured.middle_s, skin.touches.ids, question, answer)
         skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
-        if explained and skin.faults.sound and not asked.changed:
+        sound = skin.faults.sound
+        if explained and measured.whole and not asked.changed:
+            skin.asking.decide(asked, at)
+        if explained and sound and not asked.changed:
             self._learn(skin, measured, answer)
-        judgements += advice.judgements_of(skin.faults.states(), scan.status, float(asked.view.failed.mean()))
+        failed, undecided = float(asked.view.failed.mean()), skin.faults.now.doubt.undecided
+        judgements += advice.judgements_of(skin.faults.states(), scan.status, failed, undecided)
         judgements.append(judge("gap", float(skin.touches.lost), 1.0))
         judgements.append(judge("gain", float(skin.faults.gain_named(measured.middle_s)), 1.0))
         judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))

@@ -9,7 +9,7 @@ from protocol.frame_types import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA
 from services.estimation.advice import ADVICE, NO_ANSWER, listed, stuck_bit
 from services.estimation.faults.wires import WireFault, WireKind
 from services.estimation.values import numbers as n
-from services.estimation.values.judgement import Judgement, judge
+from services.estimation.values.judgement import Judgement, Verdict, judge
 
 OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(7)  # protocol.frame_types.ELECTRODE_STATES
 STATE_OF = {WireKind.EXCHANGED: SWAPPED, WireKind.SHORT: SHORT, WireKind.STUCK: STUCK}
@@ -28,12 +28,17 @@ def states_of(electrodes: int, wire: WireFault | None, opens: tuple[int, ...], c
     return states
 
 
-def judgements_of(states: NDArray[np.uint8], status: NDArray[np.uint8], failed: float) -> list[Judgement]:
-    """Of electrodes' states (E,), status bits (K,) and the share of measurements that failed."""
+def judgements_of(
+    states: NDArray[np.uint8], status: NDArray[np.uint8], failed: float, undecided: bool
+) -> list[Judgement]:
+    """Of electrodes' states (E,), status bits (K,) and the share of measurements that failed. undecided: a contact that
+    changed may be a touch.
+    """
     found = [judge("silent", failed, n.SILENT)]
     for state, row in ROW_OF.items():
         named = np.flatnonzero(states == state)
-        found.append(judge(row, len(named), 1.0, int(named[0]) if len(named) else -1))
+        turned = Verdict.REFUSE if undecided and state == DRIFTING else None
+        found.append(judge(row, len(named), 1.0, int(named[0]) if len(named) else -1, turned))
     found.append(judge("saturated", float(np.mean(status & (STATUS_CLIPPED | STATUS_RTIA) != 0)), ANY))
     found.append(judge("fifo", float(np.mean(status & STATUS_FIFO != 0)), ANY))
     lost = int(np.isin(states, (OPEN, SHORT, DRIFTING, SWAPPED)).sum())

@@ -8,7 +8,7 @@ a contact walks, and a fault that explains nothing is dropped.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -18,6 +18,7 @@ from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
 from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice, wires
+from services.estimation.faults.decided import DecidedState
 from services.estimation.faults.impedance import (
     ContactChange,
     ContactColumns,
@@ -59,6 +60,7 @@ class FaultState:
     gain_since_s: float = -np.inf
     gain_said_until_s: float = -np.inf
     unexplained_scans: int = 0
+    doubt: DecidedState = field(default_factory=DecidedState)  # of the changed contact
 
 
 @dataclass(frozen=True)
@@ -330,10 +332,14 @@ class BoardFaults:
             now.gain_said_until_s = view.middle_s + n.GAIN_NAMED_S
             return
         before = now.size if change.electrode == now.contact else 0.0
-        if now.contact not in (-1, change.electrode):
+        if now.contact not in (-1, change.electrode) and not now.doubt.undecided:
             self._settle()
+        if now.contact != change.electrode:
+            now.doubt = DecidedState()
         now.contact, now.contact_since_s, now.size_before = change.electrode, since_s, before
         now.size = max(before + n.CONTACT_CHANGES * told, LEAST)
+        if now.size > before and not now.doubt.undecided:
+            now.doubt.begin(before)
         now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
         now.still_s, now.back_scans = 0.0, 0
 
@@ -345,18 +351,23 @@ class BoardFaults:
         if not explained:
             now.unexplained_scans += whole
             if now.unexplained_scans >= n.UNEXPLAINED_SCANS:
-                now.wire, now.contact, now.unexplained_scans = None, -1, 0
+                now.wire, now.unexplained_scans = None, 0
+                self.drop_contact()
             return
         now.unexplained_scans = 0
         if now.contact < 0:
             return
         step = self._stepped(view, answer)
+        if whole:
+            now.doubt.follow(view.middle_s, now.size)
         now.still_s = now.still_s + passed_s if abs(step) < n.CONTACT_STILL * (1 + now.size) else 0.0
         unsure = n.CONTACT_BACK + 3 * float(np.sqrt(now.variance))
         nearest = min(abs(now.size), abs(now.size + now.settled[now.contact]))
         now.back_scans = (now.back_scans + whole) if nearest < unsure else 0
         now.variance += (n.CONTACT_WALK_CHANGED * (1 + now.size)) ** 2 * min(passed_s / SCAN_S, 1.0)
-        if now.still_s > n.CONTACT_SETTLES_S or now.back_scans >= n.BACK_SCANS:
+        drifts = view.middle_s < now.doubt.drifts_until_s
+        settles_s = n.UNDECIDED_SETTLES_S if now.doubt.undecided else n.CONTACT_SETTLES_S
+        if now.still_s > settles_s or (now.back_scans >= n.BACK_SCANS and not drifts):
             self._settle()
 
     def _stepped(self, view: BoardView, answer: ScoredAnswer) -> float:
@@ -371,12 +382,17 @@ class BoardFaults:
         now.variance *= max(1 - told, 1e-4)
         return step
 
+    def drop_contact(self) -> None:
+        """No contact has changed."""
+        now = self.now
+        now.contact, now.size, now.variance, now.doubt = -1, 0.0, 0.0, DecidedState()
+
     def _settle(self) -> None:
         """A changed contact is the skin's own from now on, be it as it was at the tare."""
         now = self.now
         now.settled = now.settled.copy()
         now.settled[now.contact] += now.size
-        now.contact, now.size, now.variance = -1, 0.0, 0.0
+        self.drop_contact()
 
     def states(self) -> NDArray[np.uint8]:
         """(E,) of the wire format."""

@@ -191,6 +191,16 @@ CONTACT_SETTLES_S = Number(10.0, "s", "still for so long it is the skin's own", 
 CONTACT_BACK = Number(0.004, "-", "change below which a contact is well again", "derived: ten sigmas of the filter's")
 BACK_SCANS = Number(3.0, "-", "whole scans for which it must be", "chosen: a loose wire flaps no faster")
 GAIN_NAMED_S = Number(0.3, "s", "for which a step of the gain is said", "chosen: seen by a person's tool at 5 Hz")
+CONTACT_TOLD = Number(
+    24.0, "nat", "by which a contact is likelier than a touch on it", "measured: light touches reach 18, 6 beyond"
+)
+TOUCH_TOLD = Number(8.0, "nat", "by which a touch on an electrode is likelier than its contact", "derived: FAULT_SURE")
+TOUCH_SECOND = Number(4.0, "1/unit^4", "what a touch does to its electrode, of its action squared", "measured: 4 A^2")
+PACE_S = Number(0.6, "s", "for which a contact that drifts goes on steadily", "chosen: a press takes less to come")
+PACE_LEAST = Number(0.02, "-", "of its impedance, least change in that time", "derived: 3 % a second")
+PACE_BENDS = Number(0.15, "-", "of the way, from a straight line", "chosen: as the service before")
+PACE_GROWS = Number(2.0, "-", "times its pace that a contact may drift", "chosen: as it turns round")
+UNDECIDED_SETTLES_S = Number(60.0, "s", "still for so long, what may be a touch is the skin's", "chosen: nobody rests so")
 CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itself", "derived: a fifth of its walk")
 ON_ELECTRODE = Number(0.2, "unit", "gap below which a touch changes an electrode's contact", "derived: its width")
 ACTS_Z2 = Number(9.0, "-", "squared sigmas of a touch's action, below which it may be none", "derived: 3 sigmas")

@@ -1,0 +1,84 @@
+"""How much of a changed contact impedance is known to be the contact's, and how much may be a touch on the electrode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+
+LEAST_SIZES = 6  # of a line
+
+
+@dataclass
+class SizeAt:
+    """Of a contact's change, by one whole scan."""
+
+    at_s: float
+    size: float
+
+
+@dataclass
+class DecidedState:
+    """All that changes. Sizes are relative changes of the contact impedance."""
+
+    undecided: bool = False  # what goes beyond `decided` may be a touch
+    decided: float = 0.0
+    over: Annotated[Array | None, "K"] = None  # sum of log |Z| over a skin with what is decided, touches taken off
+    scans: int = 0  # of that sum
+    sizes: list[SizeAt] = field(default_factory=list)  # of the last scans
+    pace: float = 0.0  # of a contact that drifts [1/s]
+    drifts_until_s: float = -np.inf  # as far as is known
+
+    def begin(self, decided: float) -> None:
+        """A contact has changed, or changes anew: beyond `decided` nobody knows why."""
+        self.undecided, self.decided = True, decided
+        self.over, self.scans = None, 0
+
+    def end(self, size: float) -> None:
+        """It is the contact's, all of it."""
+        self.undecided, self.decided = False, size
+        self.over, self.scans = None, 0
+
+    def follow(self, at_s: float, size: float) -> None:
+        """A contact goes on: what falls is no touch, nor what drifts on at the pace that it had."""
+        passed_s = at_s - self.sizes[-1].at_s if self.sizes else 0.0
+        step = size - self.sizes[-1].size if self.sizes else 0.0
+        least = n.CONTACT_STILL * (1 + abs(self.decided))
+        self.sizes = [*(each for each in self.sizes if each.at_s > at_s - n.PACE_S - passed_s), SizeAt(at_s, size)]
+        if size < self.decided:
+            self.end(size)
+        drifts = at_s < self.drifts_until_s
+        if drifts and not self.undecided and abs(step) < n.PACE_GROWS * self.pace * passed_s + least:
+            self.decided = size
+        if self._paces():
+            self.pace = abs(size - self.sizes[0].size) / (at_s - self.sizes[0].at_s)
+            self.drifts_until_s = at_s + n.CONTACT_SETTLES_S
+            self.end(size)
+        elif drifts and abs(step) > least:
+            self.drifts_until_s = at_s + n.CONTACT_SETTLES_S
+        if not self.undecided and size - self.decided > least:
+            self.begin(self.decided)
+
+    def _paces(self) -> bool:
+        """Whether it moved on steadily for longer than a touch takes to come."""
+        sizes = np.array([each.size for each in self.sizes])
+        times = np.array([each.at_s for each in self.sizes])
+        if len(sizes) < LEAST_SIZES or times[-1] - times[0] < n.PACE_S:
+            return False
+        way = sizes[-1] - sizes[0]
+        if abs(way) < n.PACE_LEAST:
+            return False
+        share = (sizes - sizes[0]) / way
+        line = (times - times[0]) / (times[-1] - times[0])
+        return bool(np.abs(share - line).max() < n.PACE_BENDS)
+
+    def add(self, over: Array) -> None:
+        """One more scan of the change that nobody knows."""
+        self.over = over if self.over is None else self.over + over
+        self.scans += 1
