@@ -302,12 +302,12 @@ class Estimator:
         if plain and self._complete(skin, measured.live):
             skin.held.keep(skin.noise.alike(scan.part), measured.middle_s, skin.touches.ids, question, answer)
         skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
-        sound = skin.faults.sound
+        sound, undecided = skin.faults.sound, skin.faults.now.doubt.undecided
         if explained and measured.whole and not asked.changed:
-            skin.asking.decide(asked, at)
+            undecided = undecided and not skin.asking.decide(asked, at) and skin.faults.now.doubt.undecided
         if explained and sound and not asked.changed:
             self._learn(skin, measured, answer)
-        failed, undecided = float(asked.view.failed.mean()), skin.faults.now.doubt.undecided
+        failed = float(asked.view.failed.mean())
         judgements += advice.judgements_of(skin.faults.states(), scan.status, failed, undecided)
         judgements.append(judge("gap", float(skin.touches.lost), 1.0))
         judgements.append(judge("gain", float(skin.faults.gain_named(measured.middle_s)), 1.0))

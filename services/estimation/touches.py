@@ -167,7 +167,7 @@ class TouchTracks:
     def tell(self, fit: FoundTouches, at_s: float, span_s: float) -> None:
         """What was taken for a changed contact impedance is this touch."""
         track = self._new(fit, 0, at_s, span_s)
-        track.told = True
+        track.told = track.sure = True
         _update(track, fit.states[0], fit.covariance[:STATES, :STATES], at_s, span_s, whole=True)
         self.now.tracks.append(track)
 

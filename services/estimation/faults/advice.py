@@ -17,9 +17,13 @@ ANY = 1e-6  # share of measurements: one is enough
 ROW_OF = {OPEN: "open", SHORT: "short", DRIFTING: "impedance", SWAPPED: "exchanged", STUCK: "stuck"}
 
 
-def states_of(electrodes: int, wire: WireFault | None, opens: tuple[int, ...], contact: int) -> NDArray[np.uint8]:
-    """(E,) of the wire format. contact: electrode whose impedance is changed; -1: none."""
-    states = np.zeros(electrodes, np.uint8)
+def states_of(
+    electrodes: int, wire: WireFault | None, opens: tuple[int, ...], contact: int, silent: bool
+) -> NDArray[np.uint8]:
+    """(E,) of the wire format. contact: electrode whose impedance is changed; -1: none. silent: none answers."""
+    states = np.full(electrodes, STUCK if silent else OK, np.uint8)
+    if silent:
+        return states
     if contact >= 0:
         states[contact] = DRIFTING
     states[list(opens)] = OPEN
@@ -42,7 +46,7 @@ def judgements_of(
     found.append(judge("saturated", float(np.mean(status & (STATUS_CLIPPED | STATUS_RTIA) != 0)), ANY))
     found.append(judge("fifo", float(np.mean(status & STATUS_FIFO != 0)), ANY))
     lost = int(np.isin(states, (OPEN, SHORT, DRIFTING, SWAPPED)).sum())
-    found.append(judge("degraded", lost, n.DEGRADED))
+    found.append(judge("degraded", lost if lost < n.TOO_MANY else 0.0, n.DEGRADED))
     found.append(judge("too_many", lost, n.TOO_MANY))
     return found
 

@@ -133,10 +133,12 @@ class FaultAsking:
                 return Asked(found.view, *other, changed=True)
         return found
 
-    def decide(self, found: Asked, at: AskedScan) -> None:
-        """Whether a contact that has changed is a touch on its electrode, once a scan is explained with it."""
+    def decide(self, found: Asked, at: AskedScan) -> bool:
+        """Whether a contact that has changed is a touch on its electrode, once a scan is explained with it: one that is
+        new, or that stands by now.
+        """
         if not self._faults.now.doubt.undecided or self._faults.now.wire is not None:
-            return
+            return False
         skin, own = self._covariances(at)
         touched, nearby = self._change(self._touches.expected(at.middle_s, at.span_s), at)
         misfit = self._tables.wrong**2 * float(touched @ touched) * self._tables.misfit
@@ -144,6 +146,11 @@ class FaultAsking:
         if touch is not None:
             self._faults.drop_contact()
             self._touches.tell(touch, at.middle_s, at.span_s)
+        elif self._faults.now.contact < 0:
+            for track in self._touches.now.tracks:
+                track.told = self._faults.on_electrode(track.state)
+                track.sure = track.sure or track.told
+        return self._faults.now.contact < 0
 
     def _covariances(self, at: AskedScan) -> tuple[Array, Array]:
         """(K, K) of what changes with the skin, and of what the measurements add."""

@@ -48,6 +48,7 @@ class FaultState:
     wire: WireFault | None = None
     wire_since_s: float = -np.inf
     opens: tuple[int, ...] = ()
+    silent: bool = False  # no electrode answers
     contact: int = -1  # electrode whose contact impedance is changed
     size: float = 0.0
     variance: float = 0.0
@@ -152,12 +153,13 @@ class BoardFaults:
         shown, slopes = sound, None
         if now.wire is None:
             failed = dead = self._known & (~readable | (np.abs(log_z - sound - np.log1p(mean)) > np.log(n.FAR)))
-            now.opens, _ = wires.open_electrodes(failed, self.member)
+            now.silent = bool(failed.mean() >= n.SILENT)
+            now.opens = () if now.silent else wires.open_electrodes(failed, self.member)[0]
         else:
             found = self.maps.one(now.wire, np.exp(sound + np.log1p(mean)))
             failed, dead = self._known & ~readable, ~readable | found.blind
             shown, slopes = np.log(np.maximum(found.values, 1e-9)), found.slopes
-            now.opens = ()  # what fails is left out: a wire that is wrong may be why
+            now.opens, now.silent = (), False  # what fails is left out: a wire that is wrong may be why
         dead = dead | (at_s < now.wire_since_s)  # measured by wires that were otherwise
         live = self._known & ~dead & ~self.member[:, list(now.opens)].any(axis=1)
         return BoardView(log_z, sound, failed, live, shown, slopes, mean, spread, times_s, span_s, middle_s)
@@ -396,7 +398,7 @@ class BoardFaults:
 
     def states(self) -> NDArray[np.uint8]:
         """(E,) of the wire format."""
-        return advice.states_of(len(self.now.settled), self.now.wire, self.now.opens, self.now.contact)
+        return advice.states_of(len(self.now.settled), self.now.wire, self.now.opens, self.now.contact, self.now.silent)
 
     def gain_named(self, middle_s: float) -> bool:
         return middle_s < self.now.gain_said_until_s
@@ -404,7 +406,7 @@ class BoardFaults:
     @property
     def sound(self) -> bool:
         """Whether nothing is wrong but what the skin has for good."""
-        return self.now.wire is None and self.now.contact < 0 and not self.now.opens
+        return self.now.wire is None and self.now.contact < 0 and not self.now.opens and not self.now.silent
 
 
 def _cost(change: ContactChange | GainChange) -> float:

@@ -13,6 +13,7 @@ from services.estimation.values import numbers as n
 Array = NDArray[np.float64]
 
 LEAST_SIZES = 6  # of a line
+PACES_S = (float(n.PACE_S), 3 * float(n.PACE_S))  # for which a pace is looked for
 
 
 @dataclass
@@ -50,14 +51,17 @@ class DecidedState:
         passed_s = at_s - self.sizes[-1].at_s if self.sizes else 0.0
         step = size - self.sizes[-1].size if self.sizes else 0.0
         least = n.CONTACT_STILL * (1 + abs(self.decided))
-        self.sizes = [*(each for each in self.sizes if each.at_s > at_s - n.PACE_S - passed_s), SizeAt(at_s, size)]
-        if size < self.decided:
+        self.sizes = [*(each for each in self.sizes if each.at_s > at_s - PACES_S[-1] - passed_s), SizeAt(at_s, size)]
+        if size < self.decided - least:
             self.end(size)
+        elif not self.undecided:  # as slowly the untouched skin's contacts are followed as well
+            self.decided += min(max(size - self.decided, 0.0), n.PACE_UNSEEN * passed_s)
         drifts = at_s < self.drifts_until_s
         if drifts and not self.undecided and abs(step) < n.PACE_GROWS * self.pace * passed_s + least:
             self.decided = size
-        if self._paces():
-            self.pace = abs(size - self.sizes[0].size) / (at_s - self.sizes[0].at_s)
+        pace = max(self._pace(each_s) for each_s in PACES_S)
+        if pace:
+            self.pace = pace
             self.drifts_until_s = at_s + n.CONTACT_SETTLES_S
             self.end(size)
         elif drifts and abs(step) > least:
@@ -65,18 +69,20 @@ class DecidedState:
         if not self.undecided and size - self.decided > least:
             self.begin(self.decided)
 
-    def _paces(self) -> bool:
-        """Whether it moved on steadily for longer than a touch takes to come."""
-        sizes = np.array([each.size for each in self.sizes])
+    def _pace(self, lasts_s: float) -> float:
+        """At which it moved on steadily for so long, which is longer than a touch takes to come; 0: it did not [1/s]."""
         times = np.array([each.at_s for each in self.sizes])
-        if len(sizes) < LEAST_SIZES or times[-1] - times[0] < n.PACE_S:
-            return False
-        way = sizes[-1] - sizes[0]
+        before = np.flatnonzero(times <= times[-1] - lasts_s)
+        if not before.size or len(times) - before[-1] < LEAST_SIZES:
+            return 0.0
+        times = times[before[-1] :]
+        sizes = np.array([each.size for each in self.sizes])[before[-1] :]
+        way = float(sizes[-1] - sizes[0])
         if abs(way) < n.PACE_LEAST:
-            return False
-        share = (sizes - sizes[0]) / way
+            return 0.0
         line = (times - times[0]) / (times[-1] - times[0])
-        return bool(np.abs(share - line).max() < n.PACE_BENDS)
+        off = np.abs((sizes - sizes[0]) / way - line).max()
+        return abs(way) / float(times[-1] - times[0]) if off < n.PACE_BENDS else 0.0
 
     def add(self, over: Array) -> None:
         """One more scan of the change that nobody knows."""

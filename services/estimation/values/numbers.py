@@ -199,6 +199,7 @@ TOUCH_SECOND = Number(4.0, "1/unit^4", "what a touch does to its electrode, of i
 PACE_S = Number(0.6, "s", "for which a contact that drifts goes on steadily", "chosen: a press takes less to come")
 PACE_LEAST = Number(0.02, "-", "of its impedance, least change in that time", "derived: 3 % a second")
 PACE_BENDS = Number(0.15, "-", "of the way, from a straight line", "chosen: as the service before")
+PACE_UNSEEN = Number(0.01, "1/s", "pace of a contact that is followed unsaid", "measured: drifts of 0.1 to 1 %/s")
 PACE_GROWS = Number(2.0, "-", "times its pace that a contact may drift", "chosen: as it turns round")
 UNDECIDED_SETTLES_S = Number(60.0, "s", "still for so long, what may be a touch is the skin's", "chosen: nobody rests so")
 CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itself", "derived: a fifth of its walk")
