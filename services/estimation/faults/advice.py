@@ -41,8 +41,11 @@ def judgements_of(
     found = [judge("silent", failed, n.SILENT)]
     for state, row in ROW_OF.items():
         named = np.flatnonzero(states == state)
-        turned = Verdict.REFUSE if undecided and state == DRIFTING else None
-        found.append(judge(row, len(named), 1.0, int(named[0]) if len(named) else -1, turned))
+        where = int(named[0]) if len(named) else -1
+        if undecided and state == DRIFTING:  # it may not be named yet
+            found.append(judge(row, 1.0, 1.0, where, Verdict.REFUSE))
+        else:
+            found.append(judge(row, len(named), 1.0, where))
     found.append(judge("saturated", float(np.mean(status & (STATUS_CLIPPED | STATUS_RTIA) != 0)), ANY))
     found.append(judge("fifo", float(np.mean(status & STATUS_FIFO != 0)), ANY))
     lost = int(np.isin(states, (OPEN, SHORT, DRIFTING, SWAPPED)).sum())

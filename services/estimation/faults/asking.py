@@ -96,9 +96,21 @@ class FaultAsking:
         found = asked(view)
         if faults.now.wire is not None and _doubtful(found.answer) and rewired(view):
             found = asked(look())
+        if faults.now.opens and faults.now.wire is None and (_doubtful(found.answer) or -1 in found.answer.kept):
+            found = self._lifted(found, lambda: asked(look()))
         if faults.asks(found.answer):
             found = self._changed(found, *self._change(standing, at), answering)
         return self._doubted(found, at)
+
+    def _lifted(self, found: Asked, ask: Callable[[], Asked]) -> Asked:
+        """Electrodes that are open may be off the skin, or on it and cut off: whichever explains the scan better."""
+        now = self._faults.now
+        before, now.lifted = now.lifted, () if now.lifted else now.opens
+        other = ask()
+        if (other.answer.holds, other.answer.score) > (found.answer.holds, found.answer.score + n.FAULT_SURE):
+            return other
+        now.lifted = before
+        return found
 
     def _changed(self, found: Asked, touched: Array, nearby: Array, answering: Answering) -> Asked:
         def ask(other: Question) -> ScoredAnswer:

@@ -48,6 +48,7 @@ class FaultState:
     wire: WireFault | None = None
     wire_since_s: float = -np.inf
     opens: tuple[int, ...] = ()
+    lifted: tuple[int, ...] = ()  # of them those that are off the skin, where nothing leads past them any more
     silent: bool = False  # no electrode answers
     contact: int = -1  # electrode whose contact impedance is changed
     size: float = 0.0
@@ -155,6 +156,7 @@ class BoardFaults:
             failed = dead = self._known & (~readable | (np.abs(log_z - sound - np.log1p(mean)) > np.log(n.FAR)))
             now.silent = bool(failed.mean() >= n.SILENT)
             now.opens = () if now.silent else wires.open_electrodes(failed, self.member)[0]
+            now.lifted = tuple(k for k in now.lifted if k in now.opens)
         else:
             found = self.maps.one(now.wire, np.exp(sound + np.log1p(mean)))
             failed, dead = self._known & ~readable, ~readable | found.blind
@@ -166,18 +168,22 @@ class BoardFaults:
 
     def _contacts(self, at_s: Array, course: Array) -> tuple[Array, Array]:
         now, columns = self.now, self.columns
-        mean = columns.settled_mean()
+        mean, lifted = columns.settled_mean(), columns.rest[:, list(now.lifted)] * n.SHORT_WAY
+        mean += lifted.sum(axis=1)
+        lifted *= n.SHORT_WAY_SD
         if now.contact < 0:
-            return mean, np.zeros((len(mean), 0))
+            return mean, lifted
         since = at_s >= now.contact_since_s
         after, before = columns.mean(now.contact, now.size), columns.mean(now.contact, now.size_before)
         spread = columns.spread(now.contact, now.size, np.sqrt(now.variance), course)
-        return mean + np.where(since, after, before), spread * since[:, None]
+        return mean + np.where(since, after, before), np.hstack([spread * since[:, None], lifted])
 
     # --- wires ---
 
     def suspects_wires(self, view: BoardView) -> bool:
         """Whether it is worth asking if the wires have changed."""
+        if view.failed.mean() >= n.SILENT:
+            return False
         return self._table.suspicious(self._untouched(view), self.now.wire)
 
     def wires_changed(self, view: BoardView, touched: Array, skin: Array, own: Array) -> bool:
@@ -238,6 +244,8 @@ class BoardFaults:
                 continue
             if isinstance(change, GainChange) and abs(float(column @ found.pulled)) * n.GAIN_CHANGES < n.GAIN_LEAST:
                 continue  # the touches of the answer explain all of it
+            if isinstance(change, ContactChange) and not _told(column, found):
+                continue
             plainly = found.chi2 < n.MOST and found.score + cost > answer.score + n.WIRE_SURE
             if not (found.holds or plainly):
                 continue
@@ -374,8 +382,6 @@ class BoardFaults:
 
     def _stepped(self, view: BoardView, answer: ScoredAnswer) -> float:
         now = self.now
-        if view.spread.shape[1] == 0:
-            return 0.0
         column = view.spread[:, 0]
         sd = float(np.sqrt(now.variance))
         step = sd * float(column @ answer.pulled)
@@ -398,7 +404,10 @@ class BoardFaults:
 
     def states(self) -> NDArray[np.uint8]:
         """(E,) of the wire format."""
-        return advice.states_of(len(self.now.settled), self.now.wire, self.now.opens, self.now.contact, self.now.silent)
+        now = self.now
+        named = not now.doubt.undecided or now.doubt.seen >= n.NAMED_SCANS or abs(now.size) > n.CONTACT_PLAIN
+        contact = now.contact if named else -1
+        return advice.states_of(len(now.settled), now.wire, now.opens, contact, now.silent)
 
     def gain_named(self, middle_s: float) -> bool:
         return middle_s < self.now.gain_said_until_s
@@ -407,6 +416,12 @@ class BoardFaults:
     def sound(self) -> bool:
         """Whether nothing is wrong but what the skin has for good."""
         return self.now.wire is None and self.now.contact < 0 and not self.now.opens and not self.now.silent
+
+
+def _told(column: Array, answer: ScoredAnswer) -> bool:
+    """Whether an answer knows that there is a change; column (K,): of unit variance of what it may be."""
+    known = answer.fit.information(column) if answer.fit is not None else float(np.sum(answer.white(column) ** 2))
+    return float(column @ answer.pulled) ** 2 > n.ACTS_Z2 * max(1 - known, 0.0)
 
 
 def _cost(change: ContactChange | GainChange) -> float:

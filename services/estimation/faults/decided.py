@@ -32,6 +32,7 @@ class DecidedState:
     decided: float = 0.0
     over: Annotated[Array | None, "K"] = None  # sum of log |Z| over a skin with what is decided, touches taken off
     scans: int = 0  # of that sum
+    seen: int = 0  # whole scans for which it has been undecided
     sizes: list[SizeAt] = field(default_factory=list)  # of the last scans
     pace: float = 0.0  # of a contact that drifts [1/s]
     drifts_until_s: float = -np.inf  # as far as is known
@@ -39,7 +40,7 @@ class DecidedState:
     def begin(self, decided: float) -> None:
         """A contact has changed, or changes anew: beyond `decided` nobody knows why."""
         self.undecided, self.decided = True, decided
-        self.over, self.scans = None, 0
+        self.over, self.scans, self.seen = None, 0, 0
 
     def end(self, size: float) -> None:
         """It is the contact's, all of it."""
@@ -48,11 +49,12 @@ class DecidedState:
 
     def follow(self, at_s: float, size: float) -> None:
         """A contact goes on: what falls is no touch, nor what drifts on at the pace that it had."""
+        self.seen += self.undecided
         passed_s = at_s - self.sizes[-1].at_s if self.sizes else 0.0
         step = size - self.sizes[-1].size if self.sizes else 0.0
         least = n.CONTACT_STILL * (1 + abs(self.decided))
         self.sizes = [*(each for each in self.sizes if each.at_s > at_s - PACES_S[-1] - passed_s), SizeAt(at_s, size)]
-        if size < self.decided - least:
+        if size < self.decided - least or abs(size) < n.CONTACT_STILL:  # or it is what it was at the tare
             self.end(size)
         elif not self.undecided:  # as slowly the untouched skin's contacts are followed as well
             self.decided += min(max(size - self.decided, 0.0), n.PACE_UNSEEN * passed_s)

@@ -196,6 +196,8 @@ CONTACT_TOLD = Number(
 )
 TOUCH_TOLD = Number(8.0, "nat", "by which a touch on an electrode is likelier than its contact", "derived: FAULT_SURE")
 TOUCH_SECOND = Number(4.0, "1/unit^4", "what a touch does to its electrode, of its action squared", "measured: 4 A^2")
+NAMED_SCANS = Number(2.0, "-", "further scans after which what may be a touch is named", "chosen: as the service before")
+CONTACT_PLAIN = Number(0.5, "-", "change that is named at once", "measured: touches on electrodes reach 0.35")
 PACE_S = Number(0.6, "s", "for which a contact that drifts goes on steadily", "chosen: a press takes less to come")
 PACE_LEAST = Number(0.02, "-", "of its impedance, least change in that time", "derived: 3 % a second")
 PACE_BENDS = Number(0.15, "-", "of the way, from a straight line", "chosen: as the service before")
