@@ -113,9 +113,14 @@ class FaultAsking:
         return found
 
     def _changed(self, found: Asked, touched: Array, nearby: Array, answering: Answering) -> Asked:
-        def ask(other: Question) -> ScoredAnswer:
-            return answering(self._hypotheses, other)
+        hypotheses = self._seen(found.view)
 
+        def ask(other: Question) -> ScoredAnswer:
+            return answering(hypotheses, other)
+
+        if found.view.slopes is not None:
+            touched = np.maximum(found.view.slopes @ touched, LEAST_MEAN)
+        nearby = found.view.through(nearby)
         other = self._faults.explained_by_fault(found.view, found.question, found.answer, touched, nearby, ask)
         return found if other is None else Asked(found.view, *other, changed=True)
 

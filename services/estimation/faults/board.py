@@ -28,7 +28,7 @@ from services.estimation.faults.impedance import (
     gain_onset,
 )
 from services.estimation.faults.table import BoardScan, WireTable
-from services.estimation.faults.wires import WireFault, WireMaps
+from services.estimation.faults.wires import WireFault, WireKind, WireMaps
 from services.estimation.hypotheses import AS_IT_IS, Question, ScoredAnswer
 from services.estimation.values import numbers as n
 
@@ -76,29 +76,35 @@ class BoardView:
     shown: Array  # (K,) what this one shows
     slopes: Array | None  # (K, K) of that to `sound`; None: the same
     mean: Array  # (K,) relative change by contact impedances
-    spread: Array  # (K, n) columns of unit variance of what is not known of it
+    spread: Array  # (K, n) columns of unit variance of what is not known of it, the changed contact's own first
+    contact: int  # electrode whose contact impedance is changed, as far as is known before; -1: none
     times_s: Array  # (K,) from the middle of the scan
     span_s: float
     middle_s: float
+    apart: bool = True  # `shown` is without contact impedances that changed
 
     @property
     def y(self) -> Array:
         """(K,) log |Z| over what is predicted without touches."""
         left = self.log_z - self.shown
-        if self.slopes is None:
+        if self.apart:
             left = np.log1p(np.maximum(np.expm1(np.minimum(left, 3.0)) - self.mean, LEAST))
         return np.where(self.live, left, 0.0)
 
     def covariance(self, skin: Array, own: Array) -> Array:
         """(K, K) of y. skin: of what changes with the skin; own: of what the measurements add."""
-        if self.slopes is None:
+        made: Array = self.through(skin) + own
+        if self.apart:
             scale = 1 + self.mean
-            made: Array = (skin + own) * scale[:, None] * scale + self.spread @ self.spread.T
+            made = made * scale[:, None] * scale + self.spread @ self.spread.T
             made[np.diag_indices_from(made)] += (n.CONTACT_MISFIT * self.mean) ** 2
-        else:
-            made = self.slopes @ skin @ self.slopes.T + own
         leave_out(made, self.live)
         return made
+
+
+    def through(self, covariance: Array) -> Array:
+        """(K, K) of the skin's log |Z|, as the wires show it."""
+        return covariance if self.slopes is None else np.asarray(self.slopes @ covariance @ self.slopes.T)
 
 
 class BoardFaults:
@@ -126,6 +132,11 @@ class BoardFaults:
         now = self.now
         return self.columns if now.contact < 0 else self.columns.with_change(now.contact, now.size)
 
+    @property
+    def exchanged(self) -> bool:
+        """Whether wires are exchanged: every measurement is there, in another's place."""
+        return self.now.wire is not None and self.now.wire.kind is WireKind.EXCHANGED
+
     def plain(self, oldest_s: float) -> bool:
         """Whether nothing is wrong but what the skin has for good, since the oldest value of a scan."""
         now = self.now
@@ -151,20 +162,24 @@ class BoardFaults:
         mean, spread = self._contacts(at_s, 2 * times_s / span_s)
         readable = np.isfinite(values) & (values > 0) & (status == 0)
         log_z = np.log(np.where(readable, values, 1.0))
-        shown, slopes = sound, None
+        shown, slopes, apart = sound, None, True
         if now.wire is None:
             failed = dead = self._known & (~readable | (np.abs(log_z - sound - np.log1p(mean)) > np.log(n.FAR)))
             now.silent = bool(failed.mean() >= n.SILENT)
             now.opens = () if now.silent else wires.open_electrodes(failed, self.member)[0]
             now.lifted = tuple(k for k in now.lifted if k in now.opens)
         else:
-            found = self.maps.one(now.wire, np.exp(sound + np.log1p(mean)))
+            apart = self.exchanged  # each measurement is another's then, its contacts as well
+            found = self.maps.one(now.wire, np.exp(sound if apart else sound + np.log1p(mean)))
             failed, dead = self._known & ~readable, ~readable | found.blind
             shown, slopes = np.log(np.maximum(found.values, 1e-9)), found.slopes
-            now.opens, now.silent = (), False  # what fails is left out: a wire that is wrong may be why
+            if apart:
+                mean, spread = found.slopes @ mean, found.slopes @ spread
+            now.opens, now.lifted, now.silent = (), (), False  # what fails is left out: a wire that is wrong may be why
         dead = dead | (at_s < now.wire_since_s)  # measured by wires that were otherwise
         live = self._known & ~dead & ~self.member[:, list(now.opens)].any(axis=1)
-        return BoardView(log_z, sound, failed, live, shown, slopes, mean, spread, times_s, span_s, middle_s)
+        times = times_s, span_s, middle_s
+        return BoardView(log_z, sound, failed, live, shown, slopes, mean, spread, now.contact, *times, apart)
 
     def _contacts(self, at_s: Array, course: Array) -> tuple[Array, Array]:
         now, columns = self.now, self.columns
@@ -212,7 +227,7 @@ class BoardFaults:
 
     def asks(self, answer: ScoredAnswer) -> bool:
         """Whether what explains a scan may as well be a fault."""
-        if self.now.wire is not None:
+        if self.now.wire is not None and not self.exchanged:
             return False
         new = answer.fit is not None and any(place < 0 for place in answer.kept)
         return new or not answer.holds or answer.cause != AS_IT_IS
@@ -234,10 +249,13 @@ class BoardFaults:
         if question.budget.left <= 0:  # what is left open is asked again with the scans that follow
             return None
         best, sure = None, answer.score + (n.COST_TOUCH + n.COST_SMALL if doubted else self._sure(answer))
-        changes = self._likeliest(question, touched, nearby, unexplained=not answer.holds)
+        columns, any_touch = self._columns_now, view.through(self._any_touch)
+        if view.slopes is not None:
+            columns = columns.through(view.slopes)
+        changes = self._likeliest(question, columns, any_touch, touched, nearby, unexplained=not answer.holds)
         question = replace(question, keeps=0.0)
         for k, change in enumerate(changes, 1):
-            asked, column = self._with(question.leaving(1 - k / len(changes)), change)
+            asked, column = self._with(question.leaving(1 - k / len(changes)), columns, change)
             found = ask(asked)
             cost = _cost(change)
             if found.score + cost < sure or not self._apart(change, found):
@@ -273,13 +291,19 @@ class BoardFaults:
         return bool(state[LOG_RADIUS] < np.log(n.SMALL) and nearest < n.ON_ELECTRODE)
 
     def _likeliest(
-        self, question: Question, touched: Array, nearby: Array, unexplained: bool
+        self,
+        question: Question,
+        columns: ContactColumns,
+        any_touch: Array,
+        touched: Array,
+        nearby: Array,
+        unexplained: bool,
     ) -> list[ContactChange | GainChange]:
         """At most three changes that may explain a scan: with the touches as they stand, with any touches, or, where
         nothing explains it, without those that stood; and whatever touches: a gain changes all measurements alike.
         """
         found = list[ContactChange | GainChange]()
-        tried = [(touched, nearby, float(n.MOST)), (touched, nearby + self._any_touch, np.inf)]
+        tried = [(touched, nearby, float(n.MOST)), (touched, nearby + any_touch, np.inf)]
         if unexplained and touched.any():
             tried.insert(0, (np.zeros_like(touched), np.zeros_like(nearby), float(n.MOST)))
         for touched, more, most_chi2 in tried:
@@ -287,7 +311,7 @@ class BoardFaults:
             white = Whitening.of(question.covariance + more)
             scan = Unexplained(y, 1 / (1 + touched), question.live, question.times_s, question.span_s, white)
             nothing = white.log_density - 0.5 * float(np.sum(white(y) ** 2))
-            best = max(self._every(scan), key=lambda change: change.score + _cost(change))
+            best = max(self._every(scan, columns), key=lambda change: change.score + _cost(change))
             known = [_what(change) for change in found]
             if int(scan.since(best.since_s).sum()) < n.TOLD_BY:
                 continue
@@ -297,8 +321,7 @@ class BoardFaults:
             found.append(gain_change(scan, -np.inf))
         return found
 
-    def _every(self, scan: Unexplained) -> list[ContactChange | GainChange]:
-        columns = self._columns_now
+    def _every(self, scan: Unexplained, columns: ContactColumns) -> list[ContactChange | GainChange]:
         always = np.full(len(self._places), -np.inf)
         gains = [gain_change(scan, -np.inf), gain_change(scan, gain_onset(scan))]
         found: list[ContactChange | GainChange] = [gain for gain in gains if abs(gain.log_factor) > n.GAIN_LEAST]
@@ -306,16 +329,18 @@ class BoardFaults:
         found += columns.likeliest(scan, columns.onsets(scan))
         return found
 
-    def _with(self, question: Question, change: ContactChange | GainChange) -> tuple[Question, Array]:
+    def _with(
+        self, question: Question, of_contacts: ContactColumns, change: ContactChange | GainChange
+    ) -> tuple[Question, Array]:
         """The question with a change of any size, and its column (K,) of unit variance."""
         acts = np.asarray(question.live & (question.times_s >= change.since_s), float)
         if isinstance(change, GainChange):
             column = n.GAIN_CHANGES * acts
             return replace(question, covariance=question.covariance + np.outer(column, column)), column
         course = 2 * question.times_s / question.span_s
-        y, columns = self._columns_now.taken_off(question.y, acts, course, change)
+        y, columns = of_contacts.taken_off(question.y, acts, course, change)
         wider = question.covariance + columns @ columns.T
-        misfit = n.CONTACT_MISFIT * acts * self._columns_now.mean(change.electrode, change.size)
+        misfit = n.CONTACT_MISFIT * acts * of_contacts.mean(change.electrode, change.size)
         wider[np.diag_indices_from(wider)] += misfit**2
         return replace(question, y=np.where(question.live, y, 0.0), covariance=wider), columns[:, 0]
 
@@ -382,6 +407,8 @@ class BoardFaults:
 
     def _stepped(self, view: BoardView, answer: ScoredAnswer) -> float:
         now = self.now
+        if view.contact != now.contact:  # it was found by this scan
+            return 0.0
         column = view.spread[:, 0]
         sd = float(np.sqrt(now.variance))
         step = sd * float(column @ answer.pulled)
