@@ -168,6 +168,8 @@ class BoardFaults:
             now.silent = bool(failed.mean() >= n.SILENT)
             now.opens = () if now.silent else wires.open_electrodes(failed, self.member)[0]
             now.lifted = tuple(k for k in now.lifted if k in now.opens)
+            lifted = self._lifted()
+            mean, spread = mean + lifted.sum(axis=1), np.hstack([spread, n.SHORT_WAY_SD * lifted])
         else:
             apart = self.exchanged  # each measurement is another's then, its contacts as well
             found = self.maps.one(now.wire, np.exp(sound if apart else sound + np.log1p(mean)))
@@ -183,15 +185,17 @@ class BoardFaults:
 
     def _contacts(self, at_s: Array, course: Array) -> tuple[Array, Array]:
         now, columns = self.now, self.columns
-        mean, lifted = columns.settled_mean(), columns.rest[:, list(now.lifted)] * n.SHORT_WAY
-        mean += lifted.sum(axis=1)
-        lifted *= n.SHORT_WAY_SD
+        mean = columns.settled_mean()
         if now.contact < 0:
-            return mean, lifted
+            return mean, np.zeros((len(mean), 0))
         since = at_s >= now.contact_since_s
         after, before = columns.mean(now.contact, now.size), columns.mean(now.contact, now.size_before)
         spread = columns.spread(now.contact, now.size, np.sqrt(now.variance), course)
-        return mean + np.where(since, after, before), np.hstack([spread * since[:, None], lifted])
+        return mean + np.where(since, after, before), spread * since[:, None]
+
+    def _lifted(self) -> Array:
+        """(K, n) relative changes by electrodes that are off the skin, each measurement by all the rest of a contact."""
+        return np.asarray(self._columns.rest[:, list(self.now.lifted)] * n.SHORT_WAY)
 
     # --- wires ---
 

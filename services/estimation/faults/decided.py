@@ -66,8 +66,6 @@ class DecidedState:
             self.pace = pace
             self.drifts_until_s = at_s + n.CONTACT_SETTLES_S
             self.end(size)
-        elif drifts and abs(step) > least:
-            self.drifts_until_s = at_s + n.CONTACT_SETTLES_S
         if not self.undecided and size - self.decided > least:
             self.begin(self.decided)
 
