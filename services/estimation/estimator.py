@@ -290,12 +290,12 @@ class Estimator:
         skin.touches.drop_the_past(measured.middle_s - measured.span_s / 2)
         skin.touches.drop_the_vague()
         scan = measured.scan
-        asked, untouched = self._explaining(skin, measured)
+        asked, at = self._explaining(skin, measured)
         if asked.answer.holds and (pressed := skin.refused.explained(measured.middle_s - measured.span_s / 2)):
             self._remember(skin, pressed)
-            asked, untouched = self._explaining(skin, measured)  # again: what is left may be memory
+            asked, at = self._explaining(skin, measured)  # again: what is left may be memory
         question, answer = asked.question, asked.answer
-        measured = replace(measured, log_z=untouched + asked.view.y, live=asked.view.live)
+        measured = replace(measured, log_z=at.untouched + asked.view.y, live=asked.view.live)
         explained = answer.holds
         rough = answer.fit is not None and answer.chi2 < n.MOST
         if explained or rough:
@@ -307,34 +307,39 @@ class Estimator:
         if plain and self._complete(skin, measured.live):
             skin.held.keep(skin.noise.alike(scan.part), measured.middle_s, skin.touches.ids, question, answer)
         skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
-        if explained and skin.faults.sound and not asked.changed:
+        sound, undecided = skin.faults.sound, skin.faults.now.doubt.undecided
+        if explained and measured.whole and not asked.changed:
+            undecided = undecided and not skin.asking.decide(asked, at) and skin.faults.now.doubt.undecided
+        if explained and sound and not asked.changed:
             self._learn(skin, measured, answer)
-        judgements += advice.judgements_of(skin.faults.states(), scan.status, float(asked.view.failed.mean()))
+        failed = float(asked.view.failed.mean())
+        judgements += advice.judgements_of(skin.faults.states(), scan.status, failed, undecided)
         judgements.append(judge("gap", float(skin.touches.lost), 1.0))
         judgements.append(judge("gain", float(skin.faults.gain_named(measured.middle_s)), 1.0))
         judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
         return self._said(skin, measured, question, answer, judgements, explained, rough)
 
-    def _explaining(self, skin: TaredSkin, measured: LookedAt) -> tuple[Asked, Array]:
-        """What explains a scan, and log |Z| (K,) as the filter predicts it untouched."""
+    def _explaining(self, skin: TaredSkin, measured: LookedAt) -> tuple[Asked, AskedScan]:
+        """What explains a scan, and the scan as it was asked about."""
         predicted = skin.drift.ahead(measured.middle_s, skin.noise.now.flicker)
         scan, untouched = measured.scan, skin.log_z0 + predicted.shift
+        at = AskedScan(
+            values=scan.values,
+            status=scan.status,
+            untouched=untouched,
+            predicted=predicted,
+            part=scan.part,
+            times_s=measured.span_s / 2 - scan.ages_s,
+            span_s=measured.span_s,
+            middle_s=measured.middle_s,
+            whole=measured.whole,
+        )
         asked = skin.asking(
-            AskedScan(
-                values=scan.values,
-                status=scan.status,
-                untouched=untouched,
-                predicted=predicted,
-                part=scan.part,
-                times_s=measured.span_s / 2 - scan.ages_s,
-                span_s=measured.span_s,
-                middle_s=measured.middle_s,
-                whole=measured.whole,
-            ),
+            at,
             lambda hypotheses, view, covariance: self._question(hypotheses, skin, view, covariance, measured),
             lambda hypotheses, question: self._answer(skin, hypotheses, question, predicted, measured),
         )
-        return asked, untouched
+        return asked, at
 
     def _question(
         self, hypotheses: Hypotheses, skin: TaredSkin, view: BoardView, covariance: Array, measured: LookedAt

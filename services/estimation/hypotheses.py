@@ -30,6 +30,8 @@ from services.estimation.values import numbers as n
 Array = NDArray[np.float64]
 
 ONSETS = (0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a touch may begin or end at once
+ON_ELECTRODE = ((0.03, 0.0), (0.03, 0.1), (0.03, -0.1))  # inside its edge and along it, where a search begins
+SMALL_RADIUS = 0.1  # where it begins
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
 WIDER = (MEMORY, DRIFT, BURST, NOISE)
 COSTS = {
@@ -174,6 +176,25 @@ class Hypotheses:
     def at(self, question: Question, x: float, y: float) -> ScoredAnswer:
         """The answer that something touches there."""
         return self._fitted(question, [anywhere(x, y, 0.0, question.span_s)], (-1,), n.STEPS_COLD)
+
+    def on_electrode(self, question: Question, place: Array, second: Array) -> ScoredAnswer:
+        """The likeliest small touch on an electrode. place (2,): its middle; second (K, n): what a touch does there by the
+        square of its action.
+        """
+        out = place / max(float(np.hypot(*place)), LEAST_ACTION)
+        found: ScoredAnswer | None = None
+        for inside, along in ON_ELECTRODE:
+            x, y = place - inside * out + along * np.array([-out[1], out[0]])
+            prior = anywhere(float(x), float(y), 0.0, question.span_s)
+            prior.start[LOG_RADIUS] = np.log(SMALL_RADIUS)
+            action = 0.0 if found is None or found.fit is None else float(found.fit.states[0, ACTION])
+            more = action**2 * second
+            wider = replace(question, covariance=question.covariance + more @ more.T)
+            answer = self._fitted(wider, [prior], (-1,), n.STEPS_COLD)
+            if found is None or answer.score > found.score:
+                found = answer
+        assert found is not None
+        return found
 
     def anew(self, question: Question) -> ScoredAnswer | None:
         """The likeliest touches, as if there had been none before; None where there are none."""

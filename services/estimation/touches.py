@@ -59,6 +59,7 @@ class TrackedTouch:
     moves: bool = False
     z2: float = 0.0  # how much it explains: squared sigmas of its action, in the middle of the scan or at its end
     sure: bool = False
+    told: bool = False  # several scans told it from a changed contact impedance
     lost: bool = False  # scans were lost since: it may be anywhere
     peak: float = 0.0  # action that it surely had
     held: float = 0.0  # action before it began to go
@@ -176,6 +177,13 @@ class TouchTracks:
                 memories += self._memory(track, track.until_s, 1.0)
         self.now.tracks = [track for track in self.now.tracks if track.sure or not track.ended]
         return memories
+
+    def tell(self, fit: FoundTouches, at_s: float, span_s: float) -> None:
+        """What was taken for a changed contact impedance is this touch."""
+        track = self._new(fit, 0, at_s, span_s)
+        track.told = track.sure = True
+        _update(track, fit.states[0], fit.covariance[:STATES, :STATES], at_s, span_s, whole=True)
+        self.now.tracks.append(track)
 
     def released(self, place: int, at_s: float) -> list[Memory]:
         """A touch ended at an instant within the scan; what it leaves."""

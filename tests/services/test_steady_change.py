@@ -47,15 +47,20 @@ def named(result: Result) -> bool:
 def test_a_touch_right_on_an_electrode_is_no_drifting_contact(
     skin: StubSkin, touch: tuple[int, float, float, float, float], ramp: int
 ) -> None:
+    """It is shown, or the frame says that it may be a contact and is not valid: never is it hidden in a valid one."""
     skin.rest(8)
     free, pressed = transfer(), transfer((on_electrode(*touch),))
     forces = [*np.linspace(0, 1, ramp + 1)[1:], *[1.0] * 30, *np.linspace(1, 0, ramp + 1)[1:], *[0.0] * 6]
-    doubted = False
-    for force in forces:
+    looks_like_a_contact = False
+    for k, force in enumerate(forces):
         result = skin.see(free + force * (pressed - free))
         assert not named(result), force
-        doubted |= "electrode_drift" in result.contact.reasons
-    assert doubted, "the touch does not look like a contact: it proves nothing"
+        doubted = "electrode_drift" in result.contact.reasons
+        shown = any(contact.state != "end" for contact in result.contact.contacts)
+        looks_like_a_contact |= doubted or shown
+        if ramp <= k < ramp + 30:
+            assert shown or not result.contact.valid or "changing" in result.contact.reasons, k
+    assert looks_like_a_contact, "the touch is not seen: it proves nothing"
     assert result.contact.valid and not result.contact.contacts
 
 

@@ -9,7 +9,7 @@ from protocol.frame_types import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA
 from services.estimation.advice import ADVICE, NO_ANSWER, listed, stuck_bit
 from services.estimation.faults.wires import WireFault, WireKind
 from services.estimation.values import numbers as n
-from services.estimation.values.judgement import Judgement, judge
+from services.estimation.values.judgement import Judgement, Verdict, judge
 
 OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(7)  # protocol.frame_types.ELECTRODE_STATES
 STATE_OF = {WireKind.EXCHANGED: SWAPPED, WireKind.SHORT: SHORT, WireKind.STUCK: STUCK}
@@ -17,9 +17,13 @@ ANY = 1e-6  # share of measurements: one is enough
 ROW_OF = {OPEN: "open", SHORT: "short", DRIFTING: "impedance", SWAPPED: "exchanged", STUCK: "stuck"}
 
 
-def states_of(electrodes: int, wire: WireFault | None, opens: tuple[int, ...], contact: int) -> NDArray[np.uint8]:
-    """(E,) of the wire format. contact: electrode whose impedance is changed; -1: none."""
-    states = np.zeros(electrodes, np.uint8)
+def states_of(
+    electrodes: int, wire: WireFault | None, opens: tuple[int, ...], contact: int, silent: bool
+) -> NDArray[np.uint8]:
+    """(E,) of the wire format. contact: electrode whose impedance is changed; -1: none. silent: none answers."""
+    states = np.full(electrodes, STUCK if silent else OK, np.uint8)
+    if silent:
+        return states
     if contact >= 0:
         states[contact] = DRIFTING
     states[list(opens)] = OPEN
@@ -28,16 +32,24 @@ def states_of(electrodes: int, wire: WireFault | None, opens: tuple[int, ...], c
     return states
 
 
-def judgements_of(states: NDArray[np.uint8], status: NDArray[np.uint8], failed: float) -> list[Judgement]:
-    """Of electrodes' states (E,), status bits (K,) and the share of measurements that failed."""
+def judgements_of(
+    states: NDArray[np.uint8], status: NDArray[np.uint8], failed: float, undecided: bool
+) -> list[Judgement]:
+    """Of electrodes' states (E,), status bits (K,) and the share of measurements that failed. undecided: a contact that
+    changed may be a touch.
+    """
     found = [judge("silent", failed, n.SILENT)]
     for state, row in ROW_OF.items():
         named = np.flatnonzero(states == state)
-        found.append(judge(row, len(named), 1.0, int(named[0]) if len(named) else -1))
+        where = int(named[0]) if len(named) else -1
+        if undecided and state == DRIFTING:  # it may not be named yet
+            found.append(judge(row, 1.0, 1.0, where, Verdict.REFUSE))
+        else:
+            found.append(judge(row, len(named), 1.0, where))
     found.append(judge("saturated", float(np.mean(status & (STATUS_CLIPPED | STATUS_RTIA) != 0)), ANY))
     found.append(judge("fifo", float(np.mean(status & STATUS_FIFO != 0)), ANY))
     lost = int(np.isin(states, (OPEN, SHORT, DRIFTING, SWAPPED)).sum())
-    found.append(judge("degraded", lost, n.DEGRADED))
+    found.append(judge("degraded", lost if lost < n.TOO_MANY else 0.0, n.DEGRADED))
     found.append(judge("too_many", lost, n.TOO_MANY))
     return found
 

@@ -16,6 +16,7 @@ from models.measurement.noise import NoiseModel
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, TouchPrior
 from services.estimation.faults.board import BoardFaults, BoardView, as_they_stand
+from services.estimation.faults.doubt import ContactDoubt
 from services.estimation.faults.wires import WireFault
 from services.estimation.filter import Prediction
 from services.estimation.hypotheses import AS_IT_IS, Hypotheses, Question, ScoredAnswer
@@ -66,14 +67,13 @@ class FaultAsking:
     ) -> None:
         self._tables, self._response, self._noise, self._touches = tables, response, noise, touches
         self._hypotheses, self._faults = hypotheses, faults
+        self._contact_doubt = ContactDoubt(tables, hypotheses, faults)
         self._through: tuple[WireFault, Hypotheses] | None = None
 
     def __call__(self, at: AskedScan, question_of: MakeQuestion, answering: Answering) -> Asked:
         """question_of: of hypotheses, a view and a covariance; answering: the likeliest touches of a question."""
         faults = self._faults
-        contact = self._tables.contact
-        flicker = (contact * self._noise.now.flicker) @ contact.T
-        skin, own = at.predicted.covariance + flicker, self._noise.covariance(at.part) - flicker
+        skin, own = self._covariances(at)
         standing = self._touches.expected(at.middle_s, at.span_s)
 
         def rewired(view: BoardView) -> bool:
@@ -96,14 +96,31 @@ class FaultAsking:
         found = asked(view)
         if faults.now.wire is not None and _doubtful(found.answer) and rewired(view):
             found = asked(look())
+        if faults.now.opens and faults.now.wire is None and (_doubtful(found.answer) or -1 in found.answer.kept):
+            found = self._lifted(found, lambda: asked(look()))
         if faults.asks(found.answer):
             found = self._changed(found, *self._change(standing, at), answering)
         return self._doubted(found, at)
 
-    def _changed(self, found: Asked, touched: Array, nearby: Array, answering: Answering) -> Asked:
-        def ask(other: Question) -> ScoredAnswer:
-            return answering(self._hypotheses, other)
+    def _lifted(self, found: Asked, ask: Callable[[], Asked]) -> Asked:
+        """Electrodes that are open may be off the skin, or on it and cut off: whichever explains the scan better."""
+        now = self._faults.now
+        before, now.lifted = now.lifted, () if now.lifted else now.opens
+        other = ask()
+        if (other.answer.holds, other.answer.score) > (found.answer.holds, found.answer.score + n.FAULT_SURE):
+            return other
+        now.lifted = before
+        return found
 
+    def _changed(self, found: Asked, touched: Array, nearby: Array, answering: Answering) -> Asked:
+        hypotheses = self._seen(found.view)
+
+        def ask(other: Question) -> ScoredAnswer:
+            return answering(hypotheses, other)
+
+        if found.view.slopes is not None:
+            touched = np.maximum(found.view.slopes @ touched, LEAST_MEAN)
+        nearby = found.view.through(nearby)
         other = self._faults.explained_by_fault(found.view, found.question, found.answer, touched, nearby, ask)
         return found if other is None else Asked(found.view, *other, changed=True)
 
@@ -116,6 +133,8 @@ class FaultAsking:
         for k, track in enumerate(self._touches.now.tracks):
             weak = track.state[ACTION] < n.WEAK * track.peak
             asked = track.scans in n.CONTACT_DOUBTS or weak or _doubtful(found.answer)
+            if track.told and not _doubtful(found.answer):
+                continue
             if not asked or track.ended or not self._faults.on_electrode(track.state):
                 continue
             standing = self._touches.expected(at.middle_s, at.span_s)
@@ -130,6 +149,31 @@ class FaultAsking:
                 self._touches.remove(k)
                 return Asked(found.view, *other, changed=True)
         return found
+
+    def decide(self, found: Asked, at: AskedScan) -> bool:
+        """Whether a contact that has changed is a touch on its electrode, once a scan is explained with it: one that is
+        new, or that stands by now.
+        """
+        if not self._faults.now.doubt.undecided or self._faults.now.wire is not None:
+            return False
+        skin, own = self._covariances(at)
+        touched, nearby = self._change(self._touches.expected(at.middle_s, at.span_s), at)
+        misfit = self._tables.wrong**2 * float(touched @ touched) * self._tables.misfit
+        touch = self._contact_doubt(found.view, found.question, found.answer, skin + nearby + misfit, own)
+        if touch is not None:
+            self._faults.drop_contact()
+            self._touches.tell(touch, at.middle_s, at.span_s)
+        elif self._faults.now.contact < 0:
+            for track in self._touches.now.tracks:
+                track.told = self._faults.on_electrode(track.state)
+                track.sure = track.sure or track.told
+        return self._faults.now.contact < 0
+
+    def _covariances(self, at: AskedScan) -> tuple[Array, Array]:
+        """(K, K) of what changes with the skin, and of what the measurements add."""
+        contact = self._tables.contact
+        flicker = (contact * self._noise.now.flicker) @ contact.T
+        return at.predicted.covariance + flicker, self._noise.covariance(at.part) - flicker
 
     def _with(self, standing: list[TouchPrior], loose: list[TouchPrior], question: Question) -> ScoredAnswer:
         if standing:

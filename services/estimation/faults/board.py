@@ -8,7 +8,7 @@ a contact walks, and a fault that explains nothing is dropped.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -18,6 +18,7 @@ from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
 from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice, wires
+from services.estimation.faults.decided import DecidedState
 from services.estimation.faults.impedance import (
     ContactChange,
     ContactColumns,
@@ -27,7 +28,7 @@ from services.estimation.faults.impedance import (
     gain_onset,
 )
 from services.estimation.faults.table import BoardScan, WireTable
-from services.estimation.faults.wires import WireFault, WireMaps
+from services.estimation.faults.wires import WireFault, WireKind, WireMaps
 from services.estimation.hypotheses import AS_IT_IS, Question, ScoredAnswer
 from services.estimation.values import numbers as n
 
@@ -47,6 +48,8 @@ class FaultState:
     wire: WireFault | None = None
     wire_since_s: float = -np.inf
     opens: tuple[int, ...] = ()
+    lifted: tuple[int, ...] = ()  # of them those that are off the skin, where nothing leads past them any more
+    silent: bool = False  # no electrode answers
     contact: int = -1  # electrode whose contact impedance is changed
     size: float = 0.0
     variance: float = 0.0
@@ -59,6 +62,7 @@ class FaultState:
     gain_since_s: float = -np.inf
     gain_said_until_s: float = -np.inf
     unexplained_scans: int = 0
+    doubt: DecidedState = field(default_factory=DecidedState)  # of the changed contact
 
 
 @dataclass(frozen=True)
@@ -72,29 +76,35 @@ class BoardView:
     shown: Array  # (K,) what this one shows
     slopes: Array | None  # (K, K) of that to `sound`; None: the same
     mean: Array  # (K,) relative change by contact impedances
-    spread: Array  # (K, n) columns of unit variance of what is not known of it
+    spread: Array  # (K, n) columns of unit variance of what is not known of it, the changed contact's own first
+    contact: int  # electrode whose contact impedance is changed, as far as is known before; -1: none
     times_s: Array  # (K,) from the middle of the scan
     span_s: float
     middle_s: float
+    apart: bool = True  # `shown` is without contact impedances that changed
 
     @property
     def y(self) -> Array:
         """(K,) log |Z| over what is predicted without touches."""
         left = self.log_z - self.shown
-        if self.slopes is None:
+        if self.apart:
             left = np.log1p(np.maximum(np.expm1(np.minimum(left, 3.0)) - self.mean, LEAST))
         return np.where(self.live, left, 0.0)
 
     def covariance(self, skin: Array, own: Array) -> Array:
         """(K, K) of y. skin: of what changes with the skin; own: of what the measurements add."""
-        if self.slopes is None:
+        made: Array = self.through(skin) + own
+        if self.apart:
             scale = 1 + self.mean
-            made: Array = (skin + own) * scale[:, None] * scale + self.spread @ self.spread.T
+            made = made * scale[:, None] * scale + self.spread @ self.spread.T
             made[np.diag_indices_from(made)] += (n.CONTACT_MISFIT * self.mean) ** 2
-        else:
-            made = self.slopes @ skin @ self.slopes.T + own
         leave_out(made, self.live)
         return made
+
+
+    def through(self, covariance: Array) -> Array:
+        """(K, K) of the skin's log |Z|, as the wires show it."""
+        return covariance if self.slopes is None else np.asarray(self.slopes @ covariance @ self.slopes.T)
 
 
 class BoardFaults:
@@ -122,6 +132,11 @@ class BoardFaults:
         now = self.now
         return self.columns if now.contact < 0 else self.columns.with_change(now.contact, now.size)
 
+    @property
+    def exchanged(self) -> bool:
+        """Whether wires are exchanged: every measurement is there, in another's place."""
+        return self.now.wire is not None and self.now.wire.kind is WireKind.EXCHANGED
+
     def plain(self, oldest_s: float) -> bool:
         """Whether nothing is wrong but what the skin has for good, since the oldest value of a scan."""
         now = self.now
@@ -147,18 +162,26 @@ class BoardFaults:
         mean, spread = self._contacts(at_s, 2 * times_s / span_s)
         readable = np.isfinite(values) & (values > 0) & (status == 0)
         log_z = np.log(np.where(readable, values, 1.0))
-        shown, slopes = sound, None
+        shown, slopes, apart = sound, None, True
         if now.wire is None:
             failed = dead = self._known & (~readable | (np.abs(log_z - sound - np.log1p(mean)) > np.log(n.FAR)))
-            now.opens, _ = wires.open_electrodes(failed, self.member)
+            now.silent = bool(failed.mean() >= n.SILENT)
+            now.opens = () if now.silent else wires.open_electrodes(failed, self.member)[0]
+            now.lifted = tuple(k for k in now.lifted if k in now.opens)
+            lifted = self._lifted()
+            mean, spread = mean + lifted.sum(axis=1), np.hstack([spread, n.SHORT_WAY_SD * lifted])
         else:
-            found = self.maps.one(now.wire, np.exp(sound + np.log1p(mean)))
+            apart = self.exchanged  # each measurement is another's then, its contacts as well
+            found = self.maps.one(now.wire, np.exp(sound if apart else sound + np.log1p(mean)))
             failed, dead = self._known & ~readable, ~readable | found.blind
             shown, slopes = np.log(np.maximum(found.values, 1e-9)), found.slopes
-            now.opens = ()  # what fails is left out: a wire that is wrong may be why
+            if apart:
+                mean, spread = found.slopes @ mean, found.slopes @ spread
+            now.opens, now.lifted, now.silent = (), (), False  # what fails is left out: a wire that is wrong may be why
         dead = dead | (at_s < now.wire_since_s)  # measured by wires that were otherwise
         live = self._known & ~dead & ~self.member[:, list(now.opens)].any(axis=1)
-        return BoardView(log_z, sound, failed, live, shown, slopes, mean, spread, times_s, span_s, middle_s)
+        times = times_s, span_s, middle_s
+        return BoardView(log_z, sound, failed, live, shown, slopes, mean, spread, now.contact, *times, apart)
 
     def _contacts(self, at_s: Array, course: Array) -> tuple[Array, Array]:
         now, columns = self.now, self.columns
@@ -170,10 +193,16 @@ class BoardFaults:
         spread = columns.spread(now.contact, now.size, np.sqrt(now.variance), course)
         return mean + np.where(since, after, before), spread * since[:, None]
 
+    def _lifted(self) -> Array:
+        """(K, n) relative changes by electrodes that are off the skin, each measurement by all the rest of a contact."""
+        return np.asarray(self._columns.rest[:, list(self.now.lifted)] * n.SHORT_WAY)
+
     # --- wires ---
 
     def suspects_wires(self, view: BoardView) -> bool:
         """Whether it is worth asking if the wires have changed."""
+        if view.failed.mean() >= n.SILENT:
+            return False
         return self._table.suspicious(self._untouched(view), self.now.wire)
 
     def wires_changed(self, view: BoardView, touched: Array, skin: Array, own: Array) -> bool:
@@ -202,7 +231,7 @@ class BoardFaults:
 
     def asks(self, answer: ScoredAnswer) -> bool:
         """Whether what explains a scan may as well be a fault."""
-        if self.now.wire is not None:
+        if self.now.wire is not None and not self.exchanged:
             return False
         new = answer.fit is not None and any(place < 0 for place in answer.kept)
         return new or not answer.holds or answer.cause != AS_IT_IS
@@ -224,16 +253,21 @@ class BoardFaults:
         if question.budget.left <= 0:  # what is left open is asked again with the scans that follow
             return None
         best, sure = None, answer.score + (n.COST_TOUCH + n.COST_SMALL if doubted else self._sure(answer))
-        changes = self._likeliest(question, touched, nearby, unexplained=not answer.holds)
+        columns, any_touch = self._columns_now, view.through(self._any_touch)
+        if view.slopes is not None:
+            columns = columns.through(view.slopes)
+        changes = self._likeliest(question, columns, any_touch, touched, nearby, unexplained=not answer.holds)
         question = replace(question, keeps=0.0)
         for k, change in enumerate(changes, 1):
-            asked, column = self._with(question.leaving(1 - k / len(changes)), change)
+            asked, column = self._with(question.leaving(1 - k / len(changes)), columns, change)
             found = ask(asked)
             cost = _cost(change)
             if found.score + cost < sure or not self._apart(change, found):
                 continue
             if isinstance(change, GainChange) and abs(float(column @ found.pulled)) * n.GAIN_CHANGES < n.GAIN_LEAST:
                 continue  # the touches of the answer explain all of it
+            if isinstance(change, ContactChange) and not _told(column, found):
+                continue
             plainly = found.chi2 < n.MOST and found.score + cost > answer.score + n.WIRE_SURE
             if not (found.holds or plainly):
                 continue
@@ -261,13 +295,19 @@ class BoardFaults:
         return bool(state[LOG_RADIUS] < np.log(n.SMALL) and nearest < n.ON_ELECTRODE)
 
     def _likeliest(
-        self, question: Question, touched: Array, nearby: Array, unexplained: bool
+        self,
+        question: Question,
+        columns: ContactColumns,
+        any_touch: Array,
+        touched: Array,
+        nearby: Array,
+        unexplained: bool,
     ) -> list[ContactChange | GainChange]:
         """At most three changes that may explain a scan: with the touches as they stand, with any touches, or, where
         nothing explains it, without those that stood; and whatever touches: a gain changes all measurements alike.
         """
         found = list[ContactChange | GainChange]()
-        tried = [(touched, nearby, float(n.MOST)), (touched, nearby + self._any_touch, np.inf)]
+        tried = [(touched, nearby, float(n.MOST)), (touched, nearby + any_touch, np.inf)]
         if unexplained and touched.any():
             tried.insert(0, (np.zeros_like(touched), np.zeros_like(nearby), float(n.MOST)))
         for touched, more, most_chi2 in tried:
@@ -275,7 +315,7 @@ class BoardFaults:
             white = Whitening.of(question.covariance + more)
             scan = Unexplained(y, 1 / (1 + touched), question.live, question.times_s, question.span_s, white)
             nothing = white.log_density - 0.5 * float(np.sum(white(y) ** 2))
-            best = max(self._every(scan), key=lambda change: change.score + _cost(change))
+            best = max(self._every(scan, columns), key=lambda change: change.score + _cost(change))
             known = [_what(change) for change in found]
             if int(scan.since(best.since_s).sum()) < n.TOLD_BY:
                 continue
@@ -285,8 +325,7 @@ class BoardFaults:
             found.append(gain_change(scan, -np.inf))
         return found
 
-    def _every(self, scan: Unexplained) -> list[ContactChange | GainChange]:
-        columns = self._columns_now
+    def _every(self, scan: Unexplained, columns: ContactColumns) -> list[ContactChange | GainChange]:
         always = np.full(len(self._places), -np.inf)
         gains = [gain_change(scan, -np.inf), gain_change(scan, gain_onset(scan))]
         found: list[ContactChange | GainChange] = [gain for gain in gains if abs(gain.log_factor) > n.GAIN_LEAST]
@@ -294,16 +333,18 @@ class BoardFaults:
         found += columns.likeliest(scan, columns.onsets(scan))
         return found
 
-    def _with(self, question: Question, change: ContactChange | GainChange) -> tuple[Question, Array]:
+    def _with(
+        self, question: Question, of_contacts: ContactColumns, change: ContactChange | GainChange
+    ) -> tuple[Question, Array]:
         """The question with a change of any size, and its column (K,) of unit variance."""
         acts = np.asarray(question.live & (question.times_s >= change.since_s), float)
         if isinstance(change, GainChange):
             column = n.GAIN_CHANGES * acts
             return replace(question, covariance=question.covariance + np.outer(column, column)), column
         course = 2 * question.times_s / question.span_s
-        y, columns = self._columns_now.taken_off(question.y, acts, course, change)
+        y, columns = of_contacts.taken_off(question.y, acts, course, change)
         wider = question.covariance + columns @ columns.T
-        misfit = n.CONTACT_MISFIT * acts * self._columns_now.mean(change.electrode, change.size)
+        misfit = n.CONTACT_MISFIT * acts * of_contacts.mean(change.electrode, change.size)
         wider[np.diag_indices_from(wider)] += misfit**2
         return replace(question, y=np.where(question.live, y, 0.0), covariance=wider), columns[:, 0]
 
@@ -330,10 +371,14 @@ class BoardFaults:
             now.gain_said_until_s = view.middle_s + n.GAIN_NAMED_S
             return
         before = now.size if change.electrode == now.contact else 0.0
-        if now.contact not in (-1, change.electrode):
+        if now.contact not in (-1, change.electrode) and not now.doubt.undecided:
             self._settle()
+        if now.contact != change.electrode:
+            now.doubt = DecidedState()
         now.contact, now.contact_since_s, now.size_before = change.electrode, since_s, before
         now.size = max(before + n.CONTACT_CHANGES * told, LEAST)
+        if now.size > before and not now.doubt.undecided:
+            now.doubt.begin(before)
         now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
         now.still_s, now.back_scans = 0.0, 0
 
@@ -345,23 +390,28 @@ class BoardFaults:
         if not explained:
             now.unexplained_scans += whole
             if now.unexplained_scans >= n.UNEXPLAINED_SCANS:
-                now.wire, now.contact, now.unexplained_scans = None, -1, 0
+                now.wire, now.unexplained_scans = None, 0
+                self.drop_contact()
             return
         now.unexplained_scans = 0
         if now.contact < 0:
             return
         step = self._stepped(view, answer)
+        if whole:
+            now.doubt.follow(view.middle_s, now.size)
         now.still_s = now.still_s + passed_s if abs(step) < n.CONTACT_STILL * (1 + now.size) else 0.0
         unsure = n.CONTACT_BACK + 3 * float(np.sqrt(now.variance))
         nearest = min(abs(now.size), abs(now.size + now.settled[now.contact]))
         now.back_scans = (now.back_scans + whole) if nearest < unsure else 0
         now.variance += (n.CONTACT_WALK_CHANGED * (1 + now.size)) ** 2 * min(passed_s / SCAN_S, 1.0)
-        if now.still_s > n.CONTACT_SETTLES_S or now.back_scans >= n.BACK_SCANS:
+        drifts = view.middle_s < now.doubt.drifts_until_s
+        settles_s = n.UNDECIDED_SETTLES_S if now.doubt.undecided else n.CONTACT_SETTLES_S
+        if now.still_s > settles_s or (now.back_scans >= n.BACK_SCANS and not drifts):
             self._settle()
 
     def _stepped(self, view: BoardView, answer: ScoredAnswer) -> float:
         now = self.now
-        if view.spread.shape[1] == 0:
+        if view.contact != now.contact:  # it was found by this scan
             return 0.0
         column = view.spread[:, 0]
         sd = float(np.sqrt(now.variance))
@@ -371,16 +421,24 @@ class BoardFaults:
         now.variance *= max(1 - told, 1e-4)
         return step
 
+    def drop_contact(self) -> None:
+        """No contact has changed."""
+        now = self.now
+        now.contact, now.size, now.variance, now.doubt = -1, 0.0, 0.0, DecidedState()
+
     def _settle(self) -> None:
         """A changed contact is the skin's own from now on, be it as it was at the tare."""
         now = self.now
         now.settled = now.settled.copy()
         now.settled[now.contact] += now.size
-        now.contact, now.size, now.variance = -1, 0.0, 0.0
+        self.drop_contact()
 
     def states(self) -> NDArray[np.uint8]:
         """(E,) of the wire format."""
-        return advice.states_of(len(self.now.settled), self.now.wire, self.now.opens, self.now.contact)
+        now = self.now
+        named = not now.doubt.undecided or now.doubt.seen >= n.NAMED_SCANS or abs(now.size) > n.CONTACT_PLAIN
+        contact = now.contact if named else -1
+        return advice.states_of(len(now.settled), now.wire, now.opens, contact, now.silent)
 
     def gain_named(self, middle_s: float) -> bool:
         return middle_s < self.now.gain_said_until_s
@@ -388,7 +446,13 @@ class BoardFaults:
     @property
     def sound(self) -> bool:
         """Whether nothing is wrong but what the skin has for good."""
-        return self.now.wire is None and self.now.contact < 0 and not self.now.opens
+        return self.now.wire is None and self.now.contact < 0 and not self.now.opens and not self.now.silent
+
+
+def _told(column: Array, answer: ScoredAnswer) -> bool:
+    """Whether an answer knows that there is a change; column (K,): of unit variance of what it may be."""
+    known = answer.fit.information(column) if answer.fit is not None else float(np.sum(answer.white(column) ** 2))
+    return float(column @ answer.pulled) ** 2 > n.ACTS_Z2 * max(1 - known, 0.0)
 
 
 def _cost(change: ContactChange | GainChange) -> float:

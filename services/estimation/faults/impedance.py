@@ -81,6 +81,10 @@ class ContactColumns:
     def of(cls, tables: SkinTables) -> ContactColumns:
         return cls(tables.layer, tables.contact - tables.layer, np.zeros(tables.electrodes))
 
+    def through(self, slopes: Array) -> ContactColumns:
+        """The same through wires that are exchanged; slopes (K, K)."""
+        return ContactColumns(slopes @ self.layer, slopes @ self.rest, self.settled)
+
     def with_change(self, electrode: int, size: float) -> ContactColumns:
         """The same of the skin whose contact has changed for good."""
         settled = self.settled.copy()

@@ -57,7 +57,7 @@ ROWS: Mapping[str, CheckRow] = {
     "impedance": CheckRow("faults/impedance", NOTE, "electrode_drift"),
     "gain": CheckRow("faults/impedance", NOTE, "gain"),
     "degraded": CheckRow("enough", NOTE, "degraded"),
-    "too_many": CheckRow("enough", REFUSE, "degraded"),
+    "too_many": CheckRow("enough", REFUSE),  # what is wrong with each of them is said
     "burst": CheckRow("faults/disturbance", NOTE),
     "spoilt": CheckRow("faults/disturbance", NOTE),
     "gap": CheckRow("faults/gap", REFUSE, "gap"),

@@ -1,0 +1,90 @@
+"""How much of a changed contact impedance is known to be the contact's, and how much may be a touch on the electrode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+
+LEAST_SIZES = 6  # of a line
+PACES_S = (float(n.PACE_S), 3 * float(n.PACE_S))  # for which a pace is looked for
+
+
+@dataclass
+class SizeAt:
+    """Of a contact's change, by one whole scan."""
+
+    at_s: float
+    size: float
+
+
+@dataclass
+class DecidedState:
+    """All that changes. Sizes are relative changes of the contact impedance."""
+
+    undecided: bool = False  # what goes beyond `decided` may be a touch
+    decided: float = 0.0
+    over: Annotated[Array | None, "K"] = None  # sum of log |Z| over a skin with what is decided, touches taken off
+    scans: int = 0  # of that sum
+    seen: int = 0  # whole scans for which it has been undecided
+    sizes: list[SizeAt] = field(default_factory=list)  # of the last scans
+    pace: float = 0.0  # of a contact that drifts [1/s]
+    drifts_until_s: float = -np.inf  # as far as is known
+
+    def begin(self, decided: float) -> None:
+        """A contact has changed, or changes anew: beyond `decided` nobody knows why."""
+        self.undecided, self.decided = True, decided
+        self.over, self.scans, self.seen = None, 0, 0
+
+    def end(self, size: float) -> None:
+        """It is the contact's, all of it."""
+        self.undecided, self.decided = False, size
+        self.over, self.scans = None, 0
+
+    def follow(self, at_s: float, size: float) -> None:
+        """A contact goes on: what falls is no touch, nor what drifts on at the pace that it had."""
+        self.seen += self.undecided
+        passed_s = at_s - self.sizes[-1].at_s if self.sizes else 0.0
+        step = size - self.sizes[-1].size if self.sizes else 0.0
+        least = n.CONTACT_STILL * (1 + abs(self.decided))
+        self.sizes = [*(each for each in self.sizes if each.at_s > at_s - PACES_S[-1] - passed_s), SizeAt(at_s, size)]
+        if size < self.decided - least or abs(size) < n.CONTACT_STILL:  # or it is what it was at the tare
+            self.end(size)
+        elif not self.undecided:  # as slowly the untouched skin's contacts are followed as well
+            self.decided += min(max(size - self.decided, 0.0), n.PACE_UNSEEN * passed_s)
+        drifts = at_s < self.drifts_until_s
+        if drifts and not self.undecided and abs(step) < n.PACE_GROWS * self.pace * passed_s + least:
+            self.decided = size
+        pace = max(self._pace(each_s) for each_s in PACES_S)
+        if pace:
+            self.pace = pace
+            self.drifts_until_s = at_s + n.CONTACT_SETTLES_S
+            self.end(size)
+        if not self.undecided and size - self.decided > least:
+            self.begin(self.decided)
+
+    def _pace(self, lasts_s: float) -> float:
+        """At which it moved on steadily for so long, which is longer than a touch takes to come; 0: it did not [1/s]."""
+        times = np.array([each.at_s for each in self.sizes])
+        before = np.flatnonzero(times <= times[-1] - lasts_s)
+        if not before.size or len(times) - before[-1] < LEAST_SIZES:
+            return 0.0
+        times = times[before[-1] :]
+        sizes = np.array([each.size for each in self.sizes])[before[-1] :]
+        way = float(sizes[-1] - sizes[0])
+        if abs(way) < n.PACE_LEAST:
+            return 0.0
+        line = (times - times[0]) / (times[-1] - times[0])
+        off = np.abs((sizes - sizes[0]) / way - line).max()
+        return abs(way) / float(times[-1] - times[0]) if off < n.PACE_BENDS else 0.0
+
+    def add(self, over: Array) -> None:
+        """One more scan of the change that nobody knows."""
+        self.over = over if self.over is None else self.over + over
+        self.scans += 1

@@ -1,0 +1,89 @@
+"""Is a changed contact impedance a touch right on its electrode? Both explain a scan nearly as well where it is light.
+
+The scans since the change are averaged, touches that stand taken off, and both are asked: a contact of any size, and a
+touch there with what discs miss of it at second order. A touch has more figures, so a light one is worth up to 18 nats
+less than a contact that is none; a contact that is one gains with each scan. What neither decides stays not valid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.fit import FoundTouches
+from models.measurement.tables import SkinTables
+from models.measurement.whitening import Whitening, leave_out
+from services.estimation.faults.board import LEAST, BoardFaults, BoardView
+from services.estimation.faults.impedance import ContactChange, ContactColumns, Unexplained
+from services.estimation.hypotheses import AS_IT_IS, MEMORY, Hypotheses, Question, ScoredAnswer, StepBudget
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+
+ASKED = (2, 3, 4, 6, 8, 12, 16, 24, 32)  # scans since the change at which it is asked, and every EVERY from then on
+EVERY = 16
+
+
+class ContactDoubt:
+    """Of one skin."""
+
+    def __init__(self, tables: SkinTables, hypotheses: Hypotheses, faults: BoardFaults) -> None:
+        self._tables, self._hypotheses, self._faults = tables, hypotheses, faults
+
+    def __call__(
+        self, view: BoardView, question: Question, answer: ScoredAnswer, skin: Array, own: Array
+    ) -> FoundTouches | None:
+        """A whole scan that was explained with a changed contact. skin, own: as for `BoardView.covariance`, what touches
+        that stand may do included. Returns the touch that it is.
+        """
+        faults = self._faults.now
+        doubt = faults.doubt
+        if not doubt.undecided or answer.cause not in (AS_IT_IS, MEMORY):
+            return None
+        doubt.add(self._over(view, answer))
+        if doubt.scans not in ASKED and (doubt.scans < ASKED[-1] or doubt.scans % EVERY):
+            return None
+        assert doubt.over is not None
+        y = np.where(view.live, doubt.over / doubt.scans, 0.0)
+        scale = np.exp(np.where(view.live, view.log_z - view.sound - y, 0.0))
+        covariance = (skin + own / doubt.scans) * scale[:, None] * scale
+        leave_out(covariance, view.live)
+        asked = replace(question, y=y, covariance=covariance, budget=StepBudget(n.MOST_STEPS), keeps=0.0)
+        contact = self._contact(asked)
+        nothing = asked.white.log_density - 0.5 * float(np.sum(asked.white(y) ** 2))
+        if contact.size < 0 or contact.score - nothing < n.FALSE_ALARM_Z2 / 2:  # no touch would be seen in it
+            if faults.size - doubt.decided < n.CONTACT_STILL * (1 + abs(doubt.decided)):
+                doubt.end(faults.size)
+            else:  # the touches that stand explain all of it
+                self._faults.drop_contact()
+            return None
+        touch = self._touch(asked)
+        odds = contact.score - touch.score
+        if odds > n.CONTACT_TOLD:
+            doubt.end(faults.size)
+        elif odds < -n.TOUCH_TOLD and touch.explained:
+            return touch.fit
+        return None
+
+    def _over(self, view: BoardView, answer: ScoredAnswer) -> Array:
+        """(K,) log |Z| over a skin with what is decided, touches that stand taken off."""
+        faults = self._faults
+        known = faults.columns.settled_mean() + faults.columns.mean(faults.now.contact, faults.now.doubt.decided)
+        touched = np.exp(view.y) - np.exp(answer.left)
+        left = np.expm1(np.minimum(view.log_z - view.sound, n.MISFIT_MOST)) - touched - known
+        return np.where(view.live, np.log1p(np.maximum(left, LEAST)), 0.0)
+
+    def _contact(self, asked: Question) -> ContactChange:
+        columns, now = self._faults.columns, self._faults.now
+        columns = columns.with_change(now.contact, now.doubt.decided)
+        whole = np.ones(len(asked.y))
+        scan = Unexplained(asked.y, whole, asked.live, asked.times_s, asked.span_s, asked.white)
+        return columns.likeliest(scan, np.full(self._tables.electrodes, -np.inf))[now.contact]
+
+    def _touch(self, asked: Question) -> ScoredAnswer:
+        k = self._faults.now.contact
+        columns: ContactColumns = self._faults.columns
+        second = n.TOUCH_SECOND * np.column_stack([columns.layer[:, k], columns.rest[:, k]])
+        return self._hypotheses.on_electrode(asked, self._tables.places[k], second)
