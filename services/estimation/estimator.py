@@ -221,7 +221,8 @@ class Estimator:
             return None
         assert now.information is not None
         y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
-        seen = skin.quick.look(skin.noise.alike(scan.part), scan, measured.middle_s, y, now.information)
+        alike, sure = skin.noise.alike(scan.part), skin.drift.even_variance(measured.middle_s)
+        seen = skin.quick.look(alike, scan, measured.middle_s, y, now.information, sure)
         return seen if seen is not None and seen.quiet else None
 
     def _complete(self, skin: TaredSkin, live: NDArray[np.bool_]) -> bool:
@@ -297,15 +298,18 @@ class Estimator:
             self._explained(skin, answer.cause)
         else:
             self._refused(skin, measured)
-        plain = explained and not asked.changed and skin.faults.plain(measured.middle_s - measured.span_s / 2)
+        oldest_s = measured.middle_s - measured.span_s / 2
+        plain = explained and not asked.changed and skin.faults.plain(oldest_s)
         if plain and self._complete(skin, measured.live):
             skin.held.keep(skin.noise.alike(scan.part), measured.middle_s, skin.touches.ids, question, answer)
         skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
-        if explained and skin.faults.sound and not asked.changed:
+        gross = skin.faults.gain_gross(measured.middle_s + measured.span_s / 2)
+        if explained and skin.faults.sound and not (asked.changed or gross):
             self._learn(skin, measured, answer)
         judgements += advice.judgements_of(skin.faults.states(), scan.status, float(asked.view.failed.mean()))
         judgements.append(judge("gap", float(skin.touches.lost), 1.0))
-        judgements.append(judge("gain", float(skin.faults.gain_named(measured.middle_s)), 1.0))
+        judgements.append(judge("gain", float(skin.faults.gain_stepped(oldest_s)), 1.0))
+        judgements.append(judge("gain_gross", float(gross), 1.0))
         judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
         return self._said(skin, measured, question, answer, judgements, explained, rough)
 
@@ -335,7 +339,8 @@ class Estimator:
         assert quiet is not None
         plain = skin.faults.plain(measured.middle_s - measured.span_s / 2)
         if plain and self._complete(skin, question.live):
-            skin.quick.keep(skin.noise.alike(measured.scan.part), measured.middle_s, question.white)
+            alike, sure = skin.noise.alike(measured.scan.part), skin.drift.even_variance(measured.middle_s)
+            skin.quick.keep(alike, measured.middle_s, question.white, sure)
         memory = skin.drift.beyond_memory(predicted, quiet.pulled, quiet.white)
         if memory is not None and skin.faults.now.wire is None:
             pressed = hypotheses.at(question, memory.x, memory.y)

@@ -100,6 +100,11 @@ class SkinFilter:
         columns, seen = self._columns()
         return np.asarray(columns @ x[seen] + now.remainder)
 
+    def even_variance(self, at_s: float) -> float:
+        """Of what all measurements share, but for contacts."""
+        p, passed_s = self.now.p, max(0.0, at_s - self.now.at_s)
+        return float(p[0, 0] + 2 * passed_s * p[0, MODES] + passed_s**2 * p[MODES, MODES])
+
     def faster(self, times: float = 1.0) -> Array:
         """(K, K) covariance of drift faster than the filter's own; times: that variance, beyond 1 contacts move too."""
         columns = self._tables.field
