@@ -10,8 +10,9 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.fit import FoundTouches
 from models.measurement.tables import SkinTables
-from models.measurement.touch import SHAPE_SDS, SHAPES, STATES
+from models.measurement.touch import ACTION, SHAPE_SDS, SHAPES, STATES
 from models.measurement.whitening import Whitening
 from services.estimation.faults import advice
 from services.estimation.faults.asking import AskedScan
@@ -34,7 +35,7 @@ from services.estimation.hypotheses import (
 from services.estimation.learning import Waiting
 from services.estimation.quick_look import Seen
 from services.estimation.tared import TaredSkin, TaredState
-from services.estimation.touches import estimate_of, roughly
+from services.estimation.touches import TouchTracks, estimate_of, roughly
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, TouchEstimate
 from services.estimation.values.judgement import Judgement, judge
@@ -71,7 +72,13 @@ class LookedAt:
         return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
 
     def question(
-        self, y: Array, covariance: Array, live: NDArray[np.bool_], times_s: Array, information: NDArray[np.float32]
+        self,
+        y: Array,
+        covariance: Array,
+        live: NDArray[np.bool_],
+        times_s: Array,
+        information: NDArray[np.float32],
+        candidates: Array,
     ) -> Question:
         """About this scan."""
         return Question(
@@ -84,6 +91,7 @@ class LookedAt:
             part=self.scan.part,
             information=information,
             budget=self.budget,
+            candidates=candidates,
         )
 
 
@@ -99,6 +107,7 @@ class EstimatorState:
     informed: int = 0  # `wholes` then
     informed_live: Annotated[NDArray[np.bool_], "L"] = field(default_factory=lambda: np.zeros(0, bool))
     informed_wire: WireFault | None = None
+    candidates: Annotated[Array, "C", "states"] = field(default_factory=lambda: np.zeros((0, STATES)))
     said: tuple[TouchEstimate, ...] = ()
     adopted_age_s: float | None = None  # of a baseline that was adopted, before the next scan
 
@@ -189,7 +198,7 @@ class Estimator:
             now.whole_us = scan.end_us
         measurable = np.isfinite(scan.values) & (scan.values > 0) & (scan.status == 0)
         live = measurable if self.skin is None else measurable & self.skin.live
-        budget = StepBudget.of(len(scan.new), int(scan.new.sum()))
+        budget = StepBudget.of(len(scan.new), int(scan.new.sum()), scan.separate)
         measured = LookedAt(scan, np.log(np.where(live, scan.values, 1.0)), live, whole, budget)
         if whole:
             self.taring.offer(scan, measurable, measured.middle_s)
@@ -237,7 +246,7 @@ class Estimator:
         self._explained(skin, AS_IT_IS)
         measured = replace(measured, log_z=skin.log_z0 + skin.faults.taken_off(measured.log_z - skin.log_z0))
         self._learn_untouched(skin, measured, seen.pulled, AS_IT_IS)
-        self.now.said = ()
+        self.now.said, self.now.candidates = (), np.zeros((0, STATES))
         y = np.where(measured.live, self._over(skin, measured), 0.0)
         return self._estimate(measured, y, np.zeros(len(y)), judgements, seen.z2, 0.0)
 
@@ -253,7 +262,7 @@ class Estimator:
             return None
         y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
         times_s = span_s / 2 - measured.scan.ages_s
-        question = measured.question(y, known.covariance, measured.live, times_s, now.information)
+        question = measured.question(y, known.covariance, measured.live, times_s, now.information, now.candidates)
         answer = skin.hypotheses.goes_on(question, skin.touches.expected(middle_s, span_s), known.white, known.turned)
         return (question, answer) if answer.explained and answer.left_z2 < n.GLANCE_Z2 else None
 
@@ -295,9 +304,13 @@ class Estimator:
         rough = answer.fit is not None and answer.chi2 < n.MOST
         if explained or rough:
             self._settle(skin, question, answer, measured)
+        went = answer.fit is not None and not len(skin.touches)  # whatever it was, it came and went within the scan
+        if (explained or rough) and not went:
             self._explained(skin, answer.cause)
         else:
             self._refused(skin, measured)
+        nearly = answer.fit is not None and not (explained or rough)
+        self.now.candidates = answer.fit.states.copy() if nearly else np.zeros((0, STATES))
         oldest_s = measured.middle_s - measured.span_s / 2
         plain = explained and not asked.changed and skin.faults.plain(oldest_s)
         if plain and self._complete(skin, measured.live):
@@ -311,7 +324,7 @@ class Estimator:
         judgements.append(judge("gain", float(skin.faults.gain_stepped(oldest_s)), 1.0))
         judgements.append(judge("gain_gross", float(gross), 1.0))
         judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
-        return self._said(skin, measured, question, answer, judgements, explained, rough)
+        return self._said(skin, measured, question, answer, judgements, explained and not went, rough)
 
     def _question(
         self, hypotheses: Hypotheses, skin: TaredSkin, view: BoardView, covariance: Array, measured: LookedAt
@@ -321,7 +334,7 @@ class Estimator:
         if now.information is None or new or now.wholes - now.informed >= n.LINE_SCANS:
             now.information = hypotheses.grid.information(Whitening.of(covariance))
             now.informed, now.informed_live, now.informed_wire = now.wholes, view.live, skin.faults.now.wire
-        question = measured.question(view.y, covariance, view.live, view.times_s, now.information)
+        question = measured.question(view.y, covariance, view.live, view.times_s, now.information, now.candidates)
         return question.leaving(n.FOR_FAULTS)
 
     def _answer(
@@ -478,14 +491,15 @@ class Estimator:
         if explained or rough:
             unexplained = float(np.linalg.norm(answer.left)) / max(float(np.linalg.norm(question.y)), 1e-12)
             sample_s = measured.scan.sample_ns * 1e-9
-            lasting = [track for track in skin.touches.lasting if track.sure]
+            lasting = [track for track in skin.touches.now.tracks if track.sure and track.acts_at(sample_s)]
             self.now.said = tuple(estimate_of(track, sample_s, measured.span_s, unexplained) for track in lasting)
         else:
             self.now.said = tuple(roughly(touch) for touch in self.now.said)
         unsure = any(not track.sure for track in skin.touches.now.tracks)
         sigma = np.sqrt(np.diag(question.covariance))
         changing = float(unsure or not explained)
-        return self._estimate(measured, question.y, sigma, judgements, answer.left_z2, changing)
+        felt = max([answer.left_z2, *_felt(skin.touches, None if explained or rough else answer.fit)])
+        return self._estimate(measured, question.y, sigma, judgements, felt, changing)
 
     def _estimate(
         self,
@@ -513,3 +527,11 @@ class Estimator:
         return Estimate(
             measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements)
         )
+
+
+def _felt(touches: TouchTracks, found: FoundTouches | None) -> list[float]:
+    """Squared sigmas of the touches that explain a scan; found: that do so nearly, and are none yet."""
+    if found is None:
+        return [track.z2 for track in touches.lasting]
+    variance = np.diag(found.covariance)[ACTION::STATES]
+    return list(found.states[:, ACTION] ** 2 / np.maximum(variance, 1e-18))

@@ -48,9 +48,12 @@ class StepBudget:
     left: float
 
     @classmethod
-    def of(cls, values: int, new: int) -> StepBudget:
-        """Of a scan of which so many values are new: the next comes the sooner, the fewer there are."""
-        return cls(n.MOST_STEPS * max(float(n.LEAST_BUDGET), new / values))
+    def of(cls, values: int, new: int, separate: bool) -> StepBudget:
+        """Of a scan of which so many values are new: the next comes the sooner, the fewer there are. separate: none
+        follows that could go on with what this one leaves open.
+        """
+        steps = n.MOST_STEPS * max(float(n.LEAST_BUDGET), new / values)
+        return cls(steps * n.SEPARATE if separate else steps)
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,7 @@ class Question:
     part: int  # that it ends with
     information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
     budget: StepBudget
+    candidates: Array  # (C, 7) touches that nearly explained the scan before
     keeps: float = 0.0  # steps that are left to who asks next
 
     @property
@@ -202,7 +206,16 @@ class Hypotheses:
 
     def _of_none(self, question: Question) -> list[ScoredAnswer]:
         found = [answer for cause in (AS_IT_IS, *WIDER) if (answer := self.untouched(question, cause)) is not None]
-        return [*found, *self._search(question, (), None)]
+        return [*found, *self._from_nothing(question)]
+
+    def _from_nothing(self, question: Question) -> list[ScoredAnswer]:
+        """Touches where none were: first those that the scan before left open, as a search has no steps for all."""
+        found = list[ScoredAnswer]()
+        if len(question.candidates):
+            priors = [anywhere(*state[PLACE], state[ACTION], question.span_s) for state in question.candidates]
+            begun = [replace(prior, start=state) for prior, state in zip(priors, question.candidates, strict=True)]
+            found.append(self._fitted(question, begun, (-1,) * len(begun), n.STEPS_COLD))
+        return found if _settled(question, found) else [*found, *self._search(question, (), None)]
 
     def _of_standing(
         self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]
@@ -233,7 +246,7 @@ class Hypotheses:
         self, question: Question, standing: Sequence[TouchPrior], before: Sequence[ScoredAnswer]
     ) -> list[ScoredAnswer]:
         """Where what was known does not help: touches from nothing, beside a disturbance, by a wrong response."""
-        found = self._search(question, (), None) if standing else []
+        found = self._from_nothing(question) if standing else []
         if _settled(question, found):
             return found
         touched = [answer for answer in [*before, *found] if answer.fit is not None]
