@@ -314,7 +314,7 @@ class Estimator:
         oldest_s = measured.middle_s - measured.span_s / 2
         plain = explained and not asked.changed and skin.faults.plain(oldest_s)
         if plain and self._complete(skin, measured.live):
-            skin.held.keep(skin.noise.alike(scan.part), measured.middle_s, skin.touches.ids, question, answer)
+            self._keep_looks(skin, measured, question, answer)
         skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
         gross = skin.faults.gain_gross(measured.middle_s + measured.span_s / 2)
         if explained and skin.faults.sound and not (asked.changed or gross):
@@ -325,6 +325,13 @@ class Estimator:
         judgements.append(judge("gain_gross", float(gross), 1.0))
         judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
         return self._said(skin, measured, question, answer, judgements, explained and not went, rough)
+
+    def _keep_looks(self, skin: TaredSkin, measured: LookedAt, question: Question, answer: ScoredAnswer) -> None:
+        """What the next looks need, of a scan with which nothing is wrong."""
+        alike, middle_s = skin.noise.alike(measured.scan.part), measured.middle_s
+        skin.held.keep(alike, middle_s, skin.touches.ids, question, answer)
+        if answer.fit is None:
+            skin.quick.keep(alike, middle_s, question.white, skin.drift.even_variance(middle_s))
 
     def _question(
         self, hypotheses: Hypotheses, skin: TaredSkin, view: BoardView, covariance: Array, measured: LookedAt
@@ -350,10 +357,6 @@ class Estimator:
             return hypotheses.ask(question, standing, loose)
         quiet = hypotheses.untouched(question)
         assert quiet is not None
-        plain = skin.faults.plain(measured.middle_s - measured.span_s / 2)
-        if plain and self._complete(skin, question.live):
-            alike, sure = skin.noise.alike(measured.scan.part), skin.drift.even_variance(measured.middle_s)
-            skin.quick.keep(alike, measured.middle_s, question.white, sure)
         memory = skin.drift.beyond_memory(predicted, quiet.pulled, quiet.white)
         if memory is not None and skin.faults.now.wire is None:
             pressed = hypotheses.at(question, memory.x, memory.y)
