@@ -309,8 +309,8 @@ class Estimator:
             self._explained(skin, answer.cause)
         else:
             self._refused(skin, measured)
-        nearly = answer.fit is not None and not (explained or rough)
-        self.now.candidates = answer.fit.states.copy() if nearly else np.zeros((0, STATES))
+        nearly = None if explained or rough else answer.fit
+        self.now.candidates = np.zeros((0, STATES)) if nearly is None else nearly.states.copy()
         oldest_s = measured.middle_s - measured.span_s / 2
         plain = explained and not asked.changed and skin.faults.plain(oldest_s)
         if plain and self._complete(skin, measured.live):

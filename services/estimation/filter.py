@@ -144,8 +144,14 @@ class SkinFilter:
         memories = self.now.memories
         if not memories:
             return None
-        columns = np.array([n.MEMORY_MOST * memory.action * memory.column for memory in memories]).T
+        most = [n.MEMORY_MOST * memory.action * self._faded(memory, self.now.at_s) for memory in memories]
+        columns = np.array([share * memory.column for share, memory in zip(most, memories, strict=True)]).T
         return np.asarray(columns @ columns.T)
+
+    @staticmethod
+    def _faded(memory: Memory, at_s: float) -> float:
+        """Share of what foam may remember at most that is left at an instant."""
+        return float(np.exp(-max(0.0, at_s - memory.at_s) / FADES_S).mean())
 
     def widen_memories(self) -> None:
         """They were larger than was expected."""
@@ -182,7 +188,7 @@ class SkinFilter:
             left = float(predicted.x[own].sum() + reach @ pulled)
             whitened = white(reach)
             variance = float(predicted.p[own, own].sum() - whitened @ whitened)
-            most = n.MEMORY_MOST * memory.action * float(np.exp(-age_s / FADES_S).mean())
+            most = n.MEMORY_MOST * memory.action * self._faded(memory, predicted.at_s)
             if left > most + n.MEMORY_SIGMAS * np.sqrt(max(variance, 0.0)):
                 return memory
         return None

@@ -212,8 +212,7 @@ class Hypotheses:
         """Touches where none were: first those that the scan before left open, as a search has no steps for all."""
         found = list[ScoredAnswer]()
         if len(question.candidates):
-            priors = [anywhere(*state[PLACE], state[ACTION], question.span_s) for state in question.candidates]
-            begun = [replace(prior, start=state) for prior, state in zip(priors, question.candidates, strict=True)]
+            begun = [_begun(state, question.span_s) for state in question.candidates]
             found.append(self._fitted(question, begun, (-1,) * len(begun), n.STEPS_COLD))
         return found if _settled(question, found) else [*found, *self._search(question, (), None)]
 
@@ -443,6 +442,12 @@ def _started(priors: Sequence[TouchPrior], fit: FoundTouches | None) -> list[Tou
     """The same priors, searched from where a fit ended."""
     states = fit.states if fit is not None else [prior.start for prior in priors]
     return [replace(prior, start=state.copy()) for prior, state in zip(priors, states, strict=True)]
+
+
+def _begun(state: Array, span_s: float) -> TouchPrior:
+    """A touch that may be anywhere, searched from a state."""
+    x, y = state[PLACE]
+    return replace(anywhere(float(x), float(y), float(state[ACTION]), span_s), start=state)
 
 
 def _from(fit: FoundTouches | None) -> list[TouchPrior]:
