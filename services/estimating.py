@@ -89,6 +89,7 @@ class Estimating(Stage):
         self._part = (-1, -1)  # messages last seen, and last handed on
         self._delta = 0  # scan of the last delta frame
         self._sample_ns, self._since_saved = 0, 0
+        self._gain_steps = 0  # of this baseline, that were counted
         self._undated_s = 0.0  # age of a baseline that an earlier process took, until the first scan
         self._use(None)
 
@@ -129,6 +130,7 @@ class Estimating(Stage):
         self._before = scan
         estimate = self.estimator.step(scan)
         self._look_at_baseline(scan)
+        self._count_gain_steps()
         self._electrodes = estimate.electrodes
         self._silent = any(each.name == "silent" and each.ratio >= 1 for each in estimate.judgements)
         out.valid = estimate.valid
@@ -257,6 +259,12 @@ class Estimating(Stage):
             self._problem = self.estimator.taring.now.problem
         elif self.estimator.taring.now.problem:
             self._problem = self.estimator.taring.now.problem
+
+    def _count_gain_steps(self) -> None:
+        skin = self.estimator.skin
+        steps = 0 if skin is None else skin.faults.now.gain_steps
+        self._counters["gain_steps"] += max(0, steps - self._gain_steps)
+        self._gain_steps = steps
 
     def _taken(self, by: str) -> Baseline:
         skin = self.estimator.skin

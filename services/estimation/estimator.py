@@ -10,8 +10,9 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.fit import FoundTouches
 from models.measurement.tables import SkinTables
-from models.measurement.touch import SHAPE_SDS, SHAPES, STATES
+from models.measurement.touch import ACTION, SHAPE_SDS, SHAPES, STATES
 from models.measurement.whitening import Whitening
 from services.estimation.faults import advice
 from services.estimation.faults.asking import Asked, AskedScan
@@ -34,7 +35,7 @@ from services.estimation.hypotheses import (
 from services.estimation.learning import Waiting
 from services.estimation.quick_look import Seen
 from services.estimation.tared import TaredSkin, TaredState
-from services.estimation.touches import estimate_of, roughly
+from services.estimation.touches import TouchTracks, estimate_of, roughly
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, TouchEstimate
 from services.estimation.values.judgement import Judgement, judge
@@ -71,7 +72,13 @@ class LookedAt:
         return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
 
     def question(
-        self, y: Array, covariance: Array, live: NDArray[np.bool_], times_s: Array, information: NDArray[np.float32]
+        self,
+        y: Array,
+        covariance: Array,
+        live: NDArray[np.bool_],
+        times_s: Array,
+        information: NDArray[np.float32],
+        candidates: Array,
     ) -> Question:
         """About this scan."""
         return Question(
@@ -84,6 +91,7 @@ class LookedAt:
             part=self.scan.part,
             information=information,
             budget=self.budget,
+            candidates=candidates,
         )
 
 
@@ -99,6 +107,7 @@ class EstimatorState:
     informed: int = 0  # `wholes` then
     informed_live: Annotated[NDArray[np.bool_], "L"] = field(default_factory=lambda: np.zeros(0, bool))
     informed_wire: WireFault | None = None
+    candidates: Annotated[Array, "C", "states"] = field(default_factory=lambda: np.zeros((0, STATES)))
     said: tuple[TouchEstimate, ...] = ()
     adopted_age_s: float | None = None  # of a baseline that was adopted, before the next scan
 
@@ -206,7 +215,7 @@ class Estimator:
             now.whole_us = scan.end_us
         measurable = np.isfinite(scan.values) & (scan.values > 0) & (scan.status == 0)
         live = measurable if self.skin is None else measurable & self.skin.live
-        budget = StepBudget.of(len(scan.new), int(scan.new.sum()))
+        budget = StepBudget.of(len(scan.new), int(scan.new.sum()), scan.separate)
         measured = LookedAt(scan, np.log(np.where(live, scan.values, 1.0)), live, whole, budget)
         if whole:
             self.taring.offer(scan, measurable, measured.middle_s)
@@ -238,7 +247,8 @@ class Estimator:
             return None
         assert now.information is not None
         y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
-        seen = skin.quick.look(skin.noise.alike(scan.part), scan, measured.middle_s, y, now.information)
+        alike, sure = skin.noise.alike(scan.part), skin.drift.even_variance(measured.middle_s)
+        seen = skin.quick.look(alike, scan, measured.middle_s, y, now.information, sure)
         return seen if seen is not None and seen.quiet else None
 
     def _complete(self, skin: TaredSkin, live: NDArray[np.bool_]) -> bool:
@@ -254,7 +264,7 @@ class Estimator:
         self._remember(skin, skin.refused.explained(measured.middle_s - measured.span_s / 2))
         measured = replace(measured, log_z=skin.log_z0 + skin.faults.taken_off(measured.log_z - skin.log_z0))
         self._learn_untouched(skin, measured, seen.pulled, AS_IT_IS)
-        self.now.said = ()
+        self.now.said, self.now.candidates = (), np.zeros((0, STATES))
         y = np.where(measured.live, self._over(skin, measured), 0.0)
         return self._estimate(measured, y, np.zeros(len(y)), judgements, seen.z2, 0.0)
 
@@ -270,7 +280,7 @@ class Estimator:
             return None
         y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
         times_s = span_s / 2 - measured.scan.ages_s
-        question = measured.question(y, known.covariance, measured.live, times_s, now.information)
+        question = measured.question(y, known.covariance, measured.live, times_s, now.information, now.candidates)
         answer = skin.hypotheses.goes_on(question, skin.touches.expected(middle_s, span_s), known.white, known.turned)
         return (question, answer) if answer.explained and answer.left_z2 < n.GLANCE_Z2 else None
 
@@ -300,24 +310,38 @@ class Estimator:
         rough = answer.fit is not None and answer.chi2 < n.MOST
         if explained or rough:
             self._settle(skin, question, answer, measured)
+        went = answer.fit is not None and not len(skin.touches)  # whatever it was, it came and went within the scan
+        if (explained or rough) and not went:
             self._explained(skin, answer.cause)
         else:
             self._refused(skin, measured, question.y)
-        plain = explained and not asked.changed and skin.faults.plain(measured.middle_s - measured.span_s / 2)
+        nearly = None if explained or rough else answer.fit
+        self.now.candidates = np.zeros((0, STATES)) if nearly is None else nearly.states.copy()
+        oldest_s = measured.middle_s - measured.span_s / 2
+        plain = explained and not asked.changed and skin.faults.plain(oldest_s)
         if plain and self._complete(skin, measured.live):
-            skin.held.keep(skin.noise.alike(scan.part), measured.middle_s, skin.touches.ids, question, answer)
+            self._keep_looks(skin, measured, question, answer)
         skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
+        gross = skin.faults.gain_gross(measured.middle_s + measured.span_s / 2)
         sound, undecided = skin.faults.sound, skin.faults.now.doubt.undecided
         if explained and measured.whole and not asked.changed:
             undecided = undecided and not skin.asking.decide(asked, at) and skin.faults.now.doubt.undecided
-        if explained and sound and not asked.changed:
+        if explained and sound and not (asked.changed or gross):
             self._learn(skin, measured, answer)
         failed = float(asked.view.failed.mean())
         judgements += advice.judgements_of(skin.faults.states(), scan.status, failed, undecided)
         judgements.append(judge("gap", float(skin.touches.lost), 1.0))
-        judgements.append(judge("gain", float(skin.faults.gain_named(measured.middle_s)), 1.0))
+        judgements.append(judge("gain", float(skin.faults.gain_stepped(oldest_s)), 1.0))
+        judgements.append(judge("gain_gross", float(gross), 1.0))
         judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
-        return self._said(skin, measured, question, answer, judgements, explained, rough)
+        return self._said(skin, measured, question, answer, judgements, explained and not went, rough)
+
+    def _keep_looks(self, skin: TaredSkin, measured: LookedAt, question: Question, answer: ScoredAnswer) -> None:
+        """What the next looks need, of a scan with which nothing is wrong."""
+        alike, middle_s = skin.noise.alike(measured.scan.part), measured.middle_s
+        skin.held.keep(alike, middle_s, skin.touches.ids, question, answer)
+        if answer.fit is None:
+            skin.quick.keep(alike, middle_s, question.white, skin.drift.even_variance(middle_s))
 
     def _explaining(self, skin: TaredSkin, measured: LookedAt) -> tuple[Asked, AskedScan]:
         """What explains a scan, and the scan as it was asked about."""
@@ -349,7 +373,7 @@ class Estimator:
         if now.information is None or new or now.wholes - now.informed >= n.LINE_SCANS:
             now.information = hypotheses.grid.information(Whitening.of(covariance))
             now.informed, now.informed_live, now.informed_wire = now.wholes, view.live, skin.faults.now.wire
-        question = measured.question(view.y, covariance, view.live, view.times_s, now.information)
+        question = measured.question(view.y, covariance, view.live, view.times_s, now.information, now.candidates)
         return question.leaving(n.FOR_FAULTS)
 
     def _answer(
@@ -365,9 +389,6 @@ class Estimator:
             return hypotheses.ask(question, standing, loose)
         quiet = hypotheses.untouched(question)
         assert quiet is not None
-        plain = skin.faults.plain(measured.middle_s - measured.span_s / 2)
-        if plain and self._complete(skin, question.live):
-            skin.quick.keep(skin.noise.alike(measured.scan.part), measured.middle_s, question.white)
         memory = skin.drift.beyond_memory(predicted, quiet.pulled, quiet.white)
         if memory is not None and skin.faults.now.wire is None:
             pressed = hypotheses.at(question, memory.x, memory.y)
@@ -517,14 +538,15 @@ class Estimator:
         if explained or rough:
             unexplained = float(np.linalg.norm(answer.left)) / max(float(np.linalg.norm(question.y)), 1e-12)
             sample_s = measured.scan.sample_ns * 1e-9
-            lasting = [track for track in skin.touches.lasting if track.sure]
+            lasting = [track for track in skin.touches.now.tracks if track.sure and track.acts_at(sample_s)]
             self.now.said = tuple(estimate_of(track, sample_s, measured.span_s, unexplained) for track in lasting)
         else:
             self.now.said = tuple(roughly(touch) for touch in self.now.said)
         unsure = any(not track.sure for track in skin.touches.now.tracks)
         sigma = np.sqrt(np.diag(question.covariance))
         changing = float(unsure or not explained)
-        return self._estimate(measured, question.y, sigma, judgements, answer.left_z2, changing)
+        felt = max([answer.left_z2, *_felt(skin.touches, None if explained or rough else answer.fit)])
+        return self._estimate(measured, question.y, sigma, judgements, felt, changing)
 
     def _estimate(
         self,
@@ -552,3 +574,11 @@ class Estimator:
         return Estimate(
             measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements)
         )
+
+
+def _felt(touches: TouchTracks, found: FoundTouches | None) -> list[float]:
+    """Squared sigmas of the touches that explain a scan; found: that do so nearly, and are none yet."""
+    if found is None:
+        return [track.z2 for track in touches.lasting]
+    variance = np.diag(found.covariance)[ACTION::STATES]
+    return list(found.states[:, ACTION] ** 2 / np.maximum(variance, 1e-18))

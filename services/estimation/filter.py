@@ -109,6 +109,11 @@ class SkinFilter:
         columns, seen = self._columns()
         return np.asarray(columns @ x[seen] + now.remainder)
 
+    def even_variance(self, at_s: float) -> float:
+        """Of what all measurements share, but for contacts."""
+        p, passed_s = self.now.p, max(0.0, at_s - self.now.at_s)
+        return float(p[0, 0] + 2 * passed_s * p[0, MODES] + passed_s**2 * p[MODES, MODES])
+
     def faster(self, times: float = 1.0) -> Array:
         """(K, K) covariance of drift faster than the filter's own; times: that variance, beyond 1 contacts move too."""
         columns = self._tables.field
@@ -148,7 +153,8 @@ class SkinFilter:
         memories = self.now.memories
         if not memories:
             return None
-        columns = np.array([n.MEMORY_MOST * memory.action * memory.column for memory in memories]).T
+        most = [n.MEMORY_MOST * memory.action * self._faded(memory, self.now.at_s) for memory in memories]
+        columns = np.array([share * memory.column for share, memory in zip(most, memories, strict=True)]).T
         return np.asarray(columns @ columns.T)
 
     def may_remember(self, pulled: Array) -> bool:
@@ -159,6 +165,11 @@ class SkinFilter:
             if float(self.now.x[own].sum()) + variance * float(memory.column @ pulled) > most:
                 return False
         return True
+
+    @staticmethod
+    def _faded(memory: Memory, at_s: float) -> float:
+        """Share of what foam may remember at most that is left at an instant."""
+        return float(np.exp(-max(0.0, at_s - memory.at_s) / FADES_S).mean())
 
     def widen_memories(self) -> None:
         """They were larger than was expected."""
@@ -195,7 +206,7 @@ class SkinFilter:
             left = float(predicted.x[own].sum() + reach @ pulled)
             whitened = white(reach)
             variance = float(predicted.p[own, own].sum() - whitened @ whitened)
-            most = n.MEMORY_MOST * memory.action * float(np.exp(-age_s / FADES_S).mean())
+            most = n.MEMORY_MOST * memory.action * self._faded(memory, predicted.at_s)
             if left > most + n.MEMORY_SIGMAS * np.sqrt(max(variance, 0.0)):
                 return memory
         return None

@@ -50,9 +50,12 @@ class StepBudget:
     left: float
 
     @classmethod
-    def of(cls, values: int, new: int) -> StepBudget:
-        """Of a scan of which so many values are new: the next comes the sooner, the fewer there are."""
-        return cls(n.MOST_STEPS * max(float(n.LEAST_BUDGET), new / values))
+    def of(cls, values: int, new: int, separate: bool) -> StepBudget:
+        """Of a scan of which so many values are new: the next comes the sooner, the fewer there are. separate: none
+        follows that could go on with what this one leaves open.
+        """
+        steps = n.MOST_STEPS * max(float(n.LEAST_BUDGET), new / values)
+        return cls(steps * n.SEPARATE if separate else steps)
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,7 @@ class Question:
     part: int  # that it ends with
     information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
     budget: StepBudget
+    candidates: Array  # (C, 7) touches that nearly explained the scan before
     keeps: float = 0.0  # steps that are left to who asks next
 
     @property
@@ -224,7 +228,15 @@ class Hypotheses:
 
     def _of_none(self, question: Question) -> list[ScoredAnswer]:
         found = [answer for cause in (AS_IT_IS, *WIDER) if (answer := self.untouched(question, cause)) is not None]
-        return [*found, *self._search(question, (), None)]
+        return [*found, *self._from_nothing(question)]
+
+    def _from_nothing(self, question: Question) -> list[ScoredAnswer]:
+        """Touches where none were: first those that the scan before left open, as a search has no steps for all."""
+        found = list[ScoredAnswer]()
+        if len(question.candidates):
+            begun = [_begun(state, question.span_s) for state in question.candidates]
+            found.append(self._fitted(question, begun, (-1,) * len(begun), n.STEPS_COLD))
+        return found if _settled(question, found) else [*found, *self._search(question, (), None)]
 
     def _of_standing(
         self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]
@@ -255,7 +267,7 @@ class Hypotheses:
         self, question: Question, standing: Sequence[TouchPrior], before: Sequence[ScoredAnswer]
     ) -> list[ScoredAnswer]:
         """Where what was known does not help: touches from nothing, beside a disturbance, by a wrong response."""
-        found = self._search(question, (), None) if standing else []
+        found = self._from_nothing(question) if standing else []
         if _settled(question, found):
             return found
         touched = [answer for answer in [*before, *found] if answer.fit is not None]
@@ -452,6 +464,12 @@ def _started(priors: Sequence[TouchPrior], fit: FoundTouches | None) -> list[Tou
     """The same priors, searched from where a fit ended."""
     states = fit.states if fit is not None else [prior.start for prior in priors]
     return [replace(prior, start=state.copy()) for prior, state in zip(priors, states, strict=True)]
+
+
+def _begun(state: Array, span_s: float) -> TouchPrior:
+    """A touch that may be anywhere, searched from a state."""
+    x, y = state[PLACE]
+    return replace(anywhere(float(x), float(y), float(state[ACTION]), span_s), start=state)
 
 
 def _from(fit: FoundTouches | None) -> list[TouchPrior]:

@@ -5,6 +5,7 @@ vector. It only says that all is quiet; what is not goes the whole way.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,13 @@ class Glance:
 
     at_s: float
     white: Whitening
+    even_variance: float  # of what all values share, by the filter
     newest: dict[int, Newest] = field(default_factory=dict)  # by the part measured last
+
+    @cached_property
+    def told_of_even(self) -> float:
+        """Information of what all values have in common."""
+        return float(np.sum(self.white.w.sum(axis=1) ** 2))
 
     def newest_of(self, part: int, ages_s: Array) -> Newest:
         """ages_s (K,): of a scan that ends with this part."""
@@ -65,14 +72,24 @@ class QuickLook:
         """The untouched skin is another."""
         self._glances.clear()
 
-    def keep(self, alike: int, at_s: float, white: Whitening) -> None:
+    def keep(self, alike: int, at_s: float, white: Whitening, even_variance: float) -> None:
         """alike: as NoiseModel.alike."""
-        self._glances[alike] = Glance(at_s, white)
+        self._glances[alike] = Glance(at_s, white, even_variance)
 
-    def look(self, alike: int, scan: Scan, at_s: float, y: Array, information: NDArray[np.float32]) -> Seen | None:
-        """y (K,): log |Z| over the prediction, 0 where it does not count. None: nothing is known of such scans."""
+    def look(
+        self,
+        alike: int,
+        scan: Scan,
+        at_s: float,
+        y: Array,
+        information: NDArray[np.float32],
+        even_variance: float,
+    ) -> Seen | None:
+        """y (K,): log |Z| over the prediction, 0 where it does not count. even_variance: by now. None: nothing is known
+        of such scans, or the filter has become so much surer since that it would overlook a step of the gain.
+        """
         known = self._glances.get(alike)
-        if known is None or not 0 <= at_s - known.at_s < n.GLANCE_S:
+        if known is None or not 0 <= at_s - known.at_s < n.GLANCE_S or even_variance < n.SURER * known.even_variance:
             return None
         residual = known.white(y)
         pulled = known.white.w.T @ residual
@@ -81,4 +98,5 @@ class QuickLook:
         own = pulled[newest.rows]
         fresh = float(own @ newest.energy @ own) - len(own)
         z2 = max(self._grid.likeliest(pulled, information)[0], fresh)
-        return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2, chi2, z2, pulled)
+        even = float(pulled.sum()) ** 2 / known.told_of_even < n.GAIN_Z2
+        return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, chi2, z2, pulled)

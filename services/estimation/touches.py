@@ -70,6 +70,11 @@ class TrackedTouch:
     def ended(self) -> bool:
         return self.until_s < np.inf
 
+    def acts_at(self, at_s: float) -> bool:
+        """Whether it is there at an instant of the scan that it was fitted to: it may have ended after that."""
+        left = float(self.state[ACTION] + self.state[RATE] * (at_s - self.at_s))
+        return not self.ended or (at_s < self.until_s and left > n.ENDED * self.peak)
+
 
 @dataclass
 class TouchesState:

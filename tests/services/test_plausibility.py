@@ -1,4 +1,6 @@
-"""Gross faults of the stub's board give no valid contact; the hardest touches on the same sheet stay valid."""
+"""Gross faults of the stub's board are named and give no wrong contact; the hardest touches on the same sheet stay
+valid.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +40,14 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
 NAMED = {
     "mux_stuck": {"multiplexer"},
     "electrodes_swapped": {"electrode_swapped"},
-    "stale_rtia": {"out_of_distribution"},
+    "stale_rtia": {"out_of_distribution", "gain"},
 }
 
 
 @pytest.mark.parametrize("snr_db", [60.0, 80.0])
 @pytest.mark.parametrize("shapes", [(), PRESS], ids=["free", "pressed"])
 @pytest.mark.parametrize(("name", "args"), FAULTS, ids=[f"{n}-{'-'.join(map(str, a.values()))}" for n, a in FAULTS])
-def test_a_gross_fault_gives_no_valid_contact(
+def test_a_gross_fault_is_named_and_gives_no_wrong_contact(
     tared: dict[float, StubSkin], name: str, args: dict[str, Any], shapes: tuple[Shape, ...], snr_db: float
 ) -> None:
     skin = tared[snr_db]
@@ -55,15 +57,14 @@ def test_a_gross_fault_gives_no_valid_contact(
         found = [skin.feel(shapes) for _ in range(4)]
     finally:
         skin.faults.clear()
-    followed = name == "stale_rtia" and not shapes  # a gain that steps is taken over at once, without a touch
-    assert followed or all(set(r.contact.reasons) & NAMED[name] for r in found)
+    named = [bool(set(r.contact.reasons) & NAMED[name]) for r in found]
+    assert all(named) or (named[0] and name == "stale_rtia")  # a gain that steps is taken over, and said once
     for r in found:
-        if r.contact.valid:  # the electrodes at fault were left out: what is pressed is seen, and nothing else
-            assert followed or (name == "electrodes_swapped" and "degraded" in r.contact.reasons)
+        if r.contact.valid:  # what is pressed is seen in spite of the fault, and nothing else
             assert r.delta.touched == bool(shapes) and len(r.contact.contacts) == len(shapes)
             for contact, shape in zip(r.contact.contacts, shapes, strict=True):
                 away = np.hypot(contact.position[0] - 0.05 * shape.x, contact.position[1] - 0.05 * shape.y)
-                assert away < 0.005
+                assert away < 0.003
     after = [skin.feel() for _ in range(5)]
     assert all(r.contact.valid and not r.delta.electrodes.any() for r in after[3:])  # and when it is over, all is well
 

@@ -60,7 +60,10 @@ class FaultState:
     log_gain: float = 0.0  # since the tare
     log_gain_before: float = 0.0  # of what was measured before
     gain_since_s: float = -np.inf
-    gain_said_until_s: float = -np.inf
+    gain_said_s: float = -np.inf  # end of the scan in which it was found
+    gain_steps: int = 0
+    log_gain_sound: float = 0.0  # before a gross step
+    gross_since_s: float = np.inf  # no sound board's gain is as this one since then; inf: it is
     unexplained_scans: int = 0
     doubt: DecidedState = field(default_factory=DecidedState)  # of the changed contact
 
@@ -101,7 +104,6 @@ class BoardView:
         leave_out(made, self.live)
         return made
 
-
     def through(self, covariance: Array) -> Array:
         """(K, K) of the skin's log |Z|, as the wires show it."""
         return covariance if self.slopes is None else np.asarray(self.slopes @ covariance @ self.slopes.T)
@@ -140,7 +142,9 @@ class BoardFaults:
     def plain(self, oldest_s: float) -> bool:
         """Whether nothing is wrong but what the skin has for good, since the oldest value of a scan."""
         now = self.now
-        return self.sound and not self.gain_named(oldest_s) and oldest_s > max(now.gain_since_s, now.wire_since_s)
+        if not self.sound or self.gain_gross(oldest_s):
+            return False
+        return oldest_s > max(now.gain_since_s, now.gain_said_s, now.wire_since_s)
 
     def taken_off(self, over: Array) -> Array:
         """(K,) log |Z| over an untouched skin without what the board and contacts have for good. over (K,)."""
@@ -216,9 +220,18 @@ class BoardFaults:
         rival = max(guess.score for guess in found if guess.fault != best.fault)
         if best.fault == now.wire or best.score < max(stands.score + n.WIRE_SURE, rival + n.WIRE_APART):
             return False
+        if now.wire is None and best.score < self._by_gain(view, touched, skin + own) + n.WIRE_APART:
+            return False
         now.wire, now.wire_since_s = best.fault, view.middle_s + best.since_s
         now.unexplained_scans = 0
         return True
+
+    def _by_gain(self, view: BoardView, touched: Array, covariance: Array) -> float:
+        """Log evidence and prior of a step of the gain, before the scan or within it, whatever touches."""
+        white = Whitening.of(covariance + self._any_touch)
+        y = np.where(view.live, view.y - np.log1p(touched), 0.0)
+        scan = Unexplained(y, np.ones_like(y), view.live, view.times_s, view.span_s, white)
+        return max(gain_change(scan, since_s).score for since_s in (-np.inf, gain_onset(scan))) + float(n.COST_GAIN)
 
     def _untouched(self, view: BoardView) -> BoardScan:
         sound = view.sound + np.log1p(view.mean)
@@ -234,7 +247,13 @@ class BoardFaults:
         if self.now.wire is not None and not self.exchanged:
             return False
         new = answer.fit is not None and any(place < 0 for place in answer.kept)
-        return new or not answer.holds or answer.cause != AS_IT_IS
+        return new or not answer.holds or answer.cause != AS_IT_IS or self.shared_z2(answer) > n.GAIN_Z2
+
+    def shared_z2(self, answer: ScoredAnswer) -> float:
+        """How much all values have in common beyond what explains a scan, in squared sigmas."""
+        even = np.ones(len(answer.pulled))
+        told = answer.fit.information(even) if answer.fit is not None else float(np.sum(answer.white(even) ** 2))
+        return float(answer.pulled.sum()) ** 2 / told
 
     def explained_by_fault(
         self,
@@ -368,7 +387,9 @@ class BoardFaults:
         if isinstance(change, GainChange):
             now.log_gain_before, now.gain_since_s = now.log_gain, since_s
             now.log_gain += n.GAIN_CHANGES * told
-            now.gain_said_until_s = view.middle_s + n.GAIN_NAMED_S
+            now.gain_said_s = view.middle_s + view.span_s / 2
+            now.gain_steps += 1
+            self._gross(max(since_s, view.middle_s - view.span_s / 2))
             return
         before = now.size if change.electrode == now.contact else 0.0
         if now.contact not in (-1, change.electrode) and not now.doubt.undecided:
@@ -381,6 +402,16 @@ class BoardFaults:
             now.doubt.begin(before)
         now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
         now.still_s, now.back_scans = 0.0, 0
+
+    def _gross(self, since_s: float) -> None:
+        """Whether a step of the gain is one that no sound board's makes, or the end of such a one."""
+        now = self.now
+        if abs(now.log_gain - now.log_gain_sound) < n.GAIN_BACK:
+            now.gross_since_s = np.inf
+        elif abs(now.log_gain - now.log_gain_before) > n.GAIN_GROSS:
+            now.log_gain_sound, now.gross_since_s = now.log_gain_before, since_s
+        elif now.gross_since_s == np.inf:
+            now.log_gain_sound = now.log_gain
 
     # --- what follows ---
 
@@ -440,8 +471,13 @@ class BoardFaults:
         contact = now.contact if named else -1
         return advice.states_of(len(now.settled), now.wire, now.opens, contact, now.silent)
 
-    def gain_named(self, middle_s: float) -> bool:
-        return middle_s < self.now.gain_said_until_s
+    def gain_stepped(self, oldest_s: float) -> bool:
+        """Whether a scan whose oldest value is of then holds a step of the gain, or shows it first."""
+        return oldest_s < max(self.now.gain_since_s, self.now.gain_said_s)
+
+    def gain_gross(self, at_s: float) -> bool:
+        """Whether the gain is as no sound board's, and has not lasted."""
+        return self.now.gross_since_s <= at_s < self.now.gross_since_s + n.GAIN_LASTS_S
 
     @property
     def sound(self) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from models.measurement.fit import FoundTouches
 from models.measurement.tables import SkinTables
-from models.measurement.whitening import Whitening, leave_out
+from models.measurement.whitening import leave_out
 from services.estimation.faults.board import LEAST, BoardFaults, BoardView
 from services.estimation.faults.impedance import ContactChange, ContactColumns, Unexplained
 from services.estimation.hypotheses import AS_IT_IS, MEMORY, Hypotheses, Question, ScoredAnswer, StepBudget

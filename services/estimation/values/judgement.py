@@ -56,6 +56,7 @@ ROWS: Mapping[str, CheckRow] = {
     "fifo": CheckRow("faults/wires", NOTE, "fifo"),
     "impedance": CheckRow("faults/impedance", NOTE, "electrode_drift"),
     "gain": CheckRow("faults/impedance", NOTE, "gain"),
+    "gain_gross": CheckRow("faults/impedance", REFUSE, "gain"),
     "degraded": CheckRow("enough", NOTE, "degraded"),
     "too_many": CheckRow("enough", REFUSE),  # what is wrong with each of them is said
     "burst": CheckRow("faults/disturbance", NOTE),

@@ -11,6 +11,7 @@ from models.measurement.number import Number
 FALSE_ALARM_Z2 = Number(44.0, "-", "z^2 of the best disc that is a touch", "derived: 2 (ln 650 discs + ln 1e6) + 3")
 GLANCE_Z2 = Number(36.0, "-", "the same at a first look", "derived: the whitening is 0.5 s old, 10 % of z")
 GLANCE_S = Number(0.5, "s", "for which a whitening does for a first look", "derived: drift beyond is 1e-5")
+SURER = Number(0.5, "-", "of a variance then, below which a whitening is made anew", "derived: 40 % of a sigma")
 QUIET = Number(1.6, "-", "chi^2 a measurement of what nothing needs to explain", "derived: 4.6 sigmas of 120")
 GOOD = Number(1.45, "-", "the same of a fit that explains its scan", "derived: 3.5 sigmas of 120")
 MOST = Number(2.5, "-", "the same of a fit that is roughly right: places hold", "chosen: 60 % more than the noise")
@@ -93,6 +94,7 @@ NEIGHBOURS = Number(
 MOST_TOUCHES = Number(4.0, "-", "touches at once", "chosen: cost; image and contact frames hold more")
 MOST_STEPS = Number(200.0, "-", "steps times touches of one scan, beyond which nothing new is asked", "chosen: 30 ms")
 LEAST_BUDGET = Number(0.4, "-", "of them, for a part of a scan", "chosen: the parts after it are asked as well")
+SEPARATE = Number(4.0, "-", "times that, of a scan that stands by itself", "chosen: four scans find any three touches")
 FOR_FAULTS = Number(0.4, "-", "of them, for what the board may have done", "derived: two changes, two fits each")
 STEPS_WARM = Number(4.0, "-", "steps of a fit from the scan before", "measured: 2 or 3 are used")
 STEPS_HELD = Number(1.0, "-", "the same of touches that stay as they are", "measured: seldom one is needed")
@@ -191,20 +193,27 @@ CONTACT_STILL = Number(
 CONTACT_SETTLES_S = Number(10.0, "s", "still for so long it is the skin's own", "chosen: named long enough to be read")
 CONTACT_BACK = Number(0.004, "-", "change below which a contact is well again", "derived: ten sigmas of the filter's")
 BACK_SCANS = Number(3.0, "-", "whole scans for which it must be", "chosen: a loose wire flaps no faster")
-GAIN_NAMED_S = Number(0.3, "s", "for which a step of the gain is said", "chosen: seen by a person's tool at 5 Hz")
 CONTACT_TOLD = Number(
     24.0, "nat", "by which a contact is likelier than a touch on it", "measured: light touches reach 18, 6 beyond"
 )
 TOUCH_TOLD = Number(8.0, "nat", "by which a touch on an electrode is likelier than its contact", "derived: FAULT_SURE")
 TOUCH_SECOND = Number(4.0, "1/unit^4", "what a touch does to its electrode, of its action squared", "measured: 4 A^2")
-NAMED_SCANS = Number(2.0, "-", "further scans after which what may be a touch is named", "chosen: as the service before")
+NAMED_SCANS = Number(
+    2.0, "-", "further scans after which what may be a touch is named", "chosen: as the service before"
+)
 CONTACT_PLAIN = Number(0.5, "-", "change that is named at once", "measured: touches on electrodes reach 0.35")
 PACE_S = Number(0.6, "s", "for which a contact that drifts goes on steadily", "chosen: a press takes less to come")
 PACE_LEAST = Number(0.02, "-", "of its impedance, least change in that time", "derived: 3 % a second")
 PACE_BENDS = Number(0.15, "-", "of the way, from a straight line", "chosen: as the service before")
 PACE_UNSEEN = Number(0.01, "1/s", "pace of a contact that is followed unsaid", "measured: drifts of 0.1 to 1 %/s")
 PACE_GROWS = Number(2.0, "-", "times its pace that a contact may drift", "chosen: as it turns round")
-UNDECIDED_SETTLES_S = Number(60.0, "s", "still for so long, what may be a touch is the skin's", "chosen: nobody rests so")
+UNDECIDED_SETTLES_S = Number(
+    60.0, "s", "still for so long, what may be a touch is the skin's", "chosen: nobody rests so"
+)
+GAIN_Z2 = Number(25.0, "-", "squared sigmas that all values share, from which a gain's step is asked", "derived: 1e-6")
+GAIN_GROSS = Number(0.14, "-", "log of a step that no sound board's gain makes", "data sheet: RTIA and PGA, a tenth")
+GAIN_LASTS_S = Number(1.0, "s", "for which such a step must last to be taken over", "chosen: as the service before")
+GAIN_BACK = Number(0.01, "-", "log of what is left of it when it ends", "derived: drift of a minute")
 CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itself", "derived: a fifth of its walk")
 ON_ELECTRODE = Number(0.2, "unit", "gap below which a touch changes an electrode's contact", "derived: its width")
 ACTS_Z2 = Number(9.0, "-", "squared sigmas of a touch's action, below which it may be none", "derived: 3 sigmas")
