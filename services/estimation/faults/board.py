@@ -101,7 +101,6 @@ class BoardView:
         leave_out(made, self.live)
         return made
 
-
     def through(self, covariance: Array) -> Array:
         """(K, K) of the skin's log |Z|, as the wires show it."""
         return covariance if self.slopes is None else np.asarray(self.slopes @ covariance @ self.slopes.T)
@@ -194,7 +193,7 @@ class BoardFaults:
         return mean + np.where(since, after, before), spread * since[:, None]
 
     def _lifted(self) -> Array:
-        """(K, n) relative changes by electrodes that are off the skin, each measurement by all the rest of a contact."""
+        """(K, n) relative changes by electrodes that are off the skin, by all the rest of their contacts."""
         return np.asarray(self._columns.rest[:, list(self.now.lifted)] * n.SHORT_WAY)
 
     # --- wires ---

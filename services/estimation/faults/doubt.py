@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from models.measurement.fit import FoundTouches
 from models.measurement.tables import SkinTables
-from models.measurement.whitening import Whitening, leave_out
+from models.measurement.whitening import leave_out
 from services.estimation.faults.board import LEAST, BoardFaults, BoardView
 from services.estimation.faults.impedance import ContactChange, ContactColumns, Unexplained
 from services.estimation.hypotheses import AS_IT_IS, MEMORY, Hypotheses, Question, ScoredAnswer, StepBudget
@@ -35,8 +35,8 @@ class ContactDoubt:
     def __call__(
         self, view: BoardView, question: Question, answer: ScoredAnswer, skin: Array, own: Array
     ) -> FoundTouches | None:
-        """A whole scan that was explained with a changed contact. skin, own: as for `BoardView.covariance`, what touches
-        that stand may do included. Returns the touch that it is.
+        """A whole scan that was explained with a changed contact. skin, own: as for `BoardView.covariance`, what
+        touches that stand may do included. Returns the touch that it is.
         """
         faults = self._faults.now
         doubt = faults.doubt

@@ -196,14 +196,18 @@ CONTACT_TOLD = Number(
 )
 TOUCH_TOLD = Number(8.0, "nat", "by which a touch on an electrode is likelier than its contact", "derived: FAULT_SURE")
 TOUCH_SECOND = Number(4.0, "1/unit^4", "what a touch does to its electrode, of its action squared", "measured: 4 A^2")
-NAMED_SCANS = Number(2.0, "-", "further scans after which what may be a touch is named", "chosen: as the service before")
+NAMED_SCANS = Number(
+    2.0, "-", "further scans after which what may be a touch is named", "chosen: as the service before"
+)
 CONTACT_PLAIN = Number(0.5, "-", "change that is named at once", "measured: touches on electrodes reach 0.35")
 PACE_S = Number(0.6, "s", "for which a contact that drifts goes on steadily", "chosen: a press takes less to come")
 PACE_LEAST = Number(0.02, "-", "of its impedance, least change in that time", "derived: 3 % a second")
 PACE_BENDS = Number(0.15, "-", "of the way, from a straight line", "chosen: as the service before")
 PACE_UNSEEN = Number(0.01, "1/s", "pace of a contact that is followed unsaid", "measured: drifts of 0.1 to 1 %/s")
 PACE_GROWS = Number(2.0, "-", "times its pace that a contact may drift", "chosen: as it turns round")
-UNDECIDED_SETTLES_S = Number(60.0, "s", "still for so long, what may be a touch is the skin's", "chosen: nobody rests so")
+UNDECIDED_SETTLES_S = Number(
+    60.0, "s", "still for so long, what may be a touch is the skin's", "chosen: nobody rests so"
+)
 CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itself", "derived: a fifth of its walk")
 ON_ELECTRODE = Number(0.2, "unit", "gap below which a touch changes an electrode's contact", "derived: its width")
 ACTS_Z2 = Number(9.0, "-", "squared sigmas of a touch's action, below which it may be none", "derived: 3 sigmas")
