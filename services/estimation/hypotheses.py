@@ -182,8 +182,8 @@ class Hypotheses:
         return self._fitted(question, [anywhere(x, y, 0.0, question.span_s)], (-1,), n.STEPS_COLD)
 
     def on_electrode(self, question: Question, place: Array, second: Array) -> ScoredAnswer:
-        """The likeliest small touch on an electrode. place (2,): its middle; second (K, n): what a touch does there by the
-        square of its action.
+        """The likeliest small touch on an electrode. place (2,): its middle; second (K, n): what a touch does there
+        by the square of its action.
         """
         out = place / max(float(np.hypot(*place)), LEAST_ACTION)
         found: ScoredAnswer | None = None

@@ -198,7 +198,7 @@ class BoardFaults:
         return mean + np.where(since, after, before), spread * since[:, None]
 
     def _lifted(self) -> Array:
-        """(K, n) relative changes by electrodes that are off the skin, each measurement by all the rest of a contact."""
+        """(K, n) relative changes by electrodes that are off the skin, by all the rest of their contacts."""
         return np.asarray(self._columns.rest[:, list(self.now.lifted)] * n.SHORT_WAY)
 
     # --- wires ---

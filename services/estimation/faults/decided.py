@@ -1,4 +1,4 @@
-"""How much of a changed contact impedance is known to be the contact's, and how much may be a touch on the electrode."""
+"""How much of a changed contact impedance is surely the contact's, and how much may be a touch on its electrode."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class DecidedState:
             self.begin(self.decided)
 
     def _pace(self, lasts_s: float) -> float:
-        """At which it moved on steadily for so long, which is longer than a touch takes to come; 0: it did not [1/s]."""
+        """At which it moved on steadily for so long, longer than a touch takes to come; 0: it did not [1/s]."""
         times = np.array([each.at_s for each in self.sizes])
         before = np.flatnonzero(times <= times[-1] - lasts_s)
         if not before.size or len(times) - before[-1] < LEAST_SIZES:

@@ -35,8 +35,8 @@ class ContactDoubt:
     def __call__(
         self, view: BoardView, question: Question, answer: ScoredAnswer, skin: Array, own: Array
     ) -> FoundTouches | None:
-        """A whole scan that was explained with a changed contact. skin, own: as for `BoardView.covariance`, what touches
-        that stand may do included. Returns the touch that it is.
+        """A whole scan that was explained with a changed contact. skin, own: as for `BoardView.covariance`, what
+        touches that stand may do included. Returns the touch that it is.
         """
         faults = self._faults.now
         doubt = faults.doubt
