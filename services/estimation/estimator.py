@@ -422,7 +422,7 @@ class Estimator:
             )
             self._make_sure(skin, answer)
             rest = replace(question, keeps=0.0)
-            if measured.whole and not self._apart(skin, rest, measured):
+            if measured.whole and not self._apart(skin, rest, answer, measured):
                 self._doubt(skin, rest, answer, measured)
         self._remember(skin, memories)
 
@@ -440,13 +440,15 @@ class Estimator:
         for track in skin.touches.now.tracks:
             track.sure = track.sure or track.z2 > least
 
-    def _apart(self, skin: TaredSkin, question: Question, measured: LookedAt) -> bool:
+    def _apart(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> bool:
         """Whether a young touch of an odd outline is rather several: evidence decides, while the outline is learnt."""
         young = [t for t in skin.touches.now.tracks if t.scans in AGES_OF_DOUBT and not t.ended]
         if not any(float((track.shape**2 / SHAPE_SDS**2).sum()) > n.ODD_OUTLINE for track in young):
             return False
         found = skin.hypotheses.anew(question)
         if found is None or not found.explained or found.fit is None or len(found.fit) <= len(skin.touches):
+            return False
+        if found.score <= answer.score:
             return False
         kept = skin.touches.recognised(found.fit, found.kept)
         gone = [k for k in range(len(skin.touches)) if k not in kept]
