@@ -31,6 +31,7 @@ from services.estimation.touch_decision import sigma_of_mean
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, TouchEstimate
 from services.estimation.values.scan import Scan
+from services.kept_baseline import ages
 from services.linearisation import Linearisation
 from services.runtime.config import Skin
 from services.runtime.continuity import Continuity
@@ -42,7 +43,6 @@ TAKING = "taking the baseline"  # what the status says until there is one
 REST_S = 0.25  # of the drift that skin.toml allows: what is left of it beside a touch
 SAVE_EVERY = 512  # untouched scans after which the tracked baseline is worth keeping again
 TABLES = 2  # kept that no skin holds, 14 MB each
-LONGEST_S = 1e9  # a saved time that is longer is none
 PLACE_SIGMA = 1e-4  # m: no table knows a place better
 
 skin_tables: ByBundle[SkinTables] = ByBundle(tables_of, TABLES)
@@ -71,7 +71,6 @@ class Estimating(Stage):
     def _build(self) -> None:
         """What stands on the bundle in use."""
         self.bundle, skin = self.linearisation.bundle, self.config
-        self.estimator = Estimator(skin_tables(self.bundle))
         self.pre = self.bundle.prereconstructor()
         allowed = Drift(skin.tare.scale_per_s * REST_S, skin.tare.contact_per_s * REST_S)
         self._reconstruction = Reconstruction(self.pre, allowed, skin.touch.false_alarms)
@@ -129,7 +128,7 @@ class Estimating(Stage):
         scan = Scan.of(frame, self._before)
         self._before = scan
         estimate = self.estimator.step(scan)
-        self._look_at_baseline(scan)
+        self._look_at_baseline()
         self._count_gain_steps()
         self._electrodes = estimate.electrodes
         self._silent = any(each.name == "silent" and each.ratio >= 1 for each in estimate.judgements)
@@ -250,15 +249,14 @@ class Estimating(Stage):
                 self.baseline = replace(self.baseline, taken_ns=taken_ns)
                 self._undated_s = 0.0
 
-    def _look_at_baseline(self, scan: Scan) -> None:
+    def _look_at_baseline(self) -> None:
         """Whether the estimator has taken another one."""
         if self.estimator.skin is not self._of:
             self._use(self._taken("start"))
             self._keep = True
-        if self.estimator.skin is not None:
-            self._problem = self.estimator.taring.now.problem
-        elif self.estimator.taring.now.problem:
-            self._problem = self.estimator.taring.now.problem
+        problem = self.estimator.taring.now.problem
+        if problem or self.estimator.skin is not None:
+            self._problem = problem
 
     def _count_gain_steps(self) -> None:
         skin = self.estimator.skin
@@ -318,11 +316,9 @@ class Estimating(Stage):
         """A calibration that is ready is adopted while nothing touches."""
         if not self.linearisation.follows(self._touched):
             return
-        estimator, baseline = self.estimator, self.baseline
         self._build()
-        estimator.use(skin_tables(self.bundle))
-        self.estimator = estimator
-        self._use(baseline)
+        self.estimator.use(skin_tables(self.bundle))
+        self._use(self.baseline)
         self._news = BaselineNews()
 
     # --- kept state ---
@@ -333,8 +329,7 @@ class Estimating(Stage):
             self._since_saved, self._keep = 0, True
 
     def saved(self) -> dict[str, Any] | None:
-        baseline = self._by_now()
-        if not self._keep or baseline is None or self._source == "replay":
+        if not self._keep or self._source == "replay" or (baseline := self._by_now()) is None:
             return None
         self._keep = False
         taken_s = self._undated_s or max(0.0, (self._sample_ns - baseline.taken_ns) * 1e-9)
@@ -343,6 +338,7 @@ class Estimating(Stage):
     def restore(self, saved: dict[str, Any], age_s: float) -> None:
         if self.config.tare.calibrate and self.linearisation.restore(saved):
             self._build()
+            self._forget_baseline()
         try:
             self._take_over(saved, age_s)
         except NoBaseline as why:
@@ -357,12 +353,7 @@ class Estimating(Stage):
             raise Refused(
                 f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest_s / 3600:.1f} h: another is taken"
             )
-        try:
-            taken_s, quiet_s = (float(saved.get(key, 0.0)) for key in ("taken_s", "quiet_s"))
-            if not (0 <= taken_s <= LONGEST_S and 0 <= quiet_s <= LONGEST_S):
-                raise ValueError(f"found {taken_s:g} s and {quiet_s:g} s")
-        except (TypeError, ValueError) as wrong:
-            raise Refused(f"the saved baseline has no age ({wrong}): tare again") from None
+        taken_s, quiet_s = ages(saved)
         self.set_baseline(replace(baseline, restored=True), age_s + quiet_s)
         self._undated_s = age_s + taken_s
 

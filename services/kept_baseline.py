@@ -37,13 +37,21 @@ def take_over(estimator: BaselineEstimator, saved: dict[str, Any], age_s: float,
             f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest_s / 3600:.1f} h: another is taken, and "
             "held against it"
         )
+    taken_s, quiet_s = ages(saved)
+    estimator.set_baseline(
+        dataclasses.replace(baseline, restored=True), age_s=age_s + quiet_s, undated_s=age_s + taken_s
+    )
+    estimator.news = False
+
+
+def ages(saved: dict[str, Any]) -> tuple[float, float]:
+    """When a baseline was taken and the skin last known as untouched, both in seconds before it was kept. Raises
+    Refused where those are no times.
+    """
     try:
         taken_s, quiet_s = (float(saved.get(key, 0.0)) for key in ("taken_s", "quiet_s"))
         if not (0 <= taken_s <= LONGEST_S and 0 <= quiet_s <= LONGEST_S):
             raise ValueError(f"found {taken_s:g} s and {quiet_s:g} s")
     except (TypeError, ValueError) as wrong:
         raise Refused(f"the saved baseline has no age ({wrong}): tare again") from None
-    estimator.set_baseline(
-        dataclasses.replace(baseline, restored=True), age_s=age_s + quiet_s, undated_s=age_s + taken_s
-    )
-    estimator.news = False
+    return taken_s, quiet_s
