@@ -213,3 +213,8 @@ def geometry(bundle: Bundle) -> dict[str, Any]:
         "electrodes": metres * np.asarray(centres, dtype=float).reshape(-1, 2),
         "metres_per_unit": metres,
     }
+
+
+def explains(bundle: Bundle) -> bool:
+    """Whether the response of this bundle's skins is known well enough for the measurements to tell the touches."""
+    return bundle.has_response and bundle.matrices.normalisation == "model"

@@ -16,7 +16,7 @@ from models.bundle import Bundle
 from models.locator import Located, Locator
 from models.symmetries import symmetries
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
-from services.describe import ON, refinement, symmetry
+from services.describe import ON, explains, refinement, symmetry
 from services.estimation.rolling import parts_of
 from services.image_check import ImageCheck
 from services.linearisation import Linearisation
@@ -53,7 +53,9 @@ class Inference(Stage):
         self.image_check = ImageCheck(bundle, refuses)
         self.linearisation = Linearisation(name, bundle)
         self._tells_shapes = tells_shapes(bundle)
-        self.judges = True  # whether an image may refuse its frame: not where the measurements have been explained
+        self.judges = not explains(
+            bundle
+        )  # whether an image may refuse its frame: not where measurements are explained
         self.each_alone = False  # offline: frames that do not follow each other; each waits for its fit
         self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import NamedTuple
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame, Frame, ImageFrame, RawFrame
+from services.describe import explains
 from services.estimating import Estimating
 from services.inference import Inference
 from services.preprocessing import Preprocessing
@@ -28,22 +28,18 @@ class Result(NamedTuple):
     contact: ContactFrame
 
 
-def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> tuple[Preprocessing, Inference, Publishing]:
+def preprocessing(name: str, skin: Skin, bundle: Bundle) -> Preprocessing | Estimating:
+    return (Estimating if explains(bundle) else Preprocessing)(name, skin, bundle)
+
+
+def publishing(name: str, skin: Skin, bundle: Bundle) -> Publishing | TouchPublishing:
+    return (TouchPublishing if explains(bundle) else Publishing)(name, skin, bundle)
+
+
+def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> Stages:
     """The three stages of one skin. Raises models.bundle.BundleError."""
     bundle = bundle or Bundle.load(skin.bundle)
-    return Preprocessing(name, skin, bundle), Inference(name, skin, bundle), Publishing(name, skin, bundle)
-
-
-def explains(bundle: Bundle) -> bool:
-    """Whether the response of this bundle's skins is known well enough for the measurements to tell the touches."""
-    return bundle.has_response and bundle.matrices.normalisation == "model"
-
-
-def build_anew(name: str, skin: Skin, bundle: Bundle) -> tuple[Estimating, Inference, TouchPublishing]:
-    """Those that are to take over: what touches is told by the measurements, what it looks like by the image."""
-    inference = Inference(name, skin, bundle)
-    inference.judges = False
-    return Estimating(name, skin, bundle), inference, TouchPublishing(name, skin, bundle)
+    return preprocessing(name, skin, bundle), Inference(name, skin, bundle), publishing(name, skin, bundle)
 
 
 class Pipeline:
@@ -55,18 +51,16 @@ class Pipeline:
         name: str = "skin",
         bundle: Bundle | None = None,
         always_reconstruct: bool = False,
-        build: Callable[[str, Skin, Bundle], Stages] | None = None,
     ):
         """skin: a configured one, or the name or path of a bundle. always_reconstruct: each frame by itself, an
-        image of untouched ones too. build: makes the stages; None: `build_stages`.
+        image of untouched ones too.
         """
         if isinstance(skin, str):
             skin = Skin(port="stub", bundle=skin, frame_id=name)
         self.name = name
         self.delta: DeltaFrame | None = None  # the newest one; parts of scans come between two of them
         self.image: ImageFrame | None = None  # the newest one
-        build = build or build_stages
-        self.pre, self.inference, self.publishing = build(name, skin, bundle or Bundle.load(skin.bundle))
+        self.pre, self.inference, self.publishing = build_stages(name, skin, bundle)
         self.pre.always_reconstruct = self.inference.each_alone = self.publishing.each_alone = always_reconstruct
 
     def run(self, raw: RawFrame) -> Result:

@@ -188,6 +188,7 @@ def _unusable(out: DeltaFrame, reason: str, measurements: int) -> DeltaFrame:
 if __name__ == "__main__":
     import sys
 
+    from services.pipeline import preprocessing
     from services.process import main, stages
 
-    sys.exit(main("preprocessing", stages(Preprocessing)))
+    sys.exit(main("preprocessing", stages(preprocessing)))

@@ -5,13 +5,13 @@ import sys
 import threading
 
 from services.process import main, stages
-from services.publishing import Publishing
+from services.pipeline import publishing
 from services.runner import Runner
 
 
 def run(runner: Runner) -> None:
     """Contacts flow before the first touch needs the tracker's library, which is as slow to import as all the rest."""
-    stages(Publishing)(runner)
+    stages(publishing)(runner)
     threading.Thread(target=importlib.import_module, args=("scipy.optimize",), daemon=True).start()
 
 

@@ -31,16 +31,6 @@ hypothesis.settings.register_profile(
 if not os.environ.get("EITSKIN_SEARCH"):
     hypothesis.settings.load_profile("fixed")
 
-if os.environ.get(
-    "EITSKIN_ANEW"
-):  # the same tests of the stages that are to take over, where they can: docs/reliability.md
-    from services import pipeline
-
-    stages_of_today = pipeline.build_stages
-    pipeline.build_stages = lambda name, skin, bundle=None: (  # type: ignore[assignment]
-        pipeline.build_anew(name, skin, bundle) if pipeline.explains(bundle) else stages_of_today(name, skin, bundle)
-    )
-
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background: programs we start would inherit that
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
