@@ -14,7 +14,7 @@ from models.symmetries import symmetries
 from models.touch_parameters import HIGH, LOG_RADIUS, LOW
 from protocol.frames import RawFrame
 from services.contacts.force import ForceLaw
-from services.estimation.tare import Baseline
+from services.estimation.baseline import Baseline
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE
 
@@ -213,8 +213,3 @@ def geometry(bundle: Bundle) -> dict[str, Any]:
         "electrodes": metres * np.asarray(centres, dtype=float).reshape(-1, 2),
         "metres_per_unit": metres,
     }
-
-
-def explains(bundle: Bundle) -> bool:
-    """Whether the response of this bundle's skins is known well enough for the measurements to tell the touches."""
-    return bundle.has_response and bundle.matrices.normalisation == "model"

@@ -14,19 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from models.measurement.tables import SkinTables, tables_of
 from models.prereconstruction import Drift
 from protocol.frames import DeltaFrame, EstimatedTouch, Frame, PartFrame, RawFrame, as_sent
 from services.contacts.lasting import LASTS_NS
 from services.describe import BaselineNews, FrameRate, describe, force, refinement, symmetry
 from services.estimation import checks
-from services.estimation.by_bundle import ByBundle
+from services.estimation.baseline import TAKING, Baseline, NoBaseline
+from services.estimation.by_bundle import skin_tables
 from services.estimation.estimator import Estimator, KnownBaseline
 from services.estimation.faults.advice import sentences
 from services.estimation.first.tare import TareRefused
 from services.estimation.reconstruct import Reconstruction
 from services.estimation.references import References
-from services.estimation.tare import Baseline, NoBaseline
 from services.estimation.touch_decision import sigma_of_mean
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, TouchEstimate
@@ -39,13 +38,9 @@ from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason,
 
 Array = NDArray[np.float64]
 
-TAKING = "taking the baseline"  # what the status says until there is one
 REST_S = 0.25  # of the drift that skin.toml allows: what is left of it beside a touch
 SAVE_EVERY = 512  # untouched scans after which the tracked baseline is worth keeping again
-TABLES = 2  # kept that no skin holds, 14 MB each
 PLACE_SIGMA = 1e-4  # m: no table knows a place better
-
-skin_tables: ByBundle[SkinTables] = ByBundle(tables_of, TABLES)
 
 
 class Estimating(Stage):

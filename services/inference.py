@@ -16,9 +16,8 @@ from models.bundle import Bundle
 from models.locator import Located, Locator
 from models.symmetries import symmetries
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
-from services.describe import ON, explains, refinement, symmetry
-from services.estimation.rolling import parts_of
-from services.image_check import ImageCheck
+from services.describe import ON, refinement, symmetry
+from services.estimation.quality import Residual
 from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, network
 from services.runtime.config import Skin
@@ -47,15 +46,11 @@ class Inference(Stage):
         self._network = network(str(path)) if path else OneStep(bundle)
         if isinstance(self._network, Network):
             self._network.check(bundle)
-        # Only a network's image is meant to explain a frame: a one-step image shows where, not how much. Nor is that of
-        # a registered skin: its presses leave too much open, and its locator says how well each touch is explained.
-        refuses = isinstance(self._network, Network) and bundle.locator is None
-        self.image_check = ImageCheck(bundle, refuses)
+        # Only a network's image is in S/m: a one-step image shows where, not how much, as a registered skin's does.
+        self._to_scale = isinstance(self._network, Network) and bundle.locator is None
+        self.residual = Residual(bundle, self._to_scale)
         self.linearisation = Linearisation(name, bundle)
         self._tells_shapes = tells_shapes(bundle)
-        self.judges = not explains(
-            bundle
-        )  # whether an image may refuse its frame: not where measurements are explained
         self.each_alone = False  # offline: frames that do not follow each other; each waits for its fit
         self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
@@ -68,7 +63,6 @@ class Inference(Stage):
         self.reset()
 
     def reset(self) -> None:
-        self.image_check.forget()
         if self._refinement is not None:
             self._refinement.forget()
         if self._symmetry is not None:
@@ -87,8 +81,6 @@ class Inference(Stage):
             "untouched",
             "unwanted",
             "missed",
-            "refused",
-            "changing",
             "uncalibrated",
             "symmetric",
         )
@@ -121,7 +113,6 @@ class Inference(Stage):
         else:
             self._counters["untouched"] += 1
             self._last = None
-            self.image_check.forget()
             if self._symmetry is not None:
                 self._symmetry.forget()
             self._rest(frame.sigma)
@@ -151,7 +142,7 @@ class Inference(Stage):
 
     def _build(self) -> None:
         """What stands on the matrices in use."""
-        self.image_check.follow(self.linearisation.bundle)
+        self.residual = Residual(self.linearisation.bundle, self._to_scale)
         if isinstance(self._network, OneStep):
             self._network = OneStep(self.linearisation.bundle)
         self._last, self._quiet, self._stated = None, None, 0
@@ -181,7 +172,6 @@ class Inference(Stage):
             self._quiet, self._stated = sigma, 1
 
     def warm_up(self) -> None:
-        self.image_check.warm_up(parts_of(self.bundle) if self.config.scan == "rolling" else 1)
         if self._refinement is not None:
             self._refinement.warm_up()
 
@@ -190,7 +180,7 @@ class Inference(Stage):
         if self._symmetry is not None and self._symmetry.busy:
             self._surer = self._symmetry.step()
             return True
-        return self._quiet is not None and self._stated >= SETTLED and self.image_check.prepare(self._quiet)
+        return self._quiet is not None and self._stated >= SETTLED and self.residual.prepare(self._quiet)
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
         ahead, self._ahead = self._ahead, None
@@ -202,40 +192,16 @@ class Inference(Stage):
             quantity = self._locator.quantity
             out.touches = [_touch(each, quantity) for each in self._locator.locate(frame.difference, frame.sigma)]
         self._counters["networks_run"] += 1
-        if not self.judges:
-            out.residual = self.image_check.residual(frame.difference, frame.sigma, out.image)
-        elif not self.image_check.examine(frame, out, self.each_alone):
-            return self._changed(frame, out)
-        self._judge(out)
+        out.residual = self.residual(frame.difference, frame.sigma, out.image)
         self._shows(frame, out)
-        if self._symmetry is not None and frame.touched and not self.image_check.refused:
+        if self._symmetry is not None and frame.touched:
             self._symmetry.begin(frame, (out.image, out.sigma, out.classes))
-
-    def _changed(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        """Show nothing new of a touch that changed during the scan: the image of before is held, and where there was
-        none it is empty.
-        """
-        self._counters["changing"] += 1
-        if (last := self._last) is None:
-            out.image, out.sigma = np.zeros_like(out.image), np.zeros_like(out.sigma)
-            out.reconstructed = frame.scan
-        else:
-            blank = ImageFrame(skin=self.skin)
-            out.image, out.sigma, out.classes = blank.image, blank.sigma, blank.classes
-            self._shows_again(last, out)
 
     def _shows(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """`out` has the image of `frame`, which later ones may hold."""
         self._last, self._unseen, self._surer = out, None, None
         self._last_scan = out.reconstructed = frame.scan
         self._again = False
-
-    def _judge(self, out: ImageFrame) -> None:
-        """Judge whether the image explains the measurements: else it is not that of a touch."""
-        if self.image_check.refused:
-            out.valid = False
-            add_reason(out.reasons, "out_of_distribution")
-            self._counters["refused"] += 1
 
     def _hold(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """Hold the image of the frame last reconstructed, if this process has it. It is sent again only for new
@@ -246,13 +212,8 @@ class Inference(Stage):
             self._shows_surer(frame, last, out)
         elif last is not None and self._last_scan == frame.reconstructed:
             out.noise, out.residual = last.noise, last.residual
-            self.image_check.held()
             self._shows_again(last, out)
-            self._judge(out)
             self._counters["held"] += 1
-        elif self.image_check.of_changing(frame.reconstructed):
-            self.image_check.held_changing()
-            self._judge(out)
         else:  # skipped, or before we started: not valid until the next reconstruction, at most 16 frames on
             out.valid = False
             out.reasons.append("gap")
@@ -266,7 +227,6 @@ class Inference(Stage):
         out.residual = last.residual
         self._last, self._surer, self._again = out, None, False
         self._counters["symmetric"] += 1
-        self._judge(out)
 
     def _shows_again(self, last: ImageFrame, out: ImageFrame) -> None:
         out.held, out.reconstructed = True, self._last_scan
@@ -276,7 +236,7 @@ class Inference(Stage):
             self._again = False
 
     def state(self) -> dict[str, Any]:
-        last, rest = self._last, {"image_check": self.image_check.state(), **self.linearisation.state()}
+        last, rest = self._last, self.linearisation.state()
         if last is None:
             return {"last": None, **rest}
         kept: dict[str, Any] = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
@@ -288,8 +248,6 @@ class Inference(Stage):
         if self.linearisation.load(state):
             self._build()
         last = state.get("last")
-        before = {"changing": state.get("changing", (0, 0)), "refused": (last or {}).get("refused", False)}
-        self.image_check.load(state.get("image_check", before))  # recordings have states of earlier versions
         if last is None:
             return
         try:

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.calibration_file import CalibrationFileError, unpack
 from models.files import FileError, read_bytes
-from services.estimation.evidence import TouchEvidence, evidence_of
-from services.estimation.tare import Baseline, implausibility
+from models.measurement.tables import SkinTables
+from services.estimation.baseline import Baseline, implausibility
+from services.estimation.by_bundle import skin_tables
 from services.runtime import persistence
 from services.runtime.config import ROOT
 
@@ -44,11 +45,11 @@ class MountedSkin:
         """Raises CalibrationFileError."""
         self.packed = packed
         self.bundle = unpack(packed, bundle)
-        self._evidence: TouchEvidence | None = None
+        self._tables: SkinTables | None = None
 
     def make_ready(self) -> None:
         """Make what its stages would otherwise make at their first frame, and hold it for them."""
-        self._evidence = evidence_of(self.bundle)
+        self._tables = skin_tables(self.bundle)
 
 
 def needs_fit(baseline: Baseline, bundle: Bundle) -> bool:

@@ -7,19 +7,13 @@ from typing import NamedTuple
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame, Frame, ImageFrame, RawFrame
-from services.describe import explains
 from services.estimating import Estimating
 from services.inference import Inference
-from services.preprocessing import Preprocessing
-from services.publishing import Publishing
 from services.runtime.config import Skin
 from services.runtime.stage import Stage
 from services.touch_publishing import TouchPublishing
 
 ALL = frozenset({"delta", "part", "image", "contact"})
-
-
-Stages = tuple[Preprocessing | Estimating, Inference, Publishing | TouchPublishing]
 
 
 class Result(NamedTuple):
@@ -28,18 +22,10 @@ class Result(NamedTuple):
     contact: ContactFrame
 
 
-def preprocessing(name: str, skin: Skin, bundle: Bundle) -> Preprocessing | Estimating:
-    return (Estimating if explains(bundle) else Preprocessing)(name, skin, bundle)
-
-
-def publishing(name: str, skin: Skin, bundle: Bundle) -> Publishing | TouchPublishing:
-    return (TouchPublishing if explains(bundle) else Publishing)(name, skin, bundle)
-
-
-def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> Stages:
+def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> tuple[Estimating, Inference, TouchPublishing]:
     """The three stages of one skin. Raises models.bundle.BundleError."""
     bundle = bundle or Bundle.load(skin.bundle)
-    return preprocessing(name, skin, bundle), Inference(name, skin, bundle), publishing(name, skin, bundle)
+    return Estimating(name, skin, bundle), Inference(name, skin, bundle), TouchPublishing(name, skin, bundle)
 
 
 class Pipeline:

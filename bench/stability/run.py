@@ -19,7 +19,7 @@ from models.bundle import Bundle
 from models.forward import ForwardModel, shared
 from models.shapes import Array, Shape
 from protocol.frames import Contact, FrameError, RawFrame, pack, unpack
-from services.estimation.tare import Baseline, take
+from services.estimation.baseline import Baseline, take
 from services.pipeline import Pipeline, Result
 from services.runtime.config import ScanMode, Skin
 
@@ -131,7 +131,7 @@ class InProcessStages:
         self.scan = 0
 
     def tare(self, z0: Array, relative: float | Array, rng: np.random.Generator) -> Baseline:
-        """The baseline of TARE_FRAMES frames of the untouched skin. Raises services.estimation.tare.NoBaseline."""
+        """The baseline of TARE_FRAMES frames of the untouched skin. Raises services.estimation.baseline.NoBaseline."""
         return take(noisy(z0, relative, rng, TARE_FRAMES), self.pipeline.pre.pre, "bench", 0)
 
     def begin(self, baseline: Baseline | None) -> None:

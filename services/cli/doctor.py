@@ -26,7 +26,7 @@ from services.contacts.force import ForceLaw, known_radius
 from services.contacts.placing import placement
 from services.describe import ON, geometry, refinement, symmetry
 from services.estimation import checks
-from services.estimation.tare import implausibility
+from services.estimation.baseline import implausibility
 from services.runtime.config import RECORDINGS, ConfigError, Skin, config_path, load
 
 BOARD_S = 2.5  # for a board to say who it is

@@ -7,13 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from protocol.frames import SHAPES, Contact, EstimatedTouch, ImageFrame, LocatedTouch, RefinedTouch
-from services.contacts.force import Force, ForceLaw, Look
-from services.contacts.motion import Patch, Track
+from protocol.frames import SHAPES, Contact, EstimatedTouch, RefinedTouch
+from services.contacts.force import ForceLaw
 from services.contacts.reading import Appearance
 from services.contacts.refined import agrees, refined, settled
-from services.contacts.registered import registered
-from services.contacts.segmentation import Segment
 from services.contacts.surface import Placed, Placement
 
 
@@ -22,40 +19,6 @@ class ContactWriter:
 
     def __init__(self, law: ForceLaw, place: Placement, tells_force: bool) -> None:
         self.law, self.place, self.tells_force = law, place, tells_force
-
-    def present(
-        self,
-        track: Track,
-        seen: Patch,
-        s: Segment,
-        classes: list[float],
-        frame: ImageFrame,
-        touch: LocatedTouch | None,
-    ) -> Contact:
-        found = self.law.force(Look.of(s, frame))
-        if touch is not None and not self.law.exists:
-            found = Force(touch.force_n, None if touch.force_n is None else touch.value_sigma)
-        best = int(np.argmax(classes)) if classes else -1
-        at = self.place(seen.x, seen.y)
-        return Contact(
-            id=track.id,
-            state="begin" if track.age == 1 and track.begins else "hold",
-            position=at.point.tolist(),
-            velocity=(track.vx * at.along_x + track.vy * at.along_y).tolist(),
-            normal=at.normal.tolist(),
-            orientation=s.orientation,
-            area_m2=s.area * frame.metres_per_pixel**2,
-            force_n=found.newton,
-            force_sigma_n=found.sigma,
-            pressure_pa=found.pressure,
-            pressure_sigma_pa=found.pressure_sigma,
-            wrench=_wrench(at, found.newton or 0.0),
-            shape=SHAPES[best] if classes else "unknown",  # how sure: its probability
-            shape_probability=classes[best] if classes else None,
-            confidence=confidence(s),
-            sheet=None if self.place.flat else [seen.x, seen.y],
-            **({} if touch is None else registered(touch)),
-        )
 
     def of_estimate(self, number: int, state: str, touch: EstimatedTouch, look: Appearance) -> Contact:
         """A touch as the measurements tell it, and as it looks."""
@@ -106,25 +69,8 @@ class ContactWriter:
         at, said = self.place(*touch.position), settled(contact, touch, force)
         return refined(contact, touch, at, said, _wrench(at, said[0].newton or 0.0), flat=self.place.flat)
 
-    def ended(self, tracks: list[Track]) -> list[Contact]:
-        """The last contacts of touches that ended: their last places, without force."""
-        force = 0.0 if self.tells_force else None
-        ends = []
-        for t in tracks:
-            at, sheet = self.place(t.x, t.y), None if self.place.flat else [t.x, t.y]
-            where, normal = at.point.tolist(), at.normal.tolist()
-            ends.append(
-                Contact(id=t.id, state="end", position=where, normal=normal, force_n=force, confidence=0.0, sheet=sheet)
-            )
-        return ends
-
 
 def _wrench(at: Placed, force: float) -> list[float]:
     """On the skin, at its frame's origin: the touch presses against the normal."""
     pressed = -force * at.normal
     return [*pressed.tolist(), *np.cross(at.point, pressed).tolist()]
-
-
-def confidence(s: Segment) -> float:
-    """Probability that the peak is not noise, from its own standard deviation."""
-    return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))

@@ -1,311 +1,175 @@
-"""The untouched skin over time: the first baseline, drift followed while nothing touches, the tare on command."""
+"""The untouched baseline: when frames agree well enough to be one, what their noise is, and whether the skin was
+really untouched.
+"""
 
 from __future__ import annotations
 
-import dataclasses
+import hashlib
+from dataclasses import asdict, dataclass
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.bundle import Bundle
-from protocol.frames import RawFrame, as_sent
-from services.estimation.creep import Creep
-from services.estimation.drift import DriftRates
-from services.estimation.drift_filter import DriftFilter
-from services.estimation.drift_in_touch import drifted, explain
-from services.estimation.evidence import Explanation, TouchEvidence, evidence_of
-from services.estimation.first_baseline import PRESSED, first_baseline
-from services.estimation.references import References
-from services.estimation.tare import Baseline, NoBaseline, noisy, plausible_noise, saved_noise
-from services.estimation.tare_window import TareWindow
+from models.prereconstruction import PreReconstructor, noise_of_frames
+from protocol.errors import EitskinError
 
 Array = NDArray[np.float64]
 
 TAKING = "taking the baseline"  # what the status says until there is one
-SAVE_EVERY = 512  # untouched frames after which the tracked baseline is worth keeping again
-STEADY_S = 0.25  # what is known not to have drifted is as good as a baseline of this age
-DRIFT_KNOWN_S = 4.0  # a drift that was found under a touch leaves as much open as a baseline of this age
+DISAGREEMENT = 1e-5  # probability that quiet frames are refused
+HARMLESS = 5e-5  # relative change of a measurement within the frames that does no harm as part of a baseline
+TOO_NOISY = 0.05  # median relative noise beyond which no touch could be told from it
+UNTRAINED = 0.0056  # the same (45 dB), beyond which no network was trained: models/augmentation.py
+IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
+QUARTERS = 4
+ASSUMED_NOISE = 1e-3  # relative (60 dB), where frames do not tell
+LEAST_NOISE = 2e-6  # relative: about half a step of the board's 18 bits
+IDENTICAL = 1e-12  # relative scatter below which frames are the same but for the arithmetic of their mean
 
 
-def believed(frame: RawFrame) -> bool:
-    """Whether acquisition believes this scan: that it is news, and when it was measured."""
-    return as_sent(frame)[0]
+class NoBaseline(EitskinError, ValueError):
+    """Frames, or a saved state, do not make a baseline. The text says why and what to do."""
 
 
-class BaselineEstimator:
-    """Baseline |Z0| (K,), what differences are divided by, and their noise."""
+@dataclass(frozen=True)
+class Baseline:
+    """|Z0| of the untouched skin. K measurements."""
 
-    def __init__(self, bundle: Bundle, rates: DriftRates, frames: int, tracking_s: float) -> None:
-        """frames: that the mean of a baseline is of; tracking_s: see DriftFilter."""
-        self.bundle = bundle
-        self._evidence: TouchEvidence | None = None
-        self.pre = bundle.prereconstructor()
-        self.window = TareWindow(self.pre, frames)
-        self.drift_filter = DriftFilter(self.pre, rates, tracking_s)
-        self.references = References(len(bundle.pattern))
-        self.revision = 0  # of the baseline: counts up whenever another one is used, or drift moves it
-        self.baseline: Baseline | None
-        self.normaliser: NDArray[np.floating]
-        self.sigma: Array
-        self.reset()
+    z0: Array  # (K,) unit of the raw frames
+    sigma: Array  # (K,) standard deviation of one frame's |Z|, same unit
+    frames: int  # how many it is the mean of
+    board: str  # unique id of the board
+    taken_ns: int  # `sample` of the newest frame in it
+    doubt: str = ""  # why the skin may have been touched meanwhile; empty: no doubt
+    taken_by: str = "start"  # or "command", "file"
+    restored: bool = False  # an earlier process took it
+    noise_frames: int = 0  # how many frames sigma was found from; 0: those of the mean
 
-    def reset(self) -> None:
-        self.window.reset()
-        self.references.reset()
-        self._run = 0  # untouched frames since the last touch
-        self.source = self._board = ""
-        self.last_sample_ns = 0  # stamp `sample` of the newest frame that was believed
-        self.undated_s = 0.0  # age of a baseline that an earlier process took, until the first frame
-        self.news = False  # whether there is another baseline, or much drift was followed, since somebody kept it
-        self.problem = ""  # what stands in the way of valid frames, for a person
-        self.touched_at_start = self._surely_touched = False
-        self.trusted: Baseline | None = None  # the last one without doubt: it judges the start, if it is of this board
-        self._use(None)
-
-    # frames
-
-    def follow(self, frame: RawFrame) -> None:
-        """A baseline belongs to one board, and a recording's frames never meet the live board's baseline."""
-        if self.source and (self.source == "replay") != (frame.source == "replay"):
-            self.reset()
-        self.source, self._board = frame.source, frame.board
-        if self.baseline is not None and frame.source != "replay" and self.baseline.board != frame.board:
-            self.problem = f"the baseline was of board {self.baseline.board}, this is {frame.board}: taking a new one"
-            self.window.clear()
-            self._use(None)
-
-    def offer(self, amplitude: Array, frame: RawFrame, separate: bool = False) -> bool:
-        """A frame's |Z| (K,), NaN where a measurement failed; separate: it stands by itself, and follows no other.
-        Whether there is another baseline now.
-
-        A baseline is taken from frames in a row that acquisition believes: scans that repeat tell no noise, and a stamp
-        that is wrong tells no age.
-        """
-        if not believed(frame):
-            self.window.clear()
-            return False
-        self.last_sample_ns = frame.stamps.get("sample", 0)
-        self._date()
-        if frame.kind == "reference":
-            self.window.add(amplitude)
-            return self._refer(amplitude, frame)
-        self.references.interrupted()
-        if separate:
-            self._needs_reference(frame)
-            return False
-        self.window.add(amplitude)
-        if self.baseline is None and self.window.due:
-            try:
-                return self._begin(self.window.baseline(frame.board, self.last_sample_ns))
-            except NoBaseline as why:
-                self.problem = f"no baseline yet: {why}"
-        return False
+    def __post_init__(self) -> None:
+        """Whoever holds a baseline holds what its hash says: the arrays are its own, and nobody writes to them."""
+        for name in ("z0", "sigma"):
+            array = np.array(getattr(self, name), dtype=float)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
 
     @property
-    def evidence(self) -> TouchEvidence:
-        """Made when it is first asked for, and held from then on."""
-        if self._evidence is None:
-            self._evidence = evidence_of(self.bundle)
-        return self._evidence
+    def hash(self) -> str:
+        return hashlib.sha256(self.z0.tobytes() + self.sigma.tobytes()).hexdigest()
 
-    def _begin(self, found: Baseline) -> bool:
-        """Use the first baseline, unless something touches: whether there is one now."""
-        trusted = self.trusted if self.trusted is not None and self.trusted.board == found.board else None
-        first = first_baseline(found, trusted, self.evidence)
-        self.touched_at_start, self._surely_touched = first.touched, first.surely
-        if first.baseline is None:
-            self.problem = first.problem
-            return False
-        self.set_baseline(first.baseline, self.last_sample_ns)
-        if first.drift is not None:
-            self.drifted(first.drift, self.last_sample_ns)
-        return True
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
 
-    def explain(self, d: Array, live: NDArray[np.bool_], since_s: float, creep: Array | None = None) -> Explanation:
-        """See drift_in_touch.explain."""
-        assert self.baseline is not None
-        return explain(self.evidence, d, self.sigma**2 * (1 + 1 / self.baseline.frames), live, since_s, creep)
+    @classmethod
+    def from_dict(cls, saved: dict[str, Any], measurements: int) -> Baseline:
+        """Raises NoBaseline where `saved` is no baseline of that many measurements."""
+        try:
+            z0, sigma = np.array(saved["z0"], dtype=float), np.array(saved["sigma"], dtype=float)
+            rest = int(saved["frames"]), str(saved["board"]), int(saved["taken_ns"]), str(saved["doubt"])
+            provenance = str(saved.get("taken_by", "start")), bool(saved.get("restored", False))
+            noise_frames = int(saved.get("noise_frames", 0))
+        except (KeyError, TypeError, ValueError) as wrong:
+            raise NoBaseline(f"no baseline in the saved state ({wrong}): tare again") from None
+        if z0.shape != (measurements,) or sigma.shape != (measurements,):
+            raise NoBaseline(f"the saved baseline has {z0.size} measurements, this skin {measurements}: tare again")
+        if not (np.isfinite(z0).all() and (z0 >= 0).all() and (sigma > 0).all()):
+            raise NoBaseline("the saved baseline has impedances or noises that are not possible: tare again")
+        known = int(((z0 > 0) & np.isfinite(sigma)).sum())
+        if known < 0.5 * measurements:
+            raise NoBaseline(f"the saved baseline knows only {known} of {measurements} measurements: tare again")
+        return cls(z0, sigma, *rest, *provenance, noise_frames)
 
-    def drifted(self, drift: Array, sample_ns: int, creep: Array | None = None) -> None:
-        """Move the baseline by a drift that was found under a touch, in the order of `explain`'s columns."""
-        assert self.baseline is not None
-        self._move(drifted(self.baseline.z0, self.normaliser, self.pre, drift, creep))
-        self.drift_filter.begin(sample_ns, DRIFT_KNOWN_S)
-        self._run = 0
 
-    def undrifted(self, z0: Array, sample_ns: int) -> None:
-        """Take such a drift back: a frame has just shown the skin as z0 (K,) has it."""
-        self._move(z0)
-        self.steady(sample_ns)
+def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Baseline:
+    """The baseline of (N, K) |Z|. Raises NoBaseline where the frames do not agree with each other.
 
-    def steady(self, sample_ns: int) -> None:
-        """Nothing has drifted: a frame says so."""
-        self.drift_filter.begin(sample_ns, STEADY_S)
+    A measurement that is not finite in every frame gets an infinite sigma: it is left out until the next tare.
+    """
+    live = np.isfinite(frames).all(axis=0) & (frames > 0).all(axis=0)
+    if live.sum() < 0.5 * frames.shape[1]:
+        raise NoBaseline(
+            f"only {int(live.sum())} of {frames.shape[1]} measurements give values: check the cable and the electrodes"
+        )
+    good = frames[:, live]
+    mean = good.mean(axis=0)
+    noise = float(np.median(good.std(axis=0, ddof=1) / mean))
+    if noise > TOO_NOISY:
+        raise NoBaseline(
+            f"the frames scatter by {100 * noise:.1f} % (at most {100 * TOO_NOISY:.0f} %): check grounding and cable"
+        )
+    found, limit = disagreement(good)
+    if found > limit:
+        raise NoBaseline(
+            f"the frames disagree (statistic {found:.0f}, limit {limit:.0f}): something touched or moved meanwhile"
+        )
+    z0, sigma = np.zeros(frames.shape[1]), np.full(frames.shape[1], np.inf)
+    z0[live], sigma[live] = mean, noise_of_frames(good, mean)
+    sigma = plausible_noise(z0, sigma)
+    doubt = ""
+    if noise < IDENTICAL:
+        doubt = (
+            f"the {len(frames)} untouched frames are identical, as measured ones never are: a noise of "
+            f"{ASSUMED_NOISE:g} of each measurement is assumed; check the source and run `skin tare`"
+        )
+    doubt = noisy(z0, sigma, pre) or doubt
+    misfit = implausibility(z0, pre)
+    if misfit > IMPLAUSIBLE:
+        doubt = f"the baseline is {100 * misfit:.1f} % off what the bundle predicts: free the skin and run `skin tare`"
+    return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
 
-    def difference(self, amplitude: Array, live: NDArray[np.bool_]) -> Array:
-        """d (K,) = (|Z| - |Z0|) / |Z0|, 0 where a measurement does not count."""
-        assert self.baseline is not None
-        return np.where(live, (amplitude - self.baseline.z0) / self.normaliser, 0.0)
 
-    def since_s(self, sample_ns: int) -> float:
-        """Seconds since the baseline last knew the skin as untouched."""
-        return self.drift_filter.since_s(sample_ns)
+def noisy(z0: Array, sigma: Array, pre: PreReconstructor) -> str:
+    """ "" or why no touch that is measured with this noise is to be believed. A measured bundle knows its own noise."""
+    live = np.isfinite(sigma) & (z0 > 0)
+    share = float(np.median(sigma[live] / z0[live])) if live.any() else 0.0
+    if pre.m.normalisation != "model" or share <= UNTRAINED:
+        return ""
+    return (
+        f"the frames scatter by {100 * share:.1f} %, networks were trained for {100 * UNTRAINED:.2f} % at most: check "
+        "grounding and cable, then run `skin tare`"
+    )
 
-    def begin_touch(self) -> None:
-        """The last frame offered was touched, the one before was not."""
-        assert self.baseline is not None
-        z0 = self.baseline.z0.copy()
-        self.drift_filter.begin_touch(z0)
-        self._move(z0)
-        self._run = 0
 
-    def rescale(self, factor: float) -> None:
-        """All measurements are so many times what they were: the board's gain stepped."""
-        assert self.baseline is not None
-        self.baseline = dataclasses.replace(self.baseline, sigma=self.baseline.sigma * factor)
-        self._move(self.baseline.z0 * factor)
-        self.drift_filter.rescale(factor)
-        self.window.rescale(factor)
+def plausible_noise(z0: Array, sigma: Array) -> Array:
+    """(K,) standard deviations of |Z|: at least LEAST_NOISE, and ASSUMED_NOISE where none was found (identical frames,
+    NaN); infinite ones stay.
+    """
+    found = np.isfinite(sigma) & (sigma > IDENTICAL * np.abs(z0))
+    finite = np.where(found, np.maximum(sigma, LEAST_NOISE * np.abs(z0)), ASSUMED_NOISE * np.abs(z0))
+    # A measurement that has no baseline either is not used.
+    return np.where(np.isposinf(sigma) | ~(np.abs(z0) > 0), np.inf, finite)
 
-    def touched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int) -> None:
-        """The last frame offered was touched: drift is taken out as far as a held touch shows it."""
-        assert self.baseline is not None
-        z0 = self.baseline.z0.copy()
-        if self.drift_filter.holding(z0, amplitude, live, self.sigma, self.normaliser, sample_ns):
-            self._move(z0)
 
-    def untouched(self, amplitude: Array, live: NDArray[np.bool_], sample_ns: int, creep: Creep | None = None) -> None:
-        """The last frame offered was not: slow drift is followed."""
-        assert self.baseline is not None
-        self._run += 1
-        z0 = self.baseline.z0.copy()
-        if self.drift_filter.untouched(z0, amplitude, live, self.sigma, sample_ns, creep):
-            self._move(z0)
-        if self._run % SAVE_EVERY == 0:
-            self.news = True
+def disagreement(frames: Array) -> tuple[float, float]:
+    """Chi-square statistic of the quarters' means against the noise within them, and the limit it keeps to when all
+    is quiet.
+    """
+    n = len(frames) // QUARTERS * QUARTERS
+    quarters = frames[-n:].reshape(QUARTERS, n // QUARTERS, -1)
+    mean = frames.mean(axis=0)
+    # Presses that come and go make the quarters scatter within as well; from frame to frame they seldom do.
+    noise = np.minimum(quarters.var(axis=1, ddof=1).mean(axis=0), 0.5 * (np.diff(frames, axis=0) ** 2).mean(axis=0))
+    within = noise / (n // QUARTERS) + (HARMLESS * mean) ** 2
+    statistic = float((((quarters.mean(axis=1) - quarters.mean(axis=(0, 1))) ** 2).sum(axis=0) / within).sum())
+    dof_within = n - QUARTERS
+    f_mean = dof_within / (dof_within - 2)  # the noise within is estimated too
+    dof = (QUARTERS - 1) * frames.shape[1]
+    quantile = NormalDist().inv_cdf(1 - DISAGREEMENT)
+    chi_square = dof * (1 - 2 / (9 * dof) + quantile * (2 / (9 * dof)) ** 0.5) ** 3  # Wilson-Hilferty
+    return statistic, float(chi_square * f_mean * (1 + 2 / dof_within))
 
-    # baselines
 
-    def set_baseline(self, baseline: Baseline, sample_ns: int = 0, age_s: float = 0.0, undated_s: float = 0.0) -> None:
-        """Use this baseline from the next frame on. The skin was last known as untouched age_s before the stamp
-        sample_ns (0: before the next frame). undated_s: its own newest frame is so much older than the next frame.
-        """
-        self._run, self.undated_s = 0, undated_s
-        self.drift_filter.begin(sample_ns, age_s)
-        self._use(baseline)
-
-    def tare(self, touched: bool, force: bool) -> Baseline:
-        """A new baseline from the last frames. Raises NoBaseline if they disagree, or while touched (unless forced).
-
-        Where a touch explains the skin at the start, that counts, too: a baseline of a touched skin would hide the
-        touch in valid frames.
-        """
-        needed = self.window.frames
-        if self._surely_touched and not force:
-            raise NoBaseline(PRESSED.format(" --force"))
-        sure = self.baseline is not None and not self.baseline.doubt  # else its word against a touch counts for nothing
-        if sure and not force and len(self.window) == needed:
-            if touched:
-                raise NoBaseline("the skin is touched: free it and try again (or --force, if nothing touches it)")
-            if self._run < needed:
-                few = f"only {self._run} of {needed} untouched frames since the last touch"
-                raise NoBaseline(f"{few}: wait and try again")
-        baseline = self.window.baseline(self._board, self.last_sample_ns)
-        # Whoever gives the command has looked: no doubt, but that of noise, which looking does not mend.
-        doubt = noisy(baseline.z0, baseline.sigma, self.pre)
-        self.set_baseline(dataclasses.replace(baseline, doubt=doubt, taken_by="command"), self.last_sample_ns)
-        return baseline
-
-    def progress(self) -> str:
-        return f"{TAKING}: {len(self.window)} of {self.window.frames} frames"
-
-    def _move(self, z0: Array) -> None:
-        """The same baseline, moved by what drifted."""
-        assert self.baseline is not None
-        self.baseline = dataclasses.replace(self.baseline, z0=z0)
-        self.normaliser = self.pre.normaliser(z0)
-        self.revision += 1
-        if not self.baseline.doubt:
-            self.trusted = self.baseline
-
-    def _use(self, baseline: Baseline | None) -> None:
-        self.baseline = baseline
-        self.revision += 1
-        if baseline is not None:
-            self.baseline = dataclasses.replace(baseline, sigma=plausible_noise(baseline.z0, baseline.sigma))
-            self.normaliser = self.pre.normaliser(baseline.z0)
-            self.sigma = self.baseline.sigma / self.normaliser
-            self.news = True
-            self.problem = baseline.doubt
-            self.touched_at_start = self._surely_touched = False
-            if not baseline.doubt:
-                self.trusted = self.baseline
-
-    def _refer(self, amplitude: Array, frame: RawFrame) -> bool:
-        """An imported file says that this frame is untouched: it is the baseline until the next one."""
-        found = self.references.baseline(amplitude, frame.scan, frame.board, self.last_sample_ns)
-        if found is None:
-            self._use(None)
-            self.problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"
-        else:
-            self.set_baseline(found)
-            self.sigma = self.references.sigma(found, self.pre)
-        return True
-
-    def _needs_reference(self, frame: RawFrame) -> None:
-        """A scan that stands by itself is compared with the reference just before it, and with no other."""
-        if self.baseline is not None and frame.scan != self.references.scan + 1:
-            self._use(None)
-            self.problem = f"the reference of scan {frame.scan} did not come: it cannot be compared"
-
-    # state
-
-    def state(self) -> dict[str, Any]:
-        return {
-            "bundle": self.bundle.hash,
-            "baseline": self.baseline.to_dict() if self.baseline else None,
-            "normaliser": self.normaliser if self.baseline else None,
-            "sigma": self.sigma if self.baseline else None,
-            "follower": self.drift_filter.state(),
-            "references": self.references.state(),
-            **self.window.state(),
-            "run": self._run,
-            "last_sample_ns": self.last_sample_ns,
-        }
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Raises NoBaseline where the state is of another number of measurements, or not possible; KeyError, TypeError
-        or ValueError where a part of it does not fit.
-
-        A state of another bundle still says what the untouched skin measured: so old recordings replay on new bundles.
-        """
-        self.reset()
-        k = len(self.bundle.pattern)
-        if state["baseline"] is not None:
-            self._use(Baseline.from_dict(state["baseline"], k))
-            assert self.baseline is not None
-            if state["bundle"] == self.bundle.hash:
-                self.normaliser, self.sigma = saved_noise(state, self.baseline)
-        if "references" in state:  # older recordings have none
-            self.references.load(state["references"])
-        self.window.load(state)
-        self._run = int(state["run"])
-        self.last_sample_ns = int(state["last_sample_ns"])
-        self.drift_filter.begin(self.last_sample_ns)
-        if "follower" in state and state["bundle"] == self.bundle.hash:
-            self.drift_filter.load(state["follower"])
-
-    def succeed(self, before: BaselineEstimator) -> None:
-        """Go on where another estimator of the same skin is, whose bundle describes it less well."""
-        self.load(before.state())
-        self.source, self._board, self.undated_s = before.source, before._board, before.undated_s
-        self.revision = before.revision + 1
-        self.drift_filter.begin(self.last_sample_ns, before.since_s(self.last_sample_ns))
-
-    def _date(self) -> None:
-        """Stamps begin anew with a boot: with the first frame it is known when a restored baseline was taken."""
-        if self.undated_s and self.baseline is not None:
-            taken_ns = self.last_sample_ns - round(self.undated_s * 1e9)
-            self.baseline = dataclasses.replace(self.baseline, taken_ns=taken_ns)
-            self.undated_s = 0.0
+def implausibility(z0: Array, pre: PreReconstructor) -> float:
+    """rms relative misfit of |Z0| to the bundle's prediction, up to gain and contact impedances; 0 where the bundle
+    predicts none.
+    """
+    if pre.m.normalisation != "model":
+        return 0.0
+    live = z0 > 0
+    relative = z0[live] / pre.m.z0[live]
+    gain = float(np.median(relative))
+    residual = relative / gain - 1
+    columns = np.column_stack([np.ones(int(live.sum())), pre.m.contact[live]])
+    fitted, *_ = np.linalg.lstsq(columns, residual, rcond=1e-6)
+    return float(np.sqrt(np.mean((residual - columns @ fitted) ** 2)))

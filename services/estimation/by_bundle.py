@@ -12,8 +12,11 @@ from typing import Generic, TypeVar
 from weakref import WeakValueDictionary
 
 from models.bundle import Bundle
+from models.measurement.tables import SkinTables, tables_of
 
 T = TypeVar("T")
+
+TABLES = 2  # kept that no skin holds, 14 MB each
 
 
 class ByBundle(Generic[T]):
@@ -31,3 +34,6 @@ class ByBundle(Generic[T]):
             found = self._held[bundle.hash] = self._make(bundle)
             self._newest.append(found)
         return found
+
+
+skin_tables: ByBundle[SkinTables] = ByBundle(tables_of, TABLES)

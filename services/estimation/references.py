@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import PreReconstructor
+from services.estimation.baseline import ASSUMED_NOISE, LEAST_NOISE, Baseline
 from services.estimation.saved import shaped
-from services.estimation.tare import ASSUMED_NOISE, LEAST_NOISE, Baseline
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from models.bundle import Bundle, BundleError
 from models.calibration_file import found_by
 from models.prereconstruction import PreReconstructor, noise_of_frames
 from protocol.frames import RawFrame
-from services.estimation.tare import Baseline, NoBaseline, take
+from services.estimation.baseline import Baseline, NoBaseline, take
 from services.mounting import MountingFit, needs_fit
 from services.pipeline import ALL, Pipeline, Result
 from services.recordings.npz_file import Input, frames_of

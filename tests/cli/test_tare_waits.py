@@ -10,7 +10,7 @@ import pytest
 from models.bundle import Bundle
 from services.cli import board
 from services.cli.common import CliError
-from services.estimation.tare import NoBaseline
+from services.estimation.baseline import NoBaseline
 from services.estimation.tare_window import TareWindow
 
 

@@ -322,7 +322,7 @@ def nested(depth: int) -> list[Any]:
 def _kept() -> dict[str, Any]:
     stage = _stage()
     stage.reset()
-    from services.estimation.tare import Baseline
+    from services.estimation.baseline import Baseline
 
     z0 = _bundle().z0
     stage.set_baseline(Baseline(z0.copy(), 1e-3 * z0, 64, "board", 10**9))

@@ -17,7 +17,7 @@ from protocol.frames import DeltaFrame, RawFrame
 from services.estimation.creep import Creep
 from services.estimation.drift import DriftRates
 from services.estimation.drift_filter import DriftFilter
-from services.estimation.tare import take
+from services.estimation.baseline import take
 from services.estimation.touch_detector import Noise, TouchDetector
 from services.preprocessing import Preprocessing
 from services.recordings.reconstruction import reconstruct

@@ -17,7 +17,7 @@ from models.shapes import Shape
 from protocol.frames import Contact, RawFrame
 from services.contacts.force import ForceLaw, Look
 from services.contacts.force_curve import Curve
-from services.estimation.tare import take
+from services.estimation.baseline import take
 from services.pipeline import Pipeline
 from services.runtime.config import ConfigError, Indenter, Skin
 

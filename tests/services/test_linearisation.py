@@ -25,7 +25,7 @@ from services.contacts import calibration_file
 from services.contacts.force import ForceLaw
 from services.contacts.force_curve import Curve
 from services.estimation.evidence import evidence_of
-from services.estimation.tare import Baseline
+from services.estimation.baseline import Baseline
 from services.linearisation import Linearisation
 from services.pipeline import Pipeline, Result
 from services.preprocessing import Preprocessing

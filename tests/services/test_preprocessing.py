@@ -13,7 +13,7 @@ from models.bundle import Bundle
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA, DeltaFrame, RawFrame, pack, unpack
 from services.describe import EVERY_S, MOVED
 from services.estimation import checks
-from services.estimation.tare import Baseline, NoBaseline, disagreement, take
+from services.estimation.baseline import Baseline, NoBaseline, disagreement, take
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
 from services.runtime.stage import Refused
