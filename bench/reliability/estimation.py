@@ -16,6 +16,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from services.estimation.evidence import TouchEvidence
+from services.estimation.physics import SkinPhysics
+from services.estimation.start import judge_start
+from services.estimation.tuning import TUNING, Tuning
 
 from models import geometry
 from models.bundle import Bundle
@@ -23,10 +27,6 @@ from models.command import whole
 from models.forward import ForwardModel, shared
 from models.scenes import Prior, random_scene
 from models.shapes import Shape
-from services.estimation.evidence import TouchEvidence
-from services.estimation.physics import SkinPhysics
-from services.estimation.start import judge_start
-from services.estimation.tuning import TUNING, Tuning
 
 Array = NDArray[np.float64]
 

@@ -14,14 +14,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from services.estimation.circles import MODEL, TINY, Circles
+from services.estimation.part_image import INFORMATION
 
 from bench.speed.reaction_events import HELD_S, NEAR, SIDE_M, UNIT_M, TouchEvent
 from models.bundle import Bundle
 from models.fisher import MeasurementNoise, SizePrior, floors, mean_floor
 from models.pressure import FOAM, disc
 from models.shapes import Shape
-from services.estimation.circles import MODEL, TINY, Circles
-from services.estimation.part_image import INFORMATION
 from services.estimation.rolling import parts_of, rolling_order
 
 SCAN_S = 0.0436

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from services.estimation.tare_window import TareWindow
 
 from models.bundle import Bundle
 from services.cli import board
 from services.cli.common import CliError
 from services.estimation.baseline import NoBaseline
-from services.estimation.tare_window import TareWindow
 
 
 @pytest.fixture

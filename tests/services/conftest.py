@@ -11,10 +11,6 @@ from numpy.typing import NDArray
 import services  # noqa: F401  (one thread for the numerical libraries, before numpy starts them)
 from models.bundle import Bundle
 from protocol.frames import RawFrame
-from services.estimation.part_course import PartPlaces
-from services.estimation.part_evidence import PartEvidence
-from services.estimation.part_image import PartImage
-from services.estimation.rolling import parts_of
 from services.runtime.config import Skin
 from tests import needs
 
@@ -24,22 +20,6 @@ FRAME_NS = 45_000_000
 @pytest.fixture(scope="session")
 def bundle() -> Bundle:
     return Bundle.load("square16")
-
-
-@pytest.fixture(scope="session")
-def evidence(bundle: Bundle) -> PartEvidence:
-    """Of scans in parts, as the two fixtures after it."""
-    return PartEvidence(bundle, parts_of(bundle))
-
-
-@pytest.fixture(scope="session")
-def image(bundle: Bundle) -> PartImage:
-    return PartImage(bundle)
-
-
-@pytest.fixture(scope="session")
-def places(image: PartImage) -> PartPlaces:
-    return PartPlaces(image)
 
 
 @pytest.fixture

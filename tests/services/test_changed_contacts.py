@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from services.estimation.changed_contacts import ChangedContacts
+from services.estimation.contact_doubts import ASK_EVERY
 
 from models.bundle import Bundle
 from models.shapes import Shape
-from services.estimation.changed_contacts import ChangedContacts
-from services.estimation.contact_doubts import ASK_EVERY
 from tests.services.stub_skin import StubSkin, transfer
 
 

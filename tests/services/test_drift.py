@@ -7,6 +7,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from services.estimation.creep import Creep
+from services.estimation.drift import DriftRates
+from services.estimation.drift_filter import DriftFilter
+from services.estimation.touch_detector import Noise, TouchDetector
 
 from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
@@ -14,12 +18,8 @@ from models.bundle import Bundle
 from models.prereconstruction import PreReconstructor
 from models.touch_grid import touches
 from protocol.frames import DeltaFrame, RawFrame
-from services.estimation.creep import Creep
-from services.estimation.drift import DriftRates
-from services.estimation.drift_filter import DriftFilter
+from services.estimating import Estimating
 from services.estimation.baseline import take
-from services.estimation.touch_detector import Noise, TouchDetector
-from services.preprocessing import Preprocessing
 from services.recordings.reconstruction import reconstruct
 from services.runtime.config import Skin
 from tests.services.conftest import FRAME_NS, Board
@@ -29,9 +29,9 @@ WANTED = frozenset({"delta"})
 
 
 @pytest.fixture
-def stage(skin: Skin, bundle: Bundle, board: Board) -> Preprocessing:
+def stage(skin: Skin, bundle: Bundle, board: Board) -> Estimating:
     """Tared."""
-    made = Preprocessing("palm", skin, bundle)
+    made = Estimating("palm", skin, bundle)
     for _ in range(80):
         run(made, board.frame())
     assert made.baseline_estimator.baseline is not None
@@ -50,7 +50,7 @@ def drift_rates(skin: Skin) -> DriftRates:
     return DriftRates(skin.tare.scale_per_s, skin.tare.contact_per_s)
 
 
-def run(stage: Preprocessing, frame: RawFrame) -> DeltaFrame:
+def run(stage: Estimating, frame: RawFrame) -> DeltaFrame:
     (out,) = stage.process(frame, WANTED)
     assert isinstance(out, DeltaFrame)
     return out
@@ -102,7 +102,7 @@ def test_no_false_alarm_in_three_hours_of_drift(skin: Skin, bundle: Bundle, seed
     assert worst > 0.5 * decision.begin  # the threshold is no further away than it need be
 
 
-def test_an_untouched_skin_that_dries_is_not_touched(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
+def test_an_untouched_skin_that_dries_is_not_touched(stage: Estimating, board: Board, bundle: Bundle) -> None:
     """The stub's scene "drift": 2 % of the sheet, a quarter of one contact, in five minutes; every other frame."""
     board.frame_ns = 2 * FRAME_NS
     end = directions(bundle) @ np.array([0.02, 0, 0, 0, 0.25, *[0] * 8, -0.15, 0, 0, 0])
@@ -132,7 +132,7 @@ def solved(sheet: Sheet, bundle: Bundle) -> Callable[..., Array]:
 class Time:
     """Frames of given |Z| at any times."""
 
-    def __init__(self, stage: Preprocessing, seed: int = 3) -> None:
+    def __init__(self, stage: Estimating, seed: int = 3) -> None:
         self.stage, self.rng, self.now_s, self.scan = stage, np.random.default_rng(seed), 1.0, 0
 
     def frames(
@@ -162,7 +162,7 @@ class Time:
 @pytest.fixture
 def time(skin: Skin, bundle: Bundle, solved: Callable[..., Array]) -> Time:
     """Tared on the solved sheet, 80 dB."""
-    made = Time(Preprocessing("palm", skin, bundle))
+    made = Time(Estimating("palm", skin, bundle))
     assert not any(out.touched for out in made.frames(solved(), 8.0))
     assert made.stage.baseline_estimator.baseline is not None
     return made
@@ -268,23 +268,23 @@ def test_frames_that_only_drifted_are_untouched_offline(
 def test_work_ahead_changes_no_result(skin: Skin, bundle: Bundle, solved: Callable[..., Array]) -> None:
     """Prepared or not: the same bytes; and from a saved state on, too."""
     free, pressed = solved(), solved(Touch("circle", 0.02, 0.015, 0.010, 0.3))
-    lazy, eager = (Time(Preprocessing("palm", skin, bundle)) for _ in range(2))
+    lazy, eager = (Time(Estimating("palm", skin, bundle)) for _ in range(2))
     made = [0, 0]
     for z, seconds in ((free, 8.0), (pressed, 6.0), (free, 3.0), (pressed, 3.0)):
         for n, (a, b) in enumerate(zip(lazy.frames(z, seconds), eager.frames(z, seconds), strict=True)):
             made[eager.stage.prepare()] += 1
             assert a.difference.tobytes() == b.difference.tobytes() and a.score == b.score and a.held == b.held
             if n == 50:
-                resumed = Preprocessing("palm", skin, bundle)
+                resumed = Estimating("palm", skin, bundle)
                 resumed.load(eager.stage.state())
                 eager.stage = resumed
     assert made[1] > 3
 
 
-def test_a_restored_baseline_is_as_old_as_it_is(stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board) -> None:
+def test_a_restored_baseline_is_as_old_as_it_is(stage: Estimating, skin: Skin, bundle: Bundle, board: Board) -> None:
     """Half an hour of drift while nothing ran is no touch, and what info says is when the tare was."""
     saved = stage.saved()
-    again = Preprocessing("palm", skin, bundle)
+    again = Estimating("palm", skin, bundle)
     assert saved is not None
     again.restore(saved, 1800.0)
     drifted = directions(bundle) @ np.append(0.01, 0.1 * np.cos(np.arange(16)))

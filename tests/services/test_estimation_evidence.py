@@ -7,16 +7,16 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from services.estimation.evidence import TouchEvidence
+from services.estimation.physics import SkinPhysics
+from services.estimation.start import StartVerdict, judge_start
+from services.estimation.tuning import TUNING
 
 from models.bundle import Bundle
 from models.forward import shared
 from models.mismatch import MismatchedSheet, named
 from models.prereconstruction import Drift
 from models.shapes import Shape
-from services.estimation.evidence import TouchEvidence
-from services.estimation.physics import SkinPhysics
-from services.estimation.start import StartVerdict, judge_start
-from services.estimation.tuning import TUNING
 
 Array = NDArray[np.float64]
 NOISE = 1e-4  # 80 dB

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from services.estimation.gain import common_factor
 
 from models.shapes import Shape
-from services.estimation.gain import common_factor
 from tests.services.stub_skin import StubSkin, transfer
 
 NOISE = 1e-4

@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-
 from bench.trust.anew import Anew
+
 from firmware_stub import scene as scenes
 from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World, pressed

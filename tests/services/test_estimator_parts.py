@@ -5,8 +5,8 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-
 from bench.trust.anew import Anew
+
 from firmware_stub.world import Touch, World, pressed
 from models.measurement.fit import FoundTouches, TouchFitter
 from models.measurement.whitening import Whitening

@@ -6,14 +6,14 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-
-from protocol.frames import DeltaFrame
 from services.estimation.circles import Circles
 from services.estimation.part_filter import PartFilter
 from services.estimation.part_image import PartImage
+from services.rolling_scans import RollingScans
+
+from protocol.frames import DeltaFrame
 from services.estimation.rolling import measured_at
 from services.pipeline import Pipeline
-from services.rolling_scans import RollingScans
 from services.runtime.config import Skin
 from services.runtime.persistence import arrays, plain
 from tests.services.rolling_host import rolling_host

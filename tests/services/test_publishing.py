@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from services.contacts.tracking import LOST_FRAMES
+from services.publishing import Publishing
 
 from models.bundle import Bundle
 from models.pressure import FOAM
 from protocol.frames import BegunTouch, ContactFrame, ForceFrame, Frame, ImageFrame, PartFrame, ShapeFrame, pack, unpack
 from services.contacts.outline import outline
-from services.contacts.tracking import LOST_FRAMES
-from services.publishing import Publishing
 from services.runtime import persistence
 from services.runtime.config import Skin
 

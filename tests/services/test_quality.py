@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.shapes import Shape, drop_image
-from services.estimation.quality import REFUSED, Residual
+from services.estimation.quality import Residual
 from tests.services.stub_skin import StubSkin, transfer
 
 TOUCHES = [
@@ -92,7 +92,7 @@ def test_random_frames_make_no_valid_contact(skin: StubSkin, bundle: Bundle) -> 
             result = skin.run(noisy.astype(np.complex64))
             contacts = [c for c in result.contact.contacts if c.state != "end"]
             assert not (result.contact.valid and contacts)
-            seen += result.image.residual is not None and result.image.residual > REFUSED
+            seen += result.image.residual is not None and result.image.residual > 0.5
             skin.rest(4)
     assert seen > 8  # it is the residual that refuses many of them
     assert skin.rest(3).contact.valid

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from services.rolling_scans import RollingScans
 
 from bench.speed.simulated_host import SimulatedHost
 from models.bundle import Bundle
@@ -14,7 +15,6 @@ from services.board.newest_values import NewestValues
 from services.board.remarks import WHOLE, Remarks
 from services.estimation.rolling import WholeScans, measured_at, parts_of, rolling_order
 from services.pipeline import Pipeline
-from services.rolling_scans import RollingScans
 from services.runtime.config import Skin
 from services.runtime.stage import Health
 from tests.services.rolling_host import rolling_host

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from models.shapes import Shape
 from services.estimation.contact_drift import Reference
 from services.estimation.steady_change import STEPS, WINDOW_S, PastFrames
+
+from models.shapes import Shape
 from services.pipeline import Result
 from tests.services.stub_skin import StubSkin, sheet, transfer
 

@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from scipy import ndimage
+from services.contacts.motion import Patch
+from services.contacts.tracking import Tracker
+from services.publishing import Publishing
 
 from models.bundle import Bundle
 from models.shapes import KINDS, Shape, drop_image
 from models.uncertainty import FLOOR, RELATIVE_FLOOR
 from protocol.frames import SHAPES, ContactFrame, ImageFrame, pack, unpack
-from services.contacts.motion import Patch
 from services.contacts.segmentation import KERNEL, segment
-from services.contacts.tracking import Tracker
-from services.publishing import Publishing
 from services.runtime import persistence
 from services.runtime.config import Skin
 

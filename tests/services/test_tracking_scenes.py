@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
+from services.publishing import Publishing
 
 from models.bundle import Bundle
 from models.shapes import KINDS, Shape, drop_image
 from protocol.frames import ContactFrame, ImageFrame
-from services.publishing import Publishing
 from services.runtime.config import Skin
 
 N = 64

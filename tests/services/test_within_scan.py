@@ -8,11 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from services.estimation.within_scan import ChangingTouch
 
 from models.bundle import Bundle
 from models.shapes import Shape
 from models.touch_grid import touches
-from services.estimation.within_scan import ChangingTouch
 from services.pipeline import Result
 from tests.services.stub_skin import TRANSFER, StubSkin, transfer
 
