@@ -38,6 +38,9 @@ from services.runtime.stage import HARMLESS, SEPARATE, Health, Stage, add_reason
 
 COARSE = 0.05  # of the sheet's side: a place that is less sure than that is coarse
 SAME_BIRTH_NS = 50_000_000  # a touch is the same where it has the same number and was born at the same time
+MOST_M = 10.0  # of a sheet, and of a sigma of a place on it
+MOST_STRENGTH = MOST_M**2
+UNWATCHED_NS = 1_000_000_000  # without a frame: what began meanwhile may have been there for long
 SAYS_NOTHING = {"out_of_distribution", "non_finite"}  # reasons with which a frame shows no contact, not even an end
 
 
@@ -89,6 +92,7 @@ class TouchPublishing(Stage):
         self.lasting.forget()
         self._image_of = ("", -1)  # session and scan of the image that appearances were seen in
         self._fit: tuple[RefinedTouch, float, float] | None = None  # and where its touch was then
+        self._watched_ns: tuple[int, int] | None = None  # `sample` of the first and last frame of those that came
 
     def _end_all(self) -> None:
         """What was shown ends with the next frame."""
@@ -102,8 +106,12 @@ class TouchPublishing(Stage):
         if not self.law.exists:
             add_reason(out.reasons, "uncalibrated_force")
         whole = isinstance(frame, ImageFrame)
-        if isinstance(frame, ImageFrame):
+        if not all(map(_readable, frame.estimates)):
+            out.valid = False
+            add_reason(out.reasons, "non_finite")
+        elif isinstance(frame, ImageFrame):
             self._look(frame, out)
+        self._watch(frame.stamps.get("sample", 0))
         if out.valid or not SAYS_NOTHING & set(out.reasons):
             out.contacts = self._contacts(frame, out.valid)
             self._note(frame, out)
@@ -118,6 +126,13 @@ class TouchPublishing(Stage):
         if "shape" in wanted and whole:
             frames.append(self._shape(out, frame))
         return frames
+
+    def _watch(self, now_ns: int) -> None:
+        """Since when somebody has looked."""
+        first_ns, last_ns = self._watched_ns or (now_ns, now_ns)
+        if not 0 <= now_ns - last_ns < UNWATCHED_NS:
+            first_ns = now_ns
+        self._watched_ns = first_ns, now_ns
 
     def _look(self, frame: ImageFrame, out: ContactFrame) -> None:
         """Take what the image shows."""
@@ -168,7 +183,8 @@ class TouchPublishing(Stage):
             number = self._next_id
             self._next_id += 1
         self._ids[touch.id] = number, born_ns
-        state = "begin" if touch.began and number not in before else "hold"
+        watched = self._watched_ns is not None and born_ns > self._watched_ns[0]
+        state = "begin" if touch.began and watched and number not in before else "hold"
         return self._writer.of_estimate(number, state, touch, self._appearances.of(touch))
 
     def _fitted(self, contacts: list[Contact], frame: ImageFrame | PartFrame) -> list[Contact]:
@@ -236,7 +252,7 @@ class TouchPublishing(Stage):
 
     def _looks(self, frame: ImageFrame | PartFrame, present: list[Contact]) -> list[Appearance]:
         """In the order of the contacts."""
-        touches = {self._ids[touch.id][0]: touch for touch in frame.estimates}
+        touches = {self._ids[touch.id][0]: touch for touch in frame.estimates if touch.id in self._ids}
         return [self._appearances.of(touches[contact.id]) for contact in present]
 
     def state(self) -> dict[str, Any]:
@@ -245,6 +261,7 @@ class TouchPublishing(Stage):
             "ids": [[touch, *known] for touch, known in self._ids.items()],
             "shown": [asdict(c) for c in self._shown],
             "untold": [asdict(c) for c in self._untold],
+            "watched_ns": list(self._watched_ns or ()),
             "lasting": self.lasting.state(),
             "looks": [[number, asdict(look)] for number, look in self._appearances.known.items()],
         }
@@ -254,13 +271,26 @@ class TouchPublishing(Stage):
         self._end_all()
         if "ids" not in state:
             return
-        self._next_id = max(self._next_id, int(state["next_id"]))
-        self._ids = {int(touch): (int(number), int(born_ns)) for touch, number, born_ns in state["ids"]}
-        self._shown = [Contact(**c) for c in state["shown"]]
-        self._untold = [Contact(**c) for c in state["untold"]]
+        more = self._next_id - 1  # numbers given so far: none is given twice
+        self._next_id += int(state["next_id"]) - 1
+        self._ids = {int(touch): (more + int(number), int(born_ns)) for touch, number, born_ns in state["ids"]}
+        self._shown = [Contact(**(c | {"id": more + int(c["id"])})) for c in state["shown"]]
+        self._untold += [Contact(**(c | {"id": more + int(c["id"])})) for c in state["untold"]]
+        watched = [int(each) for each in state["watched_ns"]]
+        self._watched_ns = (watched[0], watched[1]) if watched else None
         self.lasting.load(state["lasting"])
         self._appearances.known = {int(number): Appearance(**look) for number, look in state["looks"]}
 
     def health(self) -> Health:
         problem = self._invalid.problem
         return Health("WARN" if problem else "OK", [problem] if problem else [], dict(self._counters))
+
+
+def _readable(touch: EstimatedTouch) -> bool:
+    """Whether it is one that a touch may be."""
+    lengths = [*touch.position, *touch.sigma, touch.radius_m]
+    strengths = [touch.strength, touch.strength_sigma]
+    rest = [*touch.velocity, touch.age_s, touch.radius_sigma, touch.drop, touch.drop_sigma, touch.z2]
+    if not all(map(math.isfinite, [*lengths, *strengths, *rest])):
+        return False
+    return touch.radius_m > 0 and max(map(abs, lengths)) < MOST_M and max(strengths) < MOST_STRENGTH

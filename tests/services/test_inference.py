@@ -12,8 +12,6 @@ from onnx import TensorProto, helper
 from models.bundle import Bundle, write
 from protocol.frames import DeltaFrame, ImageFrame, pack
 from services.estimating import Estimating
-from services.estimation import rolling
-from services.estimation.by_bundle import ByBundle
 from services.estimation.quality import KEPT
 from services.estimation.touch_decision import MEANS
 from services.inference import SETTLED, Inference
@@ -153,65 +151,6 @@ def test_state_carries_the_held_image(stage: Inference, skin: Skin, networked: B
     assert held.reconstructed == 1 and (held.image == first.image).all()
 
 
-class Shares:
-    """In place of the forward residual: these shares are left of the frames to come."""
-
-    def __init__(self, *shares: float) -> None:
-        self.shares = list(shares)
-        self.refused = False
-
-    def __call__(self, difference: object, sigma: object, image: object) -> float:
-        share = self.shares.pop(0)
-        self.refused = share > 0.5
-        return share
-
-
-def plain(scan: int, reconstructed: int = 0) -> DeltaFrame:
-    frame = delta(scan, 0.5, held=bool(reconstructed), reconstructed=reconstructed)
-    frame.difference, frame.sigma = np.zeros(120, np.float32), np.ones(120, np.float32)
-    return frame
-
-
-def test_what_follows_a_refused_image_is_believed_at_once_only_if_it_explains_nearly_all(
-    stage: Inference, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(stage.image_check, "residual", Shares(0.9, 0.29, 0.29, 0.9, 0.04, 0.9, 0.29, 0.04))
-    valid = [run(stage, plain(scan)).valid for scan in range(1, 9)]
-    assert valid == [False, False, True, False, True, False, False, True]
-
-
-def test_what_follows_a_refused_image_is_believed_where_the_next_scan_is_like_it(
-    stage: Inference, skin: Skin, networked: Bundle, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(stage.image_check, "residual", Shares(0.9, 0.29))
-    assert [run(stage, plain(scan)).valid for scan in (1, 2)] == [False, False]
-    twin = Inference("palm", skin.model_copy(update={"network": "full"}), networked)
-    twin.load(stage.state())
-    assert run(twin, plain(3, reconstructed=2)).valid and run(stage, plain(3, reconstructed=2)).valid
-
-
-def test_what_is_not_explained_where_an_electrode_is_left_out_may_be_another_touch(
-    stage: Inference, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(stage.image_check, "residual", Shares(0.15, 0.15, 0.04))
-    valid = []
-    for scan in range(1, 4):
-        frame = plain(scan)
-        frame.reasons.append("electrode_drift")
-        valid.append(run(stage, frame).valid)
-    assert valid == [False, False, True]
-
-
-def test_a_refused_image_stays_refused_while_it_is_held(
-    stage: Inference, skin: Skin, networked: Bundle, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(stage.image_check, "residual", Shares(0.9))
-    assert not run(stage, plain(1)).valid
-    twin = Inference("palm", skin.model_copy(update={"network": "full"}), networked)
-    twin.load(stage.state())
-    assert not run(twin, plain(2, reconstructed=1)).valid and not run(stage, plain(2, reconstructed=1)).valid
-
-
 def test_without_a_network_the_one_step_image_shows_the_touch(skin: Skin, bundle: Bundle, board: Board) -> None:
     pre, stage = Estimating("palm", skin, bundle), Inference("palm", skin, bundle)
     for _ in range(72):
@@ -335,7 +274,7 @@ def test_what_a_touch_needs_is_made_while_nothing_touches(
         pieces += 1
     assert pieces == len(MEANS) and not stage.prepare()
     too_late = "a matrix was made while an image waited for it"
-    monkeypatch.setattr(stage.image_check.residual, "_condition", lambda sigma: pytest.fail(too_late))
+    monkeypatch.setattr(stage.residual, "_condition", lambda sigma: pytest.fail(too_late))
     seen = 0
     disc = board.disc(0.2, -0.1, 0.2, 0.3)
     for _ in range(40):
@@ -350,7 +289,7 @@ def test_a_noise_that_changes_from_frame_to_frame_is_not_prepared_for(
     skin: Skin, networked: Bundle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Inference("palm", skin, networked)
-    monkeypatch.setattr(stage.image_check.residual, "_condition", lambda sigma: pytest.fail("a matrix for nothing"))
+    monkeypatch.setattr(stage.residual, "_condition", lambda sigma: pytest.fail("a matrix for nothing"))
     for k in range(30):  # another measurement fails each time
         quiet = DeltaFrame(skin="palm", scan=k, valid=True)
         quiet.sigma = np.full(120, 1e-4, np.float32)
@@ -368,16 +307,5 @@ def test_what_other_touches_displaced_is_prepared_again(skin: Skin, networked: B
     while stage.prepare():
         pass
     for k in range(KEPT):
-        stage.image_check.residual.prepare(np.full(120, 1e-5 * (k + 1), np.float32))
+        stage.residual.prepare(np.full(120, 1e-5 * (k + 1), np.float32))
     assert stage.prepare()
-
-
-def test_no_frame_waits_for_the_order_of_the_parts(skin: Skin, bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes half a second, in which a press is over."""
-    monkeypatch.setattr(rolling, "rolling_order", ByBundle(rolling._order_of, rolling.KEPT))
-    stage = Inference("palm", skin.model_copy(update={"scan": "rolling", "network": "none"}), bundle)
-    stage.warm_up()
-    monkeypatch.setattr(rolling.rolling, "order", None)
-    d = np.linspace(-0.1, 0.2, len(bundle.pattern), dtype=np.float32)
-    frame = DeltaFrame(skin="palm", valid=True, touched=True, scan=7, part=3, difference=d, sigma=np.full_like(d, 1e-4))
-    assert stage.image_check._changing_touch(frame.difference, frame.sigma, frame.part) is None

@@ -1,7 +1,4 @@
-"""Id switches in scenes of synthetic images: sliding, crossing, passing, meeting touches; no network, no board.
-
-The images are as blurred, as uneven from frame to frame, and as noisy as the network's at 80 dB.
-"""
+"""Id switches in scenes of touches that slide, cross, pass and meet: scans of the stub's sheet in, contacts out."""
 
 from __future__ import annotations
 
@@ -11,17 +8,13 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import ndimage, optimize
-from services.publishing import Publishing
+from scipy import optimize
 
-from models.bundle import Bundle
-from models.shapes import KINDS, Shape, drop_image
-from protocol.frames import ContactFrame, ImageFrame
+from models.shapes import KINDS, Shape
 from services.runtime.config import Skin
 
-N = 64
 UNIT_M = 0.05  # metres per model unit
-FRAME_S = 0.0455
+FRAME_S = 0.045
 GATE_M = 0.015  # further away a contact is not the touch's
 LOST = 0.02  # share of frames that do not arrive
 
@@ -63,39 +56,16 @@ def meeting(rng: np.random.Generator) -> Iterator[list[Shape]]:
         yield [make(0, -direction(angle) * half), make(1, direction(angle) * half)]
 
 
-def image(shapes: list[Shape], rng: np.random.Generator) -> NDArray[np.float32]:
-    """The sharp image, with each touch's own peak and width as uncertain as the network's, blurred, noisy."""
-    seen = [
-        Shape(s.kind, s.x + d[0], s.y + d[1], s.radius * g, min(0.95, s.drop / g**2))
-        for s, d, g in zip(shapes, rng.normal(0, 0.012, (2, 2)), np.exp(rng.normal(0, 0.1, 2)), strict=True)
-    ]
-    noise = ndimage.gaussian_filter(rng.standard_normal((N, N)), 2.0)
-    blurred = ndimage.gaussian_filter(drop_image(seen, N), 2.0)
-    return np.maximum(blurred + 0.004 * noise / noise.std(), 0).astype(np.float32)
-
-
-def switches(stage: Publishing, scene: Scene, rng: np.random.Generator) -> tuple[int, int]:
+def switches(skin: StubSkin, scene: Scene, rng: np.random.Generator) -> tuple[int, int]:
     """(changes of a true touch's id, ids given)."""
-    stage.reset()
-    stage.new_session()
     ids: dict[int, int] = {}
     given: set[int] = set()
     count = 0
-    for scan, shapes in enumerate(scene, 1):
+    for shapes in scene:
         if rng.random() < LOST:
+            skin.scan += 1
             continue
-        frame = ImageFrame(
-            skin="palm",
-            scan=scan,
-            valid=True,
-            stamps={"sample": int(scan * FRAME_S * 1e9)},
-            touched=True,
-            image=image(shapes, rng),
-            metres_per_pixel=2 * UNIT_M / N,
-            origin=[-UNIT_M, -UNIT_M],
-        )
-        (out,) = stage.process(frame, frozenset({"contact"}))
-        assert isinstance(out, ContactFrame)
+        out = skin.see(transfer(tuple(shapes))).contact
         present = {c.id: np.array(c.position[:2]) for c in out.contacts if c.state != "end"}
         given |= set(present)
         truth = {n: s.centroid * UNIT_M for n, s in enumerate(shapes)}
@@ -111,13 +81,14 @@ def switches(stage: Publishing, scene: Scene, rng: np.random.Generator) -> tuple
 
 
 @pytest.mark.parametrize(("kind", "most"), [(crossing, 1), (passing, 0), (meeting, 0)])
-def test_ids_are_kept(bundle: Bundle, kind: Callable[[np.random.Generator], Iterator[list[Shape]]], most: int) -> None:
+def test_ids_are_kept(kind: Callable[[np.random.Generator], Iterator[list[Shape]]], most: int) -> None:
     """At most so many switches in 12 touches. Where touches inside a patch are not followed, every crossing has one."""
-    stage = Publishing("palm", Skin(port="stub", bundle="square16", frame_id="palm", network="none"), bundle)
+    skin = StubSkin(80.0, skin=Skin(port="stub", bundle="square16", frame_id="palm", network="none"))
     changed = made = 0
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        count, given = switches(stage, list(kind(rng)), rng)
+        count, given = switches(skin, list(kind(rng)), rng)
         changed, made = changed + count, made + given
+        skin.rest(20)
     assert changed <= most, f"{changed} switches"
     assert made <= 12 + most, f"{made} ids for 12 touches"
