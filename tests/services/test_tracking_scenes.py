@@ -12,6 +12,7 @@ from scipy import optimize
 
 from models.shapes import KINDS, Shape
 from services.runtime.config import Skin
+from tests.services.stub_skin import StubSkin, transfer
 
 UNIT_M = 0.05  # metres per model unit
 FRAME_S = 0.045
