@@ -69,7 +69,7 @@ def costs(tables: SkinTables, times: int) -> dict[str, float]:
     """Name -> ms."""
     k, rng = tables.measurements, np.random.default_rng(1)
     response, noise, drift = DiscResponse(tables), NoiseModel(tables), SkinFilter(tables)
-    noise.begin(1e-4 * rng.standard_normal((64, k)), 0)
+    noise.begin(1e-4 * rng.standard_normal((64, k)), (0,) * 64)
     x, y, radius = PRESS
     values = np.log1p(ACTION * response(x, y, np.log(radius))) + 1e-4 * rng.standard_normal(k)
     grid, flicker = DiscGrid(response), noise.now.flicker

@@ -68,8 +68,12 @@ class NoiseModel:
         e = tables.electrodes
         self.now = NoiseState(float(WHITE**2), np.full(e, FLICKER_FLOOR**2), np.zeros(e))
 
-    def begin(self, residuals: Array, part: int) -> None:
-        """Learn from untouched frames (n, K) less their mean, all of which end with this part."""
+    def begin(self, residuals: Array, parts: tuple[int, ...]) -> None:
+        """Learn from untouched frames (n, K) less their mean; parts (n,): with which each ended. Where one came late,
+        those after it end with another: what disturbs them is learnt of those that end alike, the most.
+        """
+        part = max(set(parts), key=parts.count)
+        alike = np.array(parts) == part
         steps = np.diff(residuals, axis=0)
         self.now.white = max(float(np.median(steps**2)) / 2 / MEDIAN_OF_SQUARES, float(RESPONSE_FLOOR**2))
         for n in range(ROUNDS):
@@ -79,7 +83,7 @@ class NoiseModel:
             energy = float(np.median(pulled**2 / white.conditional_precisions())) / MEDIAN_OF_SQUARES
             self.now.white *= min(max(energy, 0.5), 2.0)
             if n >= ROUNDS // 2:
-                self._hear_anew(pulled, part)
+                self._hear_anew(pulled[alike], part)
 
     def variances(self) -> Array:
         """(K,) of what is independent from measurement to measurement."""

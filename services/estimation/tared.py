@@ -65,7 +65,7 @@ class TaredSkin:
 
     def begin(self, scans: AgreedScans, next_id: int) -> None:
         """scans: those of the baseline."""
-        self.noise.begin(scans.residuals, scans.part)
+        self.noise.begin(scans.residuals, scans.parts)
         self.noise.now.white = max(self.noise.now.white, scans.least_white)
         self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / self.frames)
         self.touches.now.next_id = next_id

@@ -169,7 +169,7 @@ def test_contact_noise_is_learnt_and_white_noise_is_not_mistaken_for_it() -> Non
     flicker[3] = 5e-3
     rows = NOISE * rng.standard_normal((256, 120)) + rng.standard_normal((256, 16)) * flicker @ tables().contact.T
     noise = NoiseModel(tables())
-    noise.begin(rows, 0)
+    noise.begin(rows, (0,) * len(rows))
     assert np.sqrt(noise.now.white) == pytest.approx(NOISE, rel=0.1)
     assert np.sqrt(noise.now.flicker[3]) == pytest.approx(5e-3, rel=0.2)
     assert np.sqrt(np.delete(noise.now.flicker, 3)).max() < 1e-3
@@ -181,7 +181,7 @@ def test_a_line_of_any_phase_and_pickup_is_learnt_as_what_scans_have_in_common()
     turns = 50.0 * TIMES_S + rng.random((128, 1))
     rows = NOISE * rng.standard_normal((128, 120)) + 3e-4 * pickup * np.sin(2 * np.pi * turns)
     noise = NoiseModel(tables())
-    noise.begin(rows, 0)
+    noise.begin(rows, (0,) * len(rows))
     fresh = NOISE * rng.standard_normal((64, 120))
     fresh += 3e-4 * pickup * np.sin(2 * np.pi * (50.0 * TIMES_S + rng.random((64, 1))))
     energy = (Whitening.of(noise.covariance(0))(fresh.T) ** 2).mean()

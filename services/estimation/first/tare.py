@@ -41,7 +41,7 @@ class AgreedScans(NamedTuple):
     live: NDArray[np.bool_]  # (K,) measurements that none of the scans lacks: the others count not before the next tare
     residuals: Array  # (n, K) less that and an even trend
     at_s: float  # of the mean
-    part: int  # that they end with
+    parts: tuple[int, ...]  # with which each ended
     least_white: float  # variance of the noise that is assumed at least
     judgements: tuple[Judgement, ...]
 
@@ -68,7 +68,7 @@ class LatestScansState:
 
     log_z: list[Annotated[Array, "K", "gaps"]] = field(default_factory=list)  # NaN where a measurement failed
     at_s: list[float] = field(default_factory=list)
-    part: int = 0
+    parts: list[int] = field(default_factory=list)  # with which each ended
     seen: int = 0  # scans that came
     tried: int = 0  # `seen` when a first baseline was tried
 
@@ -84,17 +84,16 @@ class LatestScans:
 
     def add(self, log_z: Array, at_s: float, part: int) -> None:
         now = self.now
-        if part != now.part:  # scans that end otherwise have other noise
-            self.clear()
-            now.part = part
         now.log_z.append(log_z)
         now.at_s.append(at_s)
+        now.parts.append(part)
         now.seen += 1
-        del now.log_z[: -int(n.TARE_SCANS)], now.at_s[: -int(n.TARE_SCANS)]
+        for each in (now.log_z, now.at_s, now.parts):
+            del each[: -int(n.TARE_SCANS)]
 
     def clear(self) -> None:
         """What comes does not follow on what came."""
-        self.now.log_z, self.now.at_s = [], []
+        self.now.log_z, self.now.at_s, self.now.parts = [], [], []
 
     @property
     def due(self) -> bool:
@@ -147,7 +146,8 @@ class LatestScans:
         slope = np.linspace(-1, 1, len(scans))
         off = np.where(live, scans - log_z0, 0.0)
         residuals = off - slope[:, None] * (slope @ off / (slope @ slope))
-        return AgreedScans(log_z0, live, residuals, float(np.mean(self.now.at_s)), self.now.part, white, judgements)
+        at_s, parts = float(np.mean(self.now.at_s)), tuple(self.now.parts)
+        return AgreedScans(log_z0, live, residuals, at_s, parts, white, judgements)
 
 
 def without_drift(scans: Array, field: Array) -> Array:
