@@ -14,12 +14,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from services.estimation.circles import MODEL, TINY, Circles
-from services.estimation.part_image import INFORMATION
 
 from bench.speed.reaction_events import HELD_S, NEAR, SIDE_M, UNIT_M, TouchEvent
 from models.bundle import Bundle
 from models.fisher import MeasurementNoise, SizePrior, floors, mean_floor
+from models.measurement.disc import DiscResponse
+from models.measurement.tables import tables_of
+from models.measurement.touch import area_of
 from models.pressure import FOAM, disc
 from models.shapes import Shape
 from services.estimation.rolling import parts_of, rolling_order
@@ -28,6 +29,8 @@ SCAN_S = 0.0436
 LONGEST_S = 0.3
 MOST = 40  # touches of a kind: each takes eight solves
 PRIOR = SizePrior(radius=(0.05, 0.45))
+UNKNOWN = 1e-9  # information on what no value tells
+SIZES = np.array([0.5, 1.0])  # standard deviations of a touch's log radius and log drop before anything is measured
 
 
 def held_floor(of: Sequence[TouchEvent], snr_db: float) -> tuple[float, float]:
@@ -53,18 +56,24 @@ def _drop(event: TouchEvent) -> float:
     return FOAM.flat_drop(event.kind.force, disc(event.radius_m))
 
 
+def _slopes(response: DiscResponse, event: TouchEvent) -> NDArray[np.float64]:
+    """(K, 4) of log |Z| to x, y, log radius and log drop."""
+    log_radius = float(np.log(event.radius_m / UNIT_M))
+    action = _drop(event) * float(area_of(log_radius))
+    felt, x, y, grown = action * response.with_slopes(event.x / UNIT_M, event.y / UNIT_M, log_radius)
+    return np.column_stack([x, y, grown + 2 * felt, felt])  # a larger disc of the same drop acts more
+
+
 def growing_floor(of: Sequence[TouchEvent], snr_db: float) -> NDArray[np.float64]:
     """(N * parts,) seconds from the beginning to that part's end, of touches that begin with any part of a scan."""
     bundle = Bundle.load("square16")
-    circles, order, parts = Circles(bundle), rolling_order(bundle), parts_of(bundle)
-    at_once, count = np.zeros(len(order)), len(order) // parts
+    response, order, parts = DiscResponse(tables_of(bundle)), rolling_order(bundle), parts_of(bundle)
+    count = len(order) // parts
     noise, found = 10 ** (-snr_db / 20), []
     for event in of:
-        size = np.log([event.radius_m / UNIT_M, _drop(event)])
-        touch = np.array([[event.x / UNIT_M, event.y / UNIT_M, *size, 0.0, 0.0]])
-        slope = circles.expected(touch, circles.all, at_once)[1][:, :MODEL] / noise
+        slope = _slopes(response, event) / noise
         for first in range(parts):
-            information = INFORMATION + TINY * np.eye(MODEL)
+            information = np.diag([UNKNOWN, UNKNOWN, *SIZES**-2.0])
             for n in range(int(LONGEST_S / SCAN_S * parts)):
                 rows = order[(first + n) % parts * count :][:count]
                 at = (n + (np.arange(count) + 0.5) / count) * SCAN_S / parts

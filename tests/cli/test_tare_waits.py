@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from services.estimation.tare_window import TareWindow
 
 from models.bundle import Bundle
+from models.measurement.tables import tables_of
 from services.cli import board
 from services.cli.common import CliError
-from services.estimation.baseline import NoBaseline
+from services.estimation.first.tare import LatestScans, TareRefused
 
 
 @pytest.fixture
@@ -40,9 +40,8 @@ def test_it_tries_again_until_the_frames_are_there(refusals: list[str], capsys: 
 
 
 def test_the_other_refusal_that_time_mends(refusals: list[str]) -> None:
-    window = TareWindow(Bundle.load("square16").prereconstructor(), 64)
-    with pytest.raises(NoBaseline) as early:
-        window.baseline("board", 0)
+    with pytest.raises(TareRefused) as early:
+        LatestScans().agreed(tables_of(Bundle.load("square16")))
     refusals.append(str(early.value))
     tare()
     assert not refusals

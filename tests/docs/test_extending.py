@@ -31,14 +31,14 @@ from protocol.frame_types import AlarmFrame
 from protocol.frames import Contact, ContactFrame, pack, unpack
 from services.alarm import Alarm
 from services.estimation.noise import NoiseRise
-from services.preprocessing import Preprocessing
+from services.estimating import Estimating
 from services.runtime.config import Skin
 from services.runtime.stage import PROCESSES
 import services.publishing, models.prereconstruction
 
 assert FAULTS["noisy"].args == {"times": 20.0} and "noisy" in {row.fault for row in ROWS}
 (row,) = (row for row in ROWS if row.fault == "noisy")
-assert row.names == ("low_snr",) and Preprocessing("palm", Skin(port="stub", bundle="square16", frame_id="palm"),
+assert row.names == ("low_snr",) and Estimating("palm", Skin(port="stub", bundle="square16", frame_id="palm"),
     Bundle.load("square16")).noise._noisy == 0
 noise, rng, sigma = NoiseRise(), np.random.default_rng(2), np.full(120, 0.01)
 assert not any(noise(100 + 0.1 * k + 0.01 * rng.standard_normal(120), sigma) for k in range(20))

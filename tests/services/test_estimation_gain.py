@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from services.estimation.gain import common_factor
 
 from models.shapes import Shape
 from tests.services.stub_skin import StubSkin, transfer
@@ -13,27 +12,6 @@ NOISE = 1e-4
 K = 120
 LIVE = np.ones(K, dtype=bool)
 SIGMA = np.full(K, NOISE)
-
-
-def frames(change: np.ndarray | float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    z = rng.uniform(1.0, 3.0, K)
-    return z * (1 + NOISE * rng.standard_normal(K)), z * (1 + change) * (1 + NOISE * rng.standard_normal(K))
-
-
-@pytest.mark.parametrize("gain", [-0.3, -0.05, -0.006, -0.001, 0.001, 0.006, 0.05, 0.3])
-def test_a_common_factor_is_found(gain: float) -> None:
-    for seed in range(20):
-        before, now = frames(gain, seed)
-        assert common_factor(before, now, SIGMA, LIVE) == pytest.approx(1 + gain, abs=8e-5 * (1 + gain))
-
-
-def test_no_factor_where_nothing_changed_or_not_all_did() -> None:
-    uneven = np.full(K, 0.006)
-    uneven[:12] = 0.005
-    for seed in range(200):
-        assert common_factor(*frames(0.0, seed), SIGMA, LIVE) is None
-        assert common_factor(*frames(uneven, seed), SIGMA, LIVE) is None
 
 
 def test_a_touch_that_comes_is_no_gain() -> None:
