@@ -10,8 +10,8 @@ from rich.table import Table
 from bench.tracking.scene import Recorded
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame
-from services.networks import network
 from services.estimating import Estimating
+from services.networks import network
 from services.runtime.config import Skin, TouchConfig
 
 TOGETHER = (1, 2, 4, 8)  # skins

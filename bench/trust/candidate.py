@@ -46,10 +46,12 @@ class Today:
     def reset(self) -> None:
         self.stages = Pipeline(self._skin, f"palm-{os.getpid()}", self._bundle)  # others keep what theirs found
         self.stages.pre.warm_up()
+        self._said: ContactFrame | None = None
 
     def step(self, raw: RawFrame) -> ContactFrame | None:
         self.stages.prepare()
-        return self.stages.step(raw)
+        self._said = self.stages.step(raw)
+        return self._said
 
     def tare(self) -> None:
         try:
@@ -63,7 +65,8 @@ class Today:
 
     @property
     def refused(self) -> bool:
-        return self.stages.image is not None and not self.stages.image.valid
+        image, said = self.stages.image, self._said
+        return image is not None and said is not None and image.scan == said.scan and not image.valid
 
 
 def made(name: str, skin: Skin, bundle: Bundle) -> Candidate:

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from models.shapes import Shape
 from tests.services.stub_skin import StubSkin, transfer
-
-NOISE = 1e-4
-K = 120
-LIVE = np.ones(K, dtype=bool)
-SIGMA = np.full(K, NOISE)
 
 
 def test_a_touch_that_comes_is_no_gain() -> None:
