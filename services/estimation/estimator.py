@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from models.measurement.fit import FoundTouches
 from models.measurement.tables import SkinTables
-from models.measurement.touch import ACTION, SHAPE_SDS, SHAPES, STATES
+from models.measurement.touch import ACTION, SHAPES, STATES
 from models.measurement.whitening import Whitening
 from services.estimation.faults import advice
 from services.estimation.faults.asking import Asked, AskedScan
@@ -45,7 +45,6 @@ from services.estimation.values.state import loaded, saved
 Array = NDArray[np.float64]
 
 LAYOUT = 4  # of a kept state
-AGES_OF_DOUBT = (1, 2, 4, 8)  # whole scans of a touch, at which its outline is asked whether it is one
 
 
 @dataclass(frozen=True)
@@ -422,7 +421,7 @@ class Estimator:
             )
             self._make_sure(skin, answer)
             rest = replace(question, keeps=0.0)
-            if measured.whole and not self._apart(skin, rest, answer, measured):
+            if measured.whole and not self._recount(skin, rest, answer, measured):
                 self._doubt(skin, rest, answer, measured)
         self._remember(skin, memories)
 
@@ -440,22 +439,22 @@ class Estimator:
         for track in skin.touches.now.tracks:
             track.sure = track.sure or track.z2 > least
 
-    def _apart(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> bool:
-        """Whether a young touch of an odd outline is rather several: evidence decides, while the outline is learnt."""
-        young = [t for t in skin.touches.now.tracks if t.scans in AGES_OF_DOUBT and not t.ended]
-        if not any(float((track.shape**2 / SHAPE_SDS**2).sum()) > n.ODD_OUTLINE for track in young):
+    def _recount(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> bool:
+        """Whether there are rather more touches, or fewer. Asked with steps of its own: what explains a scan badly has
+        spent those of the scan, and would never be asked otherwise.
+        """
+        touches = skin.touches
+        if not (_strained(answer) or touches.odd) or len(touches.lasting) < len(touches):
             return False
-        found = skin.hypotheses.anew(question)
-        if found is None or not found.explained or found.fit is None or len(found.fit) <= len(skin.touches):
+        found = skin.hypotheses.recounted(replace(question, budget=StepBudget(n.MOST_STEPS)), answer)
+        if found is None or found.fit is None:
             return False
-        if found.score <= answer.score:
-            return False
-        kept = skin.touches.recognised(found.fit, found.kept)
-        gone = [k for k in range(len(skin.touches)) if k not in kept]
-        began_s = measured.middle_s - measured.span_s / 2
-        memories = [memory for k in gone for memory in skin.touches.released(k, began_s)]
-        memories += skin.touches.settle(found.fit, kept, measured.middle_s, measured.span_s, whole=True)
-        self._remember(skin, memories)
+        kept = touches.recognised(found.fit, found.kept)
+        gone = [k for k in range(len(touches)) if k not in kept]
+        touches.correct(found.fit, kept)
+        for k in reversed(gone):
+            touches.now.tracks[k].held = 0.0  # it never was there, and leaves nothing
+        touches.settle(found.fit, kept, measured.middle_s, measured.span_s, whole=True)
         self._make_sure(skin, found)
         return True
 
@@ -576,6 +575,11 @@ class Estimator:
         return Estimate(
             measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements)
         )
+
+
+def _strained(answer: ScoredAnswer) -> bool:
+    """Whether touches explain a scan only roughly, or with the help of something else."""
+    return answer.cause != AS_IT_IS or not answer.explained
 
 
 def _felt(touches: TouchTracks, found: FoundTouches | None) -> list[float]:
