@@ -100,6 +100,7 @@ class ScoredAnswer:
     white: Whitening
     pulled: Array  # (K,) S^-1 of the residual
     left: Array  # (K,)
+    recounted: bool = False  # its touches are others than those that stood
 
     @property
     def explained(self) -> bool:

@@ -130,10 +130,11 @@ class TouchTracks:
         return found
 
     def correct(self, fit: FoundTouches, kept: Sequence[int]) -> None:
-        """Tracks that stood for several touches, or for a part of one, were never where they were held."""
-        for state, place in zip(fit.states, kept, strict=True):
-            if place >= 0:
-                track = self.now.tracks[place]
+        """Tracks stood for several touches, or for parts of one: they were never where they were held."""
+        for place, track in enumerate(self.now.tracks):
+            track.held = 0.0
+            if place in kept:
+                state = fit.states[kept.index(place)]
                 track.held = track.peak = float(state[ACTION])
                 track.held_at = (float(state[X]), float(state[Y]), float(state[LOG_RADIUS]))
 
