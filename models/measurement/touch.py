@@ -73,6 +73,10 @@ def plain(prior: TouchPrior) -> TouchPrior:
     return replace(prior, shape_sd=PLAIN * SHAPE_SDS)
 
 
+def is_plain(prior: TouchPrior) -> bool:
+    return bool((prior.shape_sd <= PLAIN * SHAPE_SDS).all())
+
+
 def within_limits(states: Array) -> Array:
     """(T, 7) states moved to where touches can be."""
     limited = states.copy()

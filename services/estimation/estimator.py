@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from models.measurement.fit import FoundTouches
 from models.measurement.tables import SkinTables
-from models.measurement.touch import ACTION, SHAPE_SDS, SHAPES, STATES
+from models.measurement.touch import ACTION, SHAPES, STATES
 from models.measurement.whitening import Whitening
 from services.estimation.faults import advice
 from services.estimation.faults.asking import Asked, AskedScan
@@ -44,8 +44,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 5  # of a kept state
-AGES_OF_DOUBT = (1, 2, 4, 8)  # whole scans of a touch, at which its outline is asked whether it is one
+LAYOUT = 6  # of a kept state
 
 
 @dataclass(frozen=True)
@@ -362,6 +361,7 @@ class Estimator:
             at,
             lambda hypotheses, view, covariance: self._question(hypotheses, skin, view, covariance, measured),
             lambda hypotheses, question: self._answer(skin, hypotheses, question, predicted, measured),
+            lambda hypotheses, question, answer: self._recounted(skin, hypotheses, question, answer, measured),
         )
         return asked, at
 
@@ -396,6 +396,24 @@ class Estimator:
                 return pressed
         return quiet if quiet.quiet else hypotheses.ask(question, (), ())
 
+    def _recounted(
+        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, answer: ScoredAnswer, measured: LookedAt
+    ) -> ScoredAnswer:
+        """An answer, or rather more touches than it has, or fewer. Asked with steps of its own: what explains a scan
+        badly has spent those of the scan, and would never be asked otherwise.
+        """
+        if not measured.whole or answer.fit is None or any(prior.until_s < np.inf for prior in answer.fit.priors):
+            return answer
+        if not (_strained(answer) or skin.touches.odd):
+            return answer
+        own = replace(question, budget=StepBudget(n.MOST_STEPS), keeps=0.0)
+        found = hypotheses.recounted(own, answer)
+        if found is None or found.fit is None:
+            return answer
+        kept = skin.touches.recognised(found.fit, found.kept)
+        known = sum(place >= 0 for place in kept)
+        return replace(found, kept=kept, score=found.score - n.COST_TOUCH * known, recounted=True)
+
     def _answer_of_lost(
         self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, measured: LookedAt
     ) -> ScoredAnswer:
@@ -412,6 +430,8 @@ class Estimator:
     def _settle(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
         touches, middle_s, span_s = skin.touches, measured.middle_s, measured.span_s
         kept = answer.kept if answer.fit is None else touches.recognised(answer.fit, answer.kept)
+        if answer.recounted and answer.fit is not None:
+            touches.correct(answer.fit, kept)
         gone = [k for k in range(len(touches)) if k not in kept]
         memories = [memory for k in gone for memory in touches.released(k, middle_s - span_s / 2)]
         if answer.fit is None:
@@ -422,7 +442,7 @@ class Estimator:
             )
             self._make_sure(skin, answer)
             rest = replace(question, keeps=0.0)
-            if measured.whole and not self._apart(skin, rest, answer, measured):
+            if measured.whole and not answer.recounted:
                 self._doubt(skin, rest, answer, measured)
         self._remember(skin, memories)
 
@@ -439,25 +459,6 @@ class Estimator:
         least = n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2
         for track in skin.touches.now.tracks:
             track.sure = track.sure or track.z2 > least
-
-    def _apart(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> bool:
-        """Whether a young touch of an odd outline is rather several: evidence decides, while the outline is learnt."""
-        young = [t for t in skin.touches.now.tracks if t.scans in AGES_OF_DOUBT and not t.ended]
-        if not any(float((track.shape**2 / SHAPE_SDS**2).sum()) > n.ODD_OUTLINE for track in young):
-            return False
-        found = skin.hypotheses.anew(question)
-        if found is None or not found.explained or found.fit is None or len(found.fit) <= len(skin.touches):
-            return False
-        if found.score <= answer.score:
-            return False
-        kept = skin.touches.recognised(found.fit, found.kept)
-        gone = [k for k in range(len(skin.touches)) if k not in kept]
-        began_s = measured.middle_s - measured.span_s / 2
-        memories = [memory for k in gone for memory in skin.touches.released(k, began_s)]
-        memories += skin.touches.settle(found.fit, kept, measured.middle_s, measured.span_s, whole=True)
-        self._remember(skin, memories)
-        self._make_sure(skin, found)
-        return True
 
     def _doubt(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
         """Is one of the touches drift, or nothing? What was shown once must not stay because nothing is learnt under
@@ -576,6 +577,11 @@ class Estimator:
         return Estimate(
             measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements)
         )
+
+
+def _strained(answer: ScoredAnswer) -> bool:
+    """Whether touches explain a scan only roughly, or with the help of something else."""
+    return answer.cause != AS_IT_IS or not answer.explained
 
 
 def _felt(touches: TouchTracks, found: FoundTouches | None) -> list[float]:

@@ -100,6 +100,7 @@ class ScoredAnswer:
     white: Whitening
     pulled: Array  # (K,) S^-1 of the residual
     left: Array  # (K,)
+    recounted: bool = False  # its touches are others than those that stood
 
     @property
     def explained(self) -> bool:
@@ -200,10 +201,41 @@ class Hypotheses:
         assert found is not None
         return found
 
-    def anew(self, question: Question) -> ScoredAnswer | None:
-        """The likeliest touches, as if there had been none before; None where there are none."""
-        found = self._search(question, (), None)
-        return _likeliest(found) if found else None
+    def recounted(self, question: Question, answer: ScoredAnswer) -> ScoredAnswer | None:
+        """Other touches than those of an answer, fewer or more of them, where they are likelier: None where they are
+        not. All are asked as if nothing were known: an outline that was learnt while two pressed explains both at no
+        cost. Plain discs find them, as outlines lead to wherever one touch looks like two.
+        """
+        assert answer.fit is not None
+        new = (-1,) * len(answer.fit)
+        begun = [
+            replace(_begun(state, question.span_s), since_s=prior.since_s, until_s=prior.until_s)
+            for state, prior in zip(answer.fit.states, answer.fit.priors, strict=True)
+        ]
+        same = [self._fitted(question, begun, new, n.STEPS_COLD)]
+        if answer.cause:
+            same += self._with_cause(question, begun, new, answer.cause, answer.left)
+        discs = self._fitted(question, [plain(prior) for prior in begun], new, n.STEPS_COLD)
+        found = [discs, *self._one_more(question, begun, discs)]
+        if (pair := _neighbours(same[0].fit, new)) is not None:
+            found.append(self._merged(question, same[0], *pair))
+        if not any(other.explained for other in found):
+            found += self._search(question, (), None)
+        others = [other for other in found if other.explained and _others(other.fit, answer.fit)]
+        if not others or _likeliest(others).score < max(each.score for each in same) + n.ANOTHER:
+            return None
+        return _likeliest(others)
+
+    def _one_more(self, question: Question, begun: Sequence[TouchPrior], discs: ScoredAnswer) -> list[ScoredAnswer]:
+        """A disc beside discs, and the same with outlines. begun: the touches of those discs, with theirs."""
+        z2, disc, action, since_s = self._left(question, discs.pulled, discs.white, discs.fit, ONSETS)
+        if z2 < n.FALSE_ALARM_Z2 or len(begun) >= n.MOST_TOUCHES:
+            return []
+        x, y = self.grid.discs[disc, PLACE]
+        more = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
+        new = (-1,) * (len(begun) + 1)
+        found = self._fitted(question, [*_from(discs.fit), plain(more)], new, 2 * n.STEPS_COLD)
+        return [found, self._fitted(question, _started([*begun, more], found.fit), new, n.STEPS_COLD)]
 
     def without(self, question: Question, standing: Sequence[TouchPrior], place: int) -> ScoredAnswer:
         """The answer that one of the touches is none: there is nothing, or it is drift, or what foam remembers."""
@@ -477,6 +509,17 @@ def _from(fit: FoundTouches | None) -> list[TouchPrior]:
     if fit is None:
         return []
     return [replace(prior, start=state.copy()) for prior, state in zip(fit.priors, fit.states, strict=True)]
+
+
+def _others(fit: FoundTouches | None, than: FoundTouches) -> bool:
+    """Whether touches are others than some, or elsewhere."""
+    if fit is None or len(fit) != len(than):
+        return True
+    for state in fit.states:
+        away = np.hypot(*(than.states[:, PLACE] - state[PLACE]).T).min()
+        if away > max(n.SAME_TOUCH, float(np.exp(state[LOG_RADIUS]))):
+            return True
+    return False
 
 
 def _neighbours(fit: FoundTouches | None, kept: tuple[int, ...]) -> tuple[int, int] | None:

@@ -29,6 +29,7 @@ from models.measurement.touch import (
     Y,
     anywhere,
     drop_of,
+    is_plain,
     within_limits,
 )
 from services.estimation.filter import Memory
@@ -65,6 +66,7 @@ class TrackedTouch:
     held: float = 0.0  # action before it began to go
     held_at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y, log radius then
     stayed_since_s: float = 0.0  # at held_at
+    asked_odd: float = 0.0  # how odd its outline was when it was asked last whether it is several
 
     @property
     def ended(self) -> bool:
@@ -113,6 +115,28 @@ class TouchTracks:
     def lost(self) -> bool:
         """Whether scans were lost, and none has been explained since."""
         return any(track.lost for track in self.now.tracks)
+
+    @property
+    def odd(self) -> bool:
+        """Whether an outline has become odd enough to be that of several touches: each time it became odder, and now
+        and then. Asking makes it known.
+        """
+        found = False
+        for track in self.lasting:
+            oddness = float((track.shape**2 / SHAPE_SDS**2).sum())
+            again = oddness > n.ODDER * track.asked_odd or track.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1
+            if oddness > n.ODD_OUTLINE and again:
+                track.asked_odd, found = oddness, True
+        return found
+
+    def correct(self, fit: FoundTouches, kept: Sequence[int]) -> None:
+        """Tracks stood for several touches, or for parts of one: they were never where they were held."""
+        for place, track in enumerate(self.now.tracks):
+            track.held = 0.0
+            if place in kept:
+                state = fit.states[kept.index(place)]
+                track.held = track.peak = float(state[ACTION])
+                track.held_at = (float(state[X]), float(state[Y]), float(state[LOG_RADIUS]))
 
     def lose(self) -> None:
         """Scans were lost: touches may be anywhere, or gone."""
@@ -311,6 +335,8 @@ def _learn(track: TrackedTouch, fit: FoundTouches, k: int) -> None:
     track.log_radius = float(fit.states[k, LOG_RADIUS])
     track.log_radius_sd = float(np.hypot(sd, n.RADIUS_WALK))
     track.shape, track.shape_variance = fit.shapes[k].copy(), fit.shape_variance[k].copy()
+    if is_plain(fit.priors[k]):  # that of a disc was not asked
+        track.shape_variance = SHAPE_SDS**2
 
 
 def _action_at(state: Array, covariance: Array, after_s: float) -> tuple[float, float]:

@@ -26,6 +26,7 @@ from services.estimation.values import numbers as n
 Array = NDArray[np.float64]
 MakeQuestion = Callable[[Hypotheses, BoardView, Array], Question]
 Answering = Callable[[Hypotheses, Question], ScoredAnswer]
+Recounting = Callable[[Hypotheses, Question, ScoredAnswer], ScoredAnswer]
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,10 @@ class FaultAsking:
         self._contact_doubt = ContactDoubt(tables, hypotheses, faults)
         self._through: tuple[WireFault, Hypotheses] | None = None
 
-    def __call__(self, at: AskedScan, question_of: MakeQuestion, answering: Answering) -> Asked:
-        """question_of: of hypotheses, a view and a covariance; answering: the likeliest touches of a question."""
+    def __call__(self, at: AskedScan, question_of: MakeQuestion, answering: Answering, recounting: Recounting) -> Asked:
+        """question_of: of hypotheses, a view and a covariance; answering: the likeliest touches of a question;
+        recounting: rather others than those of an answer.
+        """
         faults = self._faults
         skin, own = self._covariances(at)
         standing = self._touches.expected(at.middle_s, at.span_s)
@@ -88,7 +91,7 @@ class FaultAsking:
         def asked(view: BoardView) -> Asked:
             hypotheses = self._seen(view)
             question = question_of(hypotheses, view, view.covariance(skin, own))
-            return Asked(view, question, answering(hypotheses, question))
+            return Asked(view, question, recounting(hypotheses, question, answering(hypotheses, question)))
 
         view = look()
         if faults.now.wire is None and rewired(view):

@@ -55,7 +55,8 @@ class FaultState:
     variance: float = 0.0
     size_before: float = 0.0  # of what was measured before
     contact_since_s: float = -np.inf
-    still_s: float = 0.0
+    still_s: float = 0.0  # for which it has been as `still_size`
+    still_size: float = 0.0
     back_scans: int = 0
     log_gain: float = 0.0  # since the tare
     log_gain_before: float = 0.0  # of what was measured before
@@ -401,7 +402,7 @@ class BoardFaults:
         if now.size > before and not now.doubt.undecided:
             now.doubt.begin(before)
         now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
-        now.still_s, now.back_scans = 0.0, 0
+        now.still_s, now.still_size, now.back_scans = 0.0, now.size, 0
 
     def _gross(self, since_s: float) -> None:
         """Whether a step of the gain is one that no sound board's makes, or the end of such a one."""
@@ -427,10 +428,10 @@ class BoardFaults:
         now.unexplained_scans = 0
         if now.contact < 0:
             return
-        step = self._stepped(view, answer)
+        self._step(view, answer)
         if whole:
             now.doubt.follow(view.middle_s, now.size)
-        now.still_s = now.still_s + passed_s if abs(step) < n.CONTACT_STILL * (1 + now.size) else 0.0
+        self._stays(passed_s)
         unsure = n.CONTACT_BACK + 3 * float(np.sqrt(now.variance))
         nearest = min(abs(now.size), abs(now.size + now.settled[now.contact]))
         now.back_scans = (now.back_scans + whole) if nearest < unsure else 0
@@ -440,17 +441,23 @@ class BoardFaults:
         if now.still_s > settles_s or (now.back_scans >= n.BACK_SCANS and not drifts):
             self._settle()
 
-    def _stepped(self, view: BoardView, answer: ScoredAnswer) -> float:
+    def _stays(self, passed_s: float) -> None:
+        """For how long it has been still: by its way, as steps from part to part are small however it drifts."""
+        now = self.now
+        now.still_s += passed_s
+        moves = n.CONTACT_STILL * (1 + now.size) + n.PACE_UNSEEN * now.still_s
+        if abs(now.size - now.still_size) > moves:
+            now.still_s, now.still_size = 0.0, now.size
+
+    def _step(self, view: BoardView, answer: ScoredAnswer) -> None:
         now = self.now
         if view.contact != now.contact:  # it was found by this scan
-            return 0.0
+            return
         column = view.spread[:, 0]
         sd = float(np.sqrt(now.variance))
-        step = sd * float(column @ answer.pulled)
         told = answer.fit.information(column) if answer.fit is not None else float(np.sum(answer.white(column) ** 2))
-        now.size = max(now.size + step, LEAST)
+        now.size = max(now.size + sd * float(column @ answer.pulled), LEAST)
         now.variance *= max(1 - told, 1e-4)
-        return step
 
     def drop_contact(self) -> None:
         """No contact has changed."""

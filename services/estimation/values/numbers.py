@@ -152,6 +152,7 @@ DOUBT_SCANS = Number(10.0, "-", "whole scans after which every touch is asked th
 ODD_OUTLINE = Number(
     12.0, "-", "squared sigmas of an outline that may be several touches", "derived: 9 figures, 1.5 sd"
 )
+ODDER = Number(1.5, "-", "times as odd as when it was asked last: it is asked again", "chosen: cost")
 SURE_SCANS = Number(2.0, "-", "whole scans that need a weak touch, after which it is shown", "derived: a chance twice")
 LEAST_LIVE = Number(0.5, "-", "share of the measurements that must count", "chosen: half, to see a touch anywhere")
 LINE_SCANS = Number(100.0, "-", "untouched scans after which lines are made anew", "derived: half of LEARNING_LINES")
