@@ -44,7 +44,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 4  # of a kept state
+LAYOUT = 5  # of a kept state
 AGES_OF_DOUBT = (1, 2, 4, 8)  # whole scans of a touch, at which its outline is asked whether it is one
 
 
