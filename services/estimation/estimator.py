@@ -44,7 +44,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 6  # of a kept state
+LAYOUT = 7  # of a kept state
 
 
 @dataclass(frozen=True)

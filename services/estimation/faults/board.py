@@ -429,10 +429,14 @@ class BoardFaults:
         if now.contact < 0:
             return
         self._step(view, answer)
+        sd = float(np.sqrt(now.variance))
+        unsure = n.CONTACT_BACK + 3 * sd
+        if whole and abs(now.size) < unsure and now.doubt.falls(now.size):  # a touch took it over, or it is well
+            self.drop_contact()
+            return
         if whole:
-            now.doubt.follow(view.middle_s, now.size)
+            now.doubt.follow(view.middle_s, now.size, sd)
         self._stays(passed_s)
-        unsure = n.CONTACT_BACK + 3 * float(np.sqrt(now.variance))
         nearest = min(abs(now.size), abs(now.size + now.settled[now.contact]))
         now.back_scans = (now.back_scans + whole) if nearest < unsure else 0
         now.variance += (n.CONTACT_WALK_CHANGED * (1 + now.size)) ** 2 * min(passed_s / SCAN_S, 1.0)

@@ -36,6 +36,7 @@ class DecidedState:
     sizes: list[SizeAt] = field(default_factory=list)  # of the last scans
     pace: float = 0.0  # of a contact that drifts [1/s]
     drifts_until_s: float = -np.inf  # as far as is known
+    unsure: float = 0.0  # by how much a scan's size may be off by its noise alone, with nothing to be seen of a touch
 
     def begin(self, decided: float) -> None:
         """A contact has changed, or changes anew: beyond `decided` nobody knows why."""
@@ -47,12 +48,23 @@ class DecidedState:
         self.undecided, self.decided = False, size
         self.over, self.scans = None, 0
 
-    def follow(self, at_s: float, size: float) -> None:
-        """A contact goes on: what falls is no touch, nor what drifts on at the pace that it had."""
+    @property
+    def least(self) -> float:
+        """Change beyond what is decided that is one: more than is let pass anywhere, and than noise makes."""
+        return max(n.CONTACT_STILL * (1 + abs(self.decided)), self.unsure)
+
+    def falls(self, size: float) -> bool:
+        """Whether what nobody knows is less than a scan before, and nothing else had changed."""
+        known = abs(self.decided) > n.CONTACT_STILL or not self.sizes
+        return self.undecided and not known and self.sizes[-1].size - size > n.CONTACT_STILL
+
+    def follow(self, at_s: float, size: float, sd: float) -> None:
+        """A contact goes on: what falls is no touch, nor what drifts on at the pace that it had. sd: of this size."""
+        self.unsure = float(np.sqrt(n.FALSE_ALARM_Z2)) * sd
         self.seen += self.undecided
         passed_s = at_s - self.sizes[-1].at_s if self.sizes else 0.0
         step = size - self.sizes[-1].size if self.sizes else 0.0
-        least = n.CONTACT_STILL * (1 + abs(self.decided))
+        least = self.least
         self.sizes = [*(each for each in self.sizes if each.at_s > at_s - PACES_S[-1] - passed_s), SizeAt(at_s, size)]
         if size < self.decided - least or abs(size) < n.CONTACT_STILL:  # or it is what it was at the tare
             self.end(size)

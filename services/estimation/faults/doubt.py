@@ -54,7 +54,7 @@ class ContactDoubt:
         contact = self._contact(asked)
         nothing = asked.white.log_density - 0.5 * float(np.sum(asked.white(y) ** 2))
         if contact.size < 0 or contact.score - nothing < n.FALSE_ALARM_Z2 / 2:  # no touch would be seen in it
-            if faults.size - doubt.decided < n.CONTACT_STILL * (1 + abs(doubt.decided)):
+            if faults.size - doubt.decided < doubt.least:
                 doubt.end(faults.size)
             else:  # the touches that stand explain all of it
                 self._faults.drop_contact()
