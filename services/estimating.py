@@ -309,7 +309,8 @@ class Estimating(Stage):
         live = np.isfinite(baseline.sigma) & (baseline.z0 > 0)
         z0 = np.where(live, baseline.z0, self.pre.m.z0)
         scatter = np.where(live, baseline.sigma / z0, 0.0)
-        self.estimator.adopt(KnownBaseline(np.log(z0), live, scatter, baseline.frames), age_s)
+        known = KnownBaseline(np.log(z0), live, scatter, baseline.frames)
+        self.estimator.adopt(known, age_s, self.config.tare.contact_per_s)
         self._use(baseline)
 
     def between_frames(self) -> None:
