@@ -213,6 +213,7 @@ class Estimating(Stage):
             self._problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"
             return _unusable(out, "stale_baseline", len(self.bundle.pattern))
         self.set_baseline(found)
+        self.estimator.saw_untouched()
         self._reconstruction.begin(self.references.sigma(found, self.pre), found.frames)
         out.difference = np.zeros(len(amplitude), np.float32)
         out.sigma = self._reconstruction.sigma.astype(np.float32)

@@ -163,6 +163,11 @@ class Estimator:
         if self.skin is not None:
             self.skin = self.skin.with_tables(tables)
 
+    def saw_untouched(self) -> None:
+        """The scan before the next one was untouched, as its source says: what touches then has begun."""
+        if self.skin is not None:
+            self.skin.touches.now.watched = True
+
     def adopt(self, baseline: KnownBaseline, age_s: float, contact_per_s: float = n.CONTACT_RATE) -> None:
         """Go on from a baseline that is age_s older than the next scan; nobody watched meanwhile. contact_per_s: by
         which contact impedances of this skin change.
