@@ -208,6 +208,7 @@ class Estimating(Stage):
             self._problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"
             return _unusable(out, "stale_baseline", len(self.bundle.pattern))
         self.set_baseline(found)
+        self.estimator.saw_untouched()
         self._reconstruction.begin(self.references.sigma(found, self.pre), found.frames)
         out.difference = np.zeros(len(amplitude), np.float32)
         out.sigma = self._reconstruction.sigma.astype(np.float32)
@@ -304,7 +305,8 @@ class Estimating(Stage):
         live = np.isfinite(baseline.sigma) & (baseline.z0 > 0)
         z0 = np.where(live, baseline.z0, self.pre.m.z0)
         scatter = np.where(live, baseline.sigma / z0, 0.0)
-        self.estimator.adopt(KnownBaseline(np.log(z0), live, scatter, baseline.frames), age_s)
+        known = KnownBaseline(np.log(z0), live, scatter, baseline.frames)
+        self.estimator.adopt(known, age_s, self.config.tare.contact_per_s)
         self._use(baseline)
 
     def between_frames(self) -> None:

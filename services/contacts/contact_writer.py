@@ -22,7 +22,7 @@ class ContactWriter:
 
     def of_estimate(self, number: int, state: str, touch: EstimatedTouch, look: Appearance) -> Contact:
         """A touch as the measurements tell it, and as it looks."""
-        found = self.law.of_touch(touch)
+        found = self.law.of_touch(touch, look.classes)
         best = int(np.argmax(look.classes)) if look.classes else -1
         at, (vx, vy) = self.place(*touch.position), touch.velocity
         return Contact(

@@ -10,13 +10,14 @@ a smaller patch that is pressed harder: little where foam answers linearly, all 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.pressure import Foam
-from protocol.frames import EstimatedTouch
+from protocol.frames import SHAPES, EstimatedTouch
 from services.contacts import patch_force
 from services.contacts.patch_force import PatchForce
 
@@ -29,13 +30,15 @@ class PatchKind(NamedTuple):
     share: float  # of touches
     spread: float  # mean square of its radius over that of a disc of its area
     beyond: float  # relative, of its action, where nothing conducts
+    names: tuple[str, ...]  # of SHAPES
 
 
 PATCHES = (
-    PatchKind(0.67, 1.0, 0.0),  # discs
-    PatchKind(0.22, 1.25, 0.15),  # triangles, rectangles and ellipses of aspect 2: 1.21 to 1.31, 0.12 to 0.17
-    PatchKind(0.11, 1.53, 0.3),  # an L
+    PatchKind(0.67, 1.0, 0.0, ("circle", "square")),
+    PatchKind(0.22, 1.25, 0.15, ("triangle", "rectangle")),  # 1.21 to 1.31, 0.12 to 0.17, and ellipses of aspect 2
+    PatchKind(0.11, 1.53, 0.3, ("L",)),
 )
+LOOKS = 0.85  # of what an image says of the shape, against those shares
 EDGES = ((0.85, 0.0), (0.05, 1.5e-3), (0.05, 2.2e-3), (0.05, 3e-3))  # share of skins, and how soft [m]
 ACTION_SIGMA = 0.025  # relative: of the response of discs, 0.98 to 1.04 on another mesh
 MOST_ACTS = 2.2  # action over area: 2 where nothing conducts, and that response's error
@@ -53,15 +56,17 @@ class Discs(NamedTuple):
     drop: Array
 
 
-def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None) -> PatchForce:
+def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None, classes: Sequence[float] = ()) -> PatchForce:
     """The foam's pressure at a patch's drop over its area, a mean over the radii and actions that the fit leaves, and
     over PATCHES and EDGES. A patch that may have saturated has a force from below only: its sigma reaches to where the
-    foam tells nothing more. area [m^2]: of what presses, where it is known.
+    foam tells nothing more. area [m^2]: of what presses, where it is known. classes: probabilities of SHAPES by an
+    image; empty: none tells.
     """
     if area is not None:
         weight, each = _of_area(touch, area)
     else:
-        found = [_through(_seen_as(touch, patch), edge, share) for patch in PATCHES for share, edge in EDGES]
+        patches = [patch._replace(share=share) for patch, share in zip(PATCHES, _shares(classes), strict=True)]
+        found = [_through(_seen_as(touch, patch), edge, share) for patch in patches for share, edge in EDGES]
         weight = np.concatenate([one.weight for one in found])
         if not weight.any():  # more than any patch does: a disc that conducts nothing
             disc = _seen_as(touch, PATCHES[0])
@@ -75,6 +80,15 @@ def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None) -> Pa
     return PatchForce(
         *_moments(each.area * pressure, weight, each.area * beyond, creeps), *_moments(pressure, weight, beyond, creeps)
     )
+
+
+def _shares(classes: Sequence[float]) -> list[float]:
+    """Of PATCHES, as an image shows the touch."""
+    before = [patch.share for patch in PATCHES]
+    if not classes:
+        return before
+    seen = [sum(classes[SHAPES.index(name)] for name in patch.names) for patch in PATCHES]
+    return [LOOKS * now + (1 - LOOKS) * then for now, then in zip(seen, before, strict=True)]
 
 
 def _moments(values: Array, weight: Array, beyond: Array, creeps: float) -> tuple[float, float]:

@@ -13,6 +13,7 @@ quantity's uncertainty was found on presses that the bundle's network never saw;
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -229,16 +230,16 @@ class ForceLaw:
         )
         return self._said(Quantity(value, sigma / value), *touch.position)
 
-    def of_touch(self, touch: EstimatedTouch) -> Force:
-        """Force and standard uncertainty of a touch as the estimator has it."""
+    def of_touch(self, touch: EstimatedTouch, classes: Sequence[float] = ()) -> Force:
+        """Force and standard uncertainty of a touch as the estimator has it. classes: of its shape, by an image."""
         if self.curve is None or not touch.strength > 0:
             return NOTHING
-        return self._said(self._of_estimate(touch), *touch.position)
+        return self._said(self._of_estimate(touch, classes), *touch.position)
 
-    def _of_estimate(self, touch: EstimatedTouch) -> Quantity:
+    def _of_estimate(self, touch: EstimatedTouch, classes: Sequence[float]) -> Quantity:
         area = None if self.indenter_area is None else self.indenter_area * self.metres_per_unit**2
         if self.reads == "pressure":
-            found = disc_force.force_of(touch, self.foam, area)
+            found = disc_force.force_of(touch, self.foam, area, classes)
             return Quantity(found.force, found.force_sigma / found.force, found.pressure, found.pressure_sigma)
         acts = touch.strength / (math.pi * touch.radius_m**2 if area is None else area)
         drop = acts / (1 + acts / 2)

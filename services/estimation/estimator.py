@@ -162,11 +162,18 @@ class Estimator:
         if self.skin is not None:
             self.skin = self.skin.with_tables(tables)
 
-    def adopt(self, baseline: KnownBaseline, age_s: float) -> None:
-        """Go on from a baseline that is age_s older than the next scan; nobody watched meanwhile."""
+    def saw_untouched(self) -> None:
+        """The scan before the next one was untouched, as its source says: what touches then has begun."""
+        if self.skin is not None:
+            self.skin.touches.now.watched = True
+
+    def adopt(self, baseline: KnownBaseline, age_s: float, contact_per_s: float = n.CONTACT_RATE) -> None:
+        """Go on from a baseline that is age_s older than the next scan; nobody watched meanwhile. contact_per_s: by
+        which contact impedances of this skin change.
+        """
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
         self.skin = TaredSkin(self._tables, baseline.log_z0, baseline.live, baseline.scatter, baseline.frames)
-        self.skin.adopt(next_id)
+        self.skin.adopt(next_id, min(contact_per_s * max(age_s, 0.0), n.START_CONTACT))
         self.now = EstimatorState(adopted_age_s=min(max(age_s, 0.0), n.OLDEST_S))
         self.taring.adopted()
 

@@ -29,7 +29,7 @@ from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 
-ONSETS = (0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a touch may begin or end at once
+ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan about which a touch may begin or end at once
 ON_ELECTRODE = ((0.03, 0.0), (0.03, 0.1), (0.03, -0.1))  # inside its edge and along it, where a search begins
 SMALL_RADIUS = 0.1  # where it begins
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
@@ -416,7 +416,7 @@ class Hypotheses:
         """z^2 of the disc that would explain most of a residual, its number, action, and since when it acts [s].
         onsets: shares of the scan after which it may have begun.
         """
-        best = (-1.0, 0, 0.0, -np.inf)
+        best, begins = (-1.0, 0, 0.0, -np.inf), 0.0
         precision = white.conditional_precisions() if onsets else np.zeros(0)
         for share in (0.0, *onsets):
             weight, since_s = None, -np.inf
@@ -436,8 +436,34 @@ class Hypotheses:
                 exact = fit.information(column)
             z2 = along**2 / exact - (n.ONSET_Z2 if share else 0.0)
             if z2 > best[0]:
-                best = (z2, disc, along / exact, since_s)
-        return best
+                best, begins = (z2, disc, along / exact, since_s), share
+        return self._sharper(question, pulled, white, fit, begins, best) if begins else best
+
+    def _sharper(
+        self,
+        question: Question,
+        pulled: Array,
+        white: Whitening,
+        fit: FoundTouches | None,
+        share: float,
+        best: tuple[float, int, float, float],
+    ) -> tuple[float, int, float, float]:
+        """The same with the likeliest instant near one of ONSETS: a strong touch tells it to a measurement or two, and
+        none of its columns makes up for one that is off by more.
+        """
+        instants = _instants(question, share)
+        column = self.grid.responses[best[1]].astype(float)
+        columns = column[:, None] * (question.times_s[:, None] >= instants)
+        along = np.maximum(columns.T @ pulled, 0.0)
+        if fit is None:
+            exact = np.sum(white(columns) ** 2, axis=0)
+        else:
+            exact = np.array([fit.information(each) for each in columns.T])
+        z2 = along**2 / np.maximum(exact, 1e-12) - n.ONSET_Z2
+        k = int(z2.argmax())
+        if z2[k] <= best[0]:
+            return best
+        return float(z2[k]), best[1], float(along[k] / exact[k]), float(instants[k])
 
     def _fresh(self, question: Question, pulled: Array, white: Whitening) -> float:
         """Energy of the newest block of measurements beyond what it is expected to have, all others given."""
@@ -464,23 +490,34 @@ class Hypotheses:
         for k, prior in enumerate(standing):
             if prior.until_s < np.inf:
                 continue
-            for share in (0.0, *ONSETS):
-                until_s = (share - 0.5) * question.span_s
-                change = whole - each[k] * (question.times_s >= until_s)
-                residual = answer.white(np.where(question.live, question.y - np.log1p(np.maximum(change, -0.9)), 0.0))
-                if (chi2 := float(residual @ residual)) < least:
-                    best, least = (k, share, until_s), chi2
+            ends = np.concatenate([[-0.5 * question.span_s], *(_instants(question, share) for share in ONSETS)])
+            change = whole[:, None] - each[k][:, None] * (question.times_s[:, None] >= ends)
+            left = np.where(question.live, question.y, 0.0)[:, None] - np.log1p(np.maximum(change, -0.9))
+            left[~question.live] = 0.0
+            chi2 = np.sum(answer.white(left) ** 2, axis=0)
+            at = int(chi2.argmin())
+            if chi2[at] < least:
+                best, least = (k, at > 0, float(ends[at])), float(chi2[at])
         if best is None:
             return None
-        k, share, until_s = best
+        k, within, until_s = best
         priors, kept = list(standing), list(range(len(standing)))
-        if share:
+        if within:
             priors[k] = replace(priors[k], until_s=until_s)
         else:
             del priors[k], kept[k]
         if not priors:
             return self.untouched(question)
         return self._fitted(question, priors, tuple(kept), n.STEPS_COLD)
+
+
+def _instants(question: Question, share: float) -> Array:
+    """(n,) nearer to this one of ONSETS than to another: before each of the values that were measured there."""
+    place, bounds = ONSETS.index(share), (0.0, *ONSETS, 1.0)
+    first, last = (bounds[place] + share) / 2, (share + bounds[place + 2]) / 2
+    near = (question.times_s >= (first - 0.5) * question.span_s) & (question.times_s < (last - 0.5) * question.span_s)
+    found = np.sort(question.times_s[near])
+    return found if len(found) else np.array([(share - 0.5) * question.span_s])
 
 
 def _settled(question: Question, answers: Sequence[ScoredAnswer]) -> bool:
