@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.locator import Located, Locator
+from models.measurement.tables import tells_touches
 from models.symmetries import symmetries
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
 from services.describe import ON, refinement, symmetry
@@ -50,6 +51,7 @@ class Inference(Stage):
         # Only a network's image is meant to explain a frame: a one-step image shows where, not how much. Nor is that of
         # a registered skin: its presses leave too much open, and its locator says how well each touch is explained.
         refuses = isinstance(self._network, Network) and bundle.locator is None
+        self._refuses = refuses and not tells_touches(bundle)  # else the measurements have been explained
         self.image_check = ImageCheck(bundle, refuses)
         self.linearisation = Linearisation(name, bundle)
         self._tells_shapes = tells_shapes(bundle)
@@ -202,6 +204,7 @@ class Inference(Stage):
         self._counters["networks_run"] += 1
         if not self.judges:
             out.residual = self.image_check.residual(frame.difference, frame.sigma, out.image)
+            self.image_check.refused = self._refuses and frame.touched and self.image_check.residual.refused
         elif not self.image_check.examine(frame, out, self.each_alone):
             return self._changed(frame, out)
         self._judge(out)

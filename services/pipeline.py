@@ -34,11 +34,6 @@ def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> tuple[P
     return Preprocessing(name, skin, bundle), Inference(name, skin, bundle), Publishing(name, skin, bundle)
 
 
-def explains(bundle: Bundle) -> bool:
-    """Whether the new stages take this bundle by now."""
-    return bundle.matrices.normalisation == "model"
-
-
 def build_anew(name: str, skin: Skin, bundle: Bundle) -> tuple[Estimating, Inference, TouchPublishing]:
     """Those that are to take over: what touches is told by the measurements, what it looks like by the image."""
     inference = Inference(name, skin, bundle)

@@ -36,10 +36,7 @@ if os.environ.get(
 ):  # the same tests of the stages that are to take over, where they can: docs/reliability.md
     from services import pipeline
 
-    stages_of_today = pipeline.build_stages
-    pipeline.build_stages = lambda name, skin, bundle=None: (  # type: ignore[assignment]
-        pipeline.build_anew(name, skin, bundle) if pipeline.explains(bundle) else stages_of_today(name, skin, bundle)
-    )
+    pipeline.build_stages = lambda name, skin, bundle=None: pipeline.build_anew(name, skin, bundle)  # type: ignore[assignment]
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background: programs we start would inherit that
     signal.signal(signal.SIGINT, signal.default_int_handler)

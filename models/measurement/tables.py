@@ -38,6 +38,7 @@ class SkinTables:
     places: Array  # (E, 2) middles of the electrodes
     wrong: float = float(MISFIT)  # share of a touch's change that the tables get wrong
     predicted: bool = True  # whether z0 is what a model says of the untouched skin: measured bundles have none
+    tells: bool = True  # whether a response is known by which touches explain scans
 
     @property
     def measurements(self) -> int:
@@ -55,8 +56,11 @@ class SkinTables:
     def relative_to(self, z0: Array) -> SkinTables:
         """The same of a skin whose untouched |Z| was measured: the impedances that a touch adds are the bundle's, up to
         one common gain. A skin whose impedances differ from the bundle's answers to touches by as much otherwise: on
-        skins mounted a few per cent wrong both are 4 to 5 %.
+        skins mounted a few per cent wrong both are 4 to 5 %. What measured bundles know is relative to the untouched
+        skin, whatever its impedances are.
         """
+        if not self.predicted:
+            return replace(self, z0=z0)
         gain = float(np.median(z0 / self.z0))
         row = gain * self.z0 / z0
         unlike = float(np.sqrt(np.mean(np.log(row) ** 2)))
@@ -100,6 +104,13 @@ class SkinTables:
         return replace(self, jacobian=soft[0], along=soft[1], turned=soft[2])
 
 
+def tells_touches(bundle: Bundle) -> bool:
+    """Whether measurements tell the touches of such a skin: not where its bundle is of another one, that was only
+    measured.
+    """
+    return bundle.matrices.normalisation == "model"
+
+
 def tables_of(bundle: Bundle) -> SkinTables:
     """Of a bundle as it ships, or as it was calibrated to a skin: its response tables where it has them, else its
     coarser Jacobian without directions. The response tables of the file are those of a skin that is mounted as the file
@@ -133,6 +144,7 @@ def tables_of(bundle: Bundle) -> SkinTables:
         pattern=np.asarray(bundle.pattern, np.int64),
         places=np.asarray(bundle.skin["electrodes"]["centre"], float),
         predicted=matrices.normalisation == "model",
+        tells=tells_touches(bundle),
         wrong=float(MISFIT if near else MISFIT_FAR),
     )
 

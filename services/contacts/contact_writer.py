@@ -10,6 +10,7 @@ import numpy as np
 from protocol.frames import SHAPES, Contact, EstimatedTouch, ImageFrame, LocatedTouch, RefinedTouch
 from services.contacts.force import Force, ForceLaw, Look
 from services.contacts.motion import Patch, Track
+from services.contacts.of_image import ImageTouch
 from services.contacts.reading import Appearance
 from services.contacts.refined import agrees, refined, settled
 from services.contacts.registered import registered
@@ -80,6 +81,33 @@ class ContactWriter:
             confidence=0.5 * (1 + math.erf(math.sqrt(touch.z2 / 2))),
             position_sigma=list(touch.sigma),
             sheet=None if self.place.flat else list(touch.position),
+        )
+
+    def of_image(self, number: int, state: str, touch: ImageTouch, frame: ImageFrame) -> Contact:
+        """A touch as an image shows it, or as a registered skin's map tells it."""
+        looks, located = touch.looks, touch.located
+        found = self.law.force(Look.of(touch.segment, frame))
+        if located is not None and not self.law.exists:
+            found = Force(located.force_n, None if located.force_n is None else located.value_sigma)
+        best = int(np.argmax(looks.classes)) if looks.classes else -1
+        at = self.place(looks.x, looks.y)
+        return Contact(
+            id=number,
+            state=state,
+            position=at.point.tolist(),
+            normal=at.normal.tolist(),
+            orientation=looks.orientation,
+            area_m2=looks.area_m2,
+            force_n=found.newton,
+            force_sigma_n=found.sigma,
+            pressure_pa=found.pressure,
+            pressure_sigma_pa=found.pressure_sigma,
+            wrench=_wrench(at, found.newton or 0.0),
+            shape=SHAPES[best] if looks.classes else "unknown",
+            shape_probability=looks.classes[best] if looks.classes else None,
+            confidence=confidence(touch.segment),
+            sheet=None if self.place.flat else [looks.x, looks.y],
+            **({} if located is None else registered(located)),
         )
 
     def gone(self, contacts: Sequence[Contact]) -> list[Contact]:

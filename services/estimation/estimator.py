@@ -38,7 +38,7 @@ from services.estimation.tared import TaredSkin, TaredState
 from services.estimation.touches import TouchTracks, estimate_of, roughly
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, TouchEstimate
-from services.estimation.values.judgement import Judgement, judge
+from services.estimation.values.judgement import Judgement, Verdict, judge
 from services.estimation.values.scan import Scan
 from services.estimation.values.state import loaded, saved
 
@@ -379,6 +379,8 @@ class Estimator:
     def _answer(
         self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
     ) -> ScoredAnswer:
+        if not self._tables.tells:
+            return hypotheses.untold(question, skin.refused.now.column)
         if self.now.unexplained_s > n.LOST_S:
             return self._answer_of_lost(skin, hypotheses, question, measured)
         if len(skin.touches):
@@ -492,7 +494,7 @@ class Estimator:
             return
         skin.refused.refuse(y, measured.span_s)
         self.now.unexplained_s += measured.span_s
-        if self.now.unexplained_s > n.CHANGING_S:
+        if self._tables.tells and self.now.unexplained_s > n.CHANGING_S:
             skin.hypotheses.adrift = min(n.MOST_ADRIFT, skin.hypotheses.adrift * n.ADRIFT)
 
     def _learn(self, skin: TaredSkin, measured: LookedAt, answer: ScoredAnswer) -> None:
@@ -546,7 +548,7 @@ class Estimator:
             self.now.said = tuple(roughly(touch) for touch in self.now.said)
         unsure = any(not track.sure for track in skin.touches.now.tracks)
         sigma = np.sqrt(np.diag(question.covariance))
-        changing = float(unsure or not explained)
+        changing = float(self._tables.tells and (unsure or not explained))
         felt = max([answer.left_z2, *_felt(skin.touches, None if explained or rough else answer.fit)])
         return self._estimate(measured, question.y, sigma, judgements, felt, changing)
 
@@ -564,7 +566,8 @@ class Estimator:
             self.taring.saw(bool(said) or z2 >= n.FALSE_ALARM_Z2)
         judgements.append(judge("touch", max([z2, *(touch.z2 for touch in said)]), n.FALSE_ALARM_Z2))
         judgements.append(judge("changing", changing, 1.0))
-        judgements.append(judge("explained", self.now.unexplained_s, n.CHANGING_S))
+        told = judge("explained", self.now.unexplained_s, n.CHANGING_S)
+        judgements.append(told if self._tables.tells else told._replace(verdict=Verdict.CANNOT))
         electrodes = np.zeros(self._tables.electrodes, np.uint8) if self.skin is None else self.skin.faults.states()
         return Estimate(
             measured.scan, measured.whole, said, electrodes, measured.live, difference, sigma, tuple(judgements)

@@ -152,14 +152,28 @@ class Hypotheses:
         z2 = max(self._left(question, pulled, white, None, ())[0], self._fresh(question, pulled, white))
         score = white.log_density - 0.5 * float(residual @ residual) + COSTS[cause]
         chi2 = float(residual @ residual) / max(int(question.live.sum()), 1)
+        if not self._tables.tells:
+            z2 = max(z2, float(n.FALSE_ALARM_Z2 / n.QUIET) * chi2)
         return ScoredAnswer(cause, None, (), chi2, z2, score, white, pulled, question.y)
 
     # --- something does ---
 
     def glance(self, question: Question) -> ScoredAnswer:
         """The likeliest answer that nothing touches, without a search."""
-        found = [answer for cause in (AS_IT_IS, *WIDER) if (answer := self.untouched(question, cause)) is not None]
+        causes = (AS_IT_IS, *WIDER) if self._tables.tells else (AS_IT_IS, MEMORY, DRIFT, BURST)
+        found = [answer for cause in causes if (answer := self.untouched(question, cause)) is not None]
         return _likeliest(found)
+
+    def untold(self, question: Question, pressed: Array) -> ScoredAnswer:
+        """The same of a skin whose touches no response tells: else something touches. pressed (K,): change by what did
+        so lately, of which foam may remember a share.
+        """
+        found = self.glance(question)
+        if found.quiet or not pressed.any():
+            return found
+        left = n.MEMORY_MOST * pressed
+        again = self.untouched(replace(question, covariance=question.covariance + np.outer(left, left)))
+        return again if again is not None and again.quiet else found
 
     def ask(self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]) -> ScoredAnswer:
         """The likeliest answer. standing, loose: what is known of the touches that there were, as they were and where
