@@ -120,6 +120,7 @@ class TouchPublishing(Stage):
             out.contacts = self._contacts(frame, out)
             self._note(frame, out)
         else:
+            self._watched = False
             self._counters["unknown"] += 1
         self._invalid(out.valid, [r for r in out.reasons if r not in HARMLESS], frame.stamps.get("sample", 0))
         if frame.part and out.valid:
@@ -175,6 +176,8 @@ class TouchPublishing(Stage):
         self._watched = out.valid
         if not out.valid:
             return found
+        if self._image_touches is not None and isinstance(frame, ImageFrame) and frame.touched:
+            self._image_of = frame.session, frame.reconstructed
         self._counters["contacts"] += sum(contact.id not in before for contact in found)
         ended = self._writer.gone(gone)
         self._untold, self._shown = [], [*found, *ended]
@@ -193,14 +196,14 @@ class TouchPublishing(Stage):
         """As the image shows them, or as they were where it is the one of before. watched: what is new began."""
         assert self._image_touches is not None
         if isinstance(frame, ImageFrame) and not frame.touched:
-            self._looks, self._drops = {}, {}
             return []
         image = (frame.session, frame.reconstructed) if isinstance(frame, ImageFrame) else self._image_of
         if isinstance(frame, PartFrame) or image == self._image_of:
             return [replace(contact, state="hold") for contact in before.values()]
-        touches = self._image_touches.found(frame, {number: self._looks[number] for number in before})
-        numbers = self._image_touches.same(touches, {number: self._looks[number] for number in before})
-        self._image_of, self._looks, self._drops = image, {}, {}
+        known_looks = {number: self._looks[number] for number in before}  # they stay where this frame is not valid
+        touches = self._image_touches.found(frame, known_looks)
+        numbers = self._image_touches.same(touches, known_looks)
+        self._looks = known_looks
         found = list[Contact]()
         for touch, known in zip(touches, numbers, strict=True):
             number = known or self._next_id

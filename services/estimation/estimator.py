@@ -380,7 +380,7 @@ class Estimator:
         self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
     ) -> ScoredAnswer:
         if not self._tables.tells:
-            return hypotheses.untold(question, skin.refused.now.column)
+            return self._answer_untold(skin, hypotheses, question)
         if self.now.unexplained_s > n.LOST_S:
             return self._answer_of_lost(skin, hypotheses, question, measured)
         if len(skin.touches):
@@ -397,6 +397,14 @@ class Estimator:
             if pressed.explained:
                 return pressed
         return quiet if quiet.quiet else hypotheses.ask(question, (), ())
+
+    def _answer_untold(self, skin: TaredSkin, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+        """Of a skin whose touches no response tells. While something touches, drift and faults are asked seldom."""
+        unexplained_s = self.now.unexplained_s
+        often = unexplained_s <= n.CHANGING_S or not round(unexplained_s / question.span_s) % n.LOST_SCANS
+        if not often:
+            question.budget.left = 0.0
+        return hypotheses.untold(question, skin.refused.now.column, often)
 
     def _answer_of_lost(
         self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, measured: LookedAt

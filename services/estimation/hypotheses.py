@@ -164,16 +164,20 @@ class Hypotheses:
         found = [answer for cause in causes if (answer := self.untouched(question, cause)) is not None]
         return _likeliest(found)
 
-    def untold(self, question: Question, pressed: Array) -> ScoredAnswer:
+    def untold(self, question: Question, pressed: Array, wider: bool) -> ScoredAnswer:
         """The same of a skin whose touches no response tells: else something touches. pressed (K,): change by what did
-        so lately, of which foam may remember a share.
+        so lately, of which foam may remember a share. wider: whether causes are asked that own more than the filter.
         """
-        found = self.glance(question)
+        found = self.glance(question) if wider else self._nothing(question, AS_IT_IS)
+        if found.cause == MEMORY and not self._drift.may_remember(found.pulled):
+            found = self._nothing(question, AS_IT_IS)
         if found.quiet or not pressed.any():
             return found
-        left = n.MEMORY_MOST * pressed
-        again = self.untouched(replace(question, covariance=question.covariance + np.outer(left, left)))
-        return again if again is not None and again.quiet else found
+        column, white = np.where(question.live, pressed, 0.0), question.white
+        along = white(column)
+        share = float(along @ white(question.y)) / max(float(along @ along), LEAST_ACTION)
+        again = self._nothing(replace(question, y=question.y - share * column), AS_IT_IS)
+        return again if again.quiet and abs(share) < n.MEMORY_MOST else found
 
     def ask(self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]) -> ScoredAnswer:
         """The likeliest answer. standing, loose: what is known of the touches that there were, as they were and where
