@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import Legendre
@@ -11,7 +12,12 @@ from scipy.ndimage import gaussian_filter
 
 from models.bundle import Bundle
 from models.calibration_file import found_by
-from models.measurement.numbers import MISFIT, MISFIT_FAR, MISFIT_POWER
+from models.measurement.disc import DiscResponse
+from models.measurement.grid import DiscGrid
+from models.measurement.measured_map import MeasuredMap
+from models.measurement.numbers import MISFIT, MISFIT_FAR, MISFIT_POWER, TYPICAL_DROP, TYPICAL_RADIUS
+from models.measurement.response import TouchModel
+from models.measurement.touch import area_of
 from models.patterns import incidence
 
 MOST_DEGREE = 3
@@ -38,7 +44,7 @@ class SkinTables:
     places: Array  # (E, 2) middles of the electrodes
     wrong: float = float(MISFIT)  # share of a touch's change that the tables get wrong
     predicted: bool = True  # whether z0 is what a model says of the untouched skin: measured bundles have none
-    tells: bool = True  # whether a response is known by which touches explain scans
+    map: MeasuredMap | None = None  # of a registered skin
 
     @property
     def measurements(self) -> int:
@@ -47,6 +53,28 @@ class SkinTables:
     @property
     def electrodes(self) -> int:
         return int(self.contact.shape[1])
+
+    @property
+    def tells(self) -> bool:
+        """Whether a response is known by which touches may explain scans: not where a bundle is of another skin, that
+        was only measured.
+        """
+        return self.predicted or self.map is not None
+
+    @cached_property
+    def response(self) -> TouchModel:
+        """What touches do. Where none is known, discs on the bundle's own skin: they see that something touches."""
+        return DiscResponse(self) if self.map is None else self.map
+
+    @cached_property
+    def grid(self) -> DiscGrid:
+        """Where something may touch."""
+        return DiscGrid(self.response)
+
+    def misfit_of(self, size2: float) -> Array:
+        """(K, K) covariance of what the response gets wrong of touches of this squared change."""
+        made = self.wrong**2 * size2 * self.misfit
+        return made if self.map is None else made + self.map.error
 
     @property
     def pixel(self) -> float:
@@ -60,7 +88,7 @@ class SkinTables:
         skin, whatever its impedances are.
         """
         if not self.predicted:
-            return replace(self, z0=z0)
+            return self
         gain = float(np.median(z0 / self.z0))
         row = gain * self.z0 / z0
         unlike = float(np.sqrt(np.mean(np.log(row) ** 2)))
@@ -91,6 +119,7 @@ class SkinTables:
             layer=slopes @ self.layer,
             field=slopes @ self.field,
             misfit=_of_trace_one(slopes @ self.misfit @ slopes.T),
+            map=None if self.map is None else self.map.through(slopes),
         )
 
     def blurred(self, width: float) -> SkinTables:
@@ -144,9 +173,16 @@ def tables_of(bundle: Bundle) -> SkinTables:
         pattern=np.asarray(bundle.pattern, np.int64),
         places=np.asarray(bundle.skin["electrodes"]["centre"], float),
         predicted=matrices.normalisation == "model",
-        tells=tells_touches(bundle),
         wrong=float(MISFIT if near else MISFIT_FAR),
+        map=_map_of(bundle),
     )
+
+
+def _map_of(bundle: Bundle) -> MeasuredMap | None:
+    if bundle.locator is None:
+        return None
+    typical = float(TYPICAL_DROP) * area_of(float(np.log(TYPICAL_RADIUS)))
+    return MeasuredMap(bundle.locator, bundle.metres_per_unit, typical)
 
 
 def _from_pixels(jacobian: NDArray[np.floating]) -> Single:

@@ -379,10 +379,15 @@ class Estimator:
     def _answer(
         self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
     ) -> ScoredAnswer:
-        if not self._tables.tells:
-            return self._answer_untold(skin, hypotheses, question)
+        if not self._tables.predicted:
+            return self._answer_measured(skin, hypotheses, question, predicted, measured)
         if self.now.unexplained_s > n.LOST_S:
             return self._answer_of_lost(skin, hypotheses, question, measured)
+        return self._answer_touched(skin, hypotheses, question, predicted, measured)
+
+    def _answer_touched(
+        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
+    ) -> ScoredAnswer:
         if len(skin.touches):
             standing = skin.touches.expected(measured.middle_s, measured.span_s)
             loose = skin.touches.expected(measured.middle_s, measured.span_s, loose=True)
@@ -398,13 +403,22 @@ class Estimator:
                 return pressed
         return quiet if quiet.quiet else hypotheses.ask(question, (), ())
 
-    def _answer_untold(self, skin: TaredSkin, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
-        """Of a skin whose touches no response tells. While something touches, drift and faults are asked seldom."""
-        unexplained_s = self.now.unexplained_s
+    def _answer_measured(
+        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
+    ) -> ScoredAnswer:
+        """Of a skin whose touches no response tells, or one that real touches differ from by more than anybody knows.
+        While something touches that nothing explains, all else is asked seldom.
+        """
+        unexplained_s, map_known = self.now.unexplained_s, self._tables.tells
         often = unexplained_s <= n.CHANGING_S or not round(unexplained_s / question.span_s) % n.LOST_SCANS
         if not often:
             question.budget.left = 0.0
-        return hypotheses.untold(question, skin.refused.now.column, often)
+        elif map_known and len(skin.touches):
+            return self._answer_touched(skin, hypotheses, question, predicted, measured)
+        found = hypotheses.untold(question, skin.refused.now.column, often and not map_known)
+        if found.quiet or not (often and map_known):
+            return found
+        return self._answer_touched(skin, hypotheses, question, predicted, measured)
 
     def _answer_of_lost(
         self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, measured: LookedAt
@@ -447,6 +461,8 @@ class Estimator:
         if not answer.explained:
             return
         least = n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2
+        if not self._tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
+            least = 0.0
         for track in skin.touches.now.tracks:
             track.sure = track.sure or track.z2 > least
 
@@ -502,7 +518,7 @@ class Estimator:
             return
         skin.refused.refuse(y, measured.span_s)
         self.now.unexplained_s += measured.span_s
-        if self._tables.tells and self.now.unexplained_s > n.CHANGING_S:
+        if self._tables.predicted and self.now.unexplained_s > n.CHANGING_S:
             skin.hypotheses.adrift = min(n.MOST_ADRIFT, skin.hypotheses.adrift * n.ADRIFT)
 
     def _learn(self, skin: TaredSkin, measured: LookedAt, answer: ScoredAnswer) -> None:
@@ -556,8 +572,10 @@ class Estimator:
             self.now.said = tuple(roughly(touch) for touch in self.now.said)
         unsure = any(not track.sure for track in skin.touches.now.tracks)
         sigma = np.sqrt(np.diag(question.covariance))
-        changing = float(self._tables.tells and (unsure or not explained))
+        changing = float(self._tables.predicted and (unsure or not explained))
         felt = max([answer.left_z2, *_felt(skin.touches, None if explained or rough else answer.fit)])
+        if answer.fit is not None and not self._tables.predicted:
+            felt = max(felt, skin.hypotheses.felt(question))
         return self._estimate(measured, question.y, sigma, judgements, felt, changing)
 
     def _estimate(
@@ -575,7 +593,7 @@ class Estimator:
         judgements.append(judge("touch", max([z2, *(touch.z2 for touch in said)]), n.FALSE_ALARM_Z2))
         judgements.append(judge("changing", changing, 1.0))
         told = judge("explained", self.now.unexplained_s, n.CHANGING_S)
-        judgements.append(told if self._tables.tells else told._replace(verdict=Verdict.CANNOT))
+        judgements.append(told if self._tables.predicted else told._replace(verdict=Verdict.CANNOT))
         electrodes = np.zeros(self._tables.electrodes, np.uint8) if self.skin is None else self.skin.faults.states()
         return Estimate(
             measured.scan, measured.whole, said, electrodes, measured.live, difference, sigma, tuple(judgements)
