@@ -99,6 +99,7 @@ class TouchPublishing(Stage):
         self._image_of = ("", -1)  # session and scan of the image that appearances were seen in
         self._looks: dict[int, Appearance] = {}  # of the contacts that are there, by their numbers
         self._drops: dict[int, float] = {}  # S/m, at least
+        self._anchors: dict[int, EstimatedTouch] = {}  # of contacts of an image, as the measurements tell them
         self._watched = False  # whether the frame before told what touched
         self._fit: tuple[RefinedTouch, float, float] | None = None  # and where its touch was then
 
@@ -199,18 +200,43 @@ class TouchPublishing(Stage):
             return []
         image = (frame.session, frame.reconstructed) if isinstance(frame, ImageFrame) else self._image_of
         if isinstance(frame, PartFrame) or image == self._image_of:
-            return [replace(contact, state="hold") for contact in before.values()]
+            return self._moved(frame, before)
         known_looks = {number: self._looks[number] for number in before}  # they stay where this frame is not valid
         touches = self._image_touches.found(frame, known_looks)
         numbers = self._image_touches.same(touches, known_looks)
-        self._looks = known_looks
+        self._looks, self._anchors = known_looks, {}
         found = list[Contact]()
         for touch, known in zip(touches, numbers, strict=True):
             number = known or self._next_id
             self._next_id = max(self._next_id, number + 1)
             state = "hold" if known or not watched else "begin"
             self._looks[number], self._drops[number] = touch.looks, touch.segment.peak
-            found.append(self._writer.of_image(number, state, touch, frame))
+            moves = self._image_touches.estimated(touch.looks, frame.estimates)
+            if moves is not None:
+                self._anchors[number] = moves
+            found.append(self._writer.of_image(number, state, touch, frame, moves))
+        return found
+
+    def _moved(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact]) -> list[Contact]:
+        """Those of the image of before, where the measurements say that they are by now, and what has begun since."""
+        now = {touch.id: touch for touch in frame.estimates}
+        found, followed = list[Contact](), set[int]()
+        for number, contact in before.items():
+            anchor, held = self._anchors.get(number), replace(contact, state="hold")
+            if anchor is None:
+                found.append(held)
+            elif anchor.id in now:
+                followed.add(anchor.id)
+                if any(now[anchor.id].velocity):  # else what differs is noise
+                    held, self._anchors[number] = self._writer.moved(held, anchor, now[anchor.id]), now[anchor.id]
+                found.append(held)
+            elif isinstance(frame, ImageFrame):
+                found.append(held)  # something touches, and nothing else is known
+        now_ns = frame.stamps.get("sample", 0)
+        for touch in frame.estimates if isinstance(frame, PartFrame) else []:
+            if touch.id not in followed:
+                found.append(self._contact(touch, now_ns, before, alone=False))
+                self._anchors[found[-1].id] = touch
         return found
 
     def _contact(self, touch: EstimatedTouch, now_ns: int, before: Mapping[int, Contact], alone: bool) -> Contact:
@@ -296,6 +322,7 @@ class TouchPublishing(Stage):
             "looks": [[touch, asdict(look)] for touch, look in self._appearances.known.items()],
             "seen": [[number, self._drops[number], asdict(look)] for number, look in self._looks.items()],
             "image_of": list(self._image_of),
+            "anchors": [[number, asdict(touch)] for number, touch in self._anchors.items()],
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -312,6 +339,7 @@ class TouchPublishing(Stage):
         seen = state.get("seen", [])
         self._looks = {int(number): Appearance(**look) for number, _, look in seen}
         self._drops = {int(number): float(drop) for number, drop, _ in seen}
+        self._anchors = {int(number): EstimatedTouch(**touch) for number, touch in state.get("anchors", [])}
         session, scan = state.get("image_of", ("", -1))
         self._image_of = str(session), int(scan)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -83,18 +84,21 @@ class ContactWriter:
             sheet=None if self.place.flat else list(touch.position),
         )
 
-    def of_image(self, number: int, state: str, touch: ImageTouch, frame: ImageFrame) -> Contact:
-        """A touch as an image shows it, or as a registered skin's map tells it."""
+    def of_image(
+        self, number: int, state: str, touch: ImageTouch, frame: ImageFrame, moves: EstimatedTouch | None
+    ) -> Contact:
+        """A touch as an image shows it, or as a registered skin's map tells it; moves: as the measurements tell it."""
         looks, located = touch.looks, touch.located
         found = self.law.force(Look.of(touch.segment, frame))
         if located is not None and not self.law.exists:
             found = Force(located.force_n, None if located.force_n is None else located.value_sigma)
         best = int(np.argmax(looks.classes)) if looks.classes else -1
-        at = self.place(looks.x, looks.y)
+        at, (vx, vy) = self.place(looks.x, looks.y), (0.0, 0.0) if moves is None else moves.velocity
         return Contact(
             id=number,
             state=state,
             position=at.point.tolist(),
+            velocity=(vx * at.along_x + vy * at.along_y).tolist(),
             normal=at.normal.tolist(),
             orientation=looks.orientation,
             area_m2=looks.area_m2,
@@ -108,6 +112,20 @@ class ContactWriter:
             confidence=confidence(touch.segment),
             sheet=None if self.place.flat else [looks.x, looks.y],
             **({} if located is None else registered(located)),
+        )
+
+    def moved(self, contact: Contact, before: EstimatedTouch, now: EstimatedTouch) -> Contact:
+        """The same contact, as far on as the measurements say."""
+        (x0, y0), (x, y), (vx, vy) = before.position, now.position, now.velocity
+        on_x, on_y = contact.on_sheet[0] + x - x0, contact.on_sheet[1] + y - y0
+        at = self.place(on_x, on_y)
+        return replace(
+            contact,
+            position=at.point.tolist(),
+            velocity=(vx * at.along_x + vy * at.along_y).tolist(),
+            normal=at.normal.tolist(),
+            wrench=_wrench(at, contact.force_n or 0.0),
+            sheet=None if self.place.flat else [on_x, on_y],
         )
 
     def gone(self, contacts: Sequence[Contact]) -> list[Contact]:

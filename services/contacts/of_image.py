@@ -5,11 +5,11 @@ skin's response map finds them. Each has the number of the one that was nearest 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from models.bundle import Bundle
-from protocol.frames import ImageFrame, LocatedTouch
+from protocol.frames import EstimatedTouch, ImageFrame, LocatedTouch
 from services.contacts.outline import outline
 from services.contacts.reading import Appearance
 from services.contacts.segmentation import Segment, class_probabilities, divided, readable, segment
@@ -44,6 +44,12 @@ class ImageTouches:
             return [self._touch(frame, s, None) for s in segment(frame.image, frame.sigma, pixels)]
         parts = divided(frame.image, frame.sigma, pixels)
         return [self._touch(frame, s, touch) for s, touch in zip(parts, frame.touches, strict=True)]
+
+    def estimated(self, looks: Appearance, estimates: Iterable[EstimatedTouch]) -> EstimatedTouch | None:
+        """A registered skin's touch as the measurements tell it: the nearest that is near enough to be the same."""
+        apart = [(math.hypot(t.position[0] - looks.x, t.position[1] - looks.y), k, t) for k, t in enumerate(estimates)]
+        distance, _, nearest = min(apart, default=(math.inf, 0, None))
+        return nearest if distance < self._same_m else None
 
     def _touch(self, frame: ImageFrame, s: Segment, located: LocatedTouch | None) -> ImageTouch:
         m, (x0, y0) = frame.metres_per_pixel, frame.origin

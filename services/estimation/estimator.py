@@ -460,7 +460,7 @@ class Estimator:
         """A touch is shown at once where its scan is explained with it: a rough start may be anything."""
         if not answer.explained:
             return
-        least = n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2
+        least = float(n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2)
         if not self._tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
             least = 0.0
         for track in skin.touches.now.tracks:
