@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.locator import Located, Locator
+from models.measurement.tables import tells_touches
 from models.symmetries import symmetries
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
 from services.describe import ON, refinement, symmetry
@@ -48,6 +49,7 @@ class Inference(Stage):
             self._network.check(bundle)
         # Only a network's image is in S/m: a one-step image shows where, not how much, as a registered skin's does.
         self._to_scale = isinstance(self._network, Network) and bundle.locator is None
+        self._refuses = self._to_scale and not tells_touches(bundle)  # else the measurements have been explained
         self.residual = Residual(bundle, self._to_scale)
         self.linearisation = Linearisation(name, bundle)
         self._tells_shapes = tells_shapes(bundle)
@@ -193,6 +195,9 @@ class Inference(Stage):
             out.touches = [_touch(each, quantity) for each in self._locator.locate(frame.difference, frame.sigma)]
         self._counters["networks_run"] += 1
         out.residual = self.residual(frame.difference, frame.sigma, out.image)
+        if self._refuses and frame.touched and self.residual.refused:
+            out.valid = False
+            add_reason(out.reasons, "out_of_distribution")
         self._shows(frame, out)
         if self._symmetry is not None and frame.touched:
             self._symmetry.begin(frame, (out.image, out.sigma, out.classes))

@@ -6,14 +6,16 @@ mean square of its radius, which is taken off again.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.numbers import EDGE_WIDTH, SHEET
-from models.measurement.tables import SkinTables
 from models.measurement.touch import SHAPES, area_of
+
+if TYPE_CHECKING:
+    from models.measurement.tables import SkinTables
 
 Array = NDArray[np.float64]
 

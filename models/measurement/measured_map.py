@@ -8,6 +8,8 @@ likelihood's place is off, and how deep or how hard a press is; its ellipses are
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
@@ -23,13 +25,14 @@ Array = NDArray[np.float64]
 class MeasuredMap:
     """Of one registered skin; see models/measurement/response.py."""
 
-    def __init__(self, arrays: LocatorArrays, metres_per_unit: float) -> None:
-        self._metres = metres_per_unit
+    def __init__(self, arrays: LocatorArrays, metres_per_unit: float, mean_press: float = 1.0) -> None:
+        """mean_press: action of the registration's mean press."""
+        self._metres, self.mean_press = metres_per_unit, mean_press
         self._locator = Locator(arrays)
         rows, columns = (int(side) for side in arrays.shape)
         allowed = arrays.allowed.reshape(rows, columns)
         table = np.zeros((rows, columns, arrays.map.shape[1]))
-        table[allowed] = arrays.map
+        table[allowed] = arrays.map / mean_press
         nearest = distance_transform_edt(~allowed, return_distances=False, return_indices=True)
         table = table[tuple(nearest)]  # beyond the presses, as where they end
         self._corner = np.asarray(arrays.corner, float) / metres_per_unit
@@ -41,6 +44,12 @@ class MeasuredMap:
         iy, ix = np.nonzero(allowed)
         places = self._corner + self._spacing * np.column_stack([ix, iy])
         self._discs = np.column_stack([places, np.full(len(places), np.log(TYPICAL_RADIUS))])
+
+    def through(self, slopes: Array) -> MeasuredMap:
+        """The same seen through a fault of the wires; slopes (K, K)."""
+        seen = copy(self)
+        seen._table, seen.error = self._table @ slopes.T, slopes @ self.error @ slopes.T
+        return seen
 
     @property
     def discs(self) -> Array:

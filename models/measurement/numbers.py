@@ -13,6 +13,7 @@ MISFIT_POWER = Number(0.3, "-", "of the Gram matrix: colour of that misfit", "me
 """How wrong a response is."""
 
 TYPICAL_RADIUS = Number(0.18, "unit", "of a touch of unknown size", "derived: 9 mm, geometric mean of 4 and 20 mm")
+TYPICAL_DROP = Number(0.5, "-", "of touches of which nothing is known", "derived: half of what foam can")
 AREA_LOG_SD = Number(0.55, "-", "of its radius's logarithm", "derived: 4 and 20 mm are 1.5 of it away")
 LEAST_RADIUS = Number(0.05, "unit", "of a touch", "derived: a pixel of the tables is 0.042")
 MOST_RADIUS = Number(0.6, "unit", "of a touch", "chosen: 30 mm, beyond the 25 mm that skins are made for")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import Legendre
@@ -11,7 +12,12 @@ from scipy.ndimage import gaussian_filter
 
 from models.bundle import Bundle
 from models.calibration_file import found_by
-from models.measurement.numbers import MISFIT, MISFIT_FAR, MISFIT_POWER
+from models.measurement.disc import DiscResponse
+from models.measurement.grid import DiscGrid
+from models.measurement.measured_map import MeasuredMap
+from models.measurement.numbers import MISFIT, MISFIT_FAR, MISFIT_POWER, TYPICAL_DROP, TYPICAL_RADIUS
+from models.measurement.response import TouchModel
+from models.measurement.touch import area_of
 from models.patterns import incidence
 
 MOST_DEGREE = 3
@@ -38,6 +44,7 @@ class SkinTables:
     places: Array  # (E, 2) middles of the electrodes
     wrong: float = float(MISFIT)  # share of a touch's change that the tables get wrong
     predicted: bool = True  # whether z0 is what a model says of the untouched skin: measured bundles have none
+    map: MeasuredMap | None = None  # of a registered skin
 
     @property
     def measurements(self) -> int:
@@ -48,6 +55,28 @@ class SkinTables:
         return int(self.contact.shape[1])
 
     @property
+    def tells(self) -> bool:
+        """Whether a response is known by which touches may explain scans: not where a bundle is of another skin, that
+        was only measured.
+        """
+        return self.predicted or self.map is not None
+
+    @cached_property
+    def response(self) -> TouchModel:
+        """What touches do. Where none is known, discs on the bundle's own skin: they see that something touches."""
+        return DiscResponse(self) if self.map is None else self.map
+
+    @cached_property
+    def grid(self) -> DiscGrid:
+        """Where something may touch."""
+        return DiscGrid(self.response)
+
+    def misfit_of(self, size2: float) -> Array:
+        """(K, K) covariance of what the response gets wrong of touches of this squared change."""
+        made = self.wrong**2 * size2 * self.misfit
+        return made if self.map is None else made + self.map.error
+
+    @property
     def pixel(self) -> float:
         """Side of a pixel."""
         return 2.0 / len(self.jacobian)
@@ -55,8 +84,11 @@ class SkinTables:
     def relative_to(self, z0: Array) -> SkinTables:
         """The same of a skin whose untouched |Z| was measured: the impedances that a touch adds are the bundle's, up to
         one common gain. A skin whose impedances differ from the bundle's answers to touches by as much otherwise: on
-        skins mounted a few per cent wrong both are 4 to 5 %.
+        skins mounted a few per cent wrong both are 4 to 5 %. What measured bundles know is relative to the untouched
+        skin, whatever its impedances are.
         """
+        if not self.predicted:
+            return self
         gain = float(np.median(z0 / self.z0))
         row = gain * self.z0 / z0
         unlike = float(np.sqrt(np.mean(np.log(row) ** 2)))
@@ -87,6 +119,7 @@ class SkinTables:
             layer=slopes @ self.layer,
             field=slopes @ self.field,
             misfit=_of_trace_one(slopes @ self.misfit @ slopes.T),
+            map=None if self.map is None else self.map.through(slopes),
         )
 
     def blurred(self, width: float) -> SkinTables:
@@ -98,6 +131,13 @@ class SkinTables:
         sigma = (width / self.pixel, width / self.pixel, 0)
         soft = [gaussian_filter(each, sigma, mode="constant") for each in (self.jacobian, self.along, self.turned)]
         return replace(self, jacobian=soft[0], along=soft[1], turned=soft[2])
+
+
+def tells_touches(bundle: Bundle) -> bool:
+    """Whether measurements tell the touches of such a skin: not where its bundle is of another one, that was only
+    measured.
+    """
+    return bundle.matrices.normalisation == "model"
 
 
 def tables_of(bundle: Bundle) -> SkinTables:
@@ -134,7 +174,15 @@ def tables_of(bundle: Bundle) -> SkinTables:
         places=np.asarray(bundle.skin["electrodes"]["centre"], float),
         predicted=matrices.normalisation == "model",
         wrong=float(MISFIT if near else MISFIT_FAR),
+        map=_map_of(bundle),
     )
+
+
+def _map_of(bundle: Bundle) -> MeasuredMap | None:
+    if bundle.locator is None:
+        return None
+    typical = float(TYPICAL_DROP) * area_of(float(np.log(TYPICAL_RADIUS)))
+    return MeasuredMap(bundle.locator, bundle.metres_per_unit, typical)
 
 
 def _from_pixels(jacobian: NDArray[np.floating]) -> Single:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from protocol.frames import SHAPES, Contact, EstimatedTouch, RefinedTouch
-from services.contacts.force import ForceLaw
+from protocol.frames import SHAPES, Contact, EstimatedTouch, ImageFrame, RefinedTouch
+from services.contacts.force import Force, ForceLaw, Look
+from services.contacts.of_image import ImageTouch
 from services.contacts.reading import Appearance
 from services.contacts.refined import agrees, refined, settled
+from services.contacts.registered import registered
+from services.contacts.segmentation import Segment
 from services.contacts.surface import Placed, Placement
 
 
@@ -45,6 +49,50 @@ class ContactWriter:
             sheet=None if self.place.flat else list(touch.position),
         )
 
+    def of_image(
+        self, number: int, state: str, touch: ImageTouch, frame: ImageFrame, moves: EstimatedTouch | None
+    ) -> Contact:
+        """A touch as an image shows it, or as a registered skin's map tells it; moves: as the measurements tell it."""
+        looks, located = touch.looks, touch.located
+        found = self.law.force(Look.of(touch.segment, frame))
+        if located is not None and not self.law.exists:
+            found = Force(located.force_n, None if located.force_n is None else located.value_sigma)
+        best = int(np.argmax(looks.classes)) if looks.classes else -1
+        at, (vx, vy) = self.place(looks.x, looks.y), (0.0, 0.0) if moves is None else moves.velocity
+        return Contact(
+            id=number,
+            state=state,
+            position=at.point.tolist(),
+            velocity=(vx * at.along_x + vy * at.along_y).tolist(),
+            normal=at.normal.tolist(),
+            orientation=looks.orientation,
+            area_m2=looks.area_m2,
+            force_n=found.newton,
+            force_sigma_n=found.sigma,
+            pressure_pa=found.pressure,
+            pressure_sigma_pa=found.pressure_sigma,
+            wrench=_wrench(at, found.newton or 0.0),
+            shape=SHAPES[best] if looks.classes else "unknown",
+            shape_probability=looks.classes[best] if looks.classes else None,
+            confidence=confidence(touch.segment),
+            sheet=None if self.place.flat else [looks.x, looks.y],
+            **({} if located is None else registered(located)),
+        )
+
+    def moved(self, contact: Contact, before: EstimatedTouch, now: EstimatedTouch) -> Contact:
+        """The same contact, as far on as the measurements say."""
+        (x0, y0), (x, y), (vx, vy) = before.position, now.position, now.velocity
+        on_x, on_y = contact.on_sheet[0] + x - x0, contact.on_sheet[1] + y - y0
+        at = self.place(on_x, on_y)
+        return replace(
+            contact,
+            position=at.point.tolist(),
+            velocity=(vx * at.along_x + vy * at.along_y).tolist(),
+            normal=at.normal.tolist(),
+            wrench=_wrench(at, contact.force_n or 0.0),
+            sheet=None if self.place.flat else [on_x, on_y],
+        )
+
     def gone(self, contacts: Sequence[Contact]) -> list[Contact]:
         """The last contacts of touches that were shown so."""
         force = 0.0 if self.tells_force else None
@@ -74,3 +122,8 @@ def _wrench(at: Placed, force: float) -> list[float]:
     """On the skin, at its frame's origin: the touch presses against the normal."""
     pressed = -force * at.normal
     return [*pressed.tolist(), *np.cross(at.point, pressed).tolist()]
+
+
+def confidence(s: Segment) -> float:
+    """Probability that the peak is not noise, from its own standard deviation."""
+    return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))

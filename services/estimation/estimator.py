@@ -38,7 +38,7 @@ from services.estimation.tared import TaredSkin, TaredState
 from services.estimation.touches import TouchTracks, estimate_of, roughly
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, TouchEstimate
-from services.estimation.values.judgement import Judgement, judge
+from services.estimation.values.judgement import Judgement, Verdict, judge
 from services.estimation.values.scan import Scan
 from services.estimation.values.state import loaded, saved
 
@@ -386,8 +386,15 @@ class Estimator:
     def _answer(
         self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
     ) -> ScoredAnswer:
+        if not self._tables.predicted:
+            return self._answer_measured(skin, hypotheses, question, predicted, measured)
         if self.now.unexplained_s > n.LOST_S:
             return self._answer_of_lost(skin, hypotheses, question, measured)
+        return self._answer_touched(skin, hypotheses, question, predicted, measured)
+
+    def _answer_touched(
+        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
+    ) -> ScoredAnswer:
         if len(skin.touches):
             standing = skin.touches.expected(measured.middle_s, measured.span_s)
             loose = skin.touches.expected(measured.middle_s, measured.span_s, loose=True)
@@ -420,6 +427,23 @@ class Estimator:
         kept = skin.touches.recognised(found.fit, found.kept)
         known = sum(place >= 0 for place in kept)
         return replace(found, kept=kept, score=found.score - n.COST_TOUCH * known, recounted=True)
+
+    def _answer_measured(
+        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
+    ) -> ScoredAnswer:
+        """Of a skin whose touches no response tells, or one that real touches differ from by more than anybody knows.
+        While something touches that nothing explains, all else is asked seldom.
+        """
+        unexplained_s, map_known = self.now.unexplained_s, self._tables.tells
+        often = unexplained_s <= n.CHANGING_S or not round(unexplained_s / question.span_s) % n.LOST_SCANS
+        if not often:
+            question.budget.left = 0.0
+        elif map_known and len(skin.touches):
+            return self._answer_touched(skin, hypotheses, question, predicted, measured)
+        found = hypotheses.untold(question, skin.refused.now.column, often and not map_known)
+        if found.quiet or not (often and map_known):
+            return found
+        return self._answer_touched(skin, hypotheses, question, predicted, measured)
 
     def _answer_of_lost(
         self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, measured: LookedAt
@@ -463,7 +487,9 @@ class Estimator:
         """A touch is shown at once where its scan is explained with it: a rough start may be anything."""
         if not answer.explained:
             return
-        least = n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2
+        least = float(n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2)
+        if not self._tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
+            least = 0.0
         for track in skin.touches.now.tracks:
             track.sure = track.sure or track.z2 > least
 
@@ -500,7 +526,7 @@ class Estimator:
             return
         skin.refused.refuse(y, measured.span_s)
         self.now.unexplained_s += measured.span_s
-        if self.now.unexplained_s > n.CHANGING_S:
+        if self._tables.predicted and self.now.unexplained_s > n.CHANGING_S:
             skin.hypotheses.adrift = min(n.MOST_ADRIFT, skin.hypotheses.adrift * n.ADRIFT)
 
     def _learn(self, skin: TaredSkin, measured: LookedAt, answer: ScoredAnswer) -> None:
@@ -554,8 +580,10 @@ class Estimator:
             self.now.said = tuple(roughly(touch) for touch in self.now.said)
         unsure = any(not track.sure for track in skin.touches.now.tracks)
         sigma = np.sqrt(np.diag(question.covariance))
-        changing = float(unsure or not explained)
+        changing = float(self._tables.predicted and (unsure or not explained))
         felt = max([answer.left_z2, *_felt(skin.touches, None if explained or rough else answer.fit)])
+        if answer.fit is not None and not self._tables.predicted:
+            felt = max(felt, skin.hypotheses.felt(question))
         return self._estimate(measured, question.y, sigma, judgements, felt, changing)
 
     def _estimate(
@@ -572,7 +600,8 @@ class Estimator:
             self.taring.saw(bool(said) or z2 >= n.FALSE_ALARM_Z2)
         judgements.append(judge("touch", max([z2, *(touch.z2 for touch in said)]), n.FALSE_ALARM_Z2))
         judgements.append(judge("changing", changing, 1.0))
-        judgements.append(judge("explained", self.now.unexplained_s, n.CHANGING_S))
+        told = judge("explained", self.now.unexplained_s, n.CHANGING_S)
+        judgements.append(told if self._tables.predicted else told._replace(verdict=Verdict.CANNOT))
         electrodes = np.zeros(self._tables.electrodes, np.uint8) if self.skin is None else self.skin.faults.states()
         return Estimate(
             measured.scan, measured.whole, said, electrodes, measured.live, difference, sigma, tuple(judgements)

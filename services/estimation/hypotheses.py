@@ -16,9 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.course import TouchCourse
-from models.measurement.disc import DiscResponse
 from models.measurement.fit import FittedScan, FoundTouches, KnownWhitening, TouchFitter, Turned
-from models.measurement.grid import DiscGrid
 from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
 from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
 from models.measurement.tables import SkinTables
@@ -119,17 +117,18 @@ class ScoredAnswer:
 class Hypotheses:
     """Of one skin."""
 
-    def __init__(self, tables: SkinTables, response: DiscResponse, noise: NoiseModel, drift: SkinFilter) -> None:
-        self.grid = DiscGrid(response)
-        self._tables, self._response, self._noise, self._drift = tables, response, noise, drift
+    def __init__(self, tables: SkinTables, noise: NoiseModel, drift: SkinFilter) -> None:
+        self.grid = tables.grid
+        self._tables, self._noise, self._drift = tables, noise, drift
         self._slopes: Array | None = None
+        # Touches that nothing explains for certain must not be taken for noise.
+        self._wider = WIDER if tables.predicted else (MEMORY, DRIFT, BURST)
         self.adrift = 1.0  # times the faster drift: grows while nothing explains the skin
 
     def through(self, slopes: Array) -> Hypotheses:
         """The same of a skin that is seen through a fault of the wires; slopes (K, K)."""
         seen = copy(self)
         seen._tables, seen.grid = self._tables.through(slopes), self.grid.through(slopes)
-        seen._response = DiscResponse(seen._tables)
         seen._slopes = slopes
         return seen
 
@@ -153,14 +152,41 @@ class Hypotheses:
         z2 = max(self._left(question, pulled, white, None, ())[0], self._fresh(question, pulled, white))
         score = white.log_density - 0.5 * float(residual @ residual) + COSTS[cause]
         chi2 = float(residual @ residual) / max(int(question.live.sum()), 1)
+        if not self._tables.predicted:
+            z2 = max(z2, float(n.FALSE_ALARM_Z2 / n.QUIET) * chi2)
         return ScoredAnswer(cause, None, (), chi2, z2, score, white, pulled, question.y)
 
     # --- something does ---
 
     def glance(self, question: Question) -> ScoredAnswer:
         """The likeliest answer that nothing touches, without a search."""
-        found = [answer for cause in (AS_IT_IS, *WIDER) if (answer := self.untouched(question, cause)) is not None]
+        found = [
+            answer for cause in (AS_IT_IS, *self._wider) if (answer := self.untouched(question, cause)) is not None
+        ]
         return _likeliest(found)
+
+    def _untouched(self, question: Question) -> list[ScoredAnswer]:
+        causes = AS_IT_IS, *self._wider
+        return [answer for cause in causes if (answer := self.untouched(question, cause)) is not None]
+
+    def felt(self, question: Question) -> float:
+        """Squared sigmas of whatever touches."""
+        return self._nothing(question, AS_IT_IS).left_z2
+
+    def untold(self, question: Question, pressed: Array, wider: bool) -> ScoredAnswer:
+        """The same of a skin whose touches no response tells: else something touches. pressed (K,): change by what did
+        so lately, of which foam may remember a share. wider: whether causes are asked that own more than the filter.
+        """
+        found = self.glance(question) if wider else self._nothing(question, AS_IT_IS)
+        if found.cause == MEMORY and not self._drift.may_remember(found.pulled):
+            found = self._nothing(question, AS_IT_IS)
+        if found.quiet or not pressed.any():
+            return found
+        column, white = np.where(question.live, pressed, 0.0), question.white
+        along = white(column)
+        share = float(along @ white(question.y)) / max(float(along @ along), LEAST_ACTION)
+        again = self._nothing(replace(question, y=question.y - share * column), AS_IT_IS)
+        return again if again.quiet and abs(share) < n.MEMORY_MOST else found
 
     def ask(self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]) -> ScoredAnswer:
         """The likeliest answer. standing, loose: what is known of the touches that there were, as they were and where
@@ -259,7 +285,9 @@ class Hypotheses:
         return answer
 
     def _of_none(self, question: Question) -> list[ScoredAnswer]:
-        found = [answer for cause in (AS_IT_IS, *WIDER) if (answer := self.untouched(question, cause)) is not None]
+        found = [
+            answer for cause in (AS_IT_IS, *self._wider) if (answer := self.untouched(question, cause)) is not None
+        ]
         return [*found, *self._from_nothing(question)]
 
     def _from_nothing(self, question: Question) -> list[ScoredAnswer]:
@@ -291,7 +319,7 @@ class Hypotheses:
         expected = self._fitted(question, standing, everyone, 0)
         answers += self._search(question, everyone, expected.fit)
         best = _likeliest(answers)
-        for cause in WIDER:
+        for cause in self._wider:
             answers += self._with_cause(question, loose, everyone, cause, best.left)
         return answers
 
@@ -308,7 +336,7 @@ class Hypotheses:
         best = _likeliest(touched)
         assert best.fit is not None
         again = _from(best.fit)
-        for cause in WIDER:
+        for cause in self._wider:
             found += self._with_cause(question, again, best.kept, cause, best.left)
         found.append(self._fitted(question, again, best.kept, n.STEPS_COLD, wide=True))
         return found
@@ -357,10 +385,11 @@ class Hypotheses:
         known: KnownWhitening | None = None,
         turned: Turned | None = None,
     ) -> ScoredAnswer:
-        course = TouchCourse(self._response, question.times_s, question.span_s)
+        course = TouchCourse(self._tables.response, question.times_s, question.span_s)
         live = int(question.live.sum())
         misfit = max(float(MISFIT_WIDE), 2 * self._tables.wrong) if wide else self._tables.wrong
-        scene = FittedScan(question.y, question.covariance, course, self._tables.misfit, live, known, turned)
+        covariance = question.covariance if self._tables.map is None else question.covariance + self._tables.map.error
+        scene = FittedScan(question.y, covariance, course, self._tables.misfit, live, known, turned)
         may = max(0.0, question.budget.left - question.keeps) / len(priors)
         fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(may)))
         question.budget.left -= (fit.steps + 1) * len(fit)
@@ -482,7 +511,7 @@ class Hypotheses:
         self, question: Question, standing: Sequence[TouchPrior], answer: ScoredAnswer
     ) -> ScoredAnswer | None:
         """One of the touches ended at once within the scan, or before it: whichever leaves least."""
-        course = TouchCourse(self._response, question.times_s, question.span_s)
+        course = TouchCourse(self._tables.response, question.times_s, question.span_s)
         starts = np.stack([prior.start for prior in standing])
         each = [course.columns(starts[k : k + 1], [prior]).mean for k, prior in enumerate(standing)]
         whole = np.sum(each, axis=0)

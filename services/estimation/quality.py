@@ -23,6 +23,9 @@ KEPT = 10  # noises of frames whose matrices are kept, 0.3 MB each
 MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through
 DRIFT = Drift(scale=2e-3, contact=1e-2)  # a change that drift of this size explains is not held against the image
 CHANCE = 4.0  # standard deviations of chi-square that the noise may come to
+REFUSED = 0.5  # share not explained from which an image is none of a touch
+FAINT = 100.0  # energy over the noise's below which it is refused from REFUSED_FAINT on:
+REFUSED_FAINT = 0.15  # of a faint touch noise hides what the image gets wrong, of a faint anything-else it does not
 
 
 class Conditioned(NamedTuple):
@@ -45,6 +48,7 @@ class Residual:
         """to_scale: images are in S/m; else only their form counts, not their size."""
         self.pre, self.to_scale = bundle.prereconstructor(), to_scale
         self.shape: tuple[int, int] = bundle.matrices.inside.shape
+        self.refused = False  # whether the last image that was given a share is of no touch
         self._sizes = (0, 0)
         self._known: OrderedDict[bytes, Conditioned] = OrderedDict()
 
@@ -73,6 +77,7 @@ class Residual:
         beyond = float(left @ left) - known.noise
         energy = max(float(seen @ seen), known.noise)
         share = max(0.0, beyond) / energy
+        self.refused = not share <= (REFUSED if energy > FAINT * known.noise else REFUSED_FAINT)
         return share if np.isfinite(share) else None
 
     def prepare(self, sigma: NDArray[np.float32]) -> bool:

@@ -8,7 +8,6 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.disc import DiscResponse
 from models.measurement.noise import NoiseModel, NoiseState
 from models.measurement.tables import SkinTables
 from services.estimation.faults.asking import FaultAsking
@@ -53,15 +52,14 @@ class TaredSkin:
         """
         self.log_z0, self.live, self.scatter, self.frames = log_z0, live, scatter, frames
         self.tables = tables.relative_to(np.exp(log_z0))
-        self.response = DiscResponse(self.tables)
         self.noise, self.drift = NoiseModel(self.tables), SkinFilter(self.tables)
-        self.touches = TouchTracks(self.response)
-        self.hypotheses = Hypotheses(self.tables, self.response, self.noise, self.drift)
+        self.touches = TouchTracks(self.tables.response)
+        self.hypotheses = Hypotheses(self.tables, self.noise, self.drift)
         self.learning = Learning(self.drift, self.noise)
         self.refused = RefusedChange(tables.measurements)
         self.quick, self.held = QuickLook(self.hypotheses.grid), HeldLook()
         self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
-        self.asking = FaultAsking(self.tables, self.response, self.noise, self.touches, self.hypotheses, self.faults)
+        self.asking = FaultAsking(self.tables, self.noise, self.touches, self.hypotheses, self.faults)
 
     def begin(self, scans: AgreedScans, next_id: int) -> None:
         """scans: those of the baseline."""

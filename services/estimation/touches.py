@@ -13,9 +13,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.disc import DiscResponse
 from models.measurement.fit import FoundTouches
 from models.measurement.numbers import MOST_WAY
+from models.measurement.response import TouchModel
 from models.measurement.touch import (
     ACTION,
     LOG_RADIUS,
@@ -90,7 +90,7 @@ class TouchesState:
 class TouchTracks:
     """Of one skin."""
 
-    def __init__(self, response: DiscResponse) -> None:
+    def __init__(self, response: TouchModel) -> None:
         self._response = response
         self.now = TouchesState()
 

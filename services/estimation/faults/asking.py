@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.course import TouchCourse
-from models.measurement.disc import DiscResponse
 from models.measurement.fit import LEAST_MEAN
 from models.measurement.noise import NoiseModel
 from models.measurement.tables import SkinTables
@@ -60,13 +59,12 @@ class FaultAsking:
     def __init__(
         self,
         tables: SkinTables,
-        response: DiscResponse,
         noise: NoiseModel,
         touches: TouchTracks,
         hypotheses: Hypotheses,
         faults: BoardFaults,
     ) -> None:
-        self._tables, self._response, self._noise, self._touches = tables, response, noise, touches
+        self._tables, self._noise, self._touches = tables, noise, touches
         self._hypotheses, self._faults = hypotheses, faults
         self._contact_doubt = ContactDoubt(tables, hypotheses, faults)
         self._through: tuple[WireFault, Hypotheses] | None = None
@@ -161,7 +159,7 @@ class FaultAsking:
             return False
         skin, own = self._covariances(at)
         touched, nearby = self._change(self._touches.expected(at.middle_s, at.span_s), at)
-        misfit = self._tables.wrong**2 * float(touched @ touched) * self._tables.misfit
+        misfit = self._tables.misfit_of(float(touched @ touched))
         touch = self._contact_doubt(found.view, found.question, found.answer, skin + nearby + misfit, own)
         if touch is not None:
             self._faults.drop_contact()
@@ -194,7 +192,7 @@ class FaultAsking:
         if not priors:
             return np.zeros(k), np.zeros((k, k))
         states = np.stack([prior.start for prior in priors])
-        course = TouchCourse(self._response, at.times_s, at.span_s)
+        course = TouchCourse(self._tables.response, at.times_s, at.span_s)
         columns = course.columns(states, priors, course.directions(states))
         known = [t.scans >= n.DOUBT_SCANS for k, t in enumerate(self._touches.now.tracks) if k != but]
         nearby = as_they_stand(columns.slopes, states)
@@ -202,7 +200,7 @@ class FaultAsking:
             return np.maximum(columns.mean, LEAST_MEAN), nearby
         outlines = columns.shapes * np.concatenate([prior.shape_sd for prior in priors])
         change = columns.mean + columns.shapes @ np.concatenate([prior.shape for prior in priors])
-        nearby += outlines @ outlines.T + self._tables.wrong**2 * float(change @ change) * self._tables.misfit
+        nearby += outlines @ outlines.T + self._tables.misfit_of(float(change @ change))
         return np.maximum(change, LEAST_MEAN), nearby
 
     def _seen(self, view: BoardView) -> Hypotheses:

@@ -122,6 +122,7 @@ class BoardFaults:
         self.maps = WireMaps(tables.pattern)
         self._table = WireTable(self.maps)
         self._columns = ContactColumns.of(tables)
+        self._predicted, self._tells = tables.predicted, tables.tells
         self._places = tables.places
         self.now = FaultState(np.zeros(tables.electrodes))
 
@@ -288,7 +289,7 @@ class BoardFaults:
                 continue  # the touches of the answer explain all of it
             if isinstance(change, ContactChange) and not _told(column, found):
                 continue
-            plainly = found.chi2 < n.MOST and found.score + cost > answer.score + n.WIRE_SURE
+            plainly = self._tells and found.chi2 < n.MOST and found.score + cost > answer.score + n.WIRE_SURE
             if not (found.holds or plainly):
                 continue
             best, sure = (change, column, asked, found), found.score + cost
@@ -349,6 +350,8 @@ class BoardFaults:
         always = np.full(len(self._places), -np.inf)
         gains = [gain_change(scan, -np.inf), gain_change(scan, gain_onset(scan))]
         found: list[ContactChange | GainChange] = [gain for gain in gains if abs(gain.log_factor) > n.GAIN_LEAST]
+        if not self._predicted:
+            return found or [gains[0]]
         found += columns.likeliest(scan, always)
         found += columns.likeliest(scan, columns.onsets(scan))
         return found

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.grid import DiscGrid
+from models.measurement.numbers import TYPICAL_DROP
 from models.measurement.touch import area_of
 from models.measurement.whitening import Whitening
 from services.estimation.faults.wires import WireFault, WireMaps, blinded
@@ -50,7 +51,7 @@ def any_touches(grid: DiscGrid) -> Array:
     """(K, K) covariance of log |Z| over touches that may be anywhere."""
     areas = np.array([area_of(log_radius) for log_radius in grid.discs[:, 2]])
     double = grid.responses.astype(float)  # a map's slopes make what rounding leaves 1000 times larger
-    weighted = double * (n.ANY_DROP * areas)[:, None]
+    weighted = double * (TYPICAL_DROP * areas)[:, None]
     return np.asarray(weighted.T @ weighted * (n.MOST_TOUCHES / len(areas)))
 
 

@@ -19,9 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.course import TouchCourse
-from models.measurement.disc import DiscResponse
 from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
-from models.measurement.grid import DiscGrid
 from models.measurement.tables import SkinTables
 from models.measurement.touch import PLACE, RATE, TouchPrior, anywhere
 from models.measurement.whitening import Whitening, leave_out
@@ -124,9 +122,8 @@ class StartLadder:
 
     def __init__(self, tables: SkinTables, y: Array, live: NDArray[np.bool_]) -> None:
         self._y, self._live = y, live
-        response = DiscResponse(tables)
-        self._grid = DiscGrid(response)
-        self._course = TouchCourse(response, np.zeros(len(y)), SPAN_S)
+        self._grid = tables.grid
+        self._course = TouchCourse(tables.response, np.zeros(len(y)), SPAN_S)
         self._misfit, self._error = tables.misfit, tables.wrong
 
     def rungs(self, base: Array, form: Array, cost: float) -> list[Rung]:

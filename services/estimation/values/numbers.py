@@ -170,7 +170,6 @@ FAR = Number(
 )
 FALLS = Number(0.03, "-", "relative fall that no touch, warmth or noise makes", "measured: as the wiring of before")
 MISFIT_MOST = Number(10.0, "-", "times FALLS, beyond which a misfit counts no more", "chosen: a third")
-ANY_DROP = Number(0.5, "-", "drop of touches of which nothing is known", "derived: half of what foam can")
 COST_WIRE = Number(-16.3, "nat", "log prior of a fault of the wires", "derived: one in 1e5 scans, 120 couples")
 COST_FAILURE = Number(-14.5, "nat", "of a measurement that fails for no reason", "derived: one in 2e6")
 COST_EXPECTED_FAILURE = Number(-3.0, "nat", "of one that a fault leaves nothing of", "derived: one in 20")
