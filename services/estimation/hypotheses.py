@@ -20,7 +20,7 @@ from models.measurement.fit import FittedScan, FoundTouches, KnownWhitening, Tou
 from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
 from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
 from models.measurement.tables import SkinTables
-from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anywhere, plain
+from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, TouchPrior, anywhere, plain
 from models.measurement.whitening import Whitening
 from services.estimation.filter import SkinFilter
 from services.estimation.values import numbers as n
@@ -309,6 +309,10 @@ class Hypotheses:
             answers.append(nothing)
             if _settled(question, answers):
                 return answers
+        if (begun := self._begun_otherwise(question, standing)) is not None:
+            answers.append(self._fitted(question, begun, everyone, n.STEPS_COLD))
+            if _settled(question, answers):
+                return answers
         if (released := self._released(question, standing, answers[0])) is not None:
             answers.append(released)
             if _settled(question, answers):
@@ -506,6 +510,33 @@ class Hypotheses:
         squares = self.grid.responses**2
         each = precision.astype(np.float32)
         return np.asarray(squares @ (each * weight.astype(np.float32)) / (squares @ each) + 1e-3)
+
+    def _begun_otherwise(self, question: Question, standing: Sequence[TouchPrior]) -> list[TouchPrior] | None:
+        """A touch that began within these values did so at another instant than the first of them told; None where
+        none did. The instant is the likeliest, whatever the action.
+        """
+        first_s = -0.5 * question.span_s
+        young = [k for k, prior in enumerate(standing) if prior.since_s > first_s and prior.until_s == np.inf]
+        if not young:
+            return None
+        course = TouchCourse(self._response, question.times_s, question.span_s)
+        priors = list(standing)
+        instants = np.sort(question.times_s)
+        for k in young:
+            everyone = np.stack([prior.start for prior in priors])
+            lasting = replace(priors[k], since_s=-np.inf)
+            steady = lasting.start.copy()
+            steady[RATE:] = 0.0
+            others = [prior for other, prior in enumerate(priors) if other != k]
+            beside = course.columns(np.delete(everyone, k, axis=0), others).mean if others else 0.0
+            own = course.columns(steady[None], [lasting]).mean
+            columns = own[:, None] * (question.times_s[:, None] >= instants)
+            seen = question.white(np.where(question.live, np.expm1(question.y) - beside, 0.0))
+            whitened = question.white(columns)
+            along = np.maximum(whitened.T @ seen, 0.0)
+            at = int((along**2 / np.maximum(np.sum(whitened**2, axis=0), 1e-12)).argmax())
+            priors[k] = replace(priors[k], since_s=float(instants[at]))
+        return priors
 
     def _released(
         self, question: Question, standing: Sequence[TouchPrior], answer: ScoredAnswer

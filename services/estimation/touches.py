@@ -194,6 +194,7 @@ class TouchTracks:
         memories = list[Memory]()
         for k, track in enumerate(self.now.tracks):
             own = slice(STATES * k, STATES * (k + 1))
+            track.since_s = at_s + fit.priors[k].since_s
             _update(track, fit.states[k], fit.covariance[own, own], at_s, span_s, whole)
             if whole:
                 _learn(track, fit, k)
