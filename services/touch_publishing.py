@@ -288,7 +288,8 @@ class TouchPublishing(Stage):
         """What to know of these contacts."""
         if any((c.force_n or 0.0) > self.law.most_n or self.law.saturates(c.pressure_pa) for c in out.contacts):
             add_reason(out.reasons, "extrapolated")
-        if any(touch.sigma[0] > self._coarse_m for touch in frame.estimates):
+        sigmas = [c.position_sigma[0] for c in out.contacts if c.position_sigma is not None]
+        if any(sigma > self._coarse_m for sigma in sigmas):
             add_reason(out.reasons, "coarse")
         for contact in out.contacts:
             if contact.id in self._drops and self.law.impossible(self._drops[contact.id], contact.force_n):
