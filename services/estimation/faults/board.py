@@ -435,13 +435,18 @@ class BoardFaults:
             return
         if whole:
             now.doubt.follow(view.middle_s, now.size, sd)
-        now.still_s = now.still_s + passed_s if abs(step) < n.CONTACT_STILL * (1 + now.size) else 0.0
-        nearest = min(abs(now.size), abs(now.size + now.settled[now.contact]))
-        now.back_scans = (now.back_scans + whole) if nearest < unsure else 0
+        now.still_s = (
+            now.still_s + passed_s if abs(step) < max(n.CONTACT_STILL * (1 + now.size), now.doubt.unsure) else 0.0
+        )
+        nearest = min(0.0, -float(now.settled[now.contact]), key=lambda size: abs(now.size - size))  # that is known
+        now.back_scans = (now.back_scans + whole) if abs(now.size - nearest) < unsure else 0
         now.variance += (n.CONTACT_WALK_CHANGED * (1 + now.size)) ** 2 * min(passed_s / SCAN_S, 1.0)
         drifts = view.middle_s < now.doubt.drifts_until_s
         settles_s = n.UNDECIDED_SETTLES_S if now.doubt.undecided else n.CONTACT_SETTLES_S
-        if now.still_s > settles_s or (now.back_scans >= n.BACK_SCANS and not drifts):
+        back = now.back_scans >= n.BACK_SCANS
+        if not drifts and (back or now.still_s > settles_s):
+            # One scan's size is off by its noise, and nothing would take that back.
+            now.size = nearest if back else now.doubt.lately(view.middle_s)
             self._settle()
 
     def _stepped(self, view: BoardView, answer: ScoredAnswer) -> float:
