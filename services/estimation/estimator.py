@@ -332,7 +332,8 @@ class Estimator:
         sound, undecided = skin.faults.sound, skin.faults.now.doubt.undecided
         if explained and measured.whole and not asked.changed:
             undecided = undecided and not skin.asking.decide(asked, at) and skin.faults.now.doubt.undecided
-        if explained and sound and not (asked.changed or gross):
+        told_apart = asked.view.contact < 0  # else the rest is off by what its size was expected to be
+        if explained and sound and told_apart and not (asked.changed or gross):
             self._learn(skin, measured, answer)
         failed = float(asked.view.failed.mean())
         judgements += advice.judgements_of(skin.faults.states(), scan.status, failed, undecided)

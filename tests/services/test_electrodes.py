@@ -120,7 +120,19 @@ def test_a_contact_that_rose_and_stays_is_not_doubted_again(skin: StubSkin, elec
     skin.rest(BACK_WITHIN + 6)
     risen = [skin.feel((), ((electrode, 1.3),)) for _ in range(80)]
     assert all(r.contact.valid and states(r) == {"drifting": [electrode]} and not present(r) for r in risen[8:])
-    assert states(skin.rest(BACK_WITHIN + 6)) == {}
+    back = [skin.feel() for _ in range(30)]
+    assert all(r.contact.valid and not present(r) and states(r) == {} for r in back[BACK_WITHIN + 2 :])
+
+
+@pytest.mark.parametrize("electrode", [0, 9])
+def test_a_contact_that_stays_as_it_rose_becomes_the_skins_own(electrode: int) -> None:
+    """After ten seconds, in which everybody could read its name; what noise makes of its size is no touch then."""
+    own, risen = StubSkin(80.0), ((electrode, 1.3),)
+    for _ in range(250):
+        own.feel((), risen)
+    settled = [own.feel((), risen) for _ in range(30)]
+    assert all(r.contact.valid and not present(r) and states(r) == {} for r in settled)
+    assert position_error_m(own.feel(PRESS, risen)) < 0.003
 
 
 def present(result: Result) -> int:

@@ -437,22 +437,25 @@ class BoardFaults:
         if whole and abs(now.size) < unsure and now.doubt.falls(now.size):  # a touch took it over, or it is well
             self.drop_contact()
             return
+        home = min(0.0, -float(now.settled[now.contact]), key=lambda size: abs(now.size - size))  # where it is well
         if whole:
-            now.doubt.follow(view.middle_s, now.size, sd)
+            now.doubt.follow(view.middle_s, now.size, sd, home)
         self._stays(passed_s)
-        nearest = min(abs(now.size), abs(now.size + now.settled[now.contact]))
-        now.back_scans = (now.back_scans + whole) if nearest < unsure else 0
+        now.back_scans = (now.back_scans + whole) if abs(now.size - home) < unsure else 0
         now.variance += (n.CONTACT_WALK_CHANGED * (1 + now.size)) ** 2 * min(passed_s / SCAN_S, 1.0)
         drifts = view.middle_s < now.doubt.drifts_until_s
         settles_s = n.UNDECIDED_SETTLES_S if now.doubt.undecided else n.CONTACT_SETTLES_S
-        if now.still_s > settles_s or (now.back_scans >= n.BACK_SCANS and not drifts):
+        back = now.back_scans >= n.BACK_SCANS
+        if not drifts and (back or now.still_s > settles_s):
+            # One scan's size is off by its noise, and nothing would take that back.
+            now.size = home if back or now.doubt.stays(home) else now.doubt.lately(view.middle_s)
             self._settle()
 
     def _stays(self, passed_s: float) -> None:
         """For how long it has been still: by its way, as steps from part to part are small however it drifts."""
         now = self.now
         now.still_s += passed_s
-        moves = n.CONTACT_STILL * (1 + now.size) + n.PACE_UNSEEN * now.still_s
+        moves = max(n.CONTACT_STILL * (1 + now.size), now.doubt.unsure) + n.PACE_UNSEEN * now.still_s
         if abs(now.size - now.still_size) > moves:
             now.still_s, now.still_size = 0.0, now.size
 

@@ -81,6 +81,10 @@ class DecidedState:
         if not self.undecided and size - self.decided > least:
             self.begin(self.decided)
 
+    def lately(self, at_s: float) -> float:
+        """Mean size of the last scans."""
+        return float(np.mean([each.size for each in self.sizes if each.at_s > at_s - n.PACE_S]))
+
     def _pace(self, lasts_s: float) -> float:
         """At which it moved on steadily for so long, longer than a touch takes to come; 0: it did not [1/s]."""
         times = np.array([each.at_s for each in self.sizes])
