@@ -429,16 +429,18 @@ class BoardFaults:
         if now.contact < 0:
             return
         self._step(view, answer)
+        home = min(0.0, -float(now.settled[now.contact]), key=lambda size: abs(now.size - size))
         if whole:
-            now.doubt.follow(view.middle_s, now.size)
+            now.doubt.follow(view.middle_s, now.size, home)
         self._stays(passed_s)
         unsure = n.CONTACT_BACK + 3 * float(np.sqrt(now.variance))
-        nearest = min(abs(now.size), abs(now.size + now.settled[now.contact]))
-        now.back_scans = (now.back_scans + whole) if nearest < unsure else 0
+        now.back_scans = (now.back_scans + whole) if abs(now.size - home) < unsure else 0
         now.variance += (n.CONTACT_WALK_CHANGED * (1 + now.size)) ** 2 * min(passed_s / SCAN_S, 1.0)
         drifts = view.middle_s < now.doubt.drifts_until_s
         settles_s = n.UNDECIDED_SETTLES_S if now.doubt.undecided else n.CONTACT_SETTLES_S
         if now.still_s > settles_s or (now.back_scans >= n.BACK_SCANS and not drifts):
+            if now.doubt.stays(home):
+                now.size = home
             self._settle()
 
     def _stays(self, passed_s: float) -> None:

@@ -47,8 +47,10 @@ class DecidedState:
         self.undecided, self.decided = False, size
         self.over, self.scans = None, 0
 
-    def follow(self, at_s: float, size: float) -> None:
-        """A contact goes on: what falls is no touch, nor what drifts on at the pace that it had."""
+    def follow(self, at_s: float, size: float, home: float) -> None:
+        """A contact goes on: what falls is no touch, nor what drifts on at the pace that it had. home: where it is
+        well, as it was at the tare or as it has become.
+        """
         self.seen += self.undecided
         passed_s = at_s - self.sizes[-1].at_s if self.sizes else 0.0
         step = size - self.sizes[-1].size if self.sizes else 0.0
@@ -66,8 +68,18 @@ class DecidedState:
             self.pace = pace
             self.drifts_until_s = at_s + n.CONTACT_SETTLES_S
             self.end(size)
+        if self.stays(home):
+            self.drifts_until_s = at_s
         if not self.undecided and size - self.decided > least:
             self.begin(self.decided)
+
+    def stays(self, home: float) -> bool:
+        """Whether it has been well for as long as the slowest pace takes to be seen: then it drifts no more."""
+        if not self.sizes or self.sizes[-1].at_s - self.sizes[0].at_s < PACES_S[-1]:
+            return False
+        sizes = np.array([each.size for each in self.sizes])
+        sd = float(sizes.std()) / np.sqrt(len(sizes))
+        return bool(abs(float(sizes.mean()) - home) < n.CONTACT_BACK + 3 * sd)
 
     def _pace(self, lasts_s: float) -> float:
         """At which it moved on steadily for so long, longer than a touch takes to come; 0: it did not [1/s]."""
