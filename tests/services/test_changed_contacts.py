@@ -1,30 +1,13 @@
-"""What a changed contact does to other pairs, as it is kept from frame to frame."""
+"""Touches beside a changed contact."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from models.bundle import Bundle
 from models.shapes import Shape
-from services.estimation.changed_contacts import ChangedContacts
 from services.pipeline import Result
 from tests.services.stub_skin import StubSkin, transfer
-
-
-def test_one_frame_alone_does_not_change_what_is_known(bundle: Bundle) -> None:
-    members = np.zeros((16, 120), dtype=bool)
-    contacts, known, other = ChangedContacts(bundle, members), np.full(120, 2e-3), np.full(120, 2e-2)
-    contacts.propose(9, known)
-    assert (contacts.felt[9] == known).all()  # nothing was known
-    contacts.propose(9, other)  # a touch begins in this frame
-    assert (contacts.felt[9] == known).all()
-    contacts.propose(9, known)
-    contacts.propose(9, 1.1 * known)  # it drifts on
-    assert (contacts.felt[9] == 1.1 * known).all()
-    contacts.load(contacts.state())
-    contacts.propose(9, known)
-    assert (contacts.felt[9] == known).all()
 
 
 @pytest.mark.parametrize("waited", range(20, 24))

@@ -111,6 +111,10 @@ def between_s(frames: list[ContactFrame], begin: float, end: float) -> list[Cont
     return [frame for frame in frames if begin <= at_s(frame) < end]
 
 
+def far_off(contact: Contact, touch: Touch) -> float:
+    return float(np.hypot(contact.on_sheet[0] - touch.x, contact.on_sheet[1] - touch.y))
+
+
 def lasting(frame: ContactFrame) -> int:
     return sum(contact.state != "end" for contact in frame.contacts)
 
@@ -201,6 +205,38 @@ def test_two_touches_are_two(parts: int) -> None:
     shown = between_s(run(press(*both), FREE_S + 1.0, parts), FREE_S + 0.35, 99)
     assert all(frame.valid and lasting(frame) == 2 for frame in shown)
     assert all(len({contact.id for contact in frame.contacts}) == 2 for frame in shown)
+
+
+@pytest.mark.parametrize("parts", [1, PARTS])
+def test_a_light_touch_that_comes_slowly_beside_a_held_one_is_told_from_its_outline(parts: int) -> None:
+    """An outline that is learnt while both press explains both."""
+    strong, light = pressed("circle", 0.0117, 0.0142, 7e-3, 2.2), pressed("circle", 0.0097, -0.0144, 10e-3, 0.5)
+    free, one, both = impedance(), impedance(strong), impedance(strong, light)
+    begins_s = FREE_S + 0.2
+    curve = between(
+        (0, free), (FREE_S, free), (FREE_S + 0.06, one), (begins_s, one), (begins_s + 0.2, both), (99, both)
+    )
+    shown = between_s(run(curve, begins_s + 1.0, parts), begins_s + 0.5, 99)
+    assert shown and all(frame.valid and lasting(frame) == 2 for frame in shown)
+    assert all(min(far_off(contact, touch) for touch in (strong, light)) < 4e-3 for contact in shown[-1].contacts)
+
+
+@pytest.mark.parametrize("parts", [1, PARTS])
+def test_three_touches_that_come_one_after_the_other_within_a_scan_are_three(parts: int) -> None:
+    """Two discs explain them roughly, the second where nothing is: they are counted again."""
+    three = (
+        pressed("circle", 0.0047, 0.0223, 8.3e-3, 2.5),
+        pressed("circle", -0.0072, -0.019, 23.1e-3, 0.86),
+        pressed("circle", -0.0279, 0.0176, 12e-3, 0.46),
+    )
+    steps = [impedance(*three[:count]) for count in range(4)]
+    ramps_s = ((0.0, 0.025), (0.025, 0.013), (0.048, 0.015))
+    points = [(0.0, steps[0])]
+    for k, (begins_s, ramp_s) in enumerate(ramps_s):
+        points += [(FREE_S + begins_s, steps[k]), (FREE_S + begins_s + ramp_s, steps[k + 1])]
+    shown = between_s(run(between(*points, (99, steps[3])), FREE_S + 0.8, parts), FREE_S + 0.4, 99)
+    assert shown and all(frame.valid and lasting(frame) == 3 for frame in shown)
+    assert all(min(far_off(contact, touch) for touch in three) < 5e-3 for contact in shown[-1].contacts)
 
 
 @pytest.mark.parametrize("parts", [1, PARTS])

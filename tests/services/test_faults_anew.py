@@ -236,6 +236,19 @@ def test_a_contact_that_drifts_under_a_touch_is_no_touch_when_that_goes(
     assert states(left[-1]) == {"drifting": [electrode]}
 
 
+def test_a_contact_that_drifts_is_named_all_the_while_and_not_long_after() -> None:
+    """It is never adopted on its way, however long that takes; and two seconds after it is well again nobody needs to
+    hear of it.
+    """
+    skin, scan_s = tared(), SCAN_NS * 1e-9
+    rises = np.arange(0.0, 1.3, 0.1 * scan_s)
+    felt = [skin.feel((), ((9, 1 + float(size)),)) for size in rises]
+    assert all(states(each) == {"drifting": [9]} for each in felt[len(rises) // 8 :])
+    well = [skin.feel() for _ in range(round(3.0 / scan_s))]
+    assert all(each.valid and not each.touches for each in [*felt[len(rises) // 8 :], *well[2:]])
+    assert states(well[3]) and not states(well[-1])
+
+
 @pytest.mark.parametrize("seed", [1, 9])
 def test_a_second_disc_that_may_be_none_is_not_shown(seed: int) -> None:
     """A broad L is better explained by two discs, the second of which is as large as its own uncertainty."""

@@ -58,8 +58,10 @@ class DecidedState:
         known = abs(self.decided) > n.CONTACT_STILL or not self.sizes
         return self.undecided and not known and self.sizes[-1].size - size > n.CONTACT_STILL
 
-    def follow(self, at_s: float, size: float, sd: float) -> None:
-        """A contact goes on: what falls is no touch, nor what drifts on at the pace that it had. sd: of this size."""
+    def follow(self, at_s: float, size: float, sd: float, home: float) -> None:
+        """A contact goes on: what falls is no touch, nor what drifts on at the pace that it had. sd: of this size;
+        home: where it is well, as it was at the tare or as it has become.
+        """
         self.unsure = float(np.sqrt(n.FALSE_ALARM_Z2)) * sd
         self.seen += self.undecided
         passed_s = at_s - self.sizes[-1].at_s if self.sizes else 0.0
@@ -78,12 +80,22 @@ class DecidedState:
             self.pace = pace
             self.drifts_until_s = at_s + n.CONTACT_SETTLES_S
             self.end(size)
+        if self.stays(home):
+            self.drifts_until_s = at_s
         if not self.undecided and size - self.decided > least:
             self.begin(self.decided)
 
     def lately(self, at_s: float) -> float:
         """Mean size of the last scans."""
         return float(np.mean([each.size for each in self.sizes if each.at_s > at_s - n.PACE_S]))
+
+    def stays(self, home: float) -> bool:
+        """Whether it has been well for as long as the slowest pace takes to be seen: then it drifts no more."""
+        if not self.sizes or self.sizes[-1].at_s - self.sizes[0].at_s < PACES_S[-1]:
+            return False
+        sizes = np.array([each.size for each in self.sizes])
+        sd = float(sizes.std()) / np.sqrt(len(sizes))
+        return bool(abs(float(sizes.mean()) - home) < n.CONTACT_BACK + 3 * sd)
 
     def _pace(self, lasts_s: float) -> float:
         """At which it moved on steadily for so long, longer than a touch takes to come; 0: it did not [1/s]."""
