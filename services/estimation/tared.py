@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from models.measurement.disc import DiscResponse
 from models.measurement.noise import NoiseModel, NoiseState
 from models.measurement.tables import SkinTables
+from models.measurement.whitening import leave_out
 from services.estimation.faults.asking import FaultAsking
 from services.estimation.faults.board import BoardFaults, FaultState
 from services.estimation.faults.table import any_touches
 from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, SkinFilter
+from services.estimation.first.start import EarlierBaseline
 from services.estimation.first.tare import AgreedScans
 from services.estimation.held_look import HeldLook
 from services.estimation.hypotheses import Hypotheses
@@ -25,6 +27,25 @@ from services.estimation.touches import TouchesState, TouchTracks
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
+
+
+class KnownBaseline(NamedTuple):
+    """Of this skin, taken earlier."""
+
+    log_z0: Annotated[Array, "K"]
+    live: Annotated[NDArray[np.bool_], "K"]
+    scatter: Annotated[Array, "K"]  # of log |Z| from scan to scan
+    frames: int
+    doubt: str = ""  # why the skin may have been touched, for a person
+
+    def after_long(self, tables: SkinTables) -> EarlierBaseline:
+        """For the first scans, when nobody knows how far the skin has drifted; tables: of its bundle."""
+        drift = SkinFilter(tables.relative_to(np.exp(self.log_z0)))
+        drift.begin(0.0, np.full(tables.electrodes, n.START_CONTACT**2))
+        covariance = drift.ahead(float(n.OLDEST_S), np.zeros(tables.electrodes)).covariance
+        covariance[np.diag_indices_from(covariance)] += self.scatter**2 / self.frames
+        leave_out(covariance, self.live)
+        return EarlierBaseline(self.log_z0, covariance)
 
 
 @dataclass
@@ -70,10 +91,12 @@ class TaredSkin:
         self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / self.frames)
         self.touches.now.next_id = next_id
 
-    def adopt(self, next_id: int) -> None:
-        """The baseline was taken earlier, and nobody watched since."""
+    def adopt(self, next_id: int, contact: float) -> None:
+        """The baseline was taken earlier, and nobody watched since. contact: by how much contact impedances may be
+        otherwise, beside their walk.
+        """
         self.noise.now.white = float(np.median(self.scatter[self.live] ** 2))
-        self.drift.begin(0.0, np.full(self.tables.electrodes, n.CONTACT_START**2))
+        self.drift.begin(0.0, np.full(self.tables.electrodes, contact**2))
         self.drift.now.remainder_variance += self.scatter**2 / self.frames
         self.touches.now.next_id, self.touches.now.watched = next_id, False
 

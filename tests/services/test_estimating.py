@@ -8,7 +8,7 @@ import pytest
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, RawFrame
 from services.estimating import Estimating
-from services.pipeline import Pipeline, build_anew
+from services.pipeline import Pipeline
 from services.runtime.config import Skin
 from services.runtime.stage import Refused
 from tests.services.test_estimator import FREE_S, PARTS, SCAN_S, Board, press, pressed
@@ -19,7 +19,7 @@ BOTH = pytest.mark.parametrize("parts", [1, PARTS], ids=["whole", "parts"])
 
 
 def pipeline() -> Pipeline:
-    return Pipeline(SKIN, "palm", Bundle.load("square16"), build=build_anew)
+    return Pipeline(SKIN, "palm", Bundle.load("square16"))
 
 
 def raws(seconds: float, parts: int = 1, **pressed_so: float) -> list[RawFrame]:

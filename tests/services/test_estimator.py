@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from bench.trust.anew import Anew
 
+from bench.trust.candidate import Today
 from firmware_stub import scene as scenes
 from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World, pressed
@@ -92,12 +92,12 @@ class Board:
 
 def run(curve: Curve, seconds: float, parts: int = 1, seed: int = 1, tare_s: float = 0.0) -> list[ContactFrame]:
     """All contact frames; times are their stamps."""
-    candidate = Anew(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle())
+    candidate = Today(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle())
     made = [candidate.step(raw) for raw in Board(curve, parts, seed).frames(seconds)]
     return [frame for frame in made if frame is not None]
 
 
-def estimator_of(candidate: Anew) -> Estimator:
+def estimator_of(candidate: Today) -> Estimator:
     stage = candidate.stages.pre
     assert isinstance(stage, Estimating)
     return stage.estimator
@@ -299,7 +299,7 @@ def test_without_a_baseline_nothing_is_valid() -> None:
 
 def test_measurements_that_the_board_marks_are_left_out() -> None:
     touch = pressed("circle", 0.012, -0.018, 9e-3, 2.0)
-    candidate = Anew(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle())
+    candidate = Today(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle())
     shown = []
     for raw in Board(press(touch), 1, 1).frames(FREE_S + 1.0):
         if raw.stamps["sample"] > FREE_S * 1e9:
@@ -318,7 +318,7 @@ def test_other_tables_of_the_same_skin_change_nothing_of_what_is_expected_untouc
     touch = pressed("circle", 0.01, -0.01, 0.01, 2.0)
     warm, full = impedance(background=1.002), impedance(touch, background=1.002)
     curve = between((0, impedance()), (FREE_S, impedance()), (warm_s, warm), (until_s, warm), (until_s + 0.1, full))
-    candidate = Anew(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle())
+    candidate = Today(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle())
     tables = tables_of(bundle())
     row = np.exp(0.02 * np.random.default_rng(3).standard_normal(120))
     frames = []

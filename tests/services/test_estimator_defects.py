@@ -50,9 +50,6 @@ def test_a_contact_impedance_that_rises_within_a_scan_is_named_in_parts() -> Non
     assert len(named) >= len(begins) - 1
 
 
-@pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="electrodes.py: a quiet frame returns before the doubts are reset"
-)
 def test_suspicious_scans_seconds_apart_are_not_in_a_row() -> None:
     """A contact that is 8 % off for one scan, three times: the third time says no more than the first."""
     samples = [t for t, _ in frames(scene(15.0), "full")]

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from bench.trust.anew import Anew
 
+from bench.trust.candidate import Today
 from firmware_stub.world import Touch, World, pressed
 from models.measurement.fit import FoundTouches, TouchFitter
 from models.measurement.whitening import Whitening
@@ -55,7 +55,7 @@ def costs(
     curve: Curve, seconds: float, patch: pytest.MonkeyPatch, dead: tuple[int, ...] = ()
 ) -> list[tuple[float, int, int]]:
     """When, steps and factors of each part."""
-    candidate, made = Anew(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle()), []
+    candidate, made = Today(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle()), []
     for raw in Board(curve, PARTS, 1).frames(seconds):
         raw.status[list(dead)] = 1
         with counted(patch) as found:
@@ -111,7 +111,7 @@ def test_a_contact_that_changed_under_a_touch_hides_nothing_when_that_goes() -> 
 
 @pytest.mark.parametrize("parts", [1, PARTS])
 def test_measurements_that_the_baseline_lacks_are_no_fault_of_the_wires(parts: int) -> None:
-    candidate = Anew(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle())
+    candidate = Today(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle())
     made = []
     for raw in Board(press(TOUCH), parts, 1).frames(FREE_S + 0.6):
         raw.status[[3, 40]] = 1
