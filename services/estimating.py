@@ -99,6 +99,8 @@ class Estimating(Stage):
 
     def _sigma(self, baseline: Baseline) -> Array:
         """(K,) of the difference, one scan."""
+        if baseline.taken_by == "file" and self.references.noise is not None:
+            return self.references.sigma(baseline, self.pre)
         return np.asarray(baseline.sigma / self.pre.normaliser(baseline.z0))
 
     # --- one scan, or the newest values after a part of one ---
@@ -213,7 +215,6 @@ class Estimating(Stage):
             self._problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"
             return _unusable(out, "stale_baseline", len(self.bundle.pattern))
         self.set_baseline(found)
-        self._reconstruction.begin(self.references.sigma(found, self.pre), found.frames)
         out.difference = np.zeros(len(amplitude), np.float32)
         out.sigma = self._reconstruction.sigma.astype(np.float32)
         return out
@@ -386,7 +387,7 @@ class Estimating(Stage):
             "baseline": baseline.to_dict() if baseline else None,
             "references": self.references.state(),
             "parts": [*self._part, self._delta],
-            "source": [self._source, self._board],
+            "board": self._board,
             "last_sample_ns": self._sample_ns,
             **self.linearisation.state(),
         }
@@ -416,15 +417,15 @@ class Estimating(Stage):
                 self.set_baseline(baseline)
             return
         self.estimator.load(state["estimator"])
+        self.references.load(state["references"])
         self._use(baseline)
         self._before = self.estimator.now.before
         self._reconstruction.load(state["hold"])
         self.continuity.load(state["continuity"])
-        self.references.load(state["references"])
         self._touched, self._told_ns = bool(state["touched"]), int(state["told_ns"])
         seen, handed, self._delta = (int(each) for each in state["parts"])
         self._part = (seen, handed)
-        self._source, self._board = (str(each) for each in state["source"])
+        self._board = str(state["board"])  # whether frames are a recording's, the next one says
 
     # --- beside frames ---
 
