@@ -19,13 +19,14 @@ from protocol.frames import DeltaFrame, EstimatedTouch, Frame, PartFrame, RawFra
 from services.contacts.lasting import LASTS_NS
 from services.describe import BaselineNews, FrameRate, describe, force, refinement, symmetry
 from services.estimation import checks
-from services.estimation.baseline import TAKING, Baseline, NoBaseline
+from services.estimation.baseline import TAKING, Baseline, NoBaseline, plausible_noise
 from services.estimation.by_bundle import skin_tables
-from services.estimation.estimator import Estimator, KnownBaseline
+from services.estimation.estimator import Estimator
 from services.estimation.faults.advice import sentences
 from services.estimation.first.tare import TareRefused
 from services.estimation.reconstruct import Reconstruction
 from services.estimation.references import References
+from services.estimation.tared import KnownBaseline
 from services.estimation.touch_decision import sigma_of_mean
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, TouchEstimate
@@ -59,8 +60,9 @@ class Estimating(Stage):
         self._unchecked = checks.sentence(bundle)
         self._force, self._symmetry = force(skin, bundle), symmetry(skin, bundle)
         self.always_reconstruct = False  # offline: an image of every scan, touched or not
-        self.frame_rate, self.continuity, self._news = FrameRate(), Continuity(), BaselineNews()
+        self.frame_rate, self._news = FrameRate(), BaselineNews()
         self._build()
+        self._told_hash = ""  # of the baseline that info told last
         self.reset()
 
     def _build(self) -> None:
@@ -72,7 +74,7 @@ class Estimating(Stage):
 
     def reset(self) -> None:
         self.estimator = Estimator(skin_tables(self.bundle))
-        self.continuity.forget()
+        self.continuity = Continuity()
         self.references = References(len(self.bundle.pattern))
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
         self._foreign = self._problem = self._source = self._board = ""
@@ -85,6 +87,7 @@ class Estimating(Stage):
         self._sample_ns, self._since_saved = 0, 0
         self._gain_steps = 0  # of this baseline, that were counted
         self._undated_s = 0.0  # age of a baseline that an earlier process took, until the first scan
+        self._trusted: Baseline | None = None  # too old to be used: the first scans are held against it
         self._use(None)
 
     def _use(self, baseline: Baseline | None) -> None:
@@ -96,6 +99,8 @@ class Estimating(Stage):
 
     def _sigma(self, baseline: Baseline) -> Array:
         """(K,) of the difference, one scan."""
+        if baseline.taken_by == "file" and self.references.noise is not None:
+            return self.references.sigma(baseline, self.pre)
         return np.asarray(baseline.sigma / self.pre.normaliser(baseline.z0))
 
     # --- one scan, or the newest values after a part of one ---
@@ -106,9 +111,9 @@ class Estimating(Stage):
         self._counters["frames"] += 1
         self.frame_rate(frame)
         out.valid, out.reasons = as_sent(frame)
-        self._part = (frame.scan, self._part[1])
         if frame.kind == "sentinel":  # of a recording made by an earlier version: no contacts are made of it
             return [_unusable(out, "coarse", len(self.bundle.pattern))]
+        self._part = (frame.scan, self._part[1])
         if self.continuity.broken(frame, frame.parts):
             add_reason(out.reasons, "gap")
         if len(frame.z) != len(self.bundle.pattern):
@@ -162,6 +167,8 @@ class Estimating(Stage):
         self._tells(out, estimate)
         out.score, out.threshold = touch.statistic, touch.expected
         self._counters["touched"] += out.touched
+        if not estimate.scan.believed:
+            self._reconstruction.rest()  # a mean of the same scan again and again is no surer
         live = estimate.live & np.isfinite(self._reconstruction.sigma)
         z0 = baseline.z0 * np.exp(self._shift(estimate.scan))
         d = np.where(live, z0 * np.expm1(estimate.difference) / self.pre.normaliser(z0), 0.0)
@@ -209,7 +216,6 @@ class Estimating(Stage):
             return _unusable(out, "stale_baseline", len(self.bundle.pattern))
         self.set_baseline(found)
         self.estimator.saw_untouched()
-        self._reconstruction.begin(self.references.sigma(found, self.pre), found.frames)
         out.difference = np.zeros(len(amplitude), np.float32)
         out.sigma = self._reconstruction.sigma.astype(np.float32)
         return out
@@ -223,7 +229,7 @@ class Estimating(Stage):
         return True
 
     def _forget_baseline(self) -> None:
-        self.estimator = Estimator(skin_tables(self.bundle))
+        self.estimator, self._trusted = Estimator(skin_tables(self.bundle)), None
         self._use(None)
 
     # --- the baseline ---
@@ -231,6 +237,8 @@ class Estimating(Stage):
     def _follow(self, frame: RawFrame) -> None:
         """A baseline belongs to one board, and a recording's frames never meet the live board's baseline."""
         replayed = frame.source == "replay"
+        if self._trusted is not None and (replayed or self._trusted.board != frame.board):
+            self._trust(None)
         if self._source and (self._source == "replay") != replayed:
             self.reset()
         elif self.baseline is not None and not replayed and self.baseline.board != frame.board:
@@ -248,8 +256,10 @@ class Estimating(Stage):
     def _look_at_baseline(self) -> None:
         """Whether the estimator has taken another one."""
         if self.estimator.skin is not self._of:
-            self._use(self._taken("start"))
-            self._keep = True
+            known = self._trusted if self.estimator.now.adopted_age_s is not None else None
+            self._undated_s = 0.0 if known is None else self._undated_s
+            self._use(self._taken("start") if known is None else replace(known, restored=True))
+            self._trusted, self._keep = None, True
         problem = self.estimator.taring.now.problem
         if problem or self.estimator.skin is not None:
             self._problem = problem
@@ -289,6 +299,7 @@ class Estimating(Stage):
             self.estimator.tare(bool(args.get("force", False)))
         except TareRefused as why:
             raise Refused(str(why)) from None
+        self._trusted, self._undated_s = None, 0.0
         self._use(self._taken("command"))
         assert self.baseline is not None
         self._keep = True
@@ -302,12 +313,20 @@ class Estimating(Stage):
 
     def set_baseline(self, baseline: Baseline, age_s: float = 0.0) -> None:
         """Use this baseline, which is age_s older than the next scan, from that scan on."""
+        baseline = replace(baseline, sigma=plausible_noise(baseline.z0, baseline.sigma))
+        self.estimator.adopt(self._known(baseline), age_s, self.config.tare.contact_per_s)
+        self._use(baseline)
+
+    def _trust(self, baseline: Baseline | None) -> None:
+        self._trusted = baseline
+        self.estimator.trust(None if baseline is None else self._known(baseline))
+
+    def _known(self, baseline: Baseline) -> KnownBaseline:
+        """The baseline in the estimator's words."""
         live = np.isfinite(baseline.sigma) & (baseline.z0 > 0)
         z0 = np.where(live, baseline.z0, self.pre.m.z0)
         scatter = np.where(live, baseline.sigma / z0, 0.0)
-        known = KnownBaseline(np.log(z0), live, scatter, baseline.frames)
-        self.estimator.adopt(known, age_s, self.config.tare.contact_per_s)
-        self._use(baseline)
+        return KnownBaseline(np.log(z0), live, scatter, baseline.frames, baseline.doubt)
 
     def between_frames(self) -> None:
         """A calibration that is ready is adopted while nothing touches."""
@@ -346,11 +365,14 @@ class Estimating(Stage):
             raise Refused("the saved baseline is of another bundle")
         baseline = Baseline.from_dict(saved.get("baseline", {}), len(self.bundle.pattern))
         oldest_s = self.config.tare.max_age_s
-        if age_s > oldest_s:
-            raise Refused(
-                f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest_s / 3600:.1f} h: another is taken"
-            )
         taken_s, quiet_s = ages(saved)
+        if age_s > oldest_s:
+            self._trust(None if baseline.doubt else baseline)
+            self._undated_s = age_s + taken_s
+            raise Refused(
+                f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest_s / 3600:.1f} h: another is taken, "
+                "and held against it"
+            )
         self.set_baseline(replace(baseline, restored=True), age_s + quiet_s)
         self._undated_s = age_s + taken_s
 
@@ -366,24 +388,27 @@ class Estimating(Stage):
             "baseline": baseline.to_dict() if baseline else None,
             "references": self.references.state(),
             "parts": [*self._part, self._delta],
-            "source": [self._source, self._board],
+            "board": self._board,
             "last_sample_ns": self._sample_ns,
             **self.linearisation.state(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
+        before, mounted = vars(self).copy(), self.linearisation.mounted
         try:
             self._load(state)
-        except NoBaseline as why:
-            raise Refused(str(why)) from None
-        except (KeyError, TypeError, ValueError) as wrong:
+        except (AttributeError, KeyError, TypeError, ValueError) as wrong:
+            vars(self).update(before)  # `_load` makes all that it changes anew
+            self.linearisation.mounted = mounted
+            if isinstance(wrong, NoBaseline):
+                raise Refused(str(wrong)) from None
             raise Refused(f"the saved state does not fit ({wrong}): reset") from None
 
     def _load(self, state: dict[str, Any]) -> None:
         """A state of an earlier version gives its baseline, and what was touched is looked for anew."""
         if self.linearisation.load(state):
-            self._build()
             self._news = BaselineNews()
+        self._build()
         self.reset()
         kept, k = state["baseline"], len(self.bundle.pattern)
         baseline = None if kept is None else Baseline.from_dict(kept, k)
@@ -393,15 +418,15 @@ class Estimating(Stage):
                 self.set_baseline(baseline)
             return
         self.estimator.load(state["estimator"])
+        self.references.load(state["references"])
         self._use(baseline)
         self._before = self.estimator.now.before
         self._reconstruction.load(state["hold"])
         self.continuity.load(state["continuity"])
-        self.references.load(state["references"])
         self._touched, self._told_ns = bool(state["touched"]), int(state["told_ns"])
         seen, handed, self._delta = (int(each) for each in state["parts"])
         self._part = (seen, handed)
-        self._source, self._board = (str(each) for each in state["source"])
+        self._board = str(state["board"])  # whether frames are a recording's, the next one says
 
     # --- beside frames ---
 
@@ -416,6 +441,8 @@ class Estimating(Stage):
         baseline, rate_hz = self._by_now(), self.frame_rate.found
         if not self._news(baseline, self._sample_ns, rate_hz):
             return None
+        if baseline is not None and baseline.hash != self._told_hash:
+            self.revision, self._told_hash = self.revision + 1, baseline.hash
         said = describe(self.config, self.bundle, self._force, baseline, self.revision, rate_hz)
         said["refinement"] = refinement(self.config, self.bundle, bool(self.linearisation.name))
         said["symmetry"] = self._symmetry

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,14 @@ from services.estimation.faults.board import BoardView
 from services.estimation.faults.gap import judged_by_itself
 from services.estimation.faults.wires import WireFault
 from services.estimation.filter import Memory, Prediction
-from services.estimation.first.tare import AgreedScans, LatestScansState, TareRefused, Taring, TaringState
+from services.estimation.first.tare import (
+    AgreedScans,
+    BaselineTells,
+    LatestScansState,
+    TareRefused,
+    Taring,
+    TaringState,
+)
 from services.estimation.hypotheses import (
     AS_IT_IS,
     BURST,
@@ -34,7 +41,7 @@ from services.estimation.hypotheses import (
 )
 from services.estimation.learning import Waiting
 from services.estimation.quick_look import Seen
-from services.estimation.tared import TaredSkin, TaredState
+from services.estimation.tared import KnownBaseline, TaredSkin, TaredState
 from services.estimation.touches import TouchTracks, estimate_of, roughly
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, TouchEstimate
@@ -44,7 +51,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 7  # of a kept state
+LAYOUT = 8  # of a kept state
 
 
 @dataclass(frozen=True)
@@ -109,15 +116,7 @@ class EstimatorState:
     candidates: Annotated[Array, "C", "states"] = field(default_factory=lambda: np.zeros((0, STATES)))
     said: tuple[TouchEstimate, ...] = ()
     adopted_age_s: float | None = None  # of a baseline that was adopted, before the next scan
-
-
-class KnownBaseline(NamedTuple):
-    """Of this skin, taken earlier."""
-
-    log_z0: Array  # (K,)
-    live: NDArray[np.bool_]  # (K,)
-    scatter: Array  # (K,) of log |Z| from scan to scan
-    frames: int
+    trusted: KnownBaseline | None = None  # too old to go on from: it tells what touches the first scans
 
 
 @dataclass
@@ -145,9 +144,16 @@ class Estimator:
         """
         if not force and self.skin is not None and self.skin.faults.now.wire is not None:
             raise TareRefused("wires of the board are wrong, expected all as they belong: mend them and try again")
-        scans = self.taring.by_command(force)
+        scans = self.taring.by_command(force, self._tells)
         self._begin(scans)
         return scans
+
+    @property
+    def _tells(self) -> BaselineTells:
+        """What the baseline's word is worth."""
+        if self.skin is None:
+            return BaselineTells.NOTHING
+        return BaselineTells.LOST if self.now.unexplained_s > n.LOST_S else BaselineTells.TOUCHES
 
     @property
     def touched(self) -> bool:
@@ -171,17 +177,39 @@ class Estimator:
         """Go on from a baseline that is age_s older than the next scan; nobody watched meanwhile. contact_per_s: by
         which contact impedances of this skin change.
         """
+        self._adopt(baseline, age_s, min(contact_per_s * max(age_s, 0.0), n.START_CONTACT))
+
+    def trust(self, baseline: KnownBaseline | None) -> None:
+        """What the first scans are held against, too old to go on from; None: their bundle alone."""
+        self.now.trusted = baseline
+
+    def _adopt(self, baseline: KnownBaseline, age_s: float, contact_sd: float) -> None:
+        """contact_sd: relative, by which contact impedances may be otherwise, beside their walk."""
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
         self.skin = TaredSkin(self._tables, baseline.log_z0, baseline.live, baseline.scatter, baseline.frames)
-        self.skin.adopt(next_id, min(contact_per_s * max(age_s, 0.0), n.START_CONTACT))
+        self.skin.adopt(next_id, contact_sd)
         self.now = EstimatorState(adopted_age_s=min(max(age_s, 0.0), n.OLDEST_S))
-        self.taring.adopted()
+        self.taring.adopted(baseline.doubt)
 
     def _begin(self, scans: AgreedScans) -> None:
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
         self.skin = TaredSkin(self._tables, scans.log_z0, scans.live, scans.scatter, len(scans.residuals))
         self.skin.begin(scans, next_id)
         self.now.information, self.now.wholes, self.now.unexplained_s = None, 0, 0.0
+        self.now.trusted = None
+
+    def _first(self) -> None:
+        """Begin as soon as the first scans tell an untouched skin, or what touches one that is known."""
+        if not self.taring.latest.due:
+            return
+        trusted = self.now.trusted
+        scans = self.taring.first(None if trusted is None else trusted.after_long(self._tables))
+        if scans is not None:
+            self._begin(scans)
+        elif trusted is not None and self.taring.now.surely:
+            latest = self.taring.latest.agreed(self._tables)
+            trusted = trusted._replace(live=trusted.live & latest.live, scatter=latest.scatter)
+            self._adopt(trusted, float(n.OLDEST_S), float(n.START_CONTACT))
 
     def state(self) -> dict[str, Any]:
         """All that changes, to be kept; who loads it goes on bit by bit as this one does."""
@@ -231,12 +259,12 @@ class Estimator:
             self.skin.drift.now.at_s = measured.middle_s - now.adopted_age_s
             now.adopted_age_s = None
         if self.skin is None:
-            if (scans := self.taring.first()) is not None:
-                self._begin(scans)
+            self._first()
             return self._unknown(measured, judgements)
         if not 0 <= gap_s <= n.GAP_S:
             self.skin.touches.lose()
-            self.skin.learning.doubt()
+        if gap_s < 0:
+            self.skin.learning.doubt()  # else it was no touch that had begun, if nothing touches now
         seen = self._glanced(self.skin, measured)
         if seen is not None:
             return self._quiet(self.skin, measured, seen, judgements)

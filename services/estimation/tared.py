@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.noise import NoiseModel, NoiseState
 from models.measurement.tables import SkinTables
+from models.measurement.whitening import leave_out
 from services.estimation.faults.asking import FaultAsking
 from services.estimation.faults.board import BoardFaults, FaultState
 from services.estimation.faults.table import any_touches
 from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, SkinFilter
+from services.estimation.first.start import EarlierBaseline
 from services.estimation.first.tare import AgreedScans
 from services.estimation.held_look import HeldLook
 from services.estimation.hypotheses import Hypotheses
@@ -24,6 +26,25 @@ from services.estimation.touches import TouchesState, TouchTracks
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
+
+
+class KnownBaseline(NamedTuple):
+    """Of this skin, taken earlier."""
+
+    log_z0: Annotated[Array, "K"]
+    live: Annotated[NDArray[np.bool_], "K"]
+    scatter: Annotated[Array, "K"]  # of log |Z| from scan to scan
+    frames: int
+    doubt: str = ""  # why the skin may have been touched, for a person
+
+    def after_long(self, tables: SkinTables) -> EarlierBaseline:
+        """For the first scans, when nobody knows how far the skin has drifted; tables: of its bundle."""
+        drift = SkinFilter(tables.relative_to(np.exp(self.log_z0)))
+        drift.begin(0.0, np.full(tables.electrodes, n.START_CONTACT**2))
+        covariance = drift.ahead(float(n.OLDEST_S), np.zeros(tables.electrodes)).covariance
+        covariance[np.diag_indices_from(covariance)] += self.scatter**2 / self.frames
+        leave_out(covariance, self.live)
+        return EarlierBaseline(self.log_z0, covariance)
 
 
 @dataclass

@@ -5,6 +5,7 @@ nothing touches. The first is taken as soon as that holds, others by the command
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 from statistics import NormalDist
 from typing import Annotated, NamedTuple
 
@@ -32,6 +33,14 @@ PRESSED = "something touches the skin, and has since the start: free it; if noth
 
 class TareRefused(EitskinError, ValueError):
     """The latest scans make no baseline. The text says why and what to do; with ": wait" in it, time alone helps."""
+
+
+class BaselineTells(Enum):
+    """What a baseline's word is worth to a command: TOUCHES is believed, LOST explains the skin no more."""
+
+    NOTHING = "nothing"
+    TOUCHES = "touches"
+    LOST = "lost"
 
 
 class AgreedScans(NamedTuple):
@@ -211,9 +220,11 @@ class Taring:
             return
         self.latest.add(np.log(np.where(live, scan.values, np.nan)), middle_s, scan.part)
 
-    def adopted(self) -> None:
+    def adopted(self, doubt: str = "") -> None:
         """A baseline of before is used."""
-        self.now, self.latest = TaringState(), LatestScans()
+        self.now, self.latest = TaringState(doubted=bool(doubt), problem=doubt), LatestScans()
+        if doubt:
+            self.now.judgements = (judge("baseline", 1.0, 1.0),)
 
     def saw(self, touched: bool) -> None:
         """Whether something touched in the latest whole scan."""
@@ -230,9 +241,7 @@ class Taring:
         except TareRefused as why:
             self.now.problem = f"no baseline yet: {why}"
             return None
-        size = len(scans.residuals)
-        variance = (scans.residuals**2).mean(axis=0) / size
-        start = self._start(scans.log_z0, variance, scans.live, earlier)
+        start = self._judged(scans, earlier)
         self.now.judgements = (*scans.judgements, *start.judgements)
         self.now.surely = start.sure
         if start.says is StartSays.TOUCHED:
@@ -241,18 +250,25 @@ class Taring:
         self._taken(scans, start)
         return scans
 
-    def by_command(self, force: bool) -> AgreedScans:
+    def _judged(self, scans: AgreedScans, earlier: EarlierBaseline | None) -> JudgedStart:
+        variance = (scans.residuals**2).mean(axis=0) / len(scans.residuals)
+        return self._start(scans.log_z0, variance, scans.live, earlier)
+
+    def by_command(self, force: bool, tells: BaselineTells) -> AgreedScans:
         """The latest scans, whatever the baseline was. Raises TareRefused, while something touches unless forced."""
         now, needed = self.now, int(n.TARE_SCANS)
         if now.surely and not force:
             raise TareRefused(PRESSED.format(" --force"))
-        if now.judgements and not (now.doubted or force) and len(self.latest) == needed:
+        believed = tells is BaselineTells.TOUCHES and not now.doubted
+        if believed and not force and len(self.latest) == needed:
             if now.touched:
                 raise TareRefused("the skin is touched: free it and try again (or --force, if nothing touches it)")
             if now.untouched < needed:
                 few = f"only {now.untouched} of {needed} untouched frames since the last touch"
                 raise TareRefused(f"{few}: wait and try again")
         scans = self.latest.agreed(self._tables)
+        if tells is BaselineTells.LOST and not force and self._judged(scans, None).sure:
+            raise TareRefused(PRESSED.format(" --force"))
         # Whoever gives the command has looked: no doubt, but that of noise, which looking does not mend.
         now.judgements = tuple(each for each in scans.judgements if each.name != "identical")
         self._taken(scans, None)

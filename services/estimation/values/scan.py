@@ -61,7 +61,7 @@ class Scan:
             ages_s = duration_s * (1 - (np.arange(count) + 0.5) / max(count, 1))
         end_us = frame.device_us + 1e6 * newest_s
         sample_ns = frame.stamps.get("sample", 0)
-        valid, _ = as_sent(frame)
+        valid, reasons = as_sent(frame)  # measurements that failed are left out
         follows = before is not None and before.board == frame.board and end_us > before.end_us
         new = end_us - 1e6 * ages_s > before.end_us if before is not None and follows else np.ones(count, bool)
         return cls(
@@ -80,7 +80,7 @@ class Scan:
             separate="separate" in frame.reasons,
             reference=frame.kind == "reference",
             believed=valid,
-            reasons=tuple(frame.reasons),
+            reasons=tuple(reasons),
         )
 
 
