@@ -519,7 +519,7 @@ class Hypotheses:
         young = [k for k, prior in enumerate(standing) if prior.since_s > first_s and prior.until_s == np.inf]
         if not young:
             return None
-        course = TouchCourse(self._response, question.times_s, question.span_s)
+        course = TouchCourse(self._tables.response, question.times_s, question.span_s)
         priors = list(standing)
         instants = np.sort(question.times_s)
         for k in young:

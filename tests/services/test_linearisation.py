@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from services.estimation.evidence import evidence_of
 
 from models import geometry, metrics
 from models.bundle import Bundle
@@ -27,6 +26,7 @@ from services.contacts.force import ForceLaw
 from services.contacts.force_curve import Curve
 from services.estimating import Estimating
 from services.estimation.baseline import Baseline
+from services.estimation.by_bundle import skin_tables
 from services.linearisation import Linearisation
 from services.pipeline import Pipeline, Result
 from services.runtime.config import Skin, TareConfig
@@ -244,11 +244,11 @@ def test_a_calibration_that_arrives_late_is_used(sheet: MismatchedSheet, bundle:
 
 def test_what_is_made_of_a_calibrated_bundle_goes_with_it(bundle: Bundle) -> None:
     """Each tare that calibrates makes a bundle with a hash of its own."""
-    held = evidence_of(bundle)
-    made = [weakref.ref(evidence_of(replaced(bundle, hash=f"{k:064x}"))) for k in range(7)]
+    held = skin_tables(bundle)
+    made = [weakref.ref(skin_tables(replaced(bundle, hash=f"{k:064x}"))) for k in range(7)]
     gc.collect()
     assert sum(each() is not None for each in made) <= 4
-    assert evidence_of(bundle) is held  # who uses it shares it, however many came since
+    assert skin_tables(bundle) is held  # who uses it shares it, however many came since
 
 
 def _raw(bench: Bench) -> RawFrame:

@@ -12,7 +12,7 @@ from models.bundle import Bundle
 from protocol.frames import Contact, RawFrame
 from services.calibration.fields import half_width, sample, sensitivities
 from services.calibration.register_command import register_presses
-from services.pipeline import Pipeline, Result, build_anew
+from services.pipeline import Pipeline, Result
 from services.runtime.config import Skin
 
 SCAN_NS = 45_000_000
@@ -51,7 +51,7 @@ class Felt:
 
     def __init__(self, skin: MeasuredSkin, bundle: Path | str) -> None:
         config = Skin(port="stub", bundle=str(bundle), frame_id="skin")
-        self.skin, self.pipeline, self.scan, self.gain = skin, Pipeline(config, build=build_anew), 0, 1.0
+        self.skin, self.pipeline, self.scan, self.gain = skin, Pipeline(config), 0, 1.0
         self.feel(0.0, 70)
         self.pipeline.pre.command("tare", {})  # no model says whether something touched at the start
         assert not touching(self.feel(0.0, 5)[-1])

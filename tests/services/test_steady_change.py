@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from services.estimation.contact_drift import Reference
-from services.estimation.steady_change import STEPS, WINDOW_S, PastFrames
 
 from models.shapes import Shape
 from services.pipeline import Result
@@ -100,30 +98,3 @@ def test_what_is_kept_goes_on_where_it_was(skin: StubSkin) -> None:
     assert ours.electrodes[4] != 0
     skin.pipeline.reset()
     skin.rest(72)
-
-
-FORM = np.array([[1.0], [1.0], [0.0], [0.0]])
-UNTOUCHED = Reference(np.ones(4), np.ones(4), np.full(4, 1e-4))
-
-
-@pytest.mark.parametrize(
-    ("path", "change", "steady"),
-    [
-        (lambda t: t, (1, 1, 0, 0), True),
-        (lambda t: -t, (1, 1, 0, 0), True),
-        (lambda t: min(1.0, t / 0.3), (1, 1, 0, 0), False),
-        (lambda t: float(t > 0.5), (1, 1, 0, 0), False),
-        (lambda t: abs(t - 0.5), (1, 1, 0, 0), False),
-        (lambda t: t, (1, 0, 1, 0), False),
-        (lambda t: 1e-3 * t, (1, 1, 0, 0), False),
-    ],
-    ids=["rises", "falls", "comes and stays", "jumps", "turns", "in another form", "next to nothing"],
-)
-def test_steady_is_along_a_line_and_in_the_contacts_form(path, change, steady) -> None:  # type: ignore[no-untyped-def]
-    past, rng = PastFrames(4), np.random.default_rng(1)
-    step = WINDOW_S / (STEPS - 1) / 2
-    for k in range(2 * STEPS + 1):
-        z = 1 + 0.05 * path(k * step) * np.array(change) + 1e-4 * rng.standard_normal(4)
-        found = past.drifts(FORM, z, k * step, UNTOUCHED, np.ones(4, bool))
-        past.follow(z, k * step)
-    assert found == steady
