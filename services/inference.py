@@ -97,7 +97,6 @@ class Inference(Stage):
         out = ImageFrame(
             **inherited(frame),
             touched=frame.touched,
-            followed=frame.followed,
             after=frame.after,
             estimates=frame.estimates,
         )

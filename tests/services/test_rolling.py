@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from services.rolling_scans import RollingScans
 
 from bench.speed.simulated_host import SimulatedHost
 from models.bundle import Bundle
@@ -13,7 +12,6 @@ from protocol.frames import RawFrame, pack, unpack
 from services.board.boardlink import BoardLink
 from services.board.newest_values import NewestValues
 from services.board.remarks import WHOLE, Remarks
-from services.estimation.rolling import WholeScans, measured_at, parts_of, rolling_order
 from services.pipeline import Pipeline
 from services.runtime.config import Skin
 from services.runtime.stage import Health
@@ -141,33 +139,14 @@ def test_frames_of_another_cut_are_foreign(bundle):
     host.rig.close()
 
 
-def test_whole_scans_share_no_value_and_begin_anew_where_the_board_does():
-    whole = WholeScans()
-    taken = [scan for scan in range(7, 60) if whole.due(scan, 10)]
-    assert taken == [7, 17, 27, 37, 47, 57]
-    assert whole.due(75, 10), "messages in between were skipped"
-    assert whole.due(2, 10), "the board was started again"
-
-
-def test_when_each_value_was_measured_goes_round_with_the_part(bundle):
-    order, parts = rolling_order(bundle), parts_of(bundle)
-    for newest in (1, 4, 10):
-        at = measured_at(bundle, newest)
-        assert sorted(at) == pytest.approx(np.linspace(0, 1, 120))
-        assert at[order.reshape(parts, -1)[newest - 1]].min() > 0.89
-        assert at[order.reshape(parts, -1)[newest % 10]].max() < 0.11
-    assert measured_at(bundle, 0) == pytest.approx(np.linspace(0, 1, 120))
-
-
 def test_a_part_makes_no_delta_frame_and_its_state_goes_with_a_recording(host):
     raws = host.raws[-40:]
     first = Pipeline(ROLLING, "palm")
     made = [first.step(raw) is not None for raw in raws[:25]]
     assert made == [k % 10 == 0 for k in range(25)]
     state = first.pre.state()
-    second = RollingScans(first.pre.bundle)
-    second.load(state["rolling"])
-    estimator = first.pre.baseline_estimator
-    assert [second.due(raw, {}, estimator) for raw in raws[25:]] == [k % 10 == 5 for k in range(15)]
-    assert second.handed_on(raws[-1].scan) == {"seen": True, "handed_on": False}
+    second = Pipeline(ROLLING, "palm")
+    second.pre.load(state)
+    assert [second.step(raw) is not None for raw in raws[25:]] == [k % 10 == 5 for k in range(15)]
+    assert second.pre.command("part", {"scan": raws[-1].scan}) == {"seen": True, "handed_on": False}
     assert first.pre.command("part", {"scan": raws[20].scan}) == {"seen": False, "handed_on": True}

@@ -7,12 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from services.estimation.within_scan import ChangingTouch
 
-from models.bundle import Bundle
 from models.shapes import Shape
-from models.touch_grid import touches
 from services.pipeline import Result
 from tests.services.stub_skin import TRANSFER, StubSkin, transfer
 
@@ -102,57 +98,3 @@ def test_what_stays_as_it_is_did_not_change(skin: StubSkin) -> None:
     assert not present(seen[1])  # at most it has ended
     assert not any(r.contact.valid for r in seen[2:])
     assert all("out_of_distribution" in r.contact.reasons for r in seen[2:])
-
-
-@pytest.mark.parametrize("touch", TOUCHES)
-def test_a_changing_touch_explains_a_scan_in_which_it_went_and_nothing_else(bundle: Bundle, touch: Shape) -> None:
-    explain = ChangingTouch(bundle)
-    whole = difference(bundle, levels(touch, (1.0,))[0])
-    time = np.linspace(0.0, 1.0, len(whole))
-    sigma = np.full(len(whole), 1e-4)
-    went = explain(whole * np.clip(1.2 - 2 * time, 0, 1), sigma)
-    came = explain(whole * np.clip(2 * time - 0.7, 0, 1), sigma)
-    assert went is not None and went.ended and came is not None and not came.ended
-    assert explain.steady(whole, sigma) and not explain.steady(whole * np.clip(1.2 - 2 * time, 0, 1), sigma)
-    rng = np.random.default_rng(3)
-    size = float(np.linalg.norm(whole))
-    strange = {
-        "measurements mixed up": whole[rng.permutation(len(whole))],
-        "noise": size / len(whole) ** 0.5 * rng.standard_normal(len(whole)),
-        "another gain from the middle on": np.where(time > 0.5, 0.05, 0.0),
-        "a touch turned over": -whole,
-        "a scan that slipped by three": np.roll(whole, 3),
-        "one electrode off": np.where((np.asarray(bundle.pattern) == 3).any(axis=1), 0.3, 0.0),
-    }
-    assert [name for name, d in strange.items() if explain(d, sigma) is not None] == []
-    assert explain(np.zeros(len(whole)), sigma) is None
-    assert explain(whole, np.full(len(whole), np.inf)) is None
-
-
-def difference(bundle: Bundle, t: TRANSFER) -> NDArray[np.float64]:
-    """(K,) d of the stub's sheet."""
-    i, j = np.asarray(bundle.pattern)[:, :2].T
-    free = transfer()
-    return np.asarray((t[i, i] + t[j, j] - 2 * t[i, j]) / (free[i, i] + free[j, j] - 2 * free[i, j]) - 1)
-
-
-@pytest.mark.parametrize("came", [True, False])
-def test_a_touch_that_comes_or_goes_at_once_explains_its_scan(came: bool) -> None:
-    """No ramp: of so many measurements each has felt all of it, or nothing."""
-    found = touches(Bundle.load("square16").matrices, 1.0, (0.2,))
-    d = 0.3 * found.response[len(found.response) // 3].astype(float)
-    changing, sigma = ChangingTouch(Bundle.load("square16")), np.full(len(d), 1e-4)
-    for felt in (10, 37, 64, 100):
-        part = d.copy()
-        part[: len(d) - felt] *= not came
-        part[len(d) - felt :] *= came
-        explained = changing(part, sigma)
-        assert explained is not None and explained.ended == (not came)
-
-
-def test_one_measurement_that_is_off_is_no_touch() -> None:
-    changing, sigma = ChangingTouch(Bundle.load("square16")), np.full(120, 1e-4)
-    for at in (0, 60, 119):
-        d = np.zeros(120)
-        d[at] = 0.05
-        assert changing(d, sigma) is None
