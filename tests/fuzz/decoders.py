@@ -326,7 +326,7 @@ def _kept() -> dict[str, Any]:
 
     z0 = _bundle().z0
     stage.set_baseline(Baseline(z0.copy(), 1e-3 * z0, 64, "board", 10**9))
-    baseline = stage.baseline_estimator.baseline
+    baseline = stage.baseline
     assert baseline is not None
     return persistence.plain({"bundle": _bundle().hash, "baseline": baseline.to_dict(), "taken_s": 1.0})  # type: ignore[no-any-return]
 

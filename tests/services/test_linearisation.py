@@ -131,7 +131,7 @@ def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(
     again = Estimating("palm", bench.skin, bundle)
     again.restore(saved, 1.0)
     assert again.linearisation.name == name and again.info() is not None
-    assert again.baseline_estimator.baseline is not None
+    assert again.baseline is not None
     off = Estimating("palm", bench.skin.model_copy(update={"tare": TareConfig(calibrate=False)}), bundle)
     with pytest.raises(Exception, match="another bundle"):
         off.restore(saved, 1.0)

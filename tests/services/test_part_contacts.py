@@ -9,9 +9,6 @@ from bench.reliability.scenes import script
 from bench.reliability.session import Session, new_pipeline
 from bench.reliability.workers import sheet as solved_sheet
 
-SIGMA = 1e-4
-AGE_US = 43_600.0
-
 
 def test_while_a_contact_rises_no_frame_shows_a_touch_and_a_whole_scan_names_it():
     """In the fault matrix, at this electrode and rise, the first parts made a phantom."""

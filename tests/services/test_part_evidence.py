@@ -8,9 +8,6 @@ import pytest
 from bench.speed.simulated_host import SimulatedHost
 from firmware_stub.timeline import PiecewiseLinear, Script, Timeline
 
-SIGMA = 1e-4
-AGE_US = 43_600.0
-
 
 @pytest.fixture(scope="module")
 def host():
