@@ -372,14 +372,16 @@ class BoardFaults:
         return replace(question, y=np.where(question.live, y, 0.0), covariance=wider), columns[:, 0]
 
     def _apart(self, change: ContactChange | GainChange, answer: ScoredAnswer) -> bool:
-        """An electrode under a touch that changes is not named: what it does is the touch's."""
+        """An electrode under a touch that changes is not named: what it does is the touch's. One that stood may change
+        from now on where a scan is not explained.
+        """
         if isinstance(change, GainChange) or answer.fit is None:
             return True
         acts = answer.fit.states[:, ACTION] ** 2 > n.ACTS_Z2 * np.diag(answer.fit.covariance)[ACTION::STATES]
         priors = answer.fit.priors
         for state, place, prior, there in zip(answer.fit.states, answer.kept, priors, acts, strict=True):
             away = float(np.hypot(*(state[PLACE] - self._places[change.electrode])))
-            still = place >= 0 and float(prior.sd[VELOCITY].max()) * SCAN_S <= 2 * n.STILL_WAY
+            still = place >= 0 and float(prior.sd[VELOCITY].max()) * SCAN_S <= 2 * n.STILL_WAY and answer.holds
             if there and away < np.exp(state[LOG_RADIUS]) + n.ON_ELECTRODE and not still:
                 return False
         return True
