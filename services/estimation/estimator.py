@@ -44,7 +44,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 5  # of a kept state
+LAYOUT = 6  # of a kept state
 AGES_OF_DOUBT = (1, 2, 4, 8)  # whole scans of a touch, at which its outline is asked whether it is one
 
 
@@ -144,11 +144,16 @@ class Estimator:
         """Take the latest scans for the untouched skin: these. Raises TareRefused, while something touches unless
         forced.
         """
-        if not force and self.skin is not None and self.skin.faults.now.wire is not None:
+        if not force and self.wire is not None:
             raise TareRefused("wires of the board are wrong, expected all as they belong: mend them and try again")
         scans = self.taring.by_command(force)
         self._begin(scans)
         return scans
+
+    @property
+    def wire(self) -> WireFault | None:
+        """What is wrong with the board's wires."""
+        return self.taring.now.wire if self.skin is None else self.skin.faults.now.wire
 
     @property
     def touched(self) -> bool:
@@ -171,10 +176,11 @@ class Estimator:
         self.now = EstimatorState(adopted_age_s=min(max(age_s, 0.0), n.OLDEST_S))
         self.taring.adopted()
 
-    def _begin(self, scans: AgreedScans) -> None:
+    def _begin(self, scans: AgreedScans, wire: WireFault | None = None) -> None:
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
         self.skin = TaredSkin(self._tables, scans.log_z0, scans.live, scans.scatter, len(scans.residuals))
         self.skin.begin(scans, next_id)
+        self.skin.faults.now.wire = wire
         self.now.information, self.now.wholes, self.now.unexplained_s = None, 0, 0.0
 
     def state(self) -> dict[str, Any]:
@@ -226,7 +232,7 @@ class Estimator:
             now.adopted_age_s = None
         if self.skin is None:
             if (scans := self.taring.first()) is not None:
-                self._begin(scans)
+                self._begin(scans, self.taring.now.wire)
             return self._unknown(measured, judgements)
         if not 0 <= gap_s <= n.GAP_S:
             self.skin.touches.lose()
@@ -574,6 +580,9 @@ class Estimator:
     def _unknown(self, measured: LookedAt, judgements: list[Judgement]) -> Estimate:
         """There is no baseline."""
         nothing, electrodes = np.zeros(self._tables.measurements), np.zeros(self._tables.electrodes, np.uint8)
+        if (wire := self.wire) is not None:
+            electrodes = advice.states_of(len(electrodes), wire, (), -1, silent=False)
+            judgements = judgements + advice.judgements_of(electrodes, measured.scan.status, 0.0, undecided=False)
         return Estimate(
             measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements)
         )
