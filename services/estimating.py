@@ -460,9 +460,7 @@ class Estimating(Stage):
 
     def _advice(self) -> list[str]:
         """What a person can do about electrodes."""
-        skin = self.estimator.skin
-        wire = None if skin is None else skin.faults.now.wire
-        return sentences(self._electrodes, wire, self._silent)
+        return sentences(self._electrodes, self.estimator.wire, self._silent)
 
 
 def on_the_wire(touch: TouchEstimate, metres: float) -> EstimatedTouch:

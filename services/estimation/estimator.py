@@ -51,7 +51,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 8  # of a kept state
+LAYOUT = 9  # of a kept state
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class Estimator:
         """Take the latest scans for the untouched skin: these. Raises TareRefused, while something touches unless
         forced.
         """
-        if not force and self.skin is not None and self.skin.faults.now.wire is not None:
+        if not force and self.wire is not None:
             raise TareRefused("wires of the board are wrong, expected all as they belong: mend them and try again")
         scans = self.taring.by_command(force, self._tells)
         self._begin(scans)
@@ -154,6 +154,11 @@ class Estimator:
         if self.skin is None:
             return BaselineTells.NOTHING
         return BaselineTells.LOST if self.now.unexplained_s > n.LOST_S else BaselineTells.TOUCHES
+
+    @property
+    def wire(self) -> WireFault | None:
+        """What is wrong with the board's wires."""
+        return self.taring.now.wire if self.skin is None else self.skin.faults.now.wire
 
     @property
     def touched(self) -> bool:
@@ -191,10 +196,11 @@ class Estimator:
         self.now = EstimatorState(adopted_age_s=min(max(age_s, 0.0), n.OLDEST_S))
         self.taring.adopted(baseline.doubt)
 
-    def _begin(self, scans: AgreedScans) -> None:
+    def _begin(self, scans: AgreedScans, wire: WireFault | None = None) -> None:
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
         self.skin = TaredSkin(self._tables, scans.log_z0, scans.live, scans.scatter, len(scans.residuals))
         self.skin.begin(scans, next_id)
+        self.skin.faults.now.wire = wire
         self.now.information, self.now.wholes, self.now.unexplained_s = None, 0, 0.0
         self.now.trusted = None
 
@@ -205,7 +211,7 @@ class Estimator:
         trusted = self.now.trusted
         scans = self.taring.first(None if trusted is None else trusted.after_long(self._tables))
         if scans is not None:
-            self._begin(scans)
+            self._begin(scans, self.taring.now.wire)
         elif trusted is not None and self.taring.now.surely:
             latest = self.taring.latest.agreed(self._tables)
             trusted = trusted._replace(live=trusted.live & latest.live, scatter=latest.scatter)
@@ -639,6 +645,9 @@ class Estimator:
     def _unknown(self, measured: LookedAt, judgements: list[Judgement]) -> Estimate:
         """There is no baseline."""
         nothing, electrodes = np.zeros(self._tables.measurements), np.zeros(self._tables.electrodes, np.uint8)
+        if (wire := self.wire) is not None:
+            electrodes = advice.states_of(len(electrodes), wire, (), -1, silent=False)
+            judgements = judgements + advice.judgements_of(electrodes, measured.scan.status, 0.0, undecided=False)
         return Estimate(
             measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements)
         )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from models.shapes import Shape
+from protocol.errors import EitskinError
 from protocol.frames import ELECTRODE_STATES, DeltaFrame, RawFrame
 from services.pipeline import Result
 from tests.services.stub_skin import StubSkin, sheet, transfer
@@ -317,13 +318,32 @@ def test_exchanged_wires_are_named_before_there_is_a_baseline() -> None:
     own.faults.inject("electrodes_swapped", {"electrodes": [4, 12]}, 0.0, 1.0)
     first = [own.feel() for _ in range(3)]
     assert states(first[-1]) == {"swapped": [4, 12]} and not first[-1].contact.valid
+    with pytest.raises(EitskinError, match="wires"):
+        own.pipeline.pre.command("tare", {})  # contacts would be elsewhere, in valid frames
     result = own.rest(77)
-    assert result.contact.valid and "degraded" in result.contact.reasons  # a baseline of the others
-    assert position_error_m(own.feel(PRESS)) < 0.004
+    assert result.contact.valid and "degraded" in result.contact.reasons and states(result) == {"swapped": [4, 12]}
+    assert position_error_m(own.feel(PRESS)) < 0.002  # each measurement is there, in another's place
     own.faults.clear()
-    result = own.rest(6)
-    assert states(result) == {"unknown": [4, 12]}  # they work again, but have no baseline
-    assert "skin tare" in own.pipeline.pre.health().messages[0]
+    own.rest(6)
+    back = [own.feel() for _ in range(20)]
+    assert all(r.contact.valid and states(r) == {} and not present(r) for r in back)
+    assert position_error_m(own.feel(PRESS)) < 0.002
+    assert own.pipeline.pre.health().level == "OK"
+
+
+@pytest.mark.parametrize(
+    ("name", "args", "reason"), [FAULTS[1][:2] + ("electrode_short",), FAULTS[5][:2] + ("multiplexer",)]
+)
+def test_wires_that_leave_too_little_are_named_at_the_start_and_make_no_baseline(
+    name: str, args: dict[str, Any], reason: str
+) -> None:
+    own = StubSkin(80.0, tare=False)
+    own.faults.inject(name, args, 0.0, 1.0)
+    first = [own.feel() for _ in range(80)]
+    assert not any(r.contact.valid for r in first) and all(reason in r.contact.reasons for r in first[2:])
+    own.faults.clear()
+    back = own.rest(80)
+    assert back.contact.valid and states(back) == {} and own.pipeline.pre.health().level == "OK"
 
 
 def test_a_state_taken_over_knows_the_faults(skin: StubSkin) -> None:

@@ -92,6 +92,10 @@ class WireMaps:
         short = z0 - passed**2 / (z0[self._joined, None] + n.SHORT_OHM)
         return np.concatenate([values[self._exchanged], short, np.abs(_combined(values, self._routed))])
 
+    def order(self, fault: WireFault) -> Indices:
+        """(K,) which measurement shows, while two wires are exchanged, what each would show if they were not."""
+        return np.asarray(self._exchanged[self.at[fault]])
+
     def one(self, fault: WireFault, z0: Array) -> WireMap:
         """Raises KeyError for a fault that this pattern cannot tell."""
         k, couples = self.at[fault], len(self._joined)

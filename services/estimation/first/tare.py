@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from models.measurement.tables import FIELD_DEGREES, SkinTables
 from protocol.errors import EitskinError
+from services.estimation.faults.wires import WireFault, WireKind
 from services.estimation.first.start import EarlierBaseline, JudgedStart, StartJudge, StartSays
+from services.estimation.first.wiring import WiresAtStart
 from services.estimation.values import numbers as n
 from services.estimation.values.judgement import Judgement, judge
 from services.estimation.values.scan import Scan
@@ -23,6 +25,7 @@ Array = NDArray[np.float64]
 
 SHARED = 32  # scans that the scatter of all measurements counts as beside each one's own
 LEAST_SCATTER = 2e-6  # about half a step of the board's 18 bits
+WIRED_AFTER = 2  # scans, after which wires are asked first; then every TARE_RETRIES
 
 UNSURE = (
     "this skin differs from its bundle by as much as a touch may make: see that nothing touches it and run `skin tare` "
@@ -80,6 +83,7 @@ class LatestScansState:
     parts: list[int] = field(default_factory=list)  # with which each ended
     seen: int = 0  # scans that came
     tried: int = 0  # `seen` when a first baseline was tried
+    wired: int = 0  # `seen` when the wires were asked
 
 
 class LatestScans:
@@ -110,12 +114,30 @@ class LatestScans:
         now = self.now
         return len(self) == int(n.TARE_SCANS) and now.seen % n.TARE_RETRIES == 0 and now.seen != now.tried
 
-    def agreed(self, tables: SkinTables) -> AgreedScans:
-        """Raises TareRefused where there are too few, or they do not agree."""
+    @property
+    def wires_due(self) -> bool:
+        """Whether the wires are to be asked with this scan."""
+        now = self.now
+        return len(self) >= WIRED_AFTER and now.seen % n.TARE_RETRIES == WIRED_AFTER and now.seen != now.wired
+
+    def mean(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """(K,) log |Z|, 0 where none of the scans has it; (K,) variance of that; (K,) what counts."""
+        scans = np.stack(self.now.log_z)
+        live: NDArray[np.bool_] = np.asarray(np.isfinite(scans).all(axis=0))
+        scans = np.where(live, scans, 0.0)
+        together = float(np.median(scans[:, live].var(axis=0, ddof=1))) if live.any() else 0.0
+        variance = np.full(len(live), max(together, LEAST_SCATTER**2) / len(scans))
+        return scans.mean(axis=0), variance, live
+
+    def agreed(self, tables: SkinTables, order: NDArray[np.intp] | None = None) -> AgreedScans:
+        """Raises TareRefused where there are too few, or they do not agree. order (K,): the value that each measurement
+        would show if no wires were exchanged; None: its own.
+        """
         needed = int(n.TARE_SCANS)
         if len(self) < needed:
             raise TareRefused(f"only {len(self)} of {needed} frames came so far: wait, or look at `skin top`")
         scans = np.stack(self.now.log_z)
+        scans = scans if order is None else scans[:, order]
         live: NDArray[np.bool_] = np.asarray(np.isfinite(scans).all(axis=0))
         if live.mean() < n.LEAST_LIVE:
             raise TareRefused(
@@ -200,6 +222,7 @@ class TaringState:
     doubted: bool = False  # the baseline's word against a touch counts for nothing
     surely: bool = False  # a touch explains the first scans
     problem: str = ""  # what stands in the way of valid frames, for a person
+    wire: WireFault | None = None  # before the first baseline
 
 
 class Taring:
@@ -211,7 +234,7 @@ class Taring:
 
     def use(self, tables: SkinTables) -> None:
         """Of the same skin, known better."""
-        self._tables, self._start = tables, StartJudge(tables)
+        self._tables, self._start, self._wires = tables, StartJudge(tables), WiresAtStart(tables)
 
     def offer(self, scan: Scan, live: NDArray[np.bool_], middle_s: float) -> None:
         """A whole scan; live (K,): what of it was measured; middle_s: when. One that is not believed interrupts."""
@@ -232,12 +255,21 @@ class Taring:
         self.now.untouched = 0 if touched else self.now.untouched + 1
 
     def first(self, earlier: EarlierBaseline | None = None) -> AgreedScans | None:
-        """The scans of a first baseline as soon as there is one. earlier: a baseline without doubt, if one is known."""
+        """The scans of a first baseline as soon as there is one. earlier: a baseline without doubt, if one is known.
+        Where wires are exchanged each measurement is there, in another's place: such scans do as well.
+        """
+        if self.latest.wires_due:
+            self.latest.now.wired = self.latest.now.seen
+            self.now.wire = self._wires(*self.latest.mean())
         if not self.latest.due:
             return None
         self.latest.now.tried = self.latest.now.seen
+        wire = self.now.wire
+        if wire is not None and wire.kind is not WireKind.EXCHANGED:
+            self.now.problem = "no baseline yet: wires of the board are wrong"
+            return None
         try:
-            scans = self.latest.agreed(self._tables)
+            scans = self.latest.agreed(self._tables, None if wire is None else self._wires.maps.order(wire))
         except TareRefused as why:
             self.now.problem = f"no baseline yet: {why}"
             return None
