@@ -45,7 +45,9 @@ STEP_LOG = Number(0.5, "-", "of log radius in one step at most", "chosen: the di
 MOVES = Number(0.02, "unit", "way within a scan from which on a touch's motion bends", "derived: half a pixel")
 TURNS = Number(0.02, "unit", "way after which a touch's own directions are taken anew", "derived: half a pixel")
 TURNS_LOG = Number(0.1, "-", "the same of log radius", "derived: a tenth of them")
-SUDDEN_S = Number(0.002, "s", "steps of the course of a touch that begins or ends at once", "derived: half a part of a scan")
+SUDDEN_S = Number(
+    0.002, "s", "steps of the course of a touch that begins or ends at once", "derived: half a part of a scan"
+)
 SUDDEN_SD = Number(0.5, "-", "of its action, by which each step may differ", "derived: from none to all")
 BENDS_BY = Number(0.15, "-", "and of its radius", "derived: its square over 8 is 0.3 %, below MISFIT")
 KINK = Number(0.8, "-", "of a change within a scan: what of it may be no straight line", "derived: a ramp's half")
