@@ -7,13 +7,11 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from protocol.frames import DeltaFrame
 from services.estimation.circles import Circles
 from services.estimation.part_filter import PartFilter
 from services.estimation.part_image import PartImage
 from services.estimation.rolling import measured_at
 from services.pipeline import Pipeline
-from services.rolling_scans import RollingScans
 from services.runtime.config import Skin
 from services.runtime.persistence import arrays, plain
 from tests.services.rolling_host import rolling_host
@@ -282,16 +280,20 @@ def test_a_recording_that_begins_while_a_touch_slides_plays_as_it_was(host):
         assert [asdict(c) for c in one.contacts] == [asdict(c) for c in other.contacts]
 
 
-def test_a_touch_that_a_whole_scan_does_not_see_any_more_is_not_followed_into_the_next(host):
+def test_a_touch_that_goes_while_it_slides_is_not_followed_any_further(host):
     until_it_slides(host)
-    rolling = host.pipeline.pre.rolling_scans
-    state, estimator, raw = rolling.state(), host.pipeline.pre.baseline_estimator, host.raws[-1]
-    after = RollingScans(host.pipeline.pre.bundle)
-    after.load(state)
-    assert after._models.filter.moves
-    sigma = estimator.sigma.astype(np.float32)
-    after.judged(DeltaFrame(skin="palm", difference=np.zeros(120, np.float32), sigma=sigma), raw, estimator)
-    assert not after._models.filter.moves and not after._models.filter.knows
+    ended, first = host.now, len(host.contacts)
+    host.release()
+    host.until(ended + 0.4)
+    after = [(t - ended, f) for t, f in host.contacts[first:]]
+    assert all(f.valid for _, f in after)
+    for _, f in after:
+        for c in f.contacts:
+            if c.state != "end":  # it is where it went, for as long as that is asked
+                assert np.hypot(c.position[0] + 0.02 - 0.04 * 0.1 / 0.3, c.position[1] + 0.01 - 0.02 * 0.1 / 0.3) < 5e-3
+    gone = next(t for t, f in after if all(c.state == "end" for c in f.contacts))
+    assert gone < 0.06
+    assert all(c.state == "end" for t, f in after if t > gone for c in f.contacts), "it does not come back"
 
 
 def test_two_touches_in_one_place_lie_on_the_skin_still(bundle):
