@@ -170,9 +170,7 @@ class TouchPublishing(Stage):
             self._image_of = image
         if frame.refined is None or len(frame.estimates) != 1:
             self._fit = None
-        elif (
-            self._fit is None or self._fit[0] != frame.refined
-        ):  # followed to a new image it is less sure, and elsewhere
+        elif self._fit is None or self._fit[0] != frame.refined:  # it is less sure in an image that it was followed to
             x, y = frame.estimates[0].position
             self._fit = frame.refined, x, y
 

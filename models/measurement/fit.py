@@ -112,10 +112,14 @@ class FoundTouches:
 
     def information(self, response: Array) -> float:
         """Of a further touch of this response (K,), touches fitted: 1 / variance of its strength."""
-        column = self.white(response)
-        along = self.design.T @ column
-        whole = float(column @ column)
-        return max(whole - float(along @ self.solved @ along), 0.02 * whole)
+        return float(self.informations(response[:, None])[0])
+
+    def informations(self, responses: Array) -> Array:
+        """(n,) of each of these responses (K, n) alone."""
+        columns = self.white(responses)
+        along = self.design.T @ columns
+        whole = np.sum(columns**2, axis=0)
+        return np.asarray(np.maximum(whole - np.sum(along * (self.solved @ along), axis=0), 0.02 * whole))
 
 
 @dataclass

@@ -27,7 +27,7 @@ from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 
-ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan about which a touch may begin or end at once
+ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
 ON_ELECTRODE = ((0.03, 0.0), (0.03, 0.1), (0.03, -0.1))  # inside its edge and along it, where a search begins
 SMALL_RADIUS = 0.1  # where it begins
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
@@ -449,7 +449,7 @@ class Hypotheses:
         """z^2 of the disc that would explain most of a residual, its number, action, and since when it acts [s].
         onsets: shares of the scan after which it may have begun.
         """
-        best, begins = (-1.0, 0, 0.0, -np.inf), 0.0
+        best = (-1.0, 0, 0.0, -np.inf)
         precision = white.conditional_precisions() if onsets else np.zeros(0)
         for share in (0.0, *onsets):
             weight, since_s = None, -np.inf
@@ -469,8 +469,8 @@ class Hypotheses:
                 exact = fit.information(column)
             z2 = along**2 / exact - (n.ONSET_Z2 if share else 0.0)
             if z2 > best[0]:
-                best, begins = (z2, disc, along / exact, since_s), share
-        return self._sharper(question, pulled, white, fit, begins, best) if begins else best
+                best = (z2, disc, along / exact, since_s)
+        return self._sharper(question, pulled, white, fit, best) if onsets else best
 
     def _sharper(
         self,
@@ -478,20 +478,16 @@ class Hypotheses:
         pulled: Array,
         white: Whitening,
         fit: FoundTouches | None,
-        share: float,
         best: tuple[float, int, float, float],
     ) -> tuple[float, int, float, float]:
-        """The same with the likeliest instant near one of ONSETS: a strong touch tells it to a measurement or two, and
-        none of its columns makes up for one that is off by more.
+        """The same disc from the likeliest instant on: a strong touch tells it to a measurement or two, and none of its
+        columns makes up for one that is off by more.
         """
-        instants = _instants(question, share)
+        instants = np.sort(question.times_s)
         column = self.grid.responses[best[1]].astype(float)
         columns = column[:, None] * (question.times_s[:, None] >= instants)
         along = np.maximum(columns.T @ pulled, 0.0)
-        if fit is None:
-            exact = np.sum(white(columns) ** 2, axis=0)
-        else:
-            exact = np.array([fit.information(each) for each in columns.T])
+        exact = np.sum(white(columns) ** 2, axis=0) if fit is None else fit.informations(columns)
         z2 = along**2 / np.maximum(exact, 1e-12) - n.ONSET_Z2
         k = int(z2.argmax())
         if z2[k] <= best[0]:
@@ -550,7 +546,7 @@ class Hypotheses:
         for k, prior in enumerate(standing):
             if prior.until_s < np.inf:
                 continue
-            ends = np.concatenate([[-0.5 * question.span_s], *(_instants(question, share) for share in ONSETS)])
+            ends = np.concatenate([[-0.5 * question.span_s], np.sort(question.times_s)])
             change = whole[:, None] - each[k][:, None] * (question.times_s[:, None] >= ends)
             left = np.where(question.live, question.y, 0.0)[:, None] - np.log1p(np.maximum(change, -0.9))
             left[~question.live] = 0.0
@@ -569,15 +565,6 @@ class Hypotheses:
         if not priors:
             return self.untouched(question)
         return self._fitted(question, priors, tuple(kept), n.STEPS_COLD)
-
-
-def _instants(question: Question, share: float) -> Array:
-    """(n,) nearer to this one of ONSETS than to another: before each of the values that were measured there."""
-    place, bounds = ONSETS.index(share), (0.0, *ONSETS, 1.0)
-    first, last = (bounds[place] + share) / 2, (share + bounds[place + 2]) / 2
-    near = (question.times_s >= (first - 0.5) * question.span_s) & (question.times_s < (last - 0.5) * question.span_s)
-    found = np.sort(question.times_s[near])
-    return found if len(found) else np.array([(share - 0.5) * question.span_s])
 
 
 def _settled(question: Question, answers: Sequence[ScoredAnswer]) -> bool:

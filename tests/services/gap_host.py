@@ -24,6 +24,7 @@ from services.runtime.stage import Stage
 
 FAR_M = 0.015
 SCAN_S = 0.0436
+STAGES = "Preprocessing", "Inference", "Publishing"
 GONE_S = 1e-3  # of simulated time by which the board's clock and ours may differ
 
 
@@ -49,7 +50,7 @@ class Press:
 
 
 class HaltingPipeline(Pipeline):
-    """`every`: by a stage's class, of how many frames that come it reads the newest, as where the machine is too slow;
+    """`every`: by a stage's name, of how many frames that come it reads the newest, as where the machine is too slow;
     0: it stands still. As in protocol/sockets.py:StageReader the frame is read too whose stack or image that one holds,
     and no part of an image that was not.
     """
@@ -57,6 +58,7 @@ class HaltingPipeline(Pipeline):
     def __init__(self, skin: Skin, bundle: Bundle) -> None:
         super().__init__(skin, "palm", bundle)
         self.every: dict[str, int] = {}
+        self._names = dict(zip((self.pre, self.inference, self.publishing), STAGES, strict=True))
         self._came: Counter[str] = Counter()
         self._seen = -1  # scan of the image that publisher read last
         self._holder: dict[str, DeltaFrame | ImageFrame] = {}  # that came last, by the stage that did not read it
@@ -70,7 +72,7 @@ class HaltingPipeline(Pipeline):
     def _made(self, stage: Stage, frame: Frame) -> list[Frame]:
         if stage is self.inference and isinstance(frame, PartFrame):
             return [frame]
-        name = type(stage).__name__
+        name = self._names[stage]
         part = isinstance(frame, PartFrame)
         if part and frame.after != self._seen:
             return []

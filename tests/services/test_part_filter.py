@@ -95,3 +95,19 @@ def test_a_recording_that_begins_while_a_touch_slides_plays_as_it_was(host):
     for one, (_, other) in zip(made, host.contacts[first:], strict=True):
         assert (one.scan, one.valid, one.reasons) == (other.scan, other.valid, other.reasons)
         assert [asdict(c) for c in one.contacts] == [asdict(c) for c in other.contacts]
+
+
+def test_a_touch_that_goes_while_it_slides_is_not_followed_any_further(host):
+    until_it_slides(host)
+    ended, first = host.now, len(host.contacts)
+    host.release()
+    host.until(ended + 0.4)
+    after = [(t - ended, f) for t, f in host.contacts[first:]]
+    assert all(f.valid for _, f in after)
+    for _, f in after:
+        for c in f.contacts:
+            if c.state != "end":  # it is where it went, for as long as that is asked
+                assert np.hypot(c.position[0] + 0.02 - 0.04 * 0.1 / 0.3, c.position[1] + 0.01 - 0.02 * 0.1 / 0.3) < 5e-3
+    gone = next(t for t, f in after if all(c.state == "end" for c in f.contacts))
+    assert gone < 0.06
+    assert all(c.state == "end" for t, f in after if t > gone for c in f.contacts), "it does not come back"

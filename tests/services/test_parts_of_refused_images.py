@@ -1,53 +1,67 @@
-"""A part of a scan is worth no more than the image on which it stands."""
+"""A part of a scan is judged by its own estimate: what preprocessing refused of it shows no contact as valid."""
 
 from __future__ import annotations
 
 import pytest
 
-from protocol.frames import PartFrame, pack, unpack
+from protocol.frames import ContactFrame, ImageFrame, PartFrame, pack, unpack
+from services.touch_publishing import TouchPublishing
 from tests.services.gap_host import GapHost, Press
 
 TOUCH = Press(0.02, -0.01, 4.0, 20.0)
+NEXT_NS = 4_360_000  # a part of a scan
 
 
 @pytest.fixture(scope="module")
-def seen():
-    """Image frames of a touch that is held, in parts, and the publisher that has seen those before."""
+def seen() -> tuple[TouchPublishing, ImageFrame, PartFrame]:
+    """An image frame and a part frame of a touch that is held, and the publisher that has seen those before."""
     host = GapHost("rolling", 3, [TOUCH])
-    kept = []
-    process = host.pipeline.inference.process
-    host.pipeline.inference.process = lambda *args: kept.extend(made := process(*args)) or made
+    images, parts = list[ImageFrame](), list[PartFrame]()
+    process = host.pipeline.publishing.process
+
+    def kept(frame, wanted):
+        if isinstance(frame, ImageFrame):
+            images.append(frame)
+        elif isinstance(frame, PartFrame):
+            parts.append(frame)
+        return process(frame, wanted)
+
+    host.pipeline.publishing.process = kept
     host.until(4.5)
     host.close()
-    return host.pipeline.publishing, [frame for frame in kept if frame.touched and frame.image.size][-1]
+    touched = [frame for frame in images if frame.touched and frame.estimates and frame.valid]
+    return host.pipeline.publishing, touched[-1], [part for part in parts if part.estimates][-1]
 
 
-def said_of(seen, *, valid: bool, reasons: list[str]):
-    """What a part frame gives after an image with these reasons."""
-    stage, last = seen
-    image = unpack(pack(last))
-    image.valid, image.reasons = valid, list(reasons)
-    image.after = stage.last_image.state()["scan"]
-    image.scan = image.reconstructed = image.after + 10
-    image.stamps["sample"] = last.stamps["sample"] + 4_360_000 * (image.scan - last.scan)
-    (contact,) = stage.process(image, frozenset({"contact"}))
-    part = PartFrame(skin="palm", session=image.session, scan=image.scan + 1, part=2, after=image.scan, valid=True)
-    part.stamps, part.followed = {"sample": image.stamps["sample"] + 4_000_000}, list(image.followed)
-    (found,) = stage.process(unpack(pack(part)), frozenset({"contact"}))
-    return contact, found
+def said_of(seen, *, image: tuple[bool, list[str]], part: tuple[bool, list[str]]) -> tuple[ContactFrame, ContactFrame]:
+    """What an image and the part after it give, each with this `valid` and these reasons."""
+    stage, last, of_part = seen
+    found = []
+    for k, (frame, (valid, reasons)) in enumerate(((last, image), (of_part, part))):
+        copy = unpack(pack(frame))
+        copy.valid, copy.reasons, copy.scan = valid, list(reasons), last.scan + 10 + k
+        copy.stamps["sample"] = last.stamps["sample"] + NEXT_NS * (10 + k)
+        (contact,) = stage.process(copy, frozenset({"contact"}))
+        found.append(contact)
+    return found[0], found[1]
 
 
 REFUSED = ("stale_baseline", "saturated", "gain", "electrode_drift", "electrode_open", "frozen", "clock", "non_finite")
 
 
 @pytest.mark.parametrize("reason", [*REFUSED, "out_of_distribution"])
-def test_a_part_of_an_image_that_was_refused_is_not_valid_and_says_why(seen, reason):
-    contact, part = said_of(seen, valid=False, reasons=[reason])
+def test_a_part_that_was_refused_is_not_valid_and_says_why(seen, reason):
+    _, part = said_of(seen, image=(True, []), part=(False, [reason]))
+    assert not part.valid and reason in part.reasons
+    contact, part = said_of(seen, image=(False, [reason]), part=(False, [reason]))
     assert not contact.valid and reason in contact.reasons
     assert not part.valid and reason in part.reasons
 
 
-def test_a_part_of_a_good_image_is_valid_and_of_one_that_was_only_late_too(seen):
-    for valid, reasons in ((True, []), (False, ["late"]), (True, [])):
-        _, part = said_of(seen, valid=valid, reasons=reasons)
-        assert part.valid and part.contacts and "late" not in part.reasons
+def test_a_part_stands_by_itself(seen):
+    """Of an image that was refused or late a part may be valid still: it has an estimate of its own."""
+    for valid, reasons in ((True, []), (False, ["late"]), (False, ["saturated"]), (True, [])):
+        _, part = said_of(seen, image=(valid, reasons), part=(True, []))
+        assert part.valid and not set(reasons) & set(part.reasons)
+        (contact,) = [c for c in part.contacts if c.state != "end"]
+        assert contact.position[:2] == pytest.approx([TOUCH.x, TOUCH.y], abs=2e-3)

@@ -31,7 +31,7 @@ def skin() -> StubSkin:
 
 
 @pytest.mark.parametrize("touch", TOUCHES)
-def test_a_touch_that_comes_and_goes_is_valid_and_says_changing_while_it_does(skin: StubSkin, touch: Shape) -> None:
+def test_a_touch_that_comes_and_goes_is_where_it_is_or_says_changing(skin: StubSkin, touch: Shape) -> None:
     skin.rest(20)
     up = levels(touch, RAMP)
     begin = [skin.see(*scan) for scan in pairwise(up)]
@@ -42,11 +42,16 @@ def test_a_touch_that_comes_and_goes_is_valid_and_says_changing_while_it_does(sk
     # Two frames in a row may be explained by a change: of an end in three scans the last may be refused.
     assert all(r.contact.valid for r in [*begin, *held, *end[:-1], *free]), [r.contact.reasons for r in every]
     assert not says_changing(held) and not says_changing(free)
-    assert says_changing(begin) and says_changing(end) <= 2
-    for n, result in enumerate(every):
+    assert says_changing(begin) <= 3 and says_changing(end) <= 2
+    whole_n = held[-1].contact.contacts[0].force_n
+    middles = [(a + b) / 2 for a, b in pairwise((*RAMP, *[1.0] * 8, *reversed(RAMP[:-1]), *[0.0] * 6))]
+    for result, share in zip(every, middles, strict=True):
+        rough = "changing" in result.contact.reasons
         for contact in result.contact.contacts:
             off = np.hypot(*(np.array(contact.position[:2]) - METRES * np.array([touch.x, touch.y])))
-            assert off < (0.003 if len(begin) < n < len(begin) + len(held) else 0.015)
+            assert off < (0.015 if rough else 0.003)
+            if not rough and contact.state != "end":  # how strongly it pressed in the middle of the scan
+                assert contact.force_n == pytest.approx(share * whole_n, rel=0.15, abs=0.02 * whole_n)
     assert all(len(present(r)) == 1 for r in held) and not present(free[-1])
     # Where it presses in any part of the scan, its contact is there, or the frame says why not, or is not valid.
     assert not any(hides(r) for r in [*begin, *end]), [r.contact.reasons for r in [*begin, *end]]
@@ -94,7 +99,7 @@ def test_what_stays_as_it_is_did_not_change(skin: StubSkin) -> None:
     for _ in range(8):
         noise = 1 + 1e-4 * np.random.default_rng(skin.scan).standard_normal(len(z))
         seen.append(skin.run((z * noise).astype(np.complex64), status))
-    assert seen[0].contact.valid and "changing" in seen[0].contact.reasons
+    assert seen[0].contact.valid and "changing" in seen[0].contact.reasons  # so far a touch that goes explains it
     assert not present(seen[1])  # at most it has ended
-    assert not any(r.contact.valid for r in seen[2:])
-    assert all("out_of_distribution" in r.contact.reasons for r in seen[2:])
+    assert not any(r.contact.valid for r in seen[3:])  # of what nothing explains two frames may be
+    assert all("out_of_distribution" in r.contact.reasons for r in seen[3:])
