@@ -537,17 +537,20 @@ class Hypotheses:
     def _released(
         self, question: Question, standing: Sequence[TouchPrior], answer: ScoredAnswer
     ) -> ScoredAnswer | None:
-        """One of the touches ended at once within the scan, or before it: whichever leaves least."""
+        """One of the touches ended at once within the scan, or before it: whichever leaves least. One that has ended
+        did so at another instant than the first values after it told.
+        """
         course = TouchCourse(self._tables.response, question.times_s, question.span_s)
         starts = np.stack([prior.start for prior in standing])
         each = [course.columns(starts[k : k + 1], [prior]).mean for k, prior in enumerate(standing)]
         whole = np.sum(each, axis=0)
         best, least = None, 0.5 * answer.chi2 * max(int(question.live.sum()), 1)
         for k, prior in enumerate(standing):
+            lasting = each[k]
             if prior.until_s < np.inf:
-                continue
+                lasting = course.columns(starts[k : k + 1], [replace(prior, until_s=np.inf)]).mean
             ends = np.concatenate([[-0.5 * question.span_s], np.sort(question.times_s)])
-            change = whole[:, None] - each[k][:, None] * (question.times_s[:, None] >= ends)
+            change = (whole - each[k])[:, None] + lasting[:, None] * (question.times_s[:, None] < ends)
             left = np.where(question.live, question.y, 0.0)[:, None] - np.log1p(np.maximum(change, -0.9))
             left[~question.live] = 0.0
             chi2 = np.sum(answer.white(left) ** 2, axis=0)

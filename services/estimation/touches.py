@@ -195,6 +195,8 @@ class TouchTracks:
         for k, track in enumerate(self.now.tracks):
             own = slice(STATES * k, STATES * (k + 1))
             track.since_s = at_s + fit.priors[k].since_s
+            if track.ended and fit.priors[k].until_s < np.inf:
+                track.until_s = at_s + fit.priors[k].until_s
             _update(track, fit.states[k], fit.covariance[own, own], at_s, span_s, whole)
             if whole:
                 _learn(track, fit, k)
