@@ -36,7 +36,7 @@ class MeasuredSkin:
         return np.asarray(strength * self.gains * sample(self.sensitivities, np.array([place]), self.reach)[0])
 
     def registered(self, folder: Path) -> Path:
-        radius, angle = 0.8 * self.reach * np.sqrt(self.rng.uniform(0, 1, 120)), self.rng.uniform(0, 2 * np.pi, 120)
+        radius, angle = 0.8 * self.reach * np.sqrt(self.rng.uniform(0, 1, 60)), self.rng.uniform(0, 2 * np.pi, 60)
         xy = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
         strength = self.rng.uniform(0.5, 1.5, len(xy))
         untouched = self.z0 * (1 + 1e-3 * self.rng.standard_normal((len(xy), len(self.z0))))
