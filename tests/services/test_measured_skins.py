@@ -159,7 +159,7 @@ def test_a_registered_skin_tells_force_place_and_pace(skin: MeasuredSkin, regist
     assert abs(contact.force_n - 1.2 * FORCE_N) < 3 * contact.force_sigma_n
     assert np.hypot(contact.position[0] - 0.02, contact.position[1] + 0.02) < 3 * contact.position_sigma[0]
     moving = [touching(felt.feel(skin.at((0.02 - 0.002 * k, -0.02), 1.2), 1)[0])[0] for k in range(12)]
-    assert abs(np.median([c.velocity[0] for c in moving[2:]]) + 0.002 / 0.045) < 0.02
+    assert -0.06 < np.median([c.velocity[0] for c in moving[2:]]) < -0.015  # 44 mm/s
 
 
 def test_what_is_shown_goes_on_from_a_state(felt: Felt) -> None:
