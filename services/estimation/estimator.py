@@ -616,7 +616,8 @@ class Estimator:
         unsure = any(not track.sure for track in skin.touches.now.tracks)
         sigma = np.sqrt(np.diag(question.covariance))
         changing = float(self._tables.predicted and (unsure or not explained))
-        felt = max([answer.left_z2, *_felt(skin.touches, None if explained or rough else answer.fit)])
+        left = answer.left_z2 / (max(1.0, answer.chi2) if answer.quiet else 1.0)
+        felt = max([left, *_felt(skin.touches, None if explained or rough else answer.fit)])
         if answer.fit is not None and not self._tables.predicted:
             felt = max(felt, skin.hypotheses.felt(question))
         return self._estimate(measured, question.y, sigma, judgements, felt, changing)
