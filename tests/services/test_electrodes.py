@@ -313,6 +313,26 @@ def test_one_electrode_dead_two_degraded_three_invalid(skin: StubSkin) -> None:
     skin.rest(4)
 
 
+@pytest.mark.parametrize(
+    ("electrodes", "touch"),
+    [((13,), Shape("circle", -0.703, -0.554, 0.288, 0.393)), ((8, 11), Shape("circle", -0.009, -0.674, 0.156, 0.309))],
+)
+def test_electrodes_that_go_dead_as_a_strong_touch_comes_are_no_multiplexer(
+    electrodes: tuple[int, ...], touch: Shape
+) -> None:
+    """Beside the dead ones, where little is seen of it: named as what they are with the first scan."""
+    own = StubSkin(80.0)
+    dead = np.where(np.isin(own.pattern, electrodes).any(axis=1), 2, 0).astype(np.uint8)
+    for _ in range(4):
+        z, _ = own.analog.measure((transfer((touch,)),) * 2, own.pattern, 128, 40_000.0, 0.0)
+        result = own.run(z, dead)
+        assert states(result) == {"open": list(electrodes)}
+        (contact,) = [c for c in result.contact.contacts if c.state != "end"]
+        assert result.contact.valid
+        assert np.hypot(contact.position[0] - 0.05 * touch.x, contact.position[1] - 0.05 * touch.y) < 3e-3
+    assert states(own.rest(6)) == {} and own.feel().contact.valid
+
+
 def test_exchanged_wires_are_named_before_there_is_a_baseline() -> None:
     own = StubSkin(80.0, tare=False)
     own.faults.inject("electrodes_swapped", {"electrodes": [4, 12]}, 0.0, 1.0)

@@ -216,7 +216,8 @@ class BoardFaults:
         own as for `covariance`.
         """
         now, untouched = self.now, self._untouched(view)
-        scan = replace(untouched, predicted=untouched.predicted + np.log1p(touched), failed=view.failed)
+        failed = view.failed & untouched.known
+        scan = replace(untouched, predicted=untouched.predicted + np.log1p(touched), failed=failed)
         found = self._table.guesses(scan, now.wire, skin + self._any_touch, own)
         best, stands = found[0], next(guess for guess in found if guess.fault == now.wire)
         rival = max(guess.score for guess in found if guess.fault != best.fault)
@@ -236,11 +237,14 @@ class BoardFaults:
         return max(gain_change(scan, since_s).score for since_s in (-np.inf, gain_onset(scan))) + float(n.COST_GAIN)
 
     def _untouched(self, view: BoardView) -> BoardScan:
+        """As the wires are asked about it: what open electrodes explain tells nothing of the others' wires."""
         sound = view.sound + np.log1p(view.mean)
         failed = view.failed
         if self.now.wire is None:
             failed = failed | (np.abs(view.log_z - sound) > np.log(n.FAR))
-        return BoardScan(view.log_z, sound, failed & self._known, self._known, view.times_s, view.span_s)
+        opens, _ = wires.open_electrodes(failed & self._known, self.member)
+        known = self._known & ~self.member[:, list(opens)].any(axis=1)
+        return BoardScan(view.log_z, sound, failed & known, known, view.times_s, view.span_s)
 
     # --- contact impedances and gain ---
 
