@@ -40,7 +40,7 @@ import services.contacts.contact_writer, services.estimation.estimator
 
 assert FAULTS["noisy"].args == {"times": 20.0} and "noisy" in {row.fault for row in ROWS}
 (row,) = (row for row in ROWS if row.fault == "noisy")
-assert row.names == ("low_snr",) and FaultState(np.zeros(16)).noise.since_s == np.inf
+assert row.names[0] == "low_snr" and FaultState(np.zeros(16)).noise.since_s == np.inf
 noise = NoiseRise()
 first, *_, last = [noise.judged(NOISE, 0.044 * scan) for scan in range(6)]
 assert first.verdict is Verdict.PASS and reasons([last]) == ["low_snr"]
