@@ -30,25 +30,28 @@ from models.bundle import Bundle
 from protocol.frame_types import AlarmFrame
 from protocol.frames import Contact, ContactFrame, pack, unpack
 from services.alarm import Alarm
-from services.estimation.noise import NoiseRise
-from services.estimating import Estimating
+from services.estimation.faults.board import FaultState
+from services.estimation.faults.noise import NoiseRise
+from services.estimation.hypotheses import AS_IT_IS, NOISE
+from services.estimation.values.judgement import Verdict, reasons
 from services.runtime.config import Skin
 from services.runtime.stage import PROCESSES
-import services.publishing, models.prereconstruction
+import services.contacts.contact_writer, services.estimation.estimator
 
 assert FAULTS["noisy"].args == {"times": 20.0} and "noisy" in {row.fault for row in ROWS}
 (row,) = (row for row in ROWS if row.fault == "noisy")
-assert row.names == ("low_snr",) and Estimating("palm", Skin(port="stub", bundle="square16", frame_id="palm"),
-    Bundle.load("square16")).noise._noisy == 0
-noise, rng, sigma = NoiseRise(), np.random.default_rng(2), np.full(120, 0.01)
-assert not any(noise(100 + 0.1 * k + 0.01 * rng.standard_normal(120), sigma) for k in range(20))
-assert [noise(100 + 0.2 * rng.standard_normal(120), sigma) for k in range(8)][-1]
+assert row.names[0] == "low_snr" and FaultState(np.zeros(16)).noise.since_s == np.inf
+noise = NoiseRise()
+first, *_, last = [noise.judged(NOISE, 0.044 * scan) for scan in range(6)]
+assert first.verdict is Verdict.PASS and reasons([last]) == ["low_snr"]
+noise.explained(AS_IT_IS)
+assert noise.judged(AS_IT_IS, 0.3).verdict is Verdict.PASS and noise.judged(NOISE, 0.35).verdict is Verdict.PASS
 rig = Rig(seed=1)
 assert rig.fault("noisy", {"times": 5.0}, 0.0)
 assert patterns.check(patterns.pattern("skip_one", 16), 16).shape == (192, 4)
 assert NETWORKS["wide"] and Skin(port="stub", bundle="square16", frame_id="palm", network="wide")
-frame = unpack(pack(ContactFrame(skin="palm", contacts=[Contact(id=1, position=[0, 0, 0], force_n=12.0, frames=7)])))
-assert frame.contacts[0].frames == 7
+frame = unpack(pack(ContactFrame(skin="palm", contacts=[Contact(id=1, position=[0, 0, 0], force_n=12.0, age_s=0.7)])))
+assert frame.contacts[0].age_s == 0.7
 (alarm,) = Alarm("palm", None, None).process(frame, frozenset({"alarm"}))
 assert unpack(pack(alarm)).too_hard and "alarm" in PROCESSES
 """
