@@ -91,10 +91,9 @@ class TaredSkin:
         self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / self.frames)
         self.touches.now.next_id = next_id
 
-    def adopt(self, next_id: int, contact: float) -> None:
-        """The baseline was taken earlier, and nobody watched since. contact: by how much contact impedances may be
-        otherwise, beside their walk.
-        """
+    def adopt(self, next_id: int, age_s: float) -> None:
+        """The baseline was taken earlier, and nobody watched since."""
+        contact = min(n.CONTACT_START + n.UNWATCHED * age_s, float(n.START_CONTACT))
         self.noise.now.white = float(np.median(self.scatter[self.live] ** 2))
         self.drift.begin(0.0, np.full(self.tables.electrodes, contact**2))
         self.drift.now.remainder_variance += self.scatter**2 / self.frames

@@ -138,6 +138,7 @@ TARE_UNTRAINED = Number(
 )
 TARE_DRIFTS = Number(3e-3, "-", "log conductivity, change while they come", "derived: a degree in 3 s")
 OLDEST_S = Number(600.0, "s", "age of a baseline beyond which it is no older", "derived: FIELD_RATE makes 12 % of it")
+UNWATCHED = Number(8e-4, "1/s", "by which a contact impedance that nobody watches drifts", "measured: as skin.toml's")
 TARE_IDENTICAL = Number(1e-12, "-", "noise below which scans are the same", "derived: arithmetic of their mean")
 TARE_ASSUMED = Number(1e-3, "-", "noise where scans tell none", "chosen: 60 dB, ten times the board's")
 LAG_SCANS = Number(
