@@ -4,7 +4,8 @@ leave.
 Of a contact impedance some noise is common to a scan (flicker), some is new with each measurement (jitter). A line that
 disturbs has any phase, so of a scan it is two fixed columns, whatever its frequency and however strongly each electrode
 picks it up: the strongest eigenvectors of the residuals' covariance, beyond what chance makes of white noise
-(V. Marchenko and L. Pastur, 1967). After each part of a scan the columns are others.
+(V. Marchenko and L. Pastur, 1967). What stays from scan to scan is no line: it is a touch that comes slowly, or drift
+that nothing has taken in. After each part of a scan the columns are others.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.numbers import (
+    ALTERNATES,
     FLICKER_FLOOR,
     JITTER_FLOOR,
     LEARNING,
@@ -36,6 +38,8 @@ Order = NDArray[np.intp]
 BURST_BLOCK = 12  # measurements that share one strength of a disturbance that comes and goes
 MEDIAN_OF_SQUARES = 0.455  # of a standard normal variable
 ROUNDS = 10  # of learning from the frames of a tare
+FIRST_LINES = (16, 32, 64)  # scans heard, at which lines are made for the first times
+LINE_SCANS = 100  # untouched scans after which they are made anew: half of those that are learnt from
 STEADY_CONTACTS = 40  # measurements whose contacts are quiet enough to tell the white noise
 
 
@@ -44,8 +48,32 @@ class LineState:
     """Of scans that end with one part."""
 
     scatter: Annotated[Array, "K", "K"]  # mean square of residuals
+    alternates: Annotated[Array, "K", "K"]  # half the mean square of their steps from one scan to the next
     columns: Annotated[Array, "K", "n"]
     heard: int = 0  # scans
+    due: bool = False  # the lines are to be made anew
+    before: Annotated[Array | None, "K"] = None  # residual of a scan that its step is to be taken from
+    before_odd: Annotated[Array | None, "K"] = None  # the same of one that was disturbed by more than was known
+
+    @classmethod
+    def of(cls, measurements: int) -> LineState:
+        nothing = np.zeros((measurements, measurements))
+        return cls(nothing, nothing.copy(), np.zeros((measurements, 0)))
+
+    def take_step(self, left: Array, odd: bool) -> bool:
+        """Residuals of two scans that were explained alike make a step: whether this one (K,) did."""
+        before = self.before_odd if odd else self.before
+        if before is not None:
+            step = left - before
+            share = min(1.0, max(2 / self.heard, 2 * float(LEARNING_LINES)))
+            self.alternates *= 1 - share
+            self.alternates += np.outer(share / 2 * step, step)
+        kept = None if before is not None else left
+        if odd:
+            self.before_odd = kept
+        else:
+            self.before = kept
+        return before is not None
 
 
 @dataclass
@@ -119,23 +147,29 @@ class NoiseModel:
         """Follow the contacts' noise alone, as far as a touch that is there leaves it to be seen."""
         self._follow_contacts(pulled[None], white, LEARNING)
 
-    def hear(self, pulled: Array, part: int) -> None:
+    def hear(self, pulled: Array, part: int, odd: bool = False) -> None:
         """Take note of what several measurements of a frame have in common beside drift and contacts: pulled (K,) is
-        S^-1 of its residual, so this is the likeliest white noise and disturbance.
+        S^-1 of its residual, so this is the likeliest white noise and disturbance. odd: more than was known.
         """
-        k = len(pulled)
-        known = self.now.lines.setdefault(part, LineState(np.zeros((k, k)), np.zeros((k, 0))))
+        if self._note(pulled, part, odd):
+            self.find_lines(part)
+
+    def _note(self, pulled: Array, part: int, odd: bool) -> bool:
+        """Whether lines are to be made anew."""
+        known = self.now.lines.setdefault(part, LineState.of(len(pulled)))
         left = self.variances() * pulled + known.columns @ (known.columns.T @ pulled)
         share = max(1 / (known.heard + 1), float(LEARNING_LINES))
         known.scatter *= 1 - share
         known.scatter += np.outer(share * left, left)
         known.heard += 1
+        known.due = known.due or odd or known.heard in FIRST_LINES or known.heard % LINE_SCANS == 0
+        return known.take_step(left, odd) and known.due
 
     def _hear_anew(self, pulled: Array, part: int) -> None:
         if part in self.now.lines:
             self.now.lines[part].heard = 0  # the first that is heard replaces all
         for row in pulled:
-            self.hear(row, part)
+            self._note(row, part, odd=False)
         self.find_lines(part)
 
     def find_lines(self, part: int) -> None:
@@ -143,13 +177,17 @@ class NoiseModel:
         known = self.now.lines.get(part)
         if known is None or not known.heard:
             return
+        known.due, known.before, known.before_odd = False, None, None  # with other lines residuals are others
         k = len(known.scatter)
         values, vectors = np.linalg.eigh(known.scatter)
         scans = min(known.heard, 1 / LEARNING_LINES)
         chance = self.now.white * LINE * (1 + np.sqrt(k / scans)) ** 2
         strong = values > chance
         strong[: -int(LINES)] = False
-        known.columns = vectors[:, strong] * np.sqrt(values[strong] - self.now.white)
+        columns = vectors[:, strong]
+        alternates = np.einsum("kn,kl,ln->n", columns, known.alternates, columns) - self.now.white
+        strength = np.minimum(values[strong] - self.now.white, ALTERNATES * np.maximum(alternates, 0.0))
+        known.columns = columns * np.sqrt(strength)
 
     def _follow_contacts(self, pulled: Array, white: Whitening, share: float) -> None:
         """Unbiased moments: the generalised least squares estimate of a contact's change has variance v + 1 / n, with

@@ -63,6 +63,9 @@ LEARNING_WHITE = Number(0.03, "-", "the same of the white noise", "derived: as L
 LEARNING_LINES = Number(0.005, "-", "the same of what they have in common", "derived: 200 scans, more than it has rows")
 LINE = Number(1.3, "-", "times what chance makes of white noise, from which on it is a line", "derived: Tracy-Widom")
 LINES = Number(6.0, "-", "eigenvectors of lines at most", "chosen: three frequencies")
+ALTERNATES = Number(
+    4.0, "-", "times what alternates from scan to scan, that a line has at most", "derived: beats of 9 scans or less"
+)
 LEFT_OUT = Number(1e4, "-", "variance of a measurement that does not count", "derived: nothing is as large")
 OUTLIER = Number(9.0, "-", "squared sigmas beyond which a residual counts no further", "derived: 3 sigmas")
 """What noise is."""

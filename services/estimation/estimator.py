@@ -182,19 +182,15 @@ class Estimator:
         """Go on from a baseline that is age_s older than the next scan; nobody watched meanwhile. contact_per_s: by
         which contact impedances of this skin change.
         """
-        self._adopt(baseline, age_s, min(contact_per_s * max(age_s, 0.0), n.START_CONTACT))
+        next_id = 1 if self.skin is None else self.skin.touches.now.next_id
+        self.skin = TaredSkin(self._tables, baseline.log_z0, baseline.live, baseline.scatter, baseline.frames)
+        self.skin.adopt(next_id, min(contact_per_s * max(age_s, 0.0), n.START_CONTACT))
+        self.now = EstimatorState(adopted_age_s=min(max(age_s, 0.0), n.OLDEST_S))
+        self.taring.adopted(baseline.doubt)
 
     def trust(self, baseline: KnownBaseline | None) -> None:
         """What the first scans are held against, too old to go on from; None: their bundle alone."""
         self.now.trusted = baseline
-
-    def _adopt(self, baseline: KnownBaseline, age_s: float, contact_sd: float) -> None:
-        """contact_sd: relative, by which contact impedances may be otherwise, beside their walk."""
-        next_id = 1 if self.skin is None else self.skin.touches.now.next_id
-        self.skin = TaredSkin(self._tables, baseline.log_z0, baseline.live, baseline.scatter, baseline.frames)
-        self.skin.adopt(next_id, contact_sd)
-        self.now = EstimatorState(adopted_age_s=min(max(age_s, 0.0), n.OLDEST_S))
-        self.taring.adopted(baseline.doubt)
 
     def _begin(self, scans: AgreedScans, wire: WireFault | None = None) -> None:
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
@@ -215,7 +211,7 @@ class Estimator:
         elif trusted is not None and self.taring.now.surely:
             latest = self.taring.latest.agreed(self._tables)
             trusted = trusted._replace(live=trusted.live & latest.live, scatter=latest.scatter)
-            self._adopt(trusted, float(n.OLDEST_S), float(n.START_CONTACT))
+            self.adopt(trusted, float(n.OLDEST_S))
 
     def state(self) -> dict[str, Any]:
         """All that changes, to be kept; who loads it goes on bit by bit as this one does."""
@@ -375,6 +371,9 @@ class Estimator:
         judgements.append(judge("gain", float(skin.faults.gain_stepped(oldest_s)), 1.0))
         judgements.append(judge("gain_gross", float(gross), 1.0))
         judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
+        if sound and answer.fit is not None:  # what drifted under the touch, as far as the scan tells it
+            drifted = np.where(measured.live, at.predicted.covariance @ answer.pulled, 0.0)
+            question = replace(question, y=question.y - drifted)
         return self._said(skin, measured, question, answer, judgements, explained and not went, rough)
 
     def _keep_looks(self, skin: TaredSkin, measured: LookedAt, question: Question, answer: ScoredAnswer) -> None:

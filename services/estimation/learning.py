@@ -15,8 +15,6 @@ from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 
-FIRST_LINES = (16, 32, 64)  # scans heard, at which lines are made for the first times
-
 
 @dataclass(frozen=True)
 class Waiting:
@@ -55,10 +53,7 @@ class Learning:
 
     def hear(self, pulled: Array, part: int, odd: bool) -> None:
         """What several measurements have in common; odd: more than was known."""
-        self._noise.hear(pulled, part)
-        heard = self._noise.now.lines[part].heard
-        if odd or heard in FIRST_LINES or heard % n.LINE_SCANS == 0:
-            self._noise.find_lines(part)
+        self._noise.hear(pulled, part, odd)
 
     def _take_in(self, scan: Waiting) -> None:
         if scan.drifts:
