@@ -184,8 +184,9 @@ class Estimator:
         """
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
         self.skin = TaredSkin(self._tables, baseline.log_z0, baseline.live, baseline.scatter, baseline.frames)
-        self.skin.adopt(next_id, min(contact_per_s * max(age_s, 0.0), n.START_CONTACT))
-        self.now = EstimatorState(adopted_age_s=min(max(age_s, 0.0), n.OLDEST_S))
+        age_s = min(max(age_s, 0.0), float(n.OLDEST_S))
+        self.skin.adopt(next_id, min(contact_per_s * age_s, n.START_CONTACT), age_s)
+        self.now = EstimatorState(adopted_age_s=age_s)
         self.taring.adopted(baseline.doubt)
 
     def trust(self, baseline: KnownBaseline | None) -> None:
@@ -351,6 +352,8 @@ class Estimator:
             self._explained(skin, answer.cause)
         else:
             self._refused(skin, measured, question.y)
+            if not went and _strange(question, answer):
+                self.now.unexplained_s = max(self.now.unexplained_s, float(n.CHANGING_S))
         nearly = None if explained or rough else answer.fit
         self.now.candidates = np.zeros((0, STATES)) if nearly is None else nearly.states.copy()
         oldest_s = measured.middle_s - measured.span_s / 2
@@ -656,6 +659,12 @@ class Estimator:
 def _strained(answer: ScoredAnswer) -> bool:
     """Whether touches explain a scan only roughly, or with the help of something else."""
     return answer.cause != AS_IT_IS or not answer.explained
+
+
+def _strange(question: Question, answer: ScoredAnswer) -> bool:
+    """Whether a scan is none of a touch: the likeliest ones leave most of it, whatever they look like."""
+    left, whole = (float(np.sum(answer.white(each) ** 2)) for each in (answer.left, question.y))
+    return left > n.STRANGE * whole
 
 
 def _felt(touches: TouchTracks, found: FoundTouches | None) -> list[float]:

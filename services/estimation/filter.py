@@ -73,10 +73,15 @@ class SkinFilter:
         self._faster = _by_degree(n.FIELD_FASTER, n.SLOPE_FASTER)
         self.begin(0.0, np.full(tables.electrodes, n.CONTACT_START**2))
 
-    def begin(self, at_s: float, contact_variance: Array) -> None:
-        """A baseline was taken; contact_variance (E,): what its frames leave open of each contact impedance."""
+    def begin(self, at_s: float, contact_variance: Array, age_s: float = 0.0) -> None:
+        """A baseline was taken; contact_variance (E,): what its frames leave open of each contact impedance. age_s: for
+        which nobody will have watched when it is used. What warms or dries unevenly evens out meanwhile: its rate is a
+        mean over that time (Ornstein and Uhlenbeck).
+        """
         k = self._tables.measurements
-        rates = _by_degree(n.FIELD_RATE, n.SLOPE_RATE)
+        ages = max(age_s / float(n.SLOPE_LASTS_S), 1e-6)
+        lasting = float(np.sqrt(2 * (ages + np.expm1(-ages))) / ages)
+        rates = _by_degree(n.FIELD_RATE, n.SLOPE_RATE * lasting)
         variance = np.concatenate([np.full(MODES, n.FIELD_START**2), rates, contact_variance])
         start = np.full(k, n.REMAINDER_START**2)
         self.now = FilterState(at_s, np.zeros(self._fixed), np.diag(variance), np.zeros(k), start)

@@ -89,12 +89,12 @@ class TaredSkin:
         self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / self.frames)
         self.touches.now.next_id = next_id
 
-    def adopt(self, next_id: int, contact_sd: float) -> None:
+    def adopt(self, next_id: int, contact_sd: float, age_s: float) -> None:
         """The baseline was taken earlier, and nobody watched since: contact_sd, relative, of what each contact
         impedance may have changed by meanwhile.
         """
         self.noise.now.white = float(np.median(self.scatter[self.live] ** 2))
-        self.drift.begin(0.0, np.full(self.tables.electrodes, n.CONTACT_START**2 + contact_sd**2))
+        self.drift.begin(0.0, np.full(self.tables.electrodes, n.CONTACT_START**2 + contact_sd**2), age_s)
         bends = n.CONTACT_BENDS * contact_sd * np.linalg.norm(self.tables.contact, axis=1)
         self.drift.now.remainder_variance += self.scatter**2 / self.frames + bends**2
         self.touches.now.next_id, self.touches.now.watched = next_id, False

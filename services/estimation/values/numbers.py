@@ -23,6 +23,7 @@ FIELD_WALK = Number(
 SLOPE_WALK = Number(3e-6, "1/sqrt(s)", "the same across the sheet", "derived: a third of FIELD_WALK")
 FIELD_RATE = Number(2e-4, "1/s", "log conductivity, even: its rate at the tare", "derived: half a degree a minute")
 SLOPE_RATE = Number(1e-4, "1/s", "the same across the sheet", "derived: half of FIELD_RATE")
+SLOPE_LASTS_S = Number(20.0, "s", "for which it goes on one way, unwatched", "derived: heat through 1 cm of foam, 5e-7 m2/s")
 FIELD_RATE_WALK = Number(2e-5, "1/s/sqrt(s)", "its walk", "measured: half a degree a minute is followed in 3 s")
 SLOPE_RATE_WALK = Number(8e-6, "1/s/sqrt(s)", "the same across the sheet", "derived: 0.4 of FIELD_RATE_WALK")
 FIELD_FASTER = Number(1e-3, "-", "faster drift than that, in one scan", "derived: ten sigmas of one measurement")
@@ -145,6 +146,7 @@ TARE_ASSUMED = Number(1e-3, "-", "noise where scans tell none", "chosen: 60 dB, 
 LAG_SCANS = Number(
     2.0, "-", "scans for which one waits to be believed untouched", "derived: a ramp of 150 ms shows in 2"
 )
+STRANGE = Number(0.5, "-", "share that touches leave of a scan, beyond which it is of none", "chosen: an L leaves 0.1")
 CHANGING_S = Number(0.1, "s", "for which what nothing explains is said to be changing", "derived: two whole scans")
 LOST_S = Number(1.0, "s", "of nothing that explains it, after which no touch is vouched for", "derived: half of 2 s")
 LOST_SCANS = Number(8.0, "-", "whole scans from search to search then", "chosen: cost, three searches a second")
