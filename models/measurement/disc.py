@@ -6,16 +6,13 @@ mean square of its radius, which is taken off again.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.numbers import EDGE_WIDTH, SHEET
 from models.measurement.touch import SHAPES, area_of
-
-if TYPE_CHECKING:
-    from models.measurement.tables import SkinTables
 
 Array = NDArray[np.float64]
 
@@ -24,6 +21,28 @@ CLOSE = 1e-6  # units: nearer to the centre no direction is known
 HARMONICS = (2, 3, 4)
 RADII = ((0.09, 0.1), (0.18, 0.12), (0.33, 0.2))  # of discs, and how far apart their centres are [unit]
 INWARD = 0.9  # of its radius that a disc's centre is within the sheet's edge
+
+
+class DropTables(Protocol):
+    """What drops in pixels do, see models/measurement/tables.py:SkinTables."""
+
+    @property
+    def jacobian(self) -> NDArray[np.float32]: ...
+
+    @property
+    def along(self) -> NDArray[np.float32]: ...
+
+    @property
+    def turned(self) -> NDArray[np.float32]: ...
+
+    @property
+    def inside(self) -> NDArray[np.bool_]: ...
+
+    @property
+    def pixel(self) -> float: ...
+
+    @property
+    def measurements(self) -> int: ...
 
 
 class Covered(NamedTuple):
@@ -41,7 +60,7 @@ class Covered(NamedTuple):
 class DiscResponse:
     """Of unit action, on one skin's tables: the disc's strength times its area is 1, whatever its radius."""
 
-    def __init__(self, tables: SkinTables) -> None:
+    def __init__(self, tables: DropTables) -> None:
         self.tables = tables
         side = len(tables.jacobian)
         self._pixel = tables.pixel
