@@ -483,7 +483,7 @@ class Hypotheses:
         """The same disc from the likeliest instant on: a strong touch tells it to a measurement or two, and none of its
         columns makes up for one that is off by more.
         """
-        instants = np.sort(question.times_s)
+        instants = _instants(question)
         column = self.grid.responses[best[1]].astype(float)
         columns = column[:, None] * (question.times_s[:, None] >= instants)
         along = np.maximum(columns.T @ pulled, 0.0)
@@ -517,7 +517,7 @@ class Hypotheses:
             return None
         course = TouchCourse(self._tables.response, question.times_s, question.span_s)
         priors = list(standing)
-        instants = np.sort(question.times_s)
+        instants = _instants(question)
         for k in young:
             everyone = np.stack([prior.start for prior in priors])
             lasting = replace(priors[k], since_s=-np.inf)
@@ -549,7 +549,7 @@ class Hypotheses:
             lasting = each[k]
             if prior.until_s < np.inf:
                 lasting = course.columns(starts[k : k + 1], [replace(prior, until_s=np.inf)]).mean
-            ends = np.concatenate([[-0.5 * question.span_s], np.sort(question.times_s)])
+            ends = np.concatenate([[-0.5 * question.span_s], _instants(question)])
             change = (whole - each[k])[:, None] + lasting[:, None] * (question.times_s[:, None] < ends)
             left = np.where(question.live, question.y, 0.0)[:, None] - np.log1p(np.maximum(change, -0.9))
             left[~question.live] = 0.0
@@ -568,6 +568,12 @@ class Hypotheses:
         if not priors:
             return self.untouched(question)
         return self._fitted(question, priors, tuple(kept), n.STEPS_COLD)
+
+
+def _instants(question: Question) -> Array:
+    """(n,) before which values something may begin or end at once: what the last few alone say, the next tell."""
+    times_s = np.sort(question.times_s)
+    return np.asarray(times_s[times_s <= (ONSETS[-1] - 0.5) * question.span_s])
 
 
 def _settled(question: Question, answers: Sequence[ScoredAnswer]) -> bool:
