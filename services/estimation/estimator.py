@@ -203,13 +203,11 @@ class Estimator:
 
     def _first(self) -> None:
         """Begin as soon as the first scans tell an untouched skin, or what touches one that is known."""
-        if not self.taring.latest.due:
-            return
-        trusted = self.now.trusted
+        due, trusted = self.taring.latest.due, self.now.trusted
         scans = self.taring.first(None if trusted is None else trusted.after_long(self._tables))
         if scans is not None:
             self._begin(scans, self.taring.now.wire)
-        elif trusted is not None and self.taring.now.surely:
+        elif due and trusted is not None and self.taring.now.surely:
             latest = self.taring.latest.agreed(self._tables)
             trusted = trusted._replace(live=trusted.live & latest.live, scatter=latest.scatter)
             self.adopt(trusted, float(n.OLDEST_S))

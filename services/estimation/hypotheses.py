@@ -481,7 +481,8 @@ class Hypotheses:
         best: tuple[float, int, float, float],
     ) -> tuple[float, int, float, float]:
         """The same disc from the likeliest instant on: a strong touch tells it to a measurement or two, and none of its
-        columns makes up for one that is off by more.
+        columns makes up for one that is off by more. One that acts in the whole scan is so unless that leaves more
+        than its response gets wrong.
         """
         instants = _instants(question)
         column = self.grid.responses[best[1]].astype(float)
@@ -490,7 +491,8 @@ class Hypotheses:
         exact = np.sum(white(columns) ** 2, axis=0) if fit is None else fit.informations(columns)
         z2 = along**2 / np.maximum(exact, 1e-12) - n.ONSET_Z2
         k = int(z2.argmax())
-        if z2[k] <= best[0]:
+        steady = best[3] == -np.inf
+        if z2[k] <= best[0] * (1 + 2 * self._tables.wrong * steady):
             return best
         return float(z2[k]), best[1], float(along[k] / exact[k]), float(instants[k])
 
