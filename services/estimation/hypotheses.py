@@ -320,12 +320,11 @@ class Hypotheses:
         answers.append(self._fitted(question, loose, everyone, n.STEPS_COLD))
         if _settled(question, answers):
             return answers
-        expected = self._fitted(question, standing, everyone, 0)
-        answers += self._search(question, everyone, expected.fit)
         best = _likeliest(answers)
-        for cause in self._wider:
+        for cause in self._wider:  # these cost little, and a search may leave no steps
             answers += self._with_cause(question, loose, everyone, cause, best.left)
-        return answers
+        expected = self._fitted(question, standing, everyone, 0)
+        return answers + self._search(question, everyone, expected.fit)
 
     def _of_anything(
         self, question: Question, standing: Sequence[TouchPrior], before: Sequence[ScoredAnswer]
@@ -447,9 +446,10 @@ class Hypotheses:
         self, question: Question, pulled: Array, white: Whitening, fit: FoundTouches | None, onsets: Sequence[float]
     ) -> tuple[float, int, float, float]:
         """z^2 of the disc that would explain most of a residual, its number, action, and since when it acts [s].
-        onsets: shares of the scan after which it may have begun.
+        onsets: shares of the scan after which it may have begun. One that acts in the whole scan is so unless that
+        leaves more than its response gets wrong.
         """
-        best = (-1.0, 0, 0.0, -np.inf)
+        found = list[tuple[float, int, float, float]]()
         precision = white.conditional_precisions() if onsets else np.zeros(0)
         for share in (0.0, *onsets):
             weight, since_s = None, -np.inf
@@ -467,10 +467,11 @@ class Hypotheses:
                 exact = float(whitened @ whitened)
             else:
                 exact = fit.information(column)
-            z2 = along**2 / exact - (n.ONSET_Z2 if share else 0.0)
-            if z2 > best[0]:
-                best = (z2, disc, along / exact, since_s)
-        return self._sharper(question, pulled, white, fit, best) if onsets else best
+            found.append((along**2 / exact - (n.ONSET_Z2 if share else 0.0), disc, along / exact, since_s))
+        if not onsets:
+            return found[0]
+        begun = self._sharper(question, pulled, white, fit, max(found))
+        return begun if begun[0] > found[0][0] * (1 + 2 * self._tables.wrong) else found[0]
 
     def _sharper(
         self,
@@ -481,18 +482,17 @@ class Hypotheses:
         best: tuple[float, int, float, float],
     ) -> tuple[float, int, float, float]:
         """The same disc from the likeliest instant on: a strong touch tells it to a measurement or two, and none of its
-        columns makes up for one that is off by more. One that acts in the whole scan is so unless that leaves more
-        than its response gets wrong.
+        columns makes up for one that is off by more.
         """
         instants = _instants(question)
         column = self.grid.responses[best[1]].astype(float)
         columns = column[:, None] * (question.times_s[:, None] >= instants)
         along = np.maximum(columns.T @ pulled, 0.0)
         exact = np.sum(white(columns) ** 2, axis=0) if fit is None else fit.informations(columns)
-        z2 = along**2 / np.maximum(exact, 1e-12) - n.ONSET_Z2
+        more = 2 * np.log(len(instants) / len(ONSETS))  # so many were looked at
+        z2 = along**2 / np.maximum(exact, 1e-12) - n.ONSET_Z2 - more
         k = int(z2.argmax())
-        steady = best[3] == -np.inf
-        if z2[k] <= best[0] * (1 + 2 * self._tables.wrong * steady):
+        if z2[k] <= best[0]:
             return best
         return float(z2[k]), best[1], float(along[k] / exact[k]), float(instants[k])
 
