@@ -455,7 +455,8 @@ class Estimator:
             return answer
         if not (_strained(answer) or skin.touches.odd):
             return answer
-        own = replace(question, budget=StepBudget(n.MOST_STEPS), keeps=0.0)
+        scan = measured.scan
+        own = replace(question, budget=StepBudget.of(len(scan.new), int(scan.new.sum()), scan.separate), keeps=0.0)
         found = hypotheses.recounted(own, answer)
         if found is None or found.fit is None:
             return answer
