@@ -350,7 +350,7 @@ class Estimator:
             self._explained(skin, answer.cause)
         else:
             self._refused(skin, measured, question.y)
-            if not went and _strange(question, answer):
+            if not (explained or rough) and _strange(question, answer):
                 self.now.unexplained_s = max(self.now.unexplained_s, float(n.CHANGING_S))
         nearly = None if explained or rough else answer.fit
         self.now.candidates = np.zeros((0, STATES)) if nearly is None else nearly.states.copy()
