@@ -209,14 +209,14 @@ class TouchTracks:
         self.now.tracks = [
             before[place] if place >= 0 else self._new(fit, k, at_s, span_s) for k, place in enumerate(kept)
         ]
-        memories = list[Memory]()
+        memories, meeting = list[Memory](), self.meeting(at_s)
         for k, track in enumerate(self.now.tracks):
             own = slice(STATES * k, STATES * (k + 1))
             track.since_s = at_s + fit.priors[k].since_s
             if track.ended and fit.priors[k].until_s < np.inf:
                 track.until_s = at_s + fit.priors[k].until_s
             _update(track, fit.states[k], fit.covariance[own, own], at_s, span_s, whole)
-            if whole:
+            if whole and k not in meeting:  # what two have in common is no outline of one
                 _learn(track, fit, k)
             if explained and not track.ended:
                 memories += self._held(track, at_s, span_s, whole)
