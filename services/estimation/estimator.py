@@ -38,6 +38,7 @@ from services.estimation.hypotheses import (
     Question,
     ScoredAnswer,
     StepBudget,
+    started_from,
 )
 from services.estimation.learning import Waiting
 from services.estimation.quick_look import Seen
@@ -51,7 +52,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 9  # of a kept state
+LAYOUT = 10  # of a kept state
 
 
 @dataclass(frozen=True)
@@ -539,9 +540,14 @@ class Estimator:
             often = track.z2 < n.DOUBT_Z2 or not track.sure
             if track.ended or not (often or track.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1):
                 continue
-            standing = touches.expected(measured.middle_s, measured.span_s)
+            standing, least = touches.expected(measured.middle_s, measured.span_s), float(n.COST_TOUCH)
+            if answer.fit is not None and k in touches.meeting(measured.middle_s) and len(touches) == len(answer.fit):
+                standing, least = (
+                    started_from(answer.fit),
+                    -least,
+                )  # it was told when it stood apart: it would have ended
             other = skin.hypotheses.without(question, standing, k)
-            if other.quiet and other.score > answer.score + n.COST_TOUCH:
+            if other.quiet and other.score > answer.score + least:
                 touches.remove(k)
                 return
             alone = len(touches) == 1  # then something touches, be its strength known or not

@@ -260,7 +260,7 @@ class Hypotheses:
         x, y = self.grid.discs[disc, PLACE]
         more = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
         new = (-1,) * (len(begun) + 1)
-        found = self._fitted(question, [*_from(discs.fit), plain(more)], new, 2 * n.STEPS_COLD)
+        found = self._fitted(question, [*started_from(discs.fit), plain(more)], new, 2 * n.STEPS_COLD)
         return [found, self._fitted(question, _started([*begun, more], found.fit), new, n.STEPS_COLD)]
 
     def without(self, question: Question, standing: Sequence[TouchPrior], place: int) -> ScoredAnswer:
@@ -338,7 +338,7 @@ class Hypotheses:
             return found
         best = _likeliest(touched)
         assert best.fit is not None
-        again = _from(best.fit)
+        again = started_from(best.fit)
         for cause in self._wider:
             found += self._with_cause(question, again, best.kept, cause, best.left)
         found.append(self._fitted(question, again, best.kept, n.STEPS_COLD, wide=True))
@@ -407,7 +407,7 @@ class Hypotheses:
         pulled, white = question.white.solve(question.y), question.white
         if fit is not None:
             pulled, white = fit.pulled, fit.white
-        score, full = -np.inf, _from(fit)
+        score, full = -np.inf, started_from(fit)
         while (len(fit) if fit else 0) < n.MOST_TOUCHES and not question.spent:
             z2, disc, action, since_s = self._left(question, pulled, white, fit, ONSETS)
             if z2 < n.FALSE_ALARM_Z2:
@@ -415,7 +415,7 @@ class Hypotheses:
             x, y = self.grid.discs[disc, PLACE]
             new = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
             full, kept = [*full, new], (*kept, -1)
-            disc_alone = self._fitted(question, [*_from(fit), plain(new)], kept, n.STEPS_COLD)
+            disc_alone = self._fitted(question, [*started_from(fit), plain(new)], kept, n.STEPS_COLD)
             if disc_alone.score < score + n.ANOTHER:
                 break
             score, fit = disc_alone.score, disc_alone.fit
@@ -436,7 +436,7 @@ class Hypotheses:
         x, y = acts @ states[[a, b], PLACE] / acts.sum()
         one = anywhere(float(x), float(y), float(acts.sum()), question.span_s)
         one.start[LOG_RADIUS] = 0.5 * np.logaddexp(2 * states[a, LOG_RADIUS], 2 * states[b, LOG_RADIUS])
-        priors = _from(answer.fit)
+        priors = started_from(answer.fit)
         priors[a] = replace(one, since_s=min(priors[a].since_s, priors[b].since_s))
         del priors[b]
         kept = tuple(place for k, place in enumerate(answer.kept) if k != b)
@@ -599,7 +599,7 @@ def _begun(state: Array, span_s: float) -> TouchPrior:
     return replace(anywhere(float(x), float(y), float(state[ACTION]), span_s), start=state)
 
 
-def _from(fit: FoundTouches | None) -> list[TouchPrior]:
+def started_from(fit: FoundTouches | None) -> list[TouchPrior]:
     """The priors of a fit, to be searched from where it ended."""
     if fit is None:
         return []

@@ -33,6 +33,7 @@ from models.measurement.touch import (
     within_limits,
 )
 from services.estimation.filter import Memory
+from services.estimation.overlap import KnownCourse, gaps
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import TouchEstimate
 
@@ -53,6 +54,7 @@ class TrackedTouch:
     log_radius_sd: float
     shape: Annotated[Array, "shapes"]
     shape_variance: Annotated[Array, "shapes"]
+    course: KnownCourse  # as known from scans that share no value
     since_s: float = -np.inf  # it acts from then on
     until_s: float = np.inf  # it acted until then: it has ended, and the window still holds values of before
     scans: int = 0  # that it was fitted to and that share no value
@@ -160,7 +162,23 @@ class TouchTracks:
 
     def expected(self, at_s: float, span_s: float, loose: bool = False) -> list[TouchPrior]:
         """What is known of each before a scan whose middle is at_s. loose: it may have begun to move or to change."""
-        return [_expected(track, at_s, span_s, loose) for track in self.now.tracks]
+        priors = [_expected(track, at_s, span_s, loose) for track in self.now.tracks]
+        for place in () if loose else self.meeting(at_s):
+            priors[place] = self.now.tracks[place].course.goes_on(priors[place], at_s)
+        return priors
+
+    def meeting(self, at_s: float) -> list[int]:
+        """Which stood apart a moment ago, and are near each other."""
+        tracks = self.now.tracks
+        lasting = [
+            k
+            for k, track in enumerate(tracks)
+            if not (track.ended or track.lost) and at_s - track.course.apart_s < n.MEET_S
+        ]
+        if len(lasting) < 2:
+            return []
+        reach = gaps([tracks[k].state for k in lasting]).min(axis=1)
+        return [k for k, gap in zip(lasting, reach, strict=True) if gap < np.exp(tracks[k].state[LOG_RADIUS])]
 
     def recognised(self, fit: FoundTouches, kept: Sequence[int]) -> tuple[int, ...]:
         """kept, where touches that were found anew are those that were there before in the same places."""
@@ -191,14 +209,14 @@ class TouchTracks:
         self.now.tracks = [
             before[place] if place >= 0 else self._new(fit, k, at_s, span_s) for k, place in enumerate(kept)
         ]
-        memories = list[Memory]()
+        memories, meeting = list[Memory](), self.meeting(at_s)
         for k, track in enumerate(self.now.tracks):
             own = slice(STATES * k, STATES * (k + 1))
             track.since_s = at_s + fit.priors[k].since_s
             if track.ended and fit.priors[k].until_s < np.inf:
                 track.until_s = at_s + fit.priors[k].until_s
             _update(track, fit.states[k], fit.covariance[own, own], at_s, span_s, whole)
-            if whole:
+            if whole and k not in meeting:  # what two have in common is no outline of one
                 _learn(track, fit, k)
             if explained and not track.ended:
                 memories += self._held(track, at_s, span_s, whole)
@@ -208,7 +226,18 @@ class TouchTracks:
                 track.until_s = at_s + span_s / 2
                 memories += self._memory(track, track.until_s, 1.0)
         self.now.tracks = [track for track in self.now.tracks if track.sure or not track.ended]
+        if whole and explained:
+            self._follow(at_s)
         return memories
+
+    def _follow(self, at_s: float) -> None:
+        tracks = self.lasting
+        if not tracks:
+            return
+        for track, gap in zip(tracks, gaps([track.state for track in tracks]).min(axis=1), strict=True):
+            track.course.follow(track.state, np.sqrt(np.maximum(np.diag(track.covariance), 0.0)), at_s)
+            if gap > n.NEIGHBOURS and track.sure and track.scans >= n.SURE_SCANS:
+                track.course.apart_s = at_s
 
     def tell(self, fit: FoundTouches, at_s: float, span_s: float) -> None:
         """What was taken for a changed contact impedance is this touch."""
@@ -242,6 +271,7 @@ class TouchTracks:
             log_radius_sd=float(prior.sd[LOG_RADIUS]),
             shape=np.zeros(len(SHAPE_SDS)),
             shape_variance=SHAPE_SDS**2,
+            course=KnownCourse.begun(state, np.sqrt(np.diag(fit.covariance)[STATES * k : STATES * (k + 1)]), at_s),
             since_s=at_s + prior.since_s,
             held_at=(float(state[X]), float(state[Y]), float(state[LOG_RADIUS])),
             stayed_since_s=at_s,
