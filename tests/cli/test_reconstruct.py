@@ -39,6 +39,13 @@ def out(noisy: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return reconstruct(read_input(noisy, 120), Skin(port="stub", bundle="square16"), bundle)
 
 
+@pytest.fixture(scope="module")
+def fresh(noisy: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same right after the untouched rows."""
+    bundle = Bundle.load("square16")
+    return reconstruct(read_input(noisy, 120), Skin(port="stub", bundle="square16"), bundle, age_s=10.0)
+
+
 def test_keys_shapes_and_types(out: dict[str, np.ndarray]) -> None:
     assert {name: (a.dtype.str, a.shape) for name, a in out.items()} == {
         "image": ("<f4", (19, 96, 96)),
@@ -53,14 +60,16 @@ def test_keys_shapes_and_types(out: dict[str, np.ndarray]) -> None:
     assert np.isfinite(out["image"]).all()
 
 
-def test_untouched_is_untouched_and_touches_are_seen(scenes, out) -> None:  # type: ignore[no-untyped-def]
+def test_untouched_is_untouched_and_touches_are_seen(scenes, out, fresh) -> None:  # type: ignore[no-untyped-def]
+    """Of rows whose age nobody says, five minutes of drift may explain a light press."""
     touched = scenes["drop"].reshape(19, -1).max(axis=1) > 0
     assert any(name.startswith("J") for name in scenes["scene"][~touched]), "scenes where all has drifted"
-    assert not out["touched"][~touched].any() and out["touched"][touched].all()
+    assert not out["touched"][~touched].any() and out["touched"][touched].mean() > 0.85
+    assert fresh["touched"][touched].all() and not fresh["touched"][0]
     assert np.isnan(out["position"][0]).all() and out["count"][0] == 0
 
 
-def test_positions_and_signs_are_the_true_ones(scenes, out) -> None:  # type: ignore[no-untyped-def]
+def test_positions_and_signs_are_the_true_ones(scenes, fresh) -> None:  # type: ignore[no-untyped-def]
     """Axes and signs, not accuracy: within a tenth of the side, and no mirror image does better."""
     rows = [k for k in range(19) if np.isfinite(scenes["shapes"][k, :, 0]).sum() == 1]
     axis = -1 + 2 * (np.arange(96) + 0.5) / 96
@@ -71,7 +80,7 @@ def test_positions_and_signs_are_the_true_ones(scenes, out) -> None:  # type: ig
             for k in rows
         ]
     )
-    found = out["position"][rows, 0] / METRES
+    found = fresh["position"][rows, 0] / METRES
     error = np.linalg.norm(found - truth, axis=1)
     assert np.median(error) < 0.05 and error.max() < 0.2
     for flip in ((-1, 1), (1, -1), (-1, -1)):
@@ -134,7 +143,10 @@ def test_a_bad_reference_costs_its_own_row_only(noisy) -> None:  # type: ignore[
     assert out["valid"].tolist() == [True, False, True] and out["touched"].tolist() == [True, False, True]
     assert out["count"][1] == 0 and not out["image"][1].any() and np.isnan(out["position"][1]).all()
     for name in whole:
-        assert np.array_equal(out[name][[0, 2]], whole[name], equal_nan=whole[name].dtype.kind == "f"), name
+        if whole[name].dtype.kind == "f":  # the rows have other times, whose last bits are other ones
+            np.testing.assert_allclose(out[name][[0, 2]], whole[name], rtol=1e-6, err_msg=name)
+        else:
+            assert np.array_equal(out[name][[0, 2]], whole[name]), name
     assert len(said) == 1 and "1 of 3 rows" in said[0]
 
 
@@ -182,8 +194,8 @@ def test_resampling_keeps_places() -> None:
 
 
 def test_rows_stand_alone_so_that_all_their_touches_count(  # type: ignore[no-untyped-def]
-    scenes, out
+    scenes, fresh
 ) -> None:
     """No row is the one before the next: nothing waits to be confirmed by it. G0 and G1: two and three touches."""
     several = [k for k, name in enumerate(scenes["scene"]) if name.startswith("G")]
-    assert [int(out["count"][k]) for k in several] == [2, 3]
+    assert [int(fresh["count"][k]) for k in several] == [2, 3]

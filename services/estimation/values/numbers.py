@@ -150,7 +150,7 @@ TARE_ASSUMED = Number(1e-3, "-", "noise where scans tell none", "chosen: 60 dB, 
 LAG_SCANS = Number(
     2.0, "-", "scans for which one waits to be believed untouched", "derived: a ramp of 150 ms shows in 2"
 )
-STRANGE = Number(0.1, "-", "share that touches leave of a scan, beyond which it is of none", "chosen: shapes and several touches leave 0.02")
+STRANGE = Number(0.1, "-", "of a scan left by touches, from which on it is of none", "chosen: odd touches leave 0.02")
 CHANGING_S = Number(0.1, "s", "for which what nothing explains is said to be changing", "derived: two whole scans")
 LOST_S = Number(1.0, "s", "of nothing that explains it, after which no touch is vouched for", "derived: half of 2 s")
 LOST_SCANS = Number(8.0, "-", "whole scans from search to search then", "chosen: cost, three searches a second")
