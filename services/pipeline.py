@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame, Frame, ImageFrame, RawFrame
-from services.estimating import Estimating
 from services.inference import Inference
+from services.preprocessing import Preprocessing
+from services.publisher import Publishing
 from services.runtime.config import Skin
 from services.runtime.stage import Stage
-from services.touch_publishing import TouchPublishing
 
 ALL = frozenset({"delta", "part", "image", "contact"})
 
@@ -22,10 +22,10 @@ class Result(NamedTuple):
     contact: ContactFrame
 
 
-def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> tuple[Estimating, Inference, TouchPublishing]:
+def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> tuple[Preprocessing, Inference, Publishing]:
     """The three stages of one skin. Raises models.bundle.BundleError."""
     bundle = bundle or Bundle.load(skin.bundle)
-    return Estimating(name, skin, bundle), Inference(name, skin, bundle), TouchPublishing(name, skin, bundle)
+    return Preprocessing(name, skin, bundle), Inference(name, skin, bundle), Publishing(name, skin, bundle)
 
 
 class Pipeline:

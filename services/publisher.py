@@ -1,9 +1,387 @@
-"""The publisher process: contacts, forces, shapes. `python -m services.publisher`; the stage is in publishing.py."""
+"""Publishing: from the touches that preprocessing found to contacts, forces and shapes, in the skin's frame [m, N].
 
-import sys
+Where, how hard, since when: the measurements say (`estimates`). What it looks like: the image. Of a skin whose
+measurements do not tell its touches the image says all.
+"""
 
-from services.process import main, stages
-from services.touch_publishing import TouchPublishing
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from models.bundle import Bundle
+from models.measurement.tables import tells_touches
+from protocol.frames import (
+    SHAPES,
+    Contact,
+    ContactFrame,
+    EstimatedTouch,
+    ForceFrame,
+    Frame,
+    ImageFrame,
+    PartFrame,
+    RefinedTouch,
+    ShapeFrame,
+)
+from protocol.held import HeldImage
+from services.contacts.contact_writer import ContactWriter
+from services.contacts.force import ForceLaw
+from services.contacts.invalid_spell import InvalidSpell
+from services.contacts.lasting import LastingStates
+from services.contacts.of_image import ImageTouches
+from services.contacts.placing import placement
+from services.contacts.reading import Appearance, Appearances
+from services.contacts.refined import area_of_image, both, refined_outline
+from services.contacts.registered import measures_force
+from services.describe import geometry
+from services.runtime.config import Skin
+from services.runtime.stage import HARMLESS, SEPARATE, Health, Stage, add_reason, inherited
+
+COARSE = 0.05  # of the sheet's side: a place that is less sure than that is coarse
+SAME_BIRTH_NS = 50_000_000  # a touch is the same where it has the same number and was born at the same time
+MOST_M = 10.0  # of a sheet, and of a sigma of a place on it
+MOST_STRENGTH = MOST_M**2
+UNWATCHED_NS = 1_000_000_000  # without a frame: what began meanwhile may have been there for long
+SAYS_NOTHING = {"out_of_distribution", "non_finite"}  # reasons with which a frame shows no contact, not even an end
+
+
+class Publishing(Stage):
+    """image -> contact, and force and shape where somebody wants them. Of scans in parts, contact and force also of the
+    part frames between two images.
+    """
+
+    reads = "image"
+    writes = ("contact", "force", "shape")
+    stamp = "publish"
+    sleeps = True
+
+    def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
+        super().__init__(name)
+        self.config = skin
+        self.law = ForceLaw.of(skin, bundle, name)
+        by_registration = measures_force(bundle)
+        self._tells_force = self.law.exists or by_registration
+        self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
+        self._image_touches = None if tells_touches(bundle) else ImageTouches(bundle)
+        place, self.frame_id = placement(skin, geometry(bundle)["outline"], name)
+        self._writer = ContactWriter(self.law, place, self._tells_force)
+        self._appearances = Appearances(bundle)
+        self._coarse_m = 2 * COARSE * bundle.half_width * bundle.metres_per_unit
+        self._next_id = 1
+        self.lasting = LastingStates()
+        self.each_alone = False  # offline: frames that do not follow each other
+        self._ids: dict[int, tuple[int, int]] = {}  # of preprocessing's touch: our number, and when it was born [ns]
+        self._untold: list[Contact] = []
+        self._shown: list[Contact] = []
+        self.reset()
+
+    def reset(self) -> None:
+        self.held = HeldImage()
+        self._end_all()
+        self._forget()
+        self._counters = {"frames": 0, "contacts": 0, "unknown": 0, "refined": 0, "disagreed": 0}
+        self._invalid = InvalidSpell()
+
+    def new_session(self) -> None:
+        self._next_id, self._ids = 1, {}
+        self._shown, self._untold = [], []
+        self._forget()
+
+    def wake(self) -> None:
+        """Nobody is left who was told of what touched."""
+        self._shown, self._untold = [], []
+        self._forget()
+
+    def _forget(self) -> None:
+        self._appearances.forget()
+        self.lasting.forget()
+        self._image_of = ("", -1)  # session and scan of the image that appearances were seen in
+        self._looks: dict[int, Appearance] = {}  # of the contacts that are there, by their numbers
+        self._drops: dict[int, float] = {}  # S/m, at least
+        self._anchors: dict[int, EstimatedTouch] = {}  # of contacts of an image, as the measurements tell them
+        self._watched = False  # whether the frame before told what touched
+        self._fit: tuple[RefinedTouch, float, float] | None = None  # and where its touch was then
+        self._watched_ns: tuple[int, int] | None = None  # `sample` of the first and last frame of those that came
+
+    def _end_all(self) -> None:
+        """What was shown ends with the next frame."""
+        self._untold += [c for c in self._shown if c.state != "end"]
+        self._shown, self._ids = [], {}
+
+    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        assert isinstance(frame, PartFrame | ImageFrame)
+        self._counters["frames"] += 1
+        out = ContactFrame(**inherited(frame), frame_id=self.frame_id, force_calibrated=self._calibrated)
+        if not self._tells_force:
+            add_reason(out.reasons, "uncalibrated_force")
+        whole = isinstance(frame, ImageFrame)
+        if not all(map(_readable, frame.estimates)):
+            out.valid = False
+            add_reason(out.reasons, "non_finite")
+        elif isinstance(frame, ImageFrame):
+            self._look(frame, out)
+        self._watch(frame.stamps.get("sample", 0))
+        if out.valid or not SAYS_NOTHING & set(out.reasons):
+            out.contacts = self._contacts(frame, out)
+            self._note(frame, out)
+        else:
+            self._watched = False
+            self._counters["unknown"] += 1
+        self._invalid(out.valid, [r for r in out.reasons if r not in HARMLESS], frame.stamps.get("sample", 0))
+        if frame.part and out.valid:
+            out.contacts = self.lasting(out.contacts, frame.stamps.get("sample", 0))
+        frames: list[Frame] = [out]
+        if "force" in wanted:
+            frames.append(self._force(out))
+        if "shape" in wanted and whole:
+            frames.append(self._shape(out))
+        return frames
+
+    def _watch(self, now_ns: int) -> None:
+        """Since when somebody has looked."""
+        first_ns, last_ns = self._watched_ns or (now_ns, now_ns)
+        if not 0 <= now_ns - last_ns < UNWATCHED_NS:
+            first_ns = now_ns
+        self._watched_ns = first_ns, now_ns
+
+    def _look(self, frame: ImageFrame, out: ContactFrame) -> None:
+        """Take what the image shows."""
+        out.held = frame.held
+        self.lacks = not self.held.complete(frame)
+        if self.lacks and self._image_touches is not None:
+            out.valid = False
+            add_reason(out.reasons, "gap")
+        if frame.image.size and not np.isfinite(frame.image).all():
+            out.valid = False
+            add_reason(out.reasons, "non_finite")
+            return
+        if frame.touched and frame.residual is not None:
+            out.quality = max(0.0, 1.0 - frame.residual)
+        image = frame.session, frame.reconstructed
+        if not frame.touched:
+            self._appearances.forget()
+            self._image_of = ("", -1)
+        elif frame.image.size and image != self._image_of and self._image_touches is None:
+            self._appearances.see(frame)
+            self._image_of = image
+        if frame.refined is None or len(frame.estimates) != 1:
+            self._fit = None
+        elif self._fit is None or self._fit[0] != frame.refined:  # it is less sure in an image that it was followed to
+            x, y = frame.estimates[0].position
+            self._fit = frame.refined, x, y
+
+    def _contacts(self, frame: ImageFrame | PartFrame, out: ContactFrame) -> list[Contact]:
+        """Those that are there, strongest first, then those that ended."""
+        alone = self.each_alone or SEPARATE in frame.reasons
+        if alone:
+            self._end_all()
+        before = {c.id: c for c in self._shown if c.state != "end"}
+        if self._image_touches is None:
+            found = self._told(frame, before, alone)
+        else:
+            found = self._pictured(frame, before, self._watched or alone)
+            if isinstance(frame, ImageFrame) and frame.touched and out.valid and not found:
+                out.valid = False
+                add_reason(out.reasons, "out_of_distribution")
+        here = {contact.id for contact in found}
+        gone = [c for c in (*self._untold, *before.values()) if c.id not in here]
+        self._watched = out.valid
+        if not out.valid:
+            return found
+        if self._image_touches is not None and isinstance(frame, ImageFrame) and frame.touched:
+            self._image_of = frame.session, frame.reconstructed
+        self._counters["contacts"] += sum(contact.id not in before for contact in found)
+        ended = self._writer.gone(gone)
+        self._untold, self._shown = [], [*found, *ended]
+        self._ids = {touch: known for touch, known in self._ids.items() if known[0] in here}
+        return list(self._shown)
+
+    def _told(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact], alone: bool) -> list[Contact]:
+        """As the measurements tell them. alone: what touches in this frame began with it."""
+        now_ns = frame.stamps.get("sample", 0)
+        self._looks, self._drops = {}, {}
+        found = [self._contact(touch, now_ns, before, alone) for touch in frame.estimates]
+        found = self._fitted(found, frame)
+        return sorted(found, key=lambda contact: -(contact.force_n or 0.0))
+
+    def _pictured(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact], watched: bool) -> list[Contact]:
+        """As the image shows them, or as they were where it is the one of before. watched: what is new began."""
+        assert self._image_touches is not None
+        if isinstance(frame, ImageFrame) and not frame.touched:
+            return []
+        image = (frame.session, frame.reconstructed) if isinstance(frame, ImageFrame) else self._image_of
+        if isinstance(frame, PartFrame) or image == self._image_of:
+            return self._moved(frame, before)
+        known_looks = {number: self._looks[number] for number in before}  # they stay where this frame is not valid
+        touches = self._image_touches.found(frame, known_looks)
+        numbers = self._image_touches.same(touches, known_looks)
+        self._looks, self._anchors = known_looks, {}
+        found = list[Contact]()
+        for touch, known in zip(touches, numbers, strict=True):
+            number = known or self._next_id
+            self._next_id = max(self._next_id, number + 1)
+            state = "hold" if known or not watched else "begin"
+            self._looks[number], self._drops[number] = touch.looks, touch.segment.peak
+            moves = self._image_touches.estimated(touch.looks, frame.estimates)
+            if moves is not None:
+                self._anchors[number] = moves
+            found.append(self._writer.of_image(number, state, touch, frame, moves))
+        return found
+
+    def _moved(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact]) -> list[Contact]:
+        """Those of the image of before, where the measurements say that they are by now, and what has begun since."""
+        now = {touch.id: touch for touch in frame.estimates}
+        found, followed = list[Contact](), set[int]()
+        for number, contact in before.items():
+            anchor, held = self._anchors.get(number), replace(contact, state="hold")
+            if anchor is None:
+                found.append(held)
+            elif anchor.id in now:
+                followed.add(anchor.id)
+                if any(now[anchor.id].velocity):  # else what differs is noise
+                    held, self._anchors[number] = self._writer.moved(held, anchor, now[anchor.id]), now[anchor.id]
+                found.append(held)
+            elif isinstance(frame, ImageFrame):
+                found.append(held)  # something touches, and nothing else is known
+        now_ns = frame.stamps.get("sample", 0)
+        for touch in frame.estimates if isinstance(frame, PartFrame) else []:
+            if touch.id not in followed:
+                found.append(self._contact(touch, now_ns, before, alone=False))
+                self._anchors[found[-1].id] = touch
+        return found
+
+    def _contact(self, touch: EstimatedTouch, now_ns: int, before: Mapping[int, Contact], alone: bool) -> Contact:
+        born_ns = now_ns - round(1e9 * touch.age_s)
+        number, then_ns = self._ids.get(touch.id, (0, 0))
+        if not number or abs(born_ns - then_ns) > SAME_BIRTH_NS:  # a preprocessing that began anew counts from 1
+            number = self._next_id
+            self._next_id += 1
+        self._ids[touch.id] = number, born_ns
+        watched = self._watched_ns is not None and born_ns > self._watched_ns[0]
+        state = "begin" if (touch.began and watched or alone) and number not in before else "hold"
+        looks = self._looks[number] = self._appearances.of(touch)
+        self._drops[number] = touch.drop - 3 * touch.drop_sigma
+        return self._writer.of_estimate(number, state, touch, looks)
+
+    def _fitted(self, contacts: list[Contact], frame: ImageFrame | PartFrame) -> list[Contact]:
+        """The only contact as a fit of its shape has it, where both mean the same touch."""
+        if self._fit is None or len(contacts) != 1:
+            return contacts
+        fit, x, y = self._fit
+        touch = frame.estimates[0]
+        dx, dy = touch.position[0] - x, touch.position[1] - y
+        moved = replace(
+            fit,
+            position=[fit.position[0] + dx, fit.position[1] + dy],
+            centre=[fit.centre[0] + dx, fit.centre[1] + dy],
+            probabilities=both(fit.probabilities, self._appearances.of(touch).classes),
+        )
+        contact = self._writer.fitted(contacts[0], moved)
+        self._counters["disagreed" if contact is None else "refined"] += 1
+        return contacts if contact is None else [contact]
+
+    def _note(self, frame: ImageFrame | PartFrame, out: ContactFrame) -> None:
+        """What to know of these contacts."""
+        if any((c.force_n or 0.0) > self.law.most_n or self.law.saturates(c.pressure_pa) for c in out.contacts):
+            add_reason(out.reasons, "extrapolated")
+        sigmas = [c.position_sigma[0] for c in out.contacts if c.position_sigma is not None]
+        if any(sigma > self._coarse_m for sigma in sigmas):
+            add_reason(out.reasons, "coarse")
+        for contact in out.contacts:
+            if contact.id in self._drops and self.law.impossible(self._drops[contact.id], contact.force_n):
+                out.valid = False
+                add_reason(out.reasons, "out_of_distribution")
+
+    def _force(self, frame: ContactFrame) -> ForceFrame:
+        """The total force; valid if the contacts are."""
+        present = [c for c in frame.contacts if c.state != "end"]
+        total = None if not self._tells_force else sum(c.force_n or 0.0 for c in present)
+        wrench = np.sum([c.wrench for c in present], axis=0).tolist() if present else [0.0] * 6
+        sigmas = [c.force_sigma_n for c in present]
+        known = [sigma for sigma in sigmas if sigma is not None]
+        return ForceFrame(
+            **inherited(frame),
+            wrench=wrench,
+            force_n=total,
+            force_sigma_n=math.hypot(*known) if known and len(known) == len(sigmas) else None,
+            refined=any(c.refined for c in present),
+        )
+
+    def _shape(self, out: ContactFrame) -> ShapeFrame:
+        present = [c for c in out.contacts if c.state != "end"]
+        looks = [self._looks[c.id] for c in present]
+        fit = self._fit[0] if self._fit is not None and any(c.refined for c in present) else None
+        outlines = [look.outline for look in looks]
+        probabilities = [look.classes or [0.0] * len(SHAPES) for look in looks]
+        if fit is not None and looks:
+            outlines = outlines if area_of_image(fit) else [refined_outline(fit)]
+            probabilities = [both(fit.probabilities, looks[0].classes)]
+        return ShapeFrame(
+            **inherited(out),
+            ids=[c.id for c in present],
+            outlines=outlines,
+            orientation=[c.orientation for c in present],
+            probabilities=probabilities,
+            refined=fit is not None,
+        )
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "next_id": self._next_id,
+            "ids": [[touch, *known] for touch, known in self._ids.items()],
+            "shown": [asdict(c) for c in self._shown],
+            "untold": [asdict(c) for c in self._untold],
+            "watched_ns": list(self._watched_ns or ()),
+            "lasting": self.lasting.state(),
+            "looks": [[touch, asdict(look)] for touch, look in self._appearances.known.items()],
+            "seen": [[number, self._drops[number], asdict(look)] for number, look in self._looks.items()],
+            "image_of": list(self._image_of),
+            "anchors": [[number, asdict(touch)] for number, touch in self._anchors.items()],
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """A state of an earlier version tells nothing that a frame does not tell anew."""
+        self._end_all()
+        if "ids" not in state:
+            return
+        more = self._next_id - 1  # numbers given so far: none is given twice
+        self._next_id += int(state["next_id"]) - 1
+        self._ids = {int(touch): (more + int(number), int(born_ns)) for touch, number, born_ns in state["ids"]}
+        self._shown = [Contact(**(c | {"id": more + int(c["id"])})) for c in state["shown"]]
+        self._untold += [Contact(**(c | {"id": more + int(c["id"])})) for c in state["untold"]]
+        watched = [int(each) for each in state["watched_ns"]]
+        self._watched_ns = (watched[0], watched[1]) if watched else None
+        self.lasting.load(state["lasting"])
+        self._appearances.known = {int(touch): Appearance(**look) for touch, look in state["looks"]}
+        seen = state.get("seen", [])
+        self._looks = {more + int(number): Appearance(**look) for number, _, look in seen}
+        self._drops = {more + int(number): float(drop) for number, drop, _ in seen}
+        self._anchors = {more + int(number): EstimatedTouch(**touch) for number, touch in state.get("anchors", [])}
+        session, scan = state.get("image_of", ("", -1))
+        self._image_of = str(session), int(scan)
+
+    def health(self) -> Health:
+        problem = self._invalid.problem
+        return Health("WARN" if problem else "OK", [problem] if problem else [], dict(self._counters))
+
+
+def _readable(touch: EstimatedTouch) -> bool:
+    """Whether it is one that a touch may be."""
+    lengths = [*touch.position, *touch.sigma, touch.radius_m]
+    strengths = [touch.strength, touch.strength_sigma]
+    rest = [*touch.velocity, touch.age_s, touch.radius_sigma, touch.drop, touch.drop_sigma, touch.z2]
+    if not all(map(math.isfinite, [*lengths, *strengths, *rest])):
+        return False
+    return touch.radius_m > 0 and max(map(abs, lengths)) < MOST_M and max(strengths) < MOST_STRENGTH
+
 
 if __name__ == "__main__":
-    sys.exit(main("publisher", stages(TouchPublishing)))
+    import sys
+
+    from services.process import main, stages
+
+    sys.exit(main("publisher", stages(Publishing)))

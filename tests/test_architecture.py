@@ -291,7 +291,7 @@ def test_the_new_estimator_stands_in_its_order() -> None:
         ours = {other for other in graph[name] if other.startswith("services")}
         assert all(other.startswith("services.estimation.values") for other in ours), name
     asks = {name for name, others in graph.items() if rooms[-1] in others}
-    assert asks == {"services.estimating"}
+    assert asks == {"services.preprocessing"}
 
 
 def test_the_measurement_model_reads_no_file_but_through_the_bundle() -> None:

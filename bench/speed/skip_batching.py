@@ -10,8 +10,8 @@ from rich.table import Table
 from bench.tracking.scene import Recorded
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame
-from services.estimating import Estimating
 from services.networks import network
+from services.preprocessing import Preprocessing
 from services.runtime.config import Skin, TouchConfig
 
 TOGETHER = (1, 2, 4, 8)  # skins
@@ -22,7 +22,7 @@ def batched(recorded: Recorded, bundle: Bundle) -> dict[str, dict[str, float]]:
     """Skins that wait at once -> CPU of a frame's network [ms], one run for all of them and one for each; and by how
     much the images differ at most [S/m].
     """
-    pre = Estimating("palm", Skin(port="stub", bundle="square16", touch=TouchConfig(hold=False)), bundle)
+    pre = Preprocessing("palm", Skin(port="stub", bundle="square16", touch=TouchConfig(hold=False)), bundle)
     made = [pre.process(recorded.frame(k), frozenset({"delta"}))[0] for k in range(len(recorded))]
     deltas = [delta for delta in made if isinstance(delta, DeltaFrame) and delta.stack.size]
     shared = network(str(bundle.network_path("int8")))

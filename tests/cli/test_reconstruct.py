@@ -85,7 +85,7 @@ def test_positions_and_signs_are_the_true_ones(scenes, fresh) -> None:  # type: 
     assert np.median(error) < 0.05 and error.max() < 0.2
     for flip in ((-1, 1), (1, -1), (-1, -1)):
         assert np.median(np.linalg.norm(found * flip - truth, axis=1)) > 3 * np.median(error)
-    brightest = [np.unravel_index(out["image"][k].argmax(), (96, 96)) for k in rows]
+    brightest = [np.unravel_index(fresh["image"][k].argmax(), (96, 96)) for k in rows]
     from_image = np.array([[axis[ix], axis[iy]] for iy, ix in brightest])
     assert np.median(np.linalg.norm(from_image - truth, axis=1)) < 0.1
 

@@ -37,7 +37,7 @@ from protocol.topics import TOPICS
 from services.calibration import presses_csv as calibration_csv
 from services.calibration.force_fit import CalibrationError
 from services.contacts import calibration_file as calibration
-from services.estimating import Estimating
+from services.preprocessing import Preprocessing
 from services.recordings import settings
 from services.recordings.recording import RecordingError, RecordingReader
 from services.recordings.replay import skins_in, steps
@@ -77,8 +77,8 @@ def fields(data: bytes) -> None:
 
 
 @cache
-def _stage() -> Estimating:
-    return Estimating("palm", PALM, _bundle())
+def _stage() -> Preprocessing:
+    return Preprocessing("palm", PALM, _bundle())
 
 
 @cache

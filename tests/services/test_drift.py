@@ -14,8 +14,8 @@ from models.bundle import Bundle
 from models.measurement.tables import tables_of
 from models.measurement.whitening import Whitening, leave_out
 from protocol.frames import DeltaFrame, RawFrame
-from services.estimating import Estimating
 from services.estimation.filter import FIELD, SkinFilter
+from services.preprocessing import Preprocessing
 from services.recordings.reconstruction import reconstruct
 from services.runtime.config import Skin
 from tests.services.conftest import FRAME_NS, Board
@@ -25,16 +25,16 @@ WANTED = frozenset({"delta"})
 
 
 @pytest.fixture
-def stage(skin: Skin, bundle: Bundle, board: Board) -> Estimating:
+def stage(skin: Skin, bundle: Bundle, board: Board) -> Preprocessing:
     """Tared."""
-    made = Estimating("palm", skin, bundle)
+    made = Preprocessing("palm", skin, bundle)
     for _ in range(80):
         out = run(made, board.frame())
     assert out.valid
     return made
 
 
-def run(stage: Estimating, frame: RawFrame) -> DeltaFrame:
+def run(stage: Preprocessing, frame: RawFrame) -> DeltaFrame:
     (out,) = stage.process(frame, WANTED)
     assert isinstance(out, DeltaFrame)
     return out
@@ -58,7 +58,7 @@ def test_no_false_alarm_in_three_hours_of_drift(skin: Skin, bundle: Bundle, seed
     rates = np.array([skin.tare.scale_per_s] + [skin.tare.contact_per_s] * 16)
     frame_s, wrong, frames = FRAME_NS * 1e-9, 0, 0
     for part in range(3):
-        stage, board = Estimating("palm", skin, bundle), Board(bundle, seed=3 * seed + part)
+        stage, board = Preprocessing("palm", skin, bundle), Board(bundle, seed=3 * seed + part)
         for _ in range(72):
             run(stage, board.frame())
         drift, rate = np.zeros(17), np.zeros(17)
@@ -73,7 +73,7 @@ def test_no_false_alarm_in_three_hours_of_drift(skin: Skin, bundle: Bundle, seed
     assert wrong == 0 and frames > 119_000
 
 
-def test_an_untouched_skin_that_dries_is_not_touched(stage: Estimating, board: Board, bundle: Bundle) -> None:
+def test_an_untouched_skin_that_dries_is_not_touched(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
     """The stub's scene "drift": 2 % of the sheet, a quarter of one contact, in five minutes; every other frame."""
     board.frame_ns = 2 * FRAME_NS
     end = directions(bundle) @ np.array([0.02, 0, 0, 0, 0.25, *[0] * 8, -0.15, 0, 0, 0])
@@ -103,7 +103,7 @@ def solved(sheet: Sheet, bundle: Bundle) -> Callable[..., Array]:
 class Time:
     """Frames of given |Z| at any times."""
 
-    def __init__(self, stage: Estimating, seed: int = 3) -> None:
+    def __init__(self, stage: Preprocessing, seed: int = 3) -> None:
         self.stage, self.rng, self.now_s, self.scan = stage, np.random.default_rng(seed), 1.0, 0
 
     def frames(
@@ -133,7 +133,7 @@ class Time:
 @pytest.fixture
 def time(skin: Skin, bundle: Bundle, solved: Callable[..., Array]) -> Time:
     """Tared on the solved sheet, 80 dB."""
-    made = Time(Estimating("palm", skin, bundle))
+    made = Time(Preprocessing("palm", skin, bundle))
     outs = list(made.frames(solved(), 8.0))
     assert outs[-1].valid and not any(out.touched for out in outs)
     return made
@@ -239,24 +239,24 @@ def test_frames_that_only_drifted_are_untouched_offline(
 def test_work_ahead_changes_no_result(skin: Skin, bundle: Bundle, solved: Callable[..., Array]) -> None:
     """Prepared or not: the same bytes; and from a saved state on, too."""
     free, pressed = solved(), solved(Touch("circle", 0.02, 0.015, 0.010, 0.3))
-    lazy, eager = (Time(Estimating("palm", skin, bundle)) for _ in range(2))
+    lazy, eager = (Time(Preprocessing("palm", skin, bundle)) for _ in range(2))
     made = [0, 0]
     for z, seconds in ((free, 8.0), (pressed, 6.0), (free, 3.0), (pressed, 3.0)):
         for n, (a, b) in enumerate(zip(lazy.frames(z, seconds), eager.frames(z, seconds), strict=True)):
             made[eager.stage.prepare()] += 1
             assert a.difference.tobytes() == b.difference.tobytes() and a.score == b.score and a.held == b.held
             if n == 50:
-                resumed = Estimating("palm", skin, bundle)
+                resumed = Preprocessing("palm", skin, bundle)
                 resumed.load(eager.stage.state())
                 eager.stage = resumed
                 lazy.stage.state()  # who was asked for it goes on as who loads it
     assert made[1] > 0
 
 
-def test_a_restored_baseline_is_as_old_as_it_is(stage: Estimating, skin: Skin, bundle: Bundle, board: Board) -> None:
+def test_a_restored_baseline_is_as_old_as_it_is(stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board) -> None:
     """Half an hour of drift while nothing ran is no touch, and what info says is when the tare was."""
     saved = stage.saved()
-    again = Estimating("palm", skin, bundle)
+    again = Preprocessing("palm", skin, bundle)
     assert saved is not None
     again.restore(saved, 1800.0)
     drifted = directions(bundle) @ np.append(0.01, 0.1 * np.cos(np.arange(16)))
@@ -290,7 +290,7 @@ def test_how_far_drift_may_have_gone_does_not_depend_on_how_time_is_cut(bundle: 
     assert 0.01 < expected.p[FIELD, FIELD][0, 0] ** 0.5 < 0.1  # of the sheet: no more than it ever drifts
 
 
-def test_a_drift_that_was_seen_is_expected_to_go_on(stage: Estimating, board: Board) -> None:
+def test_a_drift_that_was_seen_is_expected_to_go_on(stage: Preprocessing, board: Board) -> None:
     """A minute of steady drift, then ten seconds without frames: what is expected is nearer than no change."""
     per_frame = 1e-4 * FRAME_NS * 1e-9
     for n in range(1300):

@@ -17,8 +17,8 @@ from models.measurement.tables import tables_of
 from models.mismatch import Mismatch
 from models.rolling import order
 from protocol.frames import Contact, ContactFrame, RawFrame
-from services.estimating import Estimating
 from services.estimation.estimator import Estimator
+from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
 
 SCAN_S, PARTS, NOISE = 0.0437, 10, 1e-4
@@ -99,7 +99,7 @@ def run(curve: Curve, seconds: float, parts: int = 1, seed: int = 1, tare_s: flo
 
 def estimator_of(candidate: Today) -> Estimator:
     stage = candidate.stages.pre
-    assert isinstance(stage, Estimating)
+    assert isinstance(stage, Preprocessing)
     return stage.estimator
 
 

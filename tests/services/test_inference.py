@@ -11,10 +11,10 @@ from onnx import TensorProto, helper
 
 from models.bundle import Bundle, write
 from protocol.frames import DeltaFrame, ImageFrame, pack
-from services.estimating import Estimating
 from services.estimation.quality import KEPT
 from services.estimation.touch_decision import MEANS
 from services.inference import SETTLED, Inference
+from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
 from tests.services.conftest import Board
 
@@ -152,7 +152,7 @@ def test_state_carries_the_held_image(stage: Inference, skin: Skin, networked: B
 
 
 def test_without_a_network_the_one_step_image_shows_the_touch(skin: Skin, bundle: Bundle, board: Board) -> None:
-    pre, stage = Estimating("palm", skin, bundle), Inference("palm", skin, bundle)
+    pre, stage = Preprocessing("palm", skin, bundle), Inference("palm", skin, bundle)
     for _ in range(72):
         pre.process(board.frame(), WANTED)
     (frame,) = pre.process(board.frame(board.disc(0.4, -0.2, 0.2, 0.3)), WANTED)
@@ -264,7 +264,7 @@ def test_what_a_touch_needs_is_made_while_nothing_touches(
     skin: Skin, networked: Bundle, board: Board, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first image of a touch waits for no matrix, nor do those of its means."""
-    pre, stage = Estimating("palm", skin, networked), Inference("palm", skin, networked)
+    pre, stage = Preprocessing("palm", skin, networked), Inference("palm", skin, networked)
     for _ in range(80):
         (quiet,) = pre.process(board.frame(), frozenset({"delta"}))
         assert isinstance(quiet, DeltaFrame)

@@ -24,11 +24,11 @@ from services.calibration.force_presses import of_file
 from services.contacts import calibration_file
 from services.contacts.force import ForceLaw
 from services.contacts.force_curve import Curve
-from services.estimating import Estimating
 from services.estimation.baseline import Baseline
 from services.estimation.by_bundle import skin_tables
 from services.linearisation import Linearisation
 from services.pipeline import Pipeline, Result
+from services.preprocessing import Preprocessing
 from services.runtime.config import Skin, TareConfig
 from services.runtime.stage import Stage
 
@@ -128,11 +128,11 @@ def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(
     saved = bench.pipeline.pre.saved()
     assert saved is not None
     calibration_file.save(forces, calibration_file.Calibration(Curve(12.0)), "palm", bench.skin, bundle)
-    again = Estimating("palm", bench.skin, bundle)
+    again = Preprocessing("palm", bench.skin, bundle)
     again.restore(saved, 1.0)
     assert again.linearisation.name == name and again.info() is not None
     assert again.baseline is not None
-    off = Estimating("palm", bench.skin.model_copy(update={"tare": TareConfig(calibrate=False)}), bundle)
+    off = Preprocessing("palm", bench.skin.model_copy(update={"tare": TareConfig(calibrate=False)}), bundle)
     with pytest.raises(Exception, match="another bundle"):
         off.restore(saved, 1.0)
     # the same, by what a recording holds

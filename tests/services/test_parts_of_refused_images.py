@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from protocol.frames import ContactFrame, ImageFrame, PartFrame, pack, unpack
-from services.touch_publishing import TouchPublishing
+from services.publisher import Publishing
 from tests.services.gap_host import GapHost, Press
 
 TOUCH = Press(0.02, -0.01, 4.0, 20.0)
@@ -13,7 +13,7 @@ NEXT_NS = 4_360_000  # a part of a scan
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[TouchPublishing, ImageFrame, PartFrame]:
+def seen() -> tuple[Publishing, ImageFrame, PartFrame]:
     """An image frame and a part frame of a touch that is held, and the publisher that has seen those before."""
     host = GapHost("rolling", 3, [TOUCH])
     images, parts = list[ImageFrame](), list[PartFrame]()

@@ -12,10 +12,10 @@ import pytest
 from models.bundle import Bundle
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA, DeltaFrame, RawFrame, pack, unpack
 from services.describe import EVERY_S, MOVED
-from services.estimating import Estimating
 from services.estimation import checks
 from services.estimation.baseline import Baseline, NoBaseline, disagreement, take
 from services.estimation.faults.wires import WireFault, WireKind, WireMaps
+from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
 from services.runtime.stage import Refused
 from tests.services.conftest import FRAME_NS, Board
@@ -24,11 +24,11 @@ WANTED = frozenset({"delta"})
 
 
 @pytest.fixture
-def stage(skin: Skin, bundle: Bundle) -> Estimating:
-    return Estimating("palm", skin, bundle)
+def stage(skin: Skin, bundle: Bundle) -> Preprocessing:
+    return Preprocessing("palm", skin, bundle)
 
 
-def run(stage: Estimating, frame: RawFrame) -> DeltaFrame:
+def run(stage: Preprocessing, frame: RawFrame) -> DeltaFrame:
     (out,) = stage.process(frame, WANTED)
     assert isinstance(out, DeltaFrame)
     assert np.isfinite(out.difference).all()
@@ -42,20 +42,20 @@ def received(frame: RawFrame) -> RawFrame:
     return back
 
 
-def tared(stage: Estimating, board: Board) -> Estimating:
+def tared(stage: Preprocessing, board: Board) -> Preprocessing:
     for _ in range(72):
         out = run(stage, board.frame())
     assert out.valid and not out.touched
     return stage
 
 
-def test_frames_are_not_valid_before_the_baseline(stage: Estimating, board: Board) -> None:
+def test_frames_are_not_valid_before_the_baseline(stage: Preprocessing, board: Board) -> None:
     outs = [run(stage, board.frame()) for _ in range(80)]
     assert all(not o.valid and o.reasons == ["stale_baseline"] for o in outs[:60])
     assert outs[-1].valid
 
 
-def test_a_touch_during_the_first_frames_is_no_baseline(stage: Estimating, board: Board) -> None:
+def test_a_touch_during_the_first_frames_is_no_baseline(stage: Preprocessing, board: Board) -> None:
     touch = board.disc(0.3, 0.0, 0.2, 0.3)
     for n in range(72):
         out = run(stage, board.frame(touch if n > 40 else 0.0))
@@ -66,7 +66,7 @@ def test_a_touch_during_the_first_frames_is_no_baseline(stage: Estimating, board
     assert out.valid
 
 
-def test_a_touch_at_the_start_is_named_and_ends_without_a_command(stage: Estimating, board: Board) -> None:
+def test_a_touch_at_the_start_is_named_and_ends_without_a_command(stage: Preprocessing, board: Board) -> None:
     """Touched all the time: the frames agree, so the bundle's prediction must tell."""
     touch = 3 * board.disc(0.5, -0.3, 0.3, 0.5)
     for _ in range(80):
@@ -78,7 +78,7 @@ def test_a_touch_at_the_start_is_named_and_ends_without_a_command(stage: Estimat
 
 
 def test_a_tare_under_a_touch_that_the_start_found_is_refused_and_ends_by_another(
-    stage: Estimating, board: Board
+    stage: Preprocessing, board: Board
 ) -> None:
     """Its frames would be valid and hide the touch. Who forces it is believed, and needs no force to be rid of it.
     What comes then is refused after two scans that may be a touch that changes.
@@ -99,7 +99,7 @@ def test_a_tare_under_a_touch_that_the_start_found_is_refused_and_ends_by_anothe
     assert out.valid and not out.touched
 
 
-def test_a_baseline_that_explains_nothing_does_not_have_a_touch_tared(stage: Estimating, board: Board) -> None:
+def test_a_baseline_that_explains_nothing_does_not_have_a_touch_tared(stage: Preprocessing, board: Board) -> None:
     """Its word against a tare counts for nothing, but then the bundle's does."""
     touch = 3 * board.disc(0.5, -0.3, 0.3, 0.5)
     for _ in range(80):
@@ -111,7 +111,7 @@ def test_a_baseline_that_explains_nothing_does_not_have_a_touch_tared(stage: Est
         stage.command("tare", {})
 
 
-def test_a_skin_unlike_its_bundle_is_not_valid_until_one_tare(stage: Estimating, board: Board) -> None:
+def test_a_skin_unlike_its_bundle_is_not_valid_until_one_tare(stage: Preprocessing, board: Board) -> None:
     """Every |Z| off in its own way. The tare's word is kept, and is enough for the next start."""
     odd = 0.01 * np.random.default_rng(1).standard_normal(len(board.m.z0))
     for _ in range(80):
@@ -129,7 +129,7 @@ def test_a_skin_unlike_its_bundle_is_not_valid_until_one_tare(stage: Estimating,
     assert outs[-1].valid and not outs[-1].touched
 
 
-def test_a_touch_at_the_start_is_a_contact_where_an_old_baseline_is_trusted(stage: Estimating, board: Board) -> None:
+def test_a_touch_at_the_start_is_a_contact_where_an_old_baseline_is_trusted(stage: Preprocessing, board: Board) -> None:
     for _ in range(80):
         run(stage, board.frame())
     saved = stage.saved()
@@ -144,7 +144,7 @@ def test_a_touch_at_the_start_is_a_contact_where_an_old_baseline_is_trusted(stag
     assert not [run(stage, board.frame()) for _ in range(10)][-1].touched
 
 
-def test_identical_frames_tell_no_noise(stage: Estimating, board: Board, bundle: Bundle) -> None:
+def test_identical_frames_tell_no_noise(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
     """Without noise of its own a skin would be touched by anything."""
     z = np.asarray(board.m.z0, dtype=float)
     baseline = take(np.tile(z, (64, 1)), bundle.prereconstructor(), "b1", 0)
@@ -164,7 +164,7 @@ def test_frames_nearly_without_noise_are_a_tare(board: Board, bundle: Bundle) ->
         assert np.median(baseline.sigma / z) == pytest.approx(max(relative, 2e-6), rel=0.1)
 
 
-def test_presses_that_come_and_go_are_no_baseline(stage: Estimating, board: Board) -> None:
+def test_presses_that_come_and_go_are_no_baseline(stage: Preprocessing, board: Board) -> None:
     """Each quarter of the frames holds some of them, so the quarters' own scatter would hide them."""
     touch = board.disc(0.05, 0.0, 0.2, 0.3)
     for n in range(200):
@@ -196,7 +196,9 @@ def not_believed(frame: RawFrame, reason: str) -> RawFrame:
 
 
 @pytest.mark.parametrize("reason", ["frozen", "clock"])
-def test_frames_that_acquisition_does_not_believe_are_no_baseline(stage: Estimating, board: Board, reason: str) -> None:
+def test_frames_that_acquisition_does_not_believe_are_no_baseline(
+    stage: Preprocessing, board: Board, reason: str
+) -> None:
     for _ in range(144):
         assert "stale_baseline" in run(stage, not_believed(board.frame(), reason)).reasons
     assert stage.saved() is None
@@ -207,7 +209,7 @@ def test_frames_that_acquisition_does_not_believe_are_no_baseline(stage: Estimat
 
 @pytest.mark.parametrize("reason", ["frozen", "clock"])
 def test_the_baseline_follows_no_frame_that_acquisition_does_not_believe(
-    stage: Estimating, board: Board, reason: str
+    stage: Preprocessing, board: Board, reason: str
 ) -> None:
     """Nor does it learn anything else: what comes after them is judged as if they had not been."""
     tared(stage, board)
@@ -221,7 +223,7 @@ def test_the_baseline_follows_no_frame_that_acquisition_does_not_believe(
     assert abs(np.mean(even[-20:])) < 0.2e-4 and np.mean(even[:2]) > 0.5e-4
 
 
-def test_a_held_touch_is_not_averaged_over_frozen_frames(stage: Estimating, board: Board) -> None:
+def test_a_held_touch_is_not_averaged_over_frozen_frames(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     touch = board.disc(0.2, 0.1, 0.3, 0.3)
     for _ in range(3):
@@ -230,14 +232,14 @@ def test_a_held_touch_is_not_averaged_over_frozen_frames(stage: Estimating, boar
     for _ in range(40):
         frozen = dataclasses.replace(again, scan=again.scan)
         run(stage, not_believed(frozen, "frozen"))
-    single = tared(Estimating("palm", stage.config, stage.bundle), Board(stage.bundle))
+    single = tared(Preprocessing("palm", stage.config, stage.bundle), Board(stage.bundle))
     alone = run(single, Board(stage.bundle, seed=9).frame(touch)).sigma
     out = run(stage, board.frame(touch))
     assert out.valid and out.touched
     assert out.held or np.allclose(out.sigma, alone, rtol=0.3)  # of one scan, or of two
 
 
-def test_no_false_touch_and_the_lightest_touch_is_seen(stage: Estimating, board: Board) -> None:
+def test_no_false_touch_and_the_lightest_touch_is_seen(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     assert not any(run(stage, board.frame()).touched for _ in range(300))
     light = board.disc(0.0, 0.0, 0.1, 0.1)  # 1 N of the 10 mm indenter at the centre
@@ -246,14 +248,14 @@ def test_no_false_touch_and_the_lightest_touch_is_seen(stage: Estimating, board:
     assert not run(stage, board.frame()).touched
 
 
-def test_untouched_frames_carry_no_stack(stage: Estimating, board: Board) -> None:
+def test_untouched_frames_carry_no_stack(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     assert run(stage, board.frame()).stack.size == 0
     stage.always_reconstruct = True
     assert run(stage, board.frame()).stack.shape[0] == len(board.m.ladder)
 
 
-def test_an_unchanged_touch_is_held_and_averaged(stage: Estimating, board: Board) -> None:
+def test_an_unchanged_touch_is_held_and_averaged(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     touch = board.disc(0.2, 0.1, 0.2, 0.3)
     outs = [run(stage, board.frame(touch)) for _ in range(40)]
@@ -267,7 +269,7 @@ def test_an_unchanged_touch_is_held_and_averaged(stage: Estimating, board: Board
     assert error[1] < 0.6 * error[0]  # 16 frames averaged; the tare's own noise remains
 
 
-def test_creep_is_seen(stage: Estimating, board: Board) -> None:
+def test_creep_is_seen(stage: Preprocessing, board: Board) -> None:
     """Each step is far below the noise, their sum is not."""
     tared(stage, board)
     start = board.disc(0.2, 0.1, 0.2, 0.30)
@@ -282,7 +284,7 @@ def test_creep_is_seen(stage: Estimating, board: Board) -> None:
     assert truth > 0.7
 
 
-def test_a_dead_electrode_is_left_out(stage: Estimating, board: Board, bundle: Bundle) -> None:
+def test_a_dead_electrode_is_left_out(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
     tared(stage, board)
     frame = board.frame()
     uses = (bundle.pattern == 5).any(axis=1)
@@ -300,7 +302,7 @@ def test_a_dead_electrode_is_left_out(stage: Estimating, board: Board, bundle: B
 @pytest.mark.parametrize("reasons", [[], ["clock"], ["gap", "clock"]])
 @pytest.mark.parametrize("valid", [True, False])
 def test_failed_measurements_do_not_change_what_the_producer_says(
-    stage: Estimating, board: Board, valid: bool, reasons: list[str]
+    stage: Preprocessing, board: Board, valid: bool, reasons: list[str]
 ) -> None:
     tared(stage, board)
     frame = board.frame()
@@ -314,7 +316,7 @@ def test_failed_measurements_do_not_change_what_the_producer_says(
     assert run(stage, board.frame()).valid
 
 
-def test_a_short_between_two_electrodes_is_named(stage: Estimating, board: Board, bundle: Bundle) -> None:
+def test_a_short_between_two_electrodes_is_named(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
     tared(stage, board)
     frame = board.frame(board.disc(0.0, 0.0, 0.2, 0.3))
     shorted = WireMaps(bundle.pattern).one(WireFault(WireKind.SHORT, (2, 3)), np.abs(frame.z.astype(complex)))
@@ -324,7 +326,7 @@ def test_a_short_between_two_electrodes_is_named(stage: Estimating, board: Board
     assert list(np.flatnonzero(out.electrodes == 2)) == [2, 3]
 
 
-def test_more_than_two_dead_electrodes_make_a_frame_invalid(stage: Estimating, board: Board, bundle: Bundle) -> None:
+def test_more_than_two_dead_electrodes_make_a_frame_invalid(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
     tared(stage, board)
     frame = board.frame()
     frame.status[np.isin(bundle.pattern, (1, 6, 11)).any(axis=1)] = STATUS_OPEN
@@ -332,7 +334,7 @@ def test_more_than_two_dead_electrodes_make_a_frame_invalid(stage: Estimating, b
     assert not out.valid and "electrode_open" in out.reasons
 
 
-def test_frames_of_another_skin_are_refused(stage: Estimating, board: Board) -> None:
+def test_frames_of_another_skin_are_refused(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     frame = board.frame()
     frame.z, frame.status = frame.z[:64], frame.status[:64]
@@ -341,7 +343,7 @@ def test_frames_of_another_skin_are_refused(stage: Estimating, board: Board) -> 
     assert "64 measurements" in stage.health().messages[0]
 
 
-def test_tare_is_refused_while_touched(stage: Estimating, board: Board) -> None:
+def test_tare_is_refused_while_touched(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     for _ in range(70):
         run(stage, board.frame(board.disc(0.0, 0.0, 0.2, 0.3)))
@@ -357,22 +359,22 @@ def test_tare_is_refused_while_touched(stage: Estimating, board: Board) -> None:
 
 
 def test_the_baseline_survives_a_crash_but_not_another_board(
-    stage: Estimating, skin: Skin, bundle: Bundle, board: Board
+    stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board
 ) -> None:
     tared(stage, board)
     saved = stage.saved()
     assert saved is not None and stage.saved() is None
-    again = Estimating("palm", skin, bundle)
+    again = Preprocessing("palm", skin, bundle)
     again.restore(saved, 60.0)
     assert run(again, board.frame()).valid
     assert not run(again, board.frame(board="b2")).valid
     with pytest.raises(Refused, match="old"):
-        Estimating("palm", skin, bundle).restore(saved, 1e6)
+        Preprocessing("palm", skin, bundle).restore(saved, 1e6)
     with pytest.raises(Refused, match="another bundle"):
-        Estimating("palm", skin, bundle).restore(saved | {"bundle": "x"}, 1.0)
+        Preprocessing("palm", skin, bundle).restore(saved | {"bundle": "x"}, 1.0)
 
 
-def test_slow_drift_is_followed_while_untouched(stage: Estimating, board: Board) -> None:
+def test_slow_drift_is_followed_while_untouched(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     board.frame_ns = 1_000_000_000
     impedances = board.m.contact @ np.random.default_rng(2).uniform(-0.02, 0.02, 16)  # of the electrodes' contacts
@@ -381,12 +383,12 @@ def test_slow_drift_is_followed_while_untouched(stage: Estimating, board: Board)
     assert np.abs(outs[-1].difference).mean() < 0.1 * np.abs(2e-3 + impedances).mean()
 
 
-def test_state_continues_bit_by_bit(stage: Estimating, skin: Skin, bundle: Bundle, board: Board) -> None:
+def test_state_continues_bit_by_bit(stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board) -> None:
     tared(stage, board)
     touch = board.disc(-0.3, 0.4, 0.2, 0.2)
     for _ in range(5):
         run(stage, board.frame(touch))
-    twin = Estimating("palm", skin, bundle)
+    twin = Preprocessing("palm", skin, bundle)
     twin.load(stage.state())
     for n in range(20):
         frame = board.frame(touch if n < 15 else 0.0)
@@ -400,16 +402,16 @@ def test_state_continues_bit_by_bit(stage: Estimating, skin: Skin, bundle: Bundl
     [("z0", np.nan), ("z0", -1.0), ("z0", np.inf), ("sigma", 0.0), ("sigma", -1e-3), ("sigma", np.nan)],
 )
 def test_an_impossible_baseline_is_refused(
-    stage: Estimating, skin: Skin, bundle: Bundle, board: Board, key: str, value: float
+    stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board, key: str, value: float
 ) -> None:
     state = tared(stage, board).state()
     state["baseline"][key] = np.where(np.arange(120) == 7, value, state["baseline"][key])
     with pytest.raises(Refused, match="not possible"):
-        Estimating("palm", skin, bundle).load(state)
+        Preprocessing("palm", skin, bundle).load(state)
     with pytest.raises(Refused, match="not possible"):
-        Estimating("palm", skin, bundle).restore({"bundle": bundle.hash, "baseline": state["baseline"]}, 1.0)
+        Preprocessing("palm", skin, bundle).restore({"bundle": bundle.hash, "baseline": state["baseline"]}, 1.0)
     with pytest.raises(Refused):
-        Estimating("palm", skin, bundle).restore({"bundle": bundle.hash}, 1.0)
+        Preprocessing("palm", skin, bundle).restore({"bundle": bundle.hash}, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -426,10 +428,10 @@ def test_an_impossible_baseline_is_refused(
     ],
 )
 def test_a_state_of_another_shape_is_refused(
-    stage: Estimating, skin: Skin, bundle: Bundle, board: Board, key: str, value: object
+    stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board, key: str, value: object
 ) -> None:
     """And nothing changes of the stage that refuses it."""
-    twin = Estimating("palm", skin, bundle)
+    twin = Preprocessing("palm", skin, bundle)
     twin.load(tared(stage, board).state())
     state = stage.state()
     part, _, name = key.rpartition(".")
@@ -447,22 +449,22 @@ def test_a_state_of_another_shape_is_refused(
 
 
 def test_a_measurement_without_a_baseline_is_taken_over(
-    stage: Estimating, skin: Skin, bundle: Bundle, board: Board
+    stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board
 ) -> None:
     state = tared(stage, board).state()
     state["baseline"]["z0"][3], state["baseline"]["sigma"][3] = 0.0, np.inf
-    twin = Estimating("palm", skin, bundle)
+    twin = Preprocessing("palm", skin, bundle)
     twin.load(state)
     assert np.flatnonzero(~np.isfinite(run(twin, board.frame()).sigma)).tolist() == [3]
 
 
-def test_a_recording_never_meets_the_boards_baseline(stage: Estimating, board: Board) -> None:
+def test_a_recording_never_meets_the_boards_baseline(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     assert not run(stage, board.frame(source="replay")).valid
     assert stage.saved() is None
 
 
-def test_reference_frames_are_the_baseline(stage: Estimating, board: Board) -> None:
+def test_reference_frames_are_the_baseline(stage: Preprocessing, board: Board) -> None:
     for _ in range(72):
         run(stage, board.frame(source="replay"))
     shifted = 0.01 * np.cos(np.arange(120))
@@ -476,7 +478,7 @@ def test_reference_frames_are_the_baseline(stage: Estimating, board: Board) -> N
 def test_more_noise_than_networks_were_trained_with_is_never_valid(skin: Skin, bundle: Bundle) -> None:
     """Not even after a tare on command: looking at the skin does not mend it."""
     for snr_db, valid in ((50.0, True), (40.0, False), (30.0, False)):
-        stage, board = Estimating("palm", skin, bundle), Board(bundle, snr_db)
+        stage, board = Preprocessing("palm", skin, bundle), Board(bundle, snr_db)
         for _ in range(80):
             found = run(stage, board.frame())
         assert found.valid == valid and not found.touched
@@ -496,7 +498,7 @@ def test_take_refuses_noise_and_missing_measurements(bundle: Bundle) -> None:
         take(half, pre, "", 0)
 
 
-def test_info_says_what_frames_are_compared_with(stage: Estimating, board: Board) -> None:
+def test_info_says_what_frames_are_compared_with(stage: Preprocessing, board: Board) -> None:
     """Its hash is that of its arrays, drift is told as it is followed, and nothing that was told changes."""
     tared(stage, board)
     first, truth = stage.info(), np.asarray(board.m.z0, float)
@@ -520,7 +522,7 @@ def test_info_says_what_frames_are_compared_with(stage: Estimating, board: Board
     assert len({info["tare_sample_ns"] for info in told}) == 1
 
 
-def test_a_tare_is_told_at_once_and_a_still_baseline_once(stage: Estimating, board: Board) -> None:
+def test_a_tare_is_told_at_once_and_a_still_baseline_once(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     infos = [stage.info()]
     for _ in range(300):
@@ -548,7 +550,7 @@ def test_a_baseline_is_its_own(bundle: Bundle) -> None:
     ("bit", "reason"), [(STATUS_CLIPPED, "saturated"), (STATUS_RTIA, "saturated"), (STATUS_FIFO, "fifo")]
 )
 def test_a_measurement_that_the_board_doubts_is_left_out_by_name(
-    stage: Estimating, board: Board, bit: int, reason: str
+    stage: Preprocessing, board: Board, bit: int, reason: str
 ) -> None:
     tared(stage, board)
     frame = board.frame()
@@ -565,7 +567,7 @@ def test_a_measurement_that_the_board_doubts_is_left_out_by_name(
 
 @pytest.mark.parametrize("lost", [12, 33])
 def test_a_frame_that_lacks_a_run_of_measurements_knows_where_it_sees_less(
-    stage: Estimating, board: Board, lost: int
+    stage: Preprocessing, board: Board, lost: int
 ) -> None:
     """Touches are what they are within their sigma, which grows by what is missing: pairs of the last electrodes."""
     tared(stage, board)
@@ -587,7 +589,7 @@ def test_a_frame_that_lacks_a_run_of_measurements_knows_where_it_sees_less(
     assert sum(sigmas[4:]) > sum(sigmas[:4])
 
 
-def test_a_frame_that_lacks_more_than_half_of_its_measurements_is_not_valid(stage: Estimating, board: Board) -> None:
+def test_a_frame_that_lacks_more_than_half_of_its_measurements_is_not_valid(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
     frame = board.frame()
     frame.status[-66:] = STATUS_FIFO
@@ -598,7 +600,7 @@ def test_a_frame_that_lacks_more_than_half_of_its_measurements_is_not_valid(stag
 def test_what_a_bundle_cannot_tell_is_said_and_is_no_warning(skin: Skin, bundle: Bundle) -> None:
     assert checks.sentence(bundle) == ""
     found = Bundle.load("disc16")
-    measured = Estimating("disc", skin.model_copy(update={"bundle": "disc16"}), found)
+    measured = Preprocessing("disc", skin.model_copy(update={"bundle": "disc16"}), found)
     measured.set_baseline(Baseline(found.z0, 1e-4 * found.z0, 64, "b1", 0))
     assert measured.health().level == "OK"
     (message,) = measured.health().messages
@@ -626,7 +628,7 @@ def test_what_a_bundle_cannot_tell_follows_from_its_pattern(bundle: Bundle) -> N
 
 
 def test_a_short_scan_of_an_old_recording_makes_no_contact_and_disturbs_nothing(
-    stage: Estimating, board: Board, bundle: Bundle
+    stage: Preprocessing, board: Board, bundle: Bundle
 ) -> None:
     tared(stage, board)
     before = stage.state()

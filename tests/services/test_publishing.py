@@ -25,9 +25,9 @@ from protocol.frames import (
     unpack,
 )
 from services.contacts.outline import outline
+from services.publisher import Publishing
 from services.runtime import persistence
 from services.runtime.config import Skin
-from services.touch_publishing import TouchPublishing
 
 N, M = 96, 0.1 / 96
 CONTACT = frozenset({"contact"})
@@ -91,19 +91,19 @@ def part(scan: int, *touches: EstimatedTouch) -> PartFrame:
 
 
 @pytest.fixture
-def stage(skin: Skin, bundle: Bundle) -> TouchPublishing:
-    return TouchPublishing("palm", skin, bundle)
+def stage(skin: Skin, bundle: Bundle) -> Publishing:
+    return Publishing("palm", skin, bundle)
 
 
 @pytest.fixture
-def of_peak(skin: Skin, bundle: Bundle) -> TouchPublishing:
+def of_peak(skin: Skin, bundle: Bundle) -> Publishing:
     """Forces by the peak drop, 10 N a S/m: what an image shows of it is exact, where that of pressure is a mean over
     sizes, for images that no network makes as sharp as these discs.
     """
-    return TouchPublishing("palm", skin.model_copy(update={"reads": "peak"}), bundle)
+    return Publishing("palm", skin.model_copy(update={"reads": "peak"}), bundle)
 
 
-def contacts(stage: TouchPublishing, frame: Frame) -> ContactFrame:
+def contacts(stage: Publishing, frame: Frame) -> ContactFrame:
     out = stage.process(frame, CONTACT)[0]
     assert isinstance(out, ContactFrame)
     unpack(pack(out))
@@ -113,7 +113,7 @@ def contacts(stage: TouchPublishing, frame: Frame) -> ContactFrame:
 ONE = (0.02, -0.01, 0.01, 0.3)
 
 
-def test_position_force_area_and_wrench_of_a_touch(stage: TouchPublishing, of_peak: TouchPublishing) -> None:
+def test_position_force_area_and_wrench_of_a_touch(stage: Publishing, of_peak: Publishing) -> None:
     frame = seen(1, told(1, ONE))
     (exact,) = contacts(of_peak, frame).contacts
     assert exact.force_n == pytest.approx(3.0, rel=0.01)
@@ -138,9 +138,7 @@ def test_position_force_area_and_wrench_of_a_touch(stage: TouchPublishing, of_pe
         (1.05, False, "out_of_distribution"),
     ],
 )
-def test_what_no_touch_can_be_is_not_valid(
-    stage: TouchPublishing, drop: float, valid: bool, reason: str | None
-) -> None:
+def test_what_no_touch_can_be_is_not_valid(stage: Publishing, drop: float, valid: bool, reason: str | None) -> None:
     touch = told(1, (0.02, -0.01, 0.01, drop))
     out = contacts(stage, seen(1, touch))
     assert out.valid == valid
@@ -151,13 +149,13 @@ def test_what_no_touch_can_be_is_not_valid(
 
 def test_a_force_far_beyond_the_calibration_is_not_valid(skin: Skin, bundle: Bundle, tmp_path: Path) -> None:
     (tmp_path / "law.json").write_text('{"newtons_per_siemens": 10, "most_n": 2}')
-    stage = TouchPublishing("palm", skin.model_copy(update={"calibration": tmp_path / "law.json"}), bundle)
+    stage = Publishing("palm", skin.model_copy(update={"calibration": tmp_path / "law.json"}), bundle)
     for scan, (drop, valid) in enumerate(((0.35, True), (0.45, False)), 1):
         out = contacts(stage, seen(scan, told(1, (0.0, 0.0, 0.01, drop))))
         assert out.valid == valid and "extrapolated" in out.reasons
 
 
-def test_each_touch_has_its_own_part_of_the_image(stage: TouchPublishing, of_peak: TouchPublishing) -> None:
+def test_each_touch_has_its_own_part_of_the_image(stage: Publishing, of_peak: Publishing) -> None:
     """A 5 N touch and one of 0.36 N (6 mm) side by side: one threshold for both would lose the weak one."""
     frame = seen(1, told(1, (-0.02, 0.0, 0.01, 0.5)), told(2, (0.02, 0.0, 0.006, 0.1)))
     assert [c.force_n for c in contacts(of_peak, frame).contacts] == pytest.approx([5, 1], rel=0.02)
@@ -166,7 +164,7 @@ def test_each_touch_has_its_own_part_of_the_image(stage: TouchPublishing, of_pea
     assert weak.area_m2 == pytest.approx(math.pi * 0.006**2, rel=0.06)
 
 
-def test_an_image_without_a_touch_makes_no_contact_and_noise_in_one_no_other_outline(stage: TouchPublishing) -> None:
+def test_an_image_without_a_touch_makes_no_contact_and_noise_in_one_no_other_outline(stage: Publishing) -> None:
     rng = np.random.default_rng(0)
     noise = lambda s: (s * rng.standard_normal((N, N))).astype(np.float32)  # noqa: E731
     assert contacts(stage, seen(1, image=discs(ONE) + noise(0.004))).contacts == []
@@ -176,7 +174,7 @@ def test_an_image_without_a_touch_makes_no_contact_and_noise_in_one_no_other_out
         assert c.area_m2 == pytest.approx(math.pi * 0.01**2, rel=0.1)
 
 
-def test_uncertainty_of_force_and_confidence_come_from_the_measurements(stage: TouchPublishing) -> None:
+def test_uncertainty_of_force_and_confidence_come_from_the_measurements(stage: Publishing) -> None:
     weak = (0.0, 0.0, 0.01, 0.1)
     strength = told(1, weak).strength
     (sure,) = contacts(stage, seen(1, told(1, weak, strength_sigma=0.01 * strength))).contacts
@@ -186,7 +184,7 @@ def test_uncertainty_of_force_and_confidence_come_from_the_measurements(stage: T
     assert unsure.confidence < 0.9 < 0.99 < sure.confidence
 
 
-def test_a_touch_begins_lasts_and_ends_once(stage: TouchPublishing) -> None:
+def test_a_touch_begins_lasts_and_ends_once(stage: Publishing) -> None:
     said = []
     contacts(stage, seen(1))
     for scan, there in enumerate([True] * 4 + [False] * 4, 2):
@@ -196,7 +194,7 @@ def test_a_touch_begins_lasts_and_ends_once(stage: TouchPublishing) -> None:
     assert contacts(stage, seen(20, told(8, ONE))).contacts[0].id == 2
 
 
-def test_held_frames_keep_contacts_and_say_so(stage: TouchPublishing) -> None:
+def test_held_frames_keep_contacts_and_say_so(stage: Publishing) -> None:
     contacts(stage, seen(1))
     (before,) = contacts(stage, seen(2, told(1, ONE))).contacts
     for scan in (3, 4):
@@ -206,7 +204,7 @@ def test_held_frames_keep_contacts_and_say_so(stage: TouchPublishing) -> None:
         assert out.contacts[0].area_m2 == before.area_m2 and out.contacts[0].force_n == before.force_n
 
 
-def test_a_held_image_that_never_came_is_asked_for_and_the_touch_told_without(stage: TouchPublishing) -> None:
+def test_a_held_image_that_never_came_is_asked_for_and_the_touch_told_without(stage: Publishing) -> None:
     """Passed by, or of before we started: what it looks like is not known until the image comes again."""
     bar = told(1, ONE)
     for scan, frame in (
@@ -219,12 +217,12 @@ def test_a_held_image_that_never_came_is_asked_for_and_the_touch_told_without(st
     assert not stage.lacks and c.area_m2 == pytest.approx(math.pi * 0.012**2, rel=0.05)
 
 
-def test_the_state_carries_what_touches_look_like(stage: TouchPublishing, skin: Skin, bundle: Bundle) -> None:
+def test_the_state_carries_what_touches_look_like(stage: Publishing, skin: Skin, bundle: Bundle) -> None:
     """A recording may begin while a touch is held: its replay gives the same contacts, in a session of its own."""
     contacts(stage, seen(1))
     touches = told(1, (-0.02, 0.0, 0.01, 0.5)), told(2, (0.02, 0.0, 0.006, 0.2))
     contacts(stage, seen(2, *touches, session="a" * 16))
-    twin = TouchPublishing("palm", skin, bundle)
+    twin = Publishing("palm", skin, bundle)
     twin.load(persistence.arrays(persistence.plain(stage.state())))
     for scan in (3, 4):
         later = [dataclasses.replace(t, age_s=0.045 * (scan - 2)) for t in touches]
@@ -233,7 +231,7 @@ def test_the_state_carries_what_touches_look_like(stage: TouchPublishing, skin: 
         assert len(ours.contacts) == 2 and pack(ours) == pack(theirs)
 
 
-def test_a_touch_that_was_there_before_anybody_looked_does_not_begin(stage: TouchPublishing) -> None:
+def test_a_touch_that_was_there_before_anybody_looked_does_not_begin(stage: Publishing) -> None:
     """After a start, and for who wakes a publisher that slept: no `begin` of an old touch, no `end` of one that nobody
     was told of.
     """
@@ -248,13 +246,13 @@ def test_a_touch_that_was_there_before_anybody_looked_does_not_begin(stage: Touc
     assert new.state == "begin" and new.id > first.id, "no id is used twice"
 
 
-def test_a_touch_that_was_not_seen_to_begin_does_not_begin(stage: TouchPublishing) -> None:
+def test_a_touch_that_was_not_seen_to_begin_does_not_begin(stage: Publishing) -> None:
     contacts(stage, seen(1))
     (c,) = contacts(stage, seen(60, told(1, ONE, began=False))).contacts
     assert c.state == "hold"
 
 
-def test_a_touch_is_a_contact_before_any_image_and_the_image_is_of_the_same(stage: TouchPublishing) -> None:
+def test_a_touch_is_a_contact_before_any_image_and_the_image_is_of_the_same(stage: Publishing) -> None:
     assert contacts(stage, seen(1)).contacts == []
     made = stage.process(part(1, told(1, ONE)), ALL)
     assert [type(frame) for frame in made] == [ContactFrame, ForceFrame], "a shape needs an image"
@@ -277,28 +275,28 @@ def test_a_touch_is_a_contact_before_any_image_and_the_image_is_of_the_same(stag
         {"sigma": [math.inf, 0.0, 0.0]},
     ],
 )
-def test_a_touch_where_or_as_none_can_be_is_not_valid(stage: TouchPublishing, wrong: dict[str, Any]) -> None:
+def test_a_touch_where_or_as_none_can_be_is_not_valid(stage: Publishing, wrong: dict[str, Any]) -> None:
     contacts(stage, seen(1))
     for frame in (part(1, told(1, ONE, **wrong)), seen(2, told(1, ONE, **wrong), image=discs(ONE))):
         out = contacts(stage, frame)
         assert not out.valid and not out.contacts and "non_finite" in out.reasons
 
 
-def test_an_id_never_holds_and_ends_in_one_frame(stage: TouchPublishing) -> None:
+def test_an_id_never_holds_and_ends_in_one_frame(stage: Publishing) -> None:
     """A preprocessing that began anew counts from 1 again."""
     (before,) = contacts(stage, seen(1, told(1, ONE))).contacts
     after = contacts(stage, seen(100, told(1, ONE))).contacts
     assert [c.state for c in after if c.id == before.id] == ["end"] and len({c.id for c in after}) == len(after)
 
 
-def test_force_and_shape_are_no_more_valid_than_the_contacts(stage: TouchPublishing) -> None:
+def test_force_and_shape_are_no_more_valid_than_the_contacts(stage: Publishing) -> None:
     touch = told(1, (0.0, 0.0, 0.02, 1.2))
     for image in (np.full((N, N), np.nan, np.float32), None):
         out = stage.process(seen(1, touch, image=image), ALL)
         assert [frame.valid for frame in out] == [False] * 3 and all(frame.reasons == out[0].reasons for frame in out)
 
 
-def test_force_and_shape_are_made_only_when_wanted(stage: TouchPublishing, of_peak: TouchPublishing) -> None:
+def test_force_and_shape_are_made_only_when_wanted(stage: Publishing, of_peak: Publishing) -> None:
     frame = seen(1, told(1, (-0.02, 0, 0.01, 0.5)), told(2, (0.02, 0.01, 0.01, 0.2)))
     exact = of_peak.process(frame, ALL)[1]
     assert isinstance(exact, ForceFrame) and exact.force_n == pytest.approx(7.0, rel=0.01)
@@ -323,7 +321,7 @@ def test_outline_of_a_rectangle_with_a_notch() -> None:
     assert _shoelace(found) == mask.sum()
 
 
-def test_orientation_is_the_long_axis(stage: TouchPublishing) -> None:
+def test_orientation_is_the_long_axis(stage: Publishing) -> None:
     u = (AXIS[None, :] + AXIS[:, None]) / math.sqrt(2)
     v = (-AXIS[None, :] + AXIS[:, None]) / math.sqrt(2)
     bar = np.where((abs(u) < 0.02) & (abs(v) < 0.005), 0.3, 0).astype(np.float32)
@@ -332,14 +330,14 @@ def test_orientation_is_the_long_axis(stage: TouchPublishing) -> None:
     assert shape.orientation[0] == pytest.approx(math.pi / 4, abs=0.02)
 
 
-def test_shape_class_is_the_mean_over_the_touch(stage: TouchPublishing) -> None:
+def test_shape_class_is_the_mean_over_the_touch(stage: Publishing) -> None:
     classes = np.full((5, 24, 24), 0.05, np.float32)
     classes[4] = 0.8
     (c,) = contacts(stage, seen(1, told(1, ONE), classes=classes)).contacts
     assert c.shape == "L" and c.shape_probability == pytest.approx(0.8)
 
 
-def test_a_doubtful_shape_is_named_with_its_probability(stage: TouchPublishing) -> None:
+def test_a_doubtful_shape_is_named_with_its_probability(stage: Publishing) -> None:
     """Readers choose how sure is sure; only a bundle without a network has no answer."""
     classes = np.full((5, 24, 24), 0.19, np.float32)
     classes[1] = 0.24
@@ -354,7 +352,7 @@ def _shoelace(polygon: list[list[float]]) -> float:
     return float(0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1)))
 
 
-def test_frames_that_stay_invalid_are_a_warning(stage: TouchPublishing) -> None:
+def test_frames_that_stay_invalid_are_a_warning(stage: Publishing) -> None:
     """For `skin status` and `skin doctor`: each process may be well, and still nobody learns of a touch."""
     for scan in range(1, 130):
         frame = seen(scan)

@@ -19,9 +19,9 @@ from models.shapes import KINDS, Shape, drop_image
 from models.uncertainty import FLOOR, RELATIVE_FLOOR
 from protocol.frames import SHAPES, ContactFrame, ImageFrame, pack, unpack
 from services.contacts.segmentation import KERNEL, segment
+from services.publisher import Publishing
 from services.runtime import persistence
 from services.runtime.config import Skin
-from services.touch_publishing import TouchPublishing
 from tests.services.test_publishing import seen, told
 
 FRAME_NS = 45_000_000
@@ -86,8 +86,8 @@ def test_what_is_found_turns_with_the_image(scene: list[Shape]) -> None:
 
 
 @pytest.fixture(scope="module")
-def skin_stage(bundle: Bundle) -> TouchPublishing:
-    return TouchPublishing("palm", Skin(port="stub", bundle="square16", frame_id="palm", network="none"), bundle)
+def skin_stage(bundle: Bundle) -> Publishing:
+    return Publishing("palm", Skin(port="stub", bundle="square16", frame_id="palm", network="none"), bundle)
 
 
 @settings(max_examples=60, deadline=None)
@@ -112,7 +112,7 @@ def skin_stage(bundle: Bundle) -> TouchPublishing:
         max_size=6,
     )
 )
-def test_nothing_that_comes_in_makes_nan_come_out(skin_stage: TouchPublishing, frames: list[dict[str, Any]]) -> None:
+def test_nothing_that_comes_in_makes_nan_come_out(skin_stage: Publishing, frames: list[dict[str, Any]]) -> None:
     skin_stage.reset()
     skin_stage.new_session()
     for scan, fields in enumerate(frames, 1):
@@ -132,7 +132,7 @@ happenings = st.one_of(touched, touched, st.sampled_from(["lost", "reset", "relo
 class Book:
     """A publisher, and every id that it gave out. Touches are born with the first frame that has them."""
 
-    def __init__(self, stage: TouchPublishing) -> None:
+    def __init__(self, stage: Publishing) -> None:
         self.stage, self.scan = stage, 0
         self.born: dict[int, int] = {}
         self.last = 0  # of preprocessing's ids, which start from 1 again where it began anew
@@ -170,7 +170,7 @@ class Book:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(happenings, max_size=15), st.data())
 def test_every_id_begins_and_ends_once_over_resets_and_states(
-    skin_stage: TouchPublishing, what: list[Any], data: st.DataObject
+    skin_stage: Publishing, what: list[Any], data: st.DataObject
 ) -> None:
     skin_stage.reset()
     skin_stage.new_session()
@@ -185,11 +185,11 @@ def test_every_id_begins_and_ends_once_over_resets_and_states(
 @settings(max_examples=20, deadline=None)
 @given(before=st.lists(touched, max_size=5), after=st.lists(touched, max_size=5))
 def test_the_stage_goes_on_from_its_state_as_itself(
-    skin_stage: TouchPublishing, bundle: Bundle, before: list[set[int]], after: list[set[int]]
+    skin_stage: Publishing, bundle: Bundle, before: list[set[int]], after: list[set[int]]
 ) -> None:
     skin_stage.reset()
     skin_stage.new_session()
-    other = TouchPublishing("palm", skin_stage.config, bundle)
+    other = Publishing("palm", skin_stage.config, bundle)
     frames = [
         seen(scan, *(told(n, (0.02 * (n - 2), 0.0, 0.006, 0.3)) for n in sorted(touches)))
         for scan, touches in enumerate([*before, *after], 1)

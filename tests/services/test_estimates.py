@@ -7,8 +7,8 @@ import pytest
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, RawFrame
-from services.estimating import Estimating
 from services.pipeline import Pipeline
+from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
 from services.runtime.stage import Refused
 from tests.services.test_estimator import FREE_S, PARTS, SCAN_S, Board, press, pressed
@@ -74,7 +74,7 @@ def test_a_restart_under_a_touch_shows_it_at_once_under_another_id_and_does_not_
     stages.pre._keep = True
     kept = stages.pre.saved()
     assert kept is not None and before[-1].contacts
-    stages.pre = Estimating("palm", SKIN, Bundle.load("square16"))
+    stages.pre = Preprocessing("palm", SKIN, Bundle.load("square16"))
     stages.pre.restore(kept, 0.1)
     after = said(stages, frames[cut:])
     assert all(frame.valid and len(shown(frame)) == 1 for frame in after)
