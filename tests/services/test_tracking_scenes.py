@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -81,15 +82,56 @@ def switches(skin: StubSkin, scene: Scene, rng: np.random.Generator) -> tuple[in
     return count, len(given)
 
 
-@pytest.mark.parametrize(("kind", "most"), [(crossing, 1), (passing, 0), (meeting, 0)])
-def test_ids_are_kept(kind: Callable[[np.random.Generator], Iterator[list[Shape]]], most: int) -> None:
-    """At most so many switches in 12 touches. Where touches inside a patch are not followed, every crossing has one."""
-    skin = StubSkin(80.0, skin=Skin(port="stub", bundle="square16", frame_id="palm", network="none"))
+def stub_skin() -> StubSkin:
+    return StubSkin(80.0, skin=Skin(port="stub", bundle="square16", frame_id="palm", network="none"))
+
+
+QUICK, REST = range(2), range(2, 6)  # seeds: a scene costs seconds
+
+
+@pytest.mark.parametrize(
+    ("kind", "seeds", "most"),
+    [
+        (crossing, QUICK, 0),
+        (passing, QUICK, 0),
+        (meeting, QUICK, 0),
+        pytest.param(crossing, REST, 1, marks=pytest.mark.slow),
+        pytest.param(passing, REST, 0, marks=pytest.mark.slow),
+        pytest.param(meeting, REST, 0, marks=pytest.mark.slow),
+    ],
+)
+def test_ids_are_kept(kind: Callable[[np.random.Generator], Iterator[list[Shape]]], seeds: range, most: int) -> None:
+    """At most so many switches. Where touches inside a patch are not followed, every crossing has one."""
+    skin = stub_skin()
     changed = made = 0
-    for seed in range(6):
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         count, given = switches(skin, list(kind(rng)), rng)
         changed, made = changed + count, made + given
         skin.rest(20)
     assert changed <= most, f"{changed} switches"
-    assert made <= 12 + most, f"{made} ids for 12 touches"
+    assert made <= 2 * len(seeds) + most, f"{made} ids for {2 * len(seeds)} touches"
+
+
+@pytest.mark.parametrize("lifted", [0, 1])
+@pytest.mark.parametrize("away", [0.15, 0.3])  # of their middles, in model units, when one of them ends
+def test_one_that_ends_while_two_overlap_is_gone(lifted: int, away: float) -> None:
+    """It is not kept for having come as one of two, and what stays has its own force and place again."""
+    skin = stub_skin()
+    strong, weak = Shape(KINDS[0], -0.5, 0.05, 0.2, 0.4), Shape(KINDS[0], 0.0, 0.05, 0.17, 0.3)
+    for at in np.arange(-0.6, -away, 0.035):
+        before = skin.feel((replace(strong, x=float(at)), weak)).contact
+    pair = (replace(strong, x=-away), weak)
+    stays = pair[1 - lifted]
+    assert len([c for c in before.contacts if c.state != "end"]) == 2
+    ids = {c.id for c in before.contacts}
+    for _ in range(4):
+        skin.feel(pair)
+    for _ in range(6):
+        skin.feel((stays,))
+    found = skin.feel((stays,)).contact
+    assert found.valid
+    (contact,) = (c for c in found.contacts if c.state != "end")
+    assert contact.id in ids
+    assert np.linalg.norm(np.array(contact.position[:2]) - stays.centroid * UNIT_M) < 3e-3
+    assert not [c for c in skin.rest(6).contact.contacts if c.state != "end"]
