@@ -19,6 +19,7 @@ from protocol.frames import DeltaFrame, EstimatedTouch, Frame, PartFrame, RawFra
 from services.contacts.lasting import LASTS_NS
 from services.describe import BaselineNews, FrameRate, describe, force, refinement, symmetry
 from services.estimation import checks
+from services.estimation.averaging import sigma_of_mean
 from services.estimation.baseline import TAKING, Baseline, NoBaseline, plausible_noise
 from services.estimation.by_bundle import skin_tables
 from services.estimation.estimator import Estimator
@@ -27,8 +28,6 @@ from services.estimation.first.tare import TareRefused
 from services.estimation.reconstruct import Reconstruction
 from services.estimation.references import References
 from services.estimation.tared import KnownBaseline
-from services.estimation.touch_decision import sigma_of_mean
-from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, TouchEstimate
 from services.estimation.values.scan import Scan
 from services.kept_baseline import ages
@@ -70,10 +69,10 @@ class Preprocessing(Stage):
         self.bundle, skin = self.linearisation.bundle, self.config
         self.pre = self.bundle.prereconstructor()
         allowed = Drift(skin.tare.scale_per_s * REST_S, skin.tare.contact_per_s * REST_S)
-        self._reconstruction = Reconstruction(self.pre, allowed, skin.touch.false_alarms)
+        self._reconstruction = Reconstruction(self.pre, allowed)
 
     def reset(self) -> None:
-        self.estimator = Estimator(skin_tables(self.bundle))
+        self.estimator = Estimator(skin_tables(self.bundle), self.config.tare.frames)
         self.continuity = Continuity()
         self.references = References(len(self.bundle.pattern))
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
@@ -229,7 +228,7 @@ class Preprocessing(Stage):
         return True
 
     def _forget_baseline(self) -> None:
-        self.estimator, self._trusted = Estimator(skin_tables(self.bundle)), None
+        self.estimator, self._trusted = Estimator(skin_tables(self.bundle), self.config.tare.frames), None
         self._use(None)
 
     # --- the baseline ---
@@ -452,7 +451,7 @@ class Preprocessing(Stage):
         problem = self._foreign or self._problem
         if not problem and self.baseline is None:
             taring = self.estimator.taring
-            problem = f"{TAKING}: {len(taring.latest)} of {int(n.TARE_SCANS)} frames"
+            problem = f"{TAKING}: {len(taring.latest)} of {taring.latest.needed} frames"
         problems = [*([problem] if problem else []), *self._advice()]
         problems += [self.linearisation.problem] if self.linearisation.problem else []
         unchecked = [self._unchecked] if self._unchecked else []  # as the bundle is made: no warning

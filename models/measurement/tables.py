@@ -8,7 +8,6 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import Legendre
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from models.bundle import Bundle
 from models.calibration_file import found_by
@@ -121,16 +120,6 @@ class SkinTables:
             misfit=_of_trace_one(slopes @ self.misfit @ slopes.T),
             map=None if self.map is None else self.map.through(slopes),
         )
-
-    def blurred(self, width: float) -> SkinTables:
-        """The same for touches whose edges are soft by `width` (standard deviation): the tables are blurred once, not
-        every disc. The field's columns stay.
-        """
-        if not width > 0:
-            return self
-        sigma = (width / self.pixel, width / self.pixel, 0)
-        soft = [gaussian_filter(each, sigma, mode="constant") for each in (self.jacobian, self.along, self.turned)]
-        return replace(self, jacobian=soft[0], along=soft[1], turned=soft[2])
 
 
 def tells_touches(bundle: Bundle) -> bool:

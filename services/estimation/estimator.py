@@ -133,10 +133,10 @@ class WholeState:
 class Estimator:
     """Of one skin; tables: of its bundle."""
 
-    def __init__(self, tables: SkinTables) -> None:
+    def __init__(self, tables: SkinTables, tare_scans: int = int(n.TARE_SCANS)) -> None:
         self._tables = tables
         self.now = EstimatorState()
-        self.taring = Taring(tables)
+        self.taring = Taring(tables, tare_scans)
         self.skin: TaredSkin | None = None
 
     def tare(self, force: bool = False) -> AgreedScans:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import Drift, Operator, PreReconstructor
-from services.estimation.touch_decision import FrameAverager, TouchDecision
+from services.estimation.averaging import CHANGED, FrameAverager
 
 Array = NDArray[np.float64]
 
@@ -27,18 +27,16 @@ class Reconstructed(NamedTuple):
 class Reconstruction:
     """Of one skin, against one baseline."""
 
-    def __init__(self, pre: PreReconstructor, drift: Drift, false_alarms: float) -> None:
-        """drift: what the estimator leaves of it; false_alarms: probability that an unchanged touch counts as changed,
-        at least.
-        """
-        self._pre, self._drift, self._false_alarms = pre, drift, false_alarms
+    def __init__(self, pre: PreReconstructor, drift: Drift) -> None:
+        """drift: what the estimator leaves of it."""
+        self._pre, self._drift = pre, drift
         self._averager = FrameAverager()
         self.begin(np.full(pre.measurements, SUREST), 1)
 
     def begin(self, sigma: Array, frames: int) -> None:
         """Another baseline, the mean of so many frames; sigma (K,): noise of the difference to it."""
         self.sigma, self._frames = sigma, frames
-        self._operators: dict[tuple[bytes, int], tuple[Operator, TouchDecision]] = {}
+        self._operators: dict[tuple[bytes, int], tuple[Operator, float]] = {}
         self._live = np.isfinite(sigma)
         self._averager.reset()
 
@@ -59,7 +57,7 @@ class Reconstruction:
         """None: nothing changed, the image last made is held."""
         live = self._counts(live)
         self._averager.under(live, 0)
-        mean = self._averager(d, scan, self._operator(live, 1)[1])
+        mean = self._averager(d, scan, *self._operator(live, 1))
         if mean is None:
             return None
         averaged = self._averager.averaged
@@ -78,8 +76,8 @@ class Reconstruction:
         self._live = live if live.sum() >= len(live) / 2 else np.isfinite(self.sigma)
         return self._live
 
-    def _operator(self, live: NDArray[np.bool_], averaged: int) -> tuple[Operator, TouchDecision]:
-        """For the mean of so many scans, as far as noise is what it is wrong by."""
+    def _operator(self, live: NDArray[np.bool_], averaged: int) -> tuple[Operator, float]:
+        """For the mean of so many scans, as far as noise is what it is wrong by; and the limit of a change."""
         finite = self.sigma[np.isfinite(self.sigma)]
         most = int((float(np.median(finite)) / SUREST) ** 2) if finite.size else 1
         averaged = min(averaged, max(1, most))
@@ -93,7 +91,7 @@ class Reconstruction:
                 weights=live.astype(float),
                 tare_frames=max(1, self._frames // averaged),
             )
-            self._operators[key] = operator, TouchDecision(operator, self._false_alarms, self._frames)
+            self._operators[key] = operator, operator.threshold(CHANGED, self._frames)
         return self._operators[key]
 
     def state(self) -> dict[str, Any]:

@@ -71,26 +71,40 @@ class Surface(Section):
     axis_degrees: Annotated[Number, Field(ge=-360, le=360)] = 90.0  # of the cylinder's axis to the sheet's x
 
 
+def _without(given: Any, key: str) -> Any:
+    return {name: value for name, value in given.items() if name != key} if isinstance(given, dict) else given
+
+
 class TareConfig(Section):
     """How the untouched baseline is taken and kept."""
 
     frames: Annotated[Count, Field(ge=8, le=4096)] = 64
     max_age_s: Annotated[Number, Field(gt=0)] = 3600.0  # an older persisted baseline is not loaded
     calibrate: Switch = True  # after `skin tare`: fit how the skin is mounted, and use matrices that fit it
-    tracking_s: Annotated[Number, Field(gt=0)] = 120.0  # time constant of what drift does not explain, while untouched
-    # How fast an untouched skin may change, relative; see services/estimation/drift_prior.py. A foam that dries by 6 %,
-    # electrodes whose contacts change by a quarter, within five minutes.
+    # How fast an untouched skin may change, relative. A foam that dries by 6 %, electrodes whose contacts change by a
+    # quarter, within five minutes.
     scale_per_s: Annotated[Number, Field(gt=0, le=1e-2)] = 2e-4  # the sheet's conductivity
     contact_per_s: Annotated[Number, Field(gt=0, le=1e-1)] = 8e-4  # each electrode's contact impedance
 
+    @model_validator(mode="before")
+    @classmethod
+    def older(cls, given: Any) -> Any:
+        """Files and recordings of before give a time constant of drift, which is followed by its own statistics now."""
+        return _without(given, "tracking_s")
+
 
 class TouchConfig(Section):
-    """The touch decision: see services/estimation/touch_decision.py."""
+    """What a scene does not need."""
 
-    false_alarms: Annotated[Number, Field(gt=0, lt=0.1)] = 1e-7  # probability per untouched frame
     hold: Switch = True  # switch of the rule "nothing changed: do not reconstruct again"
     skip_untouched: Switch = True  # switch of the rule "nothing touches: do not reconstruct"
     symmetry: Switch = False  # a held touch's image becomes the mean over the skin's symmetries: services/symmetry.py
+
+    @model_validator(mode="before")
+    @classmethod
+    def older(cls, given: Any) -> Any:
+        """Files and recordings of before give a rate of false alarms, which is fixed now (values/numbers.py)."""
+        return _without(given, "false_alarms")
 
 
 class Indenter(Section):

@@ -11,8 +11,8 @@ from onnx import TensorProto, helper
 
 from models.bundle import Bundle, write
 from protocol.frames import DeltaFrame, ImageFrame, pack
+from services.estimation.averaging import MEANS
 from services.estimation.quality import KEPT
-from services.estimation.touch_decision import MEANS
 from services.inference import SETTLED, Inference
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin

@@ -89,8 +89,9 @@ class LatestScansState:
 class LatestScans:
     """Scans that follow each other."""
 
-    def __init__(self) -> None:
-        self.now = LatestScansState()
+    def __init__(self, needed: int = int(n.TARE_SCANS)) -> None:
+        """needed: scans of a baseline."""
+        self.now, self.needed = LatestScansState(), needed
 
     def __len__(self) -> int:
         return len(self.now.log_z)
@@ -102,7 +103,7 @@ class LatestScans:
         now.parts.append(part)
         now.seen += 1
         for each in (now.log_z, now.at_s, now.parts):
-            del each[: -int(n.TARE_SCANS)]
+            del each[: -self.needed]
 
     def clear(self) -> None:
         """What comes does not follow on what came."""
@@ -112,7 +113,7 @@ class LatestScans:
     def due(self) -> bool:
         """Whether a first baseline is to be tried with this scan."""
         now = self.now
-        return len(self) == int(n.TARE_SCANS) and now.seen % n.TARE_RETRIES == 0 and now.seen != now.tried
+        return len(self) == self.needed and now.seen % n.TARE_RETRIES == 0 and now.seen != now.tried
 
     @property
     def wires_due(self) -> bool:
@@ -133,7 +134,7 @@ class LatestScans:
         """Raises TareRefused where there are too few, or they do not agree. order (K,): the value that each measurement
         would show if no wires were exchanged; None: its own.
         """
-        needed = int(n.TARE_SCANS)
+        needed = self.needed
         if len(self) < needed:
             raise TareRefused(f"only {len(self)} of {needed} frames came so far: wait, or look at `skin top`")
         scans = np.stack(self.now.log_z)
@@ -228,9 +229,10 @@ class TaringState:
 class Taring:
     """Of one skin; tables: of its bundle."""
 
-    def __init__(self, tables: SkinTables) -> None:
+    def __init__(self, tables: SkinTables, needed: int = int(n.TARE_SCANS)) -> None:
+        """needed: scans of a baseline."""
         self.use(tables)
-        self.latest, self.now = LatestScans(), TaringState()
+        self.latest, self.now = LatestScans(needed), TaringState()
 
     def use(self, tables: SkinTables) -> None:
         """Of the same skin, known better."""
@@ -245,7 +247,7 @@ class Taring:
 
     def adopted(self, doubt: str = "") -> None:
         """A baseline of before is used."""
-        self.now, self.latest = TaringState(doubted=bool(doubt), problem=doubt), LatestScans()
+        self.now, self.latest = TaringState(doubted=bool(doubt), problem=doubt), LatestScans(self.latest.needed)
         if doubt:
             self.now.judgements = (judge("baseline", 1.0, 1.0),)
 
@@ -288,7 +290,7 @@ class Taring:
 
     def by_command(self, force: bool, tells: BaselineTells) -> AgreedScans:
         """The latest scans, whatever the baseline was. Raises TareRefused, while something touches unless forced."""
-        now, needed = self.now, int(n.TARE_SCANS)
+        now, needed = self.now, self.latest.needed
         if now.surely and not force:
             raise TareRefused(PRESSED.format(" --force"))
         believed = tells is BaselineTells.TOUCHES and not now.doubted
@@ -311,7 +313,7 @@ class Taring:
         touched = any(each.name == "start" and each.ratio >= 1 for each in self.now.judgements)
         rows = list(self.now.judgements)
         if not tared and not touched:
-            rows.insert(0, judge("baseline", n.TARE_SCANS, max(len(self.latest), 1)))
+            rows.insert(0, judge("baseline", self.latest.needed, max(len(self.latest), 1)))
         return rows
 
     def _taken(self, scans: AgreedScans, start: JudgedStart | None) -> None:

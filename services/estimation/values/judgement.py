@@ -45,7 +45,6 @@ class CheckRow:
 
 NOTE, REFUSE = Verdict.NOTE, Verdict.REFUSE
 ROWS: Mapping[str, CheckRow] = {
-    "order": CheckRow("acquisition", NOTE, "gap"),
     "believed": CheckRow("acquisition", REFUSE),  # its reasons came with the frame
     "silent": CheckRow("faults/wires", REFUSE, "multiplexer"),
     "stuck": CheckRow("faults/wires", NOTE, "multiplexer"),
@@ -59,8 +58,6 @@ ROWS: Mapping[str, CheckRow] = {
     "gain_gross": CheckRow("faults/impedance", REFUSE, "gain"),
     "degraded": CheckRow("enough", NOTE, "degraded"),
     "too_many": CheckRow("enough", REFUSE),  # what is wrong with each of them is said
-    "burst": CheckRow("faults/disturbance", NOTE),
-    "spoilt": CheckRow("faults/disturbance", NOTE),
     "gap": CheckRow("faults/gap", REFUSE, "gap"),
     "seen": CheckRow("enough", REFUSE, "degraded"),
     "baseline": CheckRow("baseline", REFUSE, "stale_baseline"),
@@ -72,11 +69,6 @@ ROWS: Mapping[str, CheckRow] = {
     "touch": CheckRow("touch", NOTE),  # it says that something touches
     "explained": CheckRow("touch", REFUSE, "out_of_distribution"),
     "changing": CheckRow("touch", NOTE, "changing"),
-    "drift_wide": CheckRow("touch", NOTE),
-    "memory": CheckRow("touch", NOTE),
-    "few_parts": CheckRow("touch", NOTE, "coarse"),
-    "force_possible": CheckRow("contact", REFUSE, "out_of_distribution"),
-    "force_range": CheckRow("contact", NOTE, "extrapolated"),
 }
 """In the order in which reasons are said. A new fault is one row here and one file in faults/."""
 

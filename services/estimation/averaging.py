@@ -1,7 +1,5 @@
-"""Touched or not, and whether anything changed since the frame last reconstructed.
-
-Both compare the operator's detection statistic (noise-whitened energy) with the threshold that an unchanged skin
-exceeds with a stated probability per frame; the threshold allows for the noise having been estimated from few frames.
+"""Which scans of a touch that is held are averaged: those since it last changed, by the detection statistic (whitened
+energy) of an image's operator. The limit allows for the noise having been estimated from few scans.
 """
 
 from __future__ import annotations
@@ -17,7 +15,6 @@ from services.estimation.saved import shaped
 
 Array = NDArray[np.float64]
 
-RELEASE = 1e-2  # hysteresis: a touch ends where an untouched skin would be with this probability per frame
 CHANGED = 1e-3  # probability that an unchanged touch is reconstructed again: costs work, not truth
 LONGEST_MEAN = 16  # frames of a hold that are averaged at most, and after which it is reconstructed again at the latest
 MEANS = (1, 2, 4, 8, LONGEST_MEAN)  # frames in what is reconstructed of a touch
@@ -26,22 +23,6 @@ MEANS = (1, 2, 4, 8, LONGEST_MEAN)  # frames in what is reconstructed of a touch
 def sigma_of_mean(sigma: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     """Of the mean of n frames, of `sigma` (K,) each: to the last bit what the frames of a touch that is held state."""
     return np.asarray(sigma / np.sqrt(n), np.float32)
-
-
-class TouchDecision:
-    """Hysteresis around the detection statistic."""
-
-    def __init__(self, operator: Operator, false_alarms: float, tare_frames: int) -> None:
-        self.operator = operator
-        self.begin = operator.threshold(false_alarms, tare_frames)
-        self.release = operator.threshold(max(RELEASE, false_alarms), tare_frames)
-        self.changed = operator.threshold(max(CHANGED, false_alarms), tare_frames)
-
-    def __call__(self, d: Array, touched: bool) -> tuple[bool, float, float]:
-        """(touched now, statistic, threshold it was compared with)."""
-        score = self.operator.score(d)
-        threshold = self.release if touched else self.begin
-        return score > threshold, score, threshold
 
 
 class FrameAverager:
@@ -72,11 +53,13 @@ class FrameAverager:
             self._forget()
         self._live, self._step = live, step
 
-    def __call__(self, d: Array, scan: int, decision: TouchDecision) -> Array | None:
-        """The difference (K,) to reconstruct now, or None to hold."""
+    def __call__(self, d: Array, scan: int, operator: Operator, limit: float) -> Array | None:
+        """The difference (K,) to reconstruct now, or None to hold. limit: of the operator's score, which one scan's noise
+        exceeds with the probability CHANGED.
+        """
         if self._reference is not None:
             variance = 1 + 1 / self.averaged  # of the change, in units of one frame's
-            if decision.operator.score(d - self._reference) > variance * decision.changed:
+            if operator.score(d - self._reference) > variance * limit:
                 self._recent.clear()
                 self._count = 0
         self._recent.append(d)
