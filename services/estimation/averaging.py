@@ -54,7 +54,7 @@ class FrameAverager:
         self._live, self._step = live, step
 
     def __call__(self, d: Array, scan: int, operator: Operator, limit: float) -> Array | None:
-        """The difference (K,) to reconstruct now, or None to hold. limit: of the operator's score, which one scan's noise
+        """The difference (K,) to reconstruct now, or None to hold. limit: of the operator's score, which a scan's noise
         exceeds with the probability CHANGED.
         """
         if self._reference is not None:

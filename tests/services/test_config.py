@@ -59,7 +59,7 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         ({"skins": {"palm": PALM | {"indenter": {"radius_m": NAN}}}}, "radius_m: found nan; allowed: a finite number"),
         ({"skins": {"palm": PALM | {"pose": {"position_m": [0, -INF, 0]}}}}, "position_m.1: found -inf; allowed: a"),
         ({"skins": {"palm": PALM | {"pose": {"quaternion_xyzw": [0, 0, NAN, 1]}}}}, "found nan; allowed: a finite"),
-        ({"skins": {"palm": PALM | {"touch": {"false_alarms": NAN}}}}, "false_alarms: found nan; allowed: a finite"),
+        ({"skins": {"palm": PALM | {"tare": {"scale_per_s": NAN}}}}, "scale_per_s: found nan; allowed: a finite"),
         ({"skins": {"palm": PALM | {"touch": {"hold": "yes"}}}}, "touch.hold: found 'yes'; allowed: a valid boolean"),
         ({"skins": {"palm": PALM | {"indenter": {"radius_m": True}}}}, "radius_m: found True; allowed: a valid number"),
         ({"skins": {"palm": PALM | {"indenter": {"radius_m": "0.01"}}}}, "radius_m: found '0.01'; allowed: a valid nu"),
