@@ -178,7 +178,7 @@ class TouchTracks:
         if len(lasting) < 2:
             return []
         reach = gaps([tracks[k].state for k in lasting]).min(axis=1)
-        return [k for k, gap in zip(lasting, reach, strict=True) if gap < np.exp(tracks[k].state[LOG_RADIUS])]
+        return [k for k, gap in zip(lasting, reach, strict=True) if gap < _radius(tracks[k])]
 
     def recognised(self, fit: FoundTouches, kept: Sequence[int]) -> tuple[int, ...]:
         """kept, where touches that were found anew are those that were there before in the same places."""
@@ -236,7 +236,7 @@ class TouchTracks:
             return
         for track, gap in zip(tracks, gaps([track.state for track in tracks]).min(axis=1), strict=True):
             track.course.follow(track.state, np.sqrt(np.maximum(np.diag(track.covariance), 0.0)), at_s)
-            if gap > n.NEIGHBOURS and track.sure and track.scans >= n.SURE_SCANS:
+            if gap > _radius(track) and track.sure and track.scans >= n.SURE_SCANS:  # by what it shows alone
                 track.course.apart_s = at_s
 
     def tell(self, fit: FoundTouches, at_s: float, span_s: float) -> None:
@@ -303,6 +303,10 @@ class TouchTracks:
         track.stayed_since_s, track.held = now_s, acts
         _stay(track, 1.0)
         return memories
+
+
+def _radius(track: TrackedTouch) -> float:
+    return float(np.exp(track.state[LOG_RADIUS]))
 
 
 def _stay(track: TrackedTouch, share: float) -> None:
