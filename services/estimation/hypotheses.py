@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
 ON_ELECTRODE = ((0.03, 0.0), (0.03, 0.1), (0.03, -0.1))  # inside its edge and along it, where a search begins
 SMALL_RADIUS = 0.1  # where it begins
+CAUSE_STEPS = 2  # that touches which are known need beside another cause
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
 WIDER = (MEMORY, DRIFT, BURST, NOISE)
 COSTS = {
@@ -320,11 +321,13 @@ class Hypotheses:
         answers.append(self._fitted(question, loose, everyone, n.STEPS_COLD))
         if _settled(question, answers):
             return answers
-        best = _likeliest(answers)
-        for cause in self._wider:  # these cost little, and a search may leave no steps
-            answers += self._with_cause(question, loose, everyone, cause, best.left)
         expected = self._fitted(question, standing, everyone, 0)
-        return answers + self._search(question, everyone, expected.fit)
+        causes = CAUSE_STEPS * len(self._wider) * len(loose)  # a search must not spend theirs
+        answers += self._search(replace(question, keeps=question.keeps + causes), everyone, expected.fit)
+        best = _likeliest(answers)
+        for cause in self._wider:
+            answers += self._with_cause(question, loose, everyone, cause, best.left)
+        return answers
 
     def _of_anything(
         self, question: Question, standing: Sequence[TouchPrior], before: Sequence[ScoredAnswer]
