@@ -62,7 +62,7 @@ def test_drift_that_was_there_is_no_touch(drifted: tuple[tuple[int, float], ...]
 
 
 @pytest.mark.xfail(
-    strict=False, reason="contacts that drifted by 4 to 5 % under a touch leave a contact where nothing is"
+    strict=False, reason="contacts that drift by 4 % under a touch leave a contact where nothing is"
 )
 def test_drift_of_contact_impedances_beyond_what_time_explains_makes_no_touch() -> None:
     """By several per cent in a minute: electrodes are in doubt, and as long as they are no frame is valid."""
