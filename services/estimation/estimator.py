@@ -534,7 +534,7 @@ class Estimator:
         """Is one of the touches drift, or nothing? What was shown once must not stay because nothing is learnt under
         it, nor because it costs nothing: a touch that is doubted counts as a new one.
         """
-        touches = skin.touches
+        touches, none = skin.touches, list[tuple[float, int]]()
         for k in reversed(range(len(touches))):
             track = touches.now.tracks[k]
             often = track.z2 < n.DOUBT_Z2 or not track.sure
@@ -542,16 +542,15 @@ class Estimator:
                 continue
             standing, least = touches.expected(measured.middle_s, measured.span_s), float(n.COST_TOUCH)
             if answer.fit is not None and k in touches.meeting(measured.middle_s) and len(touches) == len(answer.fit):
-                standing, least = (
-                    started_from(answer.fit),
-                    -least,
-                )  # it was told when it stood apart: it would have ended
+                standing, least = started_from(answer.fit), -least  # it is known by itself: it would have ended
             other = skin.hypotheses.without(question, standing, k)
             if other.quiet and other.score > answer.score + least:
-                touches.remove(k)
-                return
+                none.append((other.score - least, k))
+                continue
             alone = len(touches) == 1  # then something touches, be its strength known or not
             track.sure = track.sure or (track.scans >= n.SURE_SCANS and (alone or track.z2 > n.ACTS_Z2))
+        if none:
+            touches.remove(max(none)[1])
 
     def _explained(self, skin: TaredSkin, cause: str) -> None:
         self.now.unexplained_s = 0.0
