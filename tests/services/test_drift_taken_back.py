@@ -61,9 +61,7 @@ def test_drift_that_was_there_is_no_touch(drifted: tuple[tuple[int, float], ...]
     assert all(found.contact.valid for found in after[1:])
 
 
-@pytest.mark.xfail(
-    strict=False, reason="contacts that drift by 4 % under a touch leave a contact where nothing is"
-)
+@pytest.mark.xfail(strict=False, reason="contacts that drift by 4 % under a touch leave a contact where nothing is")
 def test_drift_of_contact_impedances_beyond_what_time_explains_makes_no_touch() -> None:
     """By several per cent in a minute: electrodes are in doubt, and as long as they are no frame is valid."""
     stub, drifted = StubSkin(80.0), ((3, 1.05), (9, 0.96))
