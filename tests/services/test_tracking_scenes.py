@@ -119,7 +119,7 @@ def test_ids_are_kept(kind: Callable[[np.random.Generator], Iterator[list[Shape]
 @pytest.mark.parametrize(
     "away",
     [
-        pytest.param(0.15, marks=pytest.mark.xfail(reason="the other one may have the number of the one that ended")),
+        0.15,
         0.3,
     ],
 )  # of their middles, in model units, when one of them ends
