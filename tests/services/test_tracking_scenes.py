@@ -102,7 +102,8 @@ QUICK, REST = range(2), range(2, 6)  # seeds: a scene costs seconds
 )
 def test_ids_are_kept(kind: Callable[[np.random.Generator], Iterator[list[Shape]]], seeds: range, most: int) -> None:
     """At most so many switches. Where touches inside a patch are not followed, every crossing has one. Those that are
-    left are of the first two scans: both begin at once there, at full strength, and are one at first, or roughly two.
+    left: both begin at once in one scan and are one at first; the first radius is so large that the two never stood
+    apart; or their middles nearly coincide, and one is ended.
     """
     skin = stub_skin()
     changed = made = 0
