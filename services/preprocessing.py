@@ -72,7 +72,7 @@ class Preprocessing(Stage):
         self._reconstruction = Reconstruction(self.pre, allowed)
 
     def reset(self) -> None:
-        self.estimator = Estimator(skin_tables(self.bundle), self.config.tare.frames)
+        self.estimator = self._new_estimator()
         self.continuity = Continuity()
         self.references = References(len(self.bundle.pattern))
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
@@ -88,6 +88,9 @@ class Preprocessing(Stage):
         self._undated_s = 0.0  # age of a baseline that an earlier process took, until the first scan
         self._trusted: Baseline | None = None  # too old to be used: the first scans are held against it
         self._use(None)
+
+    def _new_estimator(self) -> Estimator:
+        return Estimator(skin_tables(self.bundle), self.config.tare.frames)
 
     def _use(self, baseline: Baseline | None) -> None:
         self.baseline = baseline
@@ -111,7 +114,7 @@ class Preprocessing(Stage):
         self.frame_rate(frame)
         out.valid, out.reasons = as_sent(frame)
         if frame.kind == "sentinel":  # of a recording made by an earlier version: no contacts are made of it
-            return [_unusable(out, "coarse", len(self.bundle.pattern))]
+            return [self._unusable(out, "coarse")]
         self._part = (frame.scan, self._part[1])
         if self.continuity.broken(frame, frame.parts):
             add_reason(out.reasons, "gap")
@@ -123,7 +126,7 @@ class Preprocessing(Stage):
             return [self._refer(out, frame)]
         self.references.interrupted()
         if SEPARATE in frame.reasons and not self._beside_reference(frame):
-            return [_unusable(out, "stale_baseline", len(self.bundle.pattern))]
+            return [self._unusable(out, "stale_baseline")]
         scan = Scan.of(frame, self._before)
         self._before = scan
         estimate = self.estimator.step(scan)
@@ -160,7 +163,7 @@ class Preprocessing(Stage):
         out.after, self._delta = self._delta, out.scan
         out.electrodes = estimate.electrodes
         if baseline is None or touch is None:
-            return _blank(out, len(self.bundle.pattern))
+            return self._blank(out)
         out.estimates = self._said(estimate)
         out.touched = self._touched = estimate.touched or bool(out.estimates)
         self._tells(out, estimate)
@@ -198,10 +201,21 @@ class Preprocessing(Stage):
         self._counters["foreign"] += 1
         found, expected = len(frame.z), len(self.bundle.pattern)
         self._foreign = f"frames of {found} measurements, the bundle {self.bundle.name} has {expected}"
-        return _unusable(out, "out_of_distribution", len(self.bundle.pattern))
+        return self._unusable(out, "out_of_distribution")
 
     def _said(self, estimate: Estimate) -> list[EstimatedTouch]:
         return [on_the_wire(touch, self.bundle.metres_per_unit) for touch in estimate.touches]
+
+    def _unusable(self, out: DeltaFrame, reason: str) -> DeltaFrame:
+        out.valid = False
+        add_reason(out.reasons, reason)
+        return self._blank(out)
+
+    def _blank(self, out: DeltaFrame) -> DeltaFrame:
+        measurements = len(self.bundle.pattern)
+        out.difference = np.zeros(measurements, np.float32)
+        out.sigma = np.full(measurements, np.inf, np.float32)
+        return out
 
     # --- scans that stand in a file ---
 
@@ -212,7 +226,7 @@ class Preprocessing(Stage):
         if found is None:
             self._forget_baseline()
             self._problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"
-            return _unusable(out, "stale_baseline", len(self.bundle.pattern))
+            return self._unusable(out, "stale_baseline")
         self.set_baseline(found)
         self.estimator.saw_untouched()
         out.difference = np.zeros(len(amplitude), np.float32)
@@ -228,7 +242,7 @@ class Preprocessing(Stage):
         return True
 
     def _forget_baseline(self) -> None:
-        self.estimator, self._trusted = Estimator(skin_tables(self.bundle), self.config.tare.frames), None
+        self.estimator, self._trusted = self._new_estimator(), None
         self._use(None)
 
     # --- the baseline ---
@@ -482,18 +496,6 @@ def on_the_wire(touch: TouchEstimate, metres: float) -> EstimatedTouch:
         z2=touch.z2,
         unexplained=touch.unexplained,
     )
-
-
-def _unusable(out: DeltaFrame, reason: str, measurements: int) -> DeltaFrame:
-    out.valid = False
-    add_reason(out.reasons, reason)
-    return _blank(out, measurements)
-
-
-def _blank(out: DeltaFrame, measurements: int) -> DeltaFrame:
-    out.difference = np.zeros(measurements, np.float32)
-    out.sigma = np.full(measurements, np.inf, np.float32)
-    return out
 
 
 if __name__ == "__main__":

@@ -161,7 +161,7 @@ def tables_of(bundle: Bundle) -> SkinTables:
         z0=z0,
         pattern=np.asarray(bundle.pattern, np.int64),
         places=np.asarray(bundle.skin["electrodes"]["centre"], float),
-        predicted=matrices.normalisation == "model",
+        predicted=tells_touches(bundle),
         wrong=float(MISFIT if near else MISFIT_FAR),
         map=_map_of(bundle),
     )

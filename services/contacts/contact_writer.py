@@ -26,27 +26,9 @@ class ContactWriter:
 
     def of_estimate(self, number: int, state: str, touch: EstimatedTouch, look: Appearance) -> Contact:
         """A touch as the measurements tell it, and as it looks."""
-        found = self.law.of_touch(touch, look.classes)
-        best = int(np.argmax(look.classes)) if look.classes else -1
-        at, (vx, vy) = self.place(*touch.position), touch.velocity
-        return Contact(
-            id=number,
-            state=state,
-            position=at.point.tolist(),
-            velocity=(vx * at.along_x + vy * at.along_y).tolist(),
-            normal=at.normal.tolist(),
-            orientation=look.orientation,
-            area_m2=look.area_m2,
-            force_n=found.newton,
-            force_sigma_n=found.sigma,
-            pressure_pa=found.pressure,
-            pressure_sigma_pa=found.pressure_sigma,
-            wrench=_wrench(at, found.newton or 0.0),
-            shape=SHAPES[best] if look.classes else "unknown",
-            shape_probability=look.classes[best] if look.classes else None,
-            confidence=0.5 * (1 + math.erf(math.sqrt(touch.z2 / 2))),
-            position_sigma=list(touch.sigma),
-            sheet=None if self.place.flat else list(touch.position),
+        contact = self._here(number, state, look, self.law.of_touch(touch, look.classes), touch.velocity)
+        return replace(
+            contact, confidence=0.5 * (1 + math.erf(math.sqrt(touch.z2 / 2))), position_sigma=list(touch.sigma)
         )
 
     def of_image(
@@ -57,8 +39,15 @@ class ContactWriter:
         found = self.law.force(Look.of(touch.segment, frame))
         if located is not None and not self.law.exists:
             found = Force(located.force_n, None if located.force_n is None else located.value_sigma)
+        contact = self._here(number, state, looks, found, (0.0, 0.0) if moves is None else moves.velocity)
+        return replace(
+            contact, confidence=confidence(touch.segment), **({} if located is None else registered(located))
+        )
+
+    def _here(self, number: int, state: str, looks: Appearance, force: Force, velocity: Sequence[float]) -> Contact:
+        """What all contacts that are there have."""
         best = int(np.argmax(looks.classes)) if looks.classes else -1
-        at, (vx, vy) = self.place(looks.x, looks.y), (0.0, 0.0) if moves is None else moves.velocity
+        at, (vx, vy) = self.place(looks.x, looks.y), velocity
         return Contact(
             id=number,
             state=state,
@@ -67,16 +56,14 @@ class ContactWriter:
             normal=at.normal.tolist(),
             orientation=looks.orientation,
             area_m2=looks.area_m2,
-            force_n=found.newton,
-            force_sigma_n=found.sigma,
-            pressure_pa=found.pressure,
-            pressure_sigma_pa=found.pressure_sigma,
-            wrench=_wrench(at, found.newton or 0.0),
+            force_n=force.newton,
+            force_sigma_n=force.sigma,
+            pressure_pa=force.pressure,
+            pressure_sigma_pa=force.pressure_sigma,
+            wrench=_wrench(at, force.newton or 0.0),
             shape=SHAPES[best] if looks.classes else "unknown",
             shape_probability=looks.classes[best] if looks.classes else None,
-            confidence=confidence(touch.segment),
             sheet=None if self.place.flat else [looks.x, looks.y],
-            **({} if located is None else registered(located)),
         )
 
     def moved(self, contact: Contact, before: EstimatedTouch, now: EstimatedTouch) -> Contact:

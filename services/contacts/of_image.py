@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 from models.bundle import Bundle
 from protocol.frames import EstimatedTouch, ImageFrame, LocatedTouch
-from services.contacts.outline import outline
-from services.contacts.reading import Appearance
-from services.contacts.segmentation import Segment, class_probabilities, divided, readable, segment
+from services.contacts.reading import Appearance, Pixels
+from services.contacts.segmentation import Segment, divided, readable, segment
 
 SAME = 0.15  # of the skin's half side, within which a touch is the one before: 0.3 m/s, a scan of 5 cm
 
@@ -37,9 +36,9 @@ class ImageTouches:
         """Those of a new image, strongest first; before: where touches were, by their numbers."""
         if not frame.image.size or not readable(frame.image):
             return []
-        m, (x0, y0) = frame.metres_per_pixel, frame.origin
+        image = Pixels(frame.metres_per_pixel, frame.origin)
         places = [touch.position for touch in frame.touches] or [[look.x, look.y] for look in before.values()]
-        pixels = [((x - x0) / m - 0.5, (y - y0) / m - 0.5) for x, y in places]
+        pixels = [image.at(x, y) for x, y in places]
         if not frame.touches:
             return [self._touch(frame, s, None) for s in segment(frame.image, frame.sigma, pixels)]
         parts = divided(frame.image, frame.sigma, pixels)
@@ -54,15 +53,7 @@ class ImageTouches:
     def _touch(self, frame: ImageFrame, s: Segment, located: LocatedTouch | None) -> ImageTouch:
         m, (x0, y0) = frame.metres_per_pixel, frame.origin
         x, y = (x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m) if located is None else located.position
-        looks = Appearance(
-            x=x,
-            y=y,
-            area_m2=s.area * m * m,
-            orientation=s.orientation,
-            outline=outline(s.mask, m, [x0, y0]),
-            classes=class_probabilities(s, frame.classes),
-        )
-        return ImageTouch(s, looks, s.reach * m, located)
+        return ImageTouch(s, Pixels(m, frame.origin).appearance(s, frame, x, y), s.reach * m, located)
 
     def same(self, touches: list[ImageTouch], before: Mapping[int, Appearance]) -> list[int]:
         """Of each touch the number that it had before, the nearest pairs first; 0: it is new."""

@@ -13,7 +13,7 @@ import numpy as np
 from models.bundle import Bundle
 from protocol.frames import EstimatedTouch, ImageFrame
 from services.contacts.outline import outline
-from services.contacts.segmentation import class_probabilities, divided, readable
+from services.contacts.segmentation import Segment, class_probabilities, divided, readable
 
 CORNERS = 32  # of the outline of a disc
 LARGER = 2.5  # times the disc's area, or a part of it: an image that differs by more shows something else
@@ -31,11 +31,33 @@ class Appearance:
     classes: list[float]  # probabilities; empty: the image tells none
 
 
+@dataclass(frozen=True)
+class Pixels:
+    """Where the pixels of an image lie on the sheet."""
+
+    side_m: float
+    origin: list[float]  # m, of the outer corner of the first
+
+    def at(self, x: float, y: float) -> tuple[float, float]:
+        """Column and row of a place [m]; whole numbers are middles of pixels."""
+        x0, y0 = self.origin
+        return (x - x0) / self.side_m - 0.5, (y - y0) / self.side_m - 0.5
+
+    def area(self, s: Segment) -> float:
+        """m^2"""
+        return s.area * self.side_m * self.side_m
+
+    def appearance(self, s: Segment, frame: ImageFrame, x: float, y: float) -> Appearance:
+        """Of a touch at x, y [m] whose part of the image this is."""
+        drawn = outline(s.mask, self.side_m, self.origin)
+        return Appearance(x, y, self.area(s), s.orientation, drawn, class_probabilities(s, frame.classes))
+
+
 class Appearances:
     """Of one skin's touches, by their ids."""
 
     def __init__(self, bundle: Bundle) -> None:
-        self._metres, self._origin = bundle.metres_per_pixel, list(bundle.image_origin)
+        self._pixels = Pixels(bundle.metres_per_pixel, list(bundle.image_origin))
         self.forget()
 
     def forget(self) -> None:
@@ -47,20 +69,11 @@ class Appearances:
         self.known = {}
         if not touches or not frame.image.size or not readable(frame.image):
             return
-        m, (x0, y0) = self._metres, self._origin
-        places = [((t.position[0] - x0) / m - 0.5, (t.position[1] - y0) / m - 0.5) for t in touches]
+        places = [self._pixels.at(*touch.position) for touch in touches]
         for touch, s in zip(touches, divided(frame.image, frame.sigma, places), strict=True):
-            area, disc = s.area * m * m, math.pi * touch.radius_m**2
-            if not disc / LARGER < area < disc * LARGER:
-                continue
-            self.known[touch.id] = Appearance(
-                x=touch.position[0],
-                y=touch.position[1],
-                area_m2=area,
-                orientation=s.orientation,
-                outline=outline(s.mask, m, [x0, y0]),
-                classes=class_probabilities(s, frame.classes),
-            )
+            disc = math.pi * touch.radius_m**2
+            if disc / LARGER < self._pixels.area(s) < disc * LARGER:
+                self.known[touch.id] = self._pixels.appearance(s, frame, *touch.position)
 
     def of(self, touch: EstimatedTouch) -> Appearance:
         """By now."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from models.bundle import Bundle
-from services.estimation.wiring import Wiring
+from services.estimation.faults.wires import all_pairs
 
 
 def skipped(bundle: Bundle) -> dict[str, str]:
@@ -16,7 +16,7 @@ def skipped(bundle: Bundle) -> dict[str, str]:
     nothing_predicted = "a measured bundle predicts no impedances"
     if not own.any():
         found["shorts between electrodes"] = "no pair senses where it drives"
-    if measured or not Wiring(pattern).knows:
+    if measured or not all_pairs(pattern):
         why = nothing_predicted if measured else "not all pairs of electrodes are measured"
         found["exchanged wires and stuck multiplexers"] = why
     if measured or not own.all():

@@ -535,13 +535,14 @@ class Estimator:
         it, nor because it costs nothing: a touch that is doubted counts as a new one.
         """
         touches, none = skin.touches, list[tuple[float, int]]()
+        meeting = touches.meeting(measured.middle_s)
         for k in reversed(range(len(touches))):
             track = touches.now.tracks[k]
             often = track.z2 < n.DOUBT_Z2 or not track.sure
             if track.ended or not (often or track.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1):
                 continue
             standing, least = touches.expected(measured.middle_s, measured.span_s), float(n.COST_TOUCH)
-            if answer.fit is not None and k in touches.meeting(measured.middle_s) and len(touches) == len(answer.fit):
+            if answer.fit is not None and k in meeting and len(touches) == len(answer.fit):
                 standing, least = started_from(answer.fit), -least  # it is known by itself: it would have ended
             other = skin.hypotheses.without(question, standing, k)
             if other.quiet and other.score > answer.score + least:

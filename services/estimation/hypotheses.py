@@ -161,12 +161,10 @@ class Hypotheses:
 
     def glance(self, question: Question) -> ScoredAnswer:
         """The likeliest answer that nothing touches, without a search."""
-        found = [
-            answer for cause in (AS_IT_IS, *self._wider) if (answer := self.untouched(question, cause)) is not None
-        ]
-        return _likeliest(found)
+        return _likeliest(self._untouched(question))
 
     def _untouched(self, question: Question) -> list[ScoredAnswer]:
+        """That nothing touches, by each cause that this skin has."""
         causes = AS_IT_IS, *self._wider
         return [answer for cause in causes if (answer := self.untouched(question, cause)) is not None]
 
@@ -286,10 +284,7 @@ class Hypotheses:
         return answer
 
     def _of_none(self, question: Question) -> list[ScoredAnswer]:
-        found = [
-            answer for cause in (AS_IT_IS, *self._wider) if (answer := self.untouched(question, cause)) is not None
-        ]
-        return [*found, *self._from_nothing(question)]
+        return [*self._untouched(question), *self._from_nothing(question)]
 
     def _from_nothing(self, question: Question) -> list[ScoredAnswer]:
         """Touches where none were: first those that the scan before left open, as a search has no steps for all."""

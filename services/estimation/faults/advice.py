@@ -1,20 +1,34 @@
-"""What faults of the board are to a frame: states of electrodes, and judgements."""
+"""What faults of the board are to a frame, states of electrodes and judgements; and to a person, advice."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.frame_types import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA
-from services.estimation.advice import ADVICE, NO_ANSWER, listed, stuck_bit
+from protocol.frame_types import ELECTRODE_STATES, STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA
 from services.estimation.faults.wires import WireFault, WireKind
 from services.estimation.values import numbers as n
 from services.estimation.values.judgement import Judgement, Verdict, judge
 
-OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(7)  # protocol.frame_types.ELECTRODE_STATES
+OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(len(ELECTRODE_STATES))
 STATE_OF = {WireKind.EXCHANGED: SWAPPED, WireKind.SHORT: SHORT, WireKind.STUCK: STUCK}
 ANY = 1e-6  # share of measurements: one is enough
 ROW_OF = {OPEN: "open", SHORT: "short", DRIFTING: "impedance", SWAPPED: "exchanged", STUCK: "stuck"}
+ADVICE = {
+    OPEN: "electrode {}: no contact; look at its wire and press it on",
+    SHORT: "electrodes {}: connected to each other; part their wires",
+    UNKNOWN: "electrode {}: no baseline, it was at fault when that was taken; run `skin tare`",
+    DRIFTING: "electrode {}: its contact with the skin changed; press it on, then run `skin tare`",
+    SWAPPED: "electrodes {}: their wires are exchanged; put them right",
+    STUCK: "the multiplexers do not reach electrode {}",
+}
+
+NO_ANSWER = (
+    "no electrode answers: the multiplexers are not enabled, nothing is excited (power-cycle the board), or the skin's "
+    "cable is off"
+)
 
 
 def states_of(
@@ -59,10 +73,23 @@ def sentences(states: NDArray[np.uint8], wire: WireFault | None, silent: bool) -
     if silent:
         return [NO_ANSWER]
     if wire is not None and wire.kind is WireKind.STUCK:
-        return [stuck_bit(wire)]
+        return [_stuck_bit(wire)]
     found = []
     for state, text in ADVICE.items():
         named = np.flatnonzero(states == state).tolist()
         if named:
-            found.append(text.format(listed(named)) + " (electrodes are numbered from 0)")
+            found.append(text.format(_listed(named)) + " (electrodes are numbered from 0)")
     return found
+
+
+def _stuck_bit(fault: WireFault) -> str:
+    return (
+        f"an address bit of a multiplexer is stuck: bit {fault.bit} of drive{fault.side} or sense{fault.side} stays "
+        f"{fault.value}, so electrodes {_listed(fault.electrodes)} (numbered from 0) are never reached; look at the "
+        "board's address lines"
+    )
+
+
+def _listed(numbers: Iterable[int]) -> str:
+    texts = [str(n) for n in numbers]
+    return texts[0] if len(texts) == 1 else ", ".join(texts[:-1]) + " and " + texts[-1]

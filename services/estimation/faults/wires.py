@@ -62,7 +62,7 @@ class WireMaps:
 
     def __init__(self, pattern: NDArray[np.integer]) -> None:
         self.faults: list[WireFault] = []
-        self.knows = _all_pairs(pattern)
+        self.knows = all_pairs(pattern)
         if not self.knows:
             return
         first, second = (pattern[:, column].astype(np.intp) for column in (0, 1))
@@ -196,7 +196,8 @@ def members(pattern: NDArray[np.integer]) -> Mask:
     return np.asarray((pattern[:, :, None] == electrodes).any(axis=1))
 
 
-def _all_pairs(pattern: NDArray[np.integer]) -> bool:
+def all_pairs(pattern: NDArray[np.integer]) -> bool:
+    """Whether every pair of electrodes of a pattern (K, 4) drives and senses itself, once."""
     electrodes = int(pattern.max()) + 1
     themselves = bool((pattern[:, 0] == pattern[:, 2]).all() and (pattern[:, 1] == pattern[:, 3]).all())
     pairs = {frozenset(row) for row in pattern[:, :2].tolist()}

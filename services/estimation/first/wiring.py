@@ -9,8 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.disc import DiscResponse
-from models.measurement.grid import DiscGrid
 from models.measurement.tables import SkinTables
 from services.estimation.faults.table import BoardScan, WireTable, any_touches
 from services.estimation.faults.wires import WireFault, WireMaps
@@ -61,7 +59,7 @@ def likeliest(score: dict[WireFault | None, float]) -> WireFault | None:
 def covariances(tables: SkinTables) -> list[Array]:
     """(K, K) of log |Z| over what a skin and its bundle differ by, of each size, and touches anywhere."""
     contact = tables.contact * n.START_CONTACT
-    base = contact @ contact.T + n.START_GAIN**2 + any_touches(DiscGrid(DiscResponse(tables)))
+    base = contact @ contact.T + n.START_GAIN**2 + any_touches(tables.grid)
     base += n.START_FIELD**2 * smooth_field(tables) + n.START_GRAIN**2 * grain(tables)
     form = n.START_LAYER**2 * tables.layer @ tables.layer.T + n.START_ABSOLUTE**2 * np.eye(len(base))
     return [base + times**2 * form for times in LADDER]
