@@ -36,6 +36,12 @@ class Memory:
     log_radius: float
     mixed: bool = False  # of whatever pressed while nothing explained the scans: it has no place
 
+    def at_place_of(self, other: Memory) -> bool:
+        if self.mixed or other.mixed:
+            return self is other
+        apart = np.hypot(self.x - other.x, self.y - other.y)
+        return bool(apart < n.MEMORY_APART * np.exp(max(self.log_radius, other.log_radius)))
+
 
 @dataclass
 class FilterState:
@@ -163,13 +169,21 @@ class SkinFilter:
         return np.asarray(columns @ columns.T)
 
     def may_remember(self, pulled: Array) -> bool:
-        """Whether foam may remember as much as a residual says; pulled (K,): S^-1 of it, S with `more_memory`."""
-        for place, memory in enumerate(self.now.memories):
-            own, most = self._own(place), n.MEMORY_MOST * memory.action
-            variance = float(self.now.p[own, own].sum()) + most**2
-            if float(self.now.x[own].sum()) + variance * float(memory.column @ pulled) > most:
-                return False
-        return True
+        """Whether foam may remember as much as a residual says; pulled (K,): S^-1 of it, S with `more_memory`. What one
+        place remembers of several touches is no more than it may of the strongest.
+        """
+        memories = self.now.memories
+        if not memories:
+            return True
+        most = np.array([n.MEMORY_MOST * memory.action for memory in memories])
+        states = self.now.x[self._fixed :].reshape(len(memories), STATES_OF_MEMORY)
+        own = [self._own(place) for place in range(len(memories))]
+        variance = np.array([float(self.now.p[each, each].sum()) for each in own]) + most**2
+        share = states.sum(axis=1) + variance * (np.array([memory.column for memory in memories]) @ pulled)
+        return all(
+            sum(share[k] for k in places) <= max(most[k] for k in places)
+            for places in ([k for k, m in enumerate(memories) if m.at_place_of(memory)] for memory in memories)
+        )
 
     @staticmethod
     def _faded(memory: Memory, at_s: float) -> float:

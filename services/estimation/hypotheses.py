@@ -7,10 +7,11 @@ The order is a budget in solver steps, never in time: a replay decides as the se
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,7 +142,7 @@ class Hypotheses:
     # --- nothing touches ---
 
     def untouched(self, question: Question, cause: str = AS_IT_IS) -> ScoredAnswer | None:
-        """The answer that nothing touches; None where this skin has no such cause."""
+        """The answer that nothing touches; None where this skin has no such cause, or foam no such memory."""
         white = question.white
         if cause:
             more = self._more(question, cause, question.y)
@@ -150,6 +151,8 @@ class Hypotheses:
             white = Whitening.of(question.covariance + more)
         residual = white(question.y)
         pulled = white.w.T @ residual
+        if cause == MEMORY and not self._drift.may_remember(pulled):
+            return None
         z2 = max(self._left(question, pulled, white, None, ())[0], self._fresh(question, pulled, white))
         score = white.log_density - 0.5 * float(residual @ residual) + COSTS[cause]
         chi2 = float(residual @ residual) / max(int(question.live.sum()), 1)
@@ -177,8 +180,6 @@ class Hypotheses:
         so lately, of which foam may remember a share. wider: whether causes are asked that own more than the filter.
         """
         found = self.glance(question) if wider else self._nothing(question, AS_IT_IS)
-        if found.cause == MEMORY and not self._drift.may_remember(found.pulled):
-            found = self._nothing(question, AS_IT_IS)
         if found.quiet or not pressed.any():
             return found
         column, white = np.where(question.live, pressed, 0.0), question.white
@@ -268,13 +269,12 @@ class Hypotheses:
         priors = [standing[k] for k in kept]
         answers = list[ScoredAnswer]()
         for cause in (AS_IT_IS, DRIFT, MEMORY):
-            more = self._more(question, cause, question.y) if cause else 0.0
-            if more is None:
-                continue
-            wider = replace(question, covariance=question.covariance + more)
-            answer = self._fitted(wider, priors, kept, n.STEPS_WARM, cause) if kept else self._nothing(question, cause)
-            if cause != MEMORY or self._drift.may_remember(answer.pulled):
-                answers.append(answer)
+            if not kept:
+                answers += [nothing] if (nothing := self.untouched(question, cause)) is not None else []
+            elif cause:
+                answers += self._with_cause(question, priors, kept, cause, question.y, n.STEPS_WARM)
+            else:
+                answers.append(self._fitted(question, priors, kept, n.STEPS_WARM))
         return _likeliest(answers)
 
     def _nothing(self, question: Question, cause: str) -> ScoredAnswer:
@@ -320,7 +320,7 @@ class Hypotheses:
         causes = CAUSE_STEPS * len(self._wider) * len(loose)  # a search must not spend theirs
         answers += self._search(replace(question, keeps=question.keeps + causes), everyone, expected.fit)
         best = _likeliest(answers)
-        for cause in self._wider:
+        for cause in self._affordable(question):
             answers += self._with_cause(question, loose, everyone, cause, best.left)
         return answers
 
@@ -337,19 +337,31 @@ class Hypotheses:
         best = _likeliest(touched)
         assert best.fit is not None
         again = started_from(best.fit)
-        for cause in self._wider:
+        for cause in self._affordable(question):
             found += self._with_cause(question, again, best.kept, cause, best.left)
         found.append(self._fitted(question, again, best.kept, n.STEPS_COLD, wide=True))
         return found
 
+    def _affordable(self, question: Question) -> Iterator[str]:
+        """The wider causes, as long as there are steps for them."""
+        return takewhile(lambda _: not question.spent, self._wider)
+
     def _with_cause(
-        self, question: Question, priors: Sequence[TouchPrior], kept: tuple[int, ...], cause: str, left: Array
+        self,
+        question: Question,
+        priors: Sequence[TouchPrior],
+        kept: tuple[int, ...],
+        cause: str,
+        left: Array,
+        most_steps: float = n.STEPS_COLD,
     ) -> list[ScoredAnswer]:
+        """Empty where this skin has no such cause, or foam no such memory."""
         more = self._more(question, cause, left)
-        if more is None or question.spent:
+        if more is None:
             return []
         wider = replace(question, covariance=question.covariance + more)
-        return [self._fitted(wider, priors, kept, n.STEPS_COLD, cause)]
+        answer = self._fitted(wider, priors, kept, most_steps, cause)
+        return [] if cause == MEMORY and not self._drift.may_remember(answer.pulled) else [answer]
 
     def _more(self, question: Question, cause: str, left: Array) -> Array | None:
         """(K, K) what a cause adds to the covariance; left (K,): the residual that it is to explain."""

@@ -7,6 +7,7 @@ import os
 import numpy as np
 import pytest
 
+from services.runtime.config import ScanMode
 from tests.services.gap_host import FAR_M, SCAN_S, GapHost, Press
 
 PART_S = SCAN_S / 10
@@ -164,3 +165,15 @@ def test_a_stage_that_skips_most_frames_says_nothing_wrong_and_still_something(s
     assert np.mean([frame.valid for frame in frames]) > 0.8
     (contact,) = [c for c in frames[-1].contacts if c.state != "end"]
     assert np.hypot(contact.position[0] - 0.025, contact.position[1] + 0.02) < FAR_M
+
+
+@pytest.mark.parametrize("scan", ["full", "rolling"])
+def test_presses_that_take_turns_behind_gaps_are_not_what_foam_remembers(scan: ScanMode) -> None:
+    """Two places in turn for seven seconds: what each touch left there adds up to no touch."""
+    turns = [Press(*((-0.03, 0.03), (0.025, -0.02))[n % 2], 7.0 + 0.6 * n, 7.6 + 0.6 * n) for n in range(12)]
+    host = GapHost(scan, 2, turns)
+    for press in turns[1:]:
+        host.outage(press.start - 0.1, 0.3, "Preprocessing")
+    host.until(turns[-1].end)
+    host.close()
+    assert sum(1 for _ in host.valid(7.0)) > 50 and not host.wrong(7.0), "\n".join(map(str, host.wrong(7.0)))

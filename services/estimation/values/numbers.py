@@ -12,7 +12,7 @@ FALSE_ALARM_Z2 = Number(44.0, "-", "z^2 of the best disc that is a touch", "deri
 GLANCE_Z2 = Number(36.0, "-", "the same at a first look", "derived: the whitening is 0.5 s old, 10 % of z")
 GLANCE_S = Number(0.5, "s", "for which a whitening does for a first look", "derived: drift beyond is 1e-5")
 SURER = Number(0.5, "-", "of a variance then, below which a whitening is made anew", "derived: 40 % of a sigma")
-QUIET = Number(1.6, "-", "chi^2 a measurement of what nothing needs to explain", "derived: 4.6 sigmas of 120")
+QUIET = Number(1.8, "-", "chi^2 a measurement of what nothing needs to explain", "derived: one of 120 in 5e6 scans")
 GOOD = Number(1.45, "-", "the same of a fit that explains its scan", "derived: 3.5 sigmas of 120")
 MOST = Number(2.5, "-", "the same of a fit that is roughly right: places hold", "chosen: 60 % more than the noise")
 """Is something there, and is it explained?"""
