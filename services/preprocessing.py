@@ -348,7 +348,7 @@ class Preprocessing(Stage):
         self._build()
         self.estimator.use(skin_tables(self.bundle))
         self._use(self.baseline)
-        self._news = BaselineNews()
+        self._news, self._keep = BaselineNews(), True
 
     # --- kept state ---
 

@@ -348,8 +348,10 @@ class Publishing(Stage):
         self._end_all()
         if "ids" not in state:
             return
-        more = self._next_id - 1  # numbers given so far: none is given twice
-        self._next_id += int(state["next_id"]) - 1
+        next_id = int(state["next_id"])
+        # A state that goes on knows the numbers that were given so far; another one must give none of them twice.
+        more = self._next_id - 1 if next_id < self._next_id else 0
+        self._next_id = more + next_id
         self._ids = {int(touch): (more + int(number), int(born_ns)) for touch, number, born_ns in state["ids"]}
         self._shown = [Contact(**(c | {"id": more + int(c["id"])})) for c in state["shown"]]
         self._untold += [Contact(**(c | {"id": more + int(c["id"])})) for c in state["untold"]]

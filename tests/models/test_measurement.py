@@ -70,18 +70,6 @@ def test_a_disc_does_what_finite_elements_say(x: float, y: float, radius: float,
     assert np.linalg.norm(there - scale * said) < 0.004 * np.linalg.norm(there)
 
 
-def test_a_soft_edge_is_a_blurred_jacobian() -> None:
-    touch = pressed("circle", 0.038, -0.038, 0.006, 0.5)
-    there = change(touch, edge_m=3e-3)
-    left = []
-    for known in (tables(), tables().blurred(3e-3 / UNIT_M)):
-        said = action_of(touch) * DiscResponse(known)(0.76, -0.76, np.log(0.12))
-        scale = said @ there / (said @ said)
-        left.append(np.linalg.norm(there - scale * said) / np.linalg.norm(there))
-    assert left[0] > 0.03  # of a disc with a sharp edge
-    assert left[1] < 0.005
-
-
 def test_slopes_are_differences_of_responses() -> None:
     """A disc's rim runs through pixels, so that both scatter by a tenth of themselves."""
     response, step, off = DiscResponse(tables()), 0.03, list[float]()

@@ -105,9 +105,6 @@ def test_forces_and_places_of_moments_are_within_their_sigma(scan: str) -> None:
         assert sum(score.counts[f"{of} 6/{phase}"] for phase in PHASES) == 0
 
 
-@pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="RollingScans stays with the bundle that is not calibrated"
-)
 @pytest.mark.slow
 def test_parts_of_a_calibrated_skin_stand_on_its_calibration() -> None:
     """A skin that is mounted wrong, after a tare that calibrates: a slide of 0.6 s is followed with every part, 229
