@@ -94,11 +94,11 @@ class Reader:
 
 
 def contact_of(reader: NewestReader) -> ContactFrame:
-    """The next valid frame with one contact."""
+    """The next valid frame with one contact that has begun by then."""
     end = time.monotonic() + 60
     while True:
         frame = reader.recv(0.5)
-        if isinstance(frame, ContactFrame) and frame.valid and len(frame.contacts) == 1:
+        if isinstance(frame, ContactFrame) and frame.valid and [c.state for c in frame.contacts] == ["hold"]:
             return frame
         assert time.monotonic() < end, f"no valid contact: {frame}"
 
