@@ -7,6 +7,7 @@ import pytest
 
 from bench.speed.simulated_host import SimulatedHost
 from firmware_stub.timeline import PiecewiseLinear, Script, Timeline
+from tests.services.gap_host import SCAN_S
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +48,9 @@ def test_a_touch_reaches_a_controller_within_three_parts_and_so_does_its_end(hos
 @pytest.mark.slow
 @pytest.mark.parametrize("x, y", [(0.037, -0.044), (-0.0137, 0.0436)])
 def test_a_touch_on_an_electrode_is_not_taken_for_its_contact_after_parts_had_told_them_apart(x, y):
-    """The two whole scans after its beginning were of a contact that jumped, by what they show alone."""
+    """The two whole scans after its beginning were of a contact that jumped, by what they show alone. A whole scan
+    tells them apart: the first one after the beginning.
+    """
     host = SimulatedHost("rolling", snr_db=80.0, seed=4)
     host.until(6.0)
     began, first = host.now, len(host.contacts)
@@ -56,7 +59,7 @@ def test_a_touch_on_an_electrode_is_not_taken_for_its_contact_after_parts_had_to
     host.rig.close()
     frames = [f for _, f in host.contacts[first:]]
     assert all(f.valid for f in frames)
-    assert [t for t, f in host.contacts[first:] if f.contacts][0] - began < 0.025
+    assert [t for t, f in host.contacts[first:] if f.contacts][0] - began < SCAN_S
 
 
 def test_a_contact_that_jumps_as_a_touch_begins_elsewhere_is_named():
