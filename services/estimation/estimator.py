@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from models.measurement.fit import FoundTouches
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, SHAPES, STATES
-from models.measurement.whitening import Whitening
+from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice
 from services.estimation.faults.asking import Asked, AskedScan
 from services.estimation.faults.board import BoardView
@@ -52,7 +52,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 10  # of a kept state
+LAYOUT = 11  # of a kept state
 
 
 @dataclass(frozen=True)
@@ -267,6 +267,8 @@ class Estimator:
             self.skin.touches.lose()
         if gap_s < 0:
             self.skin.learning.doubt()  # else it was no touch that had begun, if nothing touches now
+        if (slowly := self._came_slowly(self.skin, measured)) is not None:
+            return self._held(self.skin, measured, *slowly, judgements)
         seen = self._glanced(self.skin, measured)
         if seen is not None:
             return self._quiet(self.skin, measured, seen, judgements)
@@ -286,6 +288,29 @@ class Estimator:
         alike, sure = skin.noise.alike(scan.part), skin.drift.even_variance(measured.middle_s)
         seen = skin.quick.look(alike, scan, measured.middle_s, y, now.information, sure)
         return seen if seen is not None and seen.quiet else None
+
+    def _came_slowly(self, skin: TaredSkin, measured: LookedAt) -> tuple[Question, ScoredAnswer] | None:
+        """A touch where nothing touched, that no drift since a while ago explains: the filter is that of then."""
+        middle_s, span_s, live = measured.middle_s, measured.span_s, measured.live
+        if len(skin.touches) or self.now.unexplained_s or not self._complete(skin, live) or not measured.whole:
+            return None
+        then = skin.slow.due(middle_s) if skin.faults.plain(middle_s - span_s / 2) and self._tables.predicted else None
+        if then is None:
+            return None
+        predicted = then.ahead(middle_s, skin.noise.now.flicker)
+        covariance = skin.noise.covariance(measured.scan.part) + predicted.covariance + then.faster(n.SLOW_TIMES)
+        leave_out(covariance, live)
+        y = np.where(live, measured.log_z - skin.log_z0 - predicted.shift, 0.0)
+        information = skin.hypotheses.grid.information(Whitening.of(covariance))
+        times_s = span_s / 2 - measured.scan.ages_s
+        question = measured.question(y, covariance, live, times_s, information, np.zeros((0, STATES)))
+        answer = skin.hypotheses.slowly(question)
+        if answer is None:
+            return None
+        skin.drift.now = then.now
+        skin.learning.doubt()
+        skin.forget_looks()
+        return question, answer
 
     def _complete(self, skin: TaredSkin, live: NDArray[np.bool_]) -> bool:
         """Whether every measurement that the baseline has counts."""
@@ -366,7 +391,7 @@ class Estimator:
             undecided = undecided and not skin.asking.decide(asked, at) and skin.faults.now.doubt.undecided
         told_apart = asked.view.contact < 0  # else the rest is off by what its size was expected to be
         if explained and sound and told_apart and not (asked.changed or gross):
-            self._learn(skin, measured, answer)
+            self._learn(skin, measured, answer, at.predicted)
         failed = float(asked.view.failed.mean())
         judgements += advice.judgements_of(skin.faults.states(), scan.status, failed, undecided)
         judgements.append(judge("gap", float(skin.touches.lost), 1.0))
@@ -505,6 +530,7 @@ class Estimator:
         if answer.fit is None:
             touches.forget(middle_s - span_s / 2)
         else:
+            skin.slow.forget()
             memories += touches.settle(
                 answer.fit, kept, middle_s, span_s, whole=measured.whole, explained=answer.explained
             )
@@ -571,8 +597,10 @@ class Estimator:
         if self._tables.predicted and self.now.unexplained_s > n.CHANGING_S:
             skin.hypotheses.adrift = min(n.MOST_ADRIFT, skin.hypotheses.adrift * n.ADRIFT)
 
-    def _learn(self, skin: TaredSkin, measured: LookedAt, answer: ScoredAnswer) -> None:
-        """From untouched scans all, while touched of the contacts' noise alone."""
+    def _learn(self, skin: TaredSkin, measured: LookedAt, answer: ScoredAnswer, predicted: Prediction) -> None:
+        """From untouched scans all, while touched what the touches leave open, now and then: what their response gets
+        wrong is the same from scan to scan.
+        """
         if answer.fit is None:
             self._learn_untouched(skin, measured, answer.pulled, answer.cause)
             return
@@ -581,6 +609,11 @@ class Estimator:
             self.now.wholes += 1
             if answer.cause == AS_IT_IS and measured.scan.believed:
                 skin.noise.learn_contacts(answer.pulled, answer.white)
+                known = not answer.recounted and self._complete(skin, measured.live)
+                known = known and len(predicted.x) == len(skin.drift.now.x)  # nothing has ended or slid away
+                if known and predicted.at_s - skin.drift.now.at_s > n.TOUCHED_LEARNS_S:
+                    skin.drift.take_in_beside(predicted, answer.fit)
+                    skin.forget_looks()
 
     def _learn_untouched(self, skin: TaredSkin, measured: LookedAt, pulled: Array, cause: str) -> None:
         if not measured.scan.believed:
@@ -600,6 +633,7 @@ class Estimator:
                 skin.forget_looks()
             waiting = Waiting(measured.middle_s, over, measured.live, measured.scan.part, drifts)
             skin.learning.untouched(waiting)
+            skin.slow.keep()
 
     # --- what is said ---
 

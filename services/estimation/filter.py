@@ -6,12 +6,14 @@ touches, and each measurement's own remainder. A Kalman filter of log |Z|; touch
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.fit import FoundTouches
 from models.measurement.tables import FIELD_DEGREES, SkinTables
 from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
@@ -100,6 +102,12 @@ class SkinFilter:
         then = before.shift(self.now.at_s)
         self.now.remainder = self.now.remainder + then - self.shift(self.now.at_s)
 
+    def as_it_was(self, then: FilterState) -> SkinFilter:
+        """Of the same skin."""
+        seen = copy(self)
+        seen.now = then
+        return seen
+
     def ahead(self, at_s: float, flicker: Array) -> Prediction:
         """flicker (E,): variances of the contact impedances' noise, of which a share is slow."""
         now = self.now
@@ -158,6 +166,25 @@ class SkinFilter:
         now.at_s = predicted.at_s
         self._forget_the_faint()
         return pulled
+
+    def take_in_beside(self, predicted: Prediction, fit: FoundTouches) -> None:
+        """Learn from a touched frame what its touches, which may be any near those that were found, leave open.
+
+        The state's posterior given a fit's own, with S = W^-1 W^-T, D its whitened design and C what it leaves open:
+        P - P H^T W^T (1 - D C D^T) W H P.
+        """
+        now, white = self.now, fit.white
+        passed_s = max(0.0, predicted.at_s - now.at_s)
+        gathered = white(predicted.reach.T)  # (K, N)
+        beside = fit.design.T @ gathered
+        now.x = predicted.x + predicted.reach @ fit.pulled
+        now.p = predicted.p - gathered.T @ gathered + beside.T @ (fit.solved @ beside)
+        told = fit.design.T @ white.w
+        precision = white.conditional_precisions() - np.sum(told * (fit.solved @ told), axis=0)
+        variance = now.remainder_variance + n.REMAINDER_WALK**2 * passed_s
+        now.remainder = now.remainder + variance * fit.pulled
+        now.remainder_variance = variance * (1 - variance * np.maximum(precision, 0.0))
+        now.at_s = predicted.at_s
 
     def more_memory(self) -> Array | None:
         """(K, K) covariance of memories that are as large as foam's may be; None where there is none."""

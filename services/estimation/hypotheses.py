@@ -188,6 +188,17 @@ class Hypotheses:
         again = self._nothing(replace(question, y=question.y - share * column), AS_IT_IS)
         return again if again.quiet and abs(share) < n.MEMORY_MOST else found
 
+    def slowly(self, question: Question) -> ScoredAnswer | None:
+        """Touches that came while nothing was seen to touch, strong enough to be none of the field's own unevenness."""
+        nothing = self._nothing(question, AS_IT_IS)
+        if nothing.left_z2 < n.FALSE_ALARM_Z2:
+            return None
+        found = self._from_nothing(question)
+        best = _likeliest(found) if found else nothing
+        if best.fit is None or not best.explained or best.score < nothing.score + n.ANOTHER:
+            return None
+        return best if float(best.fit.states[:, ACTION].sum()) > n.START_SEEN else None
+
     def ask(self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]) -> ScoredAnswer:
         """The likeliest answer. standing, loose: what is known of the touches that there were, as they were and where
         they may have begun to move or to change.

@@ -22,6 +22,7 @@ from services.estimation.hypotheses import Hypotheses
 from services.estimation.learning import Learning, LearningState
 from services.estimation.quick_look import QuickLook
 from services.estimation.refused import RefusedChange, RefusedState
+from services.estimation.slow_look import SlowLook, SlowState
 from services.estimation.touches import TouchesState, TouchTracks
 from services.estimation.values import numbers as n
 
@@ -61,6 +62,7 @@ class TaredState:
     learning: LearningState
     faults: FaultState
     refused: RefusedState
+    slow: SlowState
     adrift: float
 
 
@@ -77,6 +79,7 @@ class TaredSkin:
         self.touches = TouchTracks(self.tables.response)
         self.hypotheses = Hypotheses(self.tables, self.noise, self.drift)
         self.learning = Learning(self.drift, self.noise)
+        self.slow = SlowLook(self.drift)
         self.refused = RefusedChange(tables.measurements)
         self.quick, self.held = QuickLook(self.hypotheses.grid), HeldLook()
         self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
@@ -126,6 +129,7 @@ class TaredSkin:
             learning=self.learning.now,
             faults=self.faults.now,
             refused=self.refused.now,
+            slow=self.slow.now,
             adrift=self.hypotheses.adrift,
         )
 
@@ -139,4 +143,5 @@ class TaredSkin:
             )
         self.noise.now, self.drift.now, self.touches.now = state.noise, state.drift, state.touches
         self.learning.now, self.faults.now, self.refused.now = state.learning, state.faults, state.refused
+        self.slow.now = state.slow
         self.hypotheses.adrift = state.adrift

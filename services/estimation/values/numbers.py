@@ -151,6 +151,12 @@ LAG_SCANS = Number(
     2.0, "-", "scans for which one waits to be believed untouched", "derived: a ramp of 150 ms shows in 2"
 )
 STRANGE = Number(0.1, "-", "of a scan left by touches, from which on it is of none", "chosen: odd touches leave 0.02")
+TOUCHED_LEARNS_S = Number(1.0, "s", "after which drift is learnt beside touches", "chosen: a fidgeting finger's own")
+SLOW_S = Number(10.0, "s", "after which a slow press is told from drift", "chosen: half of the slowest press")
+SLOW_EVERY_S = Number(1.0, "s", "from look to look for one", "chosen: cost, 4 ms")
+SLOW_TIMES = Number(
+    400.0, "-", "times FIELD_FASTER^2: drift meanwhile", "derived: contacts 4 %, five times CONTACT_RATE"
+)
 CHANGING_S = Number(0.1, "s", "for which what nothing explains is said to be changing", "derived: two whole scans")
 LOST_S = Number(1.0, "s", "of nothing that explains it, after which no touch is vouched for", "derived: half of 2 s")
 LOST_SCANS = Number(8.0, "-", "whole scans from search to search then", "chosen: cost, three searches a second")
