@@ -278,7 +278,7 @@ def test_estimation_imports_numerics_only() -> None:
         assert not outside_world(path), f"{relative} imports {sorted(outside_world(path))}"
 
 
-NEW_HOUSE = ("filter", "overlap", "touches", "hypotheses", "tared", "estimator")
+NEW_HOUSE = ("filter", "overlap", "touches", "asked.hypotheses", "tared", "answering", "settling", "estimator")
 """Rooms of the new estimator, each of which stands on those before it, on values and on models/measurement."""
 
 

@@ -28,7 +28,9 @@ class ContactWriter:
         """A touch as the measurements tell it, and as it looks."""
         contact = self._here(number, state, look, self.law.of_touch(touch, look.classes), touch.velocity)
         return replace(
-            contact, confidence=0.5 * (1 + math.erf(math.sqrt(touch.z2 / 2))), position_sigma=list(touch.sigma)
+            contact,
+            confidence=0.5 * (1 + math.erf(math.sqrt(touch.z2 / 2))),
+            position_sigma=list(touch.sigma),
         )
 
     def of_image(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
@@ -14,12 +13,15 @@ from models.measurement.fit import FoundTouches
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, SHAPES, STATES
 from models.measurement.whitening import Whitening, leave_out
+from services.estimation.answering import Answering
+from services.estimation.asked.hypotheses import Hypotheses
+from services.estimation.asked.looked_at import LookedAt
+from services.estimation.asked.question import AS_IT_IS, BURST, DRIFT, MEMORY, NOISE, Question, ScoredAnswer, StepBudget
 from services.estimation.faults import advice
 from services.estimation.faults.asking import Asked, AskedScan
 from services.estimation.faults.board import BoardView
-from services.estimation.faults.gap import judged_by_itself
 from services.estimation.faults.wires import WireFault
-from services.estimation.filter import Memory, Prediction
+from services.estimation.filter import Prediction
 from services.estimation.first.tare import (
     AgreedScans,
     BaselineTells,
@@ -28,20 +30,9 @@ from services.estimation.first.tare import (
     Taring,
     TaringState,
 )
-from services.estimation.hypotheses import (
-    AS_IT_IS,
-    BURST,
-    DRIFT,
-    MEMORY,
-    NOISE,
-    Hypotheses,
-    Question,
-    ScoredAnswer,
-    StepBudget,
-    started_from,
-)
 from services.estimation.learning import Waiting
-from services.estimation.quick_look import Seen
+from services.estimation.looks.quick import Seen
+from services.estimation.settling import settle
 from services.estimation.tared import KnownBaseline, TaredSkin, TaredState
 from services.estimation.touches import TouchTracks, estimate_of, roughly
 from services.estimation.values import numbers as n
@@ -53,53 +44,6 @@ from services.estimation.values.state import loaded, saved
 Array = NDArray[np.float64]
 
 LAYOUT = 11  # of a kept state
-
-
-@dataclass(frozen=True)
-class LookedAt:
-    """A scan as the estimator looks at it."""
-
-    scan: Scan
-    log_z: Array  # (K,) 0 where a measurement does not count
-    live: NDArray[np.bool_]  # (K,)
-    whole: bool  # it shares no value with the last one that was whole
-    budget: StepBudget
-
-    @property
-    def span_s(self) -> float:
-        return self.scan.duration_s
-
-    @property
-    def middle_s(self) -> float:
-        return self.scan.at_ns * 1e-9 - self.scan.duration_s / 2
-
-    @cached_property
-    def order(self) -> NDArray[np.intp]:
-        """(K,) rank in time, 0 the oldest."""
-        return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
-
-    def question(
-        self,
-        y: Array,
-        covariance: Array,
-        live: NDArray[np.bool_],
-        times_s: Array,
-        information: NDArray[np.float32],
-        candidates: Array,
-    ) -> Question:
-        """About this scan."""
-        return Question(
-            y=y,
-            covariance=covariance,
-            live=live,
-            times_s=times_s,
-            span_s=self.span_s,
-            order=self.order,
-            part=self.scan.part,
-            information=information,
-            budget=self.budget,
-            candidates=candidates,
-        )
 
 
 @dataclass
@@ -322,7 +266,7 @@ class Estimator:
 
     def _quiet(self, skin: TaredSkin, measured: LookedAt, seen: Seen, judgements: list[Judgement]) -> Estimate:
         self._explained(skin, AS_IT_IS)
-        self._remember(skin, skin.refused.explained(measured.middle_s - measured.span_s / 2))
+        skin.remember(skin.refused.explained(measured.middle_s - measured.span_s / 2))
         measured = replace(measured, log_z=skin.log_z0 + skin.faults.taken_off(measured.log_z - skin.log_z0))
         self._learn_untouched(skin, measured, seen.pulled, AS_IT_IS)
         self.now.said, self.now.candidates = (), np.zeros((0, STATES))
@@ -353,7 +297,7 @@ class Estimator:
         answer: ScoredAnswer,
         judgements: list[Judgement],
     ) -> Estimate:
-        self._settle(skin, question, answer, measured)
+        settle(skin, question, answer, measured)
         self._explained(skin, answer.cause)
         return self._said(skin, measured, question, answer, judgements, explained=True, rough=False)
 
@@ -363,14 +307,14 @@ class Estimator:
         scan = measured.scan
         asked, at = self._explaining(skin, measured)
         if asked.answer.holds and (pressed := skin.refused.explained(measured.middle_s - measured.span_s / 2)):
-            self._remember(skin, pressed)
+            skin.remember(pressed)
             asked, at = self._explaining(skin, measured)  # again: what is left may be memory
         question, answer = asked.question, asked.answer
         measured = replace(measured, log_z=at.untouched + asked.view.y, live=asked.view.live)
         explained = answer.holds
         rough = answer.fit is not None and answer.chi2 < n.MOST
         if explained or rough:
-            self._settle(skin, question, answer, measured)
+            settle(skin, question, answer, measured)
         went = answer.fit is not None and not len(skin.touches)  # whatever it was, it came and went within the scan
         if (explained or rough) and not went:
             self._explained(skin, answer.cause)
@@ -425,11 +369,12 @@ class Estimator:
             middle_s=measured.middle_s,
             whole=measured.whole,
         )
+        answering = Answering(self._tables, skin, measured, self.now.unexplained_s)
         asked = skin.asking(
             at,
             lambda hypotheses, view, covariance: self._question(hypotheses, skin, view, covariance, measured),
-            lambda hypotheses, question: self._answer(skin, hypotheses, question, predicted, measured),
-            lambda hypotheses, question, answer: self._recounted(skin, hypotheses, question, answer, measured),
+            lambda hypotheses, question: answering.answer(hypotheses, question, predicted),
+            answering.recounted,
         )
         return asked, at
 
@@ -444,140 +389,7 @@ class Estimator:
         question = measured.question(view.y, covariance, view.live, view.times_s, now.information, now.candidates)
         return question.leaving(n.FOR_FAULTS)
 
-    def _answer(
-        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
-    ) -> ScoredAnswer:
-        if not self._tables.predicted:
-            return self._answer_measured(skin, hypotheses, question, predicted, measured)
-        if self.now.unexplained_s > n.LOST_S:
-            return self._answer_of_lost(skin, hypotheses, question, measured)
-        return self._answer_touched(skin, hypotheses, question, predicted, measured)
-
-    def _answer_touched(
-        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
-    ) -> ScoredAnswer:
-        if len(skin.touches):
-            standing = skin.touches.expected(measured.middle_s, measured.span_s)
-            loose = skin.touches.expected(measured.middle_s, measured.span_s, loose=True)
-            if skin.touches.lost:
-                return judged_by_itself(hypotheses, question, standing, loose)
-            return hypotheses.ask(question, standing, loose)
-        quiet = hypotheses.untouched(question)
-        assert quiet is not None
-        memory = skin.drift.beyond_memory(predicted, quiet.pulled, quiet.white)
-        if memory is not None and skin.faults.now.wire is None:
-            pressed = hypotheses.at(question, memory.x, memory.y)
-            if pressed.explained:
-                return pressed
-        return quiet if quiet.quiet else hypotheses.ask(question, (), ())
-
-    def _recounted(
-        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, answer: ScoredAnswer, measured: LookedAt
-    ) -> ScoredAnswer:
-        """An answer, or rather more touches than it has, or fewer. Asked with steps of its own: what explains a scan
-        badly has spent those of the scan, and would never be asked otherwise.
-        """
-        if not measured.whole or answer.fit is None or any(prior.until_s < np.inf for prior in answer.fit.priors):
-            return answer
-        if not (_strained(answer) or skin.touches.odd):
-            return answer
-        scan = measured.scan
-        own = replace(question, budget=StepBudget.of(len(scan.new), int(scan.new.sum()), scan.separate), keeps=0.0)
-        found = hypotheses.recounted(own, answer)
-        if found is None or found.fit is None:
-            return answer
-        kept = skin.touches.recognised(found.fit, found.kept)
-        known = sum(place >= 0 for place in kept)
-        return replace(found, kept=kept, score=found.score - n.COST_TOUCH * known, recounted=True)
-
-    def _answer_measured(
-        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, predicted: Prediction, measured: LookedAt
-    ) -> ScoredAnswer:
-        """Of a skin whose touches no response tells, or one that real touches differ from by more than anybody knows.
-        While something touches that nothing explains, all else is asked seldom.
-        """
-        unexplained_s, map_known = self.now.unexplained_s, self._tables.tells
-        often = unexplained_s <= n.CHANGING_S or not round(unexplained_s / question.span_s) % n.LOST_SCANS
-        if not often:
-            question.budget.left = 0.0
-        elif map_known and len(skin.touches):
-            return self._answer_touched(skin, hypotheses, question, predicted, measured)
-        found = hypotheses.untold(question, skin.refused.now.column, often and not map_known)
-        if found.quiet or not (often and map_known):
-            return found
-        return self._answer_touched(skin, hypotheses, question, predicted, measured)
-
-    def _answer_of_lost(
-        self, skin: TaredSkin, hypotheses: Hypotheses, question: Question, measured: LookedAt
-    ) -> ScoredAnswer:
-        """While nothing has explained the skin for long: a search now and then, from nothing."""
-        self._remember(skin, skin.touches.forget(measured.middle_s - measured.span_s / 2))
-        found = hypotheses.glance(question)
-        refused = round(self.now.unexplained_s / measured.span_s)
-        if found.quiet or not measured.whole or refused % n.LOST_SCANS:
-            return found
-        return hypotheses.ask(question, (), ())
-
     # --- what follows ---
-
-    def _settle(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
-        touches, middle_s, span_s = skin.touches, measured.middle_s, measured.span_s
-        kept = answer.kept if answer.fit is None else touches.recognised(answer.fit, answer.kept)
-        if answer.recounted and answer.fit is not None:
-            touches.correct(answer.fit, kept)
-        gone = [k for k in range(len(touches)) if k not in kept]
-        memories = [memory for k in gone for memory in touches.released(k, middle_s - span_s / 2)]
-        if answer.fit is None:
-            touches.forget(middle_s - span_s / 2)
-        else:
-            skin.slow.forget()
-            memories += touches.settle(
-                answer.fit, kept, middle_s, span_s, whole=measured.whole, explained=answer.explained
-            )
-            self._make_sure(skin, answer)
-            rest = replace(question, keeps=0.0)
-            if measured.whole and not answer.recounted:
-                self._doubt(skin, rest, answer, measured)
-        self._remember(skin, memories)
-
-    def _remember(self, skin: TaredSkin, memories: Sequence[Memory]) -> None:
-        for memory in memories:
-            skin.drift.remember(memory)
-        if memories:
-            skin.forget_looks()
-
-    def _make_sure(self, skin: TaredSkin, answer: ScoredAnswer) -> None:
-        """A touch is shown at once where its scan is explained with it: a rough start may be anything."""
-        if not answer.explained:
-            return
-        least = float(n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2)
-        if not self._tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
-            least = 0.0
-        for track in skin.touches.now.tracks:
-            track.sure = track.sure or track.z2 > least
-
-    def _doubt(self, skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
-        """Is one of the touches drift, or nothing? What was shown once must not stay because nothing is learnt under
-        it, nor because it costs nothing: a touch that is doubted counts as a new one.
-        """
-        touches, none = skin.touches, list[tuple[float, int]]()
-        meeting = touches.meeting(measured.middle_s)
-        for k in reversed(range(len(touches))):
-            track = touches.now.tracks[k]
-            often = track.z2 < n.DOUBT_Z2 or not track.sure
-            if track.ended or not (often or track.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1):
-                continue
-            standing, least = touches.expected(measured.middle_s, measured.span_s), float(n.COST_TOUCH)
-            if answer.fit is not None and k in meeting and len(touches) == len(answer.fit):
-                standing, least = started_from(answer.fit), -least  # it is known by itself: it would have ended
-            other = skin.hypotheses.without(question, standing, k)
-            if other.quiet and other.score > answer.score + least:
-                none.append((other.score - least, k))
-                continue
-            alone = len(touches) == 1  # then something touches, be its strength known or not
-            track.sure = track.sure or (track.scans >= n.SURE_SCANS and (alone or track.z2 > n.ACTS_Z2))
-        if none:
-            touches.remove(max(none)[1])
 
     def _explained(self, skin: TaredSkin, cause: str) -> None:
         self.now.unexplained_s = 0.0
@@ -693,11 +505,6 @@ class Estimator:
         return Estimate(
             measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements)
         )
-
-
-def _strained(answer: ScoredAnswer) -> bool:
-    """Whether touches explain a scan only roughly, or with the help of something else."""
-    return answer.cause != AS_IT_IS or not answer.explained
 
 
 def _strange(question: Question, answer: ScoredAnswer) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -11,18 +12,18 @@ from numpy.typing import NDArray
 from models.measurement.noise import NoiseModel, NoiseState
 from models.measurement.tables import SkinTables
 from models.measurement.whitening import leave_out
+from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.faults.asking import FaultAsking
 from services.estimation.faults.board import BoardFaults, FaultState
 from services.estimation.faults.table import any_touches
-from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, SkinFilter
+from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, Memory, SkinFilter
 from services.estimation.first.start import EarlierBaseline
 from services.estimation.first.tare import AgreedScans
-from services.estimation.held_look import HeldLook
-from services.estimation.hypotheses import Hypotheses
 from services.estimation.learning import Learning, LearningState
-from services.estimation.quick_look import QuickLook
+from services.estimation.looks.held import HeldLook
+from services.estimation.looks.quick import QuickLook
+from services.estimation.looks.slow import SlowLook, SlowState
 from services.estimation.refused import RefusedChange, RefusedState
-from services.estimation.slow_look import SlowLook, SlowState
 from services.estimation.touches import TouchesState, TouchTracks
 from services.estimation.values import numbers as n
 
@@ -109,6 +110,13 @@ class TaredSkin:
         made.faults.now, made.hypotheses.adrift = self.faults.now, self.hypotheses.adrift
         made.drift.succeed(self.drift)
         return made
+
+    def remember(self, memories: Sequence[Memory]) -> None:
+        """What touches that went leave in the foam."""
+        for memory in memories:
+            self.drift.remember(memory)
+        if memories:
+            self.forget_looks()
 
     def forget_looks(self) -> None:
         """The untouched skin is another than at the last scans."""

@@ -32,7 +32,7 @@ from protocol.frames import Contact, ContactFrame, pack, unpack
 from services.alarm import Alarm
 from services.estimation.faults.board import FaultState
 from services.estimation.faults.noise import NoiseRise
-from services.estimation.hypotheses import AS_IT_IS, NOISE
+from services.estimation.asked.question import AS_IT_IS, NOISE
 from services.estimation.values.judgement import Verdict, reasons
 from services.runtime.config import Skin
 from services.runtime.stage import PROCESSES

@@ -14,11 +14,12 @@ from models.measurement.fit import LEAST_MEAN
 from models.measurement.noise import NoiseModel
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, TouchPrior
+from services.estimation.asked.hypotheses import Hypotheses
+from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer
 from services.estimation.faults.board import BoardFaults, BoardView, as_they_stand
 from services.estimation.faults.doubt import ContactDoubt
 from services.estimation.faults.wires import WireFault
 from services.estimation.filter import Prediction
-from services.estimation.hypotheses import AS_IT_IS, Hypotheses, Question, ScoredAnswer
 from services.estimation.touches import TouchTracks
 from services.estimation.values import numbers as n
 

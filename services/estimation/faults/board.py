@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
 from models.measurement.whitening import Whitening, leave_out
+from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer
 from services.estimation.faults import advice, wires
 from services.estimation.faults.decided import DecidedState
 from services.estimation.faults.impedance import (
@@ -29,7 +30,6 @@ from services.estimation.faults.impedance import (
 )
 from services.estimation.faults.table import BoardScan, WireTable
 from services.estimation.faults.wires import WireFault, WireKind, WireMaps
-from services.estimation.hypotheses import AS_IT_IS, Question, ScoredAnswer
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from models.measurement.fit import FoundTouches
 from models.measurement.tables import SkinTables
 from models.measurement.whitening import leave_out
+from services.estimation.asked.hypotheses import Hypotheses
+from services.estimation.asked.question import AS_IT_IS, MEMORY, Question, ScoredAnswer, StepBudget
 from services.estimation.faults.board import LEAST, BoardFaults, BoardView
 from services.estimation.faults.impedance import ContactChange, ContactColumns, Unexplained
-from services.estimation.hypotheses import AS_IT_IS, MEMORY, Hypotheses, Question, ScoredAnswer, StepBudget
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from models.measurement.touch import TouchPrior
-from services.estimation.hypotheses import Hypotheses, Question, ScoredAnswer
+from services.estimation.asked.hypotheses import Hypotheses
+from services.estimation.asked.question import Question, ScoredAnswer
 from services.estimation.values import numbers as n
 
 

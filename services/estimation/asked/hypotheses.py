@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from itertools import takewhile
 
 import numpy as np
@@ -23,104 +22,35 @@ from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, TouchPrior, anywhere, plain
 from models.measurement.whitening import Whitening
+from services.estimation.asked.left_over import LeftOver, fresh
+from services.estimation.asked.question import (
+    AS_IT_IS,
+    BURST,
+    COSTS,
+    DRIFT,
+    MEMORY,
+    NOISE,
+    ONSETS,
+    Question,
+    ScoredAnswer,
+    started_from,
+)
 from services.estimation.filter import SkinFilter
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 
-ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
 ON_ELECTRODE = ((0.03, 0.0), (0.03, 0.1), (0.03, -0.1))  # inside its edge and along it, where a search begins
 SMALL_RADIUS = 0.1  # where it begins
 CAUSE_STEPS = 1  # that touches which are known need beside another cause
-AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
 WIDER = (MEMORY, DRIFT, BURST, NOISE)
-COSTS = {
-    AS_IT_IS: 0.0,
-    MEMORY: float(n.COST_MEMORY),
-    DRIFT: float(n.COST_DRIFT),
-    BURST: float(n.COST_BURST),
-    NOISE: float(n.COST_NOISE),
-}
-
-
-@dataclass
-class StepBudget:
-    """Solver steps, times touches, that one scan may cost: handed along with all that is asked about it."""
-
-    left: float
-
-    @classmethod
-    def of(cls, values: int, new: int, separate: bool) -> StepBudget:
-        """Of a scan of which so many values are new: the next comes the sooner, the fewer there are. separate: none
-        follows that could go on with what this one leaves open.
-        """
-        steps = n.MOST_STEPS * max(float(n.LEAST_BUDGET), new / values)
-        return cls(steps * n.SEPARATE if separate else steps)
-
-
-@dataclass(frozen=True)
-class Question:
-    """One scan, with what is predicted of it without touches."""
-
-    y: Array  # (K,) log |Z| over the prediction; 0 where a measurement does not count
-    covariance: Array  # (K, K)
-    live: NDArray[np.bool_]
-    times_s: Array  # (K,) from the middle of the scan
-    span_s: float
-    order: NDArray[np.intp]  # (K,) rank in time, 0 the oldest
-    part: int  # that it ends with
-    information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
-    budget: StepBudget
-    candidates: Array  # (C, 7) touches that nearly explained the scan before
-    keeps: float = 0.0  # steps that are left to who asks next
-
-    @property
-    def spent(self) -> bool:
-        return self.budget.left <= self.keeps
-
-    def leaving(self, share: float) -> Question:
-        """The same, which leaves so much of its steps to the next."""
-        return replace(self, keeps=self.keeps + share * max(0.0, self.budget.left - self.keeps))
-
-    @cached_property
-    def white(self) -> Whitening:
-        return Whitening.of(self.covariance)
-
-
-@dataclass(frozen=True)
-class ScoredAnswer:
-    """One hypothesis, scored."""
-
-    cause: str
-    fit: FoundTouches | None  # None: nothing touches
-    kept: tuple[int, ...]  # for each touch of the fit the standing one that it continues; -1: new
-    chi2: float
-    left_z2: float  # of the best further disc
-    score: float  # log evidence and prior
-    white: Whitening
-    pulled: Array  # (K,) S^-1 of the residual
-    left: Array  # (K,)
-    recounted: bool = False  # its touches are others than those that stood
-
-    @property
-    def explained(self) -> bool:
-        return self.chi2 < n.GOOD and self.left_z2 < n.FALSE_ALARM_Z2
-
-    @property
-    def quiet(self) -> bool:
-        return self.chi2 < n.QUIET and self.left_z2 < n.FALSE_ALARM_Z2 * max(1.0, self.chi2)
-
-    @property
-    def holds(self) -> bool:
-        """Whether it explains its scan, with touches or without."""
-        return self.quiet if self.fit is None else self.explained
 
 
 class Hypotheses:
     """Of one skin."""
 
     def __init__(self, tables: SkinTables, noise: NoiseModel, drift: SkinFilter) -> None:
-        self.grid = tables.grid
+        self.grid, self._left = tables.grid, LeftOver(tables.grid, tables.wrong)
         self._tables, self._noise, self._drift = tables, noise, drift
         self._slopes: Array | None = None
         # Touches that nothing explains for certain must not be taken for noise.
@@ -131,6 +61,7 @@ class Hypotheses:
         """The same of a skin that is seen through a fault of the wires; slopes (K, K)."""
         seen = copy(self)
         seen._tables, seen.grid = self._tables.through(slopes), self.grid.through(slopes)
+        seen._left = LeftOver(seen.grid, seen._tables.wrong)
         seen._slopes = slopes
         return seen
 
@@ -153,7 +84,7 @@ class Hypotheses:
         pulled = white.w.T @ residual
         if cause == MEMORY and not self._drift.may_remember(pulled):
             return None
-        z2 = max(self._left(question, pulled, white, None, ())[0], self._fresh(question, pulled, white))
+        z2 = max(self._left.best(question, pulled, white)[0], fresh(question, pulled, white))
         score = white.log_density - 0.5 * float(residual @ residual) + COSTS[cause]
         chi2 = float(residual @ residual) / max(int(question.live.sum()), 1)
         if not self._tables.predicted:
@@ -265,7 +196,7 @@ class Hypotheses:
 
     def _one_more(self, question: Question, begun: Sequence[TouchPrior], discs: ScoredAnswer) -> list[ScoredAnswer]:
         """A disc beside discs, and the same with outlines. begun: the touches of those discs, with theirs."""
-        z2, disc, action, since_s = self._left(question, discs.pulled, discs.white, discs.fit, ONSETS)
+        z2, disc, action, since_s = self._left.best(question, discs.pulled, discs.white, discs.fit, ONSETS)
         if z2 < n.FALSE_ALARM_Z2 or len(begun) >= n.MOST_TOUCHES:
             return []
         x, y = self.grid.discs[disc, PLACE]
@@ -417,7 +348,7 @@ class Hypotheses:
         may = max(0.0, question.budget.left - question.keeps) / len(priors)
         fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(may)))
         question.budget.left -= (fit.steps + 1) * len(fit)
-        z2 = self._left(question, fit.pulled, fit.white, fit, ())[0]
+        z2 = self._left.best(question, fit.pulled, fit.white, fit)[0]
         cost = n.COST_WIDE if wide else COSTS[cause]
         score = fit.evidence + cost + n.COST_TOUCH * sum(place < 0 for place in kept)
         return ScoredAnswer(cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left)
@@ -430,7 +361,7 @@ class Hypotheses:
             pulled, white = fit.pulled, fit.white
         score, full = -np.inf, started_from(fit)
         while (len(fit) if fit else 0) < n.MOST_TOUCHES and not question.spent:
-            z2, disc, action, since_s = self._left(question, pulled, white, fit, ONSETS)
+            z2, disc, action, since_s = self._left.best(question, pulled, white, fit, ONSETS)
             if z2 < n.FALSE_ALARM_Z2:
                 break
             x, y = self.grid.discs[disc, PLACE]
@@ -463,73 +394,6 @@ class Hypotheses:
         kept = tuple(place for k, place in enumerate(answer.kept) if k != b)
         return self._fitted(question, priors, kept, n.STEPS_COLD)
 
-    def _left(
-        self, question: Question, pulled: Array, white: Whitening, fit: FoundTouches | None, onsets: Sequence[float]
-    ) -> tuple[float, int, float, float]:
-        """z^2 of the disc that would explain most of a residual, its number, action, and since when it acts [s].
-        onsets: shares of the scan after which it may have begun. One that acts in the whole scan is so unless that
-        leaves more than its response gets wrong.
-        """
-        found = list[tuple[float, int, float, float]]()
-        precision = white.conditional_precisions() if onsets else np.zeros(0)
-        for share in (0.0, *onsets):
-            weight, since_s = None, -np.inf
-            information = question.information
-            if share:
-                since_s = (share - 0.5) * question.span_s
-                weight = (question.times_s >= since_s).astype(float)
-                information = information * self._grid_share(weight, precision)
-            _, disc, _ = self.grid.likeliest(pulled, information, weight)
-            column = self.grid.responses[disc].astype(float)
-            column = column if weight is None else column * weight
-            along = max(float(column @ pulled), 0.0)
-            if fit is None:
-                whitened = white(column)
-                exact = float(whitened @ whitened)
-            else:
-                exact = fit.information(column)
-            found.append((along**2 / exact - (n.ONSET_Z2 if share else 0.0), disc, along / exact, since_s))
-        if not onsets:
-            return found[0]
-        begun = self._sharper(question, pulled, white, fit, max(found))
-        return begun if begun[0] > found[0][0] * (1 + 2 * self._tables.wrong) else found[0]
-
-    def _sharper(
-        self,
-        question: Question,
-        pulled: Array,
-        white: Whitening,
-        fit: FoundTouches | None,
-        best: tuple[float, int, float, float],
-    ) -> tuple[float, int, float, float]:
-        """The same disc from the likeliest instant on: a strong touch tells it to a measurement or two, and none of its
-        columns makes up for one that is off by more.
-        """
-        instants = _instants(question)
-        column = self.grid.responses[best[1]].astype(float)
-        columns = column[:, None] * (question.times_s[:, None] >= instants)
-        along = np.maximum(columns.T @ pulled, 0.0)
-        exact = np.sum(white(columns) ** 2, axis=0) if fit is None else fit.informations(columns)
-        more = 2 * np.log(len(instants) / len(ONSETS))  # so many were looked at
-        z2 = along**2 / np.maximum(exact, 1e-12) - n.ONSET_Z2 - more
-        k = int(z2.argmax())
-        if z2[k] <= best[0]:
-            return best
-        return float(z2[k]), best[1], float(along[k] / exact[k]), float(instants[k])
-
-    def _fresh(self, question: Question, pulled: Array, white: Whitening) -> float:
-        """Energy of the newest block of measurements beyond what it is expected to have, all others given."""
-        newest = question.order >= len(question.y) - BURST_BLOCK
-        own = white.w[:, newest]
-        energy = pulled[newest] @ np.linalg.solve(own.T @ own, pulled[newest])
-        return float(energy) - BURST_BLOCK
-
-    def _grid_share(self, weight: Array, precision: Array) -> NDArray[np.float32]:
-        """(A,) share of each disc's information that some measurements have, by their own precisions."""
-        squares = self.grid.responses**2
-        each = precision.astype(np.float32)
-        return np.asarray(squares @ (each * weight.astype(np.float32)) / (squares @ each) + 1e-3)
-
     def _begun_otherwise(self, question: Question, standing: Sequence[TouchPrior]) -> list[TouchPrior] | None:
         """A touch that began within these values did so at another instant than the first of them told; None where
         none did. The instant is the likeliest, whatever the action.
@@ -540,7 +404,7 @@ class Hypotheses:
             return None
         course = TouchCourse(self._tables.response, question.times_s, question.span_s)
         priors = list(standing)
-        instants = _instants(question)
+        instants = question.instants
         for k in young:
             everyone = np.stack([prior.start for prior in priors])
             lasting = replace(priors[k], since_s=-np.inf)
@@ -572,7 +436,7 @@ class Hypotheses:
             lasting = each[k]
             if prior.until_s < np.inf:
                 lasting = course.columns(starts[k : k + 1], [replace(prior, until_s=np.inf)]).mean
-            ends = np.concatenate([[-0.5 * question.span_s], _instants(question)])
+            ends = np.concatenate([[-0.5 * question.span_s], question.instants])
             change = (whole - each[k])[:, None] + lasting[:, None] * (question.times_s[:, None] < ends)
             left = np.where(question.live, question.y, 0.0)[:, None] - np.log1p(np.maximum(change, -0.9))
             left[~question.live] = 0.0
@@ -591,12 +455,6 @@ class Hypotheses:
         if not priors:
             return self.untouched(question)
         return self._fitted(question, priors, tuple(kept), n.STEPS_COLD)
-
-
-def _instants(question: Question) -> Array:
-    """(n,) before which values something may begin or end at once: what the last few alone say, the next tell."""
-    times_s = np.sort(question.times_s)
-    return np.asarray(times_s[times_s <= (ONSETS[-1] - 0.5) * question.span_s])
 
 
 def _settled(question: Question, answers: Sequence[ScoredAnswer]) -> bool:
@@ -618,13 +476,6 @@ def _begun(state: Array, span_s: float) -> TouchPrior:
     """A touch that may be anywhere, searched from a state."""
     x, y = state[PLACE]
     return replace(anywhere(float(x), float(y), float(state[ACTION]), span_s), start=state)
-
-
-def started_from(fit: FoundTouches | None) -> list[TouchPrior]:
-    """The priors of a fit, to be searched from where it ended."""
-    if fit is None:
-        return []
-    return [replace(prior, start=state.copy()) for prior, state in zip(fit.priors, fit.states, strict=True)]
 
 
 def _others(fit: FoundTouches | None, than: FoundTouches) -> bool:

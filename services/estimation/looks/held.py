@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.fit import KnownWhitening, Turned
-from services.estimation.hypotheses import AS_IT_IS, Question, ScoredAnswer
+from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]

@@ -1,0 +1,94 @@
+"""How one scan is asked about: touched or not, of a skin that predicts its touches or not, or one that is lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from models.measurement.tables import SkinTables
+from services.estimation.asked.hypotheses import Hypotheses
+from services.estimation.asked.looked_at import LookedAt
+from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, StepBudget
+from services.estimation.faults.gap import judged_by_itself
+from services.estimation.filter import Prediction
+from services.estimation.tared import TaredSkin
+from services.estimation.values import numbers as n
+
+
+class Answering:
+    """Of one scan."""
+
+    def __init__(self, tables: SkinTables, skin: TaredSkin, measured: LookedAt, unexplained_s: float) -> None:
+        """unexplained_s: for how long nothing has explained the scans before."""
+        self._tables, self._skin, self._measured, self._unexplained_s = tables, skin, measured, unexplained_s
+
+    def answer(self, hypotheses: Hypotheses, question: Question, predicted: Prediction) -> ScoredAnswer:
+        """The likeliest one."""
+        if not self._tables.predicted:
+            return self._of_measured(hypotheses, question, predicted)
+        if self._unexplained_s > n.LOST_S:
+            return self._of_lost(hypotheses, question)
+        return self._of_touched(hypotheses, question, predicted)
+
+    def _of_touched(self, hypotheses: Hypotheses, question: Question, predicted: Prediction) -> ScoredAnswer:
+        if len(self._skin.touches):
+            standing = self._skin.touches.expected(self._measured.middle_s, self._measured.span_s)
+            loose = self._skin.touches.expected(self._measured.middle_s, self._measured.span_s, loose=True)
+            if self._skin.touches.lost:
+                return judged_by_itself(hypotheses, question, standing, loose)
+            return hypotheses.ask(question, standing, loose)
+        quiet = hypotheses.untouched(question)
+        assert quiet is not None
+        memory = self._skin.drift.beyond_memory(predicted, quiet.pulled, quiet.white)
+        if memory is not None and self._skin.faults.now.wire is None:
+            pressed = hypotheses.at(question, memory.x, memory.y)
+            if pressed.explained:
+                return pressed
+        return quiet if quiet.quiet else hypotheses.ask(question, (), ())
+
+    def recounted(self, hypotheses: Hypotheses, question: Question, answer: ScoredAnswer) -> ScoredAnswer:
+        """An answer, or rather more touches than it has, or fewer. Asked with steps of its own: what explains a scan
+        badly has spent those of the scan, and would never be asked otherwise.
+        """
+        if not self._measured.whole or answer.fit is None or any(prior.until_s < np.inf for prior in answer.fit.priors):
+            return answer
+        if not (_strained(answer) or self._skin.touches.odd):
+            return answer
+        scan = self._measured.scan
+        own = replace(question, budget=StepBudget.of(len(scan.new), int(scan.new.sum()), scan.separate), keeps=0.0)
+        found = hypotheses.recounted(own, answer)
+        if found is None or found.fit is None:
+            return answer
+        kept = self._skin.touches.recognised(found.fit, found.kept)
+        known = sum(place >= 0 for place in kept)
+        return replace(found, kept=kept, score=found.score - n.COST_TOUCH * known, recounted=True)
+
+    def _of_measured(self, hypotheses: Hypotheses, question: Question, predicted: Prediction) -> ScoredAnswer:
+        """Of a skin whose touches no response tells, or one that real touches differ from by more than anybody knows.
+        While something touches that nothing explains, all else is asked seldom.
+        """
+        unexplained_s, map_known = self._unexplained_s, self._tables.tells
+        often = unexplained_s <= n.CHANGING_S or not round(unexplained_s / question.span_s) % n.LOST_SCANS
+        if not often:
+            question.budget.left = 0.0
+        elif map_known and len(self._skin.touches):
+            return self._of_touched(hypotheses, question, predicted)
+        found = hypotheses.untold(question, self._skin.refused.now.column, often and not map_known)
+        if found.quiet or not (often and map_known):
+            return found
+        return self._of_touched(hypotheses, question, predicted)
+
+    def _of_lost(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+        """While nothing has explained the skin for long: a search now and then, from nothing."""
+        self._skin.remember(self._skin.touches.forget(self._measured.middle_s - self._measured.span_s / 2))
+        found = hypotheses.glance(question)
+        refused = round(self._unexplained_s / self._measured.span_s)
+        if found.quiet or not self._measured.whole or refused % n.LOST_SCANS:
+            return found
+        return hypotheses.ask(question, (), ())
+
+
+def _strained(answer: ScoredAnswer) -> bool:
+    """Whether touches explain a scan only roughly, or with the help of something else."""
+    return answer.cause != AS_IT_IS or not answer.explained

@@ -1,0 +1,61 @@
+"""A scan with what is needed to ask about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.estimation.asked.question import Question, StepBudget
+from services.estimation.values.scan import Scan
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """A scan as the estimator looks at it."""
+
+    scan: Scan
+    log_z: Array  # (K,) 0 where a measurement does not count
+    live: NDArray[np.bool_]  # (K,)
+    whole: bool  # it shares no value with the last one that was whole
+    budget: StepBudget
+
+    @property
+    def span_s(self) -> float:
+        return self.scan.duration_s
+
+    @property
+    def middle_s(self) -> float:
+        return self.scan.at_ns * 1e-9 - self.scan.duration_s / 2
+
+    @cached_property
+    def order(self) -> NDArray[np.intp]:
+        """(K,) rank in time, 0 the oldest."""
+        return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
+
+    def question(
+        self,
+        y: Array,
+        covariance: Array,
+        live: NDArray[np.bool_],
+        times_s: Array,
+        information: NDArray[np.float32],
+        candidates: Array,
+    ) -> Question:
+        """About this scan."""
+        return Question(
+            y=y,
+            covariance=covariance,
+            live=live,
+            times_s=times_s,
+            span_s=self.span_s,
+            order=self.order,
+            part=self.scan.part,
+            information=information,
+            budget=self.budget,
+            candidates=candidates,
+        )

@@ -1,0 +1,112 @@
+"""One scan as it is asked about, and an answer: what explains it, scored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.fit import FoundTouches
+from models.measurement.touch import TouchPrior
+from models.measurement.whitening import Whitening
+from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
+
+ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
+AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
+COSTS = {
+    AS_IT_IS: 0.0,
+    MEMORY: float(n.COST_MEMORY),
+    DRIFT: float(n.COST_DRIFT),
+    BURST: float(n.COST_BURST),
+    NOISE: float(n.COST_NOISE),
+}
+
+
+@dataclass
+class StepBudget:
+    """Solver steps, times touches, that one scan may cost: handed along with all that is asked about it."""
+
+    left: float
+
+    @classmethod
+    def of(cls, values: int, new: int, separate: bool) -> StepBudget:
+        """Of a scan of which so many values are new: the next comes the sooner, the fewer there are. separate: none
+        follows that could go on with what this one leaves open.
+        """
+        steps = n.MOST_STEPS * max(float(n.LEAST_BUDGET), new / values)
+        return cls(steps * n.SEPARATE if separate else steps)
+
+
+@dataclass(frozen=True)
+class Question:
+    """One scan, with what is predicted of it without touches."""
+
+    y: Array  # (K,) log |Z| over the prediction; 0 where a measurement does not count
+    covariance: Array  # (K, K)
+    live: NDArray[np.bool_]
+    times_s: Array  # (K,) from the middle of the scan
+    span_s: float
+    order: NDArray[np.intp]  # (K,) rank in time, 0 the oldest
+    part: int  # that it ends with
+    information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
+    budget: StepBudget
+    candidates: Array  # (C, 7) touches that nearly explained the scan before
+    keeps: float = 0.0  # steps that are left to who asks next
+
+    @property
+    def spent(self) -> bool:
+        return self.budget.left <= self.keeps
+
+    @cached_property
+    def instants(self) -> Array:
+        """(n,) before which values something may begin or end at once: what the last few alone say, the next tell."""
+        times_s = np.sort(self.times_s)
+        return np.asarray(times_s[times_s <= (ONSETS[-1] - 0.5) * self.span_s])
+
+    def leaving(self, share: float) -> Question:
+        """The same, which leaves so much of its steps to the next."""
+        return replace(self, keeps=self.keeps + share * max(0.0, self.budget.left - self.keeps))
+
+    @cached_property
+    def white(self) -> Whitening:
+        return Whitening.of(self.covariance)
+
+
+@dataclass(frozen=True)
+class ScoredAnswer:
+    """One hypothesis, scored."""
+
+    cause: str
+    fit: FoundTouches | None  # None: nothing touches
+    kept: tuple[int, ...]  # for each touch of the fit the standing one that it continues; -1: new
+    chi2: float
+    left_z2: float  # of the best further disc
+    score: float  # log evidence and prior
+    white: Whitening
+    pulled: Array  # (K,) S^-1 of the residual
+    left: Array  # (K,)
+    recounted: bool = False  # its touches are others than those that stood
+
+    @property
+    def explained(self) -> bool:
+        return self.chi2 < n.GOOD and self.left_z2 < n.FALSE_ALARM_Z2
+
+    @property
+    def quiet(self) -> bool:
+        return self.chi2 < n.QUIET and self.left_z2 < n.FALSE_ALARM_Z2 * max(1.0, self.chi2)
+
+    @property
+    def holds(self) -> bool:
+        """Whether it explains its scan, with touches or without."""
+        return self.quiet if self.fit is None else self.explained
+
+
+def started_from(fit: FoundTouches | None) -> list[TouchPrior]:
+    """The priors of a fit, to be searched from where it ended."""
+    if fit is None:
+        return []
+    return [replace(prior, start=state.copy()) for prior, state in zip(fit.priors, fit.states, strict=True)]

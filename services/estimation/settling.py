@@ -1,0 +1,65 @@
+"""What follows from an answer for the touches: which go on, which are new, which were none, and what they leave."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from services.estimation.asked.looked_at import LookedAt
+from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, started_from
+from services.estimation.tared import TaredSkin
+from services.estimation.values import numbers as n
+
+
+def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
+    """Take over what an answer says of the touches."""
+    touches, middle_s, span_s = skin.touches, measured.middle_s, measured.span_s
+    kept = answer.kept if answer.fit is None else touches.recognised(answer.fit, answer.kept)
+    if answer.recounted and answer.fit is not None:
+        touches.correct(answer.fit, kept)
+    gone = [k for k in range(len(touches)) if k not in kept]
+    memories = [memory for k in gone for memory in touches.released(k, middle_s - span_s / 2)]
+    if answer.fit is None:
+        touches.forget(middle_s - span_s / 2)
+    else:
+        skin.slow.forget()
+        memories += touches.settle(answer.fit, kept, middle_s, span_s, whole=measured.whole, explained=answer.explained)
+        _make_sure(skin, answer)
+        rest = replace(question, keeps=0.0)
+        if measured.whole and not answer.recounted:
+            _doubt(skin, rest, answer, measured)
+    skin.remember(memories)
+
+
+def _make_sure(skin: TaredSkin, answer: ScoredAnswer) -> None:
+    """A touch is shown at once where its scan is explained with it: a rough start may be anything."""
+    if not answer.explained:
+        return
+    least = float(n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2)
+    if not skin.tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
+        least = 0.0
+    for track in skin.touches.now.tracks:
+        track.sure = track.sure or track.z2 > least
+
+
+def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
+    """Is one of the touches drift, or nothing? What was shown once must not stay because nothing is learnt under
+    it, nor because it costs nothing: a touch that is doubted counts as a new one.
+    """
+    touches, none = skin.touches, list[tuple[float, int]]()
+    meeting = touches.meeting(measured.middle_s)
+    for k in reversed(range(len(touches))):
+        track = touches.now.tracks[k]
+        often = track.z2 < n.DOUBT_Z2 or not track.sure
+        if track.ended or not (often or track.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1):
+            continue
+        standing, least = touches.expected(measured.middle_s, measured.span_s), float(n.COST_TOUCH)
+        if answer.fit is not None and k in meeting and len(touches) == len(answer.fit):
+            standing, least = started_from(answer.fit), -least  # it is known by itself: it would have ended
+        other = skin.hypotheses.without(question, standing, k)
+        if other.quiet and other.score > answer.score + least:
+            none.append((other.score - least, k))
+            continue
+        alone = len(touches) == 1  # then something touches, be its strength known or not
+        track.sure = track.sure or (track.scans >= n.SURE_SCANS and (alone or track.z2 > n.ACTS_Z2))
+    if none:
+        touches.remove(max(none)[1])
