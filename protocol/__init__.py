@@ -24,8 +24,9 @@ __version__ = "0.2.0"
 
 __all__ = [
     "AsyncContactSubscriber", "Contact", "ContactFrame", "ContactListener", "ContactSubscriber", "ControlError",
-    "DeltaFrame", "EitskinError", "ForceFrame", "Frame", "FrameError", "ImageFrame", "InfoFrame", "NotValid",
-    "PartFrame", "RawFrame", "ShapeFrame", "Stale", "StatusFrame", "TransportError", "TruthFrame", "__version__",
+    "DeltaFrame", "EitskinError", "ForceFrame", "Frame", "FrameError", "ImageFrame", "InfoFrame",
+    "JudgementsFrame", "NotValid", "PartFrame", "RawFrame", "ShapeFrame", "Stale", "StatusFrame", "TransportError",
+    "TruthFrame", "__version__",
 ]  # fmt: skip
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
         FrameError,
         ImageFrame,
         InfoFrame,
+        JudgementsFrame,
         PartFrame,
         RawFrame,
         ShapeFrame,

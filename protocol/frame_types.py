@@ -452,6 +452,29 @@ class ShapeFrame(Frame):
     refined: bool = wire(Bool(), "whether they come from a fit, as the only contact does", False)
 
 
+VERDICTS = ("pass", "note", "refuse", "not asked", "cannot")
+"""What a judgement may say: nothing is wrong; to know, the frame may be acted on; it may not; an earlier one decided;
+this skin or board has no means to tell.
+"""
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class JudgementsFrame(Frame):
+    """Why the delta or part frame of this scan says what it says: every decision on the way to it, one entry per
+    decision in each list, in the same order. `valid` and `reasons` are that frame's. Of a part of a scan also where it
+    made no part frame, because nothing touches.
+    """
+
+    same_length: ClassVar[tuple[str, ...]] = ("names", "statistics", "expected", "ratios", "verdicts", "where")
+
+    names: list[str] = wire(ListOf(Text(64), 256), "what was asked, in few letters: `open`, `gap`, `touch`, ...", list)
+    statistics: list[float] = wire(ListOf(Float(), 256), "what was found, in the unit of `expected`", list)
+    expected: list[float] = wire(ListOf(Float(), 256), "its limit where nothing is wrong", list)
+    ratios: list[float] = wire(ListOf(Float(), 256), "statistic / expected; the verdict turns at 1", list)
+    verdicts: list[str] = wire(ListOf(Text(choices=VERDICTS), 256), "what follows for the frame", list)
+    where: list[int] = wire(ListOf(Int(-1), 256), "electrode or touch that it is about; -1: the scan", list)
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class StatusFrame(Frame):
     """How a process is: once a second, and at once when something changes."""

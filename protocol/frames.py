@@ -28,6 +28,7 @@ from .frame_types import (
     STATUS_FIFO,
     STATUS_OPEN,
     STATUS_RTIA,
+    VERDICTS,
     BegunTouch,
     Contact,
     ContactFrame,
@@ -38,6 +39,7 @@ from .frame_types import (
     Frame,
     ImageFrame,
     InfoFrame,
+    JudgementsFrame,
     LocatedTouch,
     PartFrame,
     RawFrame,
@@ -53,11 +55,11 @@ from .topics import TOPIC_OF, TOPICS
 
 __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "KINDS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
-    "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA",
+    "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA", "VERDICTS",
     "BegunTouch", "Contact", "ContactFrame", "DeltaFrame", "EstimatedTouch", "FollowedTouch", "ForceFrame",
     "Frame", "FrameError",
-    "ImageFrame", "InfoFrame", "LocatedTouch", "PartFrame", "RawFrame", "ReferenceFrame", "RefinedTouch", "ShapeFrame",
-    "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
+    "ImageFrame", "InfoFrame", "JudgementsFrame", "LocatedTouch", "PartFrame", "RawFrame", "ReferenceFrame",
+    "RefinedTouch", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
 ]  # fmt: skip
 
 MAX_MESSAGE = 4 * 1024 * 1024

@@ -92,6 +92,16 @@ TOPICS: dict[str, Topic] = {
             "all",
             "the force on the skin by another sensor, for `skin calibrate --live`",
         ),
+        Topic(
+            "judgements",
+            f.JudgementsFrame,
+            "preprocessing",
+            22,
+            True,
+            False,
+            "newest",
+            "why a scan's frames are valid or not: every check, with statistic and limit; also of each part",
+        ),
     )
 }
 

@@ -30,6 +30,7 @@ from services.estimation.references import References
 from services.estimation.tared import KnownBaseline
 from services.estimation.values.estimate import Estimate, TouchEstimate
 from services.estimation.values.scan import Scan
+from services.judged import judged
 from services.kept_baseline import ages
 from services.linearisation import Linearisation
 from services.runtime.config import Skin
@@ -44,10 +45,10 @@ PLACE_SIGMA = 1e-4  # m: no table knows a place better
 
 
 class Preprocessing(Stage):
-    """raw -> delta; of scans in parts also part. K measurements in the bundle's pattern order."""
+    """raw -> delta; of scans in parts also part; judgements where asked. K measurements in the bundle's order."""
 
     reads = "raw"
-    writes = ("delta", "part")
+    writes = ("delta", "part", "judgements")
     stamp = "preprocess"
     commands = ("tare", "part")
     persists = True
@@ -138,9 +139,13 @@ class Preprocessing(Stage):
         for reason in estimate.reasons:
             add_reason(out.reasons, reason)
         if frame.parts > 1 and not estimate.whole:
-            return [*self._part_of(out, estimate)]
-        self._part = (frame.scan, frame.scan)
-        return [self._delta_of(out, estimate)]
+            made = self._part_of(out, estimate)
+        else:
+            self._part = (frame.scan, frame.scan)
+            made = [self._delta_of(out, estimate)]
+        if "judgements" in wanted:
+            made.append(judged(out, estimate.judgements))
+        return made
 
     def _part_of(self, out: DeltaFrame, estimate: Estimate) -> list[Frame]:
         """Of parts in which nothing touches none travels on."""

@@ -21,13 +21,15 @@ from protocol.frame_types import REASONS
 from protocol.frames import ContactFrame, InfoFrame, RawFrame
 from protocol.runtime import CONFIG_LINK, AlreadyRunning, lock, runtime_dir
 from protocol.sockets import AllReader, ControlClient, ControlError, NewestReader
+from services.cli.judged import turned
 from services.estimation.baseline import TAKING
 from services.runtime.config import Skin
-from services.runtime.stage import PROCESSES
+from services.runtime.stage import HARMLESS, PROCESSES
 
 ANSWER_S = 1.0
 FRAME_S = 1.5
 BASELINE_S = 4.0  # at most: the first baseline takes three, in which every frame says stale_baseline
+JUDGED_S = 1.0  # to judgements, where contact frames have reasons
 LISTEN_S = 3.0  # to contact frames: what is judged is the skin as it is, not a moment of it
 WELL, BADLY = 0.95, 0.5
 """Share of valid frames: less than the first is warned of, less than the second stops whoever acts on contacts."""
@@ -126,11 +128,13 @@ def contacts(name: str) -> Iterator[Finding]:
     """
     what, reader = f"{name}: contacts", AllReader(["contact"], name)
     end, count, reasons = time.monotonic() + LISTEN_S, Counter[bool](), Counter[str]()
+    unwell = False
     try:
         while (left := end - time.monotonic()) > 0:
             frame = reader.recv(left)
             if isinstance(frame, ContactFrame):
                 count[frame.valid] += 1
+                unwell |= not frame.valid or not HARMLESS.issuperset(frame.reasons)
                 reasons.update([] if frame.valid else set(frame.reasons) or {"no reason"})
     finally:
         reader.close()
@@ -145,6 +149,8 @@ def contacts(name: str) -> Iterator[Finding]:
     for reason, times in reasons.most_common() if level != "OK" else ():
         meaning, todo = REASONS.get(reason, ""), ADVICE.get(reason, "")
         yield Finding(level, f"{name}: not valid", f"{reason} in {times} of {total}: {meaning}. {todo}".rstrip(": ."))
+    for check, numbers in turned(name, JUDGED_S).items() if unwell else ():
+        yield Finding(level, f"{name}: judged", f"{check}: {numbers}")
 
 
 def _status(process: str, name: str) -> Finding:

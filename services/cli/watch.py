@@ -82,7 +82,10 @@ def _live(monitor: Monitor) -> None:
 
 def echo(
     topic: Annotated[
-        str, typer.Argument(help="raw, delta, part, image, contact, force, shape, status, info, truth or reference.")
+        str,
+        typer.Argument(
+            help="raw, delta, part, image, contact, force, shape, judgements, status, info, truth or reference."
+        ),
     ],
     skin: SkinOption = "",
     count: Annotated[int, typer.Option("--count", "-n", min=0, help="Leave after so many frames; 0: never.")] = 0,
@@ -137,6 +140,10 @@ def line(name: str, frame: Any) -> str:
             for c in frame.contacts
         )
         return f"{head} {body or 'no contact'}{' (held)' if frame.held else ''}{reasons}"
+    if name == "judgements":
+        from services.cli.judged import lines
+
+        return "\n".join([f"{head}{reasons}", *lines(frame)])
     from protocol.frames import Frame
 
     header = set(Frame.__dataclass_fields__)

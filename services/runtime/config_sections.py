@@ -118,7 +118,7 @@ class Skip(Section):
     """Switches of the skip rules that are not one skin's own (those are `touch` and `scan`). All on, but to measure."""
 
     batch: Switch = True  # skins whose frames wait at once share a run of the network
-    unwanted: Switch = True  # what nobody subscribes to (force, shape) is not made
+    unwanted: Switch = True  # what nobody subscribes to (force, shape, judgements) is not made
 
 
 class RecorderSection(Section):

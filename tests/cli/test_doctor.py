@@ -20,11 +20,13 @@ from models.bundle import Bundle
 from protocol import link
 from protocol.advice import ADVICE
 from protocol.control import ControlServer
-from protocol.frames import ContactFrame
+from protocol.frames import ContactFrame, DeltaFrame, Frame, JudgementsFrame
 from protocol.runtime import CONFIG_LINK, lock
 from protocol.sockets import Publisher
 from services.cli.doctor import _key, electrode_order
 from services.estimation.baseline import TAKING
+from services.estimation.values.judgement import judge
+from services.judged import judged
 
 
 @pytest.fixture(scope="module")
@@ -81,12 +83,14 @@ def test_an_indenter_larger_than_the_skin_stops_doctor_and_service(skin, tmp_pat
 
 
 @contextlib.contextmanager
-def service(runtime: Path, config: Path, frames: Iterable[ContactFrame]) -> Iterator[None]:
-    """What `skin up` holds of a runtime folder; its publisher sends these frames again and again."""
+def service(runtime: Path, config: Path, frames: Iterable[Frame], others: Iterable[Frame] = ()) -> Iterator[None]:
+    """What `skin up` holds of a runtime folder; its publisher sends these frames again and again, preprocessing the
+    others.
+    """
     over = threading.Event()
 
-    def publish() -> None:
-        publisher = Publisher("publisher")
+    def publish(process: str, frames: Iterable[Frame]) -> None:
+        publisher = Publisher(process)
         for frame in itertools.cycle(frames):
             publisher.poll()
             publisher.send(frame)
@@ -95,14 +99,17 @@ def service(runtime: Path, config: Path, frames: Iterable[ContactFrame]) -> Iter
         publisher.close()
 
     (runtime / CONFIG_LINK).symlink_to(Path(config).resolve())
-    thread = threading.Thread(target=publish)
+    sent = {"publisher": frames, "preprocessing": others}
+    threads = [threading.Thread(target=publish, args=each) for each in sent.items()]
     with lock():
-        thread.start()
+        for thread in threads:
+            thread.start()
         try:
             yield
         finally:
             over.set()
-            thread.join()
+            for thread in threads:
+                thread.join()
 
 
 def contact(*reasons: str) -> ContactFrame:
@@ -128,6 +135,37 @@ def test_contacts_are_judged_by_the_share_of_valid_frames(  # type: ignore[no-un
         line = next(line for line in out.splitlines() if "palm: not valid" in line and reason in line)
         assert re.search(rf"{level} .*{reason} in \d+ of \d+", line) and ADVICE[reason].rstrip(".") in line
     assert ("not valid" in out) == (level != "OK")
+
+
+def judgements(opened: float, lost: float) -> JudgementsFrame:
+    found = [judge("believed", 0.0, 1.0), judge("open", opened, 1.0, 5 if opened else -1), judge("gap", lost, 1.0)]
+    return judged(DeltaFrame(skin="palm", scan=1), [*found, judge("touch", 90.0, 45.0)])
+
+
+OPEN, GAP = "open: 1, limit 1, ratio 1, electrode 5: noted", "gap: 3, limit 1, ratio 3: refused"
+
+
+@pytest.mark.parametrize(
+    ("reasons", "sent", "expected"),
+    [
+        (
+            ["gap"],
+            [judgements(1.0, 2.0), judgements(0.0, 3.0)],
+            [f"FAIL palm: judged {OPEN}", f"FAIL palm: judged {GAP}"],
+        ),
+        (["gap"], [judgements(0.0, 0.0)], []),
+        (["gap"], [], []),
+        ([], [judgements(1.0, 2.0)], []),
+    ],
+)
+def test_which_judgement_turned_is_said_where_frames_have_reasons(  # type: ignore[no-untyped-def]
+    skin, runtime, tmp_path, reasons, sent, expected
+) -> None:
+    config = configured(tmp_path, "stub", "")
+    with service(runtime, config, [contact(*reasons)], sent):
+        out = skin("doctor", "--config", config).out
+    found = [" ".join(line.split()) for line in out.splitlines() if "palm: judged" in line]
+    assert sorted(found) == sorted(expected), out
 
 
 def test_while_the_first_baseline_is_taken_it_waits(skin, runtime, tmp_path) -> None:  # type: ignore[no-untyped-def]

@@ -100,6 +100,7 @@ COMMANDS = (
     ),  # as a picture: test_top_screen.py
     Row("skin top --json", "runs", says='"skin": "palm"', instead="./skin top --json"),
     Row("(./)?skin echo contact", "runs", says="contact/palm scan +[0-9]+ valid"),
+    Row("(./)?skin echo judgements", "runs", says="judgements/palm scan +[0-9]+ valid"),
     Row("skin echo TOPIC", "ends", says="raw/palm scan", instead="./skin echo raw -n 2"),
     Row("(./)?skin scene paper_49", "ends", says="playing paper_49"),
     Row("skin scene", "ends", says="paper_49"),
@@ -151,7 +152,13 @@ COMMANDS = (
         "./skin export {folder}/export.mcap --csv --overwrite",
     ),
     Row(
-        "skin record FILE.mcap --topics .*",
+        "skin record FILE.mcap --topics raw,contact,judgements,status,info",
+        "ends",
+        says="judgements/palm [0-9]+",
+        instead="./skin record {folder}/why.mcap --overwrite --seconds 1 --topics raw,contact,judgements,status,info",
+    ),
+    Row(
+        "skin record FILE.mcap --topics raw,contact,image.*",
         "ends",
         says="image/palm [0-9]+",
         instead="./skin record {folder}/all.mcap --overwrite --seconds 1 --topics raw,contact,image,shape,status,info",

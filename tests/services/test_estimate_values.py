@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from models.measurement.number import Number
-from protocol.frame_types import REASONS
+from protocol.frame_types import REASONS, VERDICTS
 from protocol.frames import RawFrame
 from services.estimation.values import numbers
 from services.estimation.values.judgement import ROWS, Verdict, judge, reasons, valid
@@ -80,6 +80,10 @@ def test_every_number_says_its_unit_its_meaning_and_where_it_comes_from() -> Non
         assert each.unit and each.meaning, name
         assert each.origin.startswith(kinds), f"{name}: {each.origin}"
     assert all(name in numbers.table() for name in found)
+
+
+def test_the_wire_has_a_word_for_every_verdict() -> None:
+    assert tuple(each.value for each in Verdict) == VERDICTS
 
 
 def test_every_reason_of_the_table_is_one_that_frames_explain() -> None:
