@@ -345,13 +345,15 @@ class Publishing(Stage):
 
     def load(self, state: dict[str, Any]) -> None:
         """A state of an earlier version tells nothing that a frame does not tell anew."""
-        self._end_all()
+        same = "ids" in state and _given(state) == _given(self.state())
+        if same:
+            self._untold = []
+        else:
+            self._end_all()
         if "ids" not in state:
             return
-        next_id = int(state["next_id"])
-        # A state that goes on knows the numbers that were given so far; another one must give none of them twice.
-        more = self._next_id - 1 if next_id < self._next_id else 0
-        self._next_id = more + next_id
+        more = 0 if same else self._next_id - 1  # numbers of another life: none is given twice
+        self._next_id = more + int(state["next_id"])
         self._ids = {int(touch): (more + int(number), int(born_ns)) for touch, number, born_ns in state["ids"]}
         self._shown = [Contact(**(c | {"id": more + int(c["id"])})) for c in state["shown"]]
         self._untold += [Contact(**(c | {"id": more + int(c["id"])})) for c in state["untold"]]
@@ -369,6 +371,12 @@ class Publishing(Stage):
     def health(self) -> Health:
         problem = self._invalid.problem
         return Health("WARN" if problem else "OK", [problem] if problem else [], dict(self._counters))
+
+
+def _given(state: Mapping[str, Any]) -> list[Any]:
+    """The numbers that a state has given, and to what."""
+    contacts = [(int(c["id"]), c["state"]) for c in (*state["shown"], *state["untold"])]
+    return [int(state["next_id"]), [[int(each) for each in known] for known in state["ids"]], contacts]
 
 
 def _readable(touch: EstimatedTouch) -> bool:
