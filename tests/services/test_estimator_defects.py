@@ -1,6 +1,5 @@
-"""What today's estimator does wrong and the next one must not: each case from the board's bytes to contact frames.
-
-They fail today, strictly: whoever mends one takes its mark away.
+"""What the estimator did wrong, each case from the board's bytes to contact frames. What it does wrong still is marked,
+strictly: whoever mends one takes its mark away.
 """
 
 from dataclasses import replace
@@ -30,9 +29,7 @@ def _private_runtime():
         yield
 
 
-@pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="contact_drift takes the order of the pattern for the order of time"
-)
+@pytest.mark.xfail(strict=True, raises=AssertionError, reason="two parts do not tell it from a touch on its electrode")
 @pytest.mark.slow
 def test_a_contact_impedance_that_rises_within_a_scan_is_named_in_parts() -> None:
     """Each rises for 40 ms. Parts come every 4.4 ms: of 50 ms since its beginning two lie after its end."""
@@ -68,11 +65,7 @@ def test_suspicious_scans_seconds_apart_are_not_in_a_row() -> None:
     assert said[0] > 0 and said[2] <= said[0]
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="creep.py: what a place has left in the baseline does not add up over holds",
-)
+@pytest.mark.xfail(strict=True, raises=AssertionError, reason="half a newton that eased from 6 N counts as memory")
 def test_holds_leave_no_more_than_their_share_in_the_baseline() -> None:
     """A touch of 6 N that eases to 4 %, presses 1 % more, and eases to 8 %: 0.48 N that stand there must be shown."""
     touch = scenes.touch({"x": 0.01, "y": 0.0, "radius": 0.01, "force": 6.0})
