@@ -23,7 +23,7 @@ from tests.docs.snippets import ROOT
 
 KEPT = re.compile(r"PATH|LANG|.*_proxy|PIP_.*|SSL_.*|REQUESTS_.*|EITSKIN_REFERENCE|EITSKIN_REQUIRE_.*|O.*_NUM_THREADS",
                   re.IGNORECASE)  # fmt: skip
-START_S, END_S, INTERRUPT_S = 120.0, 300.0, 20.0
+START_S, END_S, INTERRUPT_S = 120.0, 600.0, 20.0
 
 
 @dataclass
