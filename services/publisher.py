@@ -345,14 +345,14 @@ class Publishing(Stage):
 
     def load(self, state: dict[str, Any]) -> None:
         """A state of an earlier version tells nothing that a frame does not tell anew."""
-        same = "ids" in state and _given(state) == _given(self.state())
-        if same:
-            self._untold = []
-        else:
-            self._end_all()
         if "ids" not in state:
+            self._end_all()
             return
-        more = 0 if same else self._next_id - 1  # numbers of another life: none is given twice
+        if _given(state) == _given(self.state()):  # its own
+            more, self._untold = 0, []
+        else:
+            more = self._next_id - 1  # numbers of another life: none is given twice
+            self._end_all()
         self._next_id = more + int(state["next_id"])
         self._ids = {int(touch): (more + int(number), int(born_ns)) for touch, number, born_ns in state["ids"]}
         self._shown = [Contact(**(c | {"id": more + int(c["id"])})) for c in state["shown"]]

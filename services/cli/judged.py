@@ -4,54 +4,35 @@ from __future__ import annotations
 
 import math
 import time
-from typing import NamedTuple
 
 from protocol.frames import JudgementsFrame
 from protocol.sockets import AllReader
-from services.estimation.values.judgement import ROWS, CheckRow, Verdict
+from services.estimation.values.judgement import ROWS, CheckRow, Judgement, Verdict
 from services.judged import MOST
 
-ORDER = [each.value for each in (Verdict.REFUSE, Verdict.NOTE, Verdict.PASS, Verdict.CANNOT, Verdict.NOT_ASKED)]
+ORDER = (Verdict.REFUSE, Verdict.NOTE, Verdict.PASS, Verdict.CANNOT, Verdict.NOT_ASKED)
 UNKNOWN = CheckRow("", Verdict.NOTE)  # a name that this version's table does not have
-TURNED = {Verdict.REFUSE.value: "refused", Verdict.NOTE.value: "noted"}
+TURNED = {Verdict.REFUSE: "refused", Verdict.NOTE: "noted"}
 
 
-class JudgementRow(NamedTuple):
-    """One judgement as it was sent."""
-
-    name: str
-    statistic: float
-    expected: float
-    ratio: float
-    verdict: str
-    where: int
-
-    @property
-    def numbers(self) -> str:
-        """Statistic, limit and ratio; which electrode or touch it is about."""
-        of = "electrode" if ROWS.get(self.name, UNKNOWN).room.startswith("faults") else "touch"
-        place = f", {of} {self.where}" if self.where >= 0 else ""
-        found, limit, ratio = (_short(each) for each in (self.statistic, self.expected, self.ratio))
-        return f"{found}, limit {limit}, ratio {ratio}{place}"
-
-
-def said(frame: JudgementsFrame) -> list[JudgementRow]:
+def said(frame: JudgementsFrame) -> list[Judgement]:
     """What turned first, then what is nearest to it."""
-    columns = frame.names, frame.statistics, frame.expected, frame.ratios, frame.verdicts, frame.where
-    found = [JudgementRow(*row) for row in zip(*columns, strict=True)]
+    verdicts = map(Verdict, frame.verdicts)
+    columns = frame.names, frame.statistics, frame.expected, frame.ratios, verdicts, frame.where
+    found = [Judgement(*row) for row in zip(*columns, strict=True)]
     return sorted(found, key=lambda each: (ORDER.index(each.verdict), -each.ratio))
 
 
 def lines(frame: JudgementsFrame) -> list[str]:
     """One line per judgement."""
-    return [f"    {each.verdict:9s} {each.name:13s} {each.numbers}" for each in said(frame)]
+    return [f"    {each.verdict.value:9s} {each.name:13s} {_numbers(each)}" for each in said(frame)]
 
 
 def turned(skin: str, seconds: float) -> dict[str, str]:
     """What the judgements of the next `seconds` say that is wrong, by their names, as it was when it was furthest from
     its limit; empty where nothing is, or no frame comes.
     """
-    worst, end = dict[str, JudgementRow](), time.monotonic() + seconds
+    worst, end = dict[str, Judgement](), time.monotonic() + seconds
     reader = AllReader(["judgements"], skin)
     try:
         while (left := end - time.monotonic()) > 0:
@@ -61,14 +42,22 @@ def turned(skin: str, seconds: float) -> dict[str, str]:
                     worst[each.name] = each
     finally:
         reader.close()
-    return {name: f"{each.numbers}: {TURNED[each.verdict]}" for name, each in worst.items()}
+    return {name: f"{_numbers(each)}: {TURNED[each.verdict]}" for name, each in worst.items()}
+
+
+def _numbers(each: Judgement) -> str:
+    """Statistic, limit and ratio; which electrode or touch it is about."""
+    of = "electrode" if ROWS.get(each.name, UNKNOWN).room.startswith("faults") else "touch"
+    place = f", {of} {each.where}" if each.where >= 0 else ""
+    found, limit, ratio = (_short(value) for value in (each.statistic, each.expected, each.ratio))
+    return f"{found}, limit {limit}, ratio {ratio}{place}"
 
 
 def _short(value: float) -> str:
     return f"{math.copysign(math.inf, value) if abs(value) >= MOST else value:.4g}"
 
 
-def _wrong(each: JudgementRow) -> bool:
+def _wrong(each: Judgement) -> bool:
     """Whether a reason follows: that something touches is noted, too, and is none."""
-    noted = each.verdict == Verdict.NOTE.value and ROWS.get(each.name, UNKNOWN).reason
-    return bool(noted) or each.verdict == Verdict.REFUSE.value
+    noted = each.verdict is Verdict.NOTE and ROWS.get(each.name, UNKNOWN).reason
+    return bool(noted) or each.verdict is Verdict.REFUSE

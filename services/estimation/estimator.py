@@ -246,8 +246,7 @@ class Estimator:
         leave_out(covariance, live)
         y = np.where(live, measured.log_z - skin.log_z0 - predicted.shift, 0.0)
         information = skin.hypotheses.grid.information(Whitening.of(covariance))
-        times_s = span_s / 2 - measured.scan.ages_s
-        question = measured.question(y, covariance, live, times_s, information, np.zeros((0, STATES)))
+        question = measured.question(y, covariance, live, measured.times_s, information, np.zeros((0, STATES)))
         answer = skin.hypotheses.slowly(question)
         if answer is None:
             return None
@@ -284,8 +283,9 @@ class Estimator:
         if known is None:
             return None
         y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
-        times_s = span_s / 2 - measured.scan.ages_s
-        question = measured.question(y, known.covariance, measured.live, times_s, now.information, now.candidates)
+        question = measured.question(
+            y, known.covariance, measured.live, measured.times_s, now.information, now.candidates
+        )
         answer = skin.hypotheses.goes_on(question, skin.touches.expected(middle_s, span_s), known.white, known.turned)
         return (question, answer) if answer.explained and answer.left_z2 < n.GLANCE_Z2 else None
 
@@ -364,7 +364,7 @@ class Estimator:
             untouched=untouched,
             predicted=predicted,
             part=scan.part,
-            times_s=measured.span_s / 2 - scan.ages_s,
+            times_s=measured.times_s,
             span_s=measured.span_s,
             middle_s=measured.middle_s,
             whole=measured.whole,
@@ -417,15 +417,17 @@ class Estimator:
             self._learn_untouched(skin, measured, answer.pulled, answer.cause)
             return
         skin.learning.doubt()
-        if measured.whole:
-            self.now.wholes += 1
-            if answer.cause == AS_IT_IS and measured.scan.believed:
-                skin.noise.learn_contacts(answer.pulled, answer.white)
-                known = not answer.recounted and self._complete(skin, measured.live)
-                known = known and len(predicted.x) == len(skin.drift.now.x)  # nothing has ended or slid away
-                if known and predicted.at_s - skin.drift.now.at_s > n.TOUCHED_LEARNS_S:
-                    skin.drift.take_in_beside(predicted, answer.fit)
-                    skin.forget_looks()
+        if not measured.whole:
+            return
+        self.now.wholes += 1
+        if answer.cause != AS_IT_IS or not measured.scan.believed:
+            return
+        skin.noise.learn_contacts(answer.pulled, answer.white)
+        due = predicted.at_s - skin.drift.now.at_s > n.TOUCHED_LEARNS_S
+        same = len(predicted.x) == len(skin.drift.now.x)  # nothing has ended or slid away
+        if due and same and not answer.recounted and self._complete(skin, measured.live):
+            skin.drift.take_in_beside(predicted, answer.fit)
+            skin.forget_looks()
 
     def _learn_untouched(self, skin: TaredSkin, measured: LookedAt, pulled: Array, cause: str) -> None:
         if not measured.scan.believed:

@@ -60,9 +60,9 @@ def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
             none.append((other.score - least, k))
             continue
         needed = answer.explained and answer.cause == AS_IT_IS and 2 * (answer.score - other.score) > n.SURE_Z2
-        if needed and track.z2 > n.ACTS_Z2 and not touches.now.watched:  # else it may be how others begin
-            track.sure = True  # that it is there: its strength may be known badly
+        acts = track.z2 > n.ACTS_Z2
+        stood = needed and acts and not touches.now.watched  # what began while somebody watched may be how others begin
         alone = len(touches) == 1  # then something touches, be its strength known or not
-        track.sure = track.sure or (track.scans >= n.SURE_SCANS and (alone or track.z2 > n.ACTS_Z2))
+        track.sure = track.sure or stood or (track.scans >= n.SURE_SCANS and (alone or acts))
     if none:
         touches.remove(max(none)[1])

@@ -32,6 +32,11 @@ class LookedAt:
     def middle_s(self) -> float:
         return self.scan.at_ns * 1e-9 - self.scan.duration_s / 2
 
+    @property
+    def times_s(self) -> Array:
+        """(K,) from the middle of the scan."""
+        return self.span_s / 2 - self.scan.ages_s
+
     @cached_property
     def order(self) -> NDArray[np.intp]:
         """(K,) rank in time, 0 the oldest."""
