@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.course import TouchColumns, TouchCourse
+from models.measurement.course import STRENGTH, TouchColumns, TouchCourse
 from models.measurement.numbers import (
     DAMPING,
     DONE,
@@ -84,11 +84,12 @@ class FittedScan:
     live: int  # measurements that count
     known: KnownWhitening | None = None  # of a moment ago, as good as this covariance's own
     turned: Turned | None = None  # of a moment ago
+    said_s: float = 0.0  # for when what is found is said, from the middle of the scan on
 
 
 @dataclass(frozen=True)
 class FoundTouches:
-    """Posterior of T touches."""
+    """Posterior of T touches. Action + rate * said_s is how strongly one acts at said_s, kinks included."""
 
     priors: tuple[TouchPrior, ...]
     states: Array  # (T, 7)
@@ -181,21 +182,29 @@ class TouchFitter:
         states = within_limits(np.stack([prior.start for prior in self._priors]))
         self._turn(states)
         columns = self._columns(states)
-        self._whiten(columns)
+        self._whiten(states, columns)
         states, columns = self._first_actions(states, columns)
-        rest = np.concatenate([self._shape_mean, np.zeros(self._kinks.shape[1])])
+        rest = np.concatenate([self._shape_mean, np.zeros(len(self._kinks))])
         point = self._descend(self._point(states, rest, columns), most_steps)
         changed, moved = _changed(self._size2(point.columns), self._known), self._moved(point.states)
         if moved:
             self._turn(point.states)
         if changed:
-            self._whiten(point.columns)
+            self._whiten(point.states, point.columns)
         if moved or changed:
-            point = self._descend(self._point(point.states, point.rest, self._columns(point.states)), most_steps)
+            rest = self._rest(point.rest)
+            point = self._descend(self._point(point.states, rest, self._columns(point.states, rest)), most_steps)
         return self._posterior(point)
 
-    def _columns(self, states: Array) -> TouchColumns:
-        return self._scene.course.columns(states, self._priors, self._turned.directions)
+    def _columns(self, states: Array, rest: Array | None = None) -> TouchColumns:
+        kinked = None if rest is None else rest[len(self._shape_mean) :]
+        return self._scene.course.columns(states, self._priors, self._turned.directions, self._kinks, kinked)
+
+    def _rest(self, rest: Array) -> Array:
+        """Shapes and kinks, where kinks were taken anew."""
+        shapes = len(self._shape_mean)
+        same = len(rest) == shapes + len(self._kinks)
+        return rest if same else np.concatenate([rest[:shapes], np.zeros(len(self._kinks))])
 
     def _turn(self, states: Array) -> None:
         """Take the touches' own directions anew, and how their courses may bend."""
@@ -229,14 +238,15 @@ class TouchFitter:
                 break
         return point
 
-    def _whiten(self, columns: TouchColumns) -> None:
-        size2, known = max(self._size2(columns), 1e-12), self._scene.known
+    def _whiten(self, states: Array, columns: TouchColumns) -> None:
+        size2, scene = max(self._size2(columns), 1e-12), self._scene
+        known = scene.known
         if known is not None and not _changed(size2, known):
             self._known = known
             return
-        self._known = KnownWhitening(
-            Whitening.of(self._scene.covariance + self._misfit**2 * size2 * self._scene.misfit), size2
-        )
+        covariance = scene.covariance + self._misfit**2 * size2 * scene.misfit
+        covariance[np.diag_indices_from(covariance)] += scene.course.jitter(states, self._priors) ** 2
+        self._known = KnownWhitening(Whitening.of(covariance), size2)
 
     @property
     def _white(self) -> Whitening:
@@ -260,14 +270,11 @@ class TouchFitter:
         found = np.linalg.lstsq(response, seen, rcond=None)[0]
         states[unknown, ACTION] = np.maximum(found, LEAST_ACTION)
         columns = self._columns(states)
-        self._whiten(columns)
+        self._whiten(states, columns)
         return states, columns
 
     def _point(self, states: Array, rest: Array, columns: TouchColumns) -> _Point:
-        linear = np.hstack([columns.shapes, self._kinks])
-        if linear.shape[1] != len(rest):  # kinks were taken anew
-            kept = rest[: columns.shapes.shape[1]]
-            rest = np.concatenate([kept, np.zeros(self._kinks.shape[1])])
+        linear = np.hstack([columns.shapes, columns.kinks])
         change = np.maximum(columns.mean + linear @ rest, LEAST_MEAN)
         live = self._scene.y != 0
         share = np.where(live, 1 / (1 + change), 0.0)
@@ -298,8 +305,8 @@ class TouchFitter:
         self._limit(point.states, step)
         n = STATES * self._count
         states = within_limits(point.states + step[:n].reshape(-1, STATES))
-        columns = self._columns(states)
-        return self._point(states, point.rest + step[n:], columns)
+        rest = point.rest + step[n:]
+        return self._point(states, rest, self._columns(states, rest))
 
     def _is_linear(self, states: Array, step: Array) -> bool:
         """Whether a step is so small that slopes hold: nothing new would be seen where it ends."""
@@ -338,10 +345,11 @@ class TouchFitter:
         if self._is_linear(states, linear.step):
             states, rest = states + linear.step[:n].reshape(-1, STATES), rest + linear.step[n:]
             left, residual, objective = left - point.sloped @ linear.step, best, objective - linear.gains
+        said = self._said(n, len(rest))
         return FoundTouches(
             priors=self._priors,
-            states=states,
-            covariance=linear.solved[:n, :n],
+            states=states + (said[:, n:] @ rest).reshape(-1, STATES),
+            covariance=said @ linear.solved @ said.T,
             shapes=rest[:shapes].reshape(self._count, SHAPES),
             shape_variance=np.diag(linear.solved)[n : n + shapes].reshape(self._count, SHAPES),
             chi2=float(residual @ residual) / max(self._scene.live, 1),
@@ -356,6 +364,15 @@ class TouchFitter:
             known=self._known,
             turned=self._turned,
         )
+
+    def _said(self, states: int, rest: int) -> Array:
+        """(7 T, N) from all that was solved for to the states that are said: kinks add to a touch's action then."""
+        said = np.eye(states, states + rest)
+        for j, kink in enumerate(self._kinks):
+            if kink.bends == STRENGTH and self._priors[kink.touch].until_s == np.inf:
+                at = states + rest - len(self._kinks) + j
+                said[STATES * kink.touch + ACTION, at] = self._scene.course.at(kink.profile, self._scene.said_s)
+        return said
 
 
 def _changed(size2: float, known: KnownWhitening) -> bool:

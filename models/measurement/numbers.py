@@ -50,6 +50,12 @@ SUDDEN_S = Number(
     0.002, "s", "steps of the course of a touch that begins or ends at once", "derived: half a part of a scan"
 )
 SUDDEN_SD = Number(0.5, "-", "of its action, by which each step may differ", "derived: from none to all")
+SUDDEN_JITTER = Number(0.1, "-", "of its action, within such a step", "derived: a kink in the middle of one")
+COURSE_S = Number(0.0044, "s", "steps of the course of a touch that changes", "derived: a part of a scan")
+COURSE_SD = Number(
+    0.3, "-", "of its change, by which each may differ", "derived: a ramp that ends half way is 0.25 off"
+)
+COURSE_JITTER = Number(0.03, "-", "of its action, within such a step", "derived: ramps of 20 ms and more")
 BENDS_BY = Number(0.15, "-", "and of its radius", "derived: its square over 8 is 0.3 %, below MISFIT")
 KINK = Number(0.8, "-", "of a change within a scan: what of it may be no straight line", "derived: a ramp's half")
 """How a touch is fitted."""

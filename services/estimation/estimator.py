@@ -303,7 +303,7 @@ class Estimator:
 
     def _asked(self, skin: TaredSkin, measured: LookedAt, passed_s: float, judgements: list[Judgement]) -> Estimate:
         skin.touches.drop_the_past(measured.middle_s - measured.span_s / 2)
-        skin.touches.drop_the_vague()
+        skin.touches.drop_the_vague(skin.faults.in_question)
         scan = measured.scan
         asked, at = self._explaining(skin, measured)
         if asked.answer.holds and (pressed := skin.refused.explained(measured.middle_s - measured.span_s / 2)):

@@ -32,13 +32,13 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
 
 def _make_sure(skin: TaredSkin, answer: ScoredAnswer) -> None:
     """A touch is shown at once where its scan is explained with it: a rough start may be anything."""
-    if not answer.explained:
+    if not answer.explained or 2 * answer.over < n.SURE_Z2:
         return
     least = float(n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2)
     if not skin.tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
         least = 0.0
     for track in skin.touches.now.tracks:
-        track.sure = track.sure or track.z2 > least
+        track.sure = track.sure or (track.z2 > least and not skin.faults.in_question(track.state))
 
 
 def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
@@ -63,6 +63,7 @@ def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         acts = track.z2 > n.ACTS_Z2
         stood = needed and acts and not touches.now.watched  # what began while somebody watched may be how others begin
         alone = len(touches) == 1  # then something touches, be its strength known or not
-        track.sure = track.sure or stood or (track.scans >= n.SURE_SCANS and (alone or acts))
+        lasts = track.scans >= n.SURE_SCANS and (alone or acts)
+        track.sure = track.sure or ((stood or lasts) and not skin.faults.in_question(track.state))
     if none:
         touches.remove(max(none)[1])

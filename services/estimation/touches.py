@@ -6,7 +6,7 @@ but where to start. What it carries as knowledge, its radius and its outline, it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -146,9 +146,12 @@ class TouchTracks:
         for track in self.now.tracks:
             track.lost, track.still = True, 0
 
-    def drop_the_vague(self) -> None:
-        """Forget what one part of a scan made of a touch that begins, and is not sure: the next one looks anew."""
-        self.now.tracks = [track for track in self.now.tracks if track.sure or track.scans]
+    def drop_the_vague(self, in_question: Callable[[Array], bool]) -> None:
+        """Forget what one part of a scan made of a touch that begins, and is not sure: the next one looks anew.
+        in_question: whether a touch of that state may as well be a contact impedance.
+        """
+        tracks = self.now.tracks
+        self.now.tracks = [t for t in tracks if t.sure or (t.scans and not in_question(t.state))]
 
     def forget(self, at_s: float) -> list[Memory]:
         """Nobody knows any more what touches. Returns what those that there were may have left in the foam."""

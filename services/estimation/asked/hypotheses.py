@@ -137,7 +137,10 @@ class Hypotheses:
         answers = self._of_standing(question, standing, loose) if len(standing) else self._of_none(question)
         if not _settled(question, answers):
             answers += self._of_anything(question, standing, answers)
-        return _likeliest(answers)
+        best = _likeliest(answers)
+        if len(standing):
+            return best
+        return replace(best, over=best.score - max(answer.score for answer in answers if answer.fit is None))
 
     def goes_on(
         self, question: Question, standing: Sequence[TouchPrior], known: KnownWhitening, turned: Turned
@@ -344,7 +347,7 @@ class Hypotheses:
         live = int(question.live.sum())
         misfit = max(float(MISFIT_WIDE), 2 * self._tables.wrong) if wide else self._tables.wrong
         covariance = question.covariance if self._tables.map is None else question.covariance + self._tables.map.error
-        scene = FittedScan(question.y, covariance, course, self._tables.misfit, live, known, turned)
+        scene = FittedScan(question.y, covariance, course, self._tables.misfit, live, known, turned, question.said_s)
         may = max(0.0, question.budget.left - question.keeps) / len(priors)
         fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(may)))
         question.budget.left -= (fit.steps + 1) * len(fit)

@@ -33,6 +33,11 @@ class LookedAt:
         return self.scan.at_ns * 1e-9 - self.scan.duration_s / 2
 
     @property
+    def said_s(self) -> float:
+        """For when what touches is said, from the middle of the scan on."""
+        return self.scan.sample_ns * 1e-9 - self.middle_s
+
+    @property
     def times_s(self) -> Array:
         """(K,) from the middle of the scan."""
         return self.span_s / 2 - self.scan.ages_s
@@ -58,6 +63,7 @@ class LookedAt:
             live=live,
             times_s=times_s,
             span_s=self.span_s,
+            said_s=self.said_s,
             order=self.order,
             part=self.scan.part,
             information=information,

@@ -50,6 +50,7 @@ class Question:
     live: NDArray[np.bool_]
     times_s: Array  # (K,) from the middle of the scan
     span_s: float
+    said_s: float  # for when what touches is said, from the middle of the scan on
     order: NDArray[np.intp]  # (K,) rank in time, 0 the oldest
     part: int  # that it ends with
     information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
@@ -90,6 +91,7 @@ class ScoredAnswer:
     pulled: Array  # (K,) S^-1 of the residual
     left: Array  # (K,)
     recounted: bool = False  # its touches are others than those that stood
+    over: float = np.inf  # by how much it is likelier than that nothing touches, where nothing did before [nat]
 
     @property
     def explained(self) -> bool:

@@ -96,9 +96,10 @@ class FaultAsking:
         if faults.now.wire is None and rewired(view):
             view = look()
         found = asked(view)
-        if faults.now.wire is not None and _doubtful(found.answer) and rewired(view):
+        odd = _doubtful(found.answer) or -1 in found.answer.kept
+        if faults.now.wire is not None and odd and rewired(view):
             found = asked(look())
-        if faults.now.opens and faults.now.wire is None and (_doubtful(found.answer) or -1 in found.answer.kept):
+        if faults.now.opens and faults.now.wire is None and odd:
             found = self._lifted(found, lambda: asked(look()))
         if faults.asks(found.answer):
             found = self._changed(found, *self._change(standing, at), answering)

@@ -286,7 +286,7 @@ class BoardFaults:
         for k, change in enumerate(changes, 1):
             asked, column = self._with(question.leaving(1 - k / len(changes)), columns, change)
             found = ask(asked)
-            cost = _cost(change)
+            cost = 0.0 if self._goes_on(change, view) else _cost(change)
             if found.score + cost < sure or not self._apart(change, found):
                 continue
             if isinstance(change, GainChange) and abs(float(column @ found.pulled)) * n.GAIN_CHANGES < n.GAIN_LEAST:
@@ -303,6 +303,11 @@ class BoardFaults:
         self._take(view, change, float(column @ found.pulled))
         return asked, found
 
+    def _goes_on(self, change: ContactChange | GainChange, view: BoardView) -> bool:
+        """Whether it is the contact that has begun to change within this scan."""
+        began_s = self.now.contact_since_s - view.middle_s
+        return isinstance(change, ContactChange) and change.electrode == self.now.contact and began_s > -view.span_s / 2
+
     def _sure(self, answer: ScoredAnswer) -> float:
         """By how much a fault must be likelier than an answer: small new touches on electrodes are seldom touches."""
         if answer.fit is None:
@@ -318,6 +323,16 @@ class BoardFaults:
         """Whether a touch (7,) is small and lies on an electrode."""
         nearest = float(np.hypot(*(state[PLACE] - self._places).T).min())
         return bool(state[LOG_RADIUS] < np.log(n.SMALL) and nearest < n.ON_ELECTRODE)
+
+    def in_question(self, state: Array) -> bool:
+        """Whether a touch (7,) lies on an electrode whose contact impedance has changed, or is the touch."""
+        now = self.now
+        return now.contact >= 0 and now.doubt.undecided and self._reaches(state, now.contact)
+
+    def _reaches(self, state: Array, electrode: int) -> bool:
+        """Whether a touch (7,) may change the contact impedance of an electrode."""
+        away = float(np.hypot(*(state[PLACE] - self._places[electrode])))
+        return away < float(np.exp(state[LOG_RADIUS])) + n.ON_ELECTRODE
 
     def _likeliest(
         self,
@@ -384,9 +399,8 @@ class BoardFaults:
         acts = answer.fit.states[:, ACTION] ** 2 > n.ACTS_Z2 * np.diag(answer.fit.covariance)[ACTION::STATES]
         priors = answer.fit.priors
         for state, place, prior, there in zip(answer.fit.states, answer.kept, priors, acts, strict=True):
-            away = float(np.hypot(*(state[PLACE] - self._places[change.electrode])))
             still = place >= 0 and float(prior.sd[VELOCITY].max()) * SCAN_S <= 2 * n.STILL_WAY and answer.holds
-            if there and away < np.exp(state[LOG_RADIUS]) + n.ON_ELECTRODE and not still:
+            if there and self._reaches(state, change.electrode) and not still:
                 return False
         return True
 

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 
 ASKED = (2, 3, 4, 6, 8, 12, 16, 24, 32)  # scans since the change at which it is asked, and every EVERY from then on
 EVERY = 16
+SETTLES = 3  # whole scans in which a change may go on
 
 
 class ContactDoubt:
@@ -42,6 +43,8 @@ class ContactDoubt:
         faults = self._faults.now
         doubt = faults.doubt
         if not doubt.undecided or answer.cause not in (AS_IT_IS, MEMORY):
+            return None
+        if self._changes(view):
             return None
         doubt.add(self._over(view, answer))
         if doubt.scans not in ASKED and (doubt.scans < ASKED[-1] or doubt.scans % EVERY):
@@ -67,6 +70,16 @@ class ContactDoubt:
         elif odds < -n.TOUCH_TOLD and touch.explained:
             return touch.fit
         return None
+
+    def _changes(self, view: BoardView) -> bool:
+        """Whether it goes on changing: a mean over such scans is neither a contact's nor a touch's. Asked of the first
+        scans: a finger on an electrode may never be still.
+        """
+        now = self._faults.now
+        if now.contact_since_s > view.middle_s - view.span_s / 2:
+            return True
+        sizes = [each.size for each in now.doubt.sizes[-2:]]
+        return now.doubt.seen <= SETTLES and len(sizes) == 2 and abs(sizes[1] - sizes[0]) > now.doubt.least
 
     def _over(self, view: BoardView, answer: ScoredAnswer) -> Array:
         """(K,) log |Z| over a skin with what is decided, touches that stand taken off."""
