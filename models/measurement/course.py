@@ -127,7 +127,8 @@ class TouchCourse:
 
     def _near(self, instants: Sequence[float]) -> NDArray[np.bool_]:
         """(K,) whether a value was measured while a touch began or ended at once."""
-        return np.any([np.abs(self._times_s - instant) < SUDDEN_REACH_S for instant in instants], axis=0)
+        away = np.abs(self._times_s - np.array(instants)[:, None])
+        return np.asarray((away < SUDDEN_REACH_S).any(axis=0))
 
     def _instants(self, prior: TouchPrior) -> list[float]:
         """At which a touch begins or ends within the scan."""

@@ -43,7 +43,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 11  # of a kept state
+LAYOUT = 12  # of a kept state
 
 
 @dataclass
@@ -297,7 +297,7 @@ class Estimator:
         answer: ScoredAnswer,
         judgements: list[Judgement],
     ) -> Estimate:
-        settle(skin, question, answer, measured)
+        settle(skin, question, answer, measured, self.now.unexplained_s)
         self._explained(skin, answer.cause)
         return self._said(skin, measured, question, answer, judgements, explained=True, rough=False)
 
@@ -314,10 +314,13 @@ class Estimator:
         explained = answer.holds
         rough = answer.fit is not None and answer.chi2 < n.MOST
         if explained or rough:
-            settle(skin, question, answer, measured)
+            settle(skin, question, answer, measured, self.now.unexplained_s)
         went = answer.fit is not None and not len(skin.touches)  # whatever it was, it came and went within the scan
         if (explained or rough) and not went:
-            self._explained(skin, answer.cause)
+            if answer.fit is None or any(track.sure for track in skin.touches.now.tracks):
+                self._explained(skin, answer.cause)
+            elif measured.whole:  # a touch that comes again and again, and never for sure, is none
+                self.now.unexplained_s += measured.span_s
         else:
             self._refused(skin, measured, question.y)
             if not (explained or rough) and _strange(question, answer):

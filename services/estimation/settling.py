@@ -10,8 +10,8 @@ from services.estimation.tared import TaredSkin
 from services.estimation.values import numbers as n
 
 
-def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
-    """Take over what an answer says of the touches."""
+def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt, unexplained_s: float) -> None:
+    """Take over what an answer says of the touches. unexplained_s: for how long nothing has explained the scans."""
     touches, middle_s, span_s = skin.touches, measured.middle_s, measured.span_s
     kept = answer.kept if answer.fit is None else touches.recognised(answer.fit, answer.kept)
     if answer.recounted and answer.fit is not None:
@@ -26,7 +26,7 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         _make_sure(skin, answer)
         rest = replace(question, keeps=0.0)
         if measured.whole and not answer.recounted:
-            _doubt(skin, rest, answer, measured)
+            _doubt(skin, rest, answer, measured, strange=unexplained_s > n.CHANGING_S)
     skin.remember(memories)
 
 
@@ -41,9 +41,10 @@ def _make_sure(skin: TaredSkin, answer: ScoredAnswer) -> None:
         track.sure = track.sure or (track.z2 > least and not skin.faults.in_question(track.state))
 
 
-def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt) -> None:
+def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt, strange: bool) -> None:
     """Is one of the touches drift, or nothing? What was shown once must not stay because nothing is learnt under
-    it, nor because it costs nothing: a touch that is doubted counts as a new one.
+    it, nor because it costs nothing: a touch that is doubted counts as a new one. strange: nothing has explained the
+    scans of late, so that one which only lasts is no touch yet.
     """
     touches, none = skin.touches, list[tuple[float, int]]()
     meeting = touches.meeting(measured.middle_s)
@@ -63,7 +64,7 @@ def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         acts = track.z2 > n.ACTS_Z2
         stood = needed and acts and not touches.now.watched  # what began while somebody watched may be how others begin
         alone = len(touches) == 1  # then something touches, be its strength known or not
-        lasts = track.scans >= n.SURE_SCANS and (alone or acts)
+        lasts = track.scans >= n.SURE_SCANS and (alone or acts) and not strange
         track.sure = track.sure or ((stood or lasts) and not skin.faults.in_question(track.state))
     if none:
         touches.remove(max(none)[1])

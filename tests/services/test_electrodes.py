@@ -376,7 +376,7 @@ def test_a_state_taken_over_knows_the_faults(skin: StubSkin) -> None:
 
 @pytest.mark.parametrize("snr_db", [70.0, 110.0])
 def test_no_touch_is_named_a_fault(snr_db: float) -> None:
-    """On, beside and across electrodes, and anywhere; one to three at a time."""
+    """On, beside and across electrodes, and anywhere; one to three at a time, on a skin that was free."""
     own, rng = StubSkin(snr_db), np.random.default_rng(4)
     centres = sheet().skin.point(sheet().skin.electrodes)
     pre = own.pipeline.pre
@@ -389,6 +389,7 @@ def test_no_touch_is_named_a_fault(snr_db: float) -> None:
             shapes.append(
                 Shape(kind, float(x), float(y), float(rng.uniform(0.05, 0.5)), float(rng.uniform(0.05, 0.85)))
             )
+        own.rest(3)
         t = sheet().model.solve(sheet().model.touched(shapes)).transfer
         z, status = own.analog.measure((t, t), own.pattern, 128, 40_000.0, 0.0)
         status[:] = 0  # a drop of 0.85 S/m on an electrode may clip the current: that is another matter

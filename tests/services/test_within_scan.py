@@ -87,7 +87,9 @@ def says_changing(results: list[Result]) -> int:
 
 
 def test_what_stays_as_it_is_did_not_change(skin: StubSkin) -> None:
-    """The same odd frame again and again: a fault that only looks like a touch that went."""
+    """The same odd frame again and again, of a touch that goes while it is scanned: something shakes there, or a fault
+    looks like it. It is no free skin, and no touch elsewhere.
+    """
     touch = TOUCHES[1]
     skin.rest(20)
     up = levels(touch, RAMP)
@@ -99,7 +101,6 @@ def test_what_stays_as_it_is_did_not_change(skin: StubSkin) -> None:
     for _ in range(8):
         noise = 1 + 1e-4 * np.random.default_rng(skin.scan).standard_normal(len(z))
         seen.append(skin.run((z * noise).astype(np.complex64), status))
-    assert seen[0].contact.valid and "changing" in seen[0].contact.reasons  # so far a touch that goes explains it
-    assert not present(seen[1])  # at most it has ended
-    assert not any(r.contact.valid for r in seen[3:])  # of what nothing explains two frames may be
-    assert all("out_of_distribution" in r.contact.reasons for r in seen[3:])
+    assert not any(hides(r) for r in seen)
+    near = METRES * np.array([touch.x, touch.y])
+    assert all(np.hypot(*(np.array(c.position[:2]) - near)) < 5e-3 for r in seen if r.contact.valid for c in present(r))

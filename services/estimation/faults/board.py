@@ -301,6 +301,8 @@ class BoardFaults:
             return None
         change, column, asked, found = best
         self._take(view, change, float(column @ found.pulled))
+        if isinstance(change, ContactChange) and found.fit is not None:
+            self.now.doubt.beside = any(self._reaches(state, change.electrode) for state in found.fit.states)
         return asked, found
 
     def _goes_on(self, change: ContactChange | GainChange, view: BoardView) -> bool:
@@ -504,7 +506,8 @@ class BoardFaults:
     def states(self) -> NDArray[np.uint8]:
         """(E,) of the wire format."""
         now = self.now
-        named = not now.doubt.undecided or now.doubt.seen >= n.NAMED_SCANS or abs(now.size) > n.CONTACT_PLAIN
+        plain = abs(now.size) > n.CONTACT_PLAIN and not now.doubt.beside
+        named = plain or not now.doubt.undecided or now.doubt.seen >= n.NAMED_SCANS
         contact = now.contact if named else -1
         return advice.states_of(len(now.settled), now.wire, now.opens, contact, now.silent)
 
