@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from models.measurement.numbers import (
     BENDS_BY,
     COURSE_JITTER,
+    COURSE_LEAST,
     COURSE_S,
     COURSE_SD,
     KINK,
@@ -165,10 +166,11 @@ class TouchCourse:
         ((changes, _),) = self.bends(state[None])
         rise = abs(state[RATE]) * self.span_s / 2
         most = abs(state[ACTION]) + rise
+        may = most if instants else max(2 * rise, COURSE_LEAST * abs(state[ACTION]))
         centres = [instant + step * SUDDEN_S for instant in instants for step in SUDDEN_STEPS]
         hats = [SUDDEN_SD * most * self._hat(centre, SUDDEN_S) for centre in centres]
-        if instants or changes:
-            size = COURSE_SD * (most if instants else 2 * rise) * self._acts(state, prior)
+        if instants or changes or not prior.steady:
+            size = COURSE_SD * may * self._acts(state, prior)
             steps = max(1, round(self.span_s / COURSE_S))
             knots = np.linspace(-self.span_s / 2, self.span_s / 2, steps + 1)
             hats += [size * self._hat(knot, self.span_s / steps) for knot in knots]

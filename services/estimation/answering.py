@@ -37,6 +37,10 @@ class Answering:
             loose = self._skin.touches.expected(self._measured.middle_s, self._measured.span_s, loose=True)
             if self._skin.touches.lost:
                 return judged_by_itself(hypotheses, question, standing, loose)
+            if self._measured.whole and self._unexplained_s > 0:  # they may be others than those that stand
+                anew = self._from_nothing(hypotheses, question)
+                if anew.explained:
+                    return anew
             return hypotheses.ask(question, standing, loose)
         quiet = hypotheses.untouched(question)
         assert quiet is not None
@@ -86,7 +90,13 @@ class Answering:
         refused = round(self._unexplained_s / self._measured.span_s)
         if found.quiet or not self._measured.whole or refused % n.LOST_SCANS:
             return found
-        return hypotheses.ask(question, (), ())
+        return self._from_nothing(hypotheses, question)
+
+    def _from_nothing(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+        """Whatever touches, with the steps of a scan that stands by itself."""
+        scan = self._measured.scan
+        budget = StepBudget.of(len(scan.new), len(scan.new), separate=True)
+        return hypotheses.ask(replace(question, budget=budget, keeps=0.0), (), ())
 
 
 def _strained(answer: ScoredAnswer) -> bool:

@@ -325,8 +325,10 @@ class Estimator:
             self._refused(skin, measured, question.y)
             if not (explained or rough) and _strange(question, answer):
                 self.now.unexplained_s = max(self.now.unexplained_s, float(n.CHANGING_S))
-        nearly = None if explained or rough else answer.fit
-        self.now.candidates = np.zeros((0, STATES)) if nearly is None else nearly.states.copy()
+        if explained or rough:
+            self.now.candidates = np.zeros((0, STATES))
+        elif answer.fit is not None:  # else no touch was looked for
+            self.now.candidates = answer.fit.states.copy()
         oldest_s = measured.middle_s - measured.span_s / 2
         plain = explained and not asked.changed and skin.faults.plain(oldest_s)
         if plain and self._complete(skin, measured.live):

@@ -253,7 +253,7 @@ COMMANDS = (
     Row(r"\./skin replay presses.mcap .*", "slow", says="1064 of them valid, 500 touched", instead="{line}"),
     Row(r"\./skin reconstruct FILE .*", "slow", says="500 rows, 500 touched, 500 valid", instead="{line}"),
     Row(r"\./skin (register|import) FILE .*", "slow", instead="{line}"),
-    Row(r"\.venv/bin/python -m bench.real_presses FILE", "slow", says="skin register"),
+    Row(r"\.venv/bin/python -m bench.real_presses FILE", "slow", says="skin register", instead="{line} --quick"),
     # examples
     Row(
         r"\.venv/bin/python -m examples\.(stop_on_contact|guarded_move --newtons 2)",
