@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from models.measurement.numbers import (
     BENDS_BY,
     COURSE_JITTER,
-    COURSE_LEAST,
     COURSE_S,
     COURSE_SD,
     KINK,
@@ -166,10 +165,10 @@ class TouchCourse:
         ((changes, _),) = self.bends(state[None])
         rise = abs(state[RATE]) * self.span_s / 2
         most = abs(state[ACTION]) + rise
-        may = most if instants else max(2 * rise, COURSE_LEAST * abs(state[ACTION]))
+        may = most if instants else 2 * rise
         centres = [instant + step * SUDDEN_S for instant in instants for step in SUDDEN_STEPS]
         hats = [SUDDEN_SD * most * self._hat(centre, SUDDEN_S) for centre in centres]
-        if instants or changes or not prior.steady:
+        if instants or changes:
             size = COURSE_SD * may * self._acts(state, prior)
             steps = max(1, round(self.span_s / COURSE_S))
             knots = np.linspace(-self.span_s / 2, self.span_s / 2, steps + 1)

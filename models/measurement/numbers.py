@@ -55,7 +55,6 @@ COURSE_S = Number(0.0044, "s", "steps of the course of a touch that changes", "d
 COURSE_SD = Number(
     0.3, "-", "of its change, by which each may differ", "derived: a ramp that ends half way is 0.25 off"
 )
-COURSE_LEAST = Number(0.3, "-", "of its action, a change that may go on or end", "derived: 50 ms, and a third of a scan")
 COURSE_JITTER = Number(0.03, "-", "of its action, within such a step", "derived: ramps of 20 ms and more")
 BENDS_BY = Number(0.15, "-", "and of its radius", "derived: its square over 8 is 0.3 %, below MISFIT")
 KINK = Number(0.8, "-", "of a change within a scan: what of it may be no straight line", "derived: a ramp's half")

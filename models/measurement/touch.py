@@ -57,7 +57,6 @@ class TouchPrior:
     shape_sd: Array = field(default_factory=lambda: SHAPE_SDS)
     since_s: float = -np.inf
     until_s: float = np.inf
-    steady: bool = False  # it has stayed as it is: it takes no course of its own
 
 
 def anywhere(x: float, y: float, action: float, span_s: float) -> TouchPrior:

@@ -347,8 +347,7 @@ def _expected(track: TrackedTouch, at_s: float, span_s: float, loose: bool) -> T
     mean[LOG_RADIUS], sd[LOG_RADIUS] = track.log_radius, track.log_radius_sd
     shape_sd = np.sqrt(np.minimum(track.shape_variance + (n.SHAPE_WALK * SHAPE_SDS) ** 2, SHAPE_SDS**2))
     state = within_limits(state[None])[0]
-    acts_s = track.since_s - at_s, track.until_s - at_s
-    return TouchPrior(state, mean, sd, track.shape, shape_sd, *acts_s, steady)
+    return TouchPrior(state, mean, sd, track.shape, shape_sd, track.since_s - at_s, track.until_s - at_s)
 
 
 def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, span_s: float, whole: bool) -> None:
