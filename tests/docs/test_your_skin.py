@@ -37,9 +37,10 @@ LIVE = {  # with a sensor and somebody who presses: tests/cli/test_calibrate_liv
     "./skin calibrate --live --skin mine --tip 0.005 --save small.csv --out mine-force.json": "",
     "./skin calibrate --live --skin mine --tip 0.012 --csv small.csv --out mine-force.json": "",
 }
+BUILD = ".venv/bin/python -m models.build --anyway --skin"
 TRAINED = {
-    "make train SKIN=my-skin QUICK=1": ".venv/bin/python -m models.build --skin my-skin --minutes 2 --anyway",
-    "make train SKIN=my-registered MINUTES=10": ".venv/bin/python -m models.build --skin my-registered --minutes 1 --anyway",
+    "make train SKIN=my-skin QUICK=1": f"{BUILD} my-skin --minutes 2",
+    "make train SKIN=my-registered MINUTES=10": f"{BUILD} my-registered --minutes 1",
 }
 
 
