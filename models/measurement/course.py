@@ -28,8 +28,6 @@ RADIUS_SLOPE = 3  # of TouchModel.with_slopes
 SUDDEN_STEPS = (-2, -1, 0, 1, 2)
 SUDDEN_REACH_S = float(SUDDEN_S) * (SUDDEN_STEPS[-1] + 1)
 CHANGES = 0.1  # of its strength within a scan, from which on a touch's change may bend
-
-
 STRENGTH = 0  # what of a touch a kink bends: how strongly it acts, else X + 1 or Y + 1
 
 

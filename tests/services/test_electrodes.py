@@ -389,7 +389,7 @@ def test_no_touch_is_named_a_fault(snr_db: float) -> None:
             shapes.append(
                 Shape(kind, float(x), float(y), float(rng.uniform(0.05, 0.5)), float(rng.uniform(0.05, 0.85)))
             )
-        own.rest(3)
+        own.rest(BACK_WITHIN + 3)
         t = sheet().model.solve(sheet().model.touched(shapes)).transfer
         z, status = own.analog.measure((t, t), own.pattern, 128, 40_000.0, 0.0)
         status[:] = 0  # a drop of 0.85 S/m on an electrode may clip the current: that is another matter

@@ -307,8 +307,11 @@ class BoardFaults:
 
     def _goes_on(self, change: ContactChange | GainChange, view: BoardView) -> bool:
         """Whether it is the contact that has begun to change within this scan."""
-        began_s = self.now.contact_since_s - view.middle_s
-        return isinstance(change, ContactChange) and change.electrode == self.now.contact and began_s > -view.span_s / 2
+        return isinstance(change, ContactChange) and change.electrode == self.now.contact and self.began_within(view)
+
+    def began_within(self, view: BoardView) -> bool:
+        """Whether the contact's change began after the oldest value of a scan."""
+        return self.now.contact_since_s > view.middle_s - view.span_s / 2
 
     def _sure(self, answer: ScoredAnswer) -> float:
         """By how much a fault must be likelier than an answer: small new touches on electrodes are seldom touches."""

@@ -75,11 +75,11 @@ class ContactDoubt:
         """Whether it goes on changing: a mean over such scans is neither a contact's nor a touch's. Asked of the first
         scans: a finger on an electrode may never be still.
         """
-        now = self._faults.now
-        if now.contact_since_s > view.middle_s - view.span_s / 2:
+        doubt = self._faults.now.doubt
+        if self._faults.began_within(view):
             return True
-        sizes = [each.size for each in now.doubt.sizes[-2:]]
-        return now.doubt.seen <= SETTLES and len(sizes) == 2 and abs(sizes[1] - sizes[0]) > now.doubt.least
+        sizes = [each.size for each in doubt.sizes[-2:]]
+        return doubt.seen <= SETTLES and len(sizes) == 2 and abs(sizes[1] - sizes[0]) > doubt.least
 
     def _over(self, view: BoardView, answer: ScoredAnswer) -> Array:
         """(K,) log |Z| over a skin with what is decided, touches that stand taken off."""
