@@ -42,6 +42,7 @@ Array = NDArray[np.float64]
 REST_S = 0.25  # of the drift that skin.toml allows: what is left of it beside a touch
 SAVE_EVERY = 512  # untouched scans after which the tracked baseline is worth keeping again
 PLACE_SIGMA = 1e-4  # m: no table knows a place better
+MOST_LOG = 3.0  # of |Z| over the baseline: no image is made of what is larger, no touch does it
 
 
 class Preprocessing(Stage):
@@ -60,6 +61,7 @@ class Preprocessing(Stage):
         self._unchecked = checks.sentence(bundle)
         self._force, self._symmetry = force(skin, bundle), symmetry(skin, bundle)
         self.always_reconstruct = False  # offline: an image of every scan, touched or not
+        self.each_alone = False  # offline: frames that do not follow each other
         self.frame_rate, self._news = FrameRate(), BaselineNews()
         self._build()
         self._told_hash = ""  # of the baseline that info told last
@@ -129,6 +131,8 @@ class Preprocessing(Stage):
         if SEPARATE in frame.reasons and not self._beside_reference(frame):
             return [self._unusable(out, "stale_baseline")]
         scan = Scan.of(frame, self._before)
+        if self.each_alone:
+            scan = replace(scan, separate=True)
         self._before = scan
         estimate = self.estimator.step(scan)
         self._look_at_baseline()
@@ -176,7 +180,7 @@ class Preprocessing(Stage):
         self._counters["touched"] += out.touched
         if not estimate.scan.believed:
             self._reconstruction.rest()  # a mean of the same scan again and again is no surer
-        live = estimate.live & np.isfinite(self._reconstruction.sigma)
+        live = estimate.live & np.isfinite(self._reconstruction.sigma) & (estimate.difference < MOST_LOG)
         z0 = baseline.z0 * np.exp(self._shift(estimate.scan))
         d = np.where(live, z0 * np.expm1(estimate.difference) / self.pre.normaliser(z0), 0.0)
         out.difference = d.astype(np.float32)

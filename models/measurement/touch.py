@@ -81,6 +81,7 @@ def within_limits(states: Array) -> Array:
     """(T, 7) states moved to where touches can be."""
     limited = states.copy()
     limited[:, PLACE] = np.minimum(np.maximum(limited[:, PLACE], -SHEET), SHEET)
+    limited[:, ACTION] = np.minimum(limited[:, ACTION], MOST_STRENGTH * area_of(np.log(MOST_RADIUS)))
     acts = np.maximum(limited[:, ACTION], LEAST_ACTION)
     least = np.maximum(0.5 * np.log(acts / (np.pi * MOST_STRENGTH)), np.log(LEAST_RADIUS))
     limited[:, LOG_RADIUS] = np.minimum(np.maximum(limited[:, LOG_RADIUS], least), np.log(MOST_RADIUS))

@@ -23,16 +23,18 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
     else:
         skin.slow.forget()
         memories += touches.settle(answer.fit, kept, middle_s, span_s, whole=measured.whole, explained=answer.explained)
-        _make_sure(skin, answer)
+        _make_sure(skin, answer, measured.scan.separate)
         rest = replace(question, keeps=0.0)
         if measured.whole and not answer.recounted:
             _doubt(skin, rest, answer, measured, strange=unexplained_s > n.CHANGING_S)
     skin.remember(memories)
 
 
-def _make_sure(skin: TaredSkin, answer: ScoredAnswer) -> None:
-    """A touch is shown at once where its scan is explained with it: a rough start may be anything."""
-    if not answer.explained or 2 * answer.over < n.SURE_Z2:
+def _make_sure(skin: TaredSkin, answer: ScoredAnswer, separate: bool) -> None:
+    """A touch is shown at once where its scan is explained with it: a rough start may be anything. Not so in a scan that
+    stands by itself (separate): none follows that would tell more.
+    """
+    if not (answer.explained or separate) or 2 * answer.over < n.SURE_Z2:
         return
     least = float(n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2)
     if not skin.tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked

@@ -128,7 +128,7 @@ def _reconstruct(
     if calibrate and data.untouched is not None:
         bundle = mounted_bundle(data.untouched, bundle, warn)
     pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
-    pipeline.inference.each_alone = pipeline.publishing.each_alone = not sequence
+    pipeline.pre.each_alone = pipeline.inference.each_alone = pipeline.publishing.each_alone = not sequence
     out = _empty(len(data.measurements))
     rows = progress(range(len(data.measurements)))
     if data.untouched is None:
