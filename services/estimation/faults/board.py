@@ -289,6 +289,8 @@ class BoardFaults:
             cost = 0.0 if self._goes_on(change, view) else _cost(change)
             if found.score + cost < sure or not self._apart(change, found):
                 continue
+            if self._beside(change, found) and found.score + cost < answer.score + n.FAULT_SURE:
+                continue  # a touch takes the contact along: both are not likelier for being seldom touches
             if isinstance(change, GainChange) and abs(float(column @ found.pulled)) * n.GAIN_CHANGES < n.GAIN_LEAST:
                 continue  # the touches of the answer explain all of it
             if isinstance(change, ContactChange) and not _told(column, found):
@@ -301,9 +303,15 @@ class BoardFaults:
             return None
         change, column, asked, found = best
         self._take(view, change, float(column @ found.pulled))
-        if isinstance(change, ContactChange) and found.fit is not None:
-            self.now.doubt.beside = any(self._reaches(state, change.electrode) for state in found.fit.states)
+        if isinstance(change, ContactChange):
+            self.now.doubt.beside = self._beside(change, found)
         return asked, found
+
+    def _beside(self, change: ContactChange | GainChange, answer: ScoredAnswer) -> bool:
+        """Whether a touch of the answer may change the contact impedance that is said to change."""
+        if isinstance(change, GainChange) or answer.fit is None:
+            return False
+        return any(self._reaches(state, change.electrode) for state in answer.fit.states)
 
     def _goes_on(self, change: ContactChange | GainChange, view: BoardView) -> bool:
         """Whether it is the contact that has begun to change within this scan."""
