@@ -83,8 +83,16 @@ def test_holds_leave_no_more_than_their_share_in_the_baseline() -> None:
     assert all(any(contact.state != "end" for contact in frame.contacts) for frame in standing)
 
 
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="sigmas of moments are too small")
-@pytest.mark.parametrize("scan", runs.SCANS)
+@pytest.mark.parametrize(
+    "scan",
+    [
+        "full",
+        pytest.param(
+            "rolling",
+            marks=pytest.mark.xfail(strict=True, raises=AssertionError, reason="sigmas of moments are too small"),
+        ),
+    ],
+)
 @pytest.mark.slow
 def test_forces_and_places_of_moments_are_within_their_sigma(scan: str) -> None:
     """In a drawn session, beginnings, slides, releases, `coarse` and `changing` frames included."""

@@ -14,13 +14,14 @@ from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from models.measurement.course import TouchCourse
 from models.measurement.fit import FittedScan, FoundTouches, KnownWhitening, TouchFitter, Turned
 from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
 from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
 from models.measurement.tables import SkinTables
-from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, TouchPrior, anywhere, plain
+from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, SHAPE_SDS, TouchPrior, anywhere, plain
 from models.measurement.whitening import Whitening
 from services.estimation.asked.left_over import LeftOver, fresh
 from services.estimation.asked.question import (
@@ -44,6 +45,8 @@ ON_ELECTRODE = ((0.03, 0.0), (0.03, 0.1), (0.03, -0.1))  # inside its edge and a
 SMALL_RADIUS = 0.1  # where it begins
 CAUSE_STEPS = 1  # that touches which are known need beside another cause
 WIDER = (MEMORY, DRIFT, BURST, NOISE)
+HALVED_ANGLES = np.arange(8) * np.pi / 8  # along which two discs are tried instead of one
+HALVED_APART = (0.6, 1.0, 1.4)  # how far each lies from its middle, in radii
 
 
 class Hypotheses:
@@ -190,6 +193,9 @@ class Hypotheses:
         found = [discs, *self._one_more(question, begun, discs)]
         if (pair := _neighbours(same[0].fit, new)) is not None:
             found.append(self._merged(question, same[0], *pair))
+        else:
+            oddest = int(np.argmax(((answer.fit.shapes / SHAPE_SDS) ** 2).sum(axis=1)))
+            found += self._halved(question, begun, discs, oddest)
         if not any(other.explained for other in found):
             found += self._search(question, (), None)
         others = [other for other in found if other.explained and _others(other.fit, answer.fit)]
@@ -207,6 +213,39 @@ class Hypotheses:
         new = (-1,) * (len(begun) + 1)
         found = self._fitted(question, [*started_from(discs.fit), plain(more)], new, 2 * n.STEPS_COLD)
         return [found, self._fitted(question, _started([*begun, more], found.fit), new, n.STEPS_COLD)]
+
+    def _halved(
+        self, question: Question, begun: Sequence[TouchPrior], discs: ScoredAnswer, one: int
+    ) -> list[ScoredAnswer]:
+        """Two discs instead of one, and the same with outlines: a disc beside one that lies between two leads to
+        neither. begun: the touches of those discs, with their outlines.
+        """
+        fit, span_s = discs.fit, question.span_s
+        if fit is None or len(fit) >= n.MOST_TOUCHES:
+            return []
+        white, response = question.white, self._tables.response
+        others = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) for k, s in enumerate(fit.states) if k != one]
+        target = white(np.where(question.live, np.expm1(question.y) - sum(others), 0.0))
+        (x, y), radius = fit.states[one, PLACE], float(np.exp(fit.states[one, LOG_RADIUS]))
+        small = float(fit.states[one, LOG_RADIUS]) - 0.5 * np.log(2.0)
+        best, least = None, np.inf
+        for angle in HALVED_ANGLES:
+            for apart in HALVED_APART:
+                way = apart * radius * np.array([np.cos(angle), np.sin(angle)])
+                halves = [(x + side * way[0], y + side * way[1]) for side in (-1, 1)]
+                both = np.stack([response(*place, small) for place in halves], axis=1)
+                columns = white(np.where(question.live[:, None], both, 0.0))
+                actions, left = nnls(columns, target)
+                if left < least and actions.min() > 0:
+                    best, least = [anywhere(*place, a, span_s) for place, a in zip(halves, actions, strict=True)], left
+        if best is None:
+            return []
+        rest = [k for k in range(len(fit)) if k != one]
+        kept = [prior for k, prior in enumerate(started_from(fit)) if k != one]
+        new = (-1,) * (len(fit) + 1)
+        found = self._fitted(question, [*kept, *(plain(half) for half in best)], new, 2 * n.STEPS_COLD)
+        outlined = [*(begun[k] for k in rest), *best]
+        return [found, self._fitted(question, _started(outlined, found.fit), new, n.STEPS_COLD)]
 
     def without(self, question: Question, standing: Sequence[TouchPrior], place: int) -> ScoredAnswer:
         """The answer that one of the touches is none: there is nothing, or it is drift, or what foam remembers."""
