@@ -60,7 +60,8 @@ class Answering:
         if not (_strained(answer) or self._skin.touches.odd):
             return answer
         scan = self._measured.scan
-        own = replace(question, budget=StepBudget.of(len(scan.new), len(scan.new), scan.separate), keeps=0.0)
+        new = max(int(scan.new.sum()), int(n.RECOUNTS * len(scan.new)))
+        own = replace(question, budget=StepBudget.of(len(scan.new), new, scan.separate), keeps=0.0)
         found = hypotheses.recounted(own, answer)
         if found is None or found.fit is None:
             return answer

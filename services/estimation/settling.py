@@ -31,8 +31,8 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
 
 
 def _make_sure(skin: TaredSkin, answer: ScoredAnswer, separate: bool) -> None:
-    """A touch is shown at once where its scan is explained with it: a rough start may be anything. Not so in a scan that
-    stands by itself (separate): none follows that would tell more.
+    """A touch is shown at once where its scan is explained with it: a rough start may be anything. One that stands by
+    itself (separate) is the end, too.
     """
     if not (answer.explained or separate) or 2 * answer.over < n.SURE_Z2:
         return

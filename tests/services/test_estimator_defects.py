@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.trust import runs
 from bench.trust.score import PHASES
 from bench.trust.session import PlayedSession, SessionPlan
 from firmware_stub import scene as scenes

@@ -193,7 +193,7 @@ class Hypotheses:
         found = [discs, *self._one_more(question, begun, discs)]
         if (pair := _neighbours(same[0].fit, new)) is not None:
             found.append(self._merged(question, same[0], *pair))
-        else:
+        elif not any(other.explained for other in found):
             oddest = int(np.argmax(((answer.fit.shapes / SHAPE_SDS) ** 2).sum(axis=1)))
             found += self._halved(question, begun, discs, oddest)
         if not any(other.explained for other in found):
@@ -245,7 +245,8 @@ class Hypotheses:
         new = (-1,) * (len(fit) + 1)
         found = self._fitted(question, [*kept, *(plain(half) for half in best)], new, 2 * n.STEPS_COLD)
         outlined = [*(begun[k] for k in rest), *best]
-        return [found, self._fitted(question, _started(outlined, found.fit), new, n.STEPS_COLD)]
+        made = [found, self._fitted(question, _started(outlined, found.fit), new, n.STEPS_COLD)]
+        return [other for other in made if other.fit is not None and not _overlap(other.fit.states)]
 
     def without(self, question: Question, standing: Sequence[TouchPrior], place: int) -> ScoredAnswer:
         """The answer that one of the touches is none: there is nothing, or it is drift, or what foam remembers."""
@@ -529,6 +530,13 @@ def _others(fit: FoundTouches | None, than: FoundTouches) -> bool:
         if away > max(n.SAME_TOUCH, float(np.exp(state[LOG_RADIUS]))):
             return True
     return False
+
+
+def _overlap(states: Array) -> bool:
+    """Whether any touches (T, 7) lie on each other, as parts of one do."""
+    radius = np.exp(states[:, LOG_RADIUS])
+    away = np.hypot(*(states[:, None, PLACE] - states[None, :, PLACE]).transpose(2, 0, 1))
+    return bool((away < radius[:, None] + radius)[~np.eye(len(states), dtype=bool)].any())
 
 
 def _neighbours(fit: FoundTouches | None, kept: tuple[int, ...]) -> tuple[int, int] | None:

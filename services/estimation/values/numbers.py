@@ -101,6 +101,9 @@ NEIGHBOURS = Number(
 MOST_TOUCHES = Number(4.0, "-", "touches at once", "chosen: cost; image and contact frames hold more")
 MOST_STEPS = Number(200.0, "-", "steps times touches of one scan, beyond which nothing new is asked", "chosen: 30 ms")
 LEAST_BUDGET = Number(0.4, "-", "of them, for a part of a scan", "chosen: the parts after it are asked as well")
+RECOUNTS = Number(
+    0.55, "-", "of a scan's steps, for a whole one in parts asked again", "measured: 0.4 leaves three as two"
+)
 SEPARATE = Number(4.0, "-", "times that, of a scan that stands by itself", "chosen: four scans find any three touches")
 FOR_FAULTS = Number(0.4, "-", "of them, for what the board may have done", "derived: two changes, two fits each")
 STEPS_WARM = Number(4.0, "-", "steps of a fit from the scan before", "measured: 2 or 3 are used")
