@@ -30,6 +30,7 @@ from models.measurement.numbers import (
 from models.measurement.touch import (
     ACTION,
     LOG_RADIUS,
+    MOST_ACTS,
     PLACE,
     RATE,
     SHAPES,
@@ -227,6 +228,8 @@ class TouchFitter:
             if self._is_linear(point.states, normal.step(0.0)):
                 break
             step = normal.step(damping)
+            if not np.isfinite(step).all():
+                break  # measurements of any magnitude: nothing explains them
             self.steps += 1
             tried = self._stepped(point, step)
             gained = point.objective - tried.objective
@@ -346,9 +349,11 @@ class TouchFitter:
             states, rest = states + linear.step[:n].reshape(-1, STATES), rest + linear.step[n:]
             left, residual, objective = left - point.sloped @ linear.step, best, objective - linear.gains
         said = self._said(n, len(rest))
+        then = states + (said[:, n:] @ rest).reshape(-1, STATES)
+        then[:, ACTION] = np.minimum(then[:, ACTION], MOST_ACTS)
         return FoundTouches(
             priors=self._priors,
-            states=states + (said[:, n:] @ rest).reshape(-1, STATES),
+            states=then,
             covariance=said @ linear.solved @ said.T,
             shapes=rest[:shapes].reshape(self._count, SHAPES),
             shape_variance=np.diag(linear.solved)[n : n + shapes].reshape(self._count, SHAPES),

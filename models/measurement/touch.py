@@ -40,6 +40,8 @@ PLACE, VELOCITY = slice(X, Y + 1), slice(VX, VY + 1)
 SHAPES = 9
 EDGE = 6
 PLAIN = 1e-3  # of what shapes differ by
+MOST_ACTS = float(MOST_STRENGTH * np.pi * MOST_RADIUS**2)  # unit^2: nothing conducts in the largest
+AT_ONCE_S = 4e-4  # one measurement: nothing begins faster
 SHAPE_SDS: Array = np.array([sd for sd in HARMONIC_SDS for _ in range(2)] + [EDGE_SD, TENSOR_SD, TENSOR_SD])
 
 
@@ -81,7 +83,8 @@ def within_limits(states: Array) -> Array:
     """(T, 7) states moved to where touches can be."""
     limited = states.copy()
     limited[:, PLACE] = np.minimum(np.maximum(limited[:, PLACE], -SHEET), SHEET)
-    limited[:, ACTION] = np.minimum(limited[:, ACTION], MOST_STRENGTH * area_of(np.log(MOST_RADIUS)))
+    limited[:, ACTION] = np.minimum(limited[:, ACTION], MOST_ACTS)
+    limited[:, RATE] = np.minimum(np.maximum(limited[:, RATE], -MOST_ACTS / AT_ONCE_S), MOST_ACTS / AT_ONCE_S)
     acts = np.maximum(limited[:, ACTION], LEAST_ACTION)
     least = np.maximum(0.5 * np.log(acts / (np.pi * MOST_STRENGTH)), np.log(LEAST_RADIUS))
     limited[:, LOG_RADIUS] = np.minimum(np.maximum(limited[:, LOG_RADIUS], least), np.log(MOST_RADIUS))

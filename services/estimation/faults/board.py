@@ -369,6 +369,8 @@ class BoardFaults:
             scan = Unexplained(y, 1 / (1 + touched), question.live, question.times_s, question.span_s, white)
             nothing = white.log_density - 0.5 * float(np.sum(white(y) ** 2))
             best = max(self._every(scan, columns), key=lambda change: change.score + _cost(change))
+            if isinstance(best, ContactChange) and abs(best.size) > n.CONTACT_MOST:
+                continue
             known = [_what(change) for change in found]
             if int(scan.since(best.since_s).sum()) < n.TOLD_BY:
                 continue

@@ -196,6 +196,7 @@ SHORT_WAY = Number(4.7, "-", "rest of a contact against its series part: b = a /
 SHORT_WAY_SD = Number(0.12, "-", "of b, relative", "measured: 1 to 6 % on the stub's mesh, 12 % on another board's")
 REST_FLOOR = Number(0.01, "-", "of b, where nothing changes", "derived: a tenth of what is named")
 CONTACT_CHANGES = Number(1.5, "-", "change of a contact impedance, one sigma", "derived: up to 9 times is 5 of it")
+CONTACT_MOST = Number(100.0, "-", "its change at most: beyond it is open", "derived: more than any pair's own")
 COURSE_FLOOR = Number(0.02, "-", "its change within a scan, at least", "derived: 10 % a second, and 0.5")
 CONTACT_MISFIT = Number(2e-3, "-", "what its columns get wrong, relative", "measured: 0.5e-3 at 8 times, stub's mesh")
 GAIN_CHANGES = Number(0.1, "-", "log of a gain's step, one sigma", "data sheet: AD5940, RTIA and PGA")
