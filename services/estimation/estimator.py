@@ -43,7 +43,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 12  # of a kept state
+LAYOUT = 13  # of a kept state
 
 
 @dataclass

@@ -55,6 +55,8 @@ class TrackedTouch:
     shape: Annotated[Array, "shapes"]
     shape_variance: Annotated[Array, "shapes"]
     course: KnownCourse  # as known from scans that share no value
+    stays_at: tuple[float, float, float] = (0.0, 0.0, np.inf)  # x, y while it stays, so known, and their sd
+    stays_for: int = 0  # scans that are in it
     since_s: float = -np.inf  # it acts from then on
     until_s: float = np.inf  # it acted until then: it has ended, and the window still holds values of before
     scans: int = 0  # that it was fitted to and that share no value
@@ -184,14 +186,20 @@ class TouchTracks:
         return [k for k, gap in zip(lasting, reach, strict=True) if gap < _radius(tracks[k])]
 
     def recognised(self, fit: FoundTouches, kept: Sequence[int]) -> tuple[int, ...]:
-        """kept, where touches that were found anew are those that were there before in the same places."""
+        """kept, where touches that were found anew are those that were there before in the same places: also a part of
+        one that is several by now.
+        """
         free = [k for k, track in enumerate(self.now.tracks) if k not in kept and not track.ended]
         found = list(kept)
         for k, place in enumerate(kept):
             near = [(float(np.hypot(*(self.now.tracks[f].state[PLACE] - fit.states[k, PLACE]))), f) for f in free]
-            if place < 0 and near and min(near)[0] < max(n.SAME_TOUCH, float(np.exp(fit.states[k, LOG_RADIUS]))):
-                found[k] = min(near)[1]
-                free.remove(found[k])
+            if place >= 0 or not near:
+                continue
+            away, nearest = min(near)
+            widest = max(fit.states[k, LOG_RADIUS], self.now.tracks[nearest].state[LOG_RADIUS])
+            if away < max(n.SAME_TOUCH, float(np.exp(widest))):
+                found[k] = nearest
+                free.remove(nearest)
         return tuple(found)
 
     def settle(
@@ -366,7 +374,28 @@ def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, s
     elif whole:
         track.still += 1
     track.scans += whole
+    if whole:
+        _follow_place(track, float(sd[PLACE].max()))
     track.peak = max(track.peak, float(state[ACTION] - 2 * sd[ACTION]))
+
+
+def _follow_place(track: TrackedTouch, sd: float) -> None:
+    """One that stays is where all its scans say, weighed as they are sure of it. sd: of the place by the last one."""
+    (x, y), known = track.state[PLACE], np.hypot(track.stays_at[2], n.PLACE_WALK)
+    if not _stays(track, sd):
+        track.stays_at, track.stays_for = (float(x), float(y), sd), 0
+        return
+    track.stays_for += 1
+    share = known**2 / (known**2 + sd**2)
+    (then_x, then_y), left = track.stays_at[:2], float(np.sqrt(share) * sd)
+    track.stays_at = float(then_x + share * (x - then_x)), float(then_y + share * (y - then_y)), left
+
+
+def _stays(track: TrackedTouch, sd: float) -> bool:
+    """Whether it is where it stayed, by a scan that knows its place to sd."""
+    off = float(np.hypot(*(track.state[PLACE] - track.stays_at[:2])))
+    known = np.hypot(track.stays_at[2], n.PLACE_WALK)
+    return bool(track.still >= n.STILL_SCANS and off < n.STAYS_WITHIN * np.hypot(known, sd))
 
 
 def _learn(track: TrackedTouch, fit: FoundTouches, k: int) -> None:
@@ -415,14 +444,20 @@ def estimate_of(track: TrackedTouch, sample_s: float, span_s: float, unexplained
     to_said[0, X] = to_said[1, Y] = to_said[2, LOG_RADIUS] = 1.0
     to_said[3, ACTION], to_said[3, LOG_RADIUS] = by_action, -2 * drop / (1 + strength / 2)
     area = float(np.pi * np.exp(2 * log_radius))
-    said = to_said @ covariance @ to_said.T
+    said, place = to_said @ covariance @ to_said.T, state[PLACE]
+    if track.stays_for >= n.STILL_SCANS and _stays(
+        track, float(np.sqrt(max(track.covariance[X, X], track.covariance[Y, Y])))
+    ):
+        place, sd = np.array(track.stays_at[:2]), track.stays_at[2]
+        less = np.array([*np.minimum(1.0, sd / np.sqrt(np.diag(said)[:2])), 1.0, 1.0])
+        said = said * np.outer(less, less)
     to_integral = area * (to_said[3] + np.eye(STATES)[LOG_RADIUS] * 2 * drop)
     return TouchEstimate(
         id=track.id,
         began=track.began,
         age_s=sample_s - track.born_s,
-        x=float(state[X]),
-        y=float(state[Y]),
+        x=float(place[0]),
+        y=float(place[1]),
         vx=0.0 if track.still >= n.STILL_SCANS else float(state[VELOCITY][0]),
         vy=0.0 if track.still >= n.STILL_SCANS else float(state[VELOCITY][1]),
         log_radius=log_radius,

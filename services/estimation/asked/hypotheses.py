@@ -190,16 +190,16 @@ class Hypotheses:
         if answer.cause:
             same += self._with_cause(question, begun, new, answer.cause, answer.left)
         discs = self._fitted(question, [plain(prior) for prior in begun], new, n.STEPS_COLD)
-        found = [discs, *self._one_more(question, begun, discs)]
+        found, enough = [discs, *self._one_more(question, begun, discs)], max(each.score for each in same) + n.ANOTHER
         if (pair := _neighbours(same[0].fit, new)) is not None:
             found.append(self._merged(question, same[0], *pair))
-        elif not any(other.explained for other in found):
+        elif not any(other.explained and other.score > enough for other in found):
             oddest = int(np.argmax(((answer.fit.shapes / SHAPE_SDS) ** 2).sum(axis=1)))
             found += self._halved(question, begun, discs, oddest)
         if not any(other.explained for other in found):
             found += self._search(question, (), None)
         others = [other for other in found if other.explained and _others(other.fit, answer.fit)]
-        if not others or _likeliest(others).score < max(each.score for each in same) + n.ANOTHER:
+        if not others or _likeliest(others).score < enough:
             return None
         return _likeliest(others)
 

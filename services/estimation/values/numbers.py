@@ -72,6 +72,8 @@ ROUGH = Number(
     0.1, "unit", "place of a touch that changed so that nothing explains it", "derived: 5 mm in a scan, 0.1 m/s"
 )
 STILL_SCANS = Number(3.0, "-", "scans without motion or change, after which a touch stays", "derived: of one in 1000")
+PLACE_WALK = Number(0.003, "unit", "place of one that stays, from scan to scan", "derived: a third of STILL_WAY")
+STAYS_WITHIN = Number(2.5, "-", "sigmas that one which stays is off at most", "derived: one scan of 25")
 STILL_WAY = Number(0.01, "unit", "way within a scan of one that stays", "derived: 0.5 mm, 12 mm/s")
 STILL_CHANGE = Number(0.1, "-", "change of its action within a scan", "derived: as the kinks' threshold")
 RADIUS_WALK = Number(0.05, "-", "log radius from scan to scan", "chosen: a finger that rolls")
