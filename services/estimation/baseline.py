@@ -21,6 +21,7 @@ TAKING = "taking the baseline"  # what the status says until there is one
 DISAGREEMENT = 1e-5  # probability that quiet frames are refused
 HARMLESS = 5e-5  # relative change of a measurement within the frames that does no harm as part of a baseline
 TOO_NOISY = 0.05  # median relative noise beyond which no touch could be told from it
+OUT_OF_PROPORTION = 1e3  # of a measurement over the median one: pairs of one sheet differ by 10
 UNTRAINED = 0.0056  # the same (45 dB), beyond which no network was trained: models/augmentation.py
 IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
 QUARTERS = 4
@@ -87,6 +88,9 @@ def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Bas
     A measurement that is not finite in every frame gets an infinite sigma: it is left out until the next tare.
     """
     live = np.isfinite(frames).all(axis=0) & (frames > 0).all(axis=0)
+    if live.any():  # what is out of all proportion is no impedance of the same sheet
+        typical = float(np.median(frames[0, live]))
+        live &= (frames < OUT_OF_PROPORTION * typical).all(axis=0) & (frames > typical / OUT_OF_PROPORTION).all(axis=0)
     if live.sum() < 0.5 * frames.shape[1]:
         raise NoBaseline(
             f"only {int(live.sum())} of {frames.shape[1]} measurements give values: check the cable and the electrodes"
