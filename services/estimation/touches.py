@@ -445,12 +445,9 @@ def estimate_of(track: TrackedTouch, sample_s: float, span_s: float, unexplained
     to_said[3, ACTION], to_said[3, LOG_RADIUS] = by_action, -2 * drop / (1 + strength / 2)
     area = float(np.pi * np.exp(2 * log_radius))
     said, place = to_said @ covariance @ to_said.T, state[PLACE]
-    if track.stays_for >= n.STILL_SCANS and _stays(
-        track, float(np.sqrt(max(track.covariance[X, X], track.covariance[Y, Y])))
-    ):
-        place, sd = np.array(track.stays_at[:2]), track.stays_at[2]
-        less = np.array([*np.minimum(1.0, sd / np.sqrt(np.diag(said)[:2])), 1.0, 1.0])
-        said = said * np.outer(less, less)
+    known_sd = float(np.sqrt(max(track.covariance[X, X], track.covariance[Y, Y])))
+    if track.stays_for >= n.STILL_SCANS and _stays(track, known_sd):
+        place = np.array(track.stays_at[:2])  # as sure as by one scan: what all of them get wrong is not known
     to_integral = area * (to_said[3] + np.eye(STATES)[LOG_RADIUS] * 2 * drop)
     return TouchEstimate(
         id=track.id,
