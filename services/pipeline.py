@@ -37,9 +37,10 @@ class Pipeline:
         name: str = "skin",
         bundle: Bundle | None = None,
         always_reconstruct: bool = False,
+        each_alone: bool = False,
     ):
-        """skin: a configured one, or the name or path of a bundle. always_reconstruct: each frame by itself, an
-        image of untouched ones too.
+        """skin: a configured one, or the name or path of a bundle. always_reconstruct: an image of
+        untouched frames too. each_alone: frames do not follow each other.
         """
         if isinstance(skin, str):
             skin = Skin(port="stub", bundle=skin, frame_id=name)
@@ -47,7 +48,8 @@ class Pipeline:
         self.delta: DeltaFrame | None = None  # the newest one; parts of scans come between two of them
         self.image: ImageFrame | None = None  # the newest one
         self.pre, self.inference, self.publishing = build_stages(name, skin, bundle)
-        self.pre.always_reconstruct = self.inference.each_alone = self.publishing.each_alone = always_reconstruct
+        self.pre.always_reconstruct = always_reconstruct
+        self.pre.each_alone = self.inference.each_alone = self.publishing.each_alone = each_alone
 
     def run(self, raw: RawFrame) -> Result:
         """What the processes would publish for one raw frame, which is a whole scan; stamps are filled in."""

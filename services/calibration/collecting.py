@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol.frames import ImageFrame, RawFrame
 from services.calibration.force_fit import CalibrationError
 from services.calibration.force_presses import PATIENCE_S, Reader, Steady
-from services.contacts.force import Look
+from services.calibration.seen import SeenTouch, TouchReader
 from services.polygon import distance, inside
 
 Array = NDArray[np.float64]
@@ -33,14 +33,16 @@ class Collected:
     force_n: float | None
     touched: Array  # (K,) mean |Z|
     untouched: Array  # (K,) the same just before
-    look: Look  # what its image showed
+    seen: SeenTouch
 
 
 class Collector:
     """Follows raw and image frames of one skin. Use: `untouched`, then press, then `pressed`, then release."""
 
-    def __init__(self, reader: Reader, clock: Callable[[], float], patience_s: float = PATIENCE_S) -> None:
-        self._reader, self._clock, self._patience_s = reader, clock, patience_s
+    def __init__(
+        self, reader: Reader, read: TouchReader, clock: Callable[[], float], patience_s: float = PATIENCE_S
+    ) -> None:
+        self._reader, self._read, self._clock, self._patience_s = reader, read, clock, patience_s
         self._raw: dict[int, Array] = {}  # scan -> |Z|, of the scans that no image has been seen of yet
         self._images: dict[int, ImageFrame] = {}  # the other way round: they come over two sockets
         self._quiet: deque[Array] = deque(maxlen=UNTOUCHED)
@@ -63,9 +65,9 @@ class Collector:
             why = "the skin has not been untouched for long enough"
         raise CalibrationError(f"no untouched scans within {self._patience_s:g} s: {why}")
 
-    def pressed(self) -> tuple[Array, Look]:
-        """(K,) mean |Z| of the next steady press, and what its image shows. Raises CalibrationError."""
-        steady, recent = Steady(), deque[tuple[int, Array]]()
+    def pressed(self) -> tuple[Array, SeenTouch]:
+        """(K,) mean |Z| of the next steady press, and what is seen of it. Raises CalibrationError."""
+        steady, recent = Steady(self._read), deque[tuple[int, Array]]()
         for image, z in self._pairs():
             now = image.stamps.get("sample", 0)
             if not image.touched:
@@ -73,8 +75,8 @@ class Collector:
             recent.append((now, z))
             while now - recent[0][0] > 1e9 * PRESSED_S:
                 recent.popleft()
-            if (look := steady(image)) is not None:
-                return np.asarray(np.mean([row for _, row in recent], axis=0)), look
+            if (seen := steady(image)) is not None:
+                return np.asarray(np.mean([row for _, row in recent], axis=0)), seen
         raise CalibrationError(f"no steady press within {self._patience_s:g} s: {steady.trouble}")
 
     def _pairs(self) -> Iterator[tuple[ImageFrame, Array]]:

@@ -14,13 +14,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.errors import EitskinError
+from services.calibration.seen import SeenTouch
 from services.contacts.calibration_file import Calibration, Of
-from services.contacts.force import NAMES, ForceLaw, Look
+from services.contacts.force import NAMES
 from services.contacts.force_curve import TERMS, Curve, columns
 from services.runtime.config import Skin
 
@@ -41,10 +43,10 @@ class CalibrationError(EitskinError):
 
 @dataclass(frozen=True)
 class Press:
-    """One press of known force, and what the image showed of it; `where` names it in errors."""
+    """One press of known force, and what was seen of it; `where` names it in errors."""
 
     force_n: float
-    look: Look
+    seen: SeenTouch
     where: str
     tip_m: float | None = None  # radius of what pressed; None: nobody says
 
@@ -85,12 +87,12 @@ class Table:
         return Table(self.force[rows], quantity, self.x[rows], self.y[rows], self.reach)
 
 
-def fit(presses: Sequence[Press], laws: dict[Of, ForceLaw], most_n: float | None = None) -> Calibration:
-    """The law of N presses. laws: what says each quantity of a look, by kind. Raises CalibrationError."""
+def fit(presses: Sequence[Press], most_n: float | None = None) -> Calibration:
+    """The law of N presses. Raises CalibrationError."""
     _check(presses)
-    table = _table(presses, laws)
-    form = _choose(table, laws)
-    left_out = _left_out(table, laws)
+    table = _table(presses)
+    form = _choose(table)
+    left_out = _left_out(table)
     error = float(np.sqrt(np.mean(left_out**2)))
     if error > MOST_ERROR:
         raise CalibrationError(
@@ -101,8 +103,8 @@ def fit(presses: Sequence[Press], laws: dict[Of, ForceLaw], most_n: float | None
     exponent = float(found[1]) if form.free_exponent else 1.0
     terms = tuple(float(v) for v in found[1 + form.free_exponent :])
     curve = Curve(float(np.exp(found[0])), exponent, form.correction, terms, table.reach)
-    images = np.array([laws[form.reads].quantity(p.look).relative or 0.0 for p in presses])
-    own = float(np.sqrt(max(0.0, error**2 - float(np.mean((exponent * images) ** 2)))))
+    known = np.array([p.seen.quantities[form.reads].relative or 0.0 for p in presses])
+    own = float(np.sqrt(max(0.0, error**2 - float(np.mean((exponent * known) ** 2)))))
     forces = [p.force_n for p in presses]
     scatter, between = error * math.sqrt(form.parameters / len(presses)), _between_tips(presses, left_out)
     said = {
@@ -162,12 +164,10 @@ def _check(presses: Sequence[Press]) -> None:
     for p in presses:
         if not (np.isfinite(p.force_n) and p.force_n > 0):
             raise CalibrationError(f"{p.where}: found a force of {p.force_n} N, expected one above 0")
-        values = (p.look.peak, p.look.integral, p.look.area)
-        if not all(np.isfinite(v) and v > 0 for v in values):
-            raise CalibrationError(
-                f"{p.where}: found peak {values[0]}, integral {values[1]}, area {values[2]}; expected all above 0: "
-                "leave this press out"
-            )
+        values = {of: q.value for of, q in p.seen.quantities.items()}
+        if not all(np.isfinite(v) and v > 0 for v in values.values()):
+            found = ", ".join(f"{of} {value}" for of, value in values.items())
+            raise CalibrationError(f"{p.where}: found {found}; expected all above 0: leave this press out")
     forces = [p.force_n for p in presses]
     if max(forces) < SPREAD * min(forces):
         raise CalibrationError(
@@ -176,18 +176,17 @@ def _check(presses: Sequence[Press]) -> None:
         )
 
 
-def _table(presses: Sequence[Press], laws: dict[Of, ForceLaw]) -> Table:
-    quantity: dict[Of, Array] = {}
-    for reads, law in laws.items():
-        quantity[reads] = np.log([law.quantity(p.look).value for p in presses])
-    x, y = (np.array([getattr(p.look, axis) for p in presses]) for axis in "xy")
+def _table(presses: Sequence[Press]) -> Table:
+    kinds: tuple[Of, ...] = get_args(Of)
+    quantity = {of: np.log([p.seen.quantities[of].value for p in presses]) for of in kinds}
+    x, y = np.array([(p.seen.x, p.seen.y) for p in presses]).T
     reach = max(float(np.max(np.abs([x, y]))), 1e-6)
     return Table(np.log([p.force_n for p in presses]), quantity, x, y, reach)
 
 
-def _forms(n: int, laws: dict[Of, ForceLaw]) -> list[Form]:
+def _forms(n: int, kinds: Sequence[Of]) -> list[Form]:
     """The laws that n presses allow, simplest first."""
-    every = [Form(*each) for each in itertools.product(laws, (False, True), TERMS)]
+    every = [Form(*each) for each in itertools.product(kinds, (False, True), TERMS)]
     return sorted((f for f in every if PRESSES_PER_PARAMETER * f.parameters <= n), key=lambda f: f.parameters)
 
 
@@ -210,14 +209,14 @@ def _residuals(table: Table, form: Form) -> Array:
     return np.asarray((y - hat @ y) / slack)
 
 
-def _choose(table: Table, laws: dict[Of, ForceLaw]) -> Form:
+def _choose(table: Table) -> Form:
     """The simplest form that is nearly as good as the best. Raises CalibrationError where force does not rise."""
     # This looks at a quantity by itself: a law of slope 1 rises whatever the presses say.
-    rising = {reads: law for reads, law in laws.items() if _rises(table, Form(reads, True, "none"))}
+    rising = [reads for reads in table.quantity if _rises(table, Form(reads, True, "none"))]
     if not rising:
         raise CalibrationError(
-            "harder presses do not leave larger images, neither in peak nor in integral: expected them to; check that "
-            "each force belongs to its press"
+            "harder presses do not act more strongly, neither by pressure nor by peak nor by integral: expected them "
+            "to; check that each force belongs to its press"
         )
     forms = [f for f in _forms(len(table.force), rising) if _rises(table, f)]
     errors = {f: float(np.sqrt(np.mean(_residuals(table, f) ** 2))) for f in forms}
@@ -225,13 +224,13 @@ def _choose(table: Table, laws: dict[Of, ForceLaw]) -> Form:
     return next(f for f in forms if errors[f] <= limit)
 
 
-def _left_out(table: Table, laws: dict[Of, ForceLaw]) -> Array:
+def _left_out(table: Table) -> Array:
     """(N,) errors of log force, each press predicted by a law that was chosen and fitted without it."""
     n = len(table.force)
     errors = np.empty(n)
     for k in range(n):
         rest = np.arange(n) != k
-        form = _choose(table.part(rest), laws)
+        form = _choose(table.part(rest))
         a, y = table.design(form)
         found, *_ = np.linalg.lstsq(a[rest], y[rest], rcond=None)
         errors[k] = y[k] - a[k] @ found

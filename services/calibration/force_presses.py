@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol, get_args
+from typing import Protocol
 
 import numpy as np
 
@@ -15,52 +15,31 @@ from models.bundle import Bundle
 from protocol.frames import Frame, ImageFrame
 from protocol.held import HeldImage
 from services.calibration.force_fit import CalibrationError
-from services.contacts.calibration_file import Of
-from services.contacts.force import ForceLaw, Look
-from services.contacts.segmentation import segment
+from services.calibration.seen import SeenTouch, TouchReader, mean
 from services.pipeline import Pipeline
 from services.recordings.npz_file import InputError, load_npz, read_input
 from services.recordings.reconstruction import baseline_of, mounted_bundle, raw_frame
 from services.runtime.config import Skin
 
 STEADY_S = 1.5  # how long a press must have been steady
-STEADY = 0.05  # relative standard deviation of the peak within that time
+STEADY = 0.05  # relative standard deviation, within that time, of how strongly it acts
 FEWEST_FRAMES = 8
 PATIENCE_S = 60.0
 
 
-def laws(skin: Skin, bundle: Bundle) -> dict[Of, ForceLaw]:
-    """The force laws that give each quantity of a look, without a calibration that may be there already."""
-    law = ForceLaw.of(skin.model_copy(update={"calibration": None}), bundle)
-    return {reads: replace(law, reads=reads) for reads in get_args(Of)}
-
-
-def looks(frame: ImageFrame) -> list[Look]:
-    """What an image shows of its touches, strongest first."""
-    if not (frame.touched and frame.image.size):
-        return []
-    return [Look.of(s, frame) for s in segment(frame.image, frame.sigma)]
-
-
-def mean(several: list[Look]) -> Look:
-    """Field by field."""
-    noises = [k.noise for k in several if k.noise is not None]
-    values = {f.name: float(np.mean([getattr(k, f.name) for k in several])) for f in fields(Look) if f.name != "noise"}
-    return Look(**values, noise=float(np.mean(noises)) if noises else None)
-
-
 class Steady:
-    """Collects images of a press until it has been steady long enough."""
+    """Collects frames of a press until it has been steady long enough."""
 
-    def __init__(self) -> None:
-        self._recent: deque[tuple[int, Look]] = deque()
+    def __init__(self, read: TouchReader) -> None:
+        self._read = read
+        self._recent: deque[tuple[int, SeenTouch]] = deque()
         self._held = HeldImage()
         self.trouble = "nothing touches"
 
-    def __call__(self, frame: ImageFrame) -> Look | None:
+    def __call__(self, frame: ImageFrame) -> SeenTouch | None:
         """The mean of the steady time, or None while it is not over; `trouble` then says why."""
         self._held.complete(frame)
-        found = looks(frame)
+        found = self._read(frame)
         if len(found) != 1 or not frame.valid:
             self._recent.clear()
             self.trouble = f"{len(found)} touches at once" if len(found) > 1 else "nothing touches"
@@ -72,8 +51,8 @@ class Steady:
         while now - self._recent[0][0] > 2e9 * STEADY_S:
             self._recent.popleft()
         lately = [k for t, k in self._recent if now - t <= 1e9 * STEADY_S]
-        peaks = np.array([k.peak for k in lately])
-        scatter = float(peaks.std() / peaks.mean())
+        acts = np.array([k.acts for k in lately])
+        scatter = float(acts.std() / acts.mean())
         if scatter > STEADY:
             self.trouble = f"the touch still changes by {100 * scatter:.0f} %"
             return None
@@ -88,17 +67,19 @@ class Reader(Protocol):
     def recv(self, timeout_s: float = 0.0) -> Frame | None: ...
 
 
-def wait_for_press(reader: Reader, clock: Callable[[], float], patience_s: float = PATIENCE_S) -> Look:
+def wait_for_press(
+    reader: Reader, read: TouchReader, clock: Callable[[], float], patience_s: float = PATIENCE_S
+) -> SeenTouch:
     """The next steady press. Raises CalibrationError where none comes."""
-    steady, end = Steady(), clock() + patience_s
+    steady, end = Steady(read), clock() + patience_s
     heard = False
     while clock() < end:
         frame = reader.recv(0.5)
         if isinstance(frame, ImageFrame):
             heard = True
-            look = steady(frame)
-            if look is not None:
-                return look
+            seen = steady(frame)
+            if seen is not None:
+                return seen
     if not heard:
         raise CalibrationError(f"no image came within {patience_s:g} s: start the service with `skin up`")
     raise CalibrationError(f"no steady press within {patience_s:g} s: {steady.trouble}")
@@ -114,9 +95,9 @@ def wait_for_release(reader: Reader, clock: Callable[[], float], patience_s: flo
     raise CalibrationError(f"something still touches after {patience_s:g} s: free the skin, or tare (`skin tare`)")
 
 
-def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None]) -> Callable[[int], Look]:
-    """What the image of each row of a file of measurements shows; that function raises ValueError. Images are those
-    that the service makes after a tare: with the skin as it is mounted, found from the untouched rows.
+def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None]) -> Callable[[int], SeenTouch]:
+    """What is seen of each row of a file of measurements; that function raises ValueError. It is what the service sees
+    after a tare: with the skin as it is mounted, found from the untouched rows.
 
     Raises CalibrationError.
     """
@@ -131,20 +112,21 @@ def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None])
     skin = skin.model_copy(update={"calibration": None})
     if skin.tare.calibrate:
         bundle = mounted_bundle(data.untouched, bundle, warn)
-    pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
-    baseline = baseline_of(data.untouched, pipeline.pre.pre, warn)
+    name = skin.frame_id or "skin"
+    pipeline = Pipeline(skin, name, bundle, always_reconstruct=True, each_alone=True)
+    baseline, read = baseline_of(data.untouched, pipeline.pre.pre, warn), TouchReader(skin, bundle)
 
-    def look(row: int) -> Look:
+    def seen(row: int) -> SeenTouch:
         if not 0 <= row < len(data.measurements):
             raise ValueError(f"{path} has rows 0 to {len(data.measurements) - 1}")
         pipeline.reset()
         pipeline.pre.set_baseline(replace(baseline, z0=baseline.z0.copy()))
         image = pipeline.run(raw_frame(data.measurements[row], 0)).image
-        found = looks(replace(image, touched=True))
+        found = read(replace(image, touched=True))
         if len(found) != 1:
-            raise ValueError(f"its image shows {len(found)} touches, expected one")
-        if not math.isfinite(found[0].peak):
-            raise ValueError("its image is not finite")
+            raise ValueError(f"found {len(found)} touches in it, expected one")
+        if not math.isfinite(found[0].acts):
+            raise ValueError("what it tells is not finite")
         return found[0]
 
-    return look
+    return seen

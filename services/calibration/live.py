@@ -17,7 +17,7 @@ from protocol.frames import Frame, ImageFrame, ReferenceFrame
 from protocol.held import HeldImage
 from protocol.sockets import AllReader
 from services.calibration.force_fit import CalibrationError, Press
-from services.calibration.force_presses import PATIENCE_S, STEADY_S, Steady, looks
+from services.calibration.force_presses import PATIENCE_S, STEADY_S, Steady
 from services.calibration.reference import (
     AROUND_S,
     GUARD_S,
@@ -28,8 +28,8 @@ from services.calibration.reference import (
     PressCourse,
     ReferenceForce,
 )
+from services.calibration.seen import SeenTouch, TouchReader
 from services.contacts.calibration_file import Calibration
-from services.contacts.force import Look
 
 FREE_S = GUARD_S + ZERO_S + AROUND_S  # how long the skin is free before a press
 COURSE = 4096  # images of one press that are kept
@@ -44,8 +44,11 @@ Tell = Callable[[str], None]
 class LivePresses:
     """The presses that are made from now on. tell: takes a line for who presses."""
 
-    def __init__(self, skin: str, tell: Tell, tip_m: float | None = None, patience_s: float = PATIENCE_S) -> None:
+    def __init__(
+        self, skin: str, read: TouchReader, tell: Tell, tip_m: float | None = None, patience_s: float = PATIENCE_S
+    ) -> None:
         self.reference = ReferenceForce(skin)
+        self._read = read
         self._skin, self._tell_all, self._tip, self._patience_s = skin, tell, tip_m, patience_s
         self._reader = AllReader(["image", "reference"], skin)
         self._ages = Ages()
@@ -63,12 +66,12 @@ class LivePresses:
         while True:
             self._free()
             try:
-                force, look = self._press()
+                force, seen = self._press()
             except Doubtful as why:
                 self._tell(f"{why}; this press does not count", again=True)
                 continue
             count += 1
-            yield Press(force, look, f"press {count}", self._tip)
+            yield Press(force, seen, f"press {count}", self._tip)
 
     def close(self) -> None:
         self._reader.close()
@@ -96,17 +99,17 @@ class LivePresses:
                 self._tell("press one place and hold still", again=True)
                 return
 
-    def _press(self) -> tuple[float, Look]:
+    def _press(self) -> tuple[float, SeenTouch]:
         """The next press. Raises Doubtful where it does not count."""
         began = self._until(True, "no press came")
-        look, steady = self._steady()
+        seen, steady = self._steady()
         self._tell("release", again=True)
         ended = self._until(False, "something still touches: free the skin, or tare (`skin tare`)")
         for _, now in self._frames("the images ended"):
             if now - ended > SETTLE_S + STEADY_S / 10:
                 break
         times, shown = np.array(self._course).T
-        return self.reference.force(PressCourse(times, shown, began, steady, ended)), look
+        return self.reference.force(PressCourse(times, shown, began, steady, ended)), seen
 
     def _until(self, touched: bool, why: str) -> float:
         """When something touched first, or nothing any more. Raises Doubtful where the reference ends meanwhile."""
@@ -117,20 +120,20 @@ class LivePresses:
                 return self._when(frame, now)
         raise AssertionError("frames end by an exception")
 
-    def _steady(self) -> tuple[Look, tuple[float, float]]:
+    def _steady(self) -> tuple[SeenTouch, tuple[float, float]]:
         """What a press shows once it is steady, and from when to when that was. Raises Doubtful."""
-        steady = Steady()
+        steady = Steady(self._read)
         self._held_up = "too short"
         for frame, now in self._frames("no steady press"):
             if trouble := self._trouble(now):
                 raise Doubtful(trouble)
-            look = steady(frame)
+            seen = steady(frame)
             if not frame.touched:
                 raise Doubtful(f"released before it was steady ({self._held_up}): hold still until told")
             self._held_up = steady.trouble
-            if look is not None:
+            if seen is not None:
                 end = self._when(frame, now)
-                return look, (end - STEADY_S, end)
+                return seen, (end - STEADY_S, end)
         raise AssertionError("frames end by an exception")
 
     # -- what comes ---------------------------------------------------------------------------------------------------
@@ -156,9 +159,9 @@ class LivePresses:
 
     def _note(self, frame: ImageFrame, now: float) -> None:
         """A point of the course: of frames that show something, or that nothing touches."""
-        found = looks(frame)
+        found = self._read(frame)
         if found or not frame.touched:
-            self._course.append((self._when(frame, now), sum(k.integral for k in found)))
+            self._course.append((self._when(frame, now), sum(touch.acts for touch in found)))
 
     def _when(self, frame: ImageFrame, arrived_s: float) -> float:
         measured = self._ages.measured_ns(frame, int(arrived_s * 1e9))
@@ -193,7 +196,7 @@ def missing(presses: Sequence[Press], found: Calibration) -> str:
     of_this = sum(p.tip_m == presses[-1].tip_m for p in presses)
     if of_this < OF_A_TIP:
         return f"{OF_A_TIP - of_this} more presses of this tip at least"
-    pressed = {(1 if p.look.x > 0 else -1, 1 if p.look.y > 0 else -1) for p in presses}
+    pressed = {(1 if p.seen.x > 0 else -1, 1 if p.seen.y > 0 else -1) for p in presses}
     if left := [name for quarter, name in QUARTERS.items() if quarter not in pressed]:
         return f"presses in the {', '.join(left)} quarter"
     scatter = found.said["error"]["scatter"]

@@ -1,10 +1,10 @@
 """Presses of known force from a CSV file, and back.
 
-A line of names, then one press a line. `force_n` [N] and either what an image showed of it
+A line of names, then one press a line. `force_n` [N] and either what was seen of it, and each one's relative sigma
 
-    force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2,noise,peak_sigma_s_per_m,whole_s_m,tip_m
+    force_n,x_m,y_m,pressure_n,peak_s_per_m,integral_s_m,pressure_relative,peak_relative,integral_relative,tip_m
 
-(from noise on, a column may be left out, a cell be empty),
+(from pressure_relative on, a column may be left out, a cell be empty),
 
 which is what `skin calibrate force --save` writes, or, with a file of measurements beside it (touched, untouched (n, k)
 or measurements, untouched, as `skin reconstruct` reads it), the row there that was measured under that force:
@@ -21,15 +21,18 @@ from pathlib import Path
 
 from models.files import FileError, read_text
 from services.calibration.force_fit import CalibrationError, Press
-from services.contacts.force import Look
+from services.calibration.seen import SeenTouch
+from services.contacts.calibration_file import Of
+from services.contacts.force import Quantity
 
-SHOWN = ("x_m", "y_m", "peak_s_per_m", "integral_s_m", "area_m2")
-MAY = ("noise", "peak_sigma_s_per_m", "whole_s_m", "tip_m")  # whole_s_m: integral with the faint rest of the image
-COLUMNS = ("force_n", *SHOWN, *MAY)
+QUANTITIES: dict[Of, str] = {"pressure": "pressure_n", "peak": "peak_s_per_m", "integral": "integral_s_m"}
+SEEN = ("x_m", "y_m", *QUANTITIES.values())
+MAY = (*(f"{of}_relative" for of in QUANTITIES), "tip_m")
+COLUMNS = ("force_n", *SEEN, *MAY)
 
 
-def read(path: Path, look_of: Callable[[int], Look] | None = None) -> list[Press]:
-    """The presses of a file. look_of: what the image of a row of the measurements shows; raises ValueError.
+def read(path: Path, seen_in: Callable[[int], SeenTouch] | None = None) -> list[Press]:
+    """The presses of a file. seen_in: what is seen in a row of the measurements; raises ValueError.
 
     Raises CalibrationError, which names line and column.
     """
@@ -40,21 +43,21 @@ def read(path: Path, look_of: Callable[[int], Look] | None = None) -> list[Press
     except csv.Error as why:
         raise CalibrationError(f"{path} is no CSV file: {why}") from None
     names = [name.strip() for name in rows[0]] if rows else []
-    wanted = ("force_n", "row") if look_of is not None else ("force_n", *SHOWN)
+    wanted = ("force_n", "row") if seen_in is not None else ("force_n", *SEEN)
     missing = [name for name in wanted if name not in names]
     if missing:
         raise CalibrationError(
             f"{path}, line 1: found columns {', '.join(names) or 'none'}; missing {', '.join(missing)}; "
-            f"expected {', '.join(wanted)}" + ("" if look_of or "row" not in names else " (or --measurements FILE.npz)")
+            f"expected {', '.join(wanted)}" + ("" if seen_in or "row" not in names else " (or --measurements FILE.npz)")
         )
     return [
-        _press(path, number, dict(zip(names, row, strict=False)), look_of)
+        _press(path, number, dict(zip(names, row, strict=False)), seen_in)
         for number, row in enumerate(rows[1:], start=2)
         if any(cell.strip() for cell in row)
     ]
 
 
-def _press(path: Path, number: int, cells: dict[str, str], look_of: Callable[[int], Look] | None) -> Press:
+def _press(path: Path, number: int, cells: dict[str, str], seen_in: Callable[[int], SeenTouch] | None) -> Press:
     where = f"{path}, line {number}"
 
     def value(name: str, least: float = -math.inf) -> float:
@@ -72,16 +75,14 @@ def _press(path: Path, number: int, cells: dict[str, str], look_of: Callable[[in
         return value(name, 0.0) if cells.get(name, "").strip() else None
 
     force, tip = value("force_n", 0.0), given("tip_m")
-    if look_of is not None:
+    if seen_in is not None:
         row = value("row", -1.0)
         try:
-            return Press(force, look_of(int(row)), where, tip)
+            return Press(force, seen_in(int(row)), where, tip)
         except ValueError as why:
             raise CalibrationError(f"{where}, column row: found {int(row)}: {why}") from None
-    x, y = value("x_m"), value("y_m")
-    peak, integral, area = (value(name, 0.0) for name in SHOWN[2:])
-    sigma, whole = given("peak_sigma_s_per_m") or 0.0, given("whole_s_m") or 0.0
-    return Press(force, Look(peak, sigma, integral, area, x, y, given("noise"), whole), where, tip)
+    found = {of: Quantity(value(name, 0.0), given(f"{of}_relative")) for of, name in QUANTITIES.items()}
+    return Press(force, SeenTouch(value("x_m"), value("y_m"), found["integral"].value, found), where, tip)
 
 
 def write(path: Path, presses: Sequence[Press]) -> None:
@@ -90,6 +91,7 @@ def write(path: Path, presses: Sequence[Press]) -> None:
         lines = csv.writer(out)
         lines.writerow(COLUMNS)
         for p in presses:
-            k = p.look
-            may = ("" if not v else f"{v:.6g}" for v in (k.noise, k.peak_sigma, k.whole, p.tip_m))
-            lines.writerow([p.force_n, *(f"{v:.6g}" for v in (k.x, k.y, k.peak, k.integral, k.area)), *may])
+            found = [p.seen.quantities[of] for of in QUANTITIES]
+            known = [p.seen.x, p.seen.y, *(q.value for q in found)]
+            may = [*(q.relative for q in found), p.tip_m]
+            lines.writerow([p.force_n, *(f"{v:.6g}" for v in known), *(f"{v:.6g}" if v else "" for v in may)])

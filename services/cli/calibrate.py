@@ -24,7 +24,9 @@ from services.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from models.bundle import Bundle
     from services.calibration.force_fit import Press
+    from services.calibration.seen import TouchReader
 
 PLAN = ((0, 0, 1), (0, 0, 3), (0, 0, 5), (1, 1, 2), (-1, 1, 4), (-1, -1, 2), (1, -1, 4))
 """Where to press (halves of the way to the edge), and about how firmly [N]; then again from the first, another tip."""
@@ -74,14 +76,15 @@ def force(
 
     By prompts: type the force, press and hold still, release; an empty line ends. With --live nothing is typed: press
     until it is enough; Ctrl-C ends before. CSV: a line of names, then a press a line:
-    force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2[,noise] as --save writes it; or, with --measurements: force_n,row
-    (from 0). With --live its presses count beside the new ones. tip_m, the radius of what pressed, may stand beside
+    force_n,x_m,y_m,pressure_n,peak_s_per_m,integral_s_m as --save writes it; or, with --measurements: force_n,row (from
+    0). With --live its presses count beside the new ones. tip_m, the radius of what pressed, may stand beside
     either: two sizes tell whether force follows pressure, peak or integral.
     """
     from models.bundle import Bundle
     from services.calibration import force_presses as calibration_presses
     from services.calibration import presses_csv as calibration_csv
     from services.calibration.force_fit import CalibrationError, fit, unknown
+    from services.calibration.seen import TouchReader
     from services.contacts import calibration_file as calibration
     from services.runtime.config import load
 
@@ -95,20 +98,20 @@ def force(
     if not live and tip:
         fail("--tip needs --live: by prompts it is asked for, in a CSV it is the column tip_m", USAGE)
     if csv is None:
-        made = [] if live else _prompted(name, bundle)
+        made = [] if live else _prompted(name, bundle, TouchReader(configured, bundle))
     elif measurements is None:
         made = calibration_csv.read(csv)
     else:
         warn = lambda text: print(f"skin: {text}", file=sys.stderr)  # noqa: E731
         made = calibration_csv.read(csv, calibration_presses.of_file(measurements, configured, bundle, warn))
     if live:
-        made += calibrate_live.pressed(name, calibration_presses.laws(configured, bundle), made, tip, presses)
+        made += calibrate_live.pressed(name, TouchReader(configured, bundle), made, tip, presses)
     out = out or Path("calibration", f"{name}-force.json")
     try:
         if save is not None:
             save.parent.mkdir(parents=True, exist_ok=True)
             calibration_csv.write(save, made)
-        found = fit(made, calibration_presses.laws(configured, bundle), most or None)
+        found = fit(made, most or None)
         out.parent.mkdir(parents=True, exist_ok=True)
         digest = calibration.save(out, found, name, configured, bundle)
     except OSError as why:
@@ -143,7 +146,7 @@ def _say(report: dict[str, Any]) -> None:
     )
 
 
-def _prompted(name: str, bundle: Any) -> list[Press]:
+def _prompted(name: str, bundle: Bundle, read: TouchReader) -> list[Press]:
     """Presses on the live service, one prompt each."""
     import time
 
@@ -175,12 +178,12 @@ def _prompted(name: str, bundle: Any) -> list[Press]:
             continue
         reader = AllReader(["image"], name)  # a new one each time: nothing of before the prompt is in it
         try:
-            look = wait_for_press(reader, time.monotonic)
+            seen = wait_for_press(reader, read, time.monotonic)
             print(
-                f"  {newton:g} N at ({look.x * 1e3:+.1f}, {look.y * 1e3:+.1f}) mm, peak {look.peak:.3f} S/m: release",
+                f"  {newton:g} N at ({seen.x * 1e3:+.1f}, {seen.y * 1e3:+.1f}) mm: release",
                 file=sys.stderr,
             )
-            presses.append(Press(newton, look, f"press {len(presses) + 1}", tip))
+            presses.append(Press(newton, seen, f"press {len(presses) + 1}", tip))
             wait_for_release(reader, time.monotonic)
         except CalibrationError as why:
             print(f"  {why}; this press does not count", file=sys.stderr)

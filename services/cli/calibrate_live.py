@@ -10,11 +10,10 @@ from services.cli.common import use_configured_sockets
 
 if TYPE_CHECKING:
     from services.calibration.force_fit import Press
-    from services.contacts.calibration_file import Of
-    from services.contacts.force import ForceLaw
+    from services.calibration.seen import TouchReader
 
 
-def pressed(name: str, laws: dict[Of, ForceLaw], before: Sequence[Press], tip: float, most: int) -> list[Press]:
+def pressed(name: str, read: TouchReader, before: Sequence[Press], tip: float, most: int) -> list[Press]:
     """The presses that are made now, until they and those of before are enough, or `most`, or Ctrl-C."""
     from services.calibration.force_fit import FEWEST, CalibrationError
     from services.calibration.live import LivePresses
@@ -22,14 +21,14 @@ def pressed(name: str, laws: dict[Of, ForceLaw], before: Sequence[Press], tip: f
     use_configured_sockets()
     _tell(f"press here and there, lightly and firmly; at most {most} presses, Ctrl-C ends before")
     found: list[Press] = []
-    presses = LivePresses(name, _tell, tip or None)
+    presses = LivePresses(name, read, _tell, tip or None)
     try:
         for press in presses:
             found.append(press)
             delay_ms = 1e3 * (presses.reference.delay_s or 0.0)
-            at = f"({press.look.x * 1e3:+.1f}, {press.look.y * 1e3:+.1f}) mm"
+            at = f"({press.seen.x * 1e3:+.1f}, {press.seen.y * 1e3:+.1f}) mm"
             _tell(f"  {len(found)}: {press.force_n:.2f} N at {at}, the reference {delay_ms:.0f} ms later")
-            if _enough([*before, *found], laws) or len(found) >= most:
+            if _enough([*before, *found]) or len(found) >= most:
                 return found
     except (CalibrationError, KeyboardInterrupt) as why:
         if len(before) + len(found) < FEWEST:
@@ -40,13 +39,13 @@ def pressed(name: str, laws: dict[Of, ForceLaw], before: Sequence[Press], tip: f
     return found
 
 
-def _enough(presses: list[Press], laws: dict[Of, ForceLaw]) -> bool:
+def _enough(presses: list[Press]) -> bool:
     """Whether they are, and what is known by now, told."""
     from services.calibration.force_fit import CalibrationError, fit
     from services.calibration.live import missing
 
     try:
-        law = fit(presses, laws)
+        law = fit(presses)
     except CalibrationError as why:
         _tell(f"  no law yet: {why}")
         return False

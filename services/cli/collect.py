@@ -58,6 +58,7 @@ def collect(
     from protocol.sockets import AllReader
     from services.calibration import collecting
     from services.calibration.force_presses import PATIENCE_S
+    from services.calibration.seen import TouchReader
     from services.runtime.config import load
 
     if target.suffix != ".npz":
@@ -73,7 +74,7 @@ def collect(
     reader = AllReader(["raw", "image"], name)
     try:
         patience_s = STUB_PATIENCE_S if stub else PATIENCE_S
-        collector = collecting.Collector(reader, time.monotonic, patience_s)
+        collector = collecting.Collector(reader, TouchReader(configured, bundle), time.monotonic, patience_s)
         presses = _on_the_stub(collector, name, bundle, stub, radius) if stub else _by_prompts(collector)
         found = list(presses)
     finally:
@@ -114,7 +115,7 @@ def _on_the_stub(collector: Collector, name: str, bundle: Bundle, n: int, radius
         try:
             before = collector.untouched()
             control("stub", "press", skin=name, **press)
-            touched, look = collector.pressed()
+            touched, seen = collector.pressed()
             failed = 0
         except CalibrationError as why:
             where = f"({x * 1e3:+.1f}, {y * 1e3:+.1f}) mm with {force:g} N"
@@ -126,8 +127,8 @@ def _on_the_stub(collector: Collector, name: str, bundle: Bundle, n: int, radius
             return
         finally:
             control("stub", "release", skin=name)
-        _say(k, x, y, force, look.x, look.y)
-        yield Collected(float(x), float(y), force, touched, before, look)
+        _say(k, x, y, force, seen.x, seen.y)
+        yield Collected(float(x), float(y), force, touched, before, seen)
 
 
 def _by_prompts(collector: Collector) -> Iterator[Collected]:
@@ -152,14 +153,14 @@ def _by_prompts(collector: Collector) -> Iterator[Collected]:
         try:
             before = collector.untouched()
             print("  press there, and hold still", file=sys.stderr)
-            touched, look = collector.pressed()
+            touched, seen = collector.pressed()
         except CalibrationError as why:
             print(f"  {why}; this press does not count", file=sys.stderr)
             continue
-        _say(count, x, y, force, look.x, look.y)
+        _say(count, x, y, force, seen.x, seen.y)
         print("  release", file=sys.stderr)
         count += 1
-        yield Collected(x, y, force, touched, before, look)
+        yield Collected(x, y, force, touched, before, seen)
 
 
 def _numbers(text: str) -> tuple[float, float, float | None] | None:

@@ -173,7 +173,7 @@ class ForceLaw:
         return pressure >= self.curve.scale * float(self.foam.pressure(patch_force.SATURATED))
 
     def quantity(self, look: Look) -> Quantity:
-        """What the curve takes, of a touch with a peak above 0."""
+        """What the curve takes, of an image's touch with a peak above 0."""
         unit = self.metres_per_unit
         edge = self.half_width - max(abs(look.x), abs(look.y)) / unit
         seen = uncertainty.ImageFeatures(
@@ -234,9 +234,10 @@ class ForceLaw:
         """Force and standard uncertainty of a touch as the estimator has it. classes: of its shape, by an image."""
         if self.curve is None or not touch.strength > 0:
             return NOTHING
-        return self._said(self._of_estimate(touch, classes), *touch.position)
+        return self._said(self.quantity_of(touch, classes), *touch.position)
 
-    def _of_estimate(self, touch: EstimatedTouch, classes: Sequence[float]) -> Quantity:
+    def quantity_of(self, touch: EstimatedTouch, classes: Sequence[float] = ()) -> Quantity:
+        """What the curve takes, of a touch that acts."""
         area = None if self.indenter_area is None else self.indenter_area * self.metres_per_unit**2
         if self.reads == "pressure":
             found = disc_force.force_of(touch, self.foam, area, classes)

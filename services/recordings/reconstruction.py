@@ -127,8 +127,8 @@ def _reconstruct(
 ) -> dict[str, NDArray[Any]]:
     if calibrate and data.untouched is not None:
         bundle = mounted_bundle(data.untouched, bundle, warn)
-    pipeline = Pipeline(skin, name=skin.frame_id or "skin", bundle=bundle, always_reconstruct=True)
-    pipeline.pre.each_alone = pipeline.inference.each_alone = pipeline.publishing.each_alone = not sequence
+    name = skin.frame_id or "skin"
+    pipeline = Pipeline(skin, name, bundle, always_reconstruct=True, each_alone=not sequence)
     out = _empty(len(data.measurements))
     rows = progress(range(len(data.measurements)))
     if data.untouched is None:

@@ -7,8 +7,8 @@ import pytest
 
 from models.bundle import Bundle
 from services.calibration.force_fit import CalibrationError
+from services.calibration.seen import SeenTouch
 from services.cli import collect
-from services.contacts.force import Look
 
 
 def test_what_cannot_be_collected(skin, tmp_path):
@@ -56,7 +56,7 @@ class Touched:
         return np.ones(120)
 
     def pressed(self):
-        return np.ones(120), Look(1.0, 0.0, 1.0, 1.0, 0.0, 0.0, None)
+        return np.ones(120), SeenTouch(0.0, 0.0, 1.0, {})
 
 
 @pytest.mark.parametrize(("busy", "kept"), [((2, 5), 4), ((3, 4, 5), 2)])

@@ -169,8 +169,8 @@ def _files(folder: Path, reference: Path) -> dict[str, str]:
     np.savez(folder / "few.npz", touched=np.tile(disc, (4, 1)), untouched=np.tile(disc, (4, 1)))
     real = reference / "hydrogel_disc16.npz"
     (folder / "forces.csv").write_text(
-        "force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2\n"
-        + "".join(f"{n},{0.004 * n},{-0.003 * n},{0.1 * n},{2.5e-5 * n},{3.1e-4}\n" for n in (1, 2, 3, 4, 5, 2.5, 3.5))
+        "force_n,x_m,y_m,pressure_n,peak_s_per_m,integral_s_m\n"
+        + "".join(f"{n},{0.004 * n},{-0.003 * n},{n},{0.1 * n},{2.5e-5 * n}\n" for n in (1, 2, 3, 4, 5, 2.5, 3.5))
     )
     return {
         "measurements": str(folder / "measurements.npz"),

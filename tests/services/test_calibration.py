@@ -13,13 +13,14 @@ import pytest
 
 from models.bundle import Bundle
 from models.pressure import FOAM
-from protocol.frames import ImageFrame
+from protocol.frames import EstimatedTouch, ImageFrame
 from services.calibration import presses_csv as calibration_csv
 from services.calibration.force_fit import CalibrationError, Press, fit, unknown
-from services.calibration.force_presses import laws, wait_for_press, wait_for_release
+from services.calibration.force_presses import wait_for_press, wait_for_release
 from services.calibration.live import missing
+from services.calibration.seen import SeenTouch, TouchReader
 from services.contacts import calibration_file as calibration
-from services.contacts.force import ForceLaw, Look
+from services.contacts.force import ForceLaw, Quantity
 from services.contacts.force_curve import Curve
 from services.describe import describe, force
 from services.runtime.config import ConfigError, Indenter, Skin
@@ -32,11 +33,18 @@ def truth(peak: float, x: float, y: float) -> float:
     return float(CONSTANT * peak**0.8 * np.exp(0.4 * (x**2 + y**2) / 0.03**2))
 
 
+def seen(peak: float, area: float, x: float = 0.0, y: float = 0.0) -> SeenTouch:
+    """A disc, by sharp readings."""
+    values = FOAM.force("circle", peak, area), peak, peak * area
+    pressure, drop, integral = (Quantity(value, 0.0) for value in values)
+    return SeenTouch(x, y, peak * area, {"pressure": pressure, "peak": drop, "integral": integral})
+
+
 def press(k: int, rng: np.random.Generator, scatter: float = 0.02) -> Press:
     peak, x, y = rng.uniform(0.05, 0.5), *rng.uniform(-0.03, 0.03, 2)
     area = rng.uniform(1e-4, 5e-4)  # of all sizes, so that the integral is no measure of force here
     force = truth(peak, x, y) * np.exp(scatter * rng.standard_normal())
-    return Press(force, Look(peak, 0.0, peak * area, area, x, y, None), f"press {k}")
+    return Press(force, seen(peak, area, x, y), f"press {k}")
 
 
 def presses(n: int, seed: int = 0, scatter: float = 0.02) -> list[Press]:
@@ -45,22 +53,22 @@ def presses(n: int, seed: int = 0, scatter: float = 0.02) -> list[Press]:
 
 
 def test_the_law_of_a_skin_is_found_and_its_error_foretold(skin: Skin, bundle: Bundle) -> None:
-    found = fit(presses(25), laws(skin, bundle))
+    found = fit(presses(25))
     assert found.reads == "peak" and found.curve.correction != "none"
     fresh = presses(300, seed=1)
-    off = [np.log(found.curve(p.look.peak, p.look.x, p.look.y) / p.force_n) for p in fresh]
+    off = [np.log(found.curve(p.seen.quantities["peak"].value, p.seen.x, p.seen.y) / p.force_n) for p in fresh]
     assert np.sqrt(np.mean(np.square(off))) < 0.05
     assert found.said["error"]["left_out_rms"] == pytest.approx(np.sqrt(np.mean(np.square(off))), rel=0.6)
 
 
 def test_few_presses_are_not_given_many_parameters(skin: Skin, bundle: Bundle) -> None:
-    found = fit(presses(6, scatter=0.1), laws(skin, bundle))
+    found = fit(presses(6, scatter=0.1))
     assert found.curve.correction in ("none", "radius")
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_more_is_always_more_force(skin: Skin, bundle: Bundle, seed: int) -> None:
-    curve = fit(presses(12, seed, scatter=0.15), laws(skin, bundle)).curve
+    curve = fit(presses(12, seed, scatter=0.15)).curve
     peaks = np.linspace(0.01, 1.5, 60)
     for x, y in ((0.0, 0.0), (0.05, -0.05), (0.5, 0.5)):
         assert (np.diff([curve(p, x, y) for p in peaks]) > 0).all()
@@ -69,12 +77,8 @@ def test_more_is_always_more_force(skin: Skin, bundle: Bundle, seed: int) -> Non
 def test_the_error_stated_is_not_that_of_the_presses_it_was_fitted_to(skin: Skin, bundle: Bundle) -> None:
     """With as many parameters as the presses allow, the fit is better than the forecast."""
     some = presses(13, seed=3, scatter=0.2)
-    found = fit(some, laws(skin, bundle))
-    q = found.reads
-    own = [
-        np.log(found.curve(getattr(p.look, q) if q == "peak" else p.look.integral, p.look.x, p.look.y) / p.force_n)
-        for p in some
-    ]
+    found = fit(some)
+    own = [np.log(found.curve(p.seen.quantities[found.reads].value, p.seen.x, p.seen.y) / p.force_n) for p in some]
     assert found.said["error"]["left_out_rms"] > np.sqrt(np.mean(np.square(own)))
 
 
@@ -82,9 +86,9 @@ def test_the_integral_is_read_where_it_tells_more(skin: Skin, bundle: Bundle) ->
     rng = np.random.default_rng(1)
     some = []
     for k in range(15):
-        peak, area = rng.uniform(0.05, 0.5), rng.uniform(1e-4, 5e-4)
-        some.append(Press(3e4 * peak * area, Look(peak, 0, peak * area, area, 0, 0, None), f"press {k}"))
-    found = fit(some, laws(skin, bundle))
+        peak, area = rng.uniform(0.3, 0.8), rng.uniform(1e-4, 5e-4)  # pressure does not rise as the drop does
+        some.append(Press(3e4 * peak * area, seen(peak, area), f"press {k}"))
+    found = fit(some)
     assert found.reads == "integral" and found.curve.exponent == 1.0 and found.curve.scale == pytest.approx(3e4)
 
 
@@ -99,34 +103,34 @@ def changed(p: Press, **more: float) -> Press:
         (lambda p: [changed(p[0], force_n=-1.0), *p[1:]], r"press 0: found a force of -1.0 N, expected one above 0"),
         (lambda p: [changed(p[0], force_n=float("nan")), *p[1:]], "press 0: found a force of nan"),
         (lambda p: [changed(q, force_n=2.0 + 0.01 * k) for k, q in enumerate(p)], "at least 1.5 times"),
-        (lambda p: [changed(q, force_n=1 / q.force_n) for q in p], "harder presses do not leave larger images"),
-        (lambda p: [replace(p[0], look=replace(p[0].look, peak=0.0)), *p[1:]], "press 0: found peak 0.0"),
+        (lambda p: [changed(q, force_n=1 / q.force_n) for q in p], "harder presses do not act more strongly"),
+        (lambda p: [replace(p[0], seen=seen(0.0, 1e-4)), *p[1:]], "press 0: found pressure 0.0, peak 0.0"),
     ],
 )
 def test_nonsense_is_refused(
     skin: Skin, bundle: Bundle, spoil: Callable[[list[Press]], list[Press]], expected: str
 ) -> None:
     with pytest.raises(CalibrationError, match=expected):
-        fit(spoil(presses(12)), laws(skin, bundle))
+        fit(spoil(presses(12)))
 
 
 def test_forces_that_have_nothing_to_do_with_the_images_are_refused(skin: Skin, bundle: Bundle) -> None:
     rng = np.random.default_rng(2)
     with pytest.raises(CalibrationError):
-        fit([changed(p, force_n=float(np.exp(rng.uniform(-1, 2.5)))) for p in presses(30)], laws(skin, bundle))
+        fit([changed(p, force_n=float(np.exp(rng.uniform(-1, 2.5)))) for p in presses(30)])
 
 
 @pytest.fixture
 def file(tmp_path: Path, skin: Skin, bundle: Bundle) -> Path:
-    calibration.save(tmp_path / "law.json", fit(presses(25), laws(skin, bundle)), "palm", skin, bundle)
+    calibration.save(tmp_path / "law.json", fit(presses(25)), "palm", skin, bundle)
     return tmp_path / "law.json"
 
 
 def test_the_file_gives_the_law_back(file: Path, skin: Skin, bundle: Bundle) -> None:
     law = ForceLaw.of(skin.model_copy(update={"calibration": file}), bundle, "palm")
-    assert law.calibrated and law.curve == fit(presses(25), laws(skin, bundle)).curve
+    assert law.calibrated and law.curve == fit(presses(25)).curve
     p = presses(1, seed=9)[0]
-    force = law.force(p.look)
+    force = law.of_touch(of_peak(p.seen.quantities["peak"].value, p.seen.x, p.seen.y))
     assert force.newton == pytest.approx(p.force_n, rel=0.12) and force.sigma is not None
     assert 0.005 < force.sigma / p.force_n < 0.1
 
@@ -134,7 +138,7 @@ def test_the_file_gives_the_law_back(file: Path, skin: Skin, bundle: Bundle) -> 
 def test_info_names_the_file(file: Path, skin: Skin, bundle: Bundle) -> None:
     configured = skin.model_copy(update={"calibration": file})
     said = describe(configured, bundle, force(configured, bundle), None)
-    digest = calibration.save(file, fit(presses(25), laws(skin, bundle)), "palm", skin, bundle)
+    digest = calibration.save(file, fit(presses(25)), "palm", skin, bundle)
     again = describe(configured, bundle, force(configured, bundle), None)
     assert len(said["calibration_hash"]) == 64 and again["calibration_hash"] == digest
     assert said["force_law"]["calibrated"] and said["force_law"]["of"] == "peak"
@@ -172,22 +176,23 @@ def test_presses_survive_the_csv(tmp_path: Path, skin: Skin, bundle: Bundle) -> 
     calibration_csv.write(tmp_path / "p.csv", some)
     back = calibration_csv.read(tmp_path / "p.csv")
     assert [p.force_n for p in back] == [p.force_n for p in some]
-    assert back[3].look.peak == pytest.approx(some[3].look.peak, rel=1e-5) and back[3].look.noise is None
+    for of, quantity in some[3].seen.quantities.items():
+        assert back[3].seen.quantities[of].value == pytest.approx(quantity.value, rel=1e-5)
 
 
-HEAD = "force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2\n"
+HEAD = "force_n,x_m,y_m,pressure_n,peak_s_per_m,integral_s_m\n"
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         ("", "line 1: found columns none; missing force_n"),
-        ("force_n,x_m\n1,2\n", "line 1: found columns force_n, x_m; missing y_m, peak_s_per_m"),
+        ("force_n,x_m\n1,2\n", "line 1: found columns force_n, x_m; missing y_m, pressure_n"),
         ("force_n,row\n1,2\n", "or --measurements FILE.npz"),
-        (HEAD + "1,0,0,0.1,1e-5,1e-4\n\ntwo,0,0,0.1,1e-5,1e-4\n", "line 4, column force_n: found 'two'"),
-        (HEAD + "1,0,0,0.1\n", "line 2, column integral_s_m: found '', expected a number above 0"),
-        (HEAD + "0,0,0,0.1,1e-5,1e-4\n", "line 2, column force_n: found '0', expected a number above 0"),
-        (HEAD + "1,0,nan,0.1,1e-5,1e-4\n", "line 2, column y_m: found 'nan'"),
+        (HEAD + "1,0,0,1,0.1,1e-5\n\ntwo,0,0,1,0.1,1e-5\n", "line 4, column force_n: found 'two'"),
+        (HEAD + "1,0,0,1,0.1\n", "line 2, column integral_s_m: found '', expected a number above 0"),
+        (HEAD + "0,0,0,1,0.1,1e-5\n", "line 2, column force_n: found '0', expected a number above 0"),
+        (HEAD + "1,0,nan,1,0.1,1e-5\n", "line 2, column y_m: found 'nan'"),
     ],
 )
 def test_errors_of_the_csv_name_line_and_column(tmp_path: Path, text: str, expected: str) -> None:
@@ -196,8 +201,29 @@ def test_errors_of_the_csv_name_line_and_column(tmp_path: Path, text: str, expec
         calibration_csv.read(tmp_path / "p.csv")
 
 
+def of_peak(peak: float, x: float, y: float) -> EstimatedTouch:
+    """A disc of 10 mm, as the measurements tell it."""
+    acts = peak / (1 - peak / 2) * math.pi * 0.01**2
+    return EstimatedTouch(
+        id=1,
+        position=[x, y],
+        sigma=[2e-4, 2e-4, 0.0],
+        radius_m=0.01,
+        radius_sigma=0.02,
+        drop=peak,
+        drop_sigma=0.02 * peak,
+        strength=acts,
+        strength_sigma=0.01 * acts,
+    )
+
+
+@pytest.fixture
+def reader(skin: Skin, bundle: Bundle) -> TouchReader:
+    return TouchReader(skin, bundle)
+
+
 class Images:
-    """A reader, and the clock that goes with it: image frames at 22 a second."""
+    """What comes, 22 image frames a second, and the clock that goes with it."""
 
     def __init__(self, peaks: Callable[[float], list[float]]) -> None:
         self.peaks, self.now = peaks, 0.0
@@ -207,30 +233,21 @@ class Images:
 
     def recv(self, timeout_s: float = 0.0) -> ImageFrame:
         self.now += 1 / 22
-        axis = -0.05 + (np.arange(96) + 0.5) * 0.1 / 96
-        image = np.zeros((96, 96), np.float32)
-        for k, peak in enumerate(self.peaks(self.now)):
-            image[np.hypot(axis[None] + 0.02 - 0.04 * k, axis[:, None]) < 0.01] = peak
-        return ImageFrame(
-            skin="palm",
-            valid=True,
-            touched=bool(image.any()),
-            image=image,
-            stamps={"sample": int(self.now * 1e9)},
-            metres_per_pixel=0.1 / 96,
-            origin=[-0.05, -0.05],
-        )
+        touches = [of_peak(peak, -0.02 + 0.04 * k, 0.0) for k, peak in enumerate(self.peaks(self.now))]
+        now_ns = int(self.now * 1e9)
+        return ImageFrame(skin="palm", valid=True, touched=bool(touches), estimates=touches, stamps={"sample": now_ns})
 
 
-def test_a_press_counts_once_it_is_steady() -> None:
+def test_a_press_counts_once_it_is_steady(reader: TouchReader) -> None:
     rng = np.random.default_rng(0)
     images = Images(lambda t: [] if t < 2 else [0.3 * min((t - 2) / 3, 1) * (1 + 0.01 * rng.standard_normal())])
-    look = wait_for_press(images, images.clock)
-    assert look.peak == pytest.approx(0.3, rel=0.03) and look.x == pytest.approx(-0.02, abs=1e-3)
+    found = wait_for_press(images, reader, images.clock)
+    assert found.quantities["peak"].value == pytest.approx(0.3, rel=0.03)
+    assert (found.x, found.y) == pytest.approx((-0.02, 0.0))
     assert 6 < images.now < 8
 
 
-def test_no_press_and_two_presses_are_told_apart() -> None:
+def test_no_press_and_two_presses_are_told_apart(reader: TouchReader) -> None:
     for peaks, expected in (
         ([], "nothing touches"),
         ([0.3, 0.2], "2 touches at once"),
@@ -238,7 +255,7 @@ def test_no_press_and_two_presses_are_told_apart() -> None:
     ):
         images = Images(lambda t, p=peaks: [0.2 + 0.15 * np.sin(3 * t)] if p is None else p)  # type: ignore[misc]
         with pytest.raises(CalibrationError, match=expected):
-            wait_for_press(images, images.clock, 10.0)
+            wait_for_press(images, reader, images.clock, 10.0)
     held = Images(lambda t: [0.3])
     with pytest.raises(CalibrationError, match="still touches"):
         wait_for_release(held, held.clock, 3.0)
@@ -247,8 +264,7 @@ def test_no_press_and_two_presses_are_told_apart() -> None:
 def of_foam(radius_mm: float, newton: float, stiffness: float, tip: bool) -> Press:
     """A press of foam `stiffness` times as stiff as the shipped, as a sharp image shows it."""
     area = math.pi * (radius_mm * 1e-3) ** 2
-    drop = FOAM.flat_drop(newton / stiffness, area)
-    shown = Look(drop, 0.03 * drop, drop * area, area, 0.0, 0.0, None)
+    shown = seen(FOAM.flat_drop(newton / stiffness, area), area)
     return Press(newton, shown, f"{newton} N", radius_mm * 1e-3 if tip else None)
 
 
@@ -256,21 +272,21 @@ def test_what_a_law_is_known_to_covers_how_much_tips_differ(skin: Skin, bundle: 
     """A law of both errs by 3 % for each of two tips that differ by 6 %, however many presses there are."""
     forces = np.linspace(0.5, 3.0, 40)
     differ = [of_foam(mm, f, of, True) for mm, of in ((7.0, 1.03), (14.0, 0.97)) for f in forces]
-    error = fit(differ, laws(skin, bundle)).said["error"]
+    error = fit(differ).said["error"]
     assert error["scatter"] < 0.01 < 0.02 < error["law"] < 0.04
-    alike = fit([of_foam(mm, f, 1.0, True) for mm in (7.0, 14.0) for f in forces], laws(skin, bundle)).said["error"]
-    one = fit([of_foam(7.0, f, 1.0, True) for f in forces], laws(skin, bundle)).said["error"]
+    alike = fit([of_foam(mm, f, 1.0, True) for mm in (7.0, 14.0) for f in forces]).said["error"]
+    one = fit([of_foam(7.0, f, 1.0, True) for f in forces]).said["error"]
     assert alike["law"] < 0.02 and one["law"] == one["scatter"]
 
 
 def test_presses_of_two_tips_choose_pressure_and_one_says_what_it_cannot_know(skin: Skin, bundle: Bundle) -> None:
     forces = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
-    two = fit([of_foam(mm, f, 1.4, True) for mm in (7.0, 14.0) for f in forces], laws(skin, bundle))
+    two = fit([of_foam(mm, f, 1.4, True) for mm in (7.0, 14.0) for f in forces])
     assert two.reads == "pressure" and two.curve.scale == pytest.approx(1.4, rel=0.08)
     assert two.said["tips_m"] == pytest.approx([0.007, 0.014]) and unknown(two, skin) == ""
-    one = fit([of_foam(10.0, f, 1.4, True) for f in forces], laws(skin, bundle))
+    one = fit([of_foam(10.0, f, 1.4, True) for f in forces])
     assert "one tip, radius 10 mm" in unknown(one, skin) and "press with two tips" in unknown(one, skin)
-    nobody = fit([of_foam(10.0, f, 1.4, False) for f in forces], laws(skin, bundle))
+    nobody = fit([of_foam(10.0, f, 1.4, False) for f in forces])
     assert "nobody said what pressed" in unknown(nobody, skin)
     assert unknown(one, skin.model_copy(update={"indenter": Indenter(radius_m=0.01)})) == ""
 
@@ -281,11 +297,11 @@ def test_a_second_tip_is_pressed_too_before_it_is_enough(skin: Skin, bundle: Bun
     def all_over(mm: float, count: int) -> list[Press]:
         made = (of_foam(mm, f, 1.0, True) for f in np.linspace(0.5, 3.0, count))
         corners = ((0.01, 0.01), (-0.01, 0.01), (-0.01, -0.01), (0.01, -0.01))
-        return [replace(p, look=replace(p.look, x=x, y=y)) for p, (x, y) in zip(made, corners * count, strict=False)]
+        return [replace(p, seen=replace(p.seen, x=x, y=y)) for p, (x, y) in zip(made, corners * count, strict=False)]
 
     first = all_over(7.0, 20)
-    assert missing(first, fit(first, laws(skin, bundle))) == ""
+    assert missing(first, fit(first)) == ""
     second = all_over(14.0, 10)
     one, every = first + second[:1], first + second
-    assert missing(one, fit(one, laws(skin, bundle))) == "9 more presses of this tip at least"
-    assert "of this tip" not in missing(every, fit(every, laws(skin, bundle)))
+    assert missing(one, fit(one)) == "9 more presses of this tip at least"
+    assert "of this tip" not in missing(every, fit(every))

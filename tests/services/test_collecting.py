@@ -16,11 +16,12 @@ from services.calibration.collecting import Collected, Collector
 from services.calibration.force_fit import CalibrationError
 from services.calibration.force_presses import of_file
 from services.calibration.presses import read_presses
-from services.contacts.force import Look
+from services.calibration.seen import SeenTouch, TouchReader
 from services.runtime.config import Skin
 from tests.services.stub_skin import StubSkin
 
 SKIN = Skin(port="stub", bundle="square16", frame_id="palm", network="none")
+READER = TouchReader(SKIN, Bundle.load("square16"))
 UNIT = 0.05  # m
 SCAN_S = 0.045
 
@@ -56,16 +57,16 @@ class Frames:
 @pytest.mark.parametrize("late", [False, True])
 def test_a_press_is_measured_against_the_scans_just_before(late: bool) -> None:
     frames = Frames(late)
-    collector = Collector(frames, frames.clock)
+    collector = Collector(frames, READER, frames.clock)
     before = collector.untouched()
     frames.shapes = (Shape("circle", 0.4, -0.2, 0.2, 0.3),)
-    touched, look = collector.pressed()
+    touched, seen = collector.pressed()
     sheet = frames.stub
     z0, z = (np.abs(sheet.analog.measure((t, t), sheet.pattern, 128, 4e4, 0.0)[0]) for t in _true(frames.shapes))
     np.testing.assert_allclose(before, z0, rtol=5e-4)  # 80 dB
     np.testing.assert_allclose(touched, z, rtol=5e-4)
     assert np.abs(touched / before - 1).max() > 0.01
-    assert (look.x, look.y) == pytest.approx((0.02, -0.01), abs=2e-3)
+    assert (seen.x, seen.y) == pytest.approx((0.02, -0.01), abs=2e-3)
 
 
 def _true(shapes: tuple[Shape, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +77,7 @@ def _true(shapes: tuple[Shape, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 def test_nobody_presses_or_something_touches_all_the_time() -> None:
     frames = Frames()
-    collector = Collector(frames, frames.clock, patience_s=5.0)
+    collector = Collector(frames, READER, frames.clock, patience_s=5.0)
     with pytest.raises(CalibrationError, match="no steady press within 5 s: nothing touches"):
         collector.pressed()
     frames.shapes = (Shape("circle", 0.4, -0.2, 0.2, 0.3),)
@@ -86,11 +87,11 @@ def test_nobody_presses_or_something_touches_all_the_time() -> None:
 
 def test_the_file_is_what_register_and_calibrate_force_read(tmp_path: Path) -> None:
     bundle = Bundle.load("square16")
-    look = Look(0.3, 0.0, 1e-4, 3e-4, 0.0, 0.0, None)
+    seen = SeenTouch(0.0, 0.0, 1e-4, {})
     rng = np.random.default_rng(0)
     z0 = np.asarray(bundle.z0)
     presses = [
-        Collected(0.001 * k, -0.002 * k, 1.0 + k, z0 * (1 + 1e-2 * rng.random(len(z0))), z0, look) for k in range(24)
+        Collected(0.001 * k, -0.002 * k, 1.0 + k, z0 * (1 + 1e-2 * rng.random(len(z0))), z0, seen) for k in range(24)
     ]
     file = tmp_path / "presses.npz"
     forces = collecting.write(file, presses, bundle.pattern)
@@ -100,10 +101,10 @@ def test_the_file_is_what_register_and_calibrate_force_read(tmp_path: Path) -> N
     np.testing.assert_allclose(found.difference, [p.touched / p.untouched - 1 for p in presses])
     assert forces == tmp_path / "presses.csv"
     rows: list[int] = []
-    read = presses_csv.read(forces, lambda row: (rows.append(row), look)[1])
+    read = presses_csv.read(forces, lambda row: (rows.append(row), seen)[1])
     assert [p.force_n for p in read] == [p.force_n for p in presses] and rows == list(range(24))
     of_file(file, SKIN, bundle, lambda text: None)  # reads measurements and reference
-    unknown = [Collected(0.0, 0.0, None, z0, z0, look)]
+    unknown = [Collected(0.0, 0.0, None, z0, z0, seen)]
     assert collecting.write(tmp_path / "unknown.npz", unknown, bundle.pattern) is None
 
 

@@ -22,7 +22,6 @@ from protocol.frames import Frame, RawFrame
 from services import mounting
 from services.calibration.force_presses import of_file
 from services.contacts import calibration_file
-from services.contacts.force import ForceLaw
 from services.contacts.force_curve import Curve
 from services.estimation.baseline import Baseline
 from services.estimation.by_bundle import skin_tables
@@ -260,7 +259,7 @@ def _raw(bench: Bench) -> RawFrame:
 
 
 @pytest.mark.slow
-def test_forces_are_calibrated_on_the_images_that_a_tare_leads_to(
+def test_forces_are_calibrated_on_what_is_seen_after_a_tare(
     sheet: MismatchedSheet, bundle: Bundle, tmp_path: Path
 ) -> None:
     press = Shape("circle", -0.5, -0.5, 0.25, 0.3)
@@ -269,14 +268,14 @@ def test_forces_are_calibrated_on_the_images_that_a_tare_leads_to(
     np.savez(tmp_path / "presses.npz", measurements=z[None], untouched=z0 * (1 + noise))
 
     def seen(**config: Any) -> tuple[float, float]:
-        """Newtons, and the peak drop of the image."""
+        """Newtons, and the integrated drop."""
         skin = Skin(port="stub", bundle=BUNDLE, frame_id="palm", **config)
-        look = of_file(tmp_path / "presses.npz", skin, bundle, lambda text: None)(0)
-        return ForceLaw.of(skin, bundle).force(look).newton, look.peak
+        found = of_file(tmp_path / "presses.npz", skin, bundle, lambda text: None)(0).quantities
+        return found["pressure"].value, found["integral"].value
 
-    newton, peak = seen()
-    assert newton == pytest.approx(press.force(0.05), rel=0.06) and peak == pytest.approx(press.drop, rel=0.06)
-    assert seen(tare=TareConfig(calibrate=False))[1] > 1.15 * press.drop
+    (newton, integral), true = seen(), press.drop * press.area * 0.05**2
+    assert newton == pytest.approx(press.force(0.05), rel=0.02) and integral == pytest.approx(true, rel=0.02)
+    assert seen(tare=TareConfig(calibrate=False))[1] > 1.03 * true
 
 
 @pytest.mark.slow

@@ -12,11 +12,14 @@ import numpy as np
 import pytest
 import zmq
 
+from models.bundle import Bundle
 from protocol.frames import ImageFrame, ReferenceFrame, pack
 from protocol.runtime import host_id
 from services.calibration.force_fit import CalibrationError
 from services.calibration.live import LivePresses
 from services.calibration.reference import MOST_GAP_S, Doubtful, PressCourse, ReferenceForce
+from services.calibration.seen import TouchReader
+from services.runtime.config import Skin
 
 BEGAN, ENDED, STEADY = 2.0, 6.0, (3.5, 5.0)
 RAMP_S, NEWTON, RATE_HZ = 0.2, 3.0, 100
@@ -122,7 +125,7 @@ def test_what_cannot_be_used_is_said_and_is_no_reading(reference: ReferenceForce
     assert "two programs publish reference/palm" in reference.trouble(now + 6)
 
 
-def test_messages_that_cannot_be_read_are_told_once_and_not_for_ever(runtime: Path) -> None:
+def test_messages_that_cannot_be_read_are_told_once_and_not_for_ever(runtime: Path, skin: Skin, bundle: Bundle) -> None:
     """Unreadable ones for a second and a half, then none: each trouble is a line, and the newest is the one told."""
     context, told = zmq.Context(), []
     images, scale = context.socket(zmq.PUB), context.socket(zmq.PUB)
@@ -138,7 +141,7 @@ def test_messages_that_cannot_be_read_are_told_once_and_not_for_ever(runtime: Pa
             if time.monotonic() - began < 1.5:
                 scale.send(b"reference/palm\0\xff\xff")
 
-    presses = LivePresses("palm", told.append, patience_s=4.0)
+    presses = LivePresses("palm", TouchReader(skin, bundle), told.append, patience_s=4.0)
     publisher = threading.Thread(target=publish)
     publisher.start()
     try:
