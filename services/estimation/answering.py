@@ -10,6 +10,7 @@ from models.measurement.tables import SkinTables
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.asked.looked_at import LookedAt
 from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, StepBudget
+from services.estimation.asked.recount import Recount
 from services.estimation.faults.gap import judged_by_itself
 from services.estimation.filter import Prediction
 from services.estimation.tared import TaredSkin
@@ -60,9 +61,9 @@ class Answering:
         if not (_strained(answer) or self._skin.touches.odd):
             return answer
         scan = self._measured.scan
-        new = max(int(scan.new.sum()), int(n.RECOUNTS * len(scan.new)))
-        own = replace(question, budget=StepBudget.of(len(scan.new), new, scan.separate), keeps=0.0)
-        found = hypotheses.recounted(own, answer)
+        budget = StepBudget.of(max(float(scan.new.mean()), float(n.RECOUNTS)), scan.separate)
+        own = replace(question, budget=budget, keeps=0.0)
+        found = Recount(hypotheses)(own, answer)
         if found is None or found.fit is None:
             return answer
         kept = self._skin.touches.recognised(found.fit, found.kept)
@@ -95,9 +96,7 @@ class Answering:
 
     def _from_nothing(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
         """Whatever touches, with the steps of a scan that stands by itself."""
-        scan = self._measured.scan
-        budget = StepBudget.of(len(scan.new), len(scan.new), separate=True)
-        return hypotheses.ask(replace(question, budget=budget, keeps=0.0), (), ())
+        return hypotheses.ask(replace(question, budget=StepBudget.of(1.0, separate=True), keeps=0.0), (), ())
 
 
 def _strained(answer: ScoredAnswer) -> bool:

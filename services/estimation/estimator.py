@@ -195,7 +195,7 @@ class Estimator:
             now.whole_us = scan.end_us
         measurable = np.isfinite(scan.values) & (scan.values > 0) & (scan.status == 0)
         live = measurable if self.skin is None else measurable & self.skin.live
-        budget = StepBudget.of(len(scan.new), int(scan.new.sum()), scan.separate)
+        budget = StepBudget.of(float(scan.new.mean()), scan.separate)
         measured = LookedAt(scan, np.log(np.where(live, scan.values, 1.0)), live, whole, budget)
         if whole:
             self.taring.offer(scan, measurable, measured.middle_s)

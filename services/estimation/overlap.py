@@ -67,7 +67,7 @@ def _place_sd(sd: Array) -> float:
     return float(np.hypot(sd[X], sd[Y])) / 2**0.5
 
 
-def gaps(states: Sequence[Array]) -> Array:
+def gaps(states: Sequence[Array] | Array) -> Array:
     """(T, T) between the edges of touches; of one with itself infinite."""
     each = np.array(states)
     radius = np.exp(each[:, LOG_RADIUS])
@@ -75,3 +75,13 @@ def gaps(states: Sequence[Array]) -> Array:
     found = away - radius[:, None] - radius
     np.fill_diagonal(found, np.inf)
     return np.asarray(found)
+
+
+def neighbours(states: Array, kept: Sequence[int], gap: float = n.NEIGHBOURS) -> tuple[int, int] | None:
+    """Two touches (T, 7), at most one of which there was before, whose edges are nearer than a gap; the new one last.
+    kept: of each the one that it was; -1: none.
+    """
+    for a, b in zip(*np.nonzero(np.triu(gaps(states) < gap)), strict=True):
+        if kept[a] < 0 or kept[b] < 0:
+            return (int(a), int(b)) if kept[b] < 0 else (int(b), int(a))
+    return None

@@ -127,10 +127,10 @@ class TouchTracks:
         """
         found = False
         for track in self.lasting:
-            oddness = float((track.shape**2 / SHAPE_SDS**2).sum())
-            again = oddness > n.ODDER * track.asked_odd or track.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1
-            if oddness > n.ODD_OUTLINE and again:
-                track.asked_odd, found = oddness, True
+            odd = oddness(track.shape)
+            again = odd > n.ODDER * track.asked_odd or track.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1
+            if odd > n.ODD_OUTLINE and again:
+                track.asked_odd, found = odd, True
         return found
 
     def correct(self, fit: FoundTouches, kept: Sequence[int]) -> None:
@@ -316,6 +316,11 @@ class TouchTracks:
         return memories
 
 
+def oddness(shape: Array) -> float:
+    """How far an outline is from a disc's, in squared standard deviations of its prior."""
+    return float((shape**2 / SHAPE_SDS**2).sum())
+
+
 def _radius(track: TrackedTouch) -> float:
     return float(np.exp(track.state[LOG_RADIUS]))
 
@@ -375,14 +380,14 @@ def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, s
         track.still += 1
     track.scans += whole
     if whole:
-        _follow_place(track, float(sd[PLACE].max()))
+        _follow_place(track)
     track.peak = max(track.peak, float(state[ACTION] - 2 * sd[ACTION]))
 
 
-def _follow_place(track: TrackedTouch, sd: float) -> None:
-    """One that stays is where all its scans say, weighed as they are sure of it. sd: of the place by the last one."""
-    (x, y), known = track.state[PLACE], np.hypot(track.stays_at[2], n.PLACE_WALK)
-    if not _stays(track, sd):
+def _follow_place(track: TrackedTouch) -> None:
+    """One that stays is where all its scans say, weighed as they are sure of it."""
+    (x, y), sd, known = track.state[PLACE], _place_sd(track), np.hypot(track.stays_at[2], n.PLACE_WALK)
+    if not _stays(track):
         track.stays_at, track.stays_for = (float(x), float(y), sd), 0
         return
     track.stays_for += 1
@@ -391,11 +396,16 @@ def _follow_place(track: TrackedTouch, sd: float) -> None:
     track.stays_at = float(then_x + share * (x - then_x)), float(then_y + share * (y - then_y)), left
 
 
-def _stays(track: TrackedTouch, sd: float) -> bool:
-    """Whether it is where it stayed, by a scan that knows its place to sd."""
+def _stays(track: TrackedTouch) -> bool:
+    """Whether the last scan has it where it stayed."""
     off = float(np.hypot(*(track.state[PLACE] - track.stays_at[:2])))
     known = np.hypot(track.stays_at[2], n.PLACE_WALK)
-    return bool(track.still >= n.STILL_SCANS and off < n.STAYS_WITHIN * np.hypot(known, sd))
+    return bool(track.still >= n.STILL_SCANS and off < n.STAYS_WITHIN * np.hypot(known, _place_sd(track)))
+
+
+def _place_sd(track: TrackedTouch) -> float:
+    """By the last scan, of the coordinate that is known worse."""
+    return float(np.sqrt(max(track.covariance[X, X], track.covariance[Y, Y], 0.0)))
 
 
 def _learn(track: TrackedTouch, fit: FoundTouches, k: int) -> None:
@@ -445,8 +455,7 @@ def estimate_of(track: TrackedTouch, sample_s: float, span_s: float, unexplained
     to_said[3, ACTION], to_said[3, LOG_RADIUS] = by_action, -2 * drop / (1 + strength / 2)
     area = float(np.pi * np.exp(2 * log_radius))
     said, place = to_said @ covariance @ to_said.T, state[PLACE]
-    known_sd = float(np.sqrt(max(track.covariance[X, X], track.covariance[Y, Y])))
-    if track.stays_for >= n.STILL_SCANS and _stays(track, known_sd):
+    if track.stays_for >= n.STILL_SCANS and _stays(track):
         place = np.array(track.stays_at[:2])  # as sure as by one scan: what all of them get wrong is not known
     to_integral = area * (to_said[3] + np.eye(STATES)[LOG_RADIUS] * 2 * drop)
     return TouchEstimate(

@@ -14,14 +14,13 @@ from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from models.measurement.course import TouchCourse
 from models.measurement.fit import FittedScan, FoundTouches, KnownWhitening, TouchFitter, Turned
 from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
 from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
 from models.measurement.tables import SkinTables
-from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, SHAPE_SDS, TouchPrior, anywhere, plain
+from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, TouchPrior, anywhere, plain
 from models.measurement.whitening import Whitening
 from services.estimation.asked.left_over import LeftOver, fresh
 from services.estimation.asked.question import (
@@ -34,9 +33,13 @@ from services.estimation.asked.question import (
     ONSETS,
     Question,
     ScoredAnswer,
+    begun_at,
+    likeliest,
+    started,
     started_from,
 )
 from services.estimation.filter import SkinFilter
+from services.estimation.overlap import neighbours
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -45,15 +48,13 @@ ON_ELECTRODE = ((0.03, 0.0), (0.03, 0.1), (0.03, -0.1))  # inside its edge and a
 SMALL_RADIUS = 0.1  # where it begins
 CAUSE_STEPS = 1  # that touches which are known need beside another cause
 WIDER = (MEMORY, DRIFT, BURST, NOISE)
-HALVED_ANGLES = np.arange(8) * np.pi / 8  # along which two discs are tried instead of one
-HALVED_APART = (0.6, 1.0, 1.4)  # how far each lies from its middle, in radii
 
 
 class Hypotheses:
     """Of one skin."""
 
     def __init__(self, tables: SkinTables, noise: NoiseModel, drift: SkinFilter) -> None:
-        self.grid, self._left = tables.grid, LeftOver(tables.grid, tables.wrong)
+        self.grid, self.response, self.left_over = tables.grid, tables.response, LeftOver(tables.grid, tables.wrong)
         self._tables, self._noise, self._drift = tables, noise, drift
         self._slopes: Array | None = None
         # Touches that nothing explains for certain must not be taken for noise.
@@ -64,7 +65,8 @@ class Hypotheses:
         """The same of a skin that is seen through a fault of the wires; slopes (K, K)."""
         seen = copy(self)
         seen._tables, seen.grid = self._tables.through(slopes), self.grid.through(slopes)
-        seen._left = LeftOver(seen.grid, seen._tables.wrong)
+        seen.response = seen._tables.response
+        seen.left_over = LeftOver(seen.grid, seen._tables.wrong)
         seen._slopes = slopes
         return seen
 
@@ -87,7 +89,7 @@ class Hypotheses:
         pulled = white.w.T @ residual
         if cause == MEMORY and not self._drift.may_remember(pulled):
             return None
-        z2 = max(self._left.best(question, pulled, white)[0], fresh(question, pulled, white))
+        z2 = max(self.left_over.best(question, pulled, white)[0], fresh(question, pulled, white))
         score = white.log_density - 0.5 * float(residual @ residual) + COSTS[cause]
         chi2 = float(residual @ residual) / max(int(question.live.sum()), 1)
         if not self._tables.predicted:
@@ -98,7 +100,7 @@ class Hypotheses:
 
     def glance(self, question: Question) -> ScoredAnswer:
         """The likeliest answer that nothing touches, without a search."""
-        return _likeliest(self._untouched(question))
+        return likeliest(self._untouched(question))
 
     def _untouched(self, question: Question) -> list[ScoredAnswer]:
         """That nothing touches, by each cause that this skin has."""
@@ -128,7 +130,7 @@ class Hypotheses:
         if nothing.left_z2 < n.FALSE_ALARM_Z2:
             return None
         found = self._from_nothing(question)
-        best = _likeliest(found) if found else nothing
+        best = likeliest(found) if found else nothing
         if best.fit is None or not best.explained or best.score < nothing.score + n.ANOTHER:
             return None
         return best if float(best.fit.states[:, ACTION].sum()) > n.START_SEEN else None
@@ -140,7 +142,7 @@ class Hypotheses:
         answers = self._of_standing(question, standing, loose) if len(standing) else self._of_none(question)
         if not _settled(question, answers):
             answers += self._of_anything(question, standing, answers)
-        best = _likeliest(answers)
+        best = likeliest(answers)
         if len(standing):
             return best
         return replace(best, over=best.score - max(answer.score for answer in answers if answer.fit is None))
@@ -150,11 +152,11 @@ class Hypotheses:
     ) -> ScoredAnswer:
         """The answer that touches stay as they are; known, turned: of a moment ago, when they did."""
         everyone = tuple(range(len(standing)))
-        return self._fitted(question, standing, everyone, n.STEPS_HELD, known=known, turned=turned)
+        return self.fitted(question, standing, everyone, n.STEPS_HELD, known=known, turned=turned)
 
     def at(self, question: Question, x: float, y: float) -> ScoredAnswer:
         """The answer that something touches there."""
-        return self._fitted(question, [anywhere(x, y, 0.0, question.span_s)], (-1,), n.STEPS_COLD)
+        return self.fitted(question, [anywhere(x, y, 0.0, question.span_s)], (-1,), n.STEPS_COLD)
 
     def on_electrode(self, question: Question, place: Array, second: Array) -> ScoredAnswer:
         """The likeliest small touch on an electrode. place (2,): its middle; second (K, n): what a touch does there
@@ -169,84 +171,11 @@ class Hypotheses:
             action = 0.0 if found is None or found.fit is None else float(found.fit.states[0, ACTION])
             more = action**2 * second
             wider = replace(question, covariance=question.covariance + more @ more.T)
-            answer = self._fitted(wider, [prior], (-1,), n.STEPS_COLD)
+            answer = self.fitted(wider, [prior], (-1,), n.STEPS_COLD)
             if found is None or answer.score > found.score:
                 found = answer
         assert found is not None
         return found
-
-    def recounted(self, question: Question, answer: ScoredAnswer) -> ScoredAnswer | None:
-        """Other touches than those of an answer, fewer or more of them, where they are likelier: None where they are
-        not. All are asked as if nothing were known: an outline that was learnt while two pressed explains both at no
-        cost. Plain discs find them, as outlines lead to wherever one touch looks like two.
-        """
-        assert answer.fit is not None
-        new = (-1,) * len(answer.fit)
-        begun = [
-            replace(_begun(state, question.span_s), since_s=prior.since_s, until_s=prior.until_s)
-            for state, prior in zip(answer.fit.states, answer.fit.priors, strict=True)
-        ]
-        same = [self._fitted(question, begun, new, n.STEPS_COLD)]
-        if answer.cause:
-            same += self._with_cause(question, begun, new, answer.cause, answer.left)
-        discs = self._fitted(question, [plain(prior) for prior in begun], new, n.STEPS_COLD)
-        found, enough = [discs, *self._one_more(question, begun, discs)], max(each.score for each in same) + n.ANOTHER
-        if (pair := _neighbours(same[0].fit, new)) is not None:
-            found.append(self._merged(question, same[0], *pair))
-        elif not any(other.explained and other.score > enough for other in found):
-            oddest = int(np.argmax(((answer.fit.shapes / SHAPE_SDS) ** 2).sum(axis=1)))
-            found += self._halved(question, begun, discs, oddest)
-        if not any(other.explained for other in found):
-            found += self._search(question, (), None)
-        others = [other for other in found if other.explained and _others(other.fit, answer.fit)]
-        if not others or _likeliest(others).score < enough:
-            return None
-        return _likeliest(others)
-
-    def _one_more(self, question: Question, begun: Sequence[TouchPrior], discs: ScoredAnswer) -> list[ScoredAnswer]:
-        """A disc beside discs, and the same with outlines. begun: the touches of those discs, with theirs."""
-        z2, disc, action, since_s = self._left.best(question, discs.pulled, discs.white, discs.fit, ONSETS)
-        if z2 < n.FALSE_ALARM_Z2 or len(begun) >= n.MOST_TOUCHES:
-            return []
-        x, y = self.grid.discs[disc, PLACE]
-        more = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
-        new = (-1,) * (len(begun) + 1)
-        found = self._fitted(question, [*started_from(discs.fit), plain(more)], new, 2 * n.STEPS_COLD)
-        return [found, self._fitted(question, _started([*begun, more], found.fit), new, n.STEPS_COLD)]
-
-    def _halved(
-        self, question: Question, begun: Sequence[TouchPrior], discs: ScoredAnswer, one: int
-    ) -> list[ScoredAnswer]:
-        """Two discs instead of one, and the same with outlines: a disc beside one that lies between two leads to
-        neither. begun: the touches of those discs, with their outlines.
-        """
-        fit, span_s = discs.fit, question.span_s
-        if fit is None or len(fit) >= n.MOST_TOUCHES:
-            return []
-        white, response = question.white, self._tables.response
-        others = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) for k, s in enumerate(fit.states) if k != one]
-        target = white(np.where(question.live, np.expm1(question.y) - sum(others), 0.0))
-        (x, y), radius = fit.states[one, PLACE], float(np.exp(fit.states[one, LOG_RADIUS]))
-        small = float(fit.states[one, LOG_RADIUS]) - 0.5 * np.log(2.0)
-        best, least = None, np.inf
-        for angle in HALVED_ANGLES:
-            for apart in HALVED_APART:
-                way = apart * radius * np.array([np.cos(angle), np.sin(angle)])
-                halves = [(x + side * way[0], y + side * way[1]) for side in (-1, 1)]
-                both = np.stack([response(*place, small) for place in halves], axis=1)
-                columns = white(np.where(question.live[:, None], both, 0.0))
-                actions, left = nnls(columns, target)
-                if left < least and actions.min() > 0:
-                    best, least = [anywhere(*place, a, span_s) for place, a in zip(halves, actions, strict=True)], left
-        if best is None:
-            return []
-        rest = [k for k in range(len(fit)) if k != one]
-        kept = [prior for k, prior in enumerate(started_from(fit)) if k != one]
-        new = (-1,) * (len(fit) + 1)
-        found = self._fitted(question, [*kept, *(plain(half) for half in best)], new, 2 * n.STEPS_COLD)
-        outlined = [*(begun[k] for k in rest), *best]
-        made = [found, self._fitted(question, _started(outlined, found.fit), new, n.STEPS_COLD)]
-        return [other for other in made if other.fit is not None and not _overlap(other.fit.states)]
 
     def without(self, question: Question, standing: Sequence[TouchPrior], place: int) -> ScoredAnswer:
         """The answer that one of the touches is none: there is nothing, or it is drift, or what foam remembers."""
@@ -257,10 +186,10 @@ class Hypotheses:
             if not kept:
                 answers += [nothing] if (nothing := self.untouched(question, cause)) is not None else []
             elif cause:
-                answers += self._with_cause(question, priors, kept, cause, question.y, n.STEPS_WARM)
+                answers += self.with_cause(question, priors, kept, cause, question.y, n.STEPS_WARM)
             else:
-                answers.append(self._fitted(question, priors, kept, n.STEPS_WARM))
-        return _likeliest(answers)
+                answers.append(self.fitted(question, priors, kept, n.STEPS_WARM))
+        return likeliest(answers)
 
     def _nothing(self, question: Question, cause: str) -> ScoredAnswer:
         """As `untouched`, of a cause that this skin has."""
@@ -275,15 +204,15 @@ class Hypotheses:
         """Touches where none were: first those that the scan before left open, as a search has no steps for all."""
         found = list[ScoredAnswer]()
         if len(question.candidates):
-            begun = [_begun(state, question.span_s) for state in question.candidates]
-            found.append(self._fitted(question, begun, (-1,) * len(begun), n.STEPS_COLD))
-        return found if _settled(question, found) else [*found, *self._search(question, (), None)]
+            begun = [begun_at(state, question.span_s) for state in question.candidates]
+            found.append(self.fitted(question, begun, (-1,) * len(begun), n.STEPS_COLD))
+        return found if _settled(question, found) else [*found, *self.search(question, (), None)]
 
     def _of_standing(
         self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]
     ) -> list[ScoredAnswer]:
         everyone = tuple(range(len(standing)))
-        answers = [self._fitted(question, standing, everyone, n.STEPS_WARM)]
+        answers = [self.fitted(question, standing, everyone, n.STEPS_WARM)]
         if _settled(question, answers):
             return answers
         if (nothing := self.untouched(question)) is not None:  # costs no step
@@ -291,22 +220,22 @@ class Hypotheses:
             if _settled(question, answers):
                 return answers
         if (begun := self._begun_otherwise(question, standing)) is not None:
-            answers.append(self._fitted(question, begun, everyone, n.STEPS_COLD))
+            answers.append(self.fitted(question, begun, everyone, n.STEPS_COLD))
             if _settled(question, answers):
                 return answers
         if (released := self._released(question, standing, answers[0])) is not None:
             answers.append(released)
             if _settled(question, answers):
                 return answers
-        answers.append(self._fitted(question, loose, everyone, n.STEPS_COLD))
+        answers.append(self.fitted(question, loose, everyone, n.STEPS_COLD))
         if _settled(question, answers):
             return answers
-        expected = self._fitted(question, standing, everyone, 0)
+        expected = self.fitted(question, standing, everyone, 0)
         causes = CAUSE_STEPS * len(self._wider) * len(loose)  # a search must not spend theirs
-        answers += self._search(replace(question, keeps=question.keeps + causes), everyone, expected.fit)
-        best = _likeliest(answers)
+        answers += self.search(replace(question, keeps=question.keeps + causes), everyone, expected.fit)
+        best = likeliest(answers)
         for cause in self._affordable(question):
-            answers += self._with_cause(question, loose, everyone, cause, best.left)
+            answers += self.with_cause(question, loose, everyone, cause, best.left)
         return answers
 
     def _of_anything(
@@ -319,19 +248,19 @@ class Hypotheses:
         touched = [answer for answer in [*before, *found] if answer.fit is not None]
         if not touched:
             return found
-        best = _likeliest(touched)
+        best = likeliest(touched)
         assert best.fit is not None
         again = started_from(best.fit)
         for cause in self._affordable(question):
-            found += self._with_cause(question, again, best.kept, cause, best.left)
-        found.append(self._fitted(question, again, best.kept, n.STEPS_COLD, wide=True))
+            found += self.with_cause(question, again, best.kept, cause, best.left)
+        found.append(self.fitted(question, again, best.kept, n.STEPS_COLD, wide=True))
         return found
 
     def _affordable(self, question: Question) -> Iterator[str]:
         """The wider causes, as long as there are steps for them."""
         return takewhile(lambda _: not question.spent, self._wider)
 
-    def _with_cause(
+    def with_cause(
         self,
         question: Question,
         priors: Sequence[TouchPrior],
@@ -345,7 +274,7 @@ class Hypotheses:
         if more is None:
             return []
         wider = replace(question, covariance=question.covariance + more)
-        answer = self._fitted(wider, priors, kept, most_steps, cause)
+        answer = self.fitted(wider, priors, kept, most_steps, cause)
         return [] if cause == MEMORY and not self._drift.may_remember(answer.pulled) else [answer]
 
     def _more(self, question: Question, cause: str, left: Array) -> Array | None:
@@ -372,7 +301,7 @@ class Hypotheses:
 
     # --- fits ---
 
-    def _fitted(
+    def fitted(
         self,
         question: Question,
         priors: Sequence[TouchPrior],
@@ -383,7 +312,7 @@ class Hypotheses:
         known: KnownWhitening | None = None,
         turned: Turned | None = None,
     ) -> ScoredAnswer:
-        course = TouchCourse(self._tables.response, question.times_s, question.span_s)
+        course = TouchCourse(self.response, question.times_s, question.span_s)
         live = int(question.live.sum())
         misfit = max(float(MISFIT_WIDE), 2 * self._tables.wrong) if wide else self._tables.wrong
         covariance = question.covariance if self._tables.map is None else question.covariance + self._tables.map.error
@@ -391,12 +320,12 @@ class Hypotheses:
         may = max(0.0, question.budget.left - question.keeps) / len(priors)
         fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(may)))
         question.budget.left -= (fit.steps + 1) * len(fit)
-        z2 = self._left.best(question, fit.pulled, fit.white, fit)[0]
+        z2 = self.left_over.best(question, fit.pulled, fit.white, fit)[0]
         cost = n.COST_WIDE if wide else COSTS[cause]
         score = fit.evidence + cost + n.COST_TOUCH * sum(place < 0 for place in kept)
         return ScoredAnswer(cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left)
 
-    def _search(self, question: Question, kept: tuple[int, ...], fit: FoundTouches | None) -> list[ScoredAnswer]:
+    def search(self, question: Question, kept: tuple[int, ...], fit: FoundTouches | None) -> list[ScoredAnswer]:
         """Further touches, one after the other: plain discs find them, their own outlines and evidence decide."""
         found = list[ScoredAnswer]()
         pulled, white = question.white.solve(question.y), question.white
@@ -404,26 +333,27 @@ class Hypotheses:
             pulled, white = fit.pulled, fit.white
         score, full = -np.inf, started_from(fit)
         while (len(fit) if fit else 0) < n.MOST_TOUCHES and not question.spent:
-            z2, disc, action, since_s = self._left.best(question, pulled, white, fit, ONSETS)
+            z2, disc, action, since_s = self.left_over.best(question, pulled, white, fit, ONSETS)
             if z2 < n.FALSE_ALARM_Z2:
                 break
             x, y = self.grid.discs[disc, PLACE]
             new = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
             full, kept = [*full, new], (*kept, -1)
-            disc_alone = self._fitted(question, [*started_from(fit), plain(new)], kept, n.STEPS_COLD)
+            disc_alone = self.fitted(question, [*started_from(fit), plain(new)], kept, n.STEPS_COLD)
             if disc_alone.score < score + n.ANOTHER:
                 break
             score, fit = disc_alone.score, disc_alone.fit
             pulled, white = disc_alone.pulled, disc_alone.white
-            outlined = self._fitted(question, _started(full, fit), kept, n.STEPS_COLD)
+            outlined = self.fitted(question, started(full, fit), kept, n.STEPS_COLD)
             found.append(outlined)
-            if (pair := _neighbours(outlined.fit, kept)) is not None:
-                found.append(self._merged(question, outlined, *pair))
+            assert outlined.fit is not None
+            if (pair := neighbours(outlined.fit.states, kept)) is not None:
+                found.append(self.merged(question, outlined, *pair))
             if disc_alone.explained:
                 break
         return found
 
-    def _merged(self, question: Question, answer: ScoredAnswer, a: int, b: int) -> ScoredAnswer:
+    def merged(self, question: Question, answer: ScoredAnswer, a: int, b: int) -> ScoredAnswer:
         """One outlined touch for two discs."""
         assert answer.fit is not None
         states = answer.fit.states
@@ -435,7 +365,7 @@ class Hypotheses:
         priors[a] = replace(one, since_s=min(priors[a].since_s, priors[b].since_s))
         del priors[b]
         kept = tuple(place for k, place in enumerate(answer.kept) if k != b)
-        return self._fitted(question, priors, kept, n.STEPS_COLD)
+        return self.fitted(question, priors, kept, n.STEPS_COLD)
 
     def _begun_otherwise(self, question: Question, standing: Sequence[TouchPrior]) -> list[TouchPrior] | None:
         """A touch that began within these values did so at another instant than the first of them told; None where
@@ -445,7 +375,7 @@ class Hypotheses:
         young = [k for k, prior in enumerate(standing) if prior.since_s > first_s and prior.until_s == np.inf]
         if not young:
             return None
-        course = TouchCourse(self._tables.response, question.times_s, question.span_s)
+        course = TouchCourse(self.response, question.times_s, question.span_s)
         priors = list(standing)
         instants = question.instants
         for k in young:
@@ -470,7 +400,7 @@ class Hypotheses:
         """One of the touches ended at once within the scan, or before it: whichever leaves least. One that has ended
         did so at another instant than the first values after it told.
         """
-        course = TouchCourse(self._tables.response, question.times_s, question.span_s)
+        course = TouchCourse(self.response, question.times_s, question.span_s)
         starts = np.stack([prior.start for prior in standing])
         each = [course.columns(starts[k : k + 1], [prior]).mean for k, prior in enumerate(standing)]
         whole = np.sum(each, axis=0)
@@ -497,56 +427,8 @@ class Hypotheses:
             del priors[k], kept[k]
         if not priors:
             return self.untouched(question)
-        return self._fitted(question, priors, tuple(kept), n.STEPS_COLD)
+        return self.fitted(question, priors, tuple(kept), n.STEPS_COLD)
 
 
 def _settled(question: Question, answers: Sequence[ScoredAnswer]) -> bool:
     return question.spent or any(answer.explained for answer in answers)
-
-
-def _likeliest(answers: Sequence[ScoredAnswer]) -> ScoredAnswer:
-    explained = [answer for answer in answers if answer.explained]
-    return max(explained or answers, key=lambda answer: answer.score)
-
-
-def _started(priors: Sequence[TouchPrior], fit: FoundTouches | None) -> list[TouchPrior]:
-    """The same priors, searched from where a fit ended."""
-    states = fit.states if fit is not None else [prior.start for prior in priors]
-    return [replace(prior, start=state.copy()) for prior, state in zip(priors, states, strict=True)]
-
-
-def _begun(state: Array, span_s: float) -> TouchPrior:
-    """A touch that may be anywhere, searched from a state."""
-    x, y = state[PLACE]
-    return replace(anywhere(float(x), float(y), float(state[ACTION]), span_s), start=state)
-
-
-def _others(fit: FoundTouches | None, than: FoundTouches) -> bool:
-    """Whether touches are others than some, or elsewhere."""
-    if fit is None or len(fit) != len(than):
-        return True
-    for state in fit.states:
-        away = np.hypot(*(than.states[:, PLACE] - state[PLACE]).T).min()
-        if away > max(n.SAME_TOUCH, float(np.exp(state[LOG_RADIUS]))):
-            return True
-    return False
-
-
-def _overlap(states: Array) -> bool:
-    """Whether any touches (T, 7) lie on each other, as parts of one do."""
-    radius = np.exp(states[:, LOG_RADIUS])
-    away = np.hypot(*(states[:, None, PLACE] - states[None, :, PLACE]).transpose(2, 0, 1))
-    return bool((away < radius[:, None] + radius)[~np.eye(len(states), dtype=bool)].any())
-
-
-def _neighbours(fit: FoundTouches | None, kept: tuple[int, ...]) -> tuple[int, int] | None:
-    """Two touches, at most one of which there was before, whose edges are near each other."""
-    if fit is None:
-        return None
-    radius = np.exp(fit.states[:, LOG_RADIUS])
-    for a in range(len(fit)):
-        for b in range(a + 1, len(fit)):
-            gap = float(np.hypot(*(fit.states[a, PLACE] - fit.states[b, PLACE]))) - radius[a] - radius[b]
-            if gap < n.NEIGHBOURS and (kept[a] < 0 or kept[b] < 0):
-                return (a, b) if kept[b] < 0 else (b, a)
-    return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.fit import FoundTouches
-from models.measurement.touch import TouchPrior
+from models.measurement.touch import ACTION, PLACE, TouchPrior, anywhere
 from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
 
@@ -33,11 +34,11 @@ class StepBudget:
     left: float
 
     @classmethod
-    def of(cls, values: int, new: int, separate: bool) -> StepBudget:
-        """Of a scan of which so many values are new: the next comes the sooner, the fewer there are. separate: none
+    def of(cls, new: float, separate: bool) -> StepBudget:
+        """Of a scan of whose values this share is new: the next comes the sooner, the fewer there are. separate: none
         follows that could go on with what this one leaves open.
         """
-        steps = n.MOST_STEPS * max(float(n.LEAST_BUDGET), new / values)
+        steps = n.MOST_STEPS * max(float(n.LEAST_BUDGET), new)
         return cls(steps * n.SEPARATE if separate else steps)
 
 
@@ -112,3 +113,21 @@ def started_from(fit: FoundTouches | None) -> list[TouchPrior]:
     if fit is None:
         return []
     return [replace(prior, start=state.copy()) for prior, state in zip(fit.priors, fit.states, strict=True)]
+
+
+def started(priors: Sequence[TouchPrior], fit: FoundTouches | None) -> list[TouchPrior]:
+    """The same priors, searched from where a fit ended."""
+    states = fit.states if fit is not None else [prior.start for prior in priors]
+    return [replace(prior, start=state.copy()) for prior, state in zip(priors, states, strict=True)]
+
+
+def begun_at(state: Array, span_s: float) -> TouchPrior:
+    """A touch that may be anywhere, searched from a state (7,)."""
+    x, y = state[PLACE]
+    return replace(anywhere(float(x), float(y), float(state[ACTION]), span_s), start=state)
+
+
+def likeliest(answers: Sequence[ScoredAnswer]) -> ScoredAnswer:
+    """Of those that explain the scan, if there are any."""
+    explained = [answer for answer in answers if answer.explained]
+    return max(explained or answers, key=lambda answer: answer.score)
