@@ -43,7 +43,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 13  # of a kept state
+LAYOUT = 14  # of a kept state
 
 
 @dataclass
@@ -207,6 +207,7 @@ class Estimator:
         if self.skin is None:
             self._first()
             return self._unknown(measured, judgements)
+        self.skin.noise.lines.ordered(scan.part, measured.order)
         if not 0 <= gap_s <= n.GAP_S:
             self.skin.touches.lose()
         if gap_s < 0:
@@ -441,7 +442,8 @@ class Estimator:
             skin.drift.widen_memories()
             skin.forget_looks()
         if self._complete(skin, measured.live):
-            skin.learning.hear(pulled, measured.scan.part, cause in (BURST, NOISE))
+            odd = cause in (BURST, NOISE)
+            skin.noise.hear(pulled, measured.scan.part, odd, measured.middle_s, measured.span_s)
         if not measured.whole:
             return
         self.now.wholes += 1

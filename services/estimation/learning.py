@@ -51,10 +51,6 @@ class Learning:
         if len(self.now.waiting) > n.LAG_SCANS:
             self._take_in(self.now.waiting.pop(0))
 
-    def hear(self, pulled: Array, part: int, odd: bool) -> None:
-        """What several measurements have in common; odd: more than was known."""
-        self._noise.hear(pulled, part, odd)
-
     def _take_in(self, scan: Waiting) -> None:
         if scan.drifts:
             self._drift.widen(scan.drifts)

@@ -9,6 +9,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.lines import LineState
 from models.measurement.noise import NoiseModel, NoiseState
 from models.measurement.tables import SkinTables
 from models.measurement.whitening import leave_out
@@ -58,6 +59,7 @@ class TaredState:
     scatter: Annotated[Array, "K"]
     frames: int
     noise: NoiseState
+    lines: LineState
     drift: FilterState
     touches: TouchesState
     learning: LearningState
@@ -106,7 +108,8 @@ class TaredSkin:
     def with_tables(self, tables: SkinTables) -> TaredSkin:
         """The same baseline and all that was learnt, with other tables of the same skin."""
         made = TaredSkin(tables, self.log_z0, self.live, self.scatter, self.frames)
-        made.noise.now, made.touches.now, made.learning.now = self.noise.now, self.touches.now, self.learning.now
+        made.noise.now, made.noise.lines.now = self.noise.now, self.noise.lines.now
+        made.touches.now, made.learning.now = self.touches.now, self.learning.now
         made.faults.now, made.hypotheses.adrift = self.faults.now, self.hypotheses.adrift
         made.drift.succeed(self.drift)
         return made
@@ -132,6 +135,7 @@ class TaredSkin:
             scatter=self.scatter,
             frames=self.frames,
             noise=self.noise.now,
+            lines=self.noise.lines.now,
             drift=self.drift.now,
             touches=self.touches.now,
             learning=self.learning.now,
@@ -149,7 +153,8 @@ class TaredSkin:
             raise ValueError(
                 f"the drift's covariance: found {len(spread)} states, {spread[0]:.1g}, expected {size}, >= 0"
             )
-        self.noise.now, self.drift.now, self.touches.now = state.noise, state.drift, state.touches
+        self.noise.now, self.noise.lines.now = state.noise, state.lines
+        self.drift.now, self.touches.now = state.drift, state.touches
         self.learning.now, self.faults.now, self.refused.now = state.learning, state.faults, state.refused
         self.slow.now = state.slow
         self.hypotheses.adrift = state.adrift

@@ -178,6 +178,35 @@ def test_a_line_of_any_phase_and_pickup_is_learnt_as_what_scans_have_in_common()
     assert noise.disturbing(3).shape[1] == 0  # of scans that end otherwise nothing is known yet
 
 
+@pytest.mark.parametrize("hertz", [50.0, 123.4])
+def test_a_line_that_is_learnt_of_scans_that_end_with_one_part_is_known_of_all_others(hertz: float) -> None:
+    """The phase goes on from scan to scan: as steadily as the line does, and not where its frequency sweeps."""
+    rng = np.random.default_rng(7)
+    pickup, order = rng.standard_normal(120), np.argsort(np.argsort(TIMES_S))
+
+    def disturbed(scans: int, newer: np.ndarray, sweeps: float = 0.0) -> np.ndarray:
+        """(scans, K); newer (K,): measured a scan later."""
+        at_s = np.arange(scans)[:, None] * SPAN_S + TIMES_S + newer * SPAN_S
+        turns = (hertz + sweeps * np.sin(at_s)) * at_s + rng.random()
+        return NOISE * rng.standard_normal((scans, 120)) + 3e-4 * pickup * np.sin(2 * np.pi * turns)
+
+    noise, newer = NoiseModel(tables()), order < 36
+    noise.begin(disturbed(128, np.zeros(120)), (10,) * 128)
+    noise.lines.ordered(10, order)
+    noise.lines.ordered(3, (order - 36) % 120)
+    energy = (Whitening.of(noise.covariance(3))(disturbed(64, newer).T) ** 2).mean()
+    assert 0.8 < energy < 1.3
+    alone = noise.disturbing(10) @ noise.disturbing(10).T
+    together = noise.disturbing(3) @ noise.disturbing(3).T
+    np.testing.assert_allclose(np.diag(together), np.diag(alone), rtol=1e-6)
+    swept = NoiseModel(tables())
+    swept.begin(disturbed(128, np.zeros(120), sweeps=20.0), (10,) * 128)
+    swept.lines.ordered(10, order)
+    swept.lines.ordered(3, (order - 36) % 120)
+    energy = (Whitening.of(swept.covariance(3))(disturbed(64, newer, sweeps=20.0).T) ** 2).mean()
+    assert energy < 1.6
+
+
 def test_a_disturbance_in_blocks_is_as_strong_within_each_and_nothing_between() -> None:
     columns, order = np.ones((120, 1)), np.arange(120)
     made = in_blocks(columns, order, 3.0)

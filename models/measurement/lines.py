@@ -1,0 +1,168 @@
+"""Lines: what disturbs several measurements of a scan at once, and goes on into the next one.
+
+A line has any phase, so of a scan it is two fixed columns, whatever its frequency and however strongly each electrode
+picks it up: the strongest eigenvectors of the residuals' covariance, beyond what chance makes of white noise
+(V. Marchenko and L. Pastur, 1967). What stays from scan to scan is no line: it is a touch that comes slowly, or drift
+that nothing has taken in.
+
+They are learnt of scans that end with one part. Scans that end with another are made of two of those, one after the
+other: some measurements of the older, the rest of the newer. How a line's share of one scan follows from that of the
+scan before (`turn`: for a steady frequency a rotation) is learnt too, and tells the columns of all the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.measurement.numbers import ALTERNATES, LEARNING_LINES, LINE, LINES
+
+Array = NDArray[np.float64]
+Order = NDArray[np.intp]
+
+FIRST_LINES = (16, 32, 64)  # scans heard, at which lines are made for the first times
+LINE_SCANS = 100  # untouched scans after which they are made anew: half of those that are learnt from
+ELSEWHERE = 300  # scans heard that end with other parts, after which it is one of those that is learnt from
+FOLLOWS = 1.5  # scans: one that comes no later than that after another follows it
+
+
+@dataclass
+class LineState:
+    """All that changes."""
+
+    part: int  # scans that end with it are learnt from
+    scatter: Annotated[Array, "K", "K"]  # mean square of residuals
+    alternates: Annotated[Array, "K", "K"]  # half the mean square of their steps from one scan to the next
+    follows: Annotated[Array, "K", "K"]  # mean product of a scan's residuals with those of the scan before
+    columns: Annotated[Array, "K", "n"]
+    turn: Annotated[Array, "n", "n"]  # correlation of the columns' amplitudes with those of the scan before
+    heard: int = 0  # scans
+    followed: int = 0  # of them, that came right after another
+    elsewhere: int = 0  # scans that ended with other parts, since
+    due: bool = False  # the columns are to be made anew
+    before: Annotated[Array | None, "K"] = None  # residual of a scan that its step is to be taken from
+    before_odd: Annotated[Array | None, "K"] = None  # the same of one that was disturbed by more than was known
+    before_s: float = -np.inf
+    before_odd_s: float = -np.inf
+    orders: dict[int, Annotated[Order, "K"]] = field(default_factory=dict)  # rank in time, by the part measured last
+
+    @classmethod
+    def of(cls, measurements: int, part: int = 0) -> LineState:
+        nothing = np.zeros((measurements, measurements))
+        return cls(part, nothing, nothing.copy(), nothing.copy(), np.zeros((measurements, 0)), np.zeros((0, 0)))
+
+    def take_in(self, left: Array, odd: bool) -> None:
+        """A residual (K,)."""
+        share = max(1 / (self.heard + 1), float(LEARNING_LINES))
+        self.scatter *= 1 - share
+        self.scatter += np.outer(share * left, left)
+        self.heard += 1
+        self.due = self.due or odd or self.heard in FIRST_LINES or self.heard % LINE_SCANS == 0
+
+    def take_step(self, left: Array, odd: bool, at_s: float, span_s: float) -> bool:
+        """Residuals of two scans that were explained alike make a step: whether this one (K,) did."""
+        before, before_s = (self.before_odd, self.before_odd_s) if odd else (self.before, self.before_s)
+        if before is not None:
+            step = left - before
+            share = min(1.0, max(2 / self.heard, 2 * float(LEARNING_LINES)))
+            self.alternates *= 1 - share
+            self.alternates += np.outer(share / 2 * step, step)
+            if at_s - before_s < FOLLOWS * span_s:
+                self._follow(left, before)
+        kept = None if before is not None else left
+        if odd:
+            self.before_odd, self.before_odd_s = kept, at_s
+        else:
+            self.before, self.before_s = kept, at_s
+        return before is not None
+
+    def _follow(self, left: Array, before: Array) -> None:
+        self.followed += 1
+        share = max(1 / self.followed, 2 * float(LEARNING_LINES))
+        self.follows *= 1 - share
+        self.follows += np.outer(share * left, before)
+
+    def make(self, white: float) -> None:
+        """The columns anew; white: variance of what disturbs one measurement alone."""
+        self.due, self.before, self.before_odd = False, None, None  # with other columns residuals are others
+        k = len(self.scatter)
+        values, vectors = np.linalg.eigh(self.scatter)
+        chance = white * LINE * (1 + np.sqrt(k / min(self.heard, 1 / LEARNING_LINES))) ** 2
+        strong = values > chance
+        strong[: -int(LINES)] = False
+        columns, beyond = vectors[:, strong], values[strong] - white
+        alternates = np.einsum("kn,kl,ln->n", columns, self.alternates, columns) - white
+        self.columns = columns * np.sqrt(np.minimum(beyond, ALTERNATES * np.maximum(alternates, 0.0)))
+        scale = np.sqrt(beyond)
+        u, s, v = np.linalg.svd(columns.T @ self.follows @ columns / scale[:, None] / scale)
+        self.turn = (u * np.minimum(s, 1.0)) @ v
+
+
+class Lines:
+    """Of one skin."""
+
+    def __init__(self, measurements: int) -> None:
+        self.now = LineState.of(measurements)
+        self._made: dict[int, tuple[Array, Order, Order, Array]] = {}  # by part: of which columns and orders, and what
+
+    def ordered(self, part: int, order: Order) -> None:
+        """In which order (K,) the measurements of a scan were taken that ends with this part."""
+        known = self.now.orders.get(part)
+        if known is None or not np.array_equal(known, order):
+            self.now.orders[part] = order
+
+    def columns(self, part: int) -> Array:
+        """(K, n) of scans that end with this part; n = 0 where nothing is known of them."""
+        known = self.now.columns
+        if part == self.now.part or not known.shape[1]:
+            return known
+        own, order = self.now.orders.get(part), self.now.orders.get(self.now.part)
+        if own is None or order is None:
+            return known[:, :0]
+        made = self._made.get(part)
+        if made is None or made[0] is not known or made[1] is not own or made[2] is not order:
+            made = self._made[part] = known, own, order, self._of_two(own, order)
+        return made[3]
+
+    def _of_two(self, own: Order, order: Order) -> Array:
+        """(K, n) of scans of this order, each of which is the end of one that is learnt from and the begin of the next;
+        n = 0 where it is not: parts were lost. order: of those that are learnt from.
+        """
+        columns = self.now.columns
+        if len(set(((own - order) % len(own)).tolist())) > 1:
+            return columns[:, :0]
+        newer = (own > order)[:, None]
+        u, s, _ = np.linalg.svd(self.now.turn)
+        after = np.where(newer, columns, 0.0)
+        beyond = u * np.sqrt(np.maximum(1 - s**2, 0.0))  # what the older one does not tell of the newer
+        return np.column_stack([np.where(newer, 0.0, columns) + after @ self.now.turn, after @ beyond])
+
+    def hear(self, left: Array, part: int, odd: bool, at_s: float, span_s: float) -> bool:
+        """Take note of the residual (K,) of an untouched scan. odd: it was disturbed by more than was known. Returns
+        whether the columns are to be made anew.
+        """
+        if part != self.now.part and self.now.heard:
+            self.now.elsewhere += 1
+            if self.now.elsewhere < ELSEWHERE:
+                return False
+        if part != self.now.part:
+            orders, self.now = self.now.orders, LineState.of(len(left), part)
+            self.now.orders = orders
+        self.now.elsewhere = 0
+        self.now.take_in(left, odd)
+        return self.now.take_step(left, odd, at_s, span_s) and self.now.due
+
+    def hear_anew(self, rows: Array, part: int, white: float) -> None:
+        """The same of untouched scans (n, K) that follow each other: what was known before is forgotten."""
+        self.now.heard = self.now.followed = 0  # the first that is heard replaces all
+        for at, row in enumerate(rows):
+            self.hear(row, part, False, float(at), 1.0)
+        self.make(white)
+
+    def make(self, white: float) -> None:
+        """The columns anew; white: variance of what disturbs one measurement alone."""
+        if self.now.heard:
+            self.now.make(white)
