@@ -59,10 +59,11 @@ class Publishing(Stage):
     stamp = "publish"
     sleeps = True
 
-    def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
+    def __init__(self, name: str, skin: Skin, bundle: Bundle, law: ForceLaw | None = None) -> None:
+        """law: another one than the skin's."""
         super().__init__(name)
         self.config = skin
-        self.law = ForceLaw.of(skin, bundle, name)
+        self.law = law or ForceLaw.of(skin, bundle, name)
         by_registration = measures_force(bundle)
         self._tells_force = self.law.exists or by_registration
         self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)

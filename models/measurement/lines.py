@@ -70,7 +70,7 @@ class LineState:
             share = min(1.0, max(2 / self.heard, 2 * float(LEARNING_LINES)))
             self.alternates *= 1 - share
             self.alternates += np.outer(share / 2 * step, step)
-            if at_s - before_s < FOLLOWS * span_s:
+            if 0 < at_s - before_s < FOLLOWS * span_s:
                 self._follow(left, before)
         kept = None if before is not None else left
         if odd:
@@ -149,11 +149,16 @@ class Lines:
             if self.now.elsewhere < ELSEWHERE:
                 return False
         if part != self.now.part:
-            orders, self.now = self.now.orders, LineState.of(len(left), part)
-            self.now.orders = orders
+            self.now = self._begun(part)
         self.now.elsewhere = 0
         self.now.take_in(left, odd)
         return self.now.take_step(left, odd, at_s, span_s) and self.now.due
+
+    def _begun(self, part: int) -> LineState:
+        """To be learnt of scans that end with this part from now on; until then what is known of them holds."""
+        columns, made = self.columns(part), LineState.of(len(self.now.columns), part)
+        made.columns, made.turn, made.orders = columns, np.zeros((columns.shape[1],) * 2), self.now.orders
+        return made
 
     def hear_anew(self, rows: Array, part: int, white: float) -> None:
         """The same of untouched scans (n, K) that follow each other: what was known before is forgotten."""

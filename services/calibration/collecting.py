@@ -67,7 +67,7 @@ class Collector:
 
     def pressed(self) -> tuple[Array, SeenTouch]:
         """(K,) mean |Z| of the next steady press, and what is seen of it. Raises CalibrationError."""
-        steady, recent = Steady(self._read), deque[tuple[int, Array]]()
+        steady, recent = Steady(), deque[tuple[int, Array]]()
         for image, z in self._pairs():
             now = image.stamps.get("sample", 0)
             if not image.touched:
@@ -75,7 +75,7 @@ class Collector:
             recent.append((now, z))
             while now - recent[0][0] > 1e9 * PRESSED_S:
                 recent.popleft()
-            if (seen := steady(image)) is not None:
+            if (seen := steady(self._read(image), now)) is not None:
                 return np.asarray(np.mean([row for _, row in recent], axis=0)), seen
         raise CalibrationError(f"no steady press within {self._patience_s:g} s: {steady.trouble}")
 

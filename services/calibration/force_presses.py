@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,9 +12,8 @@ import numpy as np
 
 from models.bundle import Bundle
 from protocol.frames import Frame, ImageFrame
-from protocol.held import HeldImage
 from services.calibration.force_fit import CalibrationError
-from services.calibration.seen import SeenTouch, TouchReader, mean
+from services.calibration.seen import Seen, SeenTouch, TouchReader, mean
 from services.pipeline import Pipeline
 from services.recordings.npz_file import InputError, load_npz, read_input
 from services.recordings.reconstruction import baseline_of, mounted_bundle, raw_frame
@@ -30,23 +28,19 @@ PATIENCE_S = 60.0
 class Steady:
     """Collects frames of a press until it has been steady long enough."""
 
-    def __init__(self, read: TouchReader) -> None:
-        self._read = read
+    def __init__(self) -> None:
         self._recent: deque[tuple[int, SeenTouch]] = deque()
-        self._held = HeldImage()
         self.trouble = "nothing touches"
 
-    def __call__(self, frame: ImageFrame) -> SeenTouch | None:
-        """The mean of the steady time, or None while it is not over; `trouble` then says why."""
-        self._held.complete(frame)
-        found = self._read(frame)
-        if len(found) != 1 or not frame.valid:
+    def __call__(self, seen: Seen, now: int) -> SeenTouch | None:
+        """The mean of the steady time, or None while it is not over; `trouble` then says why. now: `sample` [ns]."""
+        found = seen.touches
+        if len(found) != 1:
             self._recent.clear()
-            self.trouble = f"{len(found)} touches at once" if len(found) > 1 else "nothing touches"
-            if found and not frame.valid:
-                self.trouble = f"the frames are not valid: {', '.join(frame.reasons)}"
+            self.trouble = f"{len(found)} touches at once" if found else "nothing touches"
+            if seen.reasons:
+                self.trouble = f"the frames are not valid: {', '.join(seen.reasons)}"
             return None
-        now = frame.stamps.get("sample", 0)
         self._recent.append((now, found[0]))
         while now - self._recent[0][0] > 2e9 * STEADY_S:
             self._recent.popleft()
@@ -71,15 +65,15 @@ def wait_for_press(
     reader: Reader, read: TouchReader, clock: Callable[[], float], patience_s: float = PATIENCE_S
 ) -> SeenTouch:
     """The next steady press. Raises CalibrationError where none comes."""
-    steady, end = Steady(read), clock() + patience_s
+    steady, end = Steady(), clock() + patience_s
     heard = False
     while clock() < end:
         frame = reader.recv(0.5)
         if isinstance(frame, ImageFrame):
             heard = True
-            seen = steady(frame)
-            if seen is not None:
-                return seen
+            pressed = steady(read(frame), frame.stamps.get("sample", 0))
+            if pressed is not None:
+                return pressed
     if not heard:
         raise CalibrationError(f"no image came within {patience_s:g} s: start the service with `skin up`")
     raise CalibrationError(f"no steady press within {patience_s:g} s: {steady.trouble}")
@@ -114,7 +108,8 @@ def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None])
         bundle = mounted_bundle(data.untouched, bundle, warn)
     name = skin.frame_id or "skin"
     pipeline = Pipeline(skin, name, bundle, always_reconstruct=True, each_alone=True)
-    baseline, read = baseline_of(data.untouched, pipeline.pre.pre, warn), TouchReader(skin, bundle)
+    baseline = baseline_of(data.untouched, pipeline.pre.pre, warn)
+    read = TouchReader(skin, bundle, each_alone=True)
 
     def seen(row: int) -> SeenTouch:
         if not 0 <= row < len(data.measurements):
@@ -122,11 +117,11 @@ def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None])
         pipeline.reset()
         pipeline.pre.set_baseline(replace(baseline, z0=baseline.z0.copy()))
         image = pipeline.run(raw_frame(data.measurements[row], 0)).image
-        found = read(replace(image, touched=True))
+        found, reasons = read(replace(image, touched=True))
+        if reasons:
+            raise ValueError(f"it is not valid: {', '.join(reasons)}")
         if len(found) != 1:
             raise ValueError(f"found {len(found)} touches in it, expected one")
-        if not math.isfinite(found[0].acts):
-            raise ValueError("what it tells is not finite")
         return found[0]
 
     return seen

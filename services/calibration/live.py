@@ -14,7 +14,6 @@ import numpy as np
 
 from protocol.ages import Ages
 from protocol.frames import Frame, ImageFrame, ReferenceFrame
-from protocol.held import HeldImage
 from protocol.sockets import AllReader
 from services.calibration.force_fit import CalibrationError, Press
 from services.calibration.force_presses import PATIENCE_S, STEADY_S, Steady
@@ -28,7 +27,7 @@ from services.calibration.reference import (
     PressCourse,
     ReferenceForce,
 )
-from services.calibration.seen import SeenTouch, TouchReader
+from services.calibration.seen import Seen, SeenTouch, TouchReader
 from services.contacts.calibration_file import Calibration
 
 FREE_S = GUARD_S + ZERO_S + AROUND_S  # how long the skin is free before a press
@@ -57,7 +56,7 @@ class LivePresses:
         self._unread = -math.inf, ""  # when such a message came last [s], and what was wrong with it
         self._course: deque[tuple[float, float]] = deque(maxlen=COURSE)
         self._images = 0
-        self._held = HeldImage()
+        self._seen = Seen([], [])  # in the newest frame
         self._held_up = ""
 
     def __iter__(self) -> Iterator[Press]:
@@ -122,12 +121,12 @@ class LivePresses:
 
     def _steady(self) -> tuple[SeenTouch, tuple[float, float]]:
         """What a press shows once it is steady, and from when to when that was. Raises Doubtful."""
-        steady = Steady(self._read)
+        steady = Steady()
         self._held_up = "too short"
         for frame, now in self._frames("no steady press"):
             if trouble := self._trouble(now):
                 raise Doubtful(trouble)
-            seen = steady(frame)
+            seen = steady(self._seen, frame.stamps.get("sample", 0))
             if not frame.touched:
                 raise Doubtful(f"released before it was steady ({self._held_up}): hold still until told")
             self._held_up = steady.trouble
@@ -148,7 +147,7 @@ class LivePresses:
                 self.reference.take(frame, arrived)
             elif isinstance(frame, ImageFrame):
                 self._images += 1
-                self._held.complete(frame)
+                self._seen = self._read(frame)
                 self._note(frame, arrived)
                 yield frame, arrived
         if not self._images:
@@ -159,9 +158,9 @@ class LivePresses:
 
     def _note(self, frame: ImageFrame, now: float) -> None:
         """A point of the course: of frames that show something, or that nothing touches."""
-        found = self._read(frame)
-        if found or not frame.touched:
-            self._course.append((self._when(frame, now), sum(touch.acts for touch in found)))
+        if self._seen.touches or not frame.touched:
+            acts = sum(touch.acts for touch in self._seen.touches)
+            self._course.append((self._when(frame, now), acts))
 
     def _when(self, frame: ImageFrame, arrived_s: float) -> float:
         measured = self._ages.measured_ns(frame, int(arrived_s * 1e9))

@@ -2,9 +2,11 @@
 
 A line of names, then one press a line. `force_n` [N] and either what was seen of it, and each one's relative sigma
 
-    force_n,x_m,y_m,pressure_n,peak_s_per_m,integral_s_m,pressure_relative,peak_relative,integral_relative,tip_m
+    force_n,x_m,y_m,pressure_n,peak_s_per_m,integral_s_m,
+    pressure_relative,peak_relative,integral_relative,tip_m,indenter_m
 
-(from pressure_relative on, a column may be left out, a cell be empty),
+(from pressure_relative on, a column may be left out, a cell be empty; indenter_m: the radius that skin.toml named as
+`indenter`, by which the quantities were read),
 
 which is what `skin calibrate force --save` writes, or, with a file of measurements beside it (touched, untouched (n, k)
 or measurements, untouched, as `skin reconstruct` reads it), the row there that was measured under that force:
@@ -27,12 +29,13 @@ from services.contacts.force import Quantity
 
 QUANTITIES: dict[Of, str] = {"pressure": "pressure_n", "peak": "peak_s_per_m", "integral": "integral_s_m"}
 SEEN = ("x_m", "y_m", *QUANTITIES.values())
-MAY = (*(f"{of}_relative" for of in QUANTITIES), "tip_m")
+MAY = (*(f"{of}_relative" for of in QUANTITIES), "tip_m", "indenter_m")
 COLUMNS = ("force_n", *SEEN, *MAY)
 
 
-def read(path: Path, seen_in: Callable[[int], SeenTouch] | None = None) -> list[Press]:
-    """The presses of a file. seen_in: what is seen in a row of the measurements; raises ValueError.
+def read(path: Path, indenter_m: float | None = None, seen_in: Callable[[int], SeenTouch] | None = None) -> list[Press]:
+    """The presses of a file. indenter_m: radius that skin.toml names. seen_in: what is seen in a row of the
+    measurements; raises ValueError.
 
     Raises CalibrationError, which names line and column.
     """
@@ -51,13 +54,19 @@ def read(path: Path, seen_in: Callable[[int], SeenTouch] | None = None) -> list[
             f"expected {', '.join(wanted)}" + ("" if seen_in or "row" not in names else " (or --measurements FILE.npz)")
         )
     return [
-        _press(path, number, dict(zip(names, row, strict=False)), seen_in)
+        _press(path, number, dict(zip(names, row, strict=False)), indenter_m, seen_in)
         for number, row in enumerate(rows[1:], start=2)
         if any(cell.strip() for cell in row)
     ]
 
 
-def _press(path: Path, number: int, cells: dict[str, str], seen_in: Callable[[int], SeenTouch] | None) -> Press:
+def _press(
+    path: Path,
+    number: int,
+    cells: dict[str, str],
+    indenter_m: float | None,
+    seen_in: Callable[[int], SeenTouch] | None,
+) -> Press:
     where = f"{path}, line {number}"
 
     def value(name: str, least: float = -math.inf) -> float:
@@ -81,17 +90,22 @@ def _press(path: Path, number: int, cells: dict[str, str], seen_in: Callable[[in
             return Press(force, seen_in(int(row)), where, tip)
         except ValueError as why:
             raise CalibrationError(f"{where}, column row: found {int(row)}: {why}") from None
+    if (known := given("indenter_m")) != indenter_m:
+        raise CalibrationError(
+            f"{where}, column indenter_m: found {known}, skin.toml names {indenter_m}: quantities were read by another "
+            "one; press again, or put that `indenter` back"
+        )
     found = {of: Quantity(value(name, 0.0), given(f"{of}_relative")) for of, name in QUANTITIES.items()}
-    return Press(force, SeenTouch(value("x_m"), value("y_m"), found["integral"].value, found), where, tip)
+    return Press(force, SeenTouch(value("x_m"), value("y_m"), found), where, tip)
 
 
-def write(path: Path, presses: Sequence[Press]) -> None:
-    """The first form of the file. Raises OSError."""
+def write(path: Path, presses: Sequence[Press], indenter_m: float | None = None) -> None:
+    """The first form of the file. indenter_m: radius that skin.toml names. Raises OSError."""
     with path.open("w", encoding="utf-8", newline="") as out:
         lines = csv.writer(out)
         lines.writerow(COLUMNS)
         for p in presses:
             found = [p.seen.quantities[of] for of in QUANTITIES]
             known = [p.seen.x, p.seen.y, *(q.value for q in found)]
-            may = [*(q.relative for q in found), p.tip_m]
+            may = [*(q.relative for q in found), p.tip_m, indenter_m]
             lines.writerow([p.force_n, *(f"{v:.6g}" for v in known), *(f"{v:.6g}" if v else "" for v in may)])

@@ -1,70 +1,88 @@
-"""What is seen of touches whose force is known: what force laws take, read as the service reads it. That is the touch
-as the measurements tell it, or of a skin whose measurements do not tell its touches, the image.
-"""
+"""What is seen of touches whose force is known: what force laws take, of contacts as the service makes them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
 from models.bundle import Bundle
-from models.measurement.tables import tells_touches
-from protocol.frames import EstimatedTouch, ImageFrame
+from protocol.frames import ContactFrame, ImageFrame
 from services.contacts.calibration_file import Of
-from services.contacts.force import ForceLaw, Look, Quantity
-from services.contacts.reading import Appearances
-from services.contacts.segmentation import segment
+from services.contacts.force import ForceLaw, Quantity
+from services.contacts.force_curve import Curve
+from services.publisher import Publishing
 from services.runtime.config import Skin
+
+KINDS: tuple[Of, ...] = get_args(Of)
 
 
 @dataclass(frozen=True)
 class SeenTouch:
-    """Of one touch, in the skin's frame."""
+    """One touch."""
 
-    x: float  # m
+    x: float  # m, on the sheet
     y: float
-    acts: float  # how strongly: m^2 of insulating sheet, or of an image its integral [S/m m^2]
     quantities: dict[Of, Quantity]  # what each kind of law takes
+
+    @property
+    def acts(self) -> float:
+        """How strongly: the integrated drop."""
+        return self.quantities["integral"].value
+
+
+class Seen(NamedTuple):
+    """What one frame tells."""
+
+    touches: list[SeenTouch]  # strongest first; none where the frame is not valid
+    reasons: list[str]  # of a frame that is not valid; else empty
 
 
 class TouchReader:
-    """Of one skin, without a calibration that it may have already."""
+    """Of one skin, without a calibration that it may have already: its publisher, once for each kind of law, each with
+    a curve that leaves the quantity as it is. Frames are read once, in their order.
+    """
 
-    def __init__(self, skin: Skin, bundle: Bundle) -> None:
-        law = ForceLaw.of(skin.model_copy(update={"calibration": None}), bundle)
-        self._laws: dict[Of, ForceLaw] = {reads: replace(law, reads=reads) for reads in get_args(Of)}
-        self._appearances = Appearances(bundle) if tells_touches(bundle) else None
+    def __init__(self, skin: Skin, bundle: Bundle, each_alone: bool = False) -> None:
+        """each_alone: frames do not follow each other."""
+        plain = skin.model_copy(update={"calibration": None})
+        law = replace(ForceLaw.of(plain, bundle), curve=Curve(1.0))
+        self._by_kind = {of: Publishing("skin", plain, bundle, replace(law, reads=of)) for of in KINDS}
+        for publishing in self._by_kind.values():
+            publishing.each_alone = each_alone
 
-    def __call__(self, frame: ImageFrame) -> list[SeenTouch]:
-        """What a frame tells of its touches, strongest first."""
-        if not frame.touched:
-            return []
-        if self._appearances is None:
-            looks = [Look.of(s, frame) for s in segment(frame.image, frame.sigma)] if frame.image.size else []
-            return [self._of_image(look) for look in looks if look.peak > 0 and look.integral > 0]
-        self._appearances.see(frame)
-        seen = [self._of_estimate(touch, self._appearances.of(touch).classes) for touch in frame.estimates]
-        return sorted(seen, key=lambda touch: -touch.acts)
+    def __call__(self, frame: ImageFrame) -> Seen:
+        made = {of: self._contacts(publishing, frame) for of, publishing in self._by_kind.items()}
+        first = made["pressure"]
+        if not first.valid:
+            return Seen([], list(first.reasons) or ["not valid"])
+        found = list[SeenTouch]()
+        for contact in first.contacts:
+            x, y = contact.on_sheet
+            same = {of: next(c for c in each.contacts if c.id == contact.id) for of, each in made.items()}
+            quantities = {of: _quantity(c.force_n, c.force_sigma_n) for of, c in same.items()}
+            if contact.state != "end":
+                found.append(SeenTouch(x, y, quantities))
+        return Seen(sorted(found, key=lambda touch: -touch.acts), [])
 
-    def _of_image(self, look: Look) -> SeenTouch:
-        found = {reads: law.quantity(look) for reads, law in self._laws.items()}
-        return SeenTouch(look.x, look.y, look.integral, found)
+    @staticmethod
+    def _contacts(publishing: Publishing, frame: ImageFrame) -> ContactFrame:
+        (made,) = publishing.process(frame, frozenset())
+        assert isinstance(made, ContactFrame)
+        return made
 
-    def _of_estimate(self, touch: EstimatedTouch, classes: Sequence[float]) -> SeenTouch:
-        found = {reads: law.quantity_of(touch, classes) for reads, law in self._laws.items()}
-        x, y = touch.position
-        return SeenTouch(x, y, touch.strength, found)
+
+def _quantity(value: float | None, sigma: float | None) -> Quantity:
+    """As a law without a curve said it."""
+    return Quantity(value or 0.0, sigma / value if value and sigma is not None else None)
 
 
 def mean(several: Sequence[SeenTouch]) -> SeenTouch:
     """Of one touch that is held still."""
-    x, y, acts = (float(v) for v in np.mean([(touch.x, touch.y, touch.acts) for touch in several], axis=0))
-    return SeenTouch(
-        x, y, acts, {of: _mean([touch.quantities[of] for touch in several]) for of in several[0].quantities}
-    )
+    x, y = (float(v) for v in np.mean([(touch.x, touch.y) for touch in several], axis=0))
+    return SeenTouch(x, y, {of: _mean([touch.quantities[of] for touch in several]) for of in KINDS})
 
 
 def _mean(several: Sequence[Quantity]) -> Quantity:

@@ -91,6 +91,7 @@ def force(
     name = skin_name(skin)
     configured = load(config_file()).skin(name)
     bundle = Bundle.load(configured.bundle)
+    indenter_m = None if configured.indenter is None else configured.indenter.radius_m
     if measurements is not None and csv is None:
         fail(
             "--measurements needs --csv FILE with columns force_n,row: which row was measured under which force", USAGE
@@ -100,17 +101,17 @@ def force(
     if csv is None:
         made = [] if live else _prompted(name, bundle, TouchReader(configured, bundle))
     elif measurements is None:
-        made = calibration_csv.read(csv)
+        made = calibration_csv.read(csv, indenter_m)
     else:
         warn = lambda text: print(f"skin: {text}", file=sys.stderr)  # noqa: E731
-        made = calibration_csv.read(csv, calibration_presses.of_file(measurements, configured, bundle, warn))
+        made = calibration_csv.read(csv, None, calibration_presses.of_file(measurements, configured, bundle, warn))
     if live:
         made += calibrate_live.pressed(name, TouchReader(configured, bundle), made, tip, presses)
     out = out or Path("calibration", f"{name}-force.json")
     try:
         if save is not None:
             save.parent.mkdir(parents=True, exist_ok=True)
-            calibration_csv.write(save, made)
+            calibration_csv.write(save, made, indenter_m)
         found = fit(made, most or None)
         out.parent.mkdir(parents=True, exist_ok=True)
         digest = calibration.save(out, found, name, configured, bundle)

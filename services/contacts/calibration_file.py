@@ -37,7 +37,7 @@ class Calibration:
     curve: Curve
     reads: Of = "peak"
     most_n: float = MOST_N
-    own_error: float = 0.0  # relative: scatter of the presses beyond what their images explain
+    own_error: float = 0.0  # relative: scatter of the presses beyond what their own uncertainties explain
     said: dict[str, Any] = field(default_factory=dict)  # where it comes from: see the module's text
 
 

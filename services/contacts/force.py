@@ -93,7 +93,9 @@ class ForceLaw:
     half_width: float = 1.0  # model units: where the image ends
     indenter_area: float | None = None  # model units squared
     maps: dict[str, Map] = field(default_factory=dict)
-    own_error: float = 0.0  # relative: what the calibration's own presses scatter by beyond what their images explain
+    own_error: float = (
+        0.0  # relative: what the calibration's own presses scatter by beyond what their own uncertainties explain
+    )
     foam: Foam = FOAM
 
     @classmethod

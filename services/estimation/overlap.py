@@ -77,11 +77,11 @@ def gaps(states: Sequence[Array] | Array) -> Array:
     return np.asarray(found)
 
 
-def neighbours(states: Array, kept: Sequence[int], gap: float = n.NEIGHBOURS) -> tuple[int, int] | None:
-    """Two touches (T, 7), at most one of which there was before, whose edges are nearer than a gap; the new one last.
+def neighbours(states: Array, kept: Sequence[int]) -> tuple[int, int] | None:
+    """Two touches (T, 7), at most one of which there was before, whose edges are near each other; the new one last.
     kept: of each the one that it was; -1: none.
     """
-    for a, b in zip(*np.nonzero(np.triu(gaps(states) < gap)), strict=True):
+    for a, b in zip(*np.nonzero(np.triu(gaps(states) < n.NEIGHBOURS)), strict=True):
         if kept[a] < 0 or kept[b] < 0:
             return (int(a), int(b)) if kept[b] < 0 else (int(b), int(a))
     return None

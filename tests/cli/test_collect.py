@@ -56,7 +56,7 @@ class Touched:
         return np.ones(120)
 
     def pressed(self):
-        return np.ones(120), SeenTouch(0.0, 0.0, 1.0, {})
+        return np.ones(120), SeenTouch(0.0, 0.0, {})
 
 
 @pytest.mark.parametrize(("busy", "kept"), [((2, 5), 4), ((3, 4, 5), 2)])

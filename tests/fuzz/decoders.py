@@ -398,7 +398,7 @@ SEEDS: dict[str, Callable[[], list[bytes]]] = {
     "manifest": _manifests,
     "law": lambda: [b'{"newtons_per_siemens": 10.0, "most_n": 5.0}', b'{"newtons_per_siemens": NaN}', b"[" * 3000],
     "presses": lambda: [
-        b"force_n,x_m,y_m,peak_s_per_m,integral_s_m,area_m2\n1,0,0,0.1,1e-6,1e-4\n",
+        b"force_n,x_m,y_m,pressure_n,peak_s_per_m,integral_s_m\n1,0,0,1,0.1,1e-6\n",
         b"force_n,row\n1,1e400\n",
     ],
 }  # fmt: skip

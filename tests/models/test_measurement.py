@@ -196,6 +196,7 @@ def test_a_line_that_is_learnt_of_scans_that_end_with_one_part_is_known_of_all_o
     noise.lines.ordered(3, (order - 36) % 120)
     energy = (Whitening.of(noise.covariance(3))(disturbed(64, newer).T) ** 2).mean()
     assert 0.8 < energy < 1.3
+    assert np.linalg.svd(noise.lines.now.turn)[1].min() > 0.9
     alone = noise.disturbing(10) @ noise.disturbing(10).T
     together = noise.disturbing(3) @ noise.disturbing(3).T
     np.testing.assert_allclose(np.diag(together), np.diag(alone), rtol=1e-6)

@@ -36,8 +36,8 @@ def truth(peak: float, x: float, y: float) -> float:
 def seen(peak: float, area: float, x: float = 0.0, y: float = 0.0) -> SeenTouch:
     """A disc, by sharp readings."""
     values = FOAM.force("circle", peak, area), peak, peak * area
-    pressure, drop, integral = (Quantity(value, 0.0) for value in values)
-    return SeenTouch(x, y, peak * area, {"pressure": pressure, "peak": drop, "integral": integral})
+    pressure, drop, integral = (Quantity(value, 0.03) for value in values)
+    return SeenTouch(x, y, {"pressure": pressure, "peak": drop, "integral": integral})
 
 
 def press(k: int, rng: np.random.Generator, scatter: float = 0.02) -> Press:
@@ -177,7 +177,15 @@ def test_presses_survive_the_csv(tmp_path: Path, skin: Skin, bundle: Bundle) -> 
     back = calibration_csv.read(tmp_path / "p.csv")
     assert [p.force_n for p in back] == [p.force_n for p in some]
     for of, quantity in some[3].seen.quantities.items():
-        assert back[3].seen.quantities[of].value == pytest.approx(quantity.value, rel=1e-5)
+        found = back[3].seen.quantities[of]
+        assert (found.value, found.relative) == pytest.approx((quantity.value, 0.03), rel=1e-5)
+
+
+def test_presses_that_were_read_by_another_indenter_are_refused(tmp_path: Path) -> None:
+    calibration_csv.write(tmp_path / "p.csv", presses(8), indenter_m=0.01)
+    assert len(calibration_csv.read(tmp_path / "p.csv", 0.01)) == 8
+    with pytest.raises(CalibrationError, match="line 2, column indenter_m: found 0.01, skin.toml names None"):
+        calibration_csv.read(tmp_path / "p.csv")
 
 
 HEAD = "force_n,x_m,y_m,pressure_n,peak_s_per_m,integral_s_m\n"

@@ -87,7 +87,7 @@ def test_nobody_presses_or_something_touches_all_the_time() -> None:
 
 def test_the_file_is_what_register_and_calibrate_force_read(tmp_path: Path) -> None:
     bundle = Bundle.load("square16")
-    seen = SeenTouch(0.0, 0.0, 1e-4, {})
+    seen = SeenTouch(0.0, 0.0, {})
     rng = np.random.default_rng(0)
     z0 = np.asarray(bundle.z0)
     presses = [
@@ -101,7 +101,7 @@ def test_the_file_is_what_register_and_calibrate_force_read(tmp_path: Path) -> N
     np.testing.assert_allclose(found.difference, [p.touched / p.untouched - 1 for p in presses])
     assert forces == tmp_path / "presses.csv"
     rows: list[int] = []
-    read = presses_csv.read(forces, lambda row: (rows.append(row), seen)[1])
+    read = presses_csv.read(forces, None, lambda row: (rows.append(row), seen)[1])
     assert [p.force_n for p in read] == [p.force_n for p in presses] and rows == list(range(24))
     of_file(file, SKIN, bundle, lambda text: None)  # reads measurements and reference
     unknown = [Collected(0.0, 0.0, None, z0, z0, seen)]
