@@ -13,7 +13,7 @@ import numpy as np
 from models.bundle import Bundle
 from protocol.frames import Frame, ImageFrame
 from services.calibration.force_fit import CalibrationError
-from services.calibration.seen import Seen, SeenTouch, TouchReader, mean
+from services.calibration.seen import SeenTouch, SeenTouches, TouchReader, mean
 from services.pipeline import Pipeline
 from services.recordings.npz_file import InputError, load_npz, read_input
 from services.recordings.reconstruction import baseline_of, mounted_bundle, raw_frame
@@ -32,7 +32,7 @@ class Steady:
         self._recent: deque[tuple[int, SeenTouch]] = deque()
         self.trouble = "nothing touches"
 
-    def __call__(self, seen: Seen, now: int) -> SeenTouch | None:
+    def __call__(self, seen: SeenTouches, now: int) -> SeenTouch | None:
         """The mean of the steady time, or None while it is not over; `trouble` then says why. now: `sample` [ns]."""
         found = seen.touches
         if len(found) != 1:

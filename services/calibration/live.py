@@ -27,7 +27,7 @@ from services.calibration.reference import (
     PressCourse,
     ReferenceForce,
 )
-from services.calibration.seen import Seen, SeenTouch, TouchReader
+from services.calibration.seen import SeenTouch, SeenTouches, TouchReader
 from services.contacts.calibration_file import Calibration
 
 FREE_S = GUARD_S + ZERO_S + AROUND_S  # how long the skin is free before a press
@@ -56,7 +56,7 @@ class LivePresses:
         self._unread = -math.inf, ""  # when such a message came last [s], and what was wrong with it
         self._course: deque[tuple[float, float]] = deque(maxlen=COURSE)
         self._images = 0
-        self._seen = Seen([], [])  # in the newest frame
+        self._seen = SeenTouches([], [])  # in the newest frame
         self._held_up = ""
 
     def __iter__(self) -> Iterator[Press]:

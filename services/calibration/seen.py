@@ -33,7 +33,7 @@ class SeenTouch:
         return self.quantities["integral"].value
 
 
-class Seen(NamedTuple):
+class SeenTouches(NamedTuple):
     """What one frame tells."""
 
     touches: list[SeenTouch]  # strongest first; none where the frame is not valid
@@ -53,11 +53,11 @@ class TouchReader:
         for publishing in self._by_kind.values():
             publishing.each_alone = each_alone
 
-    def __call__(self, frame: ImageFrame) -> Seen:
+    def __call__(self, frame: ImageFrame) -> SeenTouches:
         made = {of: self._contacts(publishing, frame) for of, publishing in self._by_kind.items()}
         first = made["pressure"]
         if not first.valid:
-            return Seen([], list(first.reasons) or ["not valid"])
+            return SeenTouches([], list(first.reasons) or ["not valid"])
         found = list[SeenTouch]()
         for contact in first.contacts:
             x, y = contact.on_sheet
@@ -65,7 +65,7 @@ class TouchReader:
             quantities = {of: _quantity(c.force_n, c.force_sigma_n) for of, c in same.items()}
             if contact.state != "end":
                 found.append(SeenTouch(x, y, quantities))
-        return Seen(sorted(found, key=lambda touch: -touch.acts), [])
+        return SeenTouches(sorted(found, key=lambda touch: -touch.acts), [])
 
     @staticmethod
     def _contacts(publishing: Publishing, frame: ImageFrame) -> ContactFrame:

@@ -42,6 +42,10 @@ class Answering:
                 anew = self._from_nothing(hypotheses, question)
                 if anew.explained:
                     return anew
+            if self._measured.whole and hypotheses.wide:
+                narrow = hypotheses.narrow(question, standing)
+                if narrow.explained:
+                    return narrow
             return hypotheses.ask(question, standing, loose)
         quiet = hypotheses.untouched(question)
         assert quiet is not None

@@ -60,6 +60,7 @@ class EstimatorState:
     informed_wire: WireFault | None = None
     candidates: Annotated[Array, "C", "states"] = field(default_factory=lambda: np.zeros((0, STATES)))
     said: tuple[TouchEstimate, ...] = ()
+    said_ns: int = 0  # `sample` for which that was
     adopted_age_s: float | None = None  # of a baseline that was adopted, before the next scan
     trusted: KnownBaseline | None = None  # too old to go on from: it tells what touches the first scans
 
@@ -474,7 +475,9 @@ class Estimator:
             lasting = [track for track in skin.touches.now.tracks if track.sure and track.acts_at(sample_s)]
             self.now.said = tuple(estimate_of(track, sample_s, measured.span_s, unexplained) for track in lasting)
         else:
-            self.now.said = tuple(roughly(touch) for touch in self.now.said)
+            passed_s = (measured.scan.sample_ns - self.now.said_ns) * 1e-9
+            self.now.said = tuple(roughly(touch, passed_s) for touch in self.now.said)
+        self.now.said_ns = measured.scan.sample_ns
         unsure = any(not track.sure for track in skin.touches.now.tracks)
         sigma = np.sqrt(np.diag(question.covariance))
         changing = float(self._tables.predicted and (unsure or not explained))

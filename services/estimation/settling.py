@@ -28,6 +28,10 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         if measured.whole and not answer.recounted:
             _doubt(skin, rest, answer, measured, strange=unexplained_s > n.CHANGING_S)
     skin.remember(memories)
+    wide = answer.fit is not None and answer.wide
+    if answer.explained and wide != skin.hypotheses.wide:
+        skin.hypotheses.wide = wide
+        skin.forget_looks()
 
 
 def _make_sure(skin: TaredSkin, answer: ScoredAnswer, separate: bool) -> None:

@@ -67,6 +67,7 @@ class TaredState:
     refused: RefusedState
     slow: SlowState
     adrift: float
+    wide: bool
 
 
 class TaredSkin:
@@ -110,7 +111,8 @@ class TaredSkin:
         made = TaredSkin(tables, self.log_z0, self.live, self.scatter, self.frames)
         made.noise.now, made.noise.lines.now = self.noise.now, self.noise.lines.now
         made.touches.now, made.learning.now = self.touches.now, self.learning.now
-        made.faults.now, made.hypotheses.adrift = self.faults.now, self.hypotheses.adrift
+        made.faults.now = self.faults.now
+        made.hypotheses.adrift, made.hypotheses.wide = self.hypotheses.adrift, self.hypotheses.wide
         made.drift.succeed(self.drift)
         return made
 
@@ -143,6 +145,7 @@ class TaredSkin:
             refused=self.refused.now,
             slow=self.slow.now,
             adrift=self.hypotheses.adrift,
+            wide=self.hypotheses.wide,
         )
 
     def load(self, state: TaredState) -> None:
@@ -157,4 +160,4 @@ class TaredSkin:
         self.drift.now, self.touches.now = state.drift, state.touches
         self.learning.now, self.faults.now, self.refused.now = state.learning, state.faults, state.refused
         self.slow.now = state.slow
-        self.hypotheses.adrift = state.adrift
+        self.hypotheses.adrift, self.hypotheses.wide = state.adrift, state.wide

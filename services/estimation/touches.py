@@ -478,9 +478,17 @@ def estimate_of(track: TrackedTouch, sample_s: float, span_s: float, unexplained
     )
 
 
-def roughly(touch: TouchEstimate) -> TouchEstimate:
-    """One that a scan changed so that nothing explains it: that it is there, where roughly, and not how strongly."""
+def roughly(touch: TouchEstimate, passed_s: float) -> TouchEstimate:
+    """One that a scan changed so that nothing explains it: that it is there, where roughly, and not how strongly.
+    passed_s: since it was said last.
+    """
     covariance = touch.covariance.copy()
     covariance[0, 0] += n.ROUGH**2
     covariance[1, 1] += n.ROUGH**2
-    return replace(touch, covariance=covariance, strength_sd=touch.strength, integral_sd=touch.integral)
+    return replace(
+        touch,
+        age_s=touch.age_s + passed_s,
+        covariance=covariance,
+        strength_sd=touch.strength,
+        integral_sd=touch.integral,
+    )

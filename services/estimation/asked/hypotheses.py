@@ -60,6 +60,7 @@ class Hypotheses:
         # Touches that nothing explains for certain must not be taken for noise.
         self._wider = WIDER if tables.predicted else (MEMORY, DRIFT, BURST)
         self.adrift = 1.0  # times the faster drift: grows while nothing explains the skin
+        self.wide = False  # the touches that stand were explained by a response that is wrong by more than it should be
 
     def through(self, slopes: Array) -> Hypotheses:
         """The same of a skin that is seen through a fault of the wires; slopes (K, K)."""
@@ -146,6 +147,13 @@ class Hypotheses:
         if len(standing):
             return best
         return replace(best, over=best.score - max(answer.score for answer in answers if answer.fit is None))
+
+    def narrow(self, question: Question, standing: Sequence[TouchPrior]) -> ScoredAnswer:
+        """The answer that touches stay as they are, by a response that is wrong by no more than it should be."""
+        wide, self.wide = self.wide, False
+        answer = self.fitted(question, standing, tuple(range(len(standing))), n.STEPS_WARM)
+        self.wide = wide
+        return answer
 
     def goes_on(
         self, question: Question, standing: Sequence[TouchPrior], known: KnownWhitening, turned: Turned
@@ -314,16 +322,17 @@ class Hypotheses:
     ) -> ScoredAnswer:
         course = TouchCourse(self.response, question.times_s, question.span_s)
         live = int(question.live.sum())
-        misfit = max(float(MISFIT_WIDE), 2 * self._tables.wrong) if wide else self._tables.wrong
+        misfit = max(float(MISFIT_WIDE), 2 * self._tables.wrong) if wide or self.wide else self._tables.wrong
         covariance = question.covariance if self._tables.map is None else question.covariance + self._tables.map.error
         scene = FittedScan(question.y, covariance, course, self._tables.misfit, live, known, turned, question.said_s)
         may = max(0.0, question.budget.left - question.keeps) / len(priors)
         fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(may)))
         question.budget.left -= (fit.steps + 1) * len(fit)
         z2 = self.left_over.best(question, fit.pulled, fit.white, fit)[0]
-        cost = n.COST_WIDE if wide else COSTS[cause]
+        cost = n.COST_WIDE if wide and not self.wide else COSTS[cause]
         score = fit.evidence + cost + n.COST_TOUCH * sum(place < 0 for place in kept)
-        return ScoredAnswer(cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left)
+        made = ScoredAnswer(cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left)
+        return replace(made, wide=wide or self.wide)
 
     def search(self, question: Question, kept: tuple[int, ...], fit: FoundTouches | None) -> list[ScoredAnswer]:
         """Further touches, one after the other: plain discs find them, their own outlines and evidence decide."""

@@ -92,6 +92,7 @@ class ScoredAnswer:
     pulled: Array  # (K,) S^-1 of the residual
     left: Array  # (K,)
     recounted: bool = False  # its touches are others than those that stood
+    wide: bool = False  # by a response that is wrong by more than it should be
     over: float = np.inf  # by how much it is likelier than that nothing touches, where nothing did before [nat]
 
     @property
