@@ -3,7 +3,7 @@
 A line of names, then one press a line. `force_n` [N] and either what was seen of it, and each one's relative sigma
 
     force_n,x_m,y_m,pressure_n,peak_s_per_m,integral_s_m,
-    pressure_relative,peak_relative,integral_relative,tip_m,indenter_m
+    pressure_relative,peak_relative,integral_relative,indenter_m,tip_m
 
 (from pressure_relative on, a column may be left out, a cell be empty; indenter_m: the radius that skin.toml named as
 `indenter`, by which the quantities were read),
@@ -29,7 +29,7 @@ from services.contacts.force import Quantity
 
 QUANTITIES: dict[Of, str] = {"pressure": "pressure_n", "peak": "peak_s_per_m", "integral": "integral_s_m"}
 SEEN = ("x_m", "y_m", *QUANTITIES.values())
-MAY = (*(f"{of}_relative" for of in QUANTITIES), "tip_m", "indenter_m")
+MAY = (*(f"{of}_relative" for of in QUANTITIES), "indenter_m", "tip_m")
 COLUMNS = ("force_n", *SEEN, *MAY)
 
 
@@ -107,5 +107,5 @@ def write(path: Path, presses: Sequence[Press], indenter_m: float | None = None)
         for p in presses:
             found = [p.seen.quantities[of] for of in QUANTITIES]
             known = [p.seen.x, p.seen.y, *(q.value for q in found)]
-            may = [*(q.relative for q in found), p.tip_m, indenter_m]
+            may = [*(q.relative for q in found), indenter_m, p.tip_m]
             lines.writerow([p.force_n, *(f"{v:.6g}" for v in known), *(f"{v:.6g}" if v else "" for v in may)])
