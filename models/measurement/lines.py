@@ -57,8 +57,7 @@ class LineState:
     def take_in(self, left: Array, odd: bool) -> None:
         """A residual (K,)."""
         share = max(1 / (self.heard + 1), float(LEARNING_LINES))
-        self.scatter *= 1 - share
-        self.scatter += np.outer(share * left, left)
+        _blend(self.scatter, share, left, left)
         self.heard += 1
         self.due = self.due or odd or self.heard in FIRST_LINES or self.heard % LINE_SCANS == 0
 
@@ -68,8 +67,7 @@ class LineState:
         if before is not None:
             step = left - before
             share = min(1.0, max(2 / self.heard, 2 * float(LEARNING_LINES)))
-            self.alternates *= 1 - share
-            self.alternates += np.outer(share / 2 * step, step)
+            _blend(self.alternates, share, step / 2, step)
             if 0 < at_s - before_s < FOLLOWS * span_s:
                 self._follow(left, before)
         kept = None if before is not None else left
@@ -82,8 +80,7 @@ class LineState:
     def _follow(self, left: Array, before: Array) -> None:
         self.followed += 1
         share = max(1 / self.followed, 2 * float(LEARNING_LINES))
-        self.follows *= 1 - share
-        self.follows += np.outer(share * left, before)
+        _blend(self.follows, share, left, before)
 
     def make(self, white: float) -> None:
         """The columns anew; white: variance of what disturbs one measurement alone."""
@@ -99,6 +96,12 @@ class LineState:
         scale = np.sqrt(beyond)
         u, s, v = np.linalg.svd(columns.T @ self.follows @ columns / scale[:, None] / scale)
         self.turn = (u * np.minimum(s, 1.0)) @ v
+
+
+def _blend(mean: Array, share: float, a: Array, b: Array) -> None:
+    """Take a product of vectors (K,) into its mean (K, K)."""
+    mean *= 1 - share
+    mean += np.outer(share * a, b)
 
 
 class Lines:
@@ -144,11 +147,10 @@ class Lines:
         """Take note of the residual (K,) of an untouched scan. odd: it was disturbed by more than was known. Returns
         whether the columns are to be made anew.
         """
-        if part != self.now.part and self.now.heard:
-            self.now.elsewhere += 1
-            if self.now.elsewhere < ELSEWHERE:
-                return False
         if part != self.now.part:
+            self.now.elsewhere += 1
+            if self.now.heard and self.now.elsewhere < ELSEWHERE:
+                return False
             self.now = self._begun(part)
         self.now.elsewhere = 0
         self.now.take_in(left, odd)
@@ -165,9 +167,4 @@ class Lines:
         self.now.heard = self.now.followed = 0  # the first that is heard replaces all
         for at, row in enumerate(rows):
             self.hear(row, part, False, float(at), 1.0)
-        self.make(white)
-
-    def make(self, white: float) -> None:
-        """The columns anew; white: variance of what disturbs one measurement alone."""
-        if self.now.heard:
-            self.now.make(white)
+        self.now.make(white)

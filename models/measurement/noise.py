@@ -108,7 +108,7 @@ class NoiseModel:
         S^-1 of its residual. odd: more than was known.
         """
         if self.lines.hear(self._left(pulled, part), part, odd, at_s, span_s):
-            self.lines.make(self.now.white)
+            self.lines.now.make(self.now.white)
 
     def _left(self, pulled: Array, part: int) -> Array:
         """(..., K) the likeliest white noise and disturbance, of S^-1 y."""

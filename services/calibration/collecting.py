@@ -33,7 +33,6 @@ class Collected:
     force_n: float | None
     touched: Array  # (K,) mean |Z|
     untouched: Array  # (K,) the same just before
-    seen: SeenTouch
 
 
 class Collector:

@@ -14,13 +14,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.errors import EitskinError
-from services.calibration.seen import SeenTouch
+from services.calibration.seen import KINDS, SeenTouch
 from services.contacts.calibration_file import Calibration, Of
 from services.contacts.force import NAMES
 from services.contacts.force_curve import TERMS, Curve, columns
@@ -177,8 +176,7 @@ def _check(presses: Sequence[Press]) -> None:
 
 
 def _table(presses: Sequence[Press]) -> Table:
-    kinds: tuple[Of, ...] = get_args(Of)
-    quantity = {of: np.log([p.seen.quantities[of].value for p in presses]) for of in kinds}
+    quantity = {of: np.log([p.seen.quantities[of].value for p in presses]) for of in KINDS}
     x, y = np.array([(p.seen.x, p.seen.y) for p in presses]).T
     reach = max(float(np.max(np.abs([x, y]))), 1e-6)
     return Table(np.log([p.force_n for p in presses]), quantity, x, y, reach)

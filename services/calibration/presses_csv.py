@@ -30,6 +30,7 @@ from services.contacts.force import Quantity
 QUANTITIES: dict[Of, str] = {"pressure": "pressure_n", "peak": "peak_s_per_m", "integral": "integral_s_m"}
 SEEN = ("x_m", "y_m", *QUANTITIES.values())
 MAY = (*(f"{of}_relative" for of in QUANTITIES), "indenter_m", "tip_m")
+WRITTEN = 1e-5  # relative: as exactly as numbers are written
 COLUMNS = ("force_n", *SEEN, *MAY)
 
 
@@ -90,7 +91,8 @@ def _press(
             return Press(force, seen_in(int(row)), where, tip)
         except ValueError as why:
             raise CalibrationError(f"{where}, column row: found {int(row)}: {why}") from None
-    if (known := given("indenter_m")) != indenter_m:
+    known = given("indenter_m")
+    if (known is None) != (indenter_m is None) or not math.isclose(known or 0.0, indenter_m or 0.0, rel_tol=WRITTEN):
         raise CalibrationError(
             f"{where}, column indenter_m: found {known}, skin.toml names {indenter_m}: quantities were read by another "
             "one; press again, or put that `indenter` back"

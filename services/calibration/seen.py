@@ -59,12 +59,10 @@ class TouchReader:
         if not first.valid:
             return SeenTouches([], list(first.reasons) or ["not valid"])
         found = list[SeenTouch]()
-        for contact in first.contacts:
+        for contact in (contact for contact in first.contacts if contact.state != "end"):
             x, y = contact.on_sheet
             same = {of: next(c for c in each.contacts if c.id == contact.id) for of, each in made.items()}
-            quantities = {of: _quantity(c.force_n, c.force_sigma_n) for of, c in same.items()}
-            if contact.state != "end":
-                found.append(SeenTouch(x, y, quantities))
+            found.append(SeenTouch(x, y, {of: _quantity(c.force_n, c.force_sigma_n) for of, c in same.items()}))
         return SeenTouches(sorted(found, key=lambda touch: -touch.acts), [])
 
     @staticmethod

@@ -91,7 +91,7 @@ def force(
     name = skin_name(skin)
     configured = load(config_file()).skin(name)
     bundle = Bundle.load(configured.bundle)
-    indenter_m = None if configured.indenter is None else configured.indenter.radius_m
+    indenter_m = calibration.indenter_radius(configured)
     if measurements is not None and csv is None:
         fail(
             "--measurements needs --csv FILE with columns force_n,row: which row was measured under which force", USAGE

@@ -128,7 +128,7 @@ def _on_the_stub(collector: Collector, name: str, bundle: Bundle, n: int, radius
         finally:
             control("stub", "release", skin=name)
         _say(k, x, y, force, seen.x, seen.y)
-        yield Collected(float(x), float(y), force, touched, before, seen)
+        yield Collected(float(x), float(y), force, touched, before)
 
 
 def _by_prompts(collector: Collector) -> Iterator[Collected]:
@@ -160,7 +160,7 @@ def _by_prompts(collector: Collector) -> Iterator[Collected]:
         _say(count, x, y, force, seen.x, seen.y)
         print("  release", file=sys.stderr)
         count += 1
-        yield Collected(x, y, force, touched, before, seen)
+        yield Collected(x, y, force, touched, before)
 
 
 def _numbers(text: str) -> tuple[float, float, float | None] | None:

@@ -52,7 +52,7 @@ def save(path: Path, found: Calibration, name: str, skin: Skin, bundle: Bundle) 
         "frame_id": skin.frame_id,
         "bundle": bundle.name,
         "bundle_hash": bundle.hash,
-        "indenter_radius_m": _radius(skin),
+        "indenter_radius_m": indenter_radius(skin),
         "of": found.reads,
         "curve": found.curve.to_dict(),
         "most_n": found.most_n,
@@ -110,14 +110,15 @@ def _belongs(path: Path, found: dict[str, Any], skin: Skin, bundle: Bundle, name
             f"{path}: was made with bundle {found['bundle']} {found['bundle_hash'][:12]}, "
             f"skin.toml names {bundle.name} {bundle.hash[:12]}, whose images differ: {AGAIN}"
         )
-    if found["indenter_radius_m"] != _radius(skin):
+    if found["indenter_radius_m"] != indenter_radius(skin):
         raise ConfigError(
             f"{path}: was made with an indenter of radius {found['indenter_radius_m']} m, "
-            f"skin.toml says {_radius(skin)}: {AGAIN}"
+            f"skin.toml says {indenter_radius(skin)}: {AGAIN}"
         )
 
 
-def _radius(skin: Skin) -> float | None:
+def indenter_radius(skin: Skin) -> float | None:
+    """Of what presses this skin [m]; None where nobody says."""
     return None if skin.indenter is None else skin.indenter.radius_m
 
 

@@ -93,9 +93,7 @@ class ForceLaw:
     half_width: float = 1.0  # model units: where the image ends
     indenter_area: float | None = None  # model units squared
     maps: dict[str, Map] = field(default_factory=dict)
-    own_error: float = (
-        0.0  # relative: what the calibration's own presses scatter by beyond what their own uncertainties explain
-    )
+    own_error: float = 0.0  # relative: scatter of the calibration's presses beyond what their uncertainties explain
     foam: Foam = FOAM
 
     @classmethod
@@ -236,10 +234,9 @@ class ForceLaw:
         """Force and standard uncertainty of a touch as the estimator has it. classes: of its shape, by an image."""
         if self.curve is None or not touch.strength > 0:
             return NOTHING
-        return self._said(self.quantity_of(touch, classes), *touch.position)
+        return self._said(self._of_estimate(touch, classes), *touch.position)
 
-    def quantity_of(self, touch: EstimatedTouch, classes: Sequence[float] = ()) -> Quantity:
-        """What the curve takes, of a touch that acts."""
+    def _of_estimate(self, touch: EstimatedTouch, classes: Sequence[float]) -> Quantity:
         area = None if self.indenter_area is None else self.indenter_area * self.metres_per_unit**2
         if self.reads == "pressure":
             found = disc_force.force_of(touch, self.foam, area, classes)
@@ -307,7 +304,7 @@ def known_radius(skin: Skin, bundle: Bundle, name: str = "") -> float | None:
     """Radius [m] of the indenter; None where it is not known. Raises ConfigError where no such indenter can press this
     skin, or an image of it show it.
     """
-    radius = None if skin.indenter is None else skin.indenter.radius_m
+    radius = calibration.indenter_radius(skin)
     if radius is None:
         return None
     outline = np.asarray(bundle.skin.get("outline", ()), float).reshape(-1, 2)

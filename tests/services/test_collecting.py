@@ -90,9 +90,7 @@ def test_the_file_is_what_register_and_calibrate_force_read(tmp_path: Path) -> N
     seen = SeenTouch(0.0, 0.0, {})
     rng = np.random.default_rng(0)
     z0 = np.asarray(bundle.z0)
-    presses = [
-        Collected(0.001 * k, -0.002 * k, 1.0 + k, z0 * (1 + 1e-2 * rng.random(len(z0))), z0, seen) for k in range(24)
-    ]
+    presses = [Collected(0.001 * k, -0.002 * k, 1.0 + k, z0 * (1 + 1e-2 * rng.random(len(z0))), z0) for k in range(24)]
     file = tmp_path / "presses.npz"
     forces = collecting.write(file, presses, bundle.pattern)
     with np.load(file) as arrays:
@@ -104,7 +102,7 @@ def test_the_file_is_what_register_and_calibrate_force_read(tmp_path: Path) -> N
     read = presses_csv.read(forces, None, lambda row: (rows.append(row), seen)[1])
     assert [p.force_n for p in read] == [p.force_n for p in presses] and rows == list(range(24))
     of_file(file, SKIN, bundle, lambda text: None)  # reads measurements and reference
-    unknown = [Collected(0.0, 0.0, None, z0, z0, seen)]
+    unknown = [Collected(0.0, 0.0, None, z0, z0)]
     assert collecting.write(tmp_path / "unknown.npz", unknown, bundle.pattern) is None
 
 

@@ -150,10 +150,7 @@ class Hypotheses:
 
     def narrow(self, question: Question, standing: Sequence[TouchPrior]) -> ScoredAnswer:
         """The answer that touches stay as they are, by a response that is wrong by no more than it should be."""
-        wide, self.wide = self.wide, False
-        answer = self.fitted(question, standing, tuple(range(len(standing))), n.STEPS_WARM)
-        self.wide = wide
-        return answer
+        return self.fitted(question, standing, tuple(range(len(standing))), n.STEPS_WARM, wide=False)
 
     def goes_on(
         self, question: Question, standing: Sequence[TouchPrior], known: KnownWhitening, turned: Turned
@@ -316,13 +313,14 @@ class Hypotheses:
         kept: tuple[int, ...],
         most_steps: float,
         cause: str = AS_IT_IS,
-        wide: bool = False,
+        wide: bool | None = None,
         known: KnownWhitening | None = None,
         turned: Turned | None = None,
     ) -> ScoredAnswer:
+        wide = self.wide if wide is None else wide
         course = TouchCourse(self.response, question.times_s, question.span_s)
         live = int(question.live.sum())
-        misfit = max(float(MISFIT_WIDE), 2 * self._tables.wrong) if wide or self.wide else self._tables.wrong
+        misfit = max(float(MISFIT_WIDE), 2 * self._tables.wrong) if wide else self._tables.wrong
         covariance = question.covariance if self._tables.map is None else question.covariance + self._tables.map.error
         scene = FittedScan(question.y, covariance, course, self._tables.misfit, live, known, turned, question.said_s)
         may = max(0.0, question.budget.left - question.keeps) / len(priors)
@@ -331,8 +329,7 @@ class Hypotheses:
         z2 = self.left_over.best(question, fit.pulled, fit.white, fit)[0]
         cost = n.COST_WIDE if wide and not self.wide else COSTS[cause]
         score = fit.evidence + cost + n.COST_TOUCH * sum(place < 0 for place in kept)
-        made = ScoredAnswer(cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left)
-        return replace(made, wide=wide or self.wide)
+        return ScoredAnswer(cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left, wide=wide)
 
     def search(self, question: Question, kept: tuple[int, ...], fit: FoundTouches | None) -> list[ScoredAnswer]:
         """Further touches, one after the other: plain discs find them, their own outlines and evidence decide."""
