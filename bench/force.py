@@ -31,7 +31,7 @@ from models.fisher import MeasurementNoise, floors, mean_floor
 from models.force_limits import SIZES
 from models.pressure import FOAM
 from models.shapes import Shape
-from services.contacts.patch_force import SATURATED
+from services.contacts.force.of_disc import SATURATED
 from services.runtime.config import ScanMode
 
 METRES = SIDE_M / 2  # per model unit

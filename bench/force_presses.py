@@ -4,16 +4,14 @@ of each at the end of its hold.
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.speed.service import Outside, Service, running
+from bench.speed.service import Outside, Service, running_square
 from bench.speed.simulated_host import SimulatedHost
 from models.pressure import FOAM, disc
 from services.runtime.config import ScanMode
@@ -108,15 +106,12 @@ def simulated(scan: ScanMode, snr_db: float, each: int, seed: int) -> Iterator[P
 
 def live(scan: ScanMode, each: int, seed: int) -> Iterator[PressRow]:
     """A service of its own, seen by a controller that has none of the project's code."""
-    with tempfile.TemporaryDirectory(prefix="eitskin-force") as folder:
-        config = Path(folder) / "skin.toml"
-        config.write_text(f'[skins.palm]\nport = "stub"\nbundle = "square16"\nframe_id = "palm"\nscan = "{scan}"\n')
-        with running("--config", str(config)) as service:
-            contacts = Outside("contact", "palm", service.folder)
-            _last(contacts, START_S)
-            for press in planned(each, seed):
-                yield press.row(scan, _pressed(service, contacts, press))
-            contacts.close()
+    with running_square(scan) as service:
+        contacts = Outside("contact", "palm", service.folder)
+        _last(contacts, START_S)
+        for press in planned(each, seed):
+            yield press.row(scan, _pressed(service, contacts, press))
+        contacts.close()
 
 
 def _pressed(service: Service, contacts: Outside, press: PlannedPress) -> dict[str, Any] | None:

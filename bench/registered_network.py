@@ -24,7 +24,7 @@ from models.prereconstruction import Operator
 from services.calibration.locating import true_places
 from services.calibration.presses import Presses, RegistrationError, part, read_presses
 from services.calibration.registration import Similarity
-from services.contacts.segmentation import Segment, segment
+from services.contacts.images.segmentation import Segment, segment
 from services.networks import Network, network, softmax
 from services.recordings.npz_file import InputError, load_npz
 

@@ -41,11 +41,39 @@ class Picture:
     measured_ns: int
 
 
-class ContactFeed:
-    """The newest contacts of a skin."""
+class ContactPace:
+    """At most so many frames a second, and at once each that says something else than the last one: a contact that
+    begins, comes to be known otherwise, or ends.
+    """
 
-    def __init__(self, skin: str, replay: bool = False) -> None:
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = int(1e9 / rate_hz)
+        self._due_ns = 0
+        self._said: object = None
+
+    def passes(self, found: Measured) -> bool:
+        """Whether a frame is handed on."""
+        frame, at_ns = found.frame, found.measured_ns
+        says = frame.session, sorted(frame.reasons), [(c.id, c.state, c.shape) for c in frame.contacts]
+        news = says != self._said
+        if not news and self._due_ns - self._period_ns <= at_ns < self._due_ns:
+            return False
+        # On its grid while nothing is new, so that parts whose own period is no share of ours keep the rate.
+        self._due_ns = self._period_ns + (at_ns if news else max(self._due_ns, at_ns - self._period_ns))
+        self._said = says
+        return True
+
+    def refused(self) -> None:
+        """There was nothing to hand on: whatever comes next is new."""
+        self._said = None
+
+
+class ContactFeed:
+    """The newest contacts of a skin, rate_hz times a second at most."""
+
+    def __init__(self, skin: str, replay: bool = False, *, rate_hz: float) -> None:
         self._skin, self._replay = skin, replay
+        self._pace = ContactPace(rate_hz)
         self._newest: NewestContacts | None = None
         self._heard = 0.0
         self.skipped = 0
@@ -69,7 +97,9 @@ class ContactFeed:
             yield self._newest.reader.socket
 
     def take(self, waited_ns: int) -> Measured | Refusal | None:
-        """The frame that has come since the last call, or why it is not handed on; None where none has come."""
+        """The frame that has come since the last call, or why it is not handed on; None where none has come, or one too
+        soon after the last that says the same.
+        """
         if self._newest is None:
             return None
         came = bool(self._newest.reader.socket.poll(0))
@@ -79,13 +109,15 @@ class ContactFeed:
             frame = self._newest.fresh(None, valid=True)
         except NotValid as why:
             self._heard = time.monotonic()
+            self._pace.refused()
             return Refusal(str(why))
         measured_ns = self._newest.measured_ns
         if frame is None or measured_ns is None:
             self.late += came
             return None
         self._heard = time.monotonic()
-        return Measured(frame, measured_ns)
+        found = Measured(frame, measured_ns)
+        return found if self._pace.passes(found) else None
 
     def silence(self) -> Refusal | None:
         """Why nothing comes, once nothing has for longer than the newest frame was valid."""

@@ -1,5 +1,5 @@
 """Moves down until it presses with a force where contact is expected; backs off from contact anywhere else. Says how
-long ago it was measured what it stopped for. With `scan = "rolling"` in skin.toml the contact itself is known some 8 ms
+long ago it was measured what it stopped for. With scans in parts, the default, the contact itself is known some 8 ms
 after it began, plus what the computer takes (docs/figures.md, Speed).
 
 Exit status: 0 the force was reached, 1 the skin could not be trusted, 2 backed off.

@@ -20,6 +20,7 @@ from models.bundle import BundleError
 from models.mismatch import NAMED
 from protocol import logs
 from protocol.frame_types import NAME
+from protocol.part_size import BAUD
 from protocol.runtime import RuntimeDirError, control_endpoint, runtime_dir
 from protocol.sockets import ControlClient, ControlError, Publisher
 from protocol.transport import TransportError
@@ -63,11 +64,24 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         help="what a skin, or every skin, does beside, as real ones do: a name of worlds/table.py (creep)",
     )
     add("--scene", default="demo", help=f"one of {', '.join(scenes.names())}, or a .toml file (default: %(default)s)")
-    add("--snr", type=float, default=80.0, help="signal over noise in dB, at 128 DFT points (default: %(default)s)")
+    add(
+        "--snr",
+        type=float,
+        default=80.0,
+        help="signal over noise in dB, with the paper's setting (default: %(default)s)",
+    )
     add("--floor", type=float, default=0.0, help="noise floor in ohm (default: %(default)s)")
+    add("--offset", type=float, default=0.0, metavar="MV", help="spread of the electrodes' steady offsets (default: 0)")
+    add("--wander", type=float, default=0.0, metavar="MV", help="what these offsets wander by in minutes (default: 0)")
+    add("--mains", type=float, default=0.0, metavar="MV", help="mains between two electrodes, amplitude (default: 0)")
     add("--rate", type=float, help="full scans per second (default: as the real board, about 22)")
     add("--ppm", type=float, default=12.0, help="how much too fast the board's crystal is (default: %(default)s)")
-    add("--baud", type=int, default=921_600, help="bit rate of the line (default: %(default)s)")
+    add(
+        "--baud",
+        action="append",
+        metavar="[SKIN=]RATE",
+        help=f"bit rate of the line of a skin, or of every skin (default: {BAUD})",
+    )
     add("--listen", metavar="URL", help="socket://HOST:PORT instead of a pty; further skins take the ports after it")
     add("--leave", type=float, metavar="SECONDS", help="end when a host that was connected has been gone for so long")
     add("--seed", type=int, help="of the noise (default: another one each time)")
@@ -85,6 +99,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         options.skins[name] = sheet or options.geometry
     options.mismatches = _of_skins(parser, options.skins, "--mismatch", options.mismatch, NAMED, "none")
     options.worlds = _of_skins(parser, options.skins, "--world", options.world, WORLDS, "")
+    options.bauds = _bauds(parser, options.skins, options.baud)
     if any(world and options.mismatches[name] != "none" for name, world in options.worlds.items()):
         parser.error("--world and --mismatch of one skin: a world has a sheet of its own; expected one of them")
     if options.rate is not None and not 0.1 <= options.rate <= 10_000:
@@ -92,8 +107,11 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     for name, value, low, high in (
         ("--snr", options.snr, 0, 200),
         ("--floor", options.floor, 0, 1e3),
+        ("--offset", options.offset, 0, 1e3),
+        ("--wander", options.wander, 0, 1e3),
+        ("--mains", options.mains, 0, 1e3),
         ("--ppm", options.ppm, -5e4, 5e4),
-        ("--baud", options.baud, 1200, 1e8),
+        *(("--baud", baud, 1200, 1e8) for baud in options.bauds.values()),
     ):
         if not low <= value <= high:
             parser.error(f"{name} {value:g}: expected {low:g} to {high:g}")
@@ -118,6 +136,16 @@ def _of_skins(
             parser.error(f"{option} {text!r}: expected one of {', '.join(allowed)}")
         found |= dict.fromkeys([skin] if skin else found, name)
     return found
+
+
+def _bauds(parser: argparse.ArgumentParser, skins: Iterable[str], given: list[str] | None) -> dict[str, int]:
+    """Each skin's rate of what --baud says as [SKIN=]RATE; ends the program where there is no such skin or rate."""
+    rates = [text.rpartition("=")[2] for text in given or []]
+    for rate in rates:
+        if not rate.isdecimal():
+            parser.error(f"--baud {rate!r}: expected a whole number of bits a second")
+    named = _of_skins(parser, skins, "--baud", given, rates, str(BAUD))
+    return {name: int(rate) for name, rate in named.items()}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -170,8 +198,11 @@ def _open(options: argparse.Namespace, skins: dict[str, StubSkin]) -> int:
             snr_db=options.snr,
             floor_ohm=options.floor,
             rate_hz=options.rate,
+            offset_v=options.offset * 1e-3,
+            wander_v=options.wander * 1e-3,
+            mains_v=options.mains * 1e-3,
             crystal_ppm=options.ppm,
-            baud=options.baud,
+            baud=options.bauds[name],
             seed=None if options.seed is None else options.seed + n,
             unique_id=unique_id(name),
             threaded=True,

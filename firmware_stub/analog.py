@@ -13,9 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from models.scan_response import noise as noise_over_papers
 from protocol.ad5940 import DATA_MAX, decode_fifo, dft_pair, encode_fifo, impedance
 from protocol.frame_types import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA
+from protocol.scan_setting import ScanSetting
 
+from .electrode_volts import ElectrodeVolts
 from .faults import MUXES, Faults
 from .worlds.disturbances import Disturbances
 
@@ -36,7 +39,9 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class BoardNoise:
-    """sigma^2 = (relative |Z|)^2 + floor^2 at 128 DFT points; both fall with the square root of the points."""
+    """sigma^2 = (relative |Z|)^2 + floor^2 with the paper's setting; another one makes of both what it makes of white
+    noise (models/scan_response.py).
+    """
 
     relative: float = 1e-4
     floor: float = 0.0
@@ -45,8 +50,8 @@ class BoardNoise:
     def of_db(cls, snr_db: float) -> BoardNoise:
         return cls(10 ** (-snr_db / 20))
 
-    def sigma(self, z: NDArray[np.float64], points: int) -> NDArray[np.float64]:
-        return np.asarray(np.hypot(self.relative * np.abs(z), self.floor) * np.sqrt(128 / points))
+    def sigma(self, z: NDArray[np.float64], setting: ScanSetting) -> NDArray[np.float64]:
+        return np.asarray(np.hypot(self.relative * np.abs(z), self.floor) * noise_over_papers(setting))
 
 
 def four_terminal(transfer: NDArray[np.float64], scan_list: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -78,14 +83,16 @@ class Analog:
         faults: Faults,
         rng: np.random.Generator,
         disturbances: Disturbances | None = None,
+        volts: ElectrodeVolts | None = None,
     ) -> None:
         self.noise, self.faults, self.rng, self.disturbances = noise, faults, rng, disturbances
+        self.volts = volts
 
     def measure(
         self,
         transfer: Sequence[NDArray[np.float64]] | NDArray[np.float64],
         scan_list: NDArray[np.int64],
-        points: int,
+        setting: ScanSetting,
         rtia: float,
         now: float,
         weights: NDArray[np.float64] | None = None,
@@ -93,7 +100,7 @@ class Analog:
     ) -> tuple[NDArray[np.complex64], NDArray[np.uint8]]:
         """Z (K,) ohm and status (K,) of one scan. transfer: m matrices; weights (K, m): each one's share in what each
         measurement feels. Without weights the sheet goes steadily from the first of two matrices to the second.
-        instants (K,): of the measurements, where something disturbs them.
+        instants (K,): of the measurements, where something disturbs them or lies on the electrodes.
         """
         rows, driven, sensed = self._routed(scan_list, len(transfer[0]), now)
         z = self._sheet(transfer, rows, now, weights)
@@ -101,7 +108,9 @@ class Analog:
             z = z + self.disturbances.ohm(rows, instants, z)
         current = np.full(len(z), CURRENT_A * EXCITATION)
         voltage = z * PHASE * current
-        sigma = self.noise.sigma(z, points) * CURRENT_A
+        if self.volts is not None and instants is not None:
+            voltage = voltage + self.volts.left(rows, instants, np.abs(z) * INPUT_GAIN, setting) / INPUT_GAIN
+        sigma = self.noise.sigma(z, setting) * CURRENT_A
         voltage = voltage + sigma * self._normal(len(z))
         if self.faults.active("brown_out", now) is not None:
             driven, sensed = np.zeros_like(driven), np.zeros_like(sensed)

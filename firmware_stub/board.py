@@ -12,23 +12,16 @@ from numpy.typing import NDArray
 from protocol import link
 from protocol.ad5940 import LEAST_RTIA_OHM, MOST_RTIA_OHM
 from protocol.link import EventCode, NakReason, SelfTestFault
+from protocol.scan_setting import ScanSettingError
 
 from .analog import Analog
 from .faults import Faults
 from .field import Field
 
 FIRMWARE = "eitskin-stub 1.0"
-CLOCK_HZ = 16e6  # the AD5940's system clock
-SETTLE_S = 20e-6  # multiplexers and filters, before each DFT
 KEPT_CONFIGS = 8
-POINTS = [2**k for k in range(2, 15)]
 CAPABILITIES = link.Capability.SWITCHES | link.Capability.SELF_TEST | link.Capability.VARIABLE_DFT
 EVENT_PAUSE_S = 1.0  # the same event is reported at most that often
-
-
-def measurement_s(points: int) -> float:
-    """Seconds one measurement takes: voltage and current, for each the settling and a DFT of `points` at 800 kSPS."""
-    return 2 * ((20 * points + 25) / CLOCK_HZ + SETTLE_S)
 
 
 @dataclass(frozen=True)
@@ -43,7 +36,8 @@ class MeasuredScan:
 
 
 class Board:
-    """The state machine. It is scanning from START to STOP, a scan every `measurement_s` times its list's length.
+    """The state machine. It is scanning from START to STOP, a scan every `pair_s` of its setting times its list's
+    length.
 
     speed: how many times faster than a real board it measures. crystal_ppm: how much too fast its clock runs.
     answers_time, knows_parts: whether its firmware knows TIME_ASK, and scans in parts. on_scan is called with each
@@ -168,9 +162,9 @@ class Board:
                 self._refuse(message, NakReason.UNKNOWN, "this firmware does not know TIME_ASK", now)
 
     def _configure(self, config: link.Config, now: float) -> None:
-        wrong = ""
-        if config.dft_points not in POINTS:
-            wrong = f"{config.dft_points} DFT points: a power of two from {POINTS[0]} to {POINTS[-1]}"
+        wrong = _no_setting(config)
+        if wrong:
+            pass
         elif not LEAST_RTIA_OHM <= config.rtia_ohm <= MOST_RTIA_OHM:
             wrong = f"RTIA of {config.rtia_ohm:g} ohm: {LEAST_RTIA_OHM:g} to {MOST_RTIA_OHM:g}"
         elif config.scan.max() >= self.electrodes:
@@ -227,7 +221,7 @@ class Board:
 
     def _duration(self, config: link.Config) -> float:
         """Seconds until the board sends something: of a scan, or of a part."""
-        return len(config.scan) // config.parts * measurement_s(config.dft_points) / self.speed
+        return len(config.scan) // config.parts * config.setting.pair_s / self.speed
 
     def _scan(self) -> None:
         config = self._running
@@ -245,7 +239,7 @@ class Board:
         scan = np.split(np.asarray(config.scan, np.int64), config.parts)[part]
         instants = np.asarray(start + (np.arange(len(scan)) + 0.5) * ((end - start) / len(scan)))
         transfer, weights = self.field.over(instants)
-        z, status = self.analog.measure(transfer, scan, config.dft_points, config.rtia_ohm, start, weights, instants)
+        z, status = self.analog.measure(transfer, scan, config.setting, config.rtia_ohm, start, weights, instants)
         if self.faults.active("frozen", start) is not None:
             z, status = self._sent.get((config.config, part), (z, status))
         self._sent[config.config, part] = z, status
@@ -315,3 +309,11 @@ class Board:
     def _schema(self, now: float) -> int:
         wrong = self.faults.active("wrong_schema", now)
         return link.SCHEMA_HASH if wrong is None else wrong["schema"] & 0xFFFFFFFF
+
+
+def _no_setting(config: link.Config) -> str:
+    """Why pairs cannot be measured so; "" where they can."""
+    try:
+        return "" if config.setting else ""
+    except ScanSettingError as why:
+        return str(why)

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
-BAUD = 921_600
+from protocol.part_size import BAUD
+
 BURST_S = 0.002  # the bucket's depth: what a USB adapter hands over at once
 BACKLOG_S = 0.25  # of bytes; a board that has more to send drops whole messages
 UNREAD = 3500  # bytes in a pty that nobody may be reading (the kernel's line buffer holds 4095)

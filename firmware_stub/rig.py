@@ -16,12 +16,16 @@ from typing import Any
 
 import numpy as np
 
+from protocol.part_size import BAUD
+from protocol.scan_setting import COHERENT
+
 from . import scene as scenes
 from .analog import Analog, BoardNoise
-from .board import Board, MeasuredScan, measurement_s
+from .board import Board, MeasuredScan
+from .electrode_volts import ElectrodeVolts
 from .faults import FAULTS, Faults, messages_of
 from .field import Field
-from .port import BAUD, Line
+from .port import Line
 from .sheet import Sheet
 from .timeline import Script, Timeline, TouchPath, press_track
 from .world import World
@@ -38,7 +42,8 @@ class Rig:
 
     rate_hz: full scans per second instead of the real board's. threaded: solve ahead in a thread (see Field), and skip
     the scans of a pause instead of making up for them. mismatch: see Sheet. world: what the skin does beside, a name of
-    worlds/table.py, drawn from `seed`; it has a sheet of its own, unless `geometry` is one.
+    worlds/table.py, drawn from `seed`; it has a sheet of its own, unless `geometry` is one. offset_v, wander_v,
+    mains_v: see ElectrodeVolts.
     """
 
     def __init__(
@@ -58,6 +63,9 @@ class Rig:
         answers_time: bool = True,
         knows_parts: bool = True,
         world: str = "",
+        offset_v: float = 0.0,
+        wander_v: float = 0.0,
+        mains_v: float = 0.0,
     ) -> None:
         script = scenes.load(scene)  # first, since it fails fast
         drawn = int(np.random.default_rng().integers(2**31)) if seed is None else seed
@@ -74,7 +82,8 @@ class Rig:
         self._rng = np.random.default_rng(seed)
         self._realtime = threaded
         noise = BoardNoise(10 ** (-snr_db / 20), floor_ohm)
-        full_s = len(self.sheet.skin.pattern) * measurement_s(128)
+        volts = ElectrodeVolts(self.sheet.electrodes, drawn, offset_v, wander_v, mains_v)
+        full_s = len(self.sheet.skin.pattern) * COHERENT.pair_s
         self.board = Board(
             self.field,
             Analog(
@@ -82,6 +91,7 @@ class Rig:
                 self.faults,
                 np.random.default_rng(self._rng.integers(2**63)),
                 worlds.disturbances(world, drawn, self.sheet) if world else None,
+                volts if offset_v or wander_v or mains_v else None,
             ),
             self.faults,
             electrodes=self.sheet.electrodes,

@@ -29,7 +29,6 @@ import numpy as np
 
 from models import (
     bundle,
-    calibrate,
     checkpoint,
     class_temperature,
     command,
@@ -38,6 +37,7 @@ from models import (
     geometry,
     manifest,
     samples,
+    solved_presses,
     train,
     verdict,
     warped,
@@ -106,7 +106,7 @@ def networks(
     folder: Path,
     pre: PreReconstructor,
     held_out: samples.Samples,
-    presses: calibrate.SolvedPresses | None,
+    presses: solved_presses.SolvedPresses | None,
     own: OwnSkin | None = None,
     only: str | None = None,
 ) -> tuple[dict[str, bytes], dict[str, Any]]:
@@ -172,9 +172,8 @@ def replace_one(variant: str, skin: geometry.SkinGeometry, shipped: bundle.Bundl
     """
     pre, cache = shipped.prereconstructor(), work / "presses.npz"
     held_out = samples.load(work, "valid", pre)
-    made, said = networks(work, pre, held_out, calibrate.solve(skin, cache=cache), only=variant)
-    found = calibrate.uncertainty(skin, pre, made, cache=cache)
-    said[variant] |= {"uncertainty": found[variant], "built": manifest.built()}
+    made, said = networks(work, pre, held_out, solved_presses.solve(skin, cache=cache), only=variant)
+    said[variant]["built"] = manifest.built()
     if (curve := work / f"{variant}.png").is_file():
         shutil.copy(curve, shipped.path / f"training_{variant}.png")
     entries = {**shipped.manifest["network"], variant: said[variant]}
@@ -290,11 +289,9 @@ def main(argv: list[str] | None = None) -> None:
                     go_on=True,
                 )
                 teacher = teacher or trainer.as_teacher(variant)
-        count, cache = calibrate.PRESSES if plan.scenes >= 4 * VALID else calibrate.PRESSES // 4, work / "presses.npz"
-        made, said = networks(work, pre, held_out, None if own else calibrate.solve(skin, count, cache=cache), own)
-        if own is None:  # the forces of a registered skin are those of its presses
-            for variant, found in calibrate.uncertainty(skin, pre, made, count, cache).items():
-                said[variant]["uncertainty"] = found
+        count = solved_presses.PRESSES if plan.scenes >= 4 * VALID else solved_presses.PRESSES // 4
+        presses = None if own else solved_presses.solve(skin, count, cache=work / "presses.npz")
+        made, said = networks(work, pre, held_out, presses, own)
     if "full" in said:
         judged = _verdict(args.skin, pre, held_out, said["full"], own)
         said["full"]["verdict"] = judged.to_dict()

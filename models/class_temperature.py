@@ -4,8 +4,8 @@
 
 The class of a touch is the mean over its pixels of their probabilities, as services take it. Trained with cross
 entropy on single pixels, that mean is too sure or too modest; the temperature that makes the presses of
-models/calibrate.py likeliest mends it (Guo et al. 2017, "On calibration of modern neural networks"). It is divided into
-the last layer's weights, so whoever runs the network need not know of it.
+models/solved_presses.py likeliest mends it (Guo et al. 2017, "On calibration of modern neural networks"). It is divided
+into the last layer's weights, so whoever runs the network need not know of it.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from models.bundle import NETWORKS, Bundle
-from models.calibrate import SolvedPresses, scans, solve
 from models.evaluation import Predict, predict
 from models.export import session
 from models.geometry import load
 from models.network import MMCNN
 from models.prereconstruction import Array, PreReconstructor
+from models.solved_presses import SolvedPresses, scans, solve
 
 TEMPERATURES = np.geomspace(0.4, 3.0, 27)
 BINS = 10  # of the probability, for the expected calibration error
@@ -83,10 +83,10 @@ def calibration_error(shown: Array, truth: NDArray[np.int64], weight: Array) -> 
 def seen_classes(
     presses: SolvedPresses, pre: PreReconstructor, network: Predict, conditions: int = CONDITIONS
 ) -> SeenClasses:
-    """The class probabilities of the presses' touches under the conditions of `calibrate.scans`."""
+    """The class probabilities of the presses' touches under the conditions of `solved_presses.scans`."""
     kinds = np.array([t.shape_class for t in presses.touches()])
     shown, truth, decibels = [], [], []
-    for decibel, _, operator, chosen, d in scans(presses, pre, SEED, conditions):
+    for decibel, operator, chosen, d in scans(presses, pre, SEED, conditions):
         stack, context, _ = operator.stacks(d)
         drop, _, logits = network(stack, context)
         for k, image, one in zip(chosen, drop[:, 0], logits, strict=True):

@@ -2,6 +2,7 @@
 
     skin limits --skin square16 --snr 70 --map limits.png
     skin limits --forces --snr 80                            the smallest forces, by radius
+    skin limits --scan --snr 80                              how soon a touch is known, by the setting of the scan
     skin limits --rank --snr inf --floor-ohm 1e-3
 
 The floors and what they mean: models/fisher.py.
@@ -28,6 +29,8 @@ from models.force_limits import RADII_MM, places, smallest
 from models.forward import shared
 from models.prereconstruction import Drift
 from models.pressure import FOAM, disc
+from models.scan_limits import WANDER_V
+from models.scan_table import ScanTable
 from models.shapes import Shape
 
 __all__ = ["Floor", "MeasurementNoise", "SizePrior", "floors", "map_floors", "mean_floor", "rank_patterns"]
@@ -165,19 +168,36 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--grid", type=whole(), default=6, help="positions along the skin's side")
     parser.add_argument("--forces", action="store_true", help="the smallest forces that are shown and measured instead")
     parser.add_argument("--rank", action="store_true", help="rank the drive patterns instead")
+    parser.add_argument("--scan", action="store_true", help="how soon a touch is known, by the setting of the scan")
+    parser.add_argument(
+        "--wander-mv",
+        type=real(),
+        metavar="MV",
+        help="with --scan: change of the electrodes' offsets since the tare; default: 1",
+    )
+    parser.add_argument("--interference", action="store_true", help="with --scan: floors beside mains and a motor")
     parser.add_argument("--map", type=Path, metavar="PNG", help="draw the floors over the skin")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(argv)
     if options.forces:
-        _refuse_beside_forces(parser, options)
+        _refuse_beside(parser, options, "forces", ("rank", "map", "known_radius", "radius", "pattern", "drift", "scan"))
+    if options.scan:
+        _refuse_beside(parser, options, "scan", ("rank", "map", "known_radius", "radius", "pattern", "drift"))
+        _refuse_beside(parser, options, "scan", ("floor_ohm",))
+        return options
+    for name in ("wander_mv", "interference"):
+        if getattr(options, name):
+            parser.error(f"found --{name.replace('_', '-')} without --scan, to which it belongs")
     return options
 
 
-def _refuse_beside_forces(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """What a table of every radius, of the skin's own bundle soon after a tare, has no use for."""
-    for name in ("rank", "map", "known_radius", "radius", "pattern", "drift"):
+def _refuse_beside(
+    parser: argparse.ArgumentParser, options: argparse.Namespace, table: str, others: Sequence[str]
+) -> None:
+    """What a table of the skin's own bundle soon after a tare has no use for."""
+    for name in others:
         if getattr(options, name):
-            parser.error(f"found --forces and --{name.replace('_', '-')}, expected one of them: leave the other out")
+            parser.error(f"found --{table} and --{name.replace('_', '-')}, expected one of them: leave the other out")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -193,6 +213,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             SizePrior(radius=(radius, radius)) if options.known_radius else SizePrior(),
             Drift(options.drift, options.drift),
         )
+        if options.scan:
+            return _scan_table(options)
         if options.forces:
             rows = [asdict(smallest(case.skin, case.noise, mm, options.grid)) for mm in RADII_MM]
         elif options.rank:
@@ -222,6 +244,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     _print(rows)
     if options.map:
         print(f"maps: {options.map}")
+    return 0
+
+
+def _scan_table(options: argparse.Namespace) -> int:
+    """Raises ValueError, BundleError."""
+    wander_v = WANDER_V if options.wander_mv is None else options.wander_mv * 1e-3
+    if np.isinf(options.snr):
+        raise ValueError("without noise nothing limits a touch: give a finite SNR")
+    made = ScanTable(options.skin, options.snr, options.grid, wander_v, options.interference)
+    print(json.dumps(made.json(), indent=1) if options.json else made.text())
     return 0
 
 

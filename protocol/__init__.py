@@ -25,8 +25,8 @@ __version__ = "0.2.0"
 __all__ = [
     "AsyncContactSubscriber", "Contact", "ContactFrame", "ContactListener", "ContactSubscriber", "ControlError",
     "DeltaFrame", "EitskinError", "ForceFrame", "Frame", "FrameError", "ImageFrame", "InfoFrame",
-    "JudgementsFrame", "NotValid", "PartFrame", "RawFrame", "ShapeFrame", "Stale", "StatusFrame", "TransportError",
-    "TruthFrame", "__version__",
+    "JudgementsFrame", "NotValid", "PartFrame", "RawFrame", "ShapeFrame", "StackFrame", "Stale", "StatusFrame",
+    "TransportError", "TruthFrame", "__version__",
 ]  # fmt: skip
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
         PartFrame,
         RawFrame,
         ShapeFrame,
+        StackFrame,
         StatusFrame,
         TruthFrame,
     )

@@ -24,6 +24,7 @@ class EitskinError(Exception):
         ├── Wrong                             what is wrong in a bundle; a BundleError names the bundle
         ├── GeometryError (ValueError)        a skin that cannot exist
         ├── PatternError (ValueError)         a drive pattern that cannot be measured or inverted
+        ├── ScanSettingError (ValueError)     settings of a scan that no board can measure with
         ├── MeshError (RuntimeError)          an outline that cannot be meshed
         ├── MismatchError (ValueError)        a sheet that differs from its model in a way that cannot be
         ├── TooFewMeasured                    an untouched frame in which too little was measured to calibrate on
@@ -40,6 +41,7 @@ class EitskinError(Exception):
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── WorldError (ValueError)           no world of this name for a stub's skin
+        ├── UnknownCandidate (ValueError)     no candidate of this name for `skin bench shadow`
         ├── ConfigError                       services: skin.toml cannot be used
         ├── Refused                           a stage does not carry out a command now
         ├── NoBaseline (ValueError)           frames, or a saved state, do not make a baseline

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from .fields import UINT64_MAX, Array, Bool, Float, Int, Text, Vector, Version, wire
 from .records import ListOf, MapOf, Maybe, Record, Tree
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of the frames' layout: raised when a field changes its meaning, goes, or is added without a default. Readers
-accept all up to theirs. 2: `valid_for_s` counts from `sample`, not from `publish`; a held image is sent once.
+accept all up to theirs. 2: `valid_for_s` counts from `sample`, not from `publish`; a held image is sent once. 3: the
+pre-reconstruction is a topic of its own.
 """
 
 STAMPS = ("sample", "read", "preprocess", "infer", "publish")
@@ -113,19 +114,6 @@ AFTER = "of a scan in parts: scan of the delta frame before it, also where that 
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class FollowedTouch:
-    """One touch as the newest part of a scan has it: how it moved and how its strength changed since the last image. By
-    itself it is less exact than the image: what readers use is by how much it changed.
-    """
-
-    number: int = wire(_COUNT, "counts up when others are followed: only places of one number belong together", 0)
-    position: list[float] = wire(Vector(2, "m"), "x, y in the skin's frame")
-    velocity: list[float] = wire(Vector(2, "m/s"), "of `position`", lambda: [0.0, 0.0])
-    sigma: list[float] = wire(Vector(3), "as a contact's `position_sigma`")
-    integral: float = wire(Float(0, unit="S/m m^2"), "drop integrated over the touch")
-
-
-@dataclass(slots=True, kw_only=True, eq=False)
 class EstimatedTouch:
     """One touch at `sample`, as the measurements tell it: a disc of as much area and action."""
 
@@ -198,15 +186,10 @@ class DeltaFrame(Frame):
     sigma: NDArray[np.float32] = wire(
         Array("<f4", ("K",), gaps=True), "standard uncertainty of `difference`; infinite: not used", _empty("<f4", 1)
     )
-    stack: NDArray[np.float32] = wire(
-        Array("<f4", ("C", "h", "w"), or_empty=True),
-        "pre-reconstructions, the network's input; empty when no reconstruction is needed",
-        _empty("<f4", 3),
+    averaged: int = wire(
+        _COUNT, "scans that `difference` is the mean of, to be reconstructed; 0: no reconstruction is needed", 0
     )
-    context: NDArray[np.float32] = wire(
-        Array("<f4", ("n",)), "what the network is told beside them (noise level, ...)", _empty("<f4", 1)
-    )
-    scale: float = wire(Float(unit="S/m"), "the network's output times this is in S/m", 1.0)
+    tare_frames: int = wire(_COUNT, "scans that the baseline is the mean of; 0: there is none", 0)
     electrodes: NDArray[np.uint8] = wire(
         Array("|u1", ("E",)),
         "state of each electrode: " + ", ".join(f"{k} {state}" for k, state in enumerate(ELECTRODE_STATES)),
@@ -215,11 +198,6 @@ class DeltaFrame(Frame):
     calibration: str = wire(
         Text(64, form="(?:[0-9a-f]{64})?"), "hash of the bundle as it was calibrated to this skin; empty: as it is", ""
     )
-    followed: list[FollowedTouch] = wire(
-        ListOf(Record(FollowedTouch), 16),
-        "of a scan in parts: where the touches are at `sample`; empty: nobody follows them",
-        list,
-    )
     after: int = wire(_COUNT, AFTER, 0)
     estimates: list[EstimatedTouch] = wire(
         ListOf(Record(EstimatedTouch), 16), "the touches at `sample`, as the measurements tell them", list
@@ -227,28 +205,24 @@ class DeltaFrame(Frame):
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class BegunTouch:
-    """A touch that began since the last whole scan, as a circle, from the values that were measured since."""
+class StackFrame(Frame):
+    """The pre-reconstruction of a delta frame, formed of its `difference` and `sigma`: what a network reads."""
 
-    position: list[float] = wire(Vector(2, "m"), "x, y of the centroid, in the skin's frame")
-    sigma: list[float] = wire(Vector(3), "as a contact's `position_sigma`")
-    drop: float = wire(Float(0, unit="S/m"), "largest conductivity drop")
-    drop_sigma: float = wire(Float(0, unit="S/m"), "its standard uncertainty")
-    integral: float = wire(Float(0, unit="S/m m^2"), "drop integrated over the touch")
-    unexplained: float = wire(Float(0), "share of the measured change that it does not explain")
+    reconstructed: int = wire(_COUNT, "scan that it was made of", 0)
+    stack: NDArray[np.float32] = wire(
+        Array("<f4", ("C", "h", "w")), "images [iy, ix], one for each lambda, row 0 lowest y", _empty("<f4", 3)
+    )
+    context: NDArray[np.float32] = wire(
+        Array("<f4", ("n",)), "what the network is told beside them (noise level, ...)", _empty("<f4", 1)
+    )
+    scale: float = wire(Float(unit="S/m"), "the network's output times this is in S/m", 1.0)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class PartFrame(Frame):
-    """What the newest part of a scan says between two delta frames, which say all else: where the touches of the last
-    one are by now, or that a touch began.
-    """
+    """What the newest part of a scan says between two delta frames, which say all else: the touches by now."""
 
     after: int = wire(_COUNT, "scan of the delta frame before it: the image of that scan shows these touches", 0)
-    followed: list[FollowedTouch] = wire(ListOf(Record(FollowedTouch), 16), "the touches", list)
-    began: BegunTouch | None = wire(
-        Maybe(Record(BegunTouch)), "the only touch, of which there is no image yet; nil: none began", None
-    )
     estimates: list[EstimatedTouch] = wire(
         ListOf(Record(EstimatedTouch), 16), "the touches at `sample`, as the measurements tell them", list
     )
@@ -332,11 +306,6 @@ class ImageFrame(Frame):
     )
     refined: RefinedTouch | None = wire(
         Maybe(Record(RefinedTouch)), "the touch refined by a fit, also in held frames; nil: there is none yet", None
-    )
-    followed: list[FollowedTouch] = wire(
-        ListOf(Record(FollowedTouch), 16),
-        "of a scan in parts: where the touches are at `sample`; empty: nobody follows them",
-        list,
     )
     after: int = wire(_COUNT, AFTER, 0)
     estimates: list[EstimatedTouch] = wire(
@@ -496,7 +465,7 @@ INFO_KEYS = {
     "bundle_hash": "sha256 over the whole of it, as its file SHA256 says",
     "geometry": "map: outline (n, 2) [m], electrodes (E, 2) [m], metres_per_unit, name",
     "pattern": "name of the drive pattern",
-    "stack": "map: lambda_squared of each plane of delta's `stack`; one_step: the plane whose lambda is nearest that "
+    "stack": "map: lambda_squared of each plane of `stack`; one_step: the plane whose lambda is nearest that "
     "of the published one-step image",
     "frame_id": "name of the skin's coordinate frame",
     "parent_frame_id": "name of the frame that `pose` is given in",

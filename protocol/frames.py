@@ -29,12 +29,10 @@ from .frame_types import (
     STATUS_OPEN,
     STATUS_RTIA,
     VERDICTS,
-    BegunTouch,
     Contact,
     ContactFrame,
     DeltaFrame,
     EstimatedTouch,
-    FollowedTouch,
     ForceFrame,
     Frame,
     ImageFrame,
@@ -46,6 +44,7 @@ from .frame_types import (
     ReferenceFrame,
     RefinedTouch,
     ShapeFrame,
+    StackFrame,
     StatusFrame,
     TrueTouch,
     TruthFrame,
@@ -56,10 +55,11 @@ from .topics import TOPIC_OF, TOPICS
 __all__ = [
     "ELECTRODE_STATES", "INFO_KEYS", "KINDS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA", "VERDICTS",
-    "BegunTouch", "Contact", "ContactFrame", "DeltaFrame", "EstimatedTouch", "FollowedTouch", "ForceFrame",
+    "Contact", "ContactFrame", "DeltaFrame", "EstimatedTouch", "ForceFrame",
     "Frame", "FrameError",
     "ImageFrame", "InfoFrame", "JudgementsFrame", "LocatedTouch", "PartFrame", "RawFrame", "ReferenceFrame",
-    "RefinedTouch", "ShapeFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map", "unpack",
+    "RefinedTouch", "ShapeFrame", "StackFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map",
+    "unpack",
 ]  # fmt: skip
 
 MAX_MESSAGE = 4 * 1024 * 1024

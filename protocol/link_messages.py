@@ -10,12 +10,14 @@ import struct
 import zlib
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import Any, ClassVar
+from functools import cached_property
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import EitskinError
+from .scan_setting import COHERENT, WINDOWS, ScanSetting
 
 LINK_VERSION = 1
 MAX_SCAN = 512
@@ -174,12 +176,57 @@ class Config(Message):
 
     number, sender = 0x02, "host"
     config: int = _wired("u16", "id, chosen by the host")
-    dft_points: int = _wired("u16", "points of each DFT: 4, 8 ... 16384")
+    dft_points: int = _wired("u16", "points of each DFT: 4, 8 ... 16384; samples of a fit: 8 ... 128")
     rtia_ohm: float = _wired("f32", "gain resistor of the current measurement [ohm]")
     scan: NDArray[np.uint8] = _wired(
         "n u16, n x 4 u8", "electrodes drive+, drive-, sense+, sense- of each measurement, from 0"
     )
     parts: int = _wired("u8", "equal parts of the list, a FRAME each; over 1 only with PARTS", 1)
+    frequency_hz: int = _wired("u32", "of the excitation [Hz]: 1000 to 80000", COHERENT.frequency_hz)
+    sinc3: int = _wired(
+        "u8", "1: raw samples; 2, 4, 5: the sinc3 filter before, one of so many samples", COHERENT.sinc3
+    )
+    window: int = _wired(
+        "u8",
+        "0: none; 1: Hanning; 2: no DFT, a fit of sine, cosine, constant and exponential to `dft_points` samples",
+        WINDOWS.index(COHERENT.window),
+    )
+    settle_us: int = _wired(
+        "u16",
+        "settling before the voltage is measured, and again before the current [us]",
+        round(COHERENT.settle_s * 1e6),
+    )
+
+    @cached_property
+    def setting(self) -> ScanSetting:
+        """How each pair is measured. Raises ScanSettingError where no board can do that."""
+        window = WINDOWS[self.window] if self.window < len(WINDOWS) else f"of number {self.window}"
+        return ScanSetting(
+            self.frequency_hz, self.dft_points, cast(Any, self.sinc3), cast(Any, window), self.settle_us / 1e6
+        )
+
+    @classmethod
+    def of(
+        cls,
+        setting: ScanSetting,
+        *,
+        config: int,
+        rtia_ohm: float,
+        scan: NDArray[np.uint8],
+        parts: int = 1,
+    ) -> Config:
+        """The configuration that has each pair of `scan` measured so."""
+        return cls(
+            config=config,
+            dft_points=setting.points,
+            rtia_ohm=rtia_ohm,
+            scan=scan,
+            parts=parts,
+            frequency_hz=setting.frequency_hz,
+            sinc3=setting.sinc3,
+            window=WINDOWS.index(setting.window),
+            settle_us=round(setting.settle_s * 1e6),
+        )
 
     def _tail(self) -> bytes:
         scan = np.asarray(self.scan)

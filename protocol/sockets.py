@@ -156,8 +156,8 @@ STAGE_QUEUE = 200
 
 class StageReader(_SkippingReader):
     """What a stage reads of one skin: the newest raw, delta or image frame; beside images the newest part after it.
-    Older ones are skipped, but not the one whose stack or image a newer one holds: that comes first. A part comes after
-    the image of the scan that it names, whichever of the two arrives first.
+    Older ones are skipped, but not the one whose reconstruction or image a newer one holds: that comes first. A part
+    comes after the image of the scan that it names, whichever of the two arrives first; one that names none at once.
 
     A queue that is emptied at every call, and not CONFLATE, which loses a frame now and then (see NewestReader):
     nothing makes up for one of a replay, whose next frame waits for what becomes of it.
@@ -180,7 +180,7 @@ class StageReader(_SkippingReader):
     @property
     def more(self) -> bool:
         """Whether another frame is here already, whatever the socket says."""
-        return bool(self._whole) or (self._part is not None and self._part.after == self._after)
+        return bool(self._whole) or (self._part is not None and self._part.after in (self._after, 0))
 
     def recv(self, timeout_s: float = 0.0) -> Frame | None:
         """The next frame, waiting up to `timeout_s` for one; None when there is none. Never raises on bad input."""
@@ -210,11 +210,11 @@ class StageReader(_SkippingReader):
 
 
 def _holds(frame: Frame, older: Frame) -> bool:
-    """Whether a frame says no more than that all is as in an older one, of which its reader needs the arrays."""
+    """Whether a frame says no more than that all is as in an older one, which its reader needs."""
     if not (isinstance(frame, DeltaFrame | ImageFrame) and isinstance(older, DeltaFrame | ImageFrame)):
         return False
-    own, theirs = (each.stack if isinstance(each, DeltaFrame) else each.image for each in (frame, older))
-    return frame.held and frame.reconstructed == older.reconstructed and theirs.size > 0 and not own.size
+    own, theirs = (each.averaged if isinstance(each, DeltaFrame) else each.image.size for each in (frame, older))
+    return frame.held and frame.reconstructed == older.reconstructed and theirs > 0 and not own
 
 
 class AllReader(_Reader):

@@ -61,7 +61,7 @@ TOPICS: dict[str, Topic] = {
             False,
             False,
             "newest",
-            "difference, pre-reconstructions, touched?",
+            "difference, touches, what to reconstruct",
         ),
         Topic(
             "part",
@@ -71,9 +71,10 @@ TOPICS: dict[str, Topic] = {
             False,
             False,
             "newest",
-            "where touches are by now, or that one began, between two images of scans in parts",
+            "the touches by now, between two delta frames of scans in parts",
         ),
         Topic("image", f.ImageFrame, "inference", 22, False, False, "newest", "conductivity-drop image"),
+        Topic("stack", f.StackFrame, "inference", 22, True, False, "newest", "pre-reconstructions: a network's input"),
         Topic("contact", f.ContactFrame, "publisher", 22, False, False, "newest", "list of contacts, also when empty"),
         Topic("force", f.ForceFrame, "publisher", 22, True, False, "newest", "total wrench only"),
         Topic(

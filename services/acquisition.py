@@ -10,12 +10,17 @@ import logging
 import os
 import sys
 import threading
+import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 
 from models.bundle import Bundle
-from protocol.frames import Frame, RawFrame
+from protocol import transport
+from protocol.frames import Frame, RawFrame, StatusFrame
+from protocol.sockets import AllReader
 from services.board.host_time import SUSPENDED_NS, HostTime
+from services.board.parts_or_whole import PartsOrWhole
 from services.board.source import BoardSource, Source
 from services.process import main
 from services.recordings.file_source import FileSource, RecordingSource
@@ -42,12 +47,16 @@ class Acquiring(Stage):
     writes = ("raw",)
     stamp = "read"
 
-    def __init__(self, name: str, feed: SourceFeed) -> None:
+    def __init__(self, name: str, feed: SourceFeed, load: Load | None = None) -> None:
         super().__init__(name)
-        self._feed = feed
+        self._feed, self._load = feed, load
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
         return [frame]
+
+    def between_frames(self) -> None:
+        if self._load is not None:
+            self._load.look(self.skin)
 
     def health(self) -> Health:
         found = self._feed.source.health()
@@ -120,11 +129,32 @@ class SourceFeed:
                 self._stop.wait(1.0)
 
 
+class Load:
+    """How preprocessing keeps up with the boards that scan in parts, by its own statuses."""
+
+    def __init__(self, boards: Sequence[BoardSource]) -> None:
+        self._boards = {board.name: board for board in boards}
+        self._choice = PartsOrWhole(self._boards)
+        self._reader = AllReader(["status"], endpoint=transport.current().data_address("preprocessing"))
+
+    def look(self, skin: str) -> None:
+        """Tell its board whether it is to scan whole for now. Boards that know no parts tell nothing of the load."""
+        while (status := self._reader.recv()) is not None:
+            board = self._boards.get(status.skin)
+            if isinstance(status, StatusFrame) and status.process == "preprocessing" and board and board.in_parts:
+                self._choice.heard(status, time.monotonic())
+        if skin in self._boards:
+            self._boards[skin].whole = self._choice.whole(skin)
+
+
 def run(runner: Runner) -> None:
     ending = threading.Event()
-    for name, skin in runner.config.skins.items():
-        feed = SourceFeed(open_source(name, skin, runner.bundle(name)), ending=ending)
-        runner.add(Acquiring(name, feed), feed)
+    sources = [open_source(name, skin, runner.bundle(name)) for name, skin in runner.config.skins.items()]
+    boards = [source for source in sources if isinstance(source, BoardSource) and source.in_parts]
+    load = Load(boards) if boards else None
+    for source in sources:
+        feed = SourceFeed(source, ending=ending)
+        runner.add(Acquiring(source.name, feed, load), feed)
 
 
 if __name__ == "__main__":

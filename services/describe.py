@@ -13,8 +13,8 @@ from models.prereconstruction import ONE_STEP_LAMBDA
 from models.symmetries import symmetries
 from models.touch_parameters import HIGH, LOG_RADIUS, LOW
 from protocol.frames import RawFrame
-from services.contacts.force import ForceLaw
-from services.estimation.baseline import Baseline
+from services.contacts.force.law import ForceLaw
+from services.estimation.first.baseline import Baseline
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE
 

@@ -1,5 +1,6 @@
-"""Inference: from the pre-reconstruction stack to the image of the conductivity drop, by the bundle's network.
+"""Inference: from the difference to the image of the conductivity drop, by the bundle's network.
 
+difference -> stack of pre-reconstructions (services/estimation/images/operators.py), a topic too -> image
 ONNX Runtime on one thread, warmed up before the stage is ready. A bundle without a network gives the one-step image.
 """
 
@@ -14,13 +15,16 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.locator import Located, Locator
-from models.measurement.tables import tells_touches
+from models.measurement.responses.tables import tells_touches
+from models.prereconstruction import Operator
 from models.symmetries import symmetries
-from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch
+from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch, StackFrame
 from services.describe import ON, refinement, symmetry
-from services.estimation.quality import Residual
+from services.estimation.images.averaging import MEANS, sigma_of_mean
+from services.estimation.images.operators import Operators
+from services.estimation.images.quality import Residual
 from services.linearisation import Linearisation
-from services.networks import Network, OneStep, Pictures, network
+from services.networks import Network, OneStep, Pictures, Stack, network, nothing
 from services.runtime.config import Skin
 from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
 from services.symmetry import SymmetryMean
@@ -34,10 +38,10 @@ SETTLED = 5  # after so many untouched frames with the same noise, a touch is ex
 
 
 class Inference(Stage):
-    """delta -> image [S/m], on the bundle's grid."""
+    """delta -> image [S/m], on the bundle's grid; stack where asked."""
 
     reads = "delta"
-    writes = ("image",)
+    writes = ("image", "stack")
     stamp = "infer"
 
     def __init__(self, name: str, skin: Skin, bundle: Bundle) -> None:
@@ -50,8 +54,8 @@ class Inference(Stage):
         # Only a network's image is in S/m: a one-step image shows where, not how much, as a registered skin's does.
         self._to_scale = isinstance(self._network, Network) and bundle.locator is None
         self._refuses = self._to_scale and not tells_touches(bundle)  # else the measurements have been explained
-        self.residual = Residual(bundle, self._to_scale)
         self.linearisation = Linearisation(name, bundle)
+        self._use(bundle)
         self._tells_shapes = tells_shapes(bundle)
         self.each_alone = False  # offline: frames that do not follow each other; each waits for its fit
         self._metres_per_pixel = bundle.metres_per_pixel
@@ -73,8 +77,11 @@ class Inference(Stage):
         self._last: ImageFrame | None = None  # of the touch that is being held
         self._last_scan = 0  # of the frame that it was reconstructed from
         self._again = True  # whether a subscriber may not have it: the next held frame brings it
+        self._made_of: DeltaFrame | None = None  # frame of the image that is shown
+        self._stack_sent = False  # whether who subscribes to stacks has that frame's
         self._unseen: DeltaFrame | None = None  # last reconstruction that nobody wanted
-        self._ahead: tuple[DeltaFrame, Pictures] | None = None  # what `together` made
+        self._ahead: tuple[DeltaFrame, Stack, Pictures] | None = None  # what `together` made
+        self._tare_frames = 0  # of the baseline that untouched frames are held against
         self._quiet: NDArray[np.float32] | None = None  # standard deviation that untouched frames state
         self._stated = 0  # how many have stated it, one after the other
         names = (
@@ -92,7 +99,7 @@ class Inference(Stage):
         assert isinstance(frame, DeltaFrame)
         if "image" not in wanted:
             self._counters["unwanted"] += 1
-            self._unseen = frame if frame.stack.size else self._unseen
+            self._unseen = frame if frame.averaged else self._unseen
             return []
         out = ImageFrame(
             **inherited(frame),
@@ -105,7 +112,7 @@ class Inference(Stage):
             add_reason(out.reasons, "stale_baseline")
             self._counters["uncalibrated"] += 1
         out.metres_per_pixel, out.origin = self._metres_per_pixel, self._origin
-        if frame.stack.size:
+        if frame.averaged:
             self._run(frame, out)
         elif frame.held and self._unseen is not None and self._unseen.scan == frame.reconstructed:
             self._run(self._unseen, out)
@@ -113,10 +120,10 @@ class Inference(Stage):
             self._hold(frame, out)
         else:
             self._counters["untouched"] += 1
-            self._last = None
+            self._last = self._made_of = None
             if self._symmetry is not None:
                 self._symmetry.forget()
-            self._rest(frame.sigma)
+            self._rest(frame)
         if self._refinement is not None:
             self._refine(frame, out)
         return [out]
@@ -132,7 +139,8 @@ class Inference(Stage):
             return self._refinement.forget()
         if self.each_alone:
             self._refinement.fit_here()
-        out.refined = self._refinement(frame, out)
+        operator = self._operator(frame)
+        out.refined = self._refinement(frame, out, 0.0 if operator is None else operator.drift)
 
     def _follow(self, calibration: str) -> bool:
         """Use the matrices that frames are made with from now on; False where they cannot be found."""
@@ -143,30 +151,58 @@ class Inference(Stage):
 
     def _build(self) -> None:
         """What stands on the matrices in use."""
-        self.residual = Residual(self.linearisation.bundle, self._to_scale)
+        self._use(self.linearisation.bundle)
         if isinstance(self._network, OneStep):
             self._network = OneStep(self.linearisation.bundle)
         self._last, self._quiet, self._stated = None, None, 0
 
+    def _use(self, bundle: Bundle) -> None:
+        self.residual = Residual(bundle, self._to_scale)
+        tare = self.config.tare
+        self._operators = Operators(bundle.prereconstructor(), tare.scale_per_s, tare.contact_per_s)
+
     def joined(self, topic: str) -> None:
-        self._again = True
+        if topic == "stack":
+            self._stack_sent = False
+        else:
+            self._again = True
+
+    def beside(self, wanted: frozenset[str]) -> list[Frame]:
+        frame = self._made_of
+        if "stack" not in wanted or frame is None or self._stack_sent or (stack := self.stack(frame)) is None:
+            return []
+        self._stack_sent = True
+        out = StackFrame(**inherited(frame), reconstructed=frame.scan)
+        out.stack, out.context, out.scale = stack
+        return [out]
+
+    def _operator(self, frame: DeltaFrame) -> Operator | None:
+        """What makes the stack of a frame that is to be reconstructed; None of others."""
+        return self._operators(frame.sigma, frame.averaged, frame.tare_frames) if frame.averaged else None
+
+    def stack(self, frame: DeltaFrame) -> Stack | None:
+        """What a network reads of a frame that is to be reconstructed; None of others."""
+        operator = self._operator(frame)
+        return None if operator is None else Stack(*operator.stack(frame.difference))
 
     @classmethod
     def together(cls, work: Sequence[tuple[Stage, Frame]]) -> None:
         """Frames of several skins that wait at once: one run of the network for those that share it."""
         groups: dict[Network, list[tuple[Inference, DeltaFrame]]] = {}
         for stage, frame in work:
-            if isinstance(stage, Inference) and isinstance(frame, DeltaFrame) and frame.stack.size:
+            if isinstance(stage, Inference) and isinstance(frame, DeltaFrame) and stage._operator(frame) is not None:
                 if isinstance(stage._network, Network):
                     groups.setdefault(stage._network, []).append((stage, frame))
         for shared, members in groups.items():
             if len(members) > 1:
-                made = shared.run_many([frame for _, frame in members])
-                for (stage, frame), pictures in zip(members, made, strict=True):
-                    stage._ahead = frame, pictures
+                stacks = [stack for stage, frame in members if (stack := stage.stack(frame)) is not None]
+                made = shared.run_many(stacks)
+                for (stage, frame), stack, pictures in zip(members, stacks, made, strict=True):
+                    stage._ahead = frame, stack, pictures
 
-    def _rest(self, sigma: NDArray[np.float32]) -> None:
+    def _rest(self, frame: DeltaFrame) -> None:
         """Learn the noise from an untouched frame. One that stands for no scan does not state it."""
+        sigma, self._tare_frames = frame.sigma, frame.tare_frames
         if self._quiet is not None and np.array_equal(sigma, self._quiet):
             self._stated += 1
         elif np.isfinite(sigma).any():
@@ -181,11 +217,33 @@ class Inference(Stage):
         if self._symmetry is not None and self._symmetry.busy:
             self._surer = self._symmetry.step()
             return True
-        return self._quiet is not None and self._stated >= SETTLED and self.residual.prepare(self._quiet)
+        if self._quiet is None or self._stated < SETTLED:
+            return False
+        return self._prepare_operator(self._quiet) or self.residual.prepare(self._quiet)
+
+    def _prepare_operator(self, quiet: NDArray[np.float32]) -> bool:
+        """Make one of the operators of a touch whose single frames have this noise; False where all are there."""
+        if isinstance(self._network, OneStep):
+            return False
+        for n in MEANS:
+            asked = sigma_of_mean(quiet, n), n, self._tare_frames
+            if not self._operators.has(*asked):
+                return self._operators(*asked) is not None
+        return False
+
+    def _pictures(self, frame: DeltaFrame) -> tuple[Stack | None, Pictures]:
+        """Of a frame that is to be reconstructed: what the network read, and what it made of it."""
+        ahead, self._ahead = self._ahead, None
+        if ahead and ahead[0] is frame:
+            return ahead[1:]
+        if isinstance(self._network, OneStep):
+            return None, self._network.run(frame)
+        stack = self.stack(frame)
+        return stack, nothing(self.bundle.image_size) if stack is None else self._network.run(stack)
 
     def _run(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        ahead, self._ahead = self._ahead, None
-        out.image, out.sigma, out.classes = ahead[1] if ahead and ahead[0] is frame else self._network.run(frame)
+        stack, pictures = self._pictures(frame)
+        out.image, out.sigma, out.classes = pictures
         if not self._tells_shapes:
             out.classes = ImageFrame(skin=self.skin).classes
         out.noise = _rms(frame.sigma)
@@ -198,12 +256,13 @@ class Inference(Stage):
             out.valid = False
             add_reason(out.reasons, "out_of_distribution")
         self._shows(frame, out)
-        if self._symmetry is not None and frame.touched:
-            self._symmetry.begin(frame, (out.image, out.sigma, out.classes))
+        if self._symmetry is not None and frame.touched and stack is not None and np.isfinite(frame.sigma).all():
+            self._symmetry.begin(stack, (out.image, out.sigma, out.classes))
 
     def _shows(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """`out` has the image of `frame`, which later ones may hold."""
         self._last, self._unseen, self._surer = out, None, None
+        self._made_of, self._stack_sent = frame, False
         self._last_scan = out.reconstructed = frame.scan
         self._again = False
 

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.calibration_file import CalibrationFileError, unpack
 from models.files import FileError, read_bytes
-from models.measurement.tables import SkinTables
-from services.estimation.baseline import Baseline, implausibility
+from models.measurement.responses.tables import SkinTables
 from services.estimation.by_bundle import skin_tables
+from services.estimation.first.baseline import Baseline, implausibility
 from services.runtime import persistence
 from services.runtime.config import ROOT
 

@@ -79,7 +79,7 @@ class Pipeline:
     @staticmethod
     def _passed(stage: Stage, frame: Frame) -> list[Frame]:
         """What a stage makes of a frame, stamped."""
-        made = stage.process(frame, ALL)
+        made = stage.everything(frame, ALL)
         for out in made:
             out.stamps[stage.stamp] = time.monotonic_ns()
         return made

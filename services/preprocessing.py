@@ -1,7 +1,7 @@
 """Preprocessing by one model: from impedances to the touches that explain them, and to what an image is made of.
 
 scan -> Estimator (services/estimation/estimator.py) -> Estimate: touches, what is left, judgements
-difference -> stack of images, where something touches and changed: the network's input
+difference -> what an image is to be made of, where something touches and changed
 """
 
 from __future__ import annotations
@@ -14,21 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from models.prereconstruction import Drift
 from protocol.frames import DeltaFrame, EstimatedTouch, Frame, PartFrame, RawFrame, as_sent
 from services.contacts.lasting import LASTS_NS
 from services.describe import BaselineNews, FrameRate, describe, force, refinement, symmetry
-from services.estimation import checks
-from services.estimation.averaging import sigma_of_mean
-from services.estimation.baseline import TAKING, Baseline, NoBaseline, plausible_noise
 from services.estimation.by_bundle import skin_tables
-from services.estimation.estimator import Estimator
+from services.estimation.estimator import LAYOUT, Estimator
+from services.estimation.faults import checks
 from services.estimation.faults.advice import sentences
+from services.estimation.first.baseline import TAKING, Baseline, NoBaseline, plausible_noise
+from services.estimation.first.references import References
 from services.estimation.first.tare import TareRefused
-from services.estimation.reconstruct import Reconstruction
-from services.estimation.references import References
+from services.estimation.images.averaging import sigma_of_mean
+from services.estimation.images.operators import Operators
+from services.estimation.images.reconstruct import Reconstructed, Reconstruction
 from services.estimation.tared import KnownBaseline
 from services.estimation.values.estimate import Estimate, TouchEstimate
+from services.estimation.values.judgement import Judgement
 from services.estimation.values.scan import Scan
 from services.judged import judged
 from services.kept_baseline import ages
@@ -39,7 +40,6 @@ from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason,
 
 Array = NDArray[np.float64]
 
-REST_S = 0.25  # of the drift that skin.toml allows: what is left of it beside a touch
 SAVE_EVERY = 512  # untouched scans after which the tracked baseline is worth keeping again
 PLACE_SIGMA = 1e-4  # m: no table knows a place better
 MOST_LOG = 3.0  # of |Z| over the baseline: no image is made of what is larger, no touch does it
@@ -69,10 +69,10 @@ class Preprocessing(Stage):
 
     def _build(self) -> None:
         """What stands on the bundle in use."""
-        self.bundle, skin = self.linearisation.bundle, self.config
+        self.bundle = self.linearisation.bundle
         self.pre = self.bundle.prereconstructor()
-        allowed = Drift(skin.tare.scale_per_s * REST_S, skin.tare.contact_per_s * REST_S)
-        self._reconstruction = Reconstruction(self.pre, allowed)
+        tare = self.config.tare
+        self._reconstruction = Reconstruction(Operators(self.pre, tare.scale_per_s, tare.contact_per_s))
 
     def reset(self) -> None:
         self.estimator = self._new_estimator()
@@ -81,6 +81,7 @@ class Preprocessing(Stage):
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
         self._foreign = self._problem = self._source = self._board = ""
         self._before: Scan | None = None
+        self._judged: tuple[DeltaFrame, tuple[Judgement, ...]] | None = None  # of the frame processed last
         self._electrodes = np.zeros(0, np.uint8)
         self._touched = self._keep = self._silent = False
         self._told_ns = -LASTS_NS  # `sample` of the last message that said something of touches
@@ -114,6 +115,7 @@ class Preprocessing(Stage):
         assert isinstance(frame, RawFrame)
         out = DeltaFrame(**inherited(frame), calibration=self.linearisation.name)
         self._counters["frames"] += 1
+        self._judged = None
         self.frame_rate(frame)
         out.valid, out.reasons = as_sent(frame)
         if frame.kind == "sentinel":  # of a recording made by an earlier version: no contacts are made of it
@@ -147,9 +149,12 @@ class Preprocessing(Stage):
         else:
             self._part = (frame.scan, frame.scan)
             made = [self._delta_of(out, estimate)]
-        if "judgements" in wanted:
-            made.append(judged(out, estimate.judgements))
+        self._judged = out, estimate.judgements
         return made
+
+    def beside(self, wanted: frozenset[str]) -> list[Frame]:
+        self.estimator.learn()
+        return [judged(*self._judged)] if self._judged is not None and "judgements" in wanted else []
 
     def _part_of(self, out: DeltaFrame, estimate: Estimate) -> list[Frame]:
         """Of parts in which nothing touches none travels on."""
@@ -185,24 +190,24 @@ class Preprocessing(Stage):
         d = np.where(live, z0 * np.expm1(estimate.difference) / self.pre.normaliser(z0), 0.0)
         out.difference = d.astype(np.float32)
         out.sigma = np.where(live, self._reconstruction.sigma, np.inf).astype(np.float32)
+        out.tare_frames = self._reconstruction.frames
         if not out.touched:
             self._reconstruction.rest()
             self._worth_keeping()
         if out.touched or self.always_reconstruct or not self.config.touch.skip_untouched:
-            self._reconstruct(out, d, live)
+            self._reconstruct(out, d)
         return out
 
-    def _reconstruct(self, out: DeltaFrame, d: Array, live: NDArray[np.bool_]) -> None:
+    def _reconstruct(self, out: DeltaFrame, d: Array) -> None:
         holds = out.touched and self.config.touch.hold and not self.always_reconstruct
-        made = self._reconstruction(d, live, out.scan) if holds else self._reconstruction.alone(d, live)
+        made = self._reconstruction(d, out.sigma, out.scan) if holds else Reconstructed(d, 1)
         if made is None:
-            out.held, out.reconstructed = True, self._reconstruction.scan
-            self._counters["held"] += 1
+            out.held, out.reconstructed = self._reconstruction.scan > 0, self._reconstruction.scan
+            self._counters["held"] += out.held
             return
         out.difference = made.difference.astype(np.float32)
         out.sigma = sigma_of_mean(out.sigma, made.averaged)
-        out.reconstructed = out.scan
-        out.stack, out.context, out.scale = made.operator.stack(made.difference)
+        out.reconstructed, out.averaged = out.scan, made.averaged
         self._counters["reconstructed"] += 1
 
     def _no_scan(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
@@ -286,11 +291,14 @@ class Preprocessing(Stage):
         if problem or self.estimator.skin is not None:
             self._problem = problem
 
-    def _count_gain_steps(self) -> None:
+    @property
+    def _steps_of_baseline(self) -> int:
         skin = self.estimator.skin
-        steps = 0 if skin is None else skin.faults.now.gain_steps
-        self._counters["gain_steps"] += max(0, steps - self._gain_steps)
-        self._gain_steps = steps
+        return 0 if skin is None else skin.faults.now.gain_steps
+
+    def _count_gain_steps(self) -> None:
+        self._counters["gain_steps"] += max(0, self._steps_of_baseline - self._gain_steps)
+        self._gain_steps = self._steps_of_baseline
 
     def _taken(self, by: str) -> Baseline:
         skin = self.estimator.skin
@@ -408,8 +416,10 @@ class Preprocessing(Stage):
             "estimator": self.estimator.state(),
             "bundle": self.bundle.hash,
             "baseline": baseline.to_dict() if baseline else None,
+            "trusted": self._trusted.to_dict() if self._trusted else None,
+            "undated_s": self._undated_s,
             "references": self.references.state(),
-            "parts": [*self._part, self._delta],
+            "parts": list(self._part),
             "board": self._board,
             "last_sample_ns": self._sample_ns,
             **self.linearisation.state(),
@@ -435,19 +445,24 @@ class Preprocessing(Stage):
         kept, k = state["baseline"], len(self.bundle.pattern)
         baseline = None if kept is None else Baseline.from_dict(kept, k)
         self._sample_ns = int(state["last_sample_ns"])
-        if "estimator" not in state or state["bundle"] != self.bundle.hash:
+        earlier = state.get("estimator", {}).get("layout") != LAYOUT
+        if earlier or state["bundle"] != self.bundle.hash:
             if baseline is not None:
                 self.set_baseline(baseline)
             return
         self.estimator.load(state["estimator"])
+        self._gain_steps = self._steps_of_baseline  # whoever saved them has counted them
+        trusted = state.get("trusted")
+        self._trusted = None if trusted is None else Baseline.from_dict(trusted, k)
+        self._undated_s = float(state.get("undated_s", 0.0))
         self.references.load(state["references"])
         self._use(baseline)
         self._before = self.estimator.now.before
         self._reconstruction.load(state["hold"])
         self.continuity.load(state["continuity"])
         self._touched, self._told_ns = bool(state["touched"]), int(state["told_ns"])
-        seen, handed, self._delta = (int(each) for each in state["parts"])
-        self._part = (seen, handed)
+        seen, handed = map(int, state["parts"])
+        self._part = (seen, handed)  # but who reads parts from now on may never see the delta frame before
         self._board = str(state["board"])  # whether frames are a recording's, the next one says
 
     # --- beside frames ---

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from models.bundle import Bundle
-from models.measurement.tables import tells_touches
+from models.measurement.responses.tables import tells_touches
 from protocol.frames import (
     SHAPES,
     Contact,
@@ -29,20 +29,21 @@ from protocol.frames import (
 )
 from protocol.held import HeldImage
 from services.contacts.contact_writer import ContactWriter
-from services.contacts.force import ForceLaw
+from services.contacts.force.law import ForceLaw
+from services.contacts.images.of_image import ImageTouches
+from services.contacts.images.registered import measures_force
 from services.contacts.invalid_spell import InvalidSpell
 from services.contacts.lasting import LastingStates
-from services.contacts.of_image import ImageTouches
 from services.contacts.placing import placement
 from services.contacts.reading import Appearance, Appearances
 from services.contacts.refined import area_of_image, both, refined_outline
-from services.contacts.registered import measures_force
 from services.describe import geometry
 from services.runtime.config import Skin
 from services.runtime.stage import HARMLESS, SEPARATE, Health, Stage, add_reason, inherited
 
 COARSE = 0.05  # of the sheet's side: a place that is less sure than that is coarse
 SAME_BIRTH_NS = 50_000_000  # a touch is the same where it has the same number and was born at the same time
+BEYOND = 1.2  # times half the longer side of a skin, beyond which nothing touches it
 MOST_M = 10.0  # of a sheet, and of a sigma of a place on it
 MOST_STRENGTH = MOST_M**2
 UNWATCHED_NS = 1_000_000_000  # without a frame: what began meanwhile may have been there for long
@@ -72,6 +73,7 @@ class Publishing(Stage):
         self._writer = ContactWriter(self.law, place, self._tells_force)
         self._appearances = Appearances(bundle)
         self._coarse_m = 2 * COARSE * bundle.half_width * bundle.metres_per_unit
+        self._reach_m = BEYOND * bundle.metres_per_unit
         self._next_id = 1
         self.lasting = LastingStates()
         self.each_alone = False  # offline: frames that do not follow each other
@@ -120,7 +122,7 @@ class Publishing(Stage):
         if not self._tells_force:
             add_reason(out.reasons, "uncalibrated_force")
         whole = isinstance(frame, ImageFrame)
-        if not all(map(_readable, frame.estimates)):
+        if not all(_readable(touch, self._reach_m) for touch in frame.estimates):
             out.valid = False
             add_reason(out.reasons, "non_finite")
         elif isinstance(frame, ImageFrame):
@@ -135,11 +137,15 @@ class Publishing(Stage):
         self._invalid(out.valid, [r for r in out.reasons if r not in HARMLESS], frame.stamps.get("sample", 0))
         if frame.part and out.valid:
             out.contacts = self.lasting(out.contacts, frame.stamps.get("sample", 0))
-        frames: list[Frame] = [out]
+        self._last = out, whole
+        return [out]
+
+    def beside(self, wanted: frozenset[str]) -> list[Frame]:
+        (contacts, whole), frames = self._last, list[Frame]()
         if "force" in wanted:
-            frames.append(self._force(out))
+            frames.append(self._force(contacts))
         if "shape" in wanted and whole:
-            frames.append(self._shape(out))
+            frames.append(self._shape(contacts))
         return frames
 
     def _watch(self, now_ns: int) -> None:
@@ -380,12 +386,14 @@ def _given(state: Mapping[str, Any]) -> list[Any]:
     return [int(state["next_id"]), [[int(each) for each in known] for known in state["ids"]], contacts]
 
 
-def _readable(touch: EstimatedTouch) -> bool:
-    """Whether it is one that a touch may be."""
+def _readable(touch: EstimatedTouch, reach_m: float) -> bool:
+    """Whether it is one that a touch may be. reach_m: from the skin's middle along each axis."""
     lengths = [*touch.position, *touch.sigma, touch.radius_m]
     strengths = [touch.strength, touch.strength_sigma]
     rest = [*touch.velocity, touch.age_s, touch.radius_sigma, touch.drop, touch.drop_sigma, touch.z2]
     if not all(map(math.isfinite, [*lengths, *strengths, *rest])):
+        return False
+    if max(map(abs, touch.position)) > reach_m or touch.drop < 0:
         return False
     return touch.radius_m > 0 and max(map(abs, lengths)) < MOST_M and max(strengths) < MOST_STRENGTH
 

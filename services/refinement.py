@@ -92,13 +92,15 @@ class Refinement:
         self._now: _Asked | None = None  # frame last reconstructed
         self._touch: RefinedTouch | None = None
 
-    def __call__(self, frame: DeltaFrame, out: ImageFrame) -> RefinedTouch | None:
-        """The refined touch of this frame, or None. out: the image made of it, or of what it holds."""
+    def __call__(self, frame: DeltaFrame, out: ImageFrame, drift: float) -> RefinedTouch | None:
+        """The refined touch of this frame, or None. out: the image made of it, or of what it holds; drift: what may
+        have changed since the last untouched frame, rms of the difference.
+        """
         news = self._take_answer()
         if not frame.touched or not out.valid or "changing" in out.reasons:
             self.forget()
             return None
-        if frame.stack.size:
+        if frame.averaged:
             if (start := start_of(out.image)) is None:
                 self.forget()
                 return None
@@ -106,7 +108,7 @@ class Refinement:
             self._single = max(self._single, _typical(now.sigma)) if self._now else _typical(now.sigma)
             self._now = now
             moved = self._moved()
-            self._ask(now, frame.context, self._slid() if moved is None else likely(moved))
+            self._ask(now, drift, self._slid() if moved is None else likely(moved))
             if self._take_answer():  # where a frame waits for its fit
                 moved = self._moved()
             self._touch = self._told(moved)
@@ -115,12 +117,11 @@ class Refinement:
         self._counted["refined"] += self._touch is not None
         return self._touch
 
-    def _ask(self, now: _Asked, context: NDArray[np.float32], before: dict[str, Any]) -> None:
+    def _ask(self, now: _Asked, drift: float, before: dict[str, Any]) -> None:
         """A frame that is reconstructed is to be fitted."""
         self._number += 1
         self._asked[self._number] = now
         self._asked.pop(self._number - MOST_ASKED, None)
-        drift = 10 ** (2 * float(context[2]) - 5) if len(context) > 2 else 0.0
         self._fits = self._fits or shared()
         self._fits.offer(
             RefineJob(

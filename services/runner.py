@@ -149,25 +149,30 @@ class Runner:
         now = time.monotonic_ns()
         beat.heard(frame, now)
         try:
-            made = stage.process(frame, channel.wanted)
+            late = self._hand_on(channel, stage.process(frame, channel.wanted))
+            self._hand_on(channel, stage.beside(channel.wanted), late)
         except Exception as why:
             self._failed(channel, why)
             return
+        beat.done(frame, now, time.monotonic_ns(), bool(late))
+        if stage.lacks and not channel.asleep and isinstance(channel.feed, StageReader):
+            channel.feed.ask_again()
+        self._frames += 1
+
+    def _hand_on(self, channel: Channel, made: Sequence[Frame], late: bool | None = None) -> bool | None:
+        """Send what was made of a frame, stamped. late: whether that frame was too old; None: the first of these says.
+        Returns whether it was; None where nothing was made.
+        """
         done = time.monotonic_ns()
-        late = False
-        for n, out in enumerate(made):
+        for out in made:
             if out.host in ("", host_id()):  # whose clock the stamps are of
-                out.stamps.setdefault(stage.stamp, done)
-            if n == 0:
-                late = self._lateness.late(out)
+                out.stamps.setdefault(channel.stage.stamp, done)
+            late = self._lateness.late(out) if late is None else late
             if late:
                 out.valid = False
                 add_reason(out.reasons, "late")
             self._send(channel, out)
-        beat.done(frame, now, time.monotonic_ns(), late)
-        if stage.lacks and not channel.asleep and isinstance(channel.feed, StageReader):
-            channel.feed.ask_again()
-        self._frames += 1
+        return late
 
     def _joined(self, prefix: bytes) -> None:
         """Somebody has subscribed to topics with this prefix."""

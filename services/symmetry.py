@@ -7,13 +7,10 @@ are there, the mean takes the image's place. No frame waits for it.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from models.turns import Turn
-from protocol.frames import DeltaFrame
-from services.networks import Network, Pictures
+from services.networks import Network, Pictures, Stack
 
 
 class SymmetryMean:
@@ -24,22 +21,22 @@ class SymmetryMean:
         self.forget()
 
     def forget(self) -> None:
-        self._frame: DeltaFrame | None = None
+        self._stack: Stack | None = None
         self._made: list[Pictures] = []
 
-    def begin(self, frame: DeltaFrame, pictures: Pictures) -> None:
-        """A frame and what the network made of it. Where electrodes are missing, the skin has no symmetry."""
+    def begin(self, stack: Stack, pictures: Pictures) -> None:
+        """What the network read of a frame, and what it made of it."""
         self.forget()
-        if self._turns and np.isfinite(frame.sigma).all():
-            self._frame, self._made = frame, [pictures]
+        if self._turns:
+            self._stack, self._made = stack, [pictures]
 
     def step(self) -> Pictures | None:
         """Compute one more; the mean of all when it was the last."""
-        if self._frame is None:
+        if self._stack is None:
             return None
         turn = self._turns[len(self._made) - 1]
-        frame = replace(self._frame, stack=np.ascontiguousarray(turn.image(self._frame.stack)))
-        drop, sigma, classes = (turn.back.image(each) for each in self._network.run(frame))
+        turned = self._stack._replace(images=np.ascontiguousarray(turn.image(self._stack.images)))
+        drop, sigma, classes = (turn.back.image(each) for each in self._network.run(turned))
         self._made.append((drop, sigma, classes))
         if len(self._made) <= len(self._turns):
             return None
@@ -51,4 +48,4 @@ class SymmetryMean:
 
     @property
     def busy(self) -> bool:
-        return self._frame is not None
+        return self._stack is not None

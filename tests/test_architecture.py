@@ -53,7 +53,6 @@ SERVICES_USE_OF_MODELS = {
     "models.touch_parameters",
     "models.touch_posterior",
     "models.pressure",
-    "models.uncertainty",
 }
 
 WITHOUT_CIRCLES = ("protocol", "models", "services", "firmware_stub", "bridges", "bench")

@@ -61,8 +61,8 @@ from models.shapes import KINDS, Array, Shape, from_rows, to_rows
 from models.touch_posterior import TouchPosterior
 from protocol.frames import Contact
 from services.contacts.contact_writer import ContactWriter
-from services.contacts.force import ForceLaw
-from services.contacts.force_curve import Curve
+from services.contacts.force.curve import Curve
+from services.contacts.force.law import ForceLaw
 from services.contacts.refined import area_of_image, both
 from services.contacts.surface import Placement, Plane
 from services.networks import Network

@@ -50,7 +50,7 @@ def parameters(kind: str) -> int:
 
 
 def difference(bundle: Bundle, kind: str, p: Array) -> Array:
-    """(K,) d of a touch; nearly linear in -log(1 - drop), as services/estimation/quality.py has it."""
+    """(K,) d of a touch; nearly linear in -log(1 - drop), as services/estimation/images/quality.py has it."""
     rotation, aspect = p[4] if len(p) > 4 else 0.0, p[5] if len(p) > 5 else 1.0
     touch = Shape(kind, p[0], p[1], p[2], p[3], rotation, aspect)
     log_drop = -np.log(1 - p[3]) * touch.fraction(GRID, covered=True)

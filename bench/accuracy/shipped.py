@@ -16,7 +16,7 @@ from models import fisher, metrics
 from models.bundle import Bundle
 from models.shapes import CLASSES, Array
 from protocol.frames import RawFrame
-from services.estimation.baseline import take
+from services.estimation.first.baseline import take
 from services.pipeline import Pipeline
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import reconstruct

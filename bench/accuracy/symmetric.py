@@ -12,8 +12,7 @@ from models.bundle import Bundle
 from models.forward import shared
 from models.shapes import Array, Shape
 from models.turns import TURNS
-from protocol.frames import DeltaFrame
-from services.networks import Network
+from services.networks import Network, Stack
 from services.symmetry import SymmetryMean
 
 RADIUS, DROP = 0.2, 0.15  # of the paper's touch for the LDCI
@@ -23,11 +22,10 @@ def pictures(network: Network, made: tuple[Any, Any, float], mean: bool = False)
     """Drop and its standard deviation (n, n), class probabilities (5, h, w), as the service makes them of a frame;
     mean: over the square's symmetries. made: what `Operator.stack` gives.
     """
-    stack, context, scale = made
-    frame = DeltaFrame(skin="square16", stack=stack, context=context, scale=scale, sigma=np.ones(1, np.float32))
-    found = network.run(frame)
+    stack = Stack(*made)
+    found = network.run(stack)
     held = SymmetryMean(network, TURNS[1:] if mean else ())
-    held.begin(frame, found)
+    held.begin(stack, found)
     while held.busy:
         found = held.step() or found
     return [np.asarray(each, dtype=float) for each in found]

@@ -50,9 +50,7 @@ class DirectSkin:
     def _scan(self, transfer: Matrix, felt: Felt | None) -> Moment:
         config = self.pipeline.pre.config
         self.scan += 1
-        z, status = self.analog.measure(
-            (transfer, transfer), self.pattern, config.dft_points, config.rtia_ohm, self.now_s
-        )
+        z, status = self.analog.measure((transfer, transfer), self.pattern, config.setting, config.rtia_ohm, self.now_s)
         sample_ns = self.scan * SCAN_NS
         raw = RawFrame(
             skin="palm",

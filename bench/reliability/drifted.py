@@ -117,7 +117,7 @@ def rows_alone(
 
     def measured(world: World) -> np.ndarray:
         transfer = sheet.transfer(world)
-        return np.abs(analog.measure((transfer, transfer), pattern, skin.dft_points, skin.rtia_ohm, 0.0)[0])
+        return np.abs(analog.measure((transfer, transfer), pattern, skin.setting, skin.rtia_ohm, 0.0)[0])
 
     untouched = np.array([measured(World()) for _ in range(TARE_ROWS)], float)
     rows = np.array([measured(world) for world in worlds], float)

@@ -54,6 +54,10 @@ GATES: dict[str, float] = {
     "matrix late": 0,
     "ok valid": 99.5,
     "ok changing": 3,
+    "ok wrong": 0,
+    "electrode open wrong": 0,
+    "electrode dead wrong": 0,
+    "electrode drifting wrong": 0,
     "electrode open valid": 95,
     "electrode open reported": 90,
     "electrode dead valid": 95,
@@ -104,6 +108,8 @@ def _of_matrix(found: Mapping[str, Any]) -> Iterator[Keyed]:
 
 def _of_availability(rows: Mapping[str, Mapping[str, Any]]) -> Iterator[Keyed]:
     for state, row in rows.items():
+        figure = f"{'no fault' if state == 'ok' else state}: valid frames with a contact more than 15 mm off"
+        yield f"{state} wrong", Goal(figure, row["wrong"], at_most=0)
         if state == "ok":
             yield "ok valid", Goal("no fault: frames that are valid, %", row["valid_%"], at_least=99.5)
             figure = "frames that say `changing` for a begin or an end, most"

@@ -19,6 +19,7 @@ from protocol.frames import ContactFrame, DeltaFrame
 from services.pipeline import Pipeline
 from services.runtime.config import Skin
 
+FLOOR_N = 0.05  # no touch is shown from less on, whatever its radius: skin bench trust --floor
 FAR_M = 0.015  # from every true touch: a contact is wrong
 
 
@@ -53,8 +54,9 @@ class Moment:
         return tuple(c for c in self.contacts if _nearest(c, self.truth) > far_m) if self.valid else ()
 
     def unseen(self, far_m: float = FAR_M) -> tuple[PointForce, ...]:
-        """Touches that press and have no contact near them."""
-        return tuple(t for t in self.pressed if _nearest(t, self.contacts) > far_m)
+        """Touches that press and have no contact near them; what presses by less than the skin's floor has ended."""
+        pressing = (t for t in self.pressed if t.newtons is None or t.newtons > FLOOR_N)
+        return tuple(t for t in pressing if _nearest(t, self.contacts) > far_m)
 
 
 def _nearest(one: PointForce, others: tuple[PointForce, ...]) -> float:
@@ -115,6 +117,7 @@ class Session:
 
 
 def new_pipeline(bundle: str = "square16", **settings: object) -> Pipeline:
+    """Of whole scans, where `scan` is not among the settings."""
     loaded = Bundle.load(bundle)
-    skin = Skin.model_validate({"port": "stub", "bundle": bundle, "frame_id": "palm", **settings})
+    skin = Skin.model_validate({"port": "stub", "bundle": bundle, "frame_id": "palm", "scan": "full", **settings})
     return Pipeline(skin, name="palm", bundle=loaded)

@@ -32,7 +32,7 @@ from bench import goals as _goals
 from bench.goals import Goal
 from bench.json_file import write_json
 from bench.machine import provenance
-from bench.speed.service import BEGIN, Outside, Service, end_on_sigterm, running
+from bench.speed.service import BEGIN, SQUARE, Outside, Service, end_on_sigterm, running_square
 from models.command import real, whole
 from protocol.sockets import ControlClient, ControlError
 from services.bridge import NEEDS
@@ -44,7 +44,6 @@ LISTENS = "0A"  # state of a listening socket in /proc/net/tcp
 SETTLE_S = 3.0
 NEAR_NS = 5_000_000  # two times of one scan, by two readings of the clocks
 P99_MS, RATIO, GATE = 3.0, 1.1, 1.5
-SKINS = '[skins.palm]\nport = "stub"\nbundle = "square16"\nframe_id = "palm"\n'
 
 
 @dataclass
@@ -74,7 +73,7 @@ class Listened:
     def __init__(self, name: str, folder: Path, domain: int) -> None:
         self.name = name
         config = folder / f"{name}.toml"
-        config.write_text(f'{SKINS}[ros2]\ninterface = "lo"\ndomain = {domain}\n[foxglove]\nport = 0\n')
+        config.write_text(f'{SQUARE}[ros2]\ninterface = "lo"\ndomain = {domain}\n[foxglove]\nport = 0\n')
         environment = {**os.environ, "EITSKIN_CONFIG": str(config), "CYCLONEDDS_URI": ""}
         log = folder / f"{name}.txt"
         with log.open("wb") as out:
@@ -199,7 +198,7 @@ def run(seconds: float, rounds: int, names: list[str]) -> tuple[dict[str, list[f
     """(since acquisition read a frame, ms: without and with all bridges; what each bridge did)"""
     since: dict[str, list[float]] = {"without": [], "with all": []}
     heard = {name: HandedOn() for name in names}
-    with running() as service:
+    with running_square("full") as service:
         BEGIN["moving"](service)
         contacts = Outside("contact", "palm", service.folder)
         time.sleep(SETTLE_S)

@@ -15,7 +15,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,7 +33,7 @@ from bench.goals import Goal
 from bench.json_file import drawn, write_json
 from bench.machine import machine, provenance
 from bench.speed import latency_parts
-from bench.speed.service import BEGIN, Outside, Service, end_on_sigterm, running
+from bench.speed.service import BEGIN, Outside, Service, end_on_sigterm, running_square
 from models.command import real, whole
 from protocol.frames import RawFrame, TruthFrame
 from protocol.sockets import AllReader
@@ -136,7 +135,7 @@ def controllers(n: int, service: Service, stopped: bool = False) -> Iterator[Non
 def run(seconds: float, counts: list[int], priority: bool) -> tuple[dict[str, Sample], list[str]]:
     """(sample of each condition, what could not be measured)"""
     found: dict[str, list[Sample]] = {}
-    with running() as service:
+    with running_square("full") as service:
         watch = Watch(service)
         watch.sample(TARE_S)  # the floor takes its baseline
         for _ in range(2):  # each condition twice: the machine's load changes
@@ -167,18 +166,14 @@ def _scenes(service: Service, watch: Watch, seconds: float, found: dict[str, lis
 
 def _with_priority(seconds: float, found: dict[str, list[Sample]]) -> bool:
     """The scenes with [realtime] priority; False where the processes did not get it."""
-    with tempfile.TemporaryDirectory(prefix="eitskin-latency") as folder:
-        config = Path(folder) / "skin.toml"
-        skin = '[skins.palm]\nport = "stub"\nbundle = "square16"\nframe_id = "palm"\n'
-        config.write_text(f"{skin}[realtime]\npriority = {PRIORITY}\n")
-        with running("--config", str(config)) as service:
-            pids = service.pids()
-            if any(os.sched_getscheduler(pids[name]) != os.SCHED_FIFO for name in PROCESSES):
-                return False
-            watch = Watch(service)
-            watch.sample(TARE_S)
-            _scenes(service, watch, seconds, found, f", SCHED_FIFO {PRIORITY}")
-            watch.close()
+    with running_square("full", f"[realtime]\npriority = {PRIORITY}\n") as service:
+        pids = service.pids()
+        if any(os.sched_getscheduler(pids[name]) != os.SCHED_FIFO for name in PROCESSES):
+            return False
+        watch = Watch(service)
+        watch.sample(TARE_S)
+        _scenes(service, watch, seconds, found, f", SCHED_FIFO {PRIORITY}")
+        watch.close()
     return True
 
 

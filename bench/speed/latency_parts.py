@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ from rich.table import Table
 
 from bench.goals import Goal
 from bench.machine import machine
-from bench.speed.service import BEGIN, Service, running
+from bench.speed.service import BEGIN, Service, running_square
 from protocol.frames import ContactFrame, TruthFrame, unpack
 from protocol.transport import Context
 from services.runtime.stage import PROCESSES
@@ -26,22 +24,19 @@ SETTLE_S = 3.0
 
 def measured(seconds: float) -> dict[str, dict[str, Any]]:
     """The figures of each scene."""
-    with tempfile.TemporaryDirectory(prefix="eitskin-parts") as folder:
-        config = Path(folder) / "skin.toml"
-        config.write_text('[skins.palm]\nport = "stub"\nbundle = "square16"\nframe_id = "palm"\nscan = "rolling"\n')
-        with running("--config", str(config)) as service:
-            socket = Context.instance().socket(zmq.SUB)
-            socket.setsockopt(zmq.RCVHWM, 100_000)
-            for process, topic in (("publisher", b"contact/palm\0"), ("stub", b"truth/palm\0")):
-                socket.connect(f"ipc://{service.folder}/{process}.ipc")
-                socket.subscribe(topic)
-            rows = {}
-            for scene, begin in BEGIN.items():
-                begin(service)
-                _heard(socket, SETTLE_S)
-                rows[scene] = _figures(service, socket, seconds)
-            socket.close(0)
-            service.stub("release")
+    with running_square("rolling") as service:
+        socket = Context.instance().socket(zmq.SUB)
+        socket.setsockopt(zmq.RCVHWM, 100_000)
+        for process, topic in (("publisher", b"contact/palm\0"), ("stub", b"truth/palm\0")):
+            socket.connect(f"ipc://{service.folder}/{process}.ipc")
+            socket.subscribe(topic)
+        rows = {}
+        for scene, begin in BEGIN.items():
+            begin(service)
+            _heard(socket, SETTLE_S)
+            rows[scene] = _figures(service, socket, seconds)
+        socket.close(0)
+        service.stub("release")
     return rows
 
 
@@ -85,8 +80,11 @@ def goals(rows: dict[str, dict[str, Any]]) -> list[Goal]:
         found.append(Goal(f"in parts, {scene}: p50, ms", row["p50_ms"], at_most=TARGET_MS["p50"]))
         found.append(Goal(f"in parts, {scene}: p99, ms", row["p99_ms"], at_most=TARGET_MS["p99"]))
         found.append(Goal(f"in parts, {scene}: cores, four processes", row["cores"], at_most=CORES[scene]))
-    ratio = rows["untouched"]["cores"] / rows["still"]["cores"]
-    found.append(Goal("in parts, untouched: cores, of a held touch's", ratio, at_most=OF_HELD, gate=OF_HELD))
+    # Of a part, as a skin scans whole for a while where the computer does not keep up.
+    free, held = (rows[scene]["cores"] / max(rows[scene]["parts_hz"], 1e-9) for scene in ("untouched", "still"))
+    found.append(
+        Goal("in parts, untouched: CPU of a part, of a held touch's", free / held, at_most=OF_HELD, gate=OF_HELD)
+    )
     return found
 
 

@@ -25,7 +25,7 @@ from bench.goals import Goal
 from bench.json_file import write_json
 from bench.machine import provenance
 from bench.speed.bridges import quantiles
-from bench.speed.service import BEGIN, Service, end_on_sigterm, running
+from bench.speed.service import BEGIN, Service, end_on_sigterm, running_square
 from bridges.page.feed import NEWEST
 from models.command import real, whole
 from protocol.frames import ContactFrame
@@ -131,7 +131,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()
-    with running() as service:
+    with running_square("full", bridge="page") as service:
         BEGIN["moving"](service)
         cores, times = asyncio.run(run(service, args.seconds, args.rounds))
     table = Table("viewers", "page's process [cores]", "pipeline p50 [ms]", "p99 [ms]", "frames")

@@ -41,6 +41,7 @@ from bench.speed.service import end_on_sigterm
 from bench.speed.skip import ENDS_S, QUIET_S, scenes
 from bench.tracking.scene import Recorded
 from models.command import whole
+from services.networks import Network
 from services.pipeline import Pipeline
 from services.recordings.replay_session import stop
 from services.runtime.config import Skin
@@ -57,12 +58,13 @@ def solvers(recorded: Recorded) -> dict[str, Callable[[], Any]]:
     """What to time: each takes one and the same touched frame."""
     pipeline = _pipeline()
     results = [pipeline.run(recorded.frame(k)) for k in range(len(recorded))]
-    touched = next(r.delta for r in reversed(results) if r.delta.stack.size)
+    touched = next(r.delta for r in reversed(results) if r.delta.averaged)
     operator = pipeline.pre.pre.condition(touched.sigma.astype(float))
-    d, network = touched.difference.astype(float), pipeline.inference._network
+    d, network, stack = touched.difference.astype(float), pipeline.inference._network, pipeline.inference.stack(touched)
+    assert isinstance(network, Network) and stack is not None
     found: dict[str, Callable[[], Any]] = {
         "eitskin, pre-reconstruction (nine images)": lambda: operator.stack(d),
-        "eitskin, network": lambda: network.run(touched),
+        "eitskin, network": lambda: network.run(stack),
     }
     for method in ("jac", "greit", "bp"):
         peer = PyEIT(method, pairs=True)

@@ -5,10 +5,12 @@
                                               --modes rolling)
 
 Real processes and a plain controller. The stub plays a scene that it has solved beforehand and says when it began, so
-every onset is known on this host's clock. A touch is seen with the first valid frame, neither `changing` nor `coarse`,
-from which every frame until the release is within 3 % of the side. --simulated: board and stages in one process and in
-simulated time, 2 ms after the board's last byte, whatever else the machine does. Prints the tables, writes
-reaction.json and reaction.png, or reaction_simulated.json and reaction_simulated.png.
+every onset is known on this host's clock. A touch is *in place* with the first valid frame, neither `changing` nor
+`coarse`, from which every frame until the release is within 3 % of the side. It is *seen near* with the first valid
+frame that has a contact so near, `changing` and `coarse` ones included; that frame's stamps say where its time went.
+--simulated: board and stages in one process and in simulated time, 2 ms after the board's last byte, whatever else the
+machine does. Prints the tables, writes reaction.json and reaction.png, or reaction_simulated.json and
+reaction_simulated.png.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from bench.speed.reaction_pieces import Piece, joined, keep, kept, piece_seed
 from bench.speed.reaction_report import (
     FAST_RAMP,
     LIGHT,
+    SEVERAL,
     SLIDING,
     SLOW_RAMP,
     SNR_DB,
@@ -42,9 +45,11 @@ from bench.speed.reaction_report import (
     rows,
     stated,
     stated_table,
+    sums,
+    sums_table,
     table,
 )
-from bench.speed.service import Service, end_on_sigterm, running
+from bench.speed.service import Service, end_on_sigterm, running_square
 from bench.speed.simulated_host import SimulatedHost
 from models import manifest
 from models.command import whole
@@ -54,7 +59,7 @@ from protocol.transport import Context
 from services.runtime.config import ScanMode
 
 MODES: tuple[ScanMode, ...] = ("full", "rolling")
-STEPS, RAMPS, SLIDES = 500, 40, 40
+STEPS, RAMPS, SLIDES, PAIRS = 500, 40, 40, 40
 QUICK = 8
 IDLE_S = 0.35
 """Between two touches."""
@@ -88,14 +93,15 @@ class Ear(threading.Thread):
         return self.heard
 
 
-def measured(mode: ScanMode, counts: dict[str, int], seed: int) -> tuple[list[tuple[TouchEvent, Reaction]], int]:
-    """What a controller saw of each event, and how often the stub had no pose ready."""
+def measured(
+    mode: ScanMode, counts: dict[str, int], seed: int, more: str = ""
+) -> tuple[list[tuple[TouchEvent, Reaction]], int]:
+    """What a controller saw of each event, and how often the stub had no pose ready. more: sections of skin.toml."""
     plan = events(counts, IDLE_S, seed)
     with tempfile.TemporaryDirectory(prefix="eitskin-reaction") as folder:
-        script, config = Path(folder) / "reaction.toml", Path(folder) / "skin.toml"
+        script = Path(folder) / "reaction.toml"
         script.write_text(scene(plan))
-        config.write_text(f'[skins.palm]\nport = "stub"\nbundle = "square16"\nframe_id = "palm"\nscan = "{mode}"\n')
-        with running("--config", str(config)) as service:
+        with running_square(mode, more) as service:
             stub = ControlClient("stub", SOLVE_S)
             late = int(stub.call("status")["late_poses"])
             ear = Ear(service)
@@ -149,12 +155,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=whole(), default=STEPS, help="of 2 N; the others in proportion")
     parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES))
     parser.add_argument("--simulated", action="store_true", help="in simulated time, without processes")
+    parser.add_argument("--baud", type=whole(), help="of the board's line; default: as skin.toml's")
     parser.add_argument("--seed", type=whole(0), default=1)
     parser.add_argument("--more", action="store_true", help="add so many other touches to those of the last report")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} steps and a few of the others")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()
+    if args.simulated and args.baud:
+        parser.error("--baud is of the live board's line: without --simulated")
     name, before = "reaction_simulated" if args.simulated else "reaction", list[Piece]()
     if args.more:
         try:
@@ -167,12 +176,15 @@ def main(argv: list[str] | None = None) -> int:
     found, late = joined(pieces)
     result = [row for mode, each in found.items() for row in rows(mode, each)]
     Console(width=190).print(table(result))
+    pieces_of = [row for mode, each in found.items() for row in sums(mode, each)]
+    if pieces_of:
+        Console(width=150).print(sums_table(pieces_of))
     honest = [row for mode, each in found.items() for row in stated(mode, each)]
     Console(width=150).print(stated_table(honest))
     listed = goals(result, late)
     Console(width=150).print(_goals.table(listed))
     report = {**provenance("reaction", argv), "targets": [goal.to_dict() for goal in listed], "rows": result}
-    report |= {"stated": honest, "runs": [piece.row() for piece in pieces]}
+    report |= {"stated": honest, "sums": pieces_of, "runs": [piece.row() for piece in pieces]}
     report |= {"side_m": SIDE_M, "simulated": args.simulated}
     report |= {
         "contact_ms": {m: [1e3 * r.contact_s for e, r in each if e.kind.name == STEP] for m, each in found.items()}
@@ -191,12 +203,16 @@ def main(argv: list[str] | None = None) -> int:
 def _piece(args: argparse.Namespace, number: int) -> Piece:
     """One run."""
     steps = QUICK if args.quick else args.steps
-    wanted = {STEP: STEPS, LIGHT: STEPS // 5, FAST_RAMP: RAMPS, SLOW_RAMP: RAMPS, **dict.fromkeys(SLIDING, SLIDES)}
+    wanted = {STEP: STEPS, LIGHT: STEPS // 5, FAST_RAMP: RAMPS, SLOW_RAMP: RAMPS}
+    wanted |= dict.fromkeys(SLIDING, SLIDES) | dict.fromkeys(SEVERAL, PAIRS)
     counts = {name: max(2, round(n * steps / STEPS)) for name, n in wanted.items()}
     piece = Piece(piece_seed(args.seed, number), counts[STEP], load=[os.getloadavg()[0]], commit=manifest.commit())
     for mode in args.modes:  # each on the same touches
-        run = simulated if args.simulated else measured
-        piece.found[mode], piece.late[mode] = run(mode, counts, piece.seed)
+        if args.simulated:
+            piece.found[mode], piece.late[mode] = simulated(mode, counts, piece.seed)
+        else:
+            baud = f"baud = {args.baud}\n" if args.baud else ""
+            piece.found[mode], piece.late[mode] = measured(mode, counts, piece.seed, baud)
         piece.load.append(os.getloadavg()[0])
     return piece
 

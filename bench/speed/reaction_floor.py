@@ -18,19 +18,18 @@ from numpy.typing import NDArray
 from bench.speed.reaction_events import HELD_S, NEAR, SIDE_M, UNIT_M, TouchEvent
 from models.bundle import Bundle
 from models.fisher import MeasurementNoise, SizePrior, floors, mean_floor
-from models.measurement.disc import DiscResponse
-from models.measurement.tables import tables_of
-from models.measurement.touch import area_of
+from models.measurement.responses.disc import DiscResponse
+from models.measurement.responses.tables import tables_of
 from models.pressure import FOAM, disc
+from models.scan_limits import SIZES, touch_slopes
 from models.shapes import Shape
-from services.estimation.rolling import parts_of, rolling_order
+from services.board.rolling_order import parts_of, rolling_order
 
 SCAN_S = 0.0436
 LONGEST_S = 0.3
 MOST = 40  # touches of a kind: each takes eight solves
 PRIOR = SizePrior(radius=(0.05, 0.45))
 UNKNOWN = 1e-9  # information on what no value tells
-SIZES = np.array([0.5, 1.0])  # standard deviations of a touch's log radius and log drop before anything is measured
 
 
 def held_floor(of: Sequence[TouchEvent], snr_db: float) -> tuple[float, float]:
@@ -59,9 +58,7 @@ def _drop(event: TouchEvent) -> float:
 def _slopes(response: DiscResponse, event: TouchEvent) -> NDArray[np.float64]:
     """(K, 4) of log |Z| to x, y, log radius and log drop."""
     log_radius = float(np.log(event.radius_m / UNIT_M))
-    action = _drop(event) * float(area_of(log_radius))
-    felt, x, y, grown = action * response.with_slopes(event.x / UNIT_M, event.y / UNIT_M, log_radius)
-    return np.column_stack([x, y, grown + 2 * felt, felt])  # a larger disc of the same drop acts more
+    return touch_slopes(response, event.x / UNIT_M, event.y / UNIT_M, log_radius, _drop(event))
 
 
 def growing_floor(of: Sequence[TouchEvent], snr_db: float) -> NDArray[np.float64]:
@@ -73,7 +70,7 @@ def growing_floor(of: Sequence[TouchEvent], snr_db: float) -> NDArray[np.float64
     for event in of:
         slope = _slopes(response, event) / noise
         for first in range(parts):
-            information = np.diag([UNKNOWN, UNKNOWN, *SIZES**-2.0])
+            information = np.diag([UNKNOWN, UNKNOWN, *np.array(SIZES) ** -2.0])
             for n in range(int(LONGEST_S / SCAN_S * parts)):
                 rows = order[(first + n) % parts * count :][:count]
                 at = (n + (np.arange(count) + 0.5) / count) * SCAN_S / parts

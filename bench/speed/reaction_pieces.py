@@ -86,9 +86,13 @@ def _read(written: dict[str, Any]) -> Piece:
     for mode, each in written["found"].items():
         found[mode] = [
             (
-                TouchEvent(**{**event, "kind": kinds[event["kind"]], "velocity": tuple(event["velocity"])}),
+                TouchEvent(**{**event, "kind": kinds[event["kind"]], **_places(event)}),
                 Reaction(**{**reaction, "stated": [StatedError(**error) for error in reaction["stated"]]}),
             )
             for event, reaction in each
         ]
     return Piece(**{**written, "found": found})
+
+
+def _places(event: dict[str, Any]) -> dict[str, Any]:
+    return {"velocity": tuple(event["velocity"]), "others": tuple(tuple(place) for place in event["others"])}

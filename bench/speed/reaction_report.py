@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,18 @@ from bench.speed.reaction_events import KINDS, PHASES, Reaction, TouchEvent
 from bench.speed.reaction_floor import growing_floor, held_floor
 
 SNR_DB = 80.0
-STEP, LIGHT, FAST_RAMP, SLOW_RAMP, *SLIDING = (kind.name for kind in KINDS)
+STEP, LIGHT, FAST_RAMP, SLOW_RAMP = (kind.name for kind in KINDS[:4])
+SLIDING = [kind.name for kind in KINDS if kind.speed]
+SEVERAL = [kind.name for kind in KINDS if kind.touches > 1]
 TARGETS_MS = {STEP: (50, 12.0, 99, 25.0), LIGHT: (50, 18.0, 90, 35.0)}  # quantile, target, quantile, target
 GONE_MS = (15.0, 30.0)
+SEVERAL_MS = 40.0
 BEYOND_MS = {50: 8.0, 99: 15.0}  # of a force that grows: beyond the floor of the same touches
 SLIP = 0.1
+PIECES = ("to its middle", "line", "preprocessing", "inference", "publisher", "recv")
+"""Between an onset, the steps of STEPS_TO_RECV and recv: until the middle of the scan or part that tells of the touch
+was measured; the rest of it, the line and acquisition; each stage with the hop to it; the hop to the controller.
+"""
 
 
 def rows(mode: str, found: list[tuple[TouchEvent, Reaction]]) -> list[dict[str, Any]]:
@@ -34,23 +42,29 @@ def rows(mode: str, found: list[tuple[TouchEvent, Reaction]]) -> list[dict[str, 
             errors = np.array([e for r in of for e in r.errors_m])
             row |= {"frames": len(errors), "error_at_recv_mm": 1e3 * _quantile(errors, 50)}
             row |= {"velocity_error": _quantile(np.array([v for r in of for v in r.slip]), 50)}
-        elif not kind.ramp_s:
+        elif not kind.ramp_s and kind.touches == 1:
             off, force = (np.array([e for r in of for e in getattr(r, name)]) for name in ("held_m", "held_force"))
             row |= {"held_frames": len(off), "held_error_mm": 1e3 * _rms(off), "held_force_error": _rms(force)}
             place, drop = held_floor([event for event, _ in found if event.kind is kind], SNR_DB)
             row |= {"held_floor_mm": 1e3 * place, "held_force_floor": drop}
-        else:
+        elif kind.ramp_s:
             floor = 1e3 * growing_floor([event for event, _ in found if event.kind is kind], SNR_DB)
             row |= {f"floor_p{q}_ms": _quantile(floor, q) for q in (50, 99)}
-        for what in ("contact", "any", "gone"):
-            ms = 1e3 * np.array([getattr(r, f"{what}_s") for r in of])
-            # A touch that was never seen counts as one seen after every other.
-            ms = np.where(np.isnan(ms), np.inf, ms)
-            row |= {f"{what}_seen": int(np.isfinite(ms).sum())}
-            row |= {f"{what}_p{q}_ms": _quantile(ms, q) for q in (50, 90, 99)}
+        row |= waited(of)
         row |= {"wrong": sum(r.wrong for r in of), "unstated": sum(r.unstated for r in of)}
         made.append(row)
     return made
+
+
+def waited(of: Sequence[Reaction]) -> dict[str, Any]:
+    """How long until each was in place, near and gone [ms]; one that never was counts as after every other."""
+    row: dict[str, Any] = {}
+    for what in ("contact", "near", "gone"):
+        ms = 1e3 * np.array([getattr(each, f"{what}_s") for each in of])
+        ms = np.where(np.isnan(ms), np.inf, ms)
+        row |= {f"{what}_seen": int(np.isfinite(ms).sum())}
+        row |= {f"{what}_p{q}_ms": _quantile(ms, q) for q in (50, 90, 99)}
+    return row
 
 
 def _quantile(values: NDArray[np.float64], q: float) -> float:
@@ -84,6 +98,9 @@ def _rolling_goals(name: str, row: dict[str, Any]) -> list[Goal]:
         low, at_low, high, at_high = TARGETS_MS[row["kind"]]
         found.append(Goal(f"{name}: to a valid contact, median, ms", row[f"contact_p{low}_ms"], at_most=at_low))
         found.append(Goal(f"{name}: the same, p{high}, ms", row[f"contact_p{high}_ms"], at_most=at_high))
+    if row["kind"] in SEVERAL:
+        found.append(Goal(f"{name}: all near, median, ms", row["near_p50_ms"], at_most=SEVERAL_MS))
+        found.append(Goal(f"{name}: all in place, median, ms", row["contact_p50_ms"], at_most=SEVERAL_MS))
     if row["kind"] == STEP:
         found.append(Goal(f"{name}: release, median, ms", row["gone_p50_ms"], at_most=GONE_MS[0]))
         found.append(Goal(f"{name}: release, p99, ms", row["gone_p99_ms"], at_most=GONE_MS[1]))
@@ -124,13 +141,14 @@ def _beside_full(table: list[dict[str, Any]]) -> list[Goal]:
 
 def table(of: list[dict[str, Any]]) -> Table:
     made = Table(title=f"force leaves zero (or is back) to a controller's recv, ms, {machine()}", title_justify="left")
-    headings: tuple[str, ...] = ("scan", "touch", "n", "in place", "p50", "p90", "p99", "any p50", "release p50", "p99")
+    headings: tuple[str, ...] = ("scan", "touch", "n", "in place", "p50", "p90", "p99", "first near p50", "p99")
+    headings += ("release p50", "p99")
     headings += ("off > 3 sigma", "off > 3 %, no sigma", "mm at recv", "velocity", "held mm (floor)", "force")
     for heading in headings:
         made.add_column(heading, justify="left" if heading in ("scan", "touch") else "right")
     for row in of:
-        cells = [row[key] for key in ("contact_p50_ms", "contact_p90_ms", "contact_p99_ms", "any_p50_ms")]
-        cells += [row["gone_p50_ms"], row["gone_p99_ms"]]
+        cells = [row[f"contact_p{q}_ms"] for q in (50, 90, 99)]
+        cells += [row[f"{what}_p{q}_ms"] for what in ("near", "gone") for q in (50, 99)]
         slides = [f"{row['error_at_recv_mm']:.2f}", f"{row['velocity_error']:.2f}"] if "frames" in row else ["", ""]
         held = ["", ""]
         if "held_frames" in row:
@@ -149,6 +167,37 @@ def table(of: list[dict[str, Any]]) -> Table:
             *slides,
             *held,
         )
+    return made
+
+
+def sums(mode: str, found: list[tuple[TouchEvent, Reaction]]) -> list[dict[str, Any]]:
+    """Where the time to the first frame near a touch goes, by kind: medians of each piece [ms], which need not add up
+    to the whole's median; beside them when the parts of a scan can tell the place at best, by noise alone.
+    """
+    made = []
+    for kind in KINDS:
+        of = [(event, reaction) for event, reaction in found if event.kind is kind and reaction.near_after_s]
+        if not of:
+            continue
+        ends = np.array([[0.0, *reaction.near_after_s, reaction.near_s] for _, reaction in of])
+        pieces = 1e3 * np.median(np.diff(ends, axis=1), axis=0)
+        row: dict[str, Any] = {"mode": mode, "kind": kind.name, "touches": len(of)}
+        row |= {f"{name}_ms": float(ms) for name, ms in zip(PIECES, pieces, strict=True)}
+        row["whole_ms"] = 1e3 * float(np.median(ends[:, -1]))
+        if mode == "rolling" and kind.touches == 1:
+            row["floor_ms"] = 1e3 * float(np.median(growing_floor([event for event, _ in of], SNR_DB)))
+        made.append(row)
+    return made
+
+
+def sums_table(of: list[dict[str, Any]]) -> Table:
+    made = Table(title="force leaves zero to the first frame near it: medians of the pieces, ms", title_justify="left")
+    for heading in ("scan", "touch", "n", *PIECES, "whole", "floor of the parts"):
+        made.add_column(heading, justify="left" if heading in ("scan", "touch") else "right")
+    for row in of:
+        cells = [row.get(f"{name}_ms") for name in (*PIECES, "whole", "floor")]
+        numbers = ["" if ms is None else f"{ms:.1f}" for ms in cells]
+        made.add_row(row["mode"], row["kind"], str(row["touches"]), *numbers)
     return made
 
 

@@ -11,7 +11,6 @@ HOPS = (("acquisition", "raw"), ("preprocessing", "delta"), ("inference", "image
 
 STAMPS = ("sample", "read", "preprocess", "infer", "publish")
 K, N, PIXELS, CLASSES = 120, 24, 96, 5
-RUNGS = 9
 
 
 def hop(n: int) -> Frame:
@@ -22,7 +21,6 @@ def hop(n: int) -> Frame:
         made = RawFrame(skin="palm", z=np.ones(K, np.complex64), status=np.zeros(K, np.uint8), board="relay")
     elif n == 1:
         made = DeltaFrame(skin="palm", difference=np.zeros(K, of), sigma=np.ones(K, of), touched=True)
-        made.stack, made.context = np.zeros((RUNGS, N, N), of), np.zeros(4, of)
     elif n == 2:
         made = ImageFrame(skin="palm", image=np.zeros((PIXELS, PIXELS), of), touched=True)
         made.sigma, made.classes = np.ones((PIXELS, PIXELS), of), np.zeros((CLASSES, N, N), of)

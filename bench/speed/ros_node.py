@@ -37,8 +37,8 @@ from bench import goals as _goals
 from bench.goals import Goal
 from bench.json_file import write_json
 from bench.machine import provenance
-from bench.speed.bridges import NEAR_NS, P99_MS, SETTLE_S, SKINS, quantiles
-from bench.speed.service import Service, end_on_sigterm, running
+from bench.speed.bridges import NEAR_NS, P99_MS, SETTLE_S, quantiles
+from bench.speed.service import SQUARE, Service, end_on_sigterm, running_square
 from bridges import views
 from models.command import real
 from protocol.control import ControlClient, ControlError
@@ -105,7 +105,7 @@ class RosListener:
 def bridged(folder: Path, domain: int) -> Iterator[RosListener]:
     """The bridge and the node that listens to it. Raises RosMissing, RuntimeError where nothing flows."""
     config = folder / "ros2.toml"
-    config.write_text(f'{SKINS}[ros2]\ninterface = "lo"\ndomain = {domain}\n')
+    config.write_text(f'{SQUARE}[ros2]\ninterface = "lo"\ndomain = {domain}\n')
     told = {"EITSKIN_CONFIG": str(config), "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     environment = {**os.environ, **told, "CYCLONEDDS_URI": ""}
     listener = RosListener(environment, folder / "node.txt")
@@ -207,7 +207,7 @@ def drops() -> dict[str, int]:
 
 
 def run(minutes: float, domain: int) -> dict[str, Row]:
-    with running() as service, bridged(service.folder, domain) as listener:
+    with running_square("full") as service, bridged(service.folder, domain) as listener:
         sent = SentFrames()
         sent.take(SETTLE_S)
         before = drops()

@@ -20,8 +20,11 @@ import zmq
 from bench import ROOT
 from protocol.sockets import ControlClient
 from protocol.transport import Context
+from services.runtime.config import ScanMode
 
 START_S = 60.0
+SQUARE = '[skins.palm]\nport = "stub"\nbundle = "square16"\nframe_id = "palm"\n'
+"""The stub's square skin, in skin.toml."""
 
 
 BEGIN: dict[str, Callable[[Service], Any]] = {
@@ -62,6 +65,17 @@ def running(*arguments: str, skin: str = "palm") -> Iterator[Service]:
         os.environ.pop("EITSKIN_RUNTIME")
         if before is not None:
             os.environ["EITSKIN_RUNTIME"] = before
+
+
+@contextmanager
+def running_square(scan: ScanMode, more: str = "", bridge: str = "") -> Iterator[Service]:
+    """`running` with the stub's square skin as "palm", scanned so. more: further sections of skin.toml."""
+    with tempfile.TemporaryDirectory(prefix="eitskin-bench-") as folder:
+        config = Path(folder) / "skin.toml"
+        first = f'bridges = ["{bridge}"]\n' if bridge else ""
+        config.write_text(f'{first}{SQUARE}scan = "{scan}"\n{more}')
+        with running("--config", str(config)) as service:
+            yield service
 
 
 class Service:

@@ -31,7 +31,7 @@ from bench import goals as _goals
 from bench.goals import Goal
 from bench.json_file import write_json
 from bench.machine import machine, provenance
-from bench.speed.service import BEGIN, Outside, end_on_sigterm, running
+from bench.speed.service import BEGIN, Outside, end_on_sigterm, running_square
 from bench.speed.skip_averaging import SNR_DB, averaging
 from bench.speed.skip_batching import TOGETHER, batch_table, batched
 from bench.speed.skip_beside import beside, ratios, table_of
@@ -153,7 +153,7 @@ def run_once(stages: Sequence[Stage], raw: RawFrame, wanted: frozenset[str] = PL
     began = time.thread_time()
     frames: list[Frame] = []
     for stage in stages:
-        frames = stage.process(unpack(message), wanted)
+        frames = stage.everything(unpack(message), wanted)
         for frame in frames:
             frame.stamps.setdefault(stage.stamp, time.monotonic_ns())
         message = [pack(frame) for frame in frames][0]
@@ -207,7 +207,7 @@ def stages_alone(seconds: float) -> dict[str, Any]:
 def live(seconds: float) -> dict[str, Any]:
     """scene -> CPU per frame [ms] of each process, one controller on contact; and of all of them."""
     found: dict[str, Any] = {}
-    with running() as service:
+    with running_square("full") as service:
         contacts = Outside("contact", "palm", service.folder)
         for scene, start in BEGIN.items():
             start(service)

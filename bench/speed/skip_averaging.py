@@ -15,7 +15,7 @@ from models import fisher
 from models.bundle import Bundle
 from models.pressure import FOAM, disc
 from models.shapes import Shape
-from services.estimation.averaging import MEANS
+from services.estimation.images.averaging import MEANS
 from services.pipeline import Pipeline
 from services.recordings.file_source import FILE_RATE_HZ, file_frame
 from services.runtime.config import Skin, TareConfig, TouchConfig

@@ -10,6 +10,7 @@ from rich.table import Table
 from bench.tracking.scene import Recorded
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame
+from services.inference import Inference
 from services.networks import network
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin, TouchConfig
@@ -22,13 +23,15 @@ def batched(recorded: Recorded, bundle: Bundle) -> dict[str, dict[str, float]]:
     """Skins that wait at once -> CPU of a frame's network [ms], one run for all of them and one for each; and by how
     much the images differ at most [S/m].
     """
-    pre = Preprocessing("palm", Skin(port="stub", bundle="square16", touch=TouchConfig(hold=False)), bundle)
+    skin = Skin(port="stub", bundle="square16", touch=TouchConfig(hold=False))
+    pre, inference = Preprocessing("palm", skin, bundle), Inference("palm", skin, bundle)
     made = [pre.process(recorded.frame(k), frozenset({"delta"}))[0] for k in range(len(recorded))]
-    deltas = [delta for delta in made if isinstance(delta, DeltaFrame) and delta.stack.size]
+    asked = [inference.stack(delta) for delta in made if isinstance(delta, DeltaFrame)]
+    stacks = [stack for stack in asked if stack is not None]
     shared = network(str(bundle.network_path("int8")))
     found = {}
     for n in TOGETHER:
-        rounds = [deltas[k : k + n] for k in range(0, min(len(deltas), FRAMES) // n * n, n)]
+        rounds = [stacks[k : k + n] for k in range(0, min(len(stacks), FRAMES) // n * n, n)]
         times: dict[str, list[float]] = {"one run": [], "each alone": []}
         differ = 0.0
         for _ in range(ROUNDS):
@@ -36,7 +39,7 @@ def batched(recorded: Recorded, bundle: Bundle) -> dict[str, dict[str, float]]:
                 began = time.thread_time()
                 together = shared.run_many(each)
                 between = time.thread_time()
-                alone = [shared.run(delta) for delta in each]
+                alone = [shared.run(stack) for stack in each]
                 ended = time.thread_time()
                 times["one run"].append(1e3 * (between - began) / n)
                 times["each alone"].append(1e3 * (ended - between) / n)

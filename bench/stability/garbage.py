@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bench.stability.run import Answer, InProcessStages, Row, Setting, judged, noisy, share, summary
 from models.shapes import Array, Shape
 from protocol.frames import STATUS_CLIPPED, STATUS_OPEN
-from services.estimation.baseline import Baseline, NoBaseline, take
+from services.estimation.first.baseline import Baseline, NoBaseline, take
 
 USUAL_DB = 70.0
 COUNTS = (1, 2, 3, 5, 10, 20, 40, 59, 60, 61, 90, 119, 120)

@@ -27,7 +27,7 @@ from models.forward import ForwardModel
 from models.linearise import linearise
 from models.prereconstruction import Operator, PreReconstructor
 from models.shapes import Array, Shape
-from services.estimation.baseline import NoBaseline
+from services.estimation.first.baseline import NoBaseline
 
 USUAL_DB = 70.0
 SPACING = 0.5  # model units between neighbouring electrodes of a side

@@ -13,7 +13,7 @@ from bench.stability.run import METRES, NOISE_FREE, InProcessStages, Row, Settin
 from models import metrics
 from models.prereconstruction import Array, Drift, PreReconstructor
 from models.shapes import Shape
-from services.contacts.segmentation import segment
+from services.contacts.images.segmentation import segment
 
 USUAL_DB = 70.0
 FLOATS: tuple[type[np.floating], ...] = (np.float64, np.float32)

@@ -19,7 +19,7 @@ from models.bundle import Bundle
 from models.forward import ForwardModel, shared
 from models.shapes import Array, Shape
 from protocol.frames import Contact, FrameError, RawFrame, pack, unpack
-from services.estimation.baseline import Baseline, take
+from services.estimation.first.baseline import Baseline, take
 from services.pipeline import Pipeline, Result
 from services.runtime.config import ScanMode, Skin
 
@@ -131,7 +131,7 @@ class InProcessStages:
         self.scan = 0
 
     def tare(self, z0: Array, relative: float | Array, rng: np.random.Generator) -> Baseline:
-        """The baseline of TARE_FRAMES frames of the untouched skin. Raises services.estimation.baseline.NoBaseline."""
+        """The baseline of TARE_FRAMES frames of the untouched skin. Raises NoBaseline."""
         return take(noisy(z0, relative, rng, TARE_FRAMES), self.pipeline.pre.pre, "bench", 0)
 
     def begin(self, baseline: Baseline | None) -> None:
@@ -178,9 +178,7 @@ def not_finite(result: Result) -> list[str]:
     found = []
     for name, array in (
         ("delta.difference", result.delta.difference),
-        ("delta.stack", result.delta.stack),
-        ("delta.context", result.delta.context),
-        ("delta.scale", np.array([result.delta.scale, result.delta.score, result.delta.threshold])),
+        ("delta.score", np.array([result.delta.score, result.delta.threshold])),
         ("image.image", result.image.image),
         ("image.sigma", result.image.sigma),
         ("image.classes", result.image.classes),

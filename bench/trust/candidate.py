@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import time
 from typing import Protocol
@@ -13,7 +12,6 @@ from services.pipeline import Pipeline
 from services.runtime.config import Skin
 from services.runtime.stage import Refused
 
-TODAY = "bench.trust.candidate:Today"
 FIT_S = 300.0  # a fit of the mounting takes seconds
 
 
@@ -67,13 +65,3 @@ class Today:
     def refused(self) -> bool:
         image, said = self.stages.image, self._said
         return image is not None and said is not None and image.scan == said.scan and not image.valid
-
-
-def made(name: str, skin: Skin, bundle: Bundle) -> Candidate:
-    """The candidate MODULE:CLASS. Raises ValueError where there is none."""
-    module, _, kind = name.partition(":")
-    try:
-        found: type[Candidate] = getattr(importlib.import_module(module), kind)
-    except (ImportError, AttributeError, ValueError) as why:
-        raise ValueError(f"no candidate {name!r} ({why}): expected MODULE:CLASS, as {TODAY}") from None
-    return found(skin, bundle)

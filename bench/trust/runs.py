@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 from bench.reliability import workers
-from bench.trust import candidate
+from bench.trust import candidates as of_name
+from bench.trust.candidate import Candidate
 from bench.trust.kept import KeptScore, session_seed
 from bench.trust.score import WORST, TrustScore
 from bench.trust.session import PlayedSession, SessionPlan
@@ -33,9 +35,9 @@ class SessionTask:
 
 
 @lru_cache(maxsize=4)
-def _made(name: str, text: str, scan: str, bundle: str) -> candidate.Candidate:
+def _made(name: str, text: str, scan: str, bundle: str) -> Candidate:
     """The candidate of this name: two that are of one class are two."""
-    return candidate.made(text, skin_of(scan, bundle), Bundle.load(bundle))
+    return of_name.kind_of(text)(skin_of(scan, bundle), Bundle.load(bundle))
 
 
 def skin_of(scan: str, bundle: str) -> Skin:
@@ -67,7 +69,7 @@ def run(
     seed: str,
     minutes: float,
     *,
-    candidates: Sequence[tuple[str, str]] = (("today", candidate.TODAY),),
+    candidates: Sequence[tuple[str, str]] = (("today", of_name.TODAY),),
     session_s: float = SESSION_S,
     apart_m: float = 0.028,
     bundle: str = "square16",
@@ -76,8 +78,10 @@ def run(
 ) -> dict[str, TrustScore]:
     """Simulate until each candidate's score has so many minutes, those of earlier runs included."""
     of = f"{world}-{scan}-{session_s:.0f}s-{1e3 * apart_m:.0f}mm"
-    shadow = "" if len(candidates) == 1 else "-of-" + "-".join(text.replace(":", ".") for _, text in candidates)
-    kept = {name: KeptScore(of + shadow + f"-{name}" * bool(shadow), seed, folder) for name, _ in candidates}
+    names = " ".join(text for _, text in candidates)
+    shadow = "" if len(candidates) == 1 else f"-of-{hashlib.sha256(names.encode()).hexdigest()[:12]}"
+    places = {name: f"{of}{shadow}" + f"-{at}" * bool(shadow) for at, (name, _) in enumerate(candidates)}
+    kept = {name: KeptScore(place, seed, folder) for name, place in places.items()}
     first = min(each.number for each in kept.values())
     wanted = round(60 * minutes / session_s)
     where = kept[candidates[0][0]].recordings

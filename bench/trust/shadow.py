@@ -1,10 +1,13 @@
-"""Two estimators in the same sessions: the same raw frames, each judged by the same truth.
+"""Several estimators in the same sessions: the same raw frames, each judged by the same truth.
 
-    skin bench shadow --candidate MODULE:CLASS --minutes 10 --world plain --scan full
+    skin bench shadow --candidate without-memory without-rates --minutes 2 --world creep --scan full
+    skin bench shadow --candidate "MEMORY_SHARE*0.5" "MEMORY_SHARE*2" --minutes 2
+    skin bench shadow --candidate MODULE:CLASS
 
-A candidate is what bench/trust/candidate.py says: it takes raw frames and gives contact frames. By default it is the
-service's own stages once more, which differ from themselves in nothing. Writes shadow.json; the exit status is 1 where
-the candidate does more of what must not be than the service, beyond what chance would.
+A candidate is the service's own stages without a part of their model or with some other numbers
+(bench/trust/candidates.py), or what bench/trust/candidate.py says: it takes raw frames and gives contact frames.
+Writes shadow.json; the exit status is 1 where a candidate does more of what must not be than the service, beyond what
+chance would.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from typing import Any
 from bench.goals import Goal
 from bench.reliability import report as reports
 from bench.speed.service import end_on_sigterm
-from bench.trust import candidate, kept, options, report, runs
+from bench.trust import candidates, kept, options, report, runs
 from firmware_stub.worlds.table import WORLDS
 from models.command import real
 from services.recordings.replay_session import private_runtime
@@ -53,18 +56,20 @@ def compared(world: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench shadow", description=(__doc__ or "").split("\n\n")[0])
     options.add(parser, 10.0)
-    parser.add_argument("--candidate", default=candidate.TODAY, metavar="MODULE:CLASS", help="default: %(default)s")
+    parser.add_argument("--candidate", nargs="+", required=True, metavar="CANDIDATE", help="see above")
     parser.add_argument("--session", type=real(), default=runs.SESSION_S, help="seconds of one (default: 60)")
     args = parser.parse_args(argv)
     if not 0 < args.minutes <= 1e5 or not 8 <= args.session <= 3600:
         parser.error(f"--minutes {args.minutes:g} --session {args.session:g}: expected above 0, and 8 to 3600")
     try:
+        for text in args.candidate:
+            candidates.kind_of(text)
         args.seed = args.seed or kept.published_seed()
     except ValueError as why:
         parser.error(str(why))
     end_on_sigterm()
     began, rows, goals = time.perf_counter(), dict[str, Any](), list[Goal]()
-    both = (("today", candidate.TODAY), ("candidate", args.candidate))
+    everyone = (("today", candidates.TODAY), *((text, text) for text in args.candidate))
     with private_runtime():
         for world in args.world or WORLDS:
             for scan in (args.scan,) if args.scan else runs.SCANS:
@@ -73,19 +78,20 @@ def main(argv: list[str] | None = None) -> int:
                     scan,
                     args.seed,
                     args.minutes,
-                    candidates=both,
+                    candidates=everyone,
                     session_s=args.session,
                     apart_m=args.apart_mm * 1e-3,
                     bundle=args.bundle,
                     cores=args.cores,
                 )
-                old, new = scores["today"].row(), scores["candidate"].row()
-                rows |= {f"{world}, {scan}, the service": old, f"{world}, {scan}, candidate": new}
-                goals += compared(f"{world}, {scan}", old, new)
+                old = rows[f"{world}, {scan}, the service"] = scores["today"].row()
+                for text in args.candidate:
+                    new = rows[f"{world}, {scan}, {text}"] = scores[text].row()
+                    goals += compared(f"{world}, {scan}, {text}", old, new)
     report.show(rows, "shadow")
     head = reports.head("shadow", argv, args, time.perf_counter() - began)
     reports.show(head, goals)
-    reports.write(args.out / "shadow.json", head, {"rows": rows, "candidate": args.candidate}, goals)
+    reports.write(args.out / "shadow.json", head, {"rows": rows}, goals)
     return reports.status(goals, sys.stderr)
 
 

@@ -30,10 +30,18 @@ log = logging.getLogger(__name__)
 class ShownSkin:
     """One skin: what is read of it while somebody looks."""
 
-    def __init__(self, name: str, skin: BridgedSkin, context: Context, clock: WallClock, replay: bool) -> None:
+    def __init__(
+        self,
+        name: str,
+        skin: BridgedSkin,
+        context: Context,
+        clock: WallClock,
+        replay: bool,
+        rate_hz: float,
+    ) -> None:
         self.name, self._clock = name, clock
         self.channels = FoxgloveChannels(name, skin.frame_id, context)
-        self.contacts, self.images = ContactFeed(name, replay), ImageFeed(name, replay)
+        self.contacts, self.images = ContactFeed(name, replay, rate_hz=rate_hz), ImageFeed(name, replay)
         self.state: Measured | Refusal | None = None
         self._shapes = NewestFeed("shape", name)
         self._outlines: tuple[str, Outlines] = "", {}  # session, outline of each contact
@@ -116,8 +124,8 @@ class FoxgloveBridge(Bridge):
         self._clock = WallClock()
         self._context = context = Context()  # channels are closed with it
         logging.getLogger("foxglove").setLevel(logging.WARNING)  # it tells of each viewer
-        replay = bool(options.get("replay"))
-        self._skins = {n: ShownSkin(n, skin, context, self._clock, replay) for n, skin in handed.skins.items()}
+        replay, rate_hz = bool(options.get("replay")), float(options["rate_hz"])
+        self._skins = {n: ShownSkin(n, skin, context, self._clock, replay, rate_hz) for n, skin in handed.skins.items()}
         try:
             self._server = foxglove.start_server(
                 name="eitskin",

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from protocol.ages import Ages
-from protocol.frames import DeltaFrame, Frame, ImageFrame, InfoFrame, StatusFrame
+from protocol.frames import Frame, ImageFrame, InfoFrame, StackFrame, StatusFrame
 from protocol.runtime import host_id
 from protocol.sockets import AllReader, NewestReader
 from protocol.topics import TOPIC_OF, TOPICS
 
-NEWEST = ("contact", "image", "delta", "truth", "shape")
+NEWEST = ("contact", "image", "delta", "stack", "truth", "shape")
 """Topics that a viewer may ask for. Status and info come with any of them."""
 LOOK_S = 0.1
 """How often all sockets are looked at. In between a scan's contacts have them looked at: what they were made of has
@@ -48,7 +48,7 @@ class SkinFeed:
         self.latest: dict[str, Latest] = {}
         """By topic; of status by "status/PROCESS"."""
         self.pictures: dict[str, Latest] = {}
-        """The frames of `image` and `delta` that brought the newest picture: those that hold it come without."""
+        """The frames of `image` and `stack` that brought the newest picture: those that hold it come without."""
         self.source = ""
         """Of the newest contact frame: board, stub, replay; "" while nobody looks, or nothing has come."""
         self._watched: Counter[str] = Counter()
@@ -156,7 +156,7 @@ class SkinFeed:
         self._version += 1
         shown = picture(frame)
         self.latest[key] = Latest(self._version, measured, message, shown)
-        if isinstance(frame, (ImageFrame, DeltaFrame)):
+        if isinstance(frame, (ImageFrame, StackFrame)):
             if brings(frame):
                 self.pictures[topic] = self.latest[key]
             elif isinstance(frame, ImageFrame) and shown is not None and not self._has(topic, shown):
@@ -184,11 +184,11 @@ def brings(frame: Frame) -> bool:
     """Whether a frame brings a picture of its own."""
     if isinstance(frame, ImageFrame):
         return frame.image.size > 0
-    return isinstance(frame, DeltaFrame) and frame.stack.size > 0
+    return isinstance(frame, StackFrame)
 
 
 def picture(frame: Frame) -> Reconstruction | None:
     """Which picture a frame brings or holds; None where nothing is to be shown."""
-    if not isinstance(frame, (ImageFrame, DeltaFrame)) or not (brings(frame) or frame.held):
-        return None
-    return frame.session, frame.reconstructed
+    if isinstance(frame, StackFrame) or (isinstance(frame, ImageFrame) and (brings(frame) or frame.held)):
+        return frame.session, frame.reconstructed
+    return None

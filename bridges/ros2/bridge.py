@@ -38,11 +38,17 @@ class SkinTopics:
     """The topics of one skin."""
 
     def __init__(
-        self, skin: str, frame_id: str, participant: DomainParticipant, clock: WallClock, replay: bool
+        self,
+        skin: str,
+        frame_id: str,
+        participant: DomainParticipant,
+        clock: WallClock,
+        replay: bool,
+        rate_hz: float,
     ) -> None:
         base = topic_base(skin)
         self._frame_id, self._clock = frame_id, clock
-        self.contacts = ContactFeed(skin, replay)
+        self.contacts = ContactFeed(skin, replay, rate_hz=rate_hz)
         self.images = ImageFeed(skin, replay)
         self.electrodes = NewestFeed("delta", skin)
 
@@ -152,9 +158,9 @@ class Ros2Bridge(Bridge):
         bases = ", ".join(topic_base(name) for name in handed.skins)
         print(f"ros2: publishing {bases} in ROS domain {domain}", flush=True)
         self._clock = WallClock()
-        replay = bool(options.get("replay"))
+        replay, rate_hz = bool(options.get("replay")), float(options["rate_hz"])
         self._skins = {
-            name: SkinTopics(name, skin.frame_id, self._participant, self._clock, replay)
+            name: SkinTopics(name, skin.frame_id, self._participant, self._clock, replay, rate_hz)
             for name, skin in handed.skins.items()
         }
         self._diagnostics = RosWriter(self._participant, "/diagnostics", "diagnostic_msgs/DiagnosticArray", "state")

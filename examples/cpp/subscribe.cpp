@@ -32,7 +32,7 @@ namespace {
 
 using Map = std::map<std::string, msgpack::object>;
 
-constexpr int kSchema = 2;  // and all before it
+constexpr int kSchema = 3;  // and all before it
 constexpr double kSilenceS = 0.25;  // five frames of the demo
 
 struct NoFrame : std::runtime_error {

@@ -19,25 +19,28 @@ from models.measurement.numbers import (
     SUDDEN_S,
     SUDDEN_SD,
 )
-from models.measurement.response import TouchModel
-from models.measurement.touch import ACTION, LOG_RADIUS, RATE, SHAPES, STATES, VX, VY, TouchPrior, X, Y
+from models.measurement.responses.response import TouchModel
+from models.measurement.touch import ACTION, AT_ONCE_S, LOG_RADIUS, RATE, SHAPES, STATES, VX, VY, TouchPrior, X, Y
 
 Array = NDArray[np.float64]
 
-RADIUS_SLOPE = 3  # of TouchModel.with_slopes
-SUDDEN_STEPS = (-2, -1, 0, 1, 2)
-SUDDEN_REACH_S = float(SUDDEN_S) * (SUDDEN_STEPS[-1] + 1)
+SUDDEN_STEPS: Array = float(SUDDEN_S) * np.arange(-2.0, 3.0)  # s
+TURN_STEPS: Array = float(SUDDEN_S) * np.arange(-4.0, 5.0)  # s: the part after that in which it was seen is within them
+SUDDEN_REACH_S = float(SUDDEN_STEPS[-1] + SUDDEN_S)
 CHANGES = 0.1  # of its strength within a scan, from which on a touch's change may bend
 STRENGTH = 0  # what of a touch a kink bends: how strongly it acts, else X + 1 or Y + 1
 
 
 @dataclass(frozen=True)
-class Kink:
-    """What changes of a touch within the scan beside a straight line, of variance 1."""
+class Kinks:
+    """What changes of a touch within the scan beside a straight line, each of variance 1."""
 
     touch: int
     bends: int
-    profile: Array  # (K,)
+    profiles: Array  # (n, K)
+
+    def __len__(self) -> int:
+        return len(self.profiles)
 
 
 @dataclass(frozen=True)
@@ -55,9 +58,6 @@ class TouchCourse:
 
     def __init__(self, response: TouchModel, times_s: Array, span_s: float) -> None:
         self._response, self._times_s, self.span_s = response, times_s, span_s
-        u = 2 * times_s / span_s
-        self._lagrange = np.stack([(u**2 - u) / 2, 1 - u**2, (u**2 + u) / 2])
-        self._bend = u**2 - 1 / 3
 
     def directions(self, states: Array) -> list[Array]:
         """(9, K) each touch's own directions, of unit action."""
@@ -68,55 +68,62 @@ class TouchCourse:
         states: Array,
         priors: Sequence[TouchPrior],
         directions: Sequence[Array] = (),
-        kinks: Sequence[Kink] = (),
+        kinks: Sequence[Kinks] = (),
         kinked: Array | None = None,
     ) -> TouchColumns:
         """states (T, 7). directions: the touches' own, of states near these; none: nobody asks for them. kinked (n,):
         by how much each kink is taken to bend, 0 where it is not given.
         """
         count, k, shaped = len(priors), len(self._times_s), len(directions) > 0
-        mean, slopes = np.zeros(k), np.empty((k, STATES * count))
-        shapes, bent = np.zeros((k, SHAPES * count if shaped else 0)), np.zeros((k, len(kinks)))
+        mean, slopes = np.zeros(k), np.empty((STATES * count, k))
+        shapes, bent = np.empty((SHAPES * count if shaped else 0, k)), np.empty((sum(map(len, kinks)), k))
         for n, (state, prior) in enumerate(zip(states, priors, strict=True)):
-            moved = self._moved(state)
+            moved = self._moved(state, prior)
             acts = self._acts(state, prior)
             strength = acts * (state[ACTION] + state[RATE] * self._times_s)
             mean += strength * moved[0]
-            for j, kink in enumerate(kinks):
-                if kink.touch == n:
-                    bent[:, j] = kink.profile * moved[kink.bends]
-                    if kink.bends == STRENGTH and kinked is not None:
-                        strength = strength + kinked[j] * kink.profile
-            own = slopes[:, STATES * n : STATES * (n + 1)]
-            own[:, X], own[:, Y] = strength * moved[1], strength * moved[2]
-            own[:, LOG_RADIUS] = strength * moved[RADIUS_SLOPE]
-            own[:, ACTION] = acts * moved[0]
-            own[:, RATE] = acts * moved[0] * self._times_s
-            own[:, VX], own[:, VY] = strength * moved[4], strength * moved[5]
+            at = 0
+            for own in kinks:
+                among = slice(at, at + len(own))
+                at = among.stop
+                if own.touch == n:
+                    bent[among] = own.profiles * moved[own.bends]
+                    if own.bends == STRENGTH and kinked is not None:
+                        strength = strength + kinked[among] @ own.profiles
+            sloped = slopes[STATES * n : STATES * (n + 1)]
+            sloped[[X, Y, LOG_RADIUS, VX, VY]] = strength * moved[1:]
+            sloped[ACTION] = acts * moved[0]
+            sloped[RATE] = sloped[ACTION] * self._times_s
             if shaped:
-                shapes[:, SHAPES * n : SHAPES * (n + 1)] = (directions[n] * strength).T
-        return TouchColumns(mean, slopes, shapes, bent)
+                shapes[SHAPES * n : SHAPES * (n + 1)] = directions[n] * strength
+        return TouchColumns(mean, slopes.T, shapes.T, bent.T)
 
-    def kinks(self, states: Array, priors: Sequence[TouchPrior]) -> list[Kink]:
+    def kinks(self, states: Array, priors: Sequence[TouchPrior]) -> list[Kinks]:
         """What changes within the scan may be beside straight lines: slides that begin or end within it as quadratic
         courses; how strongly a touch acts as any course, straight from step to step.
         """
-        found = list[Kink]()
+        found = list[Kinks]()
         for n, (state, prior) in enumerate(zip(states, priors, strict=True)):
-            found += [Kink(n, STRENGTH, profile) for profile in self._strengths(state, prior)]
+            strengths = self._strengths(state, prior)
+            found += [Kinks(n, STRENGTH, strengths)] if len(strengths) else []
             found += self._slides(n, state, prior)
         return found
 
-    def at(self, profile: Array, time_s: float) -> float:
-        """A profile (K,) at an instant."""
+    def at(self, profiles: Array, time_s: float) -> Array:
+        """(n,) of profiles (n, K) at an instant, straight between the values that were measured about it."""
         order = np.argsort(self._times_s)
-        return float(np.interp(time_s, self._times_s[order], profile[order]))
+        times_s = self._times_s[order]
+        after = min(int(np.searchsorted(times_s, time_s)), len(times_s) - 1)
+        before = max(after - 1, 0)
+        apart_s = times_s[after] - times_s[before]
+        share = min(max((time_s - times_s[before]) / apart_s, 0.0), 1.0) if apart_s > 0 else 0.0
+        return np.asarray((1 - share) * profiles[:, order[before]] + share * profiles[:, order[after]])
 
     def jitter(self, states: Array, priors: Sequence[TouchPrior]) -> Array:
         """(K,) standard deviation of each value by how a touch changes within the steps of its course."""
         variance = np.zeros(len(self._times_s))
         for state, prior in zip(states, priors, strict=True):
-            if instants := self._instants(prior):
+            if instants := [*self._instants(prior), *self._turns(prior)]:
                 strength = np.maximum(state[ACTION] + state[RATE] * self._times_s, 0.0)
                 near = self._near(instants)
                 share = np.where(near, SUDDEN_JITTER, COURSE_JITTER * self._acts(state, prior))
@@ -132,60 +139,85 @@ class TouchCourse:
         """At which a touch begins or ends within the scan."""
         return [t for t in (prior.since_s, prior.until_s) if abs(t) < self.span_s / 2 + SUDDEN_REACH_S]
 
+    def _turns(self, prior: TouchPrior) -> list[float]:
+        """About which it may change at once, within the scan."""
+        return [prior.turns_s] if abs(prior.turns_s) < self.span_s / 2 + SUDDEN_REACH_S else []
+
     def _acts(self, state: Array, prior: TouchPrior) -> Array:
         """(K,) 1 where the touch acts, else 0."""
         acts = state[ACTION] + state[RATE] * self._times_s > 0
         acts &= (self._times_s >= prior.since_s) & (self._times_s < prior.until_s)
         return np.asarray(acts, float)
 
-    def _moved(self, state: Array) -> Array:
+    def _acting(self, prior: TouchPrior) -> tuple[float, float]:
+        """Middle and half of the time within the scan in which a touch acts."""
+        half_s = self.span_s / 2
+        first_s, last_s = max(-half_s, min(prior.since_s, half_s)), min(half_s, max(prior.until_s, -half_s))
+        return (first_s + last_s) / 2, max((last_s - first_s) / 2, AT_ONCE_S)
+
+    def _moved(self, state: Array, prior: TouchPrior) -> Array:
         """(6, K) response where the touch is when each value is measured, its slopes to x, y, log radius, and those to
         the velocity.
         """
-        x, y, log_radius = state[X], state[Y], state[LOG_RADIUS]
-        moves = np.hypot(state[VX], state[VY]) * self.span_s > max(MOVES, BENDS_BY * np.exp(log_radius))
+        middle_s, half_s = self._acting(prior)
+        x, y, log_radius = state[X] + state[VX] * middle_s, state[Y] + state[VY] * middle_s, state[LOG_RADIUS]
+        way = 2 * half_s * np.hypot(state[VX], state[VY])
+        moved = np.empty((6, len(self._times_s)))
         middle = self._response.with_slopes(x, y, log_radius)
-        if not moves:
-            return np.vstack([middle, middle[1:3] * self._times_s])
-        half_s = self.span_s / 2
+        if way <= max(MOVES, BENDS_BY * np.exp(log_radius)):
+            moved[:4] = middle
+            moved[4:] = middle[1:3] * self._times_s
+            moved[0] += (state[[VX, VY]] @ middle[1:3]) * (self._times_s - middle_s)
+            return moved
         first = self._response.with_slopes(x - state[VX] * half_s, y - state[VY] * half_s, log_radius)
         last = self._response.with_slopes(x + state[VX] * half_s, y + state[VY] * half_s, log_radius)
-        before, at, after = self._lagrange
-        moved = before * first + at * middle + after * last
-        velocity = half_s * (after * last[1:3] - before * first[1:3])
-        return np.vstack([moved, velocity])
+        u = (self._times_s - middle_s) / half_s
+        before, at, after = (u**2 - u) / 2, 1 - u**2, (u**2 + u) / 2  # Lagrange's
+        moved[:4] = before * first + at * middle + after * last
+        moved[4:] = (middle_s - half_s) * before * first[1:3] + middle_s * at * middle[1:3]
+        moved[4:] += (middle_s + half_s) * after * last[1:3]
+        return moved
 
-    def _strengths(self, state: Array, prior: TouchPrior) -> list[Array]:
-        """(K,) each: hats of how strongly a touch acts. Those of a touch that begins or ends at once are finer about
-        that instant.
+    def _strengths(self, state: Array, prior: TouchPrior) -> Array:
+        """(n, K): hats of how strongly a touch acts. Those of a touch that begins, ends or changes at once are finer
+        about that instant.
         """
         instants = self._instants(prior)
-        ((changes, _),) = self.bends(state[None])
+        ((changes, _),) = self.bends(state[None], [prior])
         rise = abs(state[RATE]) * self.span_s / 2
         most = abs(state[ACTION]) + rise
         may = most if instants else 2 * rise
-        centres = [instant + step * SUDDEN_S for instant in instants for step in SUDDEN_STEPS]
-        hats = [SUDDEN_SD * most * self._hat(centre, SUDDEN_S) for centre in centres]
+        hats = list[Array]()
+        if instants:
+            centres = np.add.outer(instants, SUDDEN_STEPS).ravel()
+            hats.append(SUDDEN_SD * most * self._hats(centres, SUDDEN_S))
+        for turns_s in self._turns(prior):
+            hats.append(SUDDEN_SD * most * self._hats(turns_s + TURN_STEPS, SUDDEN_S))
+            after = self._times_s >= turns_s
+            hats.append(SUDDEN_SD * most * (~after if prior.grows else after)[None])
         if instants or changes:
-            size = COURSE_SD * may * self._acts(state, prior)
             steps = max(1, round(self.span_s / COURSE_S))
             knots = np.linspace(-self.span_s / 2, self.span_s / 2, steps + 1)
-            hats += [size * self._hat(knot, self.span_s / steps) for knot in knots]
-        return [hat for hat in hats if hat.any()]
+            hats.append(COURSE_SD * may * self._acts(state, prior) * self._hats(knots, self.span_s / steps))
+        found = np.concatenate(hats) if hats else np.empty((0, len(self._times_s)))
+        return found[found.any(axis=1)]
 
-    def _hat(self, centre_s: float, half_s: float) -> Array:
-        return np.asarray(np.maximum(0.0, 1 - np.abs(self._times_s - centre_s) / half_s))
+    def _hats(self, centres_s: Array, half_s: float) -> Array:
+        """(n, K)"""
+        return np.asarray(np.maximum(0.0, 1 - np.abs(self._times_s - centres_s[:, None]) / half_s))
 
-    def bends(self, states: Array) -> list[tuple[bool, bool]]:
+    def bends(self, states: Array, priors: Sequence[TouchPrior]) -> list[tuple[bool, bool]]:
         """Of each touch whether its action changes, and whether it moves, by enough to do so unevenly."""
         rise = np.abs(states[:, RATE]) * self.span_s / 2
-        way = np.hypot(states[:, VX], states[:, VY]) * self.span_s / 2
+        way = np.hypot(states[:, VX], states[:, VY]) * [self._acting(prior)[1] for prior in priors]
         return list(zip(rise > CHANGES * np.abs(states[:, ACTION]), way > MOVES / 2, strict=True))
 
-    def _slides(self, touch: int, state: Array, prior: TouchPrior) -> list[Kink]:
-        ((_, moves),) = self.bends(state[None])
+    def _slides(self, touch: int, state: Array, prior: TouchPrior) -> list[Kinks]:
+        ((_, moves),) = self.bends(state[None], [prior])
         if not moves:
             return []
-        way = np.hypot(state[VX], state[VY]) * self.span_s / 2
+        middle_s, half_s = self._acting(prior)
+        way = np.hypot(state[VX], state[VY]) * half_s
         strength = self._acts(state, prior) * (state[ACTION] + state[RATE] * self._times_s)
-        return [Kink(touch, axis + 1, strength * (KINK * way) * self._bend) for axis in (X, Y)]
+        bent = strength * (KINK * way) * (((self._times_s - middle_s) / half_s) ** 2 - 1 / 3)
+        return [Kinks(touch, axis + 1, bent[None]) for axis in (X, Y)]

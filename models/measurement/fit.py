@@ -12,8 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
-from models.measurement.course import STRENGTH, TouchColumns, TouchCourse
+from models.measurement.course import STRENGTH, Kinks, TouchColumns, TouchCourse
+from models.measurement.covariance.whitening import Whitening, diagonal_of, factor
 from models.measurement.numbers import (
     DAMPING,
     DONE,
@@ -40,9 +42,9 @@ from models.measurement.touch import (
     TouchPrior,
     X,
     Y,
+    is_disc,
     within_limits,
 )
-from models.measurement.whitening import Whitening
 
 Array = NDArray[np.float64]
 
@@ -149,12 +151,15 @@ class _Normal:
     def damped(self, damping: float) -> Array:
         """(N, N) with the priors, the measurements' diagonal raised as Levenberg does."""
         normal = self.measured.copy()
-        diagonal = np.diag_indices_from(normal)
-        normal[diagonal] = normal[diagonal] * (1 + damping) + self.precision
+        diagonal = diagonal_of(normal)
+        diagonal *= 1 + damping
+        diagonal += self.precision
         return normal
 
     def step(self, damping: float) -> Array:
-        return np.asarray(np.linalg.solve(self.damped(damping), self.slope), float)
+        """(N,) not finite where measurements of any magnitude leave no normal equations."""
+        _, step, failed = lapack.dposv(self.damped(damping), self.slope, lower=1)
+        return np.full_like(self.slope, np.nan) if failed else np.asarray(step)
 
 
 @dataclass(frozen=True)
@@ -174,62 +179,73 @@ class TouchFitter:
         self._count = len(self._priors)
         self._mean = np.concatenate([prior.mean for prior in self._priors])
         self._precision = np.concatenate([prior.sd for prior in self._priors]) ** -2.0
-        self._shape_mean = np.concatenate([prior.shape for prior in self._priors])
-        self._shape_precision = np.concatenate([prior.shape_sd for prior in self._priors]) ** -2.0
+        self._shaped = not all(is_disc(prior) for prior in self._priors)
+        shaped = self._priors if self._shaped else ()
+        self._shape_mean = np.concatenate([np.zeros(0), *(prior.shape for prior in shaped)])
+        self._shape_precision = np.concatenate([np.zeros(0), *(prior.shape_sd**-2.0 for prior in shaped)])
         self.steps = 0
 
     def fit(self, most_steps: int) -> FoundTouches:
         """Raises ValueError where a covariance is none."""
         states = within_limits(np.stack([prior.start for prior in self._priors]))
-        self._turn(states)
+        self._kinks = list[Kinks]()
+        rest = self._turn(states, self._shape_mean)
         columns = self._columns(states)
         self._whiten(states, columns)
         states, columns = self._first_actions(states, columns)
-        rest = np.concatenate([self._shape_mean, np.zeros(len(self._kinks))])
         point = self._descend(self._point(states, rest, columns), most_steps)
         changed, moved = _changed(self._size2(point.columns), self._known), self._moved(point.states)
-        if moved:
-            self._turn(point.states)
+        rest = self._turn(point.states, point.rest) if moved else point.rest
         if changed:
             self._whiten(point.states, point.columns)
         if moved or changed:
-            rest = self._rest(point.rest)
             point = self._descend(self._point(point.states, rest, self._columns(point.states, rest)), most_steps)
+        if self._size2(point.columns) < SIZE_CHANGED[0] * self._known.size2:  # larger touches' misfit explains anything
+            self._whiten(point.states, point.columns)
+            point = self._point(point.states, point.rest, point.columns)
         return self._posterior(point)
 
     def _columns(self, states: Array, rest: Array | None = None) -> TouchColumns:
         kinked = None if rest is None else rest[len(self._shape_mean) :]
-        return self._scene.course.columns(states, self._priors, self._turned.directions, self._kinks, kinked)
+        directions = self._turned.directions if self._shaped else []
+        return self._scene.course.columns(states, self._priors, directions, self._kinks, kinked)
 
-    def _rest(self, rest: Array) -> Array:
-        """Shapes and kinks, where kinks were taken anew."""
-        shapes = len(self._shape_mean)
-        same = len(rest) == shapes + len(self._kinks)
-        return rest if same else np.concatenate([rest[:shapes], np.zeros(len(self._kinks))])
-
-    def _turn(self, states: Array) -> None:
-        """Take the touches' own directions anew, and how their courses may bend."""
-        course, known = self._scene.course, self._scene.turned
-        self._bends = course.bends(states)
-        if known is None or not known.near(states):
-            known = Turned(states, course.directions(states))
+    def _turn(self, states: Array, rest: Array) -> Array:
+        """Take the touches' own directions anew, and how their courses may bend. Returns shapes and kinks as far as
+        they are the same as in rest (N,), the others at their means.
+        """
+        course, known, before = self._scene.course, self._scene.turned, self._kinks
+        self._bends = course.bends(states, self._priors)
+        if known is None or not known.near(states) or (self._shaped and not known.directions):
+            known = Turned(states, course.directions(states) if self._shaped else [])
         self._turned = known
         self._kinks = course.kinks(states, self._priors)
+        shapes = len(self._shape_mean)
+        bent = dict[tuple[int, int, int], Array]()
+        for kinks, among in zip(before, _each(before, shapes), strict=True):
+            bent[kinks.touch, kinks.bends, len(kinks)] = rest[among]
+        kinked = [bent.get((k.touch, k.bends, len(k)), np.zeros(len(k))) for k in self._kinks]
+        made = np.concatenate([rest[:shapes], *kinked])
+        self._precisions = np.concatenate([self._precision, self._shape_precision, np.ones(len(made) - shapes)])
+        return made
 
     def _moved(self, states: Array) -> bool:
-        """Whether their directions are others by now."""
-        return not self._turned.near(states) or self._scene.course.bends(states) != self._bends
+        """Whether their directions are others by now, or a course bends that was straight."""
+        if not self._turned.near(states):
+            return True
+        both = zip(self._scene.course.bends(states, self._priors), self._bends, strict=True)
+        return any((changes and not changed) or (moves and not moved) for (changes, moves), (changed, moved) in both)
 
     def _descend(self, point: _Point, most_steps: int) -> _Point:
         """Levenberg and Marquardt's steps until they gain nothing, or what is left to go is linear."""
         damping = float(DAMPING)
         for _ in range(most_steps):
             normal = self._normal(point)
-            if self._is_linear(point.states, normal.step(0.0)):
-                break
             step = normal.step(damping)
             if not np.isfinite(step).all():
                 break  # measurements of any magnitude: nothing explains them
+            if self._is_linear(point.states, normal.step(0.0)):
+                break
             self.steps += 1
             tried = self._stepped(point, step)
             gained = point.objective - tried.objective
@@ -248,7 +264,8 @@ class TouchFitter:
             self._known = known
             return
         covariance = scene.covariance + self._misfit**2 * size2 * scene.misfit
-        covariance[np.diag_indices_from(covariance)] += scene.course.jitter(states, self._priors) ** 2
+        diagonal = diagonal_of(covariance)
+        diagonal += scene.course.jitter(states, self._priors) ** 2
         self._known = KnownWhitening(Whitening.of(covariance), size2)
 
     @property
@@ -277,21 +294,20 @@ class TouchFitter:
         return states, columns
 
     def _point(self, states: Array, rest: Array, columns: TouchColumns) -> _Point:
-        linear = np.hstack([columns.shapes, columns.kinks])
-        change = np.maximum(columns.mean + linear @ rest, LEAST_MEAN)
-        live = self._scene.y != 0
-        share = np.where(live, 1 / (1 + change), 0.0)
-        left = np.where(live, self._scene.y - np.log1p(change), 0.0)
-        sloped = np.hstack([columns.slopes, linear]) * share[:, None]
-        whitened = self._white(np.column_stack([left, sloped]))
+        y, states_of = self._scene.y, columns.slopes.shape[1]
+        both = np.empty((len(y), 1 + states_of + len(rest)))  # the residual, and the slopes of log |Z|
+        left, sloped = both[:, 0], both[:, 1:]
+        sloped[:, :states_of] = columns.slopes
+        sloped[:, states_of:] = np.hstack([columns.shapes, columns.kinks])
+        change = np.maximum(columns.mean + sloped[:, states_of:] @ rest, LEAST_MEAN)
+        live = y != 0
+        left[:] = np.where(live, y - np.log1p(change), 0.0)
+        sloped *= np.where(live, 1 / (1 + change), 0.0)[:, None]
+        whitened = self._white(both)
         residual, design = whitened[:, 0], whitened[:, 1:]
-        off, precision = self._off(states, rest), self._precisions(len(rest))
-        objective = float(residual @ residual + precision @ off**2)
+        off = self._off(states, rest)
+        objective = float(residual @ residual + self._precisions @ off**2)
         return _Point(states, rest, columns, left, sloped, residual, design, objective)
-
-    def _precisions(self, rest: int) -> Array:
-        kinks = np.ones(rest - len(self._shape_precision))
-        return np.concatenate([self._precision, self._shape_precision, kinks])
 
     def _off(self, states: Array, rest: Array) -> Array:
         """From the priors' means."""
@@ -300,9 +316,8 @@ class TouchFitter:
         return off
 
     def _normal(self, point: _Point) -> _Normal:
-        precision = self._precisions(len(point.rest))
-        slope = point.design.T @ point.residual - precision * self._off(point.states, point.rest)
-        return _Normal(point.design.T @ point.design, precision, slope)
+        slope = point.design.T @ point.residual - self._precisions * self._off(point.states, point.rest)
+        return _Normal(point.design.T @ point.design, self._precisions, slope)
 
     def _stepped(self, point: _Point, step: Array) -> _Point:
         self._limit(point.states, step)
@@ -333,16 +348,15 @@ class TouchFitter:
 
     def _solve(self, point: _Point) -> _Linear:
         normal = self._normal(point)
-        whole = normal.damped(0.0)
-        solved: Array = np.asarray(np.linalg.inv(whole), float)
-        _, log_det = np.linalg.slogdet(whole)
+        w, log_density = factor(normal.damped(0.0))
+        solved = w.T @ w
         step = solved @ normal.slope
-        return _Linear(solved, float(log_det), normal.precision, step, float(normal.slope @ step))
+        return _Linear(solved, -2 * log_density, normal.precision, step, float(normal.slope @ step))
 
     def _posterior(self, point: _Point) -> FoundTouches:
         linear = self._solve(point)
         occam = 0.5 * (linear.log_det - float(np.log(linear.precision).sum()))
-        n, shapes = STATES * self._count, SHAPES * self._count
+        n, shapes = STATES * self._count, len(self._shape_mean)
         best = point.residual - point.design @ linear.step  # what the linear optimum would leave
         states, rest, left, residual, objective = point.states, point.rest, point.left, point.residual, point.objective
         if self._is_linear(states, linear.step):
@@ -351,12 +365,17 @@ class TouchFitter:
         said = self._said(n, len(rest))
         then = states + (said[:, n:] @ rest).reshape(-1, STATES)
         then[:, ACTION] = np.minimum(then[:, ACTION], MOST_ACTS)
+        if self._shaped:
+            outline, unsure = rest[:shapes], np.diag(linear.solved)[n : n + shapes]
+        else:
+            outline = np.concatenate([prior.shape for prior in self._priors])
+            unsure = np.concatenate([prior.shape_sd for prior in self._priors]) ** 2
         return FoundTouches(
             priors=self._priors,
             states=then,
             covariance=said @ linear.solved @ said.T,
-            shapes=rest[:shapes].reshape(self._count, SHAPES),
-            shape_variance=np.diag(linear.solved)[n : n + shapes].reshape(self._count, SHAPES),
+            shapes=outline.reshape(self._count, SHAPES),
+            shape_variance=unsure.reshape(self._count, SHAPES),
             chi2=float(residual @ residual) / max(self._scene.live, 1),
             evidence=self._white.log_density - 0.5 * objective - occam,
             white=self._white,
@@ -373,11 +392,16 @@ class TouchFitter:
     def _said(self, states: int, rest: int) -> Array:
         """(7 T, N) from all that was solved for to the states that are said: kinks add to a touch's action then."""
         said = np.eye(states, states + rest)
-        for j, kink in enumerate(self._kinks):
-            if kink.bends == STRENGTH and self._priors[kink.touch].until_s == np.inf:
-                at = states + rest - len(self._kinks) + j
-                said[STATES * kink.touch + ACTION, at] = self._scene.course.at(kink.profile, self._scene.said_s)
+        for kinks, among in zip(self._kinks, _each(self._kinks, states + len(self._shape_mean)), strict=True):
+            if kinks.bends == STRENGTH and self._priors[kinks.touch].until_s == np.inf:
+                said[STATES * kinks.touch + ACTION, among] = self._scene.course.at(kinks.profiles, self._scene.said_s)
         return said
+
+
+def _each(kinks: Sequence[Kinks], first: int) -> list[slice]:
+    """Where each of them is among all that is solved for, from place `first` on."""
+    ends = first + np.cumsum([len(each) for each in kinks], dtype=int)
+    return [slice(end - len(each), end) for each, end in zip(kinks, ends, strict=True)]
 
 
 def _changed(size2: float, known: KnownWhitening) -> bool:

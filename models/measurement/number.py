@@ -1,4 +1,4 @@
-"""A number that decides, with its unit, its meaning and where it comes from: each room has a `numbers.py` of them."""
+"""A number that decides, with its unit, its meaning and where it comes from."""
 
 from __future__ import annotations
 

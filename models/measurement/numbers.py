@@ -51,6 +51,9 @@ SUDDEN_S = Number(
 )
 SUDDEN_SD = Number(0.5, "-", "of its action, by which each step may differ", "derived: from none to all")
 SUDDEN_JITTER = Number(0.1, "-", "of its action, within such a step", "derived: a kink in the middle of one")
+STEADY = Number(
+    0.05, "-", "of its action, by which one that ended at once changed before", "derived: foam creeps by 5 %"
+)
 COURSE_S = Number(0.0044, "s", "steps of the course of a touch that changes", "derived: a part of a scan")
 COURSE_SD = Number(
     0.3, "-", "of its change, by which each may differ", "derived: a ramp that ends half way is 0.25 off"

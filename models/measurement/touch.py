@@ -21,6 +21,7 @@ from models.measurement.numbers import (
     MOST_STRENGTH,
     NEW_WAY,
     SHEET,
+    STEADY,
     TENSOR_SD,
     TYPICAL_RADIUS,
 )
@@ -41,6 +42,7 @@ SHAPES = 9
 EDGE = 6
 PLAIN = 1e-3  # of what shapes differ by
 MOST_ACTS = float(MOST_STRENGTH * np.pi * MOST_RADIUS**2)  # unit^2: nothing conducts in the largest
+ANYWHERE_SD = 2.0  # unit: the sheet's width
 AT_ONCE_S = 4e-4  # one measurement: nothing begins faster
 SHAPE_SDS: Array = np.array([sd for sd in HARMONIC_SDS for _ in range(2)] + [EDGE_SD, TENSOR_SD, TENSOR_SD])
 
@@ -49,7 +51,8 @@ SHAPE_SDS: Array = np.array([sd for sd in HARMONIC_SDS for _ in range(2)] + [EDG
 class TouchPrior:
     """What is known of a touch before a scan: a Gaussian of its state and of its shape, and its course.
 
-    It acts from `since_s` to `until_s` only, in seconds from the reference instant.
+    It acts from `since_s` to `until_s` only, and how strongly may change at once about `turns_s`, in seconds from the
+    reference instant. grows: its action is that after `turns_s`, before which it was another; else it is that before.
     """
 
     start: Array  # (7,) where the search begins
@@ -59,6 +62,8 @@ class TouchPrior:
     shape_sd: Array = field(default_factory=lambda: SHAPE_SDS)
     since_s: float = -np.inf
     until_s: float = np.inf
+    turns_s: float = np.inf
+    grows: bool = False
 
 
 def anywhere(x: float, y: float, action: float, span_s: float) -> TouchPrior:
@@ -66,8 +71,20 @@ def anywhere(x: float, y: float, action: float, span_s: float) -> TouchPrior:
     start = np.array([x, y, np.log(TYPICAL_RADIUS), action, 0.0, 0.0, 0.0])
     mean = np.array([0.0, 0.0, np.log(TYPICAL_RADIUS), 0.0, 0.0, 0.0, 0.0])
     rate_sd = BEGINS_WITHIN * max(action, LEAST_ACTION) / span_s
-    sd = np.array([2.0, 2.0, AREA_LOG_SD, MOST_ACTION, rate_sd, NEW_WAY / span_s, NEW_WAY / span_s])
+    sd = np.array([ANYWHERE_SD, ANYWHERE_SD, AREA_LOG_SD, MOST_ACTION, rate_sd, NEW_WAY / span_s, NEW_WAY / span_s])
     return TouchPrior(start, mean, sd)
+
+
+def acting_steadily(prior: TouchPrior, action: float, span_s: float) -> TouchPrior:
+    """The same of a touch that acted so until it ended or changed at once: how it did is in its course's steps, for
+    which a few values would mistake its action and rate.
+    """
+    start, mean, sd = prior.start.copy(), prior.mean.copy(), prior.sd.copy()
+    start[ACTION] = mean[ACTION] = action
+    start[RATE] = mean[RATE] = 0.0
+    sd[ACTION] = STEADY * max(action, LEAST_ACTION)
+    sd[RATE] = sd[ACTION] / span_s
+    return replace(prior, start=start, mean=mean, sd=sd)
 
 
 def plain(prior: TouchPrior) -> TouchPrior:
@@ -75,8 +92,18 @@ def plain(prior: TouchPrior) -> TouchPrior:
     return replace(prior, shape_sd=PLAIN * SHAPE_SDS)
 
 
+def is_anywhere(prior: TouchPrior) -> bool:
+    """Whether nothing is known of its place."""
+    return bool((prior.sd[PLACE] >= ANYWHERE_SD).all())
+
+
 def is_plain(prior: TouchPrior) -> bool:
     return bool((prior.shape_sd <= PLAIN * SHAPE_SDS).all())
+
+
+def is_disc(prior: TouchPrior) -> bool:
+    """Whether it is plain, and no outline is known of it: its own directions make no difference."""
+    return is_plain(prior) and not prior.shape.any()
 
 
 def within_limits(states: Array) -> Array:

@@ -123,9 +123,9 @@ class BoardLink:
             s = self.scanning
             if self.state == "config":
                 return link.encode(
-                    link.Config(
+                    link.Config.of(
+                        s.setting,
                         config=s.config,
-                        dft_points=s.dft_points,
                         rtia_ohm=s.rtia_ohm,
                         scan=s.scan_list.astype("u1"),
                         parts=s.parts,
@@ -134,6 +134,14 @@ class BoardLink:
             self._start_s = now_s if self._start_s is None else self._start_s
             return link.encode(link.Start(config=s.config))
         return b""
+
+    def scan_as(self, scanning: Scanning, now_s: float) -> None:
+        """What the board is to scan from now on. One that runs is configured anew, and goes on after some messages."""
+        if self.knows_no_parts or scanning.config == self.scanning.config:
+            return
+        self.scanning = scanning
+        if self.state in ("start", "running"):
+            self._to(now_s, "config")
 
     def suspended(self, now_s: float) -> None:
         """This machine was suspended, and its clock with it, while the board's went on."""

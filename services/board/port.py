@@ -15,9 +15,9 @@ import serial
 from serial.tools import list_ports
 
 from protocol.errors import EitskinError
+from protocol.part_size import BAUD
 from protocol.runtime import runtime_dir
 
-BAUD = 921_600
 STUB_LINKS = "board-"  # and the skin's name: the link to the stub's pty in the runtime folder
 
 
@@ -28,10 +28,10 @@ class PortError(EitskinError):
 class Port:
     """An open port. Raises PortError from every method once the device is gone."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, baud: int = BAUD) -> None:
         self.url = url
         try:
-            self._serial: Any = serial.serial_for_url(url, baudrate=BAUD, timeout=0, write_timeout=1, exclusive=True)
+            self._serial: Any = serial.serial_for_url(url, baudrate=baud, timeout=0, write_timeout=1, exclusive=True)
         except (serial.SerialException, OSError, ValueError, LookupError, re.error) as why:  # by the kind of URL
             raise PortError(explain(url, why)) from None
         try:

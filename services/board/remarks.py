@@ -12,7 +12,8 @@ UNTIMED = (
     "this board's firmware does not tell its time (TIME_ASK): a delay of its line that was there from the start, "
     f"or that grows by less than {MAX_RATE_ERROR * 1e3:g} ms/s, is not seen"
 )
-WHOLE = 'this board\'s firmware knows whole scans only: scan = "rolling" is without effect'
+WHOLE = "this board's firmware knows whole scans only: touches are told after whole scans"
+FOR_NOW = "the board scans whole for now, as preprocessing did not keep up with parts; they are tried again by and by"
 FROZEN = "the board sends the same scan again and again, with new numbers: its frames are not valid; power-cycle it"
 UNKNOWN = (
     f"how old the board's frames are is not known within {WIDE_NS / 1e6:.0f} ms, for its answers take too long: "
@@ -31,14 +32,16 @@ class Remarks:
         """Acquisition has not run for so long, and skipped so many scans that waited."""
         self._stood_still = now_s, f"acquisition stood still for {stood_s:.1f} s: {skipped} scans were skipped"
 
-    def look(self, board: BoardLink, now_s: float) -> None:
-        """Looks for what is to be said now."""
+    def look(self, board: BoardLink, now_s: float, whole: bool = False) -> None:
+        """Looks for what is to be said now. whole: parts are too much for now."""
         levels = {}
         if board.state == "running":
             if not board.clock.timed:
                 levels[UNTIMED] = "WARN"
             if board.knows_no_parts:
-                levels[WHOLE] = "WARN"
+                levels[WHOLE] = "OK"
+            elif whole:
+                levels[FOR_NOW] = "OK"
             if board.clock_unknown:
                 levels[UNKNOWN] = "ERROR"
             if board.frozen:

@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import link
+from protocol.scan_setting import ScanSetting
 
 
 @dataclass(frozen=True)
 class Scanning:
-    """What the board is to do: measurements (K, 4) of electrodes, DFT points, gain resistor. A scan in parts has an
-    order of the measurements (K,): part after part.
+    """What the board is to do: measurements (K, 4) of electrodes, how each is measured, gain resistor. A scan in parts
+    has an order of the measurements (K,): part after part.
     """
 
     pattern: NDArray[np.integer]
-    dft_points: int
+    setting: ScanSetting
     rtia_ohm: float
     parts: int = 1
     order: NDArray[np.integer] | None = None
@@ -31,14 +32,14 @@ class Scanning:
     @property
     def whole(self) -> Scanning:
         """The same as whole scans, in the pattern's order."""
-        return self if self.order is None else Scanning(self.pattern, self.dft_points, self.rtia_ohm)
+        return self if self.order is None else Scanning(self.pattern, self.setting, self.rtia_ohm)
 
     @property
     def config(self) -> int:
         """Id of this configuration on the board: from its content, so that one of an earlier session is never taken
         for it.
         """
-        text = self.scan_list.astype("u1").tobytes() + f"{self.dft_points} {self.rtia_ohm:g}".encode()
+        text = self.scan_list.astype("u1").tobytes() + f"{self.setting} {self.rtia_ohm:g}".encode()
         text += f" {self.parts}".encode() if self.parts > 1 else b""
         return zlib.crc32(text) & 0xFFFF
 

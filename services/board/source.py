@@ -13,8 +13,10 @@ from collections.abc import Generator, Iterator
 from dataclasses import replace
 
 from models.bundle import Bundle
+from models.measurement.responses.tables import tells_touches
 from protocol import link
 from protocol.frames import RawFrame
+from protocol.part_size import parts_on_line
 from protocol.pause import pause
 from services.board import port as ports
 from services.board.boardlink import BoardLink
@@ -22,8 +24,8 @@ from services.board.clock import UNSETTLED_NS
 from services.board.host_time import STOOD_STILL_S, HostTime, Suspensions
 from services.board.newest_values import NewestValues
 from services.board.remarks import Remarks
+from services.board.rolling_order import parts_of, rolling_order
 from services.board.scanning import Scanning
-from services.estimation.rolling import parts_of, rolling_order
 from services.runtime.config import Skin
 from services.runtime.stage import Health, add_reason, valid_for_s
 
@@ -70,6 +72,12 @@ class Source(ABC):
         return str(self.bundle.skin.get("pattern", "custom"))
 
 
+def in_parts(scanning: Scanning, bundle: Bundle, baud: int) -> Scanning:
+    """The same in as many parts as the line carries; whole where it carries none."""
+    parts = parts_on_line(len(bundle.pattern), parts_of(bundle), scanning.setting, baud)
+    return replace(scanning, parts=parts, order=rolling_order(bundle)) if parts > 1 else scanning
+
+
 class BoardSource(Source):
     """A board behind a serial port. Opens, asks, configures, starts, and does so again whenever anything goes wrong."""
 
@@ -78,9 +86,11 @@ class BoardSource(Source):
         self.host = host or HostTime()
         self.remarks = Remarks()
         self._logged: dict[str, float] = {}  # what was logged lately, and when
-        self.scanning = Scanning(bundle.pattern, skin.dft_points, skin.rtia_ohm)
-        if skin.scan == "rolling":
-            self.scanning = replace(self.scanning, parts=parts_of(bundle), order=rolling_order(bundle))
+        self.scanning = Scanning(bundle.pattern, skin.setting, skin.rtia_ohm)
+        if skin.scan == "rolling" and tells_touches(bundle):  # a measured map gains nothing from parts
+            self.scanning = in_parts(self.scanning, bundle, skin.baud)
+        self.whole = False  # for now, though it could scan in parts; another thread's to say
+        self.in_parts = self.scanning.parts > 1  # where the load allows it, as far as the board is known
         self._port: ports.Port | None = None
         self._board = ""  # unique id of the board that we know
         self._usb_serial: str | None = None
@@ -108,7 +118,7 @@ class BoardSource(Source):
 
     def open_port(self, url: str) -> ports.Port:
         """Raises PortError."""
-        return ports.Port(url)
+        return ports.Port(url, self.skin.baud)
 
     def health(self) -> Health:
         return self.remarks.added_to(super().health())
@@ -124,12 +134,15 @@ class BoardSource(Source):
         """
         opened = last = self._now()
         board, suspensions = BoardLink(self.scanning, opened), Suspensions(self.host)
-        newest = self.newest()
+        newest, whole = self.newest(), False
         seen: Counter[str] = Counter()
         counted = 0.0
         try:
             while True:
                 now = self._now()
+                if whole != self.whole:
+                    whole, newest = self.whole, self.newest()
+                    board.scan_as(self.scanning.whole if whole else self.scanning, now)
                 wait_s = POLL_S if board.state == "running" else 0.02
                 # After a standstill what waits is read first: the board was not silent, and not asked either.
                 due = board.to_send(now) if now - last < STOOD_STILL_S else b""
@@ -158,7 +171,8 @@ class BoardSource(Source):
                 if last - counted > COUNT_EVERY_S or not came:
                     counted = last
                     self._count(board, seen)
-                    self.remarks.look(board, last)
+                    self.remarks.look(board, last, whole)
+                    self.in_parts = self.scanning.parts > 1 and not board.knows_no_parts
                 yield from (frame for frame in frames if frame is not None)
                 if not came:
                     yield None

@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 UNTOUCHED = 32  # scans before a press whose mean is its reference
 FEWEST_UNTOUCHED = 8
+REPEATED_S = 0.1  # two whole scans: in parts a frame repeats values that are as old as one, of before a release
 PRESSED_S = 1.0  # the last of a steady press: its scans are averaged
 
 
@@ -52,11 +53,18 @@ class Collector:
         while self._reader.recv(0.0) is not None:  # what was measured before
             pass
         why = "no frame came: start the service with `skin up`"
+        since_ns = None
         for image, z in self._pairs():
+            now_ns = image.stamps.get("sample", 0)
+            if since_ns is None:
+                since_ns = now_ns
             if image.touched or not image.valid:
+                since_ns = now_ns
                 self._quiet.clear()
                 reasons = f" ({', '.join(image.reasons)})" if image.reasons else ""
                 why = "something touches" if image.touched else f"the frames are not valid{reasons}"
+                continue
+            if now_ns - since_ns < 1e9 * REPEATED_S:
                 continue
             self._quiet.append(z)
             if len(self._quiet) >= FEWEST_UNTOUCHED:

@@ -5,6 +5,9 @@ is above 0. It is linear in its coefficients, so leave-one-out errors cost nothi
 presses choose the quantity, whether the exponent is free, and the number of terms: the law that predicts each left-out
 press best wins, or a simpler one that is nearly as good. The number of presses limits the choice. The stated error is
 that of presses that took no part in the fit or in the choice.
+
+How strongly a touch acts is known far better than its size, on which pressure hangs where foam saturates. So presses of
+one tip may tell its radius: the quantity is then the pressure over that area.
 """
 
 from __future__ import annotations
@@ -18,11 +21,13 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
+from models.pressure import FOAM, disc
 from protocol.errors import EitskinError
 from services.calibration.seen import KINDS, SeenTouch
-from services.contacts.calibration_file import Calibration, Of
-from services.contacts.force import NAMES
-from services.contacts.force_curve import TERMS, Curve, columns
+from services.contacts.force.calibration_file import Calibration, Of
+from services.contacts.force.curve import TERMS, Curve, columns
+from services.contacts.force.law import NAMES
+from services.contacts.force.of_disc import pressure_under
 from services.runtime.config import Skin
 
 Array = NDArray[np.float64]
@@ -30,6 +35,8 @@ Array = NDArray[np.float64]
 FEWEST = 5
 PRESSES_PER_PARAMETER = 2.5
 NEARLY = 1.05  # times the best cross-validated error: the simpler one is taken
+OF_ONE_TIP = 1.5  # times as well must a law of one tip foretell as one of tips of any size
+TIPS_M: tuple[float, ...] = tuple(np.geomspace(1.5e-3, 40e-3, 60).tolist())  # radii that are tried
 SPREAD = 1.5  # ratio of the largest to the smallest force, at least
 MOST_ERROR = 0.5  # rms of log force, left out: beyond it nothing was learned
 LEAST_EXPONENT = 0.2
@@ -57,25 +64,27 @@ class Form:
     reads: Of
     free_exponent: bool
     correction: str
+    tip_m: float | None = None  # radius of the tip that all presses were of
 
     @property
     def parameters(self) -> int:
-        return 1 + self.free_exponent + len(TERMS[self.correction])
+        return 1 + self.free_exponent + len(TERMS[self.correction]) + (self.tip_m is not None)
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """N presses: log force, log quantity by kind, places [m]."""
+    """N presses: log force, log quantity by kind, and by the radius of a tip, places [m]."""
 
     force: Array
     quantity: dict[Of, Array]
+    of_tip: dict[float, Array]  # empty where no such law may be told
     x: Array
     y: Array
     reach: float
 
     def design(self, form: Form) -> tuple[Array, Array]:
         """(N, P) columns and (N,) targets; without a free exponent log quantity is on the left."""
-        q = self.quantity[form.reads]
+        q = self.quantity[form.reads] if form.tip_m is None else self.of_tip[form.tip_m]
         parts = [np.ones((len(q), 1)), columns(TERMS[form.correction], self.x, self.y, self.reach)]
         if form.free_exponent:
             return np.hstack([parts[0], q[:, None], parts[1]]), self.force
@@ -83,13 +92,16 @@ class Table:
 
     def part(self, rows: NDArray[np.bool_]) -> Table:
         quantity: dict[Of, Array] = {k: v[rows] for k, v in self.quantity.items()}
-        return Table(self.force[rows], quantity, self.x[rows], self.y[rows], self.reach)
+        of_tip = {k: v[rows] for k, v in self.of_tip.items()}
+        return Table(self.force[rows], quantity, of_tip, self.x[rows], self.y[rows], self.reach)
 
 
-def fit(presses: Sequence[Press], most_n: float | None = None) -> Calibration:
-    """The law of N presses. Raises CalibrationError."""
+def fit(presses: Sequence[Press], most_n: float | None = None, any_tip: bool = False) -> Calibration:
+    """The law of N presses. any_tip: nobody named what presses, so that presses of one tip may tell its radius.
+    Raises CalibrationError.
+    """
     _check(presses)
-    table = _table(presses)
+    table = _table(presses, any_tip and len(tips(presses)) < 2)
     form = _choose(table)
     left_out = _left_out(table)
     error = float(np.sqrt(np.mean(left_out**2)))
@@ -118,7 +130,7 @@ def fit(presses: Sequence[Press], most_n: float | None = None) -> Calibration:
         "forces_n": [min(forces), max(forces)],
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    return Calibration(curve, form.reads, most_n or max(forces), own, said)
+    return Calibration(curve, form.reads, most_n or max(forces), own, form.tip_m, said)
 
 
 def tips(presses: Sequence[Press]) -> list[float]:
@@ -175,16 +187,25 @@ def _check(presses: Sequence[Press]) -> None:
         )
 
 
-def _table(presses: Sequence[Press]) -> Table:
+def _table(presses: Sequence[Press], of_one_tip: bool) -> Table:
     quantity = {of: np.log([p.seen.quantities[of].value for p in presses]) for of in KINDS}
     x, y = np.array([(p.seen.x, p.seen.y) for p in presses]).T
     reach = max(float(np.max(np.abs([x, y]))), 1e-6)
-    return Table(np.log([p.force_n for p in presses]), quantity, x, y, reach)
+    of_tip = {radius: _under(radius, presses) for radius in TIPS_M} if of_one_tip else {}
+    return Table(np.log([p.force_n for p in presses]), quantity, of_tip, x, y, reach)
 
 
-def _forms(n: int, kinds: Sequence[Of]) -> list[Form]:
+def _under(radius_m: float, presses: Sequence[Press]) -> Array:
+    """(N,) log of the pressure over a tip."""
+    each = [p.seen.strength for p in presses]
+    return np.log([pressure_under(s.value, s.value * (s.relative or 0.0), disc(radius_m), FOAM) for s in each])
+
+
+def _forms(n: int, kinds: Sequence[Of], tip_m: float | None) -> list[Form]:
     """The laws that n presses allow, simplest first."""
     every = [Form(*each) for each in itertools.product(kinds, (False, True), TERMS)]
+    if tip_m is not None:
+        every += [Form("pressure", *each, tip_m) for each in itertools.product((False, True), TERMS)]
     return sorted((f for f in every if PRESSES_PER_PARAMETER * f.parameters <= n), key=lambda f: f.parameters)
 
 
@@ -216,10 +237,19 @@ def _choose(table: Table) -> Form:
             "harder presses do not act more strongly, neither by pressure nor by peak nor by integral: expected them "
             "to; check that each force belongs to its press"
         )
-    forms = [f for f in _forms(len(table.force), rising) if _rises(table, f)]
-    errors = {f: float(np.sqrt(np.mean(_residuals(table, f) ** 2))) for f in forms}
+    forms = [f for f in _forms(len(table.force), rising, _likeliest_tip(table)) if _rises(table, f)]
+    errors = {f: _error(table, f) * (OF_ONE_TIP if f.tip_m is not None else 1.0) for f in forms}
     limit = NEARLY * min(errors.values())
     return next(f for f in forms if errors[f] <= limit)
+
+
+def _error(table: Table, form: Form) -> float:
+    return float(np.sqrt(np.mean(_residuals(table, form) ** 2)))
+
+
+def _likeliest_tip(table: Table) -> float | None:
+    """By whose pressure force is most nearly a constant share."""
+    return min(table.of_tip, key=lambda radius: float(np.var(table.force - table.of_tip[radius])), default=None)
 
 
 def _left_out(table: Table) -> Array:

@@ -28,7 +28,7 @@ from services.calibration.reference import (
     ReferenceForce,
 )
 from services.calibration.seen import SeenTouch, SeenTouches, TouchReader
-from services.contacts.calibration_file import Calibration
+from services.contacts.force.calibration_file import Calibration
 
 FREE_S = GUARD_S + ZERO_S + AROUND_S  # how long the skin is free before a press
 COURSE = 4096  # images of one press that are kept

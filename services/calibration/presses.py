@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.errors import EitskinError
-from services.estimation.references import noise_of_references
+from services.estimation.first.references import noise_of_references
 from services.recordings.npz_file import InputError, delta_unit, measurement_order
 
 Array = NDArray[np.float64]

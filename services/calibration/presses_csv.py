@@ -24,8 +24,8 @@ from pathlib import Path
 from models.files import FileError, read_text
 from services.calibration.force_fit import CalibrationError, Press
 from services.calibration.seen import SeenTouch
-from services.contacts.calibration_file import Of
-from services.contacts.force import Quantity
+from services.contacts.force.calibration_file import Of
+from services.contacts.force.law import Quantity
 
 QUANTITIES: dict[Of, str] = {"pressure": "pressure_n", "peak": "peak_s_per_m", "integral": "integral_s_m"}
 SEEN = ("x_m", "y_m", *QUANTITIES.values())

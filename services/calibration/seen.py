@@ -10,9 +10,9 @@ import numpy as np
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, ImageFrame
-from services.contacts.calibration_file import Of
-from services.contacts.force import ForceLaw, Quantity
-from services.contacts.force_curve import Curve
+from services.contacts.force.calibration_file import Of
+from services.contacts.force.curve import Curve
+from services.contacts.force.law import ForceLaw, Quantity
 from services.publisher import Publishing
 from services.runtime.config import Skin
 
@@ -26,6 +26,12 @@ class SeenTouch:
     x: float  # m, on the sheet
     y: float
     quantities: dict[Of, Quantity]  # what each kind of law takes
+
+    @property
+    def strength(self) -> Quantity:
+        """How it acts on the measurements, drop times m^2, whatever its size: of touches of sizes that nobody named."""
+        integral = self.quantities["integral"]
+        return Quantity(integral.value / (1 - min(self.quantities["peak"].value, 1.0) / 2), integral.relative)
 
     @property
     def acts(self) -> float:

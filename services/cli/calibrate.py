@@ -85,13 +85,13 @@ def force(
     from services.calibration import presses_csv as calibration_csv
     from services.calibration.force_fit import CalibrationError, fit, unknown
     from services.calibration.seen import TouchReader
-    from services.contacts import calibration_file as calibration
+    from services.contacts.force import calibration_file as calibration
     from services.runtime.config import load
 
     name = skin_name(skin)
     configured = load(config_file()).skin(name)
     bundle = Bundle.load(configured.bundle)
-    indenter_m = calibration.indenter_radius(configured)
+    indenter_m, any_tip = calibration.indenter_radius(configured), configured.indenter is None
     if measurements is not None and csv is None:
         fail(
             "--measurements needs --csv FILE with columns force_n,row: which row was measured under which force", USAGE
@@ -106,13 +106,13 @@ def force(
         warn = lambda text: print(f"skin: {text}", file=sys.stderr)  # noqa: E731
         made = calibration_csv.read(csv, None, calibration_presses.of_file(measurements, configured, bundle, warn))
     if live:
-        made += calibrate_live.pressed(name, TouchReader(configured, bundle), made, tip, presses)
+        made += calibrate_live.pressed(name, TouchReader(configured, bundle), made, tip, presses, any_tip)
     out = out or Path("calibration", f"{name}-force.json")
     try:
         if save is not None:
             save.parent.mkdir(parents=True, exist_ok=True)
             calibration_csv.write(save, made, indenter_m)
-        found = fit(made, most or None)
+        found = fit(made, most or None, any_tip)
         out.parent.mkdir(parents=True, exist_ok=True)
         digest = calibration.save(out, found, name, configured, bundle)
     except OSError as why:
@@ -121,7 +121,14 @@ def force(
         if save is not None:
             print(f"skin: the presses are kept in {save}", file=sys.stderr)
         raise
-    report = {"file": str(out), "sha256": digest, "of": found.reads, "most_n": found.most_n, **found.said}
+    report = {
+        "file": str(out),
+        "sha256": digest,
+        "of": found.reads,
+        "tip_m": found.tip_m,
+        "most_n": found.most_n,
+        **found.said,
+    }
     report |= {"curve": found.curve.to_dict(), "unknown": unknown(found, configured)}
     if as_json:
         emit(report)
@@ -130,10 +137,12 @@ def force(
 
 
 def _say(report: dict[str, Any]) -> None:
-    from services.contacts.force import NAMES
+    from services.contacts.force.law import NAMES
 
     curve, error, of = report["curve"], report["error"], NAMES[report["of"]]
     place = "" if curve["correction"] == "none" else f", corrected for the place ({curve['correction']})"
+    if report["tip_m"] is not None:
+        print(f"all presses are as under one tip of {1e3 * report['tip_m']:.1f} mm radius: forces are of such a tip")
     print(f"force = {curve['scale']:.4g} * ({of})^{curve['exponent']:.3f}{place}, to {report['most_n']:g} N")
     print(
         f"each of the {report['presses']} presses foretold by the others: off by "

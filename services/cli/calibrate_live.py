@@ -13,8 +13,10 @@ if TYPE_CHECKING:
     from services.calibration.seen import TouchReader
 
 
-def pressed(name: str, read: TouchReader, before: Sequence[Press], tip: float, most: int) -> list[Press]:
-    """The presses that are made now, until they and those of before are enough, or `most`, or Ctrl-C."""
+def pressed(name: str, read: TouchReader, before: Sequence[Press], tip: float, most: int, any_tip: bool) -> list[Press]:
+    """The presses that are made now, until they and those of before are enough, or `most`, or Ctrl-C. any_tip: see
+    `force_fit.fit`.
+    """
     from services.calibration.force_fit import FEWEST, CalibrationError
     from services.calibration.live import LivePresses
 
@@ -28,7 +30,7 @@ def pressed(name: str, read: TouchReader, before: Sequence[Press], tip: float, m
             delay_ms = 1e3 * (presses.reference.delay_s or 0.0)
             at = f"({press.seen.x * 1e3:+.1f}, {press.seen.y * 1e3:+.1f}) mm"
             _tell(f"  {len(found)}: {press.force_n:.2f} N at {at}, the reference {delay_ms:.0f} ms later")
-            if _enough([*before, *found]) or len(found) >= most:
+            if _enough([*before, *found], any_tip) or len(found) >= most:
                 return found
     except (CalibrationError, KeyboardInterrupt) as why:
         if len(before) + len(found) < FEWEST:
@@ -39,13 +41,13 @@ def pressed(name: str, read: TouchReader, before: Sequence[Press], tip: float, m
     return found
 
 
-def _enough(presses: list[Press]) -> bool:
+def _enough(presses: list[Press], any_tip: bool) -> bool:
     """Whether they are, and what is known by now, told."""
     from services.calibration.force_fit import CalibrationError, fit
     from services.calibration.live import missing
 
     try:
-        law = fit(presses)
+        law = fit(presses, any_tip=any_tip)
     except CalibrationError as why:
         _tell(f"  no law yet: {why}")
         return False

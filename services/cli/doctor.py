@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle, BundleError
 from protocol import transport
 from protocol.link import SCHEMA_HASH
+from protocol.part_size import line_load
 from protocol.runtime import RuntimeDirError, runtime_dir
 from services.board import port as ports
 from services.board.boardlink import BoardLink
@@ -22,11 +23,11 @@ from services.board.scanning import Scanning
 from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
 from services.cli.doctor_mounting import mounting_found
-from services.contacts.force import ForceLaw, known_radius
+from services.contacts.force.law import ForceLaw, known_radius
 from services.contacts.placing import placement
 from services.describe import ON, geometry, refinement, symmetry
-from services.estimation import checks
-from services.estimation.baseline import implausibility
+from services.estimation.faults import checks
+from services.estimation.first.baseline import implausibility
 from services.runtime.config import RECORDINGS, ConfigError, Skin, config_path, load
 
 BOARD_S = 2.5  # for a board to say who it is
@@ -186,13 +187,14 @@ def _reads(name: str, skin: Skin, bundle: Bundle) -> Finding:
 def _device(name: str, skin: Skin, bundle: Bundle) -> Iterator[Finding]:
     what = f"{name}: port"
     try:
-        port = ports.Port(skin.port)
+        port = ports.Port(skin.port, skin.baud)
     except ports.PortError as why:
         yield Finding("FAIL", what, str(why))
         return
     try:
         yield Finding("OK", what, f"{skin.port} opens")
         yield _board(name, skin, bundle, port)
+        yield from _line(name, skin, bundle)
     finally:
         port.close()
 
@@ -206,10 +208,18 @@ def _latency_timer(name: str, skin: Skin) -> Iterator[Finding]:
         yield Finding("OK" if good else "WARN", f"{name}: latency timer", f"{found} ms{todo}")
 
 
+def _line(name: str, skin: Skin, bundle: Bundle) -> Iterator[Finding]:
+    """Whether the line carries the scans."""
+    load = line_load(len(bundle.pattern), 1, skin.setting, skin.baud)
+    if load > 1:
+        todo = f"scans take {load:.1f} times as long on the line as to measure, so most are lost: raise `baud`"
+        yield Finding("WARN", f"{name}: line", f"{skin.baud} baud at {skin.setting}: {todo}")
+
+
 def _board(name: str, skin: Skin, bundle: Bundle, port: ports.Port) -> Finding:
     """Ask the board who it is; it is not started."""
     what, began = f"{name}: board", time.monotonic()
-    link = BoardLink(Scanning(bundle.pattern, skin.dft_points, skin.rtia_ohm), began)
+    link = BoardLink(Scanning(bundle.pattern, skin.setting, skin.rtia_ohm), began)
     try:
         while (now := time.monotonic()) < began + BOARD_S and link.ident is None:
             if link.state == "hello" and (due := link.to_send(now)):
@@ -221,7 +231,9 @@ def _board(name: str, skin: Skin, bundle: Bundle, port: ports.Port) -> Finding:
         return Finding("FAIL", what, link.problem or f"no answer within {BOARD_S:g} s: is this the board's port?")
     if link.state == "refused":
         return Finding("FAIL", what, link.problem)
-    return Finding("OK", what, f"{link.board}, firmware {link.ident.firmware!r}, schema {SCHEMA_HASH:08x} as ours")
+    ours = f"{link.board}, firmware {link.ident.firmware!r}, schema {SCHEMA_HASH:08x} as ours"
+    rate = 1 / skin.setting.scan_s(len(bundle.pattern))
+    return Finding("OK", what, f"{ours}; to scan at {skin.setting}: {rate:.1f} a second")
 
 
 def electrode_order(name: str, z0: NDArray[np.float64] | None, bundle: Bundle) -> Finding:

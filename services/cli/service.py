@@ -76,7 +76,7 @@ def _check_bundles(config: ConfigFile) -> None:
         except BundleError as why:
             fail(f"{config.path}: skins.{name}.bundle: {why}", USAGE)
         if (skin.calibration, skin.indenter, skin.reads) != (None, None, None):
-            from services.contacts.force import ForceLaw
+            from services.contacts.force.law import ForceLaw
 
             ForceLaw.of(skin, bundle, name)
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 
 from protocol.frames import SHAPES, Contact, EstimatedTouch, ImageFrame, RefinedTouch
-from services.contacts.force import Force, ForceLaw, Look
-from services.contacts.of_image import ImageTouch
+from services.contacts.force.law import Force, ForceLaw, Look
+from services.contacts.images.of_image import ImageTouch
+from services.contacts.images.registered import registered
+from services.contacts.images.segmentation import Segment
 from services.contacts.reading import Appearance
 from services.contacts.refined import agrees, refined, settled
-from services.contacts.registered import registered
-from services.contacts.segmentation import Segment
 from services.contacts.surface import Placed, Placement
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from models.bundle import Bundle
 from protocol.frames import EstimatedTouch, ImageFrame
-from services.contacts.outline import outline
-from services.contacts.segmentation import Segment, class_probabilities, divided, readable
+from services.contacts.images.outline import outline
+from services.contacts.images.segmentation import Segment, class_probabilities, divided, readable
 
 CORNERS = 32  # of the outline of a disc
 LARGER = 2.5  # times the disc's area, or a part of it: an image that differs by more shows something else

@@ -9,7 +9,7 @@ import numpy as np
 
 from models.shapes import Shape
 from protocol.frames import SHAPES, Contact, RefinedTouch
-from services.contacts.force import Force
+from services.contacts.force.law import Force
 from services.contacts.surface import Placed
 
 APART = 3.0  # standard uncertainties beyond which image and fit do not mean the same touch

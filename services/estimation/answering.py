@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.measurement.tables import SkinTables
+from models.measurement.responses.tables import SkinTables
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.asked.looked_at import LookedAt
 from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, StepBudget
@@ -23,6 +23,7 @@ class Answering:
     def __init__(self, tables: SkinTables, skin: TaredSkin, measured: LookedAt, unexplained_s: float) -> None:
         """unexplained_s: for how long nothing has explained the scans before."""
         self._tables, self._skin, self._measured, self._unexplained_s = tables, skin, measured, unexplained_s
+        self._searched = False  # anew, whatever stands: once, it costs four scans' steps
 
     def answer(self, hypotheses: Hypotheses, question: Question, predicted: Prediction) -> ScoredAnswer:
         """The likeliest one."""
@@ -38,7 +39,8 @@ class Answering:
             loose = self._skin.touches.expected(self._measured.middle_s, self._measured.span_s, loose=True)
             if self._skin.touches.lost:
                 return judged_by_itself(hypotheses, question, standing, loose)
-            if self._measured.whole and self._unexplained_s > 0:  # they may be others than those that stand
+            if self._measured.whole and self._unexplained_s > 0 and not self._searched:
+                self._searched = True  # they may be others than those that stand
                 anew = self._from_nothing(hypotheses, question)
                 if anew.explained:
                     return anew
@@ -50,7 +52,7 @@ class Answering:
         quiet = hypotheses.untouched(question)
         assert quiet is not None
         memory = self._skin.drift.beyond_memory(predicted, quiet.pulled, quiet.white)
-        if memory is not None and self._skin.faults.now.wire is None:
+        if memory is not None and self._measured.whole and self._skin.faults.now.wire is None:
             pressed = hypotheses.at(question, memory.x, memory.y)
             if pressed.explained:
                 return pressed
@@ -91,7 +93,7 @@ class Answering:
 
     def _of_lost(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
         """While nothing has explained the skin for long: a search now and then, from nothing."""
-        self._skin.remember(self._skin.touches.forget(self._measured.middle_s - self._measured.span_s / 2))
+        self._skin.remember(self._skin.touches.forget(self._measured.oldest_s))
         found = hypotheses.glance(question)
         refused = round(self._unexplained_s / self._measured.span_s)
         if found.quiet or not self._measured.whole or refused % n.LOST_SCANS:

@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 from weakref import WeakValueDictionary
 
 from models.bundle import Bundle
-from models.measurement.tables import SkinTables, tables_of
+from models.measurement.responses.tables import SkinTables, tables_of
 
 T = TypeVar("T")
 

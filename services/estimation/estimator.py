@@ -9,14 +9,23 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.covariance.whitening import Whitening, leave_out
 from models.measurement.fit import FoundTouches
-from models.measurement.tables import SkinTables
+from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import ACTION, SHAPES, STATES
-from models.measurement.whitening import Whitening, leave_out
 from services.estimation.answering import Answering
 from services.estimation.asked.hypotheses import Hypotheses
-from services.estimation.asked.looked_at import LookedAt
-from services.estimation.asked.question import AS_IT_IS, BURST, DRIFT, MEMORY, NOISE, Question, ScoredAnswer, StepBudget
+from services.estimation.asked.looked_at import LookedAt, OpenTouch
+from services.estimation.asked.question import (
+    AS_IT_IS,
+    BURST,
+    DRIFT,
+    MEMORY,
+    NOISE,
+    Question,
+    ScoredAnswer,
+    StepBudget,
+)
 from services.estimation.faults import advice
 from services.estimation.faults.asking import Asked, AskedScan
 from services.estimation.faults.board import BoardView
@@ -43,7 +52,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 14  # of a kept state
+LAYOUT = 18  # of a kept state
 
 
 @dataclass
@@ -58,7 +67,8 @@ class EstimatorState:
     informed: int = 0  # `wholes` then
     informed_live: Annotated[NDArray[np.bool_], "L"] = field(default_factory=lambda: np.zeros(0, bool))
     informed_wire: WireFault | None = None
-    candidates: Annotated[Array, "C", "states"] = field(default_factory=lambda: np.zeros((0, STATES)))
+    noticed: bool = False  # the part before was the first that was not quiet, and was not asked about
+    candidates: list[OpenTouch] = field(default_factory=list)
     said: tuple[TouchEstimate, ...] = ()
     said_ns: int = 0  # `sample` for which that was
     adopted_age_s: float | None = None  # of a baseline that was adopted, before the next scan
@@ -185,8 +195,16 @@ class Estimator:
 
     # --- one scan ---
 
+    def learn(self) -> None:
+        """What scans before the next one teach: at the latest that asks for it, so who calls it while nothing waits is
+        answered sooner, and the same.
+        """
+        if self.skin is not None:
+            self.skin.learning.catch_up()
+
     def step(self, scan: Scan) -> Estimate:
         """What touches, by this scan and those before it."""
+        self.learn()
         now = self.now
         oldest_us = scan.end_us - 1e6 * scan.duration_s
         whole = not scan.part or oldest_us >= now.whole_us - 1.0 or scan.end_us < now.whole_us
@@ -215,32 +233,33 @@ class Estimator:
             self.skin.learning.doubt()  # else it was no touch that had begun, if nothing touches now
         if (slowly := self._came_slowly(self.skin, measured)) is not None:
             return self._held(self.skin, measured, *slowly, judgements)
-        seen = self._glanced(self.skin, measured)
-        if seen is not None:
+        seen, noticed, now.noticed = self._glanced(self.skin, measured), now.noticed, False
+        if seen is not None and seen.quiet:
             return self._quiet(self.skin, measured, seen, judgements)
+        if seen is not None and not (noticed or measured.whole):
+            return self._noticed(measured, seen, judgements)
         if (goes_on := self._going_on(self.skin, measured)) is not None:
             return self._held(self.skin, measured, *goes_on, judgements)
         return self._asked(self.skin, measured, max(gap_s, 0.0), judgements)
 
     def _glanced(self, skin: TaredSkin, measured: LookedAt) -> Seen | None:
-        """What a first look sees where nothing touched before and all is quiet; else None."""
+        """What a first look sees where nothing touched before; None where it cannot tell."""
         now, scan = self.now, measured.scan
-        oldest_s = measured.middle_s - measured.span_s / 2
+        oldest_s = measured.oldest_s
         may = not len(skin.touches) and self._complete(skin, measured.live) and now.information is not None
         if not may or not skin.faults.plain(oldest_s) or (measured.whole and skin.drift.remembers(measured.middle_s)):
             return None
         assert now.information is not None
         y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
         alike, sure = skin.noise.alike(scan.part), skin.drift.even_variance(measured.middle_s)
-        seen = skin.quick.look(alike, scan, measured.middle_s, y, now.information, sure)
-        return seen if seen is not None and seen.quiet else None
+        return skin.quick.look(alike, scan, measured.middle_s, y, now.information, sure)
 
     def _came_slowly(self, skin: TaredSkin, measured: LookedAt) -> tuple[Question, ScoredAnswer] | None:
         """A touch where nothing touched, that no drift since a while ago explains: the filter is that of then."""
-        middle_s, span_s, live = measured.middle_s, measured.span_s, measured.live
+        middle_s, live = measured.middle_s, measured.live
         if len(skin.touches) or self.now.unexplained_s or not self._complete(skin, live) or not measured.whole:
             return None
-        then = skin.slow.due(middle_s) if skin.faults.plain(middle_s - span_s / 2) and self._tables.predicted else None
+        then = skin.slow.due(middle_s) if skin.faults.plain(measured.oldest_s) and self._tables.predicted else None
         if then is None:
             return None
         predicted = then.ahead(middle_s, skin.noise.now.flicker)
@@ -248,7 +267,7 @@ class Estimator:
         leave_out(covariance, live)
         y = np.where(live, measured.log_z - skin.log_z0 - predicted.shift, 0.0)
         information = skin.hypotheses.grid.information(Whitening.of(covariance))
-        question = measured.question(y, covariance, live, measured.times_s, information, np.zeros((0, STATES)))
+        question = measured.question(y, covariance, live, measured.times_s, information, ())
         answer = skin.hypotheses.slowly(question)
         if answer is None:
             return None
@@ -266,28 +285,33 @@ class Estimator:
         return measured.log_z - skin.log_z0 - skin.drift.shift(measured.middle_s)
 
     def _quiet(self, skin: TaredSkin, measured: LookedAt, seen: Seen, judgements: list[Judgement]) -> Estimate:
-        self._explained(skin, AS_IT_IS)
-        skin.remember(skin.refused.explained(measured.middle_s - measured.span_s / 2))
-        measured = replace(measured, log_z=skin.log_z0 + skin.faults.taken_off(measured.log_z - skin.log_z0))
+        self._explained(skin, measured, AS_IT_IS)
+        skin.remember(skin.refused.explained(measured.oldest_s))
+        if measured.whole:
+            measured = replace(measured, log_z=skin.log_z0 + skin.faults.taken_off(measured.log_z - skin.log_z0))
         self._learn_untouched(skin, measured, seen.pulled, AS_IT_IS)
-        self.now.said, self.now.candidates = (), np.zeros((0, STATES))
-        y = np.where(measured.live, self._over(skin, measured), 0.0)
-        return self._estimate(measured, y, np.zeros(len(y)), judgements, seen.z2, 0.0)
+        self.now.said, self.now.candidates = (), []
+        return self._estimate(measured, seen.y, np.zeros(len(seen.y)), judgements, seen.z2, 0.0)
+
+    def _noticed(self, measured: LookedAt, seen: Seen, judgements: list[Judgement]) -> Estimate:
+        """Something begins. Its first few values tell no place that could be shown, and asking what they are takes
+        longer than the next part, which tells: it is asked about.
+        """
+        self.now.noticed = True
+        return self._estimate(measured, seen.y, np.zeros(len(seen.y)), judgements, seen.z2, 1.0)
 
     def _going_on(self, skin: TaredSkin, measured: LookedAt) -> tuple[Question, ScoredAnswer] | None:
         """That touches which stayed as they are do so in a further part of a scan; else None."""
         now, middle_s, span_s = self.now, measured.middle_s, measured.span_s
         if measured.whole or now.information is None or not skin.touches.steady or now.unexplained_s:
             return None
-        if not skin.faults.plain(middle_s - span_s / 2) or not self._complete(skin, measured.live):
+        if not skin.faults.plain(measured.oldest_s) or not self._complete(skin, measured.live):
             return None
         known = skin.held.known(skin.noise.alike(measured.scan.part), middle_s, skin.touches.ids)
         if known is None:
             return None
         y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
-        question = measured.question(
-            y, known.covariance, measured.live, measured.times_s, now.information, now.candidates
-        )
+        question = measured.question(y, known.covariance, measured.live, measured.times_s, now.information, ())
         answer = skin.hypotheses.goes_on(question, skin.touches.expected(middle_s, span_s), known.white, known.turned)
         return (question, answer) if answer.explained and answer.left_z2 < n.GLANCE_Z2 else None
 
@@ -300,17 +324,20 @@ class Estimator:
         judgements: list[Judgement],
     ) -> Estimate:
         settle(skin, question, answer, measured, self.now.unexplained_s)
-        self._explained(skin, answer.cause)
+        self._explained(skin, measured, answer.cause)
         return self._said(skin, measured, question, answer, judgements, explained=True, rough=False)
 
     def _asked(self, skin: TaredSkin, measured: LookedAt, passed_s: float, judgements: list[Judgement]) -> Estimate:
-        skin.touches.drop_the_past(measured.middle_s - measured.span_s / 2)
-        skin.touches.drop_the_vague(skin.faults.in_question)
-        scan = measured.scan
+        skin.touches.drop_the_past(measured.oldest_s)
+        if vague := skin.touches.drop_the_vague(skin.faults.in_question):
+            self.now.candidates = [OpenTouch(track.state, track.since_s) for track in vague]
+        scan, steps = measured.scan, skin.faults.now.gain_steps
         asked, at = self._explaining(skin, measured)
-        if asked.answer.holds and (pressed := skin.refused.explained(measured.middle_s - measured.span_s / 2)):
+        if asked.answer.holds and (pressed := skin.refused.explained(measured.oldest_s)):
             skin.remember(pressed)
             asked, at = self._explaining(skin, measured)  # again: what is left may be memory
+        if skin.faults.now.gain_steps > steps:
+            skin.learning.stepped()
         question, answer = asked.question, asked.answer
         measured = replace(measured, log_z=at.untouched + asked.view.y, live=asked.view.live)
         explained = answer.holds
@@ -320,7 +347,7 @@ class Estimator:
         went = answer.fit is not None and not len(skin.touches)  # whatever it was, it came and went within the scan
         if (explained or rough) and not went:
             if answer.fit is None or any(track.sure for track in skin.touches.now.tracks):
-                self._explained(skin, answer.cause)
+                self._explained(skin, measured, answer.cause, roughly=not explained)
             elif measured.whole:  # a touch that comes again and again, and never for sure, is none
                 self.now.unexplained_s += measured.span_s
         else:
@@ -328,21 +355,22 @@ class Estimator:
             if not (explained or rough) and _strange(question, answer):
                 self.now.unexplained_s = max(self.now.unexplained_s, float(n.CHANGING_S))
         if explained or rough:
-            self.now.candidates = np.zeros((0, STATES))
+            self.now.candidates = []
         elif answer.fit is not None:  # else no touch was looked for
-            self.now.candidates = answer.fit.states.copy()
-        oldest_s = measured.middle_s - measured.span_s / 2
+            found = zip(answer.fit.states, answer.fit.priors, strict=True)
+            self.now.candidates = [OpenTouch(state, measured.middle_s + prior.since_s) for state, prior in found]
+        oldest_s = measured.oldest_s
         plain = explained and not asked.changed and skin.faults.plain(oldest_s)
         if plain and self._complete(skin, measured.live):
             self._keep_looks(skin, measured, question, answer)
         skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
-        gross = skin.faults.gain_gross(measured.middle_s + measured.span_s / 2)
+        gross = skin.faults.gain_gross(measured.end_s)
         sound, undecided = skin.faults.sound, skin.faults.now.doubt.undecided
         if explained and measured.whole and not asked.changed:
             undecided = undecided and not skin.asking.decide(asked, at) and skin.faults.now.doubt.undecided
         told_apart = asked.view.contact < 0  # else the rest is off by what its size was expected to be
         if explained and sound and told_apart and not (asked.changed or gross):
-            self._learn(skin, measured, answer, at.predicted)
+            self._learn(skin, measured, answer, at.predicted, asked.view.grown)
         failed = float(asked.view.failed.mean())
         judgements += advice.judgements_of(skin.faults.states(), scan.status, failed, undecided)
         judgements.append(judge("gap", float(skin.touches.lost), 1.0))
@@ -350,7 +378,8 @@ class Estimator:
         judgements.append(judge("gain_gross", float(gross), 1.0))
         judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
         if sound and answer.fit is not None:  # what drifted under the touch, as far as the scan tells it
-            drifted = np.where(measured.live, at.predicted.covariance @ answer.pulled, 0.0)
+            grown = asked.view.grown
+            drifted = np.where(measured.live, grown * (at.predicted.covariance @ (grown * answer.pulled)), 0.0)
             question = replace(question, y=question.y - drifted)
         return self._said(skin, measured, question, answer, judgements, explained and not went, rough)
 
@@ -393,14 +422,17 @@ class Estimator:
         if now.information is None or new or now.wholes - now.informed >= n.LINE_SCANS:
             now.information = hypotheses.grid.information(Whitening.of(covariance))
             now.informed, now.informed_live, now.informed_wire = now.wholes, view.live, skin.faults.now.wire
-        question = measured.question(view.y, covariance, view.live, view.times_s, now.information, now.candidates)
+        candidates = tuple(candidate.begun(measured) for candidate in now.candidates)
+        question = measured.question(view.y, covariance, view.live, view.times_s, now.information, candidates)
         return question.leaving(n.FOR_FAULTS)
 
     # --- what follows ---
 
-    def _explained(self, skin: TaredSkin, cause: str) -> None:
+    def _explained(self, skin: TaredSkin, measured: LookedAt, cause: str, roughly: bool = False) -> None:
         self.now.unexplained_s = 0.0
         skin.touches.now.watched = True
+        if not roughly:
+            skin.faults.gain_holds(measured.end_s)
         if cause == AS_IT_IS:
             skin.hypotheses.adrift = 1.0
 
@@ -416,9 +448,11 @@ class Estimator:
         if self._tables.predicted and self.now.unexplained_s > n.CHANGING_S:
             skin.hypotheses.adrift = min(n.MOST_ADRIFT, skin.hypotheses.adrift * n.ADRIFT)
 
-    def _learn(self, skin: TaredSkin, measured: LookedAt, answer: ScoredAnswer, predicted: Prediction) -> None:
+    def _learn(
+        self, skin: TaredSkin, measured: LookedAt, answer: ScoredAnswer, predicted: Prediction, grown: Array
+    ) -> None:
         """From untouched scans all, while touched what the touches leave open, now and then: what their response gets
-        wrong is the same from scan to scan.
+        wrong is the same from scan to scan. grown (K,): times what the skin changes by, as the board shows it.
         """
         if answer.fit is None:
             self._learn_untouched(skin, measured, answer.pulled, answer.cause)
@@ -433,7 +467,7 @@ class Estimator:
         due = predicted.at_s - skin.drift.now.at_s > n.TOUCHED_LEARNS_S
         same = len(predicted.x) == len(skin.drift.now.x)  # nothing has ended or slid away
         if due and same and not answer.recounted and self._complete(skin, measured.live):
-            skin.drift.take_in_beside(predicted, answer.fit)
+            skin.drift.take_in_beside(predicted, answer.fit, grown)
             skin.forget_looks()
 
     def _learn_untouched(self, skin: TaredSkin, measured: LookedAt, pulled: Array, cause: str) -> None:

@@ -13,9 +13,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FoundTouches
-from models.measurement.tables import FIELD_DEGREES, SkinTables
-from models.measurement.whitening import Whitening
+from models.measurement.responses.tables import FIELD_DEGREES, SkinTables
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -76,6 +76,8 @@ class SkinFilter:
         self._tables = tables
         self.contacts = slice(2 * MODES, 2 * MODES + tables.electrodes)
         self._fixed = self.contacts.stop
+        self._lasting = np.hstack([tables.field, tables.contact])  # columns of all states but memories
+        self._lasting_seen = np.r_[0:MODES, 2 * MODES : self._fixed]
         self._value_walk = _by_degree(n.FIELD_WALK, n.SLOPE_WALK)
         self._rate_walk = _by_degree(n.FIELD_RATE_WALK, n.SLOPE_RATE_WALK)
         self._faster = _by_degree(n.FIELD_FASTER, n.SLOPE_FASTER)
@@ -124,7 +126,8 @@ class SkinFilter:
         now, passed_s = self.now, max(0.0, at_s - self.now.at_s)
         x = now.x.copy()
         x[FIELD] += passed_s * x[RATES]
-        x[self._fixed :] *= np.tile(np.exp(-passed_s / FADES_S), len(now.memories))
+        if now.memories:
+            x[self._fixed :] *= np.tile(np.exp(-passed_s / FADES_S), len(now.memories))
         columns, seen = self._columns()
         return np.asarray(columns @ x[seen] + now.remainder)
 
@@ -167,23 +170,25 @@ class SkinFilter:
         self._forget_the_faint()
         return pulled
 
-    def take_in_beside(self, predicted: Prediction, fit: FoundTouches) -> None:
-        """Learn from a touched frame what its touches, which may be any near those that were found, leave open.
+    def take_in_beside(self, predicted: Prediction, fit: FoundTouches, grown: Array) -> None:
+        """Learn from a touched frame what its touches, which may be any near those that were found, leave open. grown
+        (K,): times what the skin changes by, as the fit's values show it.
 
         The state's posterior given a fit's own, with S = W^-1 W^-T, D its whitened design and C what it leaves open:
         P - P H^T W^T (1 - D C D^T) W H P.
         """
         now, white = self.now, fit.white
         passed_s = max(0.0, predicted.at_s - now.at_s)
-        gathered = white(predicted.reach.T)  # (K, N)
+        reach = predicted.reach * grown
+        gathered = white(reach.T)  # (K, N)
         beside = fit.design.T @ gathered
-        now.x = predicted.x + predicted.reach @ fit.pulled
+        now.x = predicted.x + reach @ fit.pulled
         now.p = predicted.p - gathered.T @ gathered + beside.T @ (fit.solved @ beside)
         told = fit.design.T @ white.w
         precision = white.conditional_precisions() - np.sum(told * (fit.solved @ told), axis=0)
         variance = now.remainder_variance + n.REMAINDER_WALK**2 * passed_s
-        now.remainder = now.remainder + variance * fit.pulled
-        now.remainder_variance = variance * (1 - variance * np.maximum(precision, 0.0))
+        now.remainder = now.remainder + variance * grown * fit.pulled
+        now.remainder_variance = variance * (1 - variance * grown**2 * np.maximum(precision, 0.0))
         now.at_s = predicted.at_s
 
     def more_memory(self) -> Array | None:
@@ -286,10 +291,13 @@ class SkinFilter:
         return x, p
 
     def _columns(self) -> tuple[Array, NDArray[np.intp]]:
+        """(K, S) of the states that are seen, and (S,) their places."""
+        if not self.now.memories:
+            return self._lasting, self._lasting_seen
         memories = [memory.column for memory in self.now.memories for _ in range(STATES_OF_MEMORY)]
-        parts = [self._tables.field, self._tables.contact]
-        columns = np.hstack([*parts, np.array(memories).T]) if memories else np.hstack(parts)
-        return columns, np.concatenate([np.arange(MODES), np.arange(2 * MODES, len(self.now.x))])
+        return np.hstack([self._lasting, np.array(memories).T]), np.r_[
+            self._lasting_seen, self._fixed : len(self.now.x)
+        ]
 
     def _forget_the_faint(self) -> None:
         """Memories that no scan shows any more, and the oldest of too many, become each measurement's own remainder."""

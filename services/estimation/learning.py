@@ -8,8 +8,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.noise import NoiseModel
-from models.measurement.whitening import Whitening, leave_out
+from models.measurement.covariance.noise import NoiseModel
+from models.measurement.covariance.whitening import Whitening, leave_out
 from services.estimation.filter import SkinFilter
 from services.estimation.values import numbers as n
 
@@ -43,13 +43,21 @@ class Learning:
         """Something touches, or may: what waits is not believed."""
         self.now.waiting = []
 
+    def stepped(self) -> None:
+        """The gain has, of late: what was taken for drift may have been that."""
+        self.now.waiting = [scan for scan in self.now.waiting if not scan.drifts]
+
     def untouched(self, scan: Waiting) -> None:
-        """A scan on which nothing touches, by all that is known."""
+        """A scan on which nothing touches, by all that is known: `catch_up` learns from those that waited enough."""
         self.now.waiting.append(scan)
-        if scan.drifts > 1:  # it was lost: what explains it now is the skin
-            self._take_in(self.now.waiting.pop())
-        if len(self.now.waiting) > n.LAG_SCANS:
-            self._take_in(self.now.waiting.pop(0))
+
+    def catch_up(self) -> None:
+        """Takes longer than a look at a quiet scan: what is said of a scan does not wait for it."""
+        waiting = self.now.waiting
+        if waiting and waiting[-1].drifts > 1:  # the filter was lost: what explains this scan now is the skin
+            self._take_in(waiting.pop())
+        if len(waiting) > n.LAG_SCANS:
+            self._take_in(waiting.pop(0))
 
     def _take_in(self, scan: Waiting) -> None:
         if scan.drifts:

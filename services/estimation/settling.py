@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
+from models.measurement.touch import LOG_RADIUS
 from services.estimation.asked.looked_at import LookedAt
 from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, started_from
 from services.estimation.tared import TaredSkin
@@ -17,13 +20,13 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
     if answer.recounted and answer.fit is not None:
         touches.correct(answer.fit, kept)
     gone = [k for k in range(len(touches)) if k not in kept]
-    memories = [memory for k in gone for memory in touches.released(k, middle_s - span_s / 2)]
+    memories = [memory for k in gone for memory in touches.released(k, measured.oldest_s)]
     if answer.fit is None:
-        touches.forget(middle_s - span_s / 2)
+        touches.forget(measured.oldest_s)
     else:
         skin.slow.forget()
         memories += touches.settle(answer.fit, kept, middle_s, span_s, whole=measured.whole, explained=answer.explained)
-        _make_sure(skin, answer, measured.scan.separate)
+        _make_sure(skin, answer, measured)
         rest = replace(question, keeps=0.0)
         if measured.whole and not answer.recounted:
             _doubt(skin, rest, answer, measured, strange=unexplained_s > n.CHANGING_S)
@@ -34,17 +37,24 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         skin.forget_looks()
 
 
-def _make_sure(skin: TaredSkin, answer: ScoredAnswer, separate: bool) -> None:
+def _make_sure(skin: TaredSkin, answer: ScoredAnswer, measured: LookedAt) -> None:
     """A touch is shown at once where its scan is explained with it: a rough start may be anything. One that stands by
     itself (separate) is the end, too.
     """
-    if not (answer.explained or separate) or 2 * answer.over < n.SURE_Z2:
+    if not (answer.explained or measured.scan.separate) or 2 * answer.over < n.SURE_Z2:
         return
     least = float(n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2)
     if not skin.tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
         least = 0.0
+    may_wait = skin.tables.predicted and not measured.scan.separate
     for track in skin.touches.now.tracks:
-        track.sure = track.sure or (track.z2 > least and not skin.faults.in_question(track.state))
+        # How strongly it presses a first part hardly tells: its place and that it is there, it does.
+        placed = track.place_sd < n.PLACED and track.z2 > n.PLACED_Z2
+        told = track.z2 > least or (placed and not measured.whole and answer.cause == AS_IT_IS)
+        track.sure = track.sure or (told and not skin.faults.in_question(track.state))
+        broad = track.state[LOG_RADIUS] > np.log(n.BROAD) and track.scans < n.SURE_SCANS
+        if broad and may_wait:  # it may be two that began together, and is where neither of them is
+            track.sure = False
 
 
 def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt, strange: bool) -> None:
@@ -57,7 +67,7 @@ def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
     for k in reversed(range(len(touches))):
         track = touches.now.tracks[k]
         often = track.z2 < n.DOUBT_Z2 or not track.sure
-        if track.ended or not (often or track.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1):
+        if track.ended or not (often or track.doubt_due):
             continue
         standing, least = touches.expected(measured.middle_s, measured.span_s), float(n.COST_TOUCH)
         if answer.fit is not None and k in meeting and len(touches) == len(answer.fit):

@@ -9,10 +9,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.lines import LineState
-from models.measurement.noise import NoiseModel, NoiseState
-from models.measurement.tables import SkinTables
-from models.measurement.whitening import leave_out
+from models.measurement.covariance.lines import LineState
+from models.measurement.covariance.noise import NoiseModel, NoiseState
+from models.measurement.covariance.whitening import leave_out
+from models.measurement.responses.tables import SkinTables
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.faults.asking import FaultAsking
 from services.estimation.faults.board import BoardFaults, FaultState

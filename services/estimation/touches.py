@@ -13,9 +13,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.course import SUDDEN_REACH_S
 from models.measurement.fit import FoundTouches
 from models.measurement.numbers import MOST_WAY
-from models.measurement.response import TouchModel
+from models.measurement.responses.response import TouchModel
 from models.measurement.touch import (
     ACTION,
     LOG_RADIUS,
@@ -27,8 +28,10 @@ from models.measurement.touch import (
     TouchPrior,
     X,
     Y,
+    acting_steadily,
     anywhere,
     drop_of,
+    is_anywhere,
     is_plain,
     within_limits,
 )
@@ -59,6 +62,8 @@ class TrackedTouch:
     stays_for: int = 0  # scans that are in it
     since_s: float = -np.inf  # it acts from then on
     until_s: float = np.inf  # it acted until then: it has ended, and the window still holds values of before
+    at_once: bool = False  # so it ended
+    turned_s: float = np.inf  # when how strongly it acts changed at once
     scans: int = 0  # that it was fitted to and that share no value
     still: int = 0  # of them, in a row: it neither moved nor changed
     moves: bool = False
@@ -73,8 +78,18 @@ class TrackedTouch:
     asked_odd: float = 0.0  # how odd its outline was when it was asked last whether it is several
 
     @property
+    def doubt_due(self) -> bool:
+        """Whether it is time to ask what it is, as every touch is asked now and then."""
+        return self.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1
+
+    @property
     def ended(self) -> bool:
         return self.until_s < np.inf
+
+    @property
+    def place_sd(self) -> float:
+        """By the last scan, of the coordinate that is known worse."""
+        return float(np.sqrt(max(self.covariance[X, X], self.covariance[Y, Y], 0.0)))
 
     def acts_at(self, at_s: float) -> bool:
         """Whether it is there at an instant of the scan that it was fitted to: it may have ended after that."""
@@ -121,6 +136,11 @@ class TouchTracks:
         return any(track.lost for track in self.now.tracks)
 
     @property
+    def in_doubt(self) -> bool:
+        """Whether it is time to ask what stands, as is done now and then."""
+        return any(track.scans in n.CONTACT_DOUBTS or track.doubt_due for track in self.lasting)
+
+    @property
     def odd(self) -> bool:
         """Whether an outline has become odd enough to be that of several touches: each time it became odder, and now
         and then. Asking makes it known.
@@ -128,7 +148,7 @@ class TouchTracks:
         found = False
         for track in self.lasting:
             odd = oddness(track.shape)
-            again = odd > n.ODDER * track.asked_odd or track.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1
+            again = odd > n.ODDER * track.asked_odd or track.doubt_due
             if odd > n.ODD_OUTLINE and again:
                 track.asked_odd, found = odd, True
         return found
@@ -148,12 +168,13 @@ class TouchTracks:
         for track in self.now.tracks:
             track.lost, track.still = True, 0
 
-    def drop_the_vague(self, in_question: Callable[[Array], bool]) -> None:
+    def drop_the_vague(self, in_question: Callable[[Array], bool]) -> list[TrackedTouch]:
         """Forget what one part of a scan made of a touch that begins, and is not sure: the next one looks anew.
-        in_question: whether a touch of that state may as well be a contact impedance.
+        in_question: whether a touch of that state may as well be a contact impedance. Returns those.
         """
         tracks = self.now.tracks
         self.now.tracks = [t for t in tracks if t.sure or (t.scans and not in_question(t.state))]
+        return [t for t in tracks if all(t is not kept for kept in self.now.tracks)]
 
     def forget(self, at_s: float) -> list[Memory]:
         """Nobody knows any more what touches. Returns what those that there were may have left in the foam."""
@@ -163,7 +184,7 @@ class TouchTracks:
 
     def drop_the_past(self, oldest_s: float) -> None:
         """Forget what ended before the oldest value that a window holds."""
-        self.now.tracks = [track for track in self.now.tracks if track.until_s > oldest_s]
+        self.now.tracks = [track for track in self.now.tracks if track.until_s > oldest_s - SUDDEN_REACH_S]
 
     def expected(self, at_s: float, span_s: float, loose: bool = False) -> list[TouchPrior]:
         """What is known of each before a scan whose middle is at_s. loose: it may have begun to move or to change."""
@@ -217,25 +238,34 @@ class TouchTracks:
         ended or moved away leave in the foam.
         """
         before = self.now.tracks
-        self.now.tracks = [
-            before[place] if place >= 0 else self._new(fit, k, at_s, span_s) for k, place in enumerate(kept)
-        ]
+        self.now.tracks = [before[place] if place >= 0 else self._new(fit, k, at_s) for k, place in enumerate(kept)]
         memories, meeting = list[Memory](), self.meeting(at_s)
         for k, track in enumerate(self.now.tracks):
             own = slice(STATES * k, STATES * (k + 1))
             track.since_s = at_s + fit.priors[k].since_s
-            if track.ended and fit.priors[k].until_s < np.inf:
+            if track.ended:
                 track.until_s = at_s + fit.priors[k].until_s
+                if not track.ended:  # it goes on after all: that it ended was said
+                    track.id, self.now.next_id = self.now.next_id, self.now.next_id + 1
+            track.turned_s = at_s + fit.priors[k].turns_s
+            if track.sure and is_anywhere(fit.priors[k]):  # found anew: it may be another one, or none
+                track.scans = 0
             _update(track, fit.states[k], fit.covariance[own, own], at_s, span_s, whole)
             if whole and k not in meeting:  # what two have in common is no outline of one
                 _learn(track, fit, k)
             if explained and not track.ended:
                 memories += self._held(track, at_s, span_s, whole)
             if not track.ended and fit.priors[k].until_s < np.inf:
+                track.at_once = True
                 memories += self.released(k, at_s + fit.priors[k].until_s)
             if not track.ended and _has_ended(track, span_s):
                 track.until_s = at_s + span_s / 2
+                track.at_once = track.turned_s < np.inf or -track.state[RATE] * span_s > n.GOES * track.held
                 memories += self._memory(track, track.until_s, 1.0)
+        if -1 in kept:
+            for track, place in zip(self.now.tracks, kept, strict=True):
+                if place >= 0 and track.scans <= n.SURE_SCANS:
+                    _forget_size(track, fit.priors[kept.index(-1)])
         self.now.tracks = [track for track in self.now.tracks if track.sure or not track.ended]
         if whole and explained:
             self._follow(at_s)
@@ -252,7 +282,7 @@ class TouchTracks:
 
     def tell(self, fit: FoundTouches, at_s: float, span_s: float) -> None:
         """What was taken for a changed contact impedance is this touch."""
-        track = self._new(fit, 0, at_s, span_s)
+        track = self._new(fit, 0, at_s)
         track.told = track.sure = True
         _update(track, fit.states[0], fit.covariance[:STATES, :STATES], at_s, span_s, whole=True)
         self.now.tracks.append(track)
@@ -269,7 +299,7 @@ class TouchTracks:
         """It was none."""
         del self.now.tracks[place]
 
-    def _new(self, fit: FoundTouches, k: int, at_s: float, span_s: float) -> TrackedTouch:
+    def _new(self, fit: FoundTouches, k: int, at_s: float) -> TrackedTouch:
         prior, state = fit.priors[k], fit.states[k]
         track = TrackedTouch(
             id=self.now.next_id,
@@ -360,7 +390,11 @@ def _expected(track: TrackedTouch, at_s: float, span_s: float, loose: bool) -> T
     mean[LOG_RADIUS], sd[LOG_RADIUS] = track.log_radius, track.log_radius_sd
     shape_sd = np.sqrt(np.minimum(track.shape_variance + (n.SHAPE_WALK * SHAPE_SDS) ** 2, SHAPE_SDS**2))
     state = within_limits(state[None])[0]
-    return TouchPrior(state, mean, sd, track.shape, shape_sd, track.since_s - at_s, track.until_s - at_s)
+    if not track.moves and passed_s <= span_s / 2:  # most of the values are those that told its velocity
+        state[VELOCITY] = track.state[VELOCITY]
+    since_s, until_s, turns_s = track.since_s - at_s, track.until_s - at_s, track.turned_s - at_s
+    prior = TouchPrior(state, mean, sd, track.shape, shape_sd, since_s, until_s, turns_s)
+    return acting_steadily(prior, track.held, span_s) if track.at_once and track.held > 0 else prior
 
 
 def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, span_s: float, whole: bool) -> None:
@@ -386,7 +420,7 @@ def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, s
 
 def _follow_place(track: TrackedTouch) -> None:
     """One that stays is where all its scans say, weighed as they are sure of it."""
-    (x, y), sd, known = track.state[PLACE], _place_sd(track), np.hypot(track.stays_at[2], n.PLACE_WALK)
+    (x, y), sd, known = track.state[PLACE], track.place_sd, np.hypot(track.stays_at[2], n.PLACE_WALK)
     if not _stays(track):
         track.stays_at, track.stays_for = (float(x), float(y), sd), 0
         return
@@ -400,12 +434,7 @@ def _stays(track: TrackedTouch) -> bool:
     """Whether the last scan has it where it stayed."""
     off = float(np.hypot(*(track.state[PLACE] - track.stays_at[:2])))
     known = np.hypot(track.stays_at[2], n.PLACE_WALK)
-    return bool(track.still >= n.STILL_SCANS and off < n.STAYS_WITHIN * np.hypot(known, _place_sd(track)))
-
-
-def _place_sd(track: TrackedTouch) -> float:
-    """By the last scan, of the coordinate that is known worse."""
-    return float(np.sqrt(max(track.covariance[X, X], track.covariance[Y, Y], 0.0)))
+    return bool(track.still >= n.STILL_SCANS and off < n.STAYS_WITHIN * np.hypot(known, track.place_sd))
 
 
 def _learn(track: TrackedTouch, fit: FoundTouches, k: int) -> None:
@@ -416,6 +445,14 @@ def _learn(track: TrackedTouch, fit: FoundTouches, k: int) -> None:
     track.shape, track.shape_variance = fit.shapes[k].copy(), fit.shape_variance[k].copy()
     if is_plain(fit.priors[k]):  # that of a disc was not asked
         track.shape_variance = SHAPE_SDS**2
+
+
+def _forget_size(track: TrackedTouch, free: TouchPrior) -> None:
+    """It has just come, and was taken for what now are two: nothing is known of its radius and outline but what any
+    touch has.
+    """
+    track.log_radius, track.log_radius_sd = float(free.mean[LOG_RADIUS]), float(free.sd[LOG_RADIUS])
+    track.shape, track.shape_variance = np.zeros(len(SHAPE_SDS)), SHAPE_SDS**2
 
 
 def _action_at(state: Array, covariance: Array, after_s: float) -> tuple[float, float]:

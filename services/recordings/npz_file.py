@@ -17,7 +17,7 @@ from models import npz
 from models.bundle import Bundle
 from models.files import FileError
 from protocol.errors import EitskinError
-from services.estimation.references import alike
+from services.estimation.first.references import alike
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,8 @@ from models.bundle import Bundle, BundleError
 from models.calibration_file import found_by
 from models.prereconstruction import PreReconstructor, noise_of_frames
 from protocol.frames import RawFrame
-from services.estimation.baseline import Baseline, NoBaseline, take
+from services.estimation.first.baseline import Baseline, NoBaseline, take
+from services.estimation.values import numbers
 from services.mounting import MountingFit, needs_fit
 from services.pipeline import ALL, Pipeline, Result
 from services.recordings.npz_file import Input, frames_of
@@ -28,8 +29,6 @@ ROW_NS = 45_000_000
 """Time between rows of a --sequence: the board's nominal scan."""
 UNKNOWN_AGE_S = 300.0
 """Between the untouched rows of a file and its measurements, where nobody says: all the drift that is allowed for."""
-ASSUMED_NOISE = 1e-3
-"""Relative noise of a frame (60 dB) where a file holds too few untouched frames to find it."""
 FEWEST_FOR_TARE = 16
 
 
@@ -87,8 +86,8 @@ def baseline_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None
         measured = frames[:, good]
         sigma[good] = noise_of_frames(np.where(np.isfinite(measured), measured, mean), mean)
     else:
-        sigma[good] = ASSUMED_NOISE * mean
-        warn(f"`untouched` has one row: a noise of {ASSUMED_NOISE:g} of each measurement is assumed")
+        sigma[good] = numbers.TARE_ASSUMED * mean
+        warn(f"`untouched` has one row: a noise of {numbers.TARE_ASSUMED:g} of each measurement is assumed")
     return Baseline(z0, sigma, len(frames), "file", 0, doubt)
 
 

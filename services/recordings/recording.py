@@ -26,8 +26,8 @@ from models.files import FileError, open_file
 from protocol.errors import EitskinError
 from services.recordings.patient_file import PatientFile
 
-FLUSH_S = 0.1
-CHUNK_BYTES = 64 * 1024
+FLUSH_S = 0.5  # each scan in parts repeats most of the one before: a chunk of 0.1 s packs half as well
+CHUNK_BYTES = 1024 * 1024
 PROFILE = "eitskin"
 STATE_TOPIC = "state"
 MAX_FILE = 2**40
@@ -76,6 +76,7 @@ class RecordingWriter:
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
         self._oldest: float | None = None
+        self._open = 0  # bytes of messages in the chunk that is not closed yet
         self.lost = 0
         """Messages that there was no room for."""
         if metadata:
@@ -94,7 +95,9 @@ class RecordingWriter:
             name, _, skin = topic.partition("/")
             self._channels[topic] = self._writer.register_channel(topic, "msgpack", 0, {"topic": name, "skin": skin})
         sequence = self._sequence[topic] = self._sequence.get(topic, 0) + 1
+        written = self._file.tell()
         self._writer.add_message(self._channels[topic], log_time_ns, data, log_time_ns, sequence)
+        self._open = self._open + len(data) if self._file.tell() == written else 0
         if self._oldest is None:
             self._oldest = time.monotonic()
         self.flush_if_due()
@@ -109,7 +112,7 @@ class RecordingWriter:
         """Closes the chunk and hands it to the operating system."""
         self._close_chunk()
         self._file.flush()
-        self._oldest = None
+        self._oldest, self._open = None, 0
 
     @property
     def full(self) -> str:
@@ -123,8 +126,8 @@ class RecordingWriter:
 
     @property
     def bytes(self) -> int:
-        """Size of the file, with what still waits to be written."""
-        return self._file.tell()
+        """Size of the file, with what still waits to be written; what is not packed yet counts as it is."""
+        return self._file.tell() + self._open
 
     @property
     def counts(self) -> dict[str, int]:

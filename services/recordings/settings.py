@@ -1,8 +1,8 @@
 """The part of the configuration that a recording carries: what the stages need to give the same contacts again.
 
     {"skins": {"palm": {"bundle": "square16", "bundle_hash": ..., "frame_id": ..., "pose": ..., "network": ...,
-     "reads": ..., "indenter": ..., "dft_points": ..., "scan": ..., "rtia_ohm": ..., "tare": ..., "touch": ...,
-     "calibration": {...}}}, "skip": {...}}
+     "reads": ..., "indenter": ..., "scan_setting": ..., "dft_points": ..., "scan": ..., "rtia_ohm": ..., "tare": ...,
+     "touch": ..., "calibration": {...}}}, "skip": {...}}
 
 It holds no address, key, port or path. A recording may come from anybody, so its settings are checked like a
 configuration. Its bundle is looked for among the installed ones by its hash.
@@ -20,7 +20,8 @@ from pydantic import Field, ValidationError, field_validator
 
 from models.bundle import BUNDLES, Bundle, BundleError
 from models.files import read_text
-from services.contacts import calibration_file as calibration
+from protocol.scan_setting import SettingName
+from services.contacts.force import calibration_file as calibration
 from services.recordings.recording import RecordingError
 from services.runtime.config import (
     SKIN_NAME,
@@ -39,7 +40,19 @@ from services.runtime.config_sections import Number, Section, Skip
 KEY = "settings"
 """The key of a recording's metadata."""
 MOST_BYTES = 1024 * 1024
-CARRIED = ("frame_id", "pose", "network", "reads", "indenter", "dft_points", "scan", "rtia_ohm", "tare", "touch")
+CARRIED = (
+    "frame_id",
+    "pose",
+    "network",
+    "reads",
+    "indenter",
+    "scan_setting",
+    "dft_points",
+    "scan",
+    "rtia_ohm",
+    "tare",
+    "touch",
+)
 
 Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{0,256}$")]
 
@@ -58,6 +71,7 @@ class RecordedSkin(Section):
     network: Literal["full", "fast", "int8", "none"] = "int8"
     reads: Reads | None = None
     indenter: Indenter | None = None
+    scan_setting: SettingName = "paper"  # the only one that there was before recordings said it
     dft_points: Literal[128, 256, 512] = 128
     scan: ScanMode = "full"
     rtia_ohm: Annotated[Number, Field(gt=0)] = 40_000.0

@@ -10,6 +10,7 @@ import os
 import re
 import tomllib
 import unicodedata
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,6 +19,8 @@ from pydantic import BaseModel, Field, ValidationError, field_validator, model_v
 from models.files import FileError, read_text
 from protocol.ad5940 import LEAST_RTIA_OHM, MOST_RTIA_OHM
 from protocol.errors import EitskinError
+from protocol.part_size import BAUD, FASTEST_BAUD, SLOWEST_BAUD
+from protocol.scan_setting import NAMED, WITH_POINTS, ScanSetting, SettingName
 from protocol.topics import BRIDGES
 from protocol.transport import Transport
 from services.runtime.config_sections import (
@@ -136,6 +139,7 @@ class Indenter(Section):
         return self
 
 
+LEAST_POINTS = 128
 NetworkFile = Literal["full", "fast", "int8", "none"]
 ScanMode = Literal["full", "rolling"]
 Reads = Literal["pressure", "peak"]
@@ -152,12 +156,14 @@ class Skin(Section):
     contacts_in: Literal["skin", "parent"] = "skin"  # "parent": contacts come in the frame that `pose` names
     mismatch: str = "none"  # how the stub's sheet differs from the bundle: a name of models/mismatch.py
     world: str = ""  # what the stub's skin does beside, as real ones do: a name of firmware_stub/worlds/table.py
-    calibration: Path | None = None  # JSON of this very skin's force law: see services/contacts/calibration_file.py
+    calibration: Path | None = None  # this very skin's force law: services/contacts/force/calibration_file.py
     reads: Reads | None = None  # what forces are read from; None: as the bundle says, else "pressure"
     indenter: Indenter | None = None
     network: NetworkFile = "int8"
-    dft_points: Literal[128, 256, 512] = 128
-    scan: ScanMode = "full"  # rolling: scans in parts
+    scan_setting: SettingName = "coherent"  # how each pair is measured: protocol/scan_setting.py
+    dft_points: Literal[128, 256, 512] = 128  # of a setting with a DFT of 128
+    baud: Annotated[int, Field(ge=SLOWEST_BAUD, le=FASTEST_BAUD, strict=True)] = BAUD  # of the serial line
+    scan: ScanMode = "rolling"  # in parts, where board and bundle can and the load allows it; full: whole
     rtia_ohm: Annotated[Number, Field(ge=LEAST_RTIA_OHM, le=MOST_RTIA_OHM)] = (
         40_000.0  # gain resistor of the board's current measurement
     )
@@ -175,6 +181,21 @@ class Skin(Section):
             '"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000), a recording (*.mcap) or a file '
             "of measurements (*.npz)"
         )
+
+    @property
+    def setting(self) -> ScanSetting:
+        """How the board measures each pair."""
+        named = NAMED[self.scan_setting]
+        return replace(named, points=self.dft_points) if self.scan_setting in WITH_POINTS else named
+
+    @model_validator(mode="after")
+    def points_of_a_dft(self) -> Skin:
+        if self.dft_points != LEAST_POINTS and self.scan_setting not in WITH_POINTS:
+            raise ValueError(
+                f"`dft_points` with scan_setting = {' or '.join(map(repr, WITH_POINTS))}: the others have points of "
+                f"their own (found {self.dft_points} with {self.scan_setting!r})"
+            )
+        return self
 
     @field_validator("scan", mode="before")
     @classmethod

@@ -66,6 +66,14 @@ class Stage(ABC):
         frame.
         """
 
+    def beside(self, wanted: frozenset[str]) -> list[Frame]:
+        """What else follows from the frame processed last, and can wait until the frames of `process` have left."""
+        return []
+
+    def everything(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
+        """All that follows from `frame`, in the order in which it leaves."""
+        return [*self.process(frame, wanted), *self.beside(wanted)]
+
     def reset(self) -> None:  # noqa: B027  (a stage without state)
         """Forget all temporal state."""
 

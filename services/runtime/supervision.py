@@ -28,6 +28,7 @@ from supervisor.process import Subprocess
 from supervisor.states import ProcessStates
 from supervisor.supervisord import Supervisor
 
+from protocol.part_size import BAUD
 from protocol.runtime import CONFIG_LINK, lock, runtime_dir
 from protocol.topics import RECORDER
 from services.runtime.config import BUNDLES, MANIFEST, ROOT, ConfigFile
@@ -77,13 +78,14 @@ def programs(config: ConfigFile, record: Path | None = None) -> list[Program]:
 
 def stub_arguments(config: ConfigFile) -> tuple[str, ...]:
     """What `python -m firmware_stub` is told: a board for each skin whose port is "stub", with that skin's bundle and
-    the names of the mismatch between its sheet and the bundle and of its world.
+    the names of the mismatch between its sheet and the bundle and of its world, and its line's rate.
     """
     skins = [(name, skin) for name, skin in config.skins.items() if skin.port == "stub"]
     said = [part for name, skin in skins for part in ("--skin", f"{name}={_folder(skin.bundle)}")]
     for name, skin in skins:
         said += ["--mismatch", f"{name}={skin.mismatch}"] if skin.mismatch != "none" else []
         said += ["--world", f"{name}={skin.world}"] if skin.world else []
+        said += ["--baud", f"{name}={skin.baud}"] if skin.baud != BAUD else []
     return tuple(said)
 
 

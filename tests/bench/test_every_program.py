@@ -15,7 +15,11 @@ from bench.json_file import write_json  # noqa: F401  (numerical libraries get o
 from tests import needs
 
 MODULES = {**bench.commands(), "limits": "models.limits"}
-NEEDED = {"registered_network": ["presses.npz", "folder"], "estimation": ["start"]}
+NEEDED = {
+    "registered_network": ["presses.npz", "folder"],
+    "estimation": ["start"],
+    "shadow": ["--candidate", "without-memory"],
+}
 NUMBERS = ("x", "", "nan", "-1", "-inf", "1.5.2")
 
 

@@ -27,7 +27,7 @@ from models.bundle import Bundle
 from models.forward import shared
 from models.shapes import Array
 from protocol.frames import Contact
-from services.estimation.baseline import Baseline, NoBaseline
+from services.estimation.first.baseline import Baseline, NoBaseline
 from tests import needs
 
 RELATIVE = 10 ** (-80 / 20)  # the board's noise

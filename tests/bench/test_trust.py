@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.trust import __main__ as trust
-from bench.trust import floor, kept, runs, shadow
+from bench.trust import candidates, floor, kept, runs, shadow
 from bench.trust.candidate import Today
 from bench.trust.judge import Judge
 from bench.trust.scene import BEGIN_S, SceneDrawer, Trouble, TrustScene
@@ -18,6 +18,7 @@ from firmware_stub.timeline import Script
 from firmware_stub.world import World
 from firmware_stub.worlds import table
 from protocol.frames import Contact, ContactFrame, RawFrame, pack, unpack
+from services.estimation.values import numbers
 from services.recordings import golden
 from services.recordings.replay_session import private_runtime
 from tests.bench.trust_sessions import frames, played, press, scene, today
@@ -284,6 +285,31 @@ def test_worlds_are_listed_and_others_refused(capsys: pytest.CaptureFixture[str]
         trust.main(["--world", "moon"])
     assert "invalid choice: 'moon'" in capsys.readouterr().err
     assert shadow.main.__module__ == "bench.trust.shadow"
+
+
+def test_a_candidate_with_other_numbers_has_them_while_it_runs_alone(tmp_path: Path) -> None:
+    names = "without-memory", "FALSE_ALARM_Z2*1e6"
+    found = runs.run(
+        "creep", "full", "5", 0.2, session_s=12.0, folder=tmp_path,
+        candidates=(("today", candidates.TODAY), *((name, name) for name in names)),
+    )  # fmt: skip
+    shown = {name: score.counts["touches"] - score.counts["never shown"] for name, score in found.items()}
+    assert shown["today"] > 0 and shown["FALSE_ALARM_Z2*1e6"] < shown["today"]
+    assert float(numbers.FALSE_ALARM_Z2) == 44.0
+
+
+@pytest.mark.parametrize(
+    "name, says",
+    [
+        ("without-luck", "no part 'luck' of the model: expected one of rates, "),
+        ("LUCK*2", "no number 'LUCK'"),
+        ("MEMORY_SHARE", "expected NAME\\*FACTOR, as MEMORY_SHARE\\*2"),
+        ("nowhere:Nobody", "no candidate 'nowhere:Nobody'"),
+    ],
+)
+def test_a_candidate_that_is_none_is_refused(name: str, says: str) -> None:
+    with pytest.raises(candidates.UnknownCandidate, match=says):
+        candidates.kind_of(name)
 
 
 def test_the_truth_says_nothing_of_what_a_world_hides() -> None:

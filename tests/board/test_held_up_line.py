@@ -49,7 +49,8 @@ class Got:
 
 
 class Bench:
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, scan: str) -> None:
+        self.scan = scan
         environment = dict(os.environ, EITSKIN_RUNTIME=str(folder), OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
         self.log = folder / "log.txt"
         stub = [sys.executable, "-m", "firmware_stub", "--listen", "socket://127.0.0.1:0", "--seed", "1"]
@@ -58,7 +59,8 @@ class Bench:
         assert " at socket://" in line, line
         self.proxy = DelayingProxy(("127.0.0.1", int(line.split(",")[0].rpartition(":")[2])))
         config = folder / "skin.toml"
-        config.write_text(f'[skins.palm]\nport = "socket://127.0.0.1:{self.proxy.port}"\nbundle = "square16"\n')
+        port = f"socket://127.0.0.1:{self.proxy.port}"
+        config.write_text(f'[skins.palm]\nport = "{port}"\nbundle = "square16"\nscan = "{scan}"\n')
         environment["EITSKIN_CONFIG"] = str(config)
         with open(self.log, "w") as log:
             self.processes.append(
@@ -112,10 +114,10 @@ class Bench:
         self.socket.close(linger=0)
 
 
-@pytest.fixture(scope="module")
-def line() -> Iterator[Bench]:
+@pytest.fixture(scope="module", params=["full", "rolling"])
+def line(request: pytest.FixtureRequest) -> Iterator[Bench]:
     folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
-    bench = Bench(folder)
+    bench = Bench(folder, request.param)
     yield bench
     bench.close()
     shutil.rmtree(folder, ignore_errors=True)
@@ -163,7 +165,9 @@ def test_scans_that_come_twice_or_out_of_order_are_shown_once_and_in_order(well:
         heard = well.hear(2.0)
         setattr(well.proxy, what, False)
         scans = [g.frame.get("scan", 0) for g in heard]
-        assert len(scans) > 10 and scans == sorted(set(scans))
+        assert scans == sorted(set(scans))
+        # in parts every second one is refused, being older than what came last: no scan has all its values
+        assert len(scans) > 10 or (what == "reorder" and well.scan == "rolling")
         well.promise(heard)
 
 

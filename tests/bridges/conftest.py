@@ -24,10 +24,11 @@ SQUARE = [[0.01, -0.01], [0.03, -0.01], [0.03, 0.01], [0.01, 0.01]]
 
 
 class FakeService:
-    """Publishes contacts and images of `palm` every EVERY_S, one touch of 3 N at (0.02, 0), until told otherwise."""
+    """Publishes contacts and images of `palm` every `every_s`, one touch of 3 N at (0.02, 0), until told otherwise."""
 
     def __init__(self) -> None:
         self.valid, self.silent = True, False
+        self.every_s, self.contact = EVERY_S, 1
         self.scan = 0
         self.sent: list[tuple[int, int, bool]] = []  # scan, sample, valid
         self.subscribers: dict[str, int] = {}
@@ -42,7 +43,7 @@ class FakeService:
         told = {"pose": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], "parent_frame_id": "wrist", "frame_id": "palm"}
         outline = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
         preprocessing.send(InfoFrame(skin="palm", valid=True, info={**told, "geometry": {"outline": outline}}))
-        while not self._closing.wait(EVERY_S):
+        while not self._closing.wait(self.every_s):
             for each in (publisher, inference, preprocessing):
                 each.poll()
             control.serve_once()
@@ -68,7 +69,7 @@ class FakeService:
             "stamps": {"sample": now},
         }
         touch = Contact(
-            id=1,
+            id=self.contact,
             position=[0.02, 0.0, 0.0],
             area_m2=3e-4,
             force_n=3.0,
@@ -76,7 +77,9 @@ class FakeService:
             wrench=[0, 0, -3.0, 0, 0.06, 0],
         )
         publisher.send(ContactFrame(**head, frame_id="palm", contacts=[touch]))  # type: ignore[arg-type]
-        publisher.send(ShapeFrame(**head, ids=[1], outlines=[SQUARE], orientation=[0.0], probabilities=[[0.2] * 5]))  # type: ignore[arg-type]
+        publisher.send(
+            ShapeFrame(**head, ids=[touch.id], outlines=[SQUARE], orientation=[0.0], probabilities=[[0.2] * 5])  # type: ignore[arg-type]
+        )
         image = np.zeros((8, 8), "<f4")
         image[4, 6] = 0.3
         inference.send(ImageFrame(**head, touched=True, image=image, metres_per_pixel=0.01, origin=[-0.04, -0.04]))  # type: ignore[arg-type]

@@ -136,7 +136,9 @@ TIPS = {0.005: (0.5, 2.0), 0.012: (0.8, 4.5)}  # m: newtons
 
 @pytest.mark.slow
 def test_presses_of_two_tips_teach_a_law_that_covers_both(runtime: Path) -> None:
-    """The second run goes on from the presses of the first and ends by itself; what it claims is one standard error."""
+    """The second run goes on from the presses of the first and ends by itself; what it claims is one standard error, of
+    which three are allowed: by two, one run of ten would fail by chance.
+    """
     rng, kept, more = (
         np.random.default_rng(11),
         runtime / "small.csv",
@@ -164,7 +166,7 @@ def test_presses_of_two_tips_teach_a_law_that_covers_both(runtime: Path) -> None
             ratios = [said / STIFFER for said in said_over_pressed(rng, 12, tip, newtons)]
             print(tip, claim, report["presses"], ratios)
             ours = 1.25 * np.std(ratios) / len(ratios) ** 0.5  # standard error of the median that it is held against
-            assert float(np.median(ratios)) == pytest.approx(1.0, abs=2 * float(np.hypot(claim, ours)))
+            assert float(np.median(ratios)) == pytest.approx(1.0, abs=3 * float(np.hypot(claim, ours)))
 
 
 def said_over_pressed(

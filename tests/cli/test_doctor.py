@@ -24,7 +24,7 @@ from protocol.frames import ContactFrame, DeltaFrame, Frame, JudgementsFrame
 from protocol.runtime import CONFIG_LINK, lock
 from protocol.sockets import Publisher
 from services.cli.doctor import _key, electrode_order
-from services.estimation.baseline import TAKING
+from services.estimation.first.baseline import TAKING
 from services.estimation.values.judgement import judge
 from services.judged import judged
 
@@ -331,5 +331,6 @@ def test_the_board_is_asked_for_its_firmware(skin, tmp_path, schema) -> None:  #
         os.close(theirs)
     if schema == link.SCHEMA_HASH:
         assert ran.code == 0 and "firmware 'board 1.2'" in ran.out
+        assert "to scan at 50 kHz, N 128, raw, Hanning, 20 us: 22.9 a second" in ran.out.replace("\n", " ")
     else:
         assert ran.code == 1 and "speaks schema bad0f00d" in ran.out and "flash a matching one" in ran.out

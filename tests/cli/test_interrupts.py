@@ -67,7 +67,7 @@ def test_commands(runtime: Path, tmp_path: Path, arguments: tuple[str, ...], cod
     assert code in codes and "Traceback" not in out and "a fault of this program" not in out, (code, out)
 
 
-@pytest.mark.parametrize("name", ["stop_on_contact", "guarded_move", "follow_the_finger"])
+@pytest.mark.parametrize("name", ["stop_on_contact", "guarded_move", "follow_the_finger", "reflex"])
 def test_examples(runtime: Path, name: str) -> None:
     command = [sys.executable, "-m", f"examples.{name}", "--max-age", "60"]
     code, out = interrupted(command, RUNS, runtime)

@@ -8,11 +8,11 @@ import pytest
 from models.bundle import Bundle
 from models.locator import NINETY, Locator
 from models.measurement.course import TouchCourse
+from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
-from models.measurement.grid import DiscGrid
-from models.measurement.measured_map import MeasuredMap
+from models.measurement.responses.grid import DiscGrid
+from models.measurement.responses.measured_map import MeasuredMap
 from models.measurement.touch import ACTION, PLACE, RATE, TouchPrior, X, Y, anywhere, plain
-from models.measurement.whitening import Whitening
 from services.calibration.locating import build, true_places
 from services.calibration.presses import Presses, part, read_presses
 from services.calibration.registration import register

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from services.estimation.references import noise_of_references
+from services.estimation.first.references import noise_of_references
 from services.recordings.npz_file import Input, read_input
 from services.recordings.reconstruction import reconstruct, resampled
 from services.runtime.config import Skin

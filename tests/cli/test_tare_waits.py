@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from models.measurement.tables import tables_of
+from models.measurement.responses.tables import tables_of
 from services.cli import board
 from services.cli.common import CliError
 from services.estimation.first.tare import LatestScans, TareRefused

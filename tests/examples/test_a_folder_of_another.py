@@ -39,6 +39,7 @@ CLIENTS = {
     "stop_on_contact": ("-m", "examples.stop_on_contact"),
     "guarded_move": ("-m", "examples.guarded_move"),
     "follow_the_finger": ("-m", "examples.follow_the_finger", "--seconds", "2"),
+    "reflex": ("-m", "examples.reflex"),
 }
 """What follows `python`."""
 

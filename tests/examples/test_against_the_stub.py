@@ -184,6 +184,21 @@ def test_stop_on_contact_stops_when_the_service_falls_silent(start: Start) -> No
         os.kill(publisher, signal.SIGCONT)
 
 
+def test_reflex_says_how_far_an_arm_goes_on(start: Start) -> None:
+    """Begun anew where a busy machine loses frames while the arm moves, for which it rightly stops."""
+    for _ in range(5):
+        arm = start(*example("reflex"), "--speeds", "0.25", "--touches", "3", "--deceleration", "5")
+        printed, _ = arm.communicate(timeout=90)
+        if arm.returncode != 1:
+            break
+    assert arm.returncode == 0, printed
+    said = re.search(r"^ +0\.25 +(\d+), +(\d+) +([.\d]+), +([.\d]+) +([.\d]+)$", printed, re.MULTILINE)
+    assert said, printed
+    typical_ms, latest_ms, typical_mm, most_mm, brakes_mm = map(float, said.groups())
+    assert 0 < typical_ms <= latest_ms and brakes_mm == pytest.approx(6.2, abs=0.1)
+    assert typical_mm == pytest.approx(6.25 + 0.25 * typical_ms, abs=0.2) and typical_mm <= most_mm
+
+
 def test_guarded_move_reaches_its_force(start: Start) -> None:
     status, printed, _ = moved_until_pressed(start, (0.0, 0.0, 4.0), *example("guarded_move"), "--newtons", "2")
     assert status == 0 and re.search(r"force reached, stopped \d+ ms after it was measured: \(", printed)

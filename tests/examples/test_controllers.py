@@ -9,6 +9,7 @@ import pytest
 from bench.speed.simulated_host import SimulatedHost
 from examples.follow_the_finger import DAMPING, FASTEST, answer, follow, push
 from examples.guarded_move import guarded_move
+from examples.reflex import Arm, told_s
 from examples.robot import Robot
 from examples.stop_on_contact import stop_on_contact
 from protocol.client import NotValid, Stale
@@ -112,6 +113,21 @@ def test_with_rolling_scans_guarded_move_stops_within_20_ms_of_contact():
         assert 0 < given[stop][0] - pressed < 0.020
         host.until(host.now + 0.6)
     host.rig.close()
+
+
+def test_an_arm_goes_on_until_it_is_told_and_then_brakes():
+    assert Arm(0.5, 10.0, 2000.0).goes_on_m(0.02) == pytest.approx(0.5 * 0.02 + 0.0125)
+
+
+def test_an_arm_is_told_by_the_first_frame_after_its_touch_that_has_a_contact():
+    touch_ns, before, after = time.monotonic_ns(), frame(contact(0, 0, 1.0)), frame(contact(0, 0, 1.0, "end"))
+    told = told_s(Skin(frame(), after, frame(contact(0.01, 0, 0.5))), touch_ns)
+    assert told is not None and 0 < told < 0.3
+    with pytest.raises(Stale):  # frames of before the touch tell nothing of it
+        told_s(Skin(before), time.monotonic_ns() + 10**9)
+    assert told_s(Skin(frame()), touch_ns - 10**9) is None
+    with pytest.raises(Stale):
+        told_s(Skin(frame(valid=False)), touch_ns)
 
 
 @pytest.mark.parametrize("touch", [contact(0.04, 0.0, 0.2), contact(0.0, 0.0, None)])

@@ -36,7 +36,7 @@ from protocol.link_messages import BY_NUMBER
 from protocol.topics import TOPICS
 from services.calibration import presses_csv as calibration_csv
 from services.calibration.force_fit import CalibrationError
-from services.contacts import calibration_file as calibration
+from services.contacts.force import calibration_file as calibration
 from services.preprocessing import Preprocessing
 from services.recordings import settings
 from services.recordings.recording import RecordingError, RecordingReader
@@ -322,7 +322,7 @@ def nested(depth: int) -> list[Any]:
 def _kept() -> dict[str, Any]:
     stage = _stage()
     stage.reset()
-    from services.estimation.baseline import Baseline
+    from services.estimation.first.baseline import Baseline
 
     z0 = _bundle().z0
     stage.set_baseline(Baseline(z0.copy(), 1e-3 * z0, 64, "board", 10**9))

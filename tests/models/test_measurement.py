@@ -10,13 +10,13 @@ from firmware_stub.world import Touch, World, pressed
 from firmware_stub.worlds import table
 from models.bundle import Bundle
 from models.measurement.course import TouchCourse
-from models.measurement.disc import DiscResponse
+from models.measurement.covariance.noise import NoiseModel, in_blocks
+from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
-from models.measurement.grid import DiscGrid
-from models.measurement.noise import NoiseModel, in_blocks
-from models.measurement.tables import SkinTables, tables_of
+from models.measurement.responses.disc import DiscResponse
+from models.measurement.responses.grid import DiscGrid
+from models.measurement.responses.tables import SkinTables, tables_of
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, VX, TouchPrior, X, Y, anywhere
-from models.measurement.whitening import Whitening
 from models.mismatch import Mismatch
 
 NOISE = 1e-4

@@ -12,13 +12,13 @@ from models import bundle, geometry, manifest
 from models.forward import ForwardModel
 from models.linearise import linearise
 from models.measurement.course import TouchCourse
-from models.measurement.disc import DiscResponse
+from models.measurement.covariance.noise import NoiseModel
+from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FittedScan, TouchFitter
-from models.measurement.grid import DiscGrid
-from models.measurement.noise import NoiseModel
-from models.measurement.tables import SkinTables, tables_of
+from models.measurement.responses.disc import DiscResponse
+from models.measurement.responses.grid import DiscGrid
+from models.measurement.responses.tables import SkinTables, tables_of
 from models.measurement.touch import ACTION, PLACE, anywhere
-from models.measurement.whitening import Whitening
 from models.response_tables import response_tables
 from models.shapes import Shape
 

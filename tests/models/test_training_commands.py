@@ -83,7 +83,6 @@ def state(path):
         ("models.build", ["--package", "--only", "fast", "--work", "/nowhere"], "found no checkpoint in /nowhere"),
         ("models.published", ["--minutes", "nan"], "--minutes: found nan, expected a number above 0"),
         ("models.average", ["/nowhere.pt", "--out", "/nowhere/full.pt"], "found no file /nowhere.pt"),
-        ("models.calibrate", ["nowhere"], "no bundle 'nowhere': shipped are"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
@@ -96,7 +95,7 @@ def test_an_error_is_one_line(monkeypatch, module, arguments, said):
 
 
 def test_the_line_is_on_stderr_and_the_status_is_1():
-    command_line = [sys.executable, "-m", "models.calibrate", "nowhere"]
+    command_line = [sys.executable, "-m", "models.average", "/nowhere.pt", "--out", "/nowhere/full.pt"]
     ran = subprocess.run(command_line, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert ran.returncode == 1 and not ran.stdout and len(ran.stderr.splitlines()) == 1
 
@@ -237,8 +236,7 @@ def test_a_bundle_of_too_little_training_is_not_written_unless_asked_for(small, 
     entry, judged = bundle.manifest["network"]["full"], verdict.TrainingVerdict("too little", "far from it.", {})
     monkeypatch.setattr(build, "make_scenes", lambda *_: None)
     monkeypatch.setattr(build, "physics", lambda skin, folder, _: (bundle.matrices, samples.load(folder, "valid", pre)))
-    monkeypatch.setattr(build.calibrate, "solve", lambda *_, **__: None)
-    monkeypatch.setattr(build.calibrate, "uncertainty", lambda *_: {"full": entry["uncertainty"]})
+    monkeypatch.setattr(build.solved_presses, "solve", lambda *_, **__: None)
     monkeypatch.setattr(build, "response_tables", lambda _: None)
     networks = {"full": bundle.network_path("full").read_bytes()}, {"full": dict(entry)}
     monkeypatch.setattr(build, "networks", lambda *_: networks)
@@ -270,7 +268,7 @@ def test_a_second_build_goes_on_and_the_fast_network_learns_from_the_full_one(
 
     monkeypatch.setattr(build, "make_scenes", lambda *_: None)
     monkeypatch.setattr(build, "physics", lambda skin, folder, _: (bundle.matrices, samples.load(folder, "valid", pre)))
-    monkeypatch.setattr(build.calibrate, "solve", packaging)
+    monkeypatch.setattr(build.solved_presses, "solve", packaging)
     full, fast = built()
     model = build.restore(work / "full.pt")[0]
     assert fast["numbers"]["start"] == {"part_of": {"variant": "full", "network": checkpoint.weights_hash(model)}}

@@ -132,8 +132,7 @@ def test_shapes_are_stated_only_where_they_were_told_apart(
     assert registered.locator is not None
     sigma = np.full(len(made.pattern), 1e-3)
     difference = registered.locator.map[100]
-    stack, context, scale = made.prereconstructor().condition(sigma).stack(difference)
-    frame = DeltaFrame(skin="own", touched=True, stack=stack, context=context, scale=scale)
+    frame = DeltaFrame(skin="own", touched=True, averaged=1, tare_frames=64)
     frame.difference, frame.sigma = difference.astype(np.float32), sigma.astype(np.float32)
     (image,) = stage.process(frame, frozenset({"image"}))
     assert isinstance(image, ImageFrame) and image.image.shape == (96, 96) and len(image.touches) == 1

@@ -19,7 +19,11 @@ ITEM = {"<f4": "f", "<f8": "d", "<c8": "ff", "|u1": "B"}
 # number and fixed fields of each message of the link, from WIRE.md's tables
 LINK = {
     "Hello": (0x01, "<BI", ("link_version", "schema_hash")),
-    "Config": (0x02, "<HHfB", ("config", "dft_points", "rtia_ohm", "parts")),
+    "Config": (
+        0x02,
+        "<HHfBIBBH",
+        ("config", "dft_points", "rtia_ohm", "parts", "frequency_hz", "sinc3", "window", "settle_us"),
+    ),
     "Start": (0x03, "<H", ("config",)),
     "Stop": (0x04, "<", ()),
     "SelfTest": (0x05, "<", ()),

@@ -45,9 +45,9 @@ def refused(data):
 @pytest.mark.parametrize(
     ("field", "value", "found", "expected"),
     [
-        ("schema", 3, "schema 3", "schema 2 at most: who sent it is newer, update this reader"),
-        ("schema", 0, "int 0", "int 1..2"),
-        ("schema", "2", "str '2'", "int 1..2"),
+        ("schema", 4, "schema 4", "schema 3 at most: who sent it is newer, update this reader"),
+        ("schema", 0, "int 0", "int 1..3"),
+        ("schema", "2", "str '2'", "int 1..3"),
         ("skin", "other", "'other'", "'palm', as in the message's topic"),
         ("skin", "pa/lm", "'pa/lm'", "text"),
         ("session", "0123", "'0123'", "[0-9a-f]{16}"),

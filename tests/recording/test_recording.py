@@ -129,7 +129,7 @@ def test_noise_after_the_magic_never_raises(tmp_path: Path) -> None:
         list(RecordingReader(path).messages())
 
 
-def test_kill_9_loses_at_most_two_tenths_of_a_second(tmp_path: Path) -> None:
+def test_kill_9_loses_at_most_six_tenths_of_a_second(tmp_path: Path) -> None:
     path = tmp_path / "killed.mcap"
     program = textwrap.dedent("""
         import sys, time
@@ -150,8 +150,8 @@ def test_kill_9_loses_at_most_two_tenths_of_a_second(tmp_path: Path) -> None:
     process.wait()
     last_sent = int((rest.split() or lines[-1:])[-1])
     got = list(RecordingReader(path).messages())
-    assert got and last_sent - got[-1].log_time_ns < 0.2e9 and killed_ns - got[-1].log_time_ns < 0.5e9
-    assert FLUSH_S < 0.2
+    assert got and last_sent - got[-1].log_time_ns < 0.6e9 and killed_ns - got[-1].log_time_ns < 0.9e9
+    assert FLUSH_S < 0.6
 
 
 def chunk(compression: str, declared: int, data: bytes, crc: int = 0) -> bytes:

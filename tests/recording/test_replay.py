@@ -13,6 +13,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from firmware_stub.world import pressed
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, RawFrame, pack, unpack
 from protocol.runtime import runtime_dir
@@ -22,7 +23,8 @@ from services.recordings.recording import RecordingReader, RecordingWriter
 from services.recordings.replay import ReplayError, steps
 from services.recordings.replay_session import replay_file
 from services.runtime import persistence
-from services.runtime.config import ROOT
+from services.runtime.config import ROOT, Skin
+from tests.services.test_estimator import FREE_S, PARTS, Board, press
 
 
 @pytest.fixture(scope="module")
@@ -181,6 +183,31 @@ def test_a_recording_that_begins_while_a_touch_is_held_is_replayed_as_it_was(run
     for one, other in zip(live, again, strict=True):
         assert isinstance(other, ContactFrame)
         assert (one.scan, one.valid, one.held) == (other.scan, other.valid, other.held)
+        assert [asdict(c) for c in one.contacts] == [asdict(c) for c in other.contacts]
+
+
+def test_a_recording_in_parts_that_begins_within_a_scan_is_replayed_as_it_was(runtime: Path, tmp_path: Path) -> None:
+    """No stage will ever see the whole scan before it, after which its first parts come."""
+    pipeline = Pipeline(Skin(port="stub", bundle="square16", frame_id="palm"), "palm")
+    stages = {"preprocessing": pipeline.pre, "inference": pipeline.inference, "publisher": pipeline.publishing}
+    live: list[ContactFrame] = []
+    began_s = FREE_S + 0.6
+    with RecordingWriter(tmp_path / "held.mcap", {"bundle": "square16"}) as writer:
+        for raw in Board(press(pressed("circle", 0.02, -0.01, 8e-3, 3.0)), PARTS, 3).frames(began_s + 0.1):
+            raw.valid_for_s, raw.stamps["read"] = 0.25, raw.stamps["sample"] + 1
+            recorded = raw.stamps["sample"] > began_s * 1e9 and (live or raw.part == 4)
+            if recorded and not live:
+                states = {name: persistence.plain(stage.state()) for name, stage in stages.items()}
+                writer.write("state/palm", msgpack.packb(states), raw.stamps["sample"] - 1)
+            if recorded:
+                writer.write("raw/palm", pack(raw).partition(b"\0")[2], raw.stamps["sample"])
+            contact = pipeline.step(raw)
+            live += [contact] if recorded and contact is not None else []
+    report = replay_file(tmp_path / "held.mcap", None, out=tmp_path / "again.mcap", private=True)
+    assert report["warnings"] == [] and report["touched"] == report["frames"] == len(live) > 15
+    again = [unpack(message.wire) for message in RecordingReader(tmp_path / "again.mcap").messages({"contact"})]
+    for one, other in zip(live, again, strict=True):
+        assert isinstance(other, ContactFrame) and (one.scan, one.valid) == (other.scan, other.valid)
         assert [asdict(c) for c in one.contacts] == [asdict(c) for c in other.contacts]
 
 

@@ -16,8 +16,8 @@ import pytest
 from models import bundle as bundles
 from models.bundle import Bundle
 from protocol.frames import RawFrame, pack
-from services.contacts import calibration_file as calibration
-from services.contacts.force_curve import Curve
+from services.contacts.force import calibration_file as calibration
+from services.contacts.force.curve import Curve
 from services.recordings import settings
 from services.recordings.recorder import metadata
 from services.recordings.recording import RecordingError, RecordingReader, RecordingWriter
@@ -150,7 +150,7 @@ def test_settings_that_are_no_json_are_refused(text: str) -> None:
     [
         ({"newtons_per_siemens": -1}, "above 0"),
         ({"newtons_per_siemens": float("nan")}, "above 0"),
-        ({"schema": "eitskin.force/1"}, "no calibration"),
+        ({"schema": "eitskin.force/2"}, "no calibration"),
         ({"newtons_per_siemens": [1]}, "no calibration"),
     ],
 )

@@ -88,8 +88,8 @@ class HaltingPipeline(Pipeline):
         self._holder.pop(name, None)
         made = []
         if isinstance(frame, DeltaFrame | ImageFrame) and frame.held and waited is not None:
-            made = stage.process(waited, ALL) if waited.reconstructed == frame.reconstructed else []
-        made = [*made, *stage.process(frame, ALL)]
+            made = stage.everything(waited, ALL) if waited.reconstructed == frame.reconstructed else []
+        made = [*made, *stage.everything(frame, ALL)]
         if self.publishing.lacks:
             self.inference.joined("image")
         return made

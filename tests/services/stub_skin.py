@@ -13,6 +13,7 @@ from firmware_stub.sheet import Sheet
 from models.bundle import Bundle
 from models.shapes import Shape
 from protocol.frames import RawFrame
+from protocol.scan_setting import COHERENT
 from services.pipeline import Pipeline, Result
 from services.runtime.config import Skin
 
@@ -55,7 +56,7 @@ class StubSkin:
 
     def see(self, t: TRANSFER, end: TRANSFER | None = None) -> Result:
         """One scan of a sheet with these transfer impedances; end: with those when it ends, changing steadily."""
-        z, status = self.analog.measure((t, t if end is None else end), self.pattern, 128, 40_000.0, 0.0)
+        z, status = self.analog.measure((t, t if end is None else end), self.pattern, COHERENT, 40_000.0, 0.0)
         return self.run(z, status)
 
     def run(self, z: NDArray[np.complex64], status: NDArray[np.uint8] | None = None) -> Result:

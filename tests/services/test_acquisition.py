@@ -18,6 +18,7 @@ from models.bundle import Bundle
 from models.patterns import pattern
 from protocol import link
 from protocol.frames import STATUS_OPEN, RawFrame, pack
+from protocol.scan_setting import COHERENT
 from services.acquisition import SourceFeed, open_source
 from services.board.boardlink import ANSWER_S, DEAD_SCANS, REFUSED_AGAIN_S, SILENT_S, BoardLink
 from services.board.clock import DeviceClock
@@ -29,7 +30,7 @@ from services.recordings.recording import RecordingWriter
 from services.runtime.config import Skin
 from tests.services.fake_board import FakeBoard, PtyBoard
 
-SCANNING = Scanning(pattern("pairs"), 128, 40_000.0)
+SCANNING = Scanning(pattern("pairs"), COHERENT, 40_000.0)
 
 
 def talk(host: BoardLink, board: FakeBoard, start_s: float, seconds: float = 1.0) -> float:

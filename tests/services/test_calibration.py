@@ -19,9 +19,10 @@ from services.calibration.force_fit import CalibrationError, Press, fit, unknown
 from services.calibration.force_presses import wait_for_press, wait_for_release
 from services.calibration.live import missing
 from services.calibration.seen import SeenTouch, TouchReader
-from services.contacts import calibration_file as calibration
-from services.contacts.force import ForceLaw, Quantity
-from services.contacts.force_curve import Curve
+from services.contacts.force import calibration_file as calibration
+from services.contacts.force.curve import Curve
+from services.contacts.force.law import ForceLaw, Quantity
+from services.contacts.force.of_disc import flat_drop
 from services.describe import describe, force
 from services.runtime.config import ConfigError, Indenter, Skin
 
@@ -33,10 +34,10 @@ def truth(peak: float, x: float, y: float) -> float:
     return float(CONSTANT * peak**0.8 * np.exp(0.4 * (x**2 + y**2) / 0.03**2))
 
 
-def seen(peak: float, area: float, x: float = 0.0, y: float = 0.0) -> SeenTouch:
+def seen(peak: float, area: float, x: float = 0.0, y: float = 0.0, relative: float = 0.03) -> SeenTouch:
     """A disc, by sharp readings."""
     values = FOAM.force("circle", peak, area), peak, peak * area
-    pressure, drop, integral = (Quantity(value, 0.03) for value in values)
+    pressure, drop, integral = (Quantity(value, relative) for value in values)
     return SeenTouch(x, y, {"pressure": pressure, "peak": drop, "integral": integral})
 
 
@@ -59,6 +60,45 @@ def test_the_law_of_a_skin_is_found_and_its_error_foretold() -> None:
     off = [np.log(found.curve(p.seen.quantities["peak"].value, p.seen.x, p.seen.y) / p.force_n) for p in fresh]
     assert np.sqrt(np.mean(np.square(off))) < 0.05
     assert found.said["error"]["left_out_rms"] == pytest.approx(np.sqrt(np.mean(np.square(off))), rel=0.6)
+
+
+def of_tip(radius_m: float, n: int, seed: int, told_sd: float = 0.3) -> list[Press]:
+    """Presses of one tip, whose area each tells anew to told_sd, and how strongly it acts to 0.2 %."""
+    rng, area, made = np.random.default_rng(seed), np.pi * radius_m**2, []
+    for k in range(n):
+        force, (x, y) = float(rng.uniform(1.5, 4.0)), rng.uniform(-0.03, 0.03, 2)
+        drop = FOAM.flat_drop(force, area)
+        strength = area * drop / (1 - drop / 2) * np.exp(0.002 * rng.standard_normal())
+        told = area * np.exp(told_sd * rng.standard_normal())
+        touch = seen(float(flat_drop(strength / told)), told, float(x), float(y), relative=0.002)
+        made.append(Press(force, touch, f"press {k}"))
+    return made
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_presses_of_one_tip_that_saturates_the_foam_tell_its_size(tmp_path: Path, bundle: Bundle, seed: int) -> None:
+    some = of_tip(0.006, 30, seed)
+    without, found = fit(some), fit(some, any_tip=True)
+    assert found.reads == "pressure" and found.tip_m == pytest.approx(0.006, rel=0.1)
+    errors = [each.said["error"]["left_out_rms"] for each in (without, found)]
+    assert errors[1] < 0.05 < errors[0] / 1.5
+    skin = Skin(port="stub", bundle="square16")
+    calibration.save(tmp_path / "law.json", found, "palm", skin, bundle)
+    law = ForceLaw.of(skin.model_copy(update={"calibration": tmp_path / "law.json"}), bundle, "palm")
+    assert law.curve == found.curve and law.indenter_m2 == pytest.approx(np.pi * found.tip_m**2)
+    for press in of_tip(0.006, 20, 90 + seed):
+        strength = press.seen.strength.value
+        touch = EstimatedTouch(
+            id=1, position=[press.seen.x, press.seen.y], sigma=[1e-3, 1e-3, 0.0], radius_m=0.006, radius_sigma=0.1,
+            drop=0.5, drop_sigma=0.1, strength=strength, strength_sigma=0.01 * strength,
+        )  # fmt: skip
+        assert law.of_touch(touch).newton == pytest.approx(press.force_n, rel=0.15)
+
+
+def test_a_tip_is_not_made_of_presses_that_any_size_explains() -> None:
+    assert fit(of_tip(0.015, 30, 1, told_sd=0.002), any_tip=True).tip_m is None
+    two = [replace(p, tip_m=mm * 1e-3) for mm in (5.0, 8.0) for p in of_tip(mm * 1e-3, 15, 2)]
+    assert fit(two, any_tip=True).tip_m is None
 
 
 def test_few_presses_are_not_given_many_parameters() -> None:
@@ -154,9 +194,9 @@ def test_a_file_of_something_else_is_refused(file: Path, skin: Skin, bundle: Bun
     text = file.read_text()
     file.write_text(text.replace('"most_n": ', '"most_n": 1'))
     refused("changed or damaged")
-    file.write_text(text.replace("eitskin.force/1", "eitskin.force/9"))
-    refused("schema 'eitskin.force/9', this program reads eitskin.force/1")
-    for other in ("[]", "nonsense", '{"newtons_per_siemens": -3}', json.dumps({"schema": "eitskin.force/1"})):
+    file.write_text(text.replace("eitskin.force/2", "eitskin.force/9"))
+    refused("schema 'eitskin.force/9', this program reads eitskin.force/2")
+    for other in ("[]", "nonsense", '{"newtons_per_siemens": -3}', json.dumps({"schema": "eitskin.force/2"})):
         file.write_text(other)
         refused("is no calibration of forces")
 

@@ -11,6 +11,7 @@ import pytest
 from models.bundle import Bundle
 from models.shapes import Shape
 from protocol.frames import Frame
+from protocol.scan_setting import COHERENT
 from services.calibration import collecting, presses_csv
 from services.calibration.collecting import Collected, Collector
 from services.calibration.force_fit import CalibrationError
@@ -62,7 +63,7 @@ def test_a_press_is_measured_against_the_scans_just_before(late: bool) -> None:
     frames.shapes = (Shape("circle", 0.4, -0.2, 0.2, 0.3),)
     touched, seen = collector.pressed()
     sheet = frames.stub
-    z0, z = (np.abs(sheet.analog.measure((t, t), sheet.pattern, 128, 4e4, 0.0)[0]) for t in _true(frames.shapes))
+    z0, z = (np.abs(sheet.analog.measure((t, t), sheet.pattern, COHERENT, 4e4, 0.0)[0]) for t in _true(frames.shapes))
     np.testing.assert_allclose(before, z0, rtol=5e-4)  # 80 dB
     np.testing.assert_allclose(touched, z, rtol=5e-4)
     assert np.abs(touched / before - 1).max() > 0.01

@@ -10,8 +10,9 @@ from typing import Any, get_args
 import pytest
 
 from models.bundle import Bundle
-from services.contacts.force import ForceLaw
-from services.contacts.force_curve import Curve
+from protocol.scan_setting import COHERENT, PAPER, ScanSetting
+from services.contacts.force.curve import Curve
+from services.contacts.force.law import ForceLaw
 from services.runtime.config import (
     ROOT,
     ConfigError,
@@ -46,6 +47,14 @@ def test_the_shipped_configuration_is_the_demo() -> None:
         ({"skins": {"palm": PALM | {"port": "com1"}}}, "*.npz"),
         ({"skins": {"palm": PALM | {"pot": "stub"}}}, "skins.palm.pot: unknown key; allowed here: port, bundle"),
         ({"skins": {"palm": PALM | {"dft_points": 100}}}, "dft_points: found 100; allowed: 128, 256 or 512"),
+        (
+            {"skins": {"palm": PALM | {"scan_setting": "slow"}}},
+            "scan_setting: found 'slow'; allowed: 'coherent', 'paper'",
+        ),
+        (
+            {"skins": {"palm": PALM | {"scan_setting": "quick", "dft_points": 256}}},
+            "`dft_points` with scan_setting = 'coherent' or 'paper': the others have points of their own (found 256",
+        ),
         ({"skins": {"palm": PALM | {"tare": {"frames": 2}}}}, "skins.palm.tare.frames: found 2; allowed: "),
         ({"skins": {"palm": PALM | {"tare": {"frame": 64}}}}, "unknown key; allowed here: frames, max_age_s"),
         ({"skins": {"palm": PALM | {"pose": {"quaternion_xyzw": [1, 1, 0, 0]}}}}, "a quaternion of length 1"),
@@ -266,3 +275,10 @@ def test_addresses_and_keys_reach_the_sockets() -> None:
     transport = config.transport()
     assert transport.data_address("publisher") == "tcp://0.0.0.0:47600"
     assert transport.secret_key == Path("/robot/keys/me.key_secret")
+
+
+def test_a_scan_setting_has_a_name() -> None:
+    assert parse({"skins": {"palm": PALM}}).skin("palm").setting == COHERENT
+    paper = parse({"skins": {"palm": PALM | {"scan_setting": "paper", "dft_points": 256}}}).skin("palm").setting
+    assert paper == ScanSetting(40_000, 256) and PAPER == ScanSetting(40_000, 128)
+    assert parse({"skins": {"palm": PALM | {"scan_setting": "quick"}}}).skin("palm").setting.points == 64

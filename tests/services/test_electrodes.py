@@ -10,6 +10,7 @@ import pytest
 from models.shapes import Shape
 from protocol.errors import EitskinError
 from protocol.frames import ELECTRODE_STATES, DeltaFrame, RawFrame
+from protocol.scan_setting import COHERENT
 from services.pipeline import Result
 from tests.services.stub_skin import StubSkin, sheet, transfer
 
@@ -225,7 +226,7 @@ def test_a_channel_that_comes_back_under_a_lifted_contact_blinds_nobody(broken: 
     own, lifted = StubSkin(80.0), ((9, 6.0),)
 
     def felt(contacts: tuple[tuple[int, float], ...], gone: bool) -> Result:
-        z, status = own.analog.measure((transfer(PRESS, contacts),) * 2, own.pattern, 128, 40_000.0, 0.0)
+        z, status = own.analog.measure((transfer(PRESS, contacts),) * 2, own.pattern, COHERENT, 40_000.0, 0.0)
         z[50] = broken if gone else z[50]
         return own.run(z, status)
 
@@ -255,7 +256,7 @@ def test_a_contact_that_rises_within_scans_is_named_before_it_is_up(skin: StubSk
     rising = [transfer((), ((9, factor),)) for factor in (1.0, 3.5, 6.0)]
     named = []
     for before, after in zip(rising, [*rising[1:], rising[-1]], strict=True):
-        z, status = skin.analog.measure((before, after), skin.pattern, 128, 40_000.0, 0.0)
+        z, status = skin.analog.measure((before, after), skin.pattern, COHERENT, 40_000.0, 0.0)
         named.append(states(skin.run(z, status)))
     assert {"drifting": [9]} in named[:2] and named[-1] == {"drifting": [9]}
     assert states(skin.rest(BACK_WITHIN + 3)) == {}
@@ -301,7 +302,7 @@ def test_a_tare_takes_a_changed_contact_as_it_is() -> None:
 
 def test_one_electrode_dead_two_degraded_three_invalid(skin: StubSkin) -> None:
     dead = np.zeros(len(skin.pattern), np.uint8)
-    z, _ = skin.analog.measure((transfer(PRESS),) * 2, skin.pattern, 128, 40_000.0, 0.0)
+    z, _ = skin.analog.measure((transfer(PRESS),) * 2, skin.pattern, COHERENT, 40_000.0, 0.0)
     for count, electrodes in enumerate(((), (5,), (5, 12), (5, 12, 2))):
         dead[:] = np.where(np.isin(skin.pattern, electrodes).any(axis=1), 2, 0)
         skin.rest(4)
@@ -324,7 +325,7 @@ def test_electrodes_that_go_dead_as_a_strong_touch_comes_are_no_multiplexer(
     own = StubSkin(80.0)
     dead = np.where(np.isin(own.pattern, electrodes).any(axis=1), 2, 0).astype(np.uint8)
     for _ in range(4):
-        z, _ = own.analog.measure((transfer((touch,)),) * 2, own.pattern, 128, 40_000.0, 0.0)
+        z, _ = own.analog.measure((transfer((touch,)),) * 2, own.pattern, COHERENT, 40_000.0, 0.0)
         result = own.run(z, dead)
         assert states(result) == {"open": list(electrodes)}
         (contact,) = [c for c in result.contact.contacts if c.state != "end"]
@@ -391,7 +392,7 @@ def test_no_touch_is_named_a_fault(snr_db: float) -> None:
             )
         own.rest(BACK_WITHIN + 3)
         t = sheet().model.solve(sheet().model.touched(shapes)).transfer
-        z, status = own.analog.measure((t, t), own.pattern, 128, 40_000.0, 0.0)
+        z, status = own.analog.measure((t, t), own.pattern, COHERENT, 40_000.0, 0.0)
         status[:] = 0  # a drop of 0.85 S/m on an electrode may clip the current: that is another matter
         result = _named(own, z, status)
         assert result == {}, shapes

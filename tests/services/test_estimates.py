@@ -122,7 +122,7 @@ def test_two_touches_have_outlines_in_the_order_of_their_contacts() -> None:
     frames = list(Board(two, 1, 1).frames(FREE_S + 0.6))
     said(stages, frames[:-1])
     image = stages.inference.process(stages.pre.process(frames[-1], frozenset({"delta"}))[0], frozenset({"image"}))[0]
-    contact, shape = stages.publishing.process(image, frozenset({"contact", "shape"}))
+    contact, shape = stages.publishing.everything(image, frozenset({"contact", "shape"}))
     assert isinstance(contact, ContactFrame)
     assert shape.ids == shown(contact) and len(shape.ids) == 2  # type: ignore[attr-defined]
     for each, line in zip(contact.contacts, shape.outlines, strict=True):  # type: ignore[attr-defined]

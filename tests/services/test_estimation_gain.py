@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from models.shapes import Shape
+from protocol.scan_setting import COHERENT
 from tests.services.stub_skin import StubSkin, transfer
 
 
@@ -106,7 +107,7 @@ def test_a_gain_step_in_the_midst_of_a_scan_is_taken_over_by_the_next(gain: floa
 
     for step in range(20):
         skin.feel(touching(step))
-    z, status = skin.analog.measure((transfer(touching(20)),) * 2, skin.pattern, 128, 40_000.0, 0.0)
+    z, status = skin.analog.measure((transfer(touching(20)),) * 2, skin.pattern, COHERENT, 40_000.0, 0.0)
     z[50:] *= 1 + gain
     between = skin.run(z, status).contact
     assert not (between.valid and situation == "untouched" and between.contacts)

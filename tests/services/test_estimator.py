@@ -13,7 +13,7 @@ from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World, pressed
 from firmware_stub.worlds import table
 from models.bundle import Bundle
-from models.measurement.tables import tables_of
+from models.measurement.responses.tables import tables_of
 from models.mismatch import Mismatch
 from models.rolling import order
 from protocol.frames import Contact, ContactFrame, RawFrame

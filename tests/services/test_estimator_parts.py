@@ -8,8 +8,8 @@ import pytest
 
 from bench.trust.candidate import Today
 from firmware_stub.world import Touch, World, pressed
+from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FoundTouches, TouchFitter
-from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
 from services.runtime.config import Skin
 from tests.services.test_estimator import (
@@ -21,13 +21,14 @@ from tests.services.test_estimator import (
     between,
     between_s,
     bundle,
+    impedance,
     lasting,
     press,
     run,
     sheet,
 )
 
-TOUCH = pressed("circle", 0.012, -0.018, 9e-3, 3.0)
+TOUCH, STRONG = (pressed("circle", 0.012, -0.018, 9e-3, force_n) for force_n in (3.0, 5.0))
 
 
 @contextmanager
@@ -52,11 +53,11 @@ def counted(patch: pytest.MonkeyPatch) -> Iterator[dict[str, int]]:
 
 
 def costs(
-    curve: Curve, seconds: float, patch: pytest.MonkeyPatch, dead: tuple[int, ...] = ()
+    curve: Curve, seconds: float, patch: pytest.MonkeyPatch, dead: tuple[int, ...] = (), parts: int = PARTS
 ) -> list[tuple[float, int, int]]:
-    """When, steps and factors of each part."""
+    """When, steps and factors of each part, or of each whole scan."""
     candidate, made = Today(Skin.model_validate({"port": "stub", "bundle": "square16"}), bundle()), []
-    for raw in Board(curve, PARTS, 1).frames(seconds):
+    for raw in Board(curve, parts, 1).frames(seconds):
         raw.status[list(dead)] = 1
         with counted(patch) as found:
             candidate.step(raw)
@@ -121,3 +122,32 @@ def test_measurements_that_the_baseline_lacks_are_no_fault_of_the_wires(parts: i
             made.append(frame)
     assert all(frame.valid and lasting(frame) == 1 for frame in between_s(made, FREE_S + 0.3, 99))
     assert all(frame.valid and not frame.contacts for frame in between_s(made, FREE_S - 0.3, FREE_S))
+
+
+@pytest.mark.parametrize("parts", [1, PARTS])
+@pytest.mark.parametrize("ramp_s", [5e-4, 2e-3, 5e-3, 0.01, 0.02])
+def test_a_strong_touch_that_is_let_go_at_once_costs_no_search(
+    ramp_s: float, parts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whenever within a scan: what else it may be is not asked, which costs a scan's whole budget."""
+    for later_s in (0.0, 0.021):
+        until_s = FREE_S + 0.7 + later_s
+        made = costs(press(STRONG, ramp_s=ramp_s, until_s=until_s), until_s + 0.12, monkeypatch, parts=parts)
+        assert max(steps for at, steps, _ in made if at > until_s - 0.05) <= 3 * n.STEPS_COLD
+
+
+@pytest.mark.parametrize("parts", [1, PARTS])
+@pytest.mark.parametrize("ramp_s", [1e-3, 5e-3, 0.02])
+@pytest.mark.parametrize(("first_n", "then_n"), [(5.0, 2.5), (2.5, 5.0)])
+def test_a_touch_whose_force_changes_at_once_goes_on(ramp_s: float, parts: int, first_n: float, then_n: float) -> None:
+    """Whenever within a scan: it is there in every frame, with its id. What is half gone is no release, and what comes
+    to it is no other touch.
+    """
+    free = impedance()
+    first, then = (impedance(pressed("circle", 0.012, -0.018, 9e-3, force_n)) for force_n in (first_n, then_n))
+    for later_s in (0.0, 0.0067, 0.0134, 0.034):
+        at = FREE_S + 0.7 + later_s
+        curve = between((0, free), (FREE_S, free), (FREE_S + 0.1, first), (at, first), (at + ramp_s, then), (99, then))
+        shown = between_s(run(curve, at + 0.3, parts), at - 0.1, 99)
+        assert all(frame.valid and lasting(frame) == 1 for frame in shown)
+        assert len({contact.id for frame in shown for contact in frame.contacts}) == 1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from firmware_stub.world import Touch
-from models.measurement.tables import tables_of
+from models.measurement.responses.tables import tables_of
 from protocol.records import Tree
 from services.estimation.estimator import Estimator
 from services.estimation.values.estimate import Estimate

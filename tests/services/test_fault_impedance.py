@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from firmware_stub.analog import Analog, BoardNoise
 from firmware_stub.faults import Faults
 from models.bundle import Bundle
-from models.measurement.tables import SkinTables, tables_of
-from models.measurement.whitening import Whitening
+from models.measurement.covariance.whitening import Whitening
+from models.measurement.responses.tables import SkinTables, tables_of
 from models.shapes import Shape
+from protocol.scan_setting import COHERENT
 from services.estimation.faults.impedance import ContactChange, ContactColumns, Unexplained, gain_change
 from tests.services.stub_skin import transfer
 
@@ -29,7 +30,7 @@ ALWAYS = -np.inf
 def scan(begin: NDArray[np.float64], end: NDArray[np.float64] | None = None, seed: int = 3) -> Array:
     """log |Z| (K,) of a sheet that goes from one transfer matrix to another while it is measured."""
     analog = Analog(BoardNoise(NOISE), Faults(), np.random.default_rng(seed))
-    z, _ = analog.measure((begin, begin if end is None else end), PATTERN, 128, 40_000.0, 0.0)
+    z, _ = analog.measure((begin, begin if end is None else end), PATTERN, COHERENT, 40_000.0, 0.0)
     return np.asarray(np.log(np.abs(z).astype(float)))
 
 
@@ -51,7 +52,7 @@ def asked(log_z: Array) -> Unexplained:
 
 def likeliest(log_z: Array, begins_s: float = ALWAYS) -> tuple[ContactChange, float]:
     """And by how much it is likelier than the next."""
-    found = ContactColumns.of(tables()).likeliest(asked(log_z), np.full(16, begins_s))
+    found = ContactColumns.of(tables()).changes(asked(log_z), np.arange(16), np.full(16, begins_s))
     found.sort(key=lambda change: -change.score)
     return found[0], found[0].score - found[1].score
 
@@ -76,7 +77,8 @@ def test_a_contact_that_jumps_in_the_midst_of_a_scan() -> None:
     assert late.electrode == 9 and margin > 30 and late.chi2 < 1.6
     assert late.size == pytest.approx(2.0, rel=0.1)
     assert late.score > likeliest(log_z)[0].score + 30
-    assert ContactColumns.of(tables()).onsets(asked(log_z))[9] == pytest.approx(0.01, abs=2e-3)
+    found = max(ContactColumns.of(tables()).likeliest(asked(log_z)), key=lambda change: change.score)
+    assert found.electrode == 9 and found.since_s == pytest.approx(0.01, abs=2e-3)
 
 
 def test_nothing_is_no_change() -> None:

@@ -13,6 +13,7 @@ from firmware_stub.faults import MUXES, Faults
 from models.bundle import Bundle
 from models.patterns import adjacent, pairs
 from models.shapes import Shape
+from protocol.scan_setting import COHERENT
 from services.estimation.faults import wires
 from services.estimation.faults.wires import WireFault, WireKind, WireMaps
 from tests.services.stub_skin import transfer
@@ -32,7 +33,7 @@ def measured(
     for name, args in faults.items():
         board.inject(name, args, 0.0, 1.0)
     analog = Analog(BoardNoise(1e-7), board, np.random.default_rng(3))
-    z, status = analog.measure((transfer(touch),) * 2, pattern, 128, 40_000.0, 0.0)
+    z, status = analog.measure((transfer(touch),) * 2, pattern, COHERENT, 40_000.0, 0.0)
     return np.abs(z).astype(float), status
 
 
@@ -78,9 +79,9 @@ def test_a_stuck_bit_that_leads_to_where_nothing_is_connected() -> None:
     board = Faults()
     board.inject("mux_stuck", {"mux": "drive-", "bit": 2, "value": 1}, 0.0, 1.0)
     analog = Analog(BoardNoise(1e-7), board, np.random.default_rng(3))
-    _, status = analog.measure((reachable,) * 2, pattern, 128, 40_000.0, 0.0)
+    _, status = analog.measure((reachable,) * 2, pattern, COHERENT, 40_000.0, 0.0)
     well = Analog(BoardNoise(1e-7), Faults(), np.random.default_rng(3))
-    z0 = np.abs(well.measure((reachable,) * 2, pattern, 128, 40_000.0, 0.0)[0]).astype(float)
+    z0 = np.abs(well.measure((reachable,) * 2, pattern, COHERENT, 40_000.0, 0.0)[0]).astype(float)
     maps = WireMaps(pattern)
     (fault,) = [f for f in maps.faults if (f.side, f.bit, f.value) == ("-", 2, 1)]
     assert (maps.one(fault, z0).blind >= (status != 0)).all() and (status != 0).any()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from models.measurement.disc import DiscResponse
-from models.measurement.grid import DiscGrid
+from models.measurement.responses.disc import DiscResponse
+from models.measurement.responses.grid import DiscGrid
 from models.shapes import Shape
 from services.estimation.faults.table import BoardScan, WireGuess, WireTable, any_touches
 from services.estimation.faults.wires import WireFault, WireKind, WireMaps

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.forward import shared
-from models.measurement.tables import tables_of
+from models.measurement.responses.tables import tables_of
 from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
 from protocol.frames import RawFrame

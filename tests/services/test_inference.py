@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
 from models.bundle import Bundle, write
-from protocol.frames import DeltaFrame, ImageFrame, pack
-from services.estimation.averaging import MEANS
-from services.estimation.quality import KEPT
+from protocol.frames import DeltaFrame, ImageFrame, StackFrame, pack
+from services.estimation.images.averaging import MEANS
+from services.estimation.images.quality import KEPT
 from services.inference import SETTLED, Inference
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
@@ -58,18 +59,37 @@ def networked(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundl
 
 @pytest.fixture
 def stage(skin: Skin, networked: Bundle) -> Inference:
-    return Inference("palm", skin.model_copy(update={"network": "full"}), networked)
+    return with_images_of_value(Inference("palm", skin.model_copy(update={"network": "full"}), networked))
 
 
 def delta(scan: int, value: float = 0.0, held: bool = False, reconstructed: int = 0) -> DeltaFrame:
     frame = DeltaFrame(skin="palm", scan=scan, valid=True, touched=True, held=held)
     frame.reconstructed = reconstructed or scan
-    frame.scale = 0.4
     if not held:
-        frame.stack = np.full((9, 24, 24), value, np.float32)
-        frame.stack[0, 3, 17] = 2 * value
-        frame.context = np.zeros(4, np.float32)
+        frame.averaged, frame.difference = 1, np.array([value], np.float32)
     return frame
+
+
+class OfValue:
+    """An operator whose images are the difference's one value, and twice that in a pixel of the first."""
+
+    drift = 0.0
+
+    def __call__(self, *noise: object) -> OfValue:
+        return self
+
+    def has(self, *noise: object) -> bool:
+        return True
+
+    def stack(self, difference: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+        images = np.full((9, 24, 24), difference[0], np.float32)
+        images[0, 3, 17] *= 2
+        return images, np.zeros(4, np.float32), 0.4
+
+
+def with_images_of_value(stage: Inference) -> Inference:
+    stage._operators = OfValue()  # type: ignore[assignment]
+    return stage
 
 
 def run(stage: Inference, frame: DeltaFrame) -> ImageFrame:
@@ -128,7 +148,8 @@ def test_what_nobody_wants_is_not_run_but_made_up_for(stage: Inference) -> None:
 def test_skins_that_wait_together_share_a_run_and_keep_their_own(
     skin: Skin, networked: Bundle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    alike = [Inference(name, skin.model_copy(update={"network": "full"}), networked) for name in ("palm", "arm")]
+    both = [Inference(name, skin.model_copy(update={"network": "full"}), networked) for name in ("palm", "arm")]
+    alike = [with_images_of_value(stage) for stage in both]
     frames = [delta(1, 0.5), delta(1, 0.25)]
     alone = [run(stage, frame).image for stage, frame in zip(alike, frames, strict=True)]
     runs: list[int] = []
@@ -141,6 +162,23 @@ def test_skins_that_wait_together_share_a_run_and_keep_their_own(
     assert runs == [2]
     assert run(alike[0], frames[1]).image == pytest.approx(alone[1])  # not what lay ready for another frame
     assert runs == [2, 1]
+
+
+def test_a_stack_is_sent_to_who_asks_once_for_each_image(stage: Inference) -> None:
+    def asked(frame: DeltaFrame, *topics: str) -> list[StackFrame]:
+        made = stage.everything(frame, frozenset({"image", *topics}))
+        return [each for each in made if isinstance(each, StackFrame)]
+
+    assert not asked(delta(1, 0.5))
+    (late,) = asked(delta(2, held=True, reconstructed=1), "stack")
+    assert late.reconstructed == late.scan == 1 and late.stack.max() == 1.0 and late.scale == pytest.approx(0.4)
+    assert not asked(delta(3, held=True, reconstructed=1), "stack")
+    (newer,) = asked(delta(4, 0.25), "stack")
+    assert newer.reconstructed == 4 and newer.stack.max() == 0.5
+    stage.joined("stack")
+    assert len(asked(delta(5, held=True, reconstructed=4), "stack")) == 1
+    stage.joined("stack")
+    assert not asked(DeltaFrame(skin="palm", scan=6, valid=True), "stack"), "nothing touches"
 
 
 def test_state_carries_the_held_image(stage: Inference, skin: Skin, networked: Bundle) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from models.bundle import Bundle
 from protocol.frames import STATUS_OPEN, DeltaFrame, JudgementsFrame, PartFrame, RawFrame, pack, unpack
 from services.cli.judged import lines
 from services.cli.watch import line
+from services.estimation.values import judgement
 from services.estimation.values.judgement import ROWS, judge
 from services.inference import Inference
 from services.judged import judged
@@ -29,7 +32,7 @@ def stage(skin: Skin, bundle: Bundle) -> Preprocessing:
 
 def run(stage: Preprocessing, frame: RawFrame) -> tuple[DeltaFrame, JudgementsFrame]:
     """What is made of a whole scan, the judgements as a subscriber has them."""
-    delta, made = stage.process(frame, ASKED)
+    delta, made = stage.everything(frame, ASKED)
     said = unpack(pack(made))
     assert isinstance(delta, DeltaFrame) and isinstance(said, JudgementsFrame)
     header = ("skin", "scan", "part", "stamps", "source", "valid", "reasons", "valid_for_s")
@@ -97,14 +100,14 @@ def test_a_press_is_noted_and_refuses_nothing(stage: Preprocessing, board: Board
 
 def test_nothing_is_made_that_nobody_asked_for(stage: Preprocessing, bundle: Bundle, board: Board) -> None:
     for frame in (*(board.frame() for _ in range(72)), without(bundle, board, 5)):
-        (made,) = stage.process(frame, UNASKED)
+        (made,) = stage.everything(frame, UNASKED)
         assert isinstance(made, DeltaFrame)
 
 
 def test_a_scan_that_cannot_be_judged_has_no_judgements(stage: Preprocessing, board: Board) -> None:
     frame = board.frame()
     frame.z, frame.status = frame.z[:-1], frame.status[:-1]
-    (made,) = stage.process(frame, ASKED)
+    (made,) = stage.everything(frame, ASKED)
     assert isinstance(made, DeltaFrame) and made.reasons == ["out_of_distribution"]
 
 
@@ -115,8 +118,8 @@ def test_every_part_of_a_scan_is_explained_also_where_nothing_touches(skin: Skin
     asked, unasked = (Preprocessing("palm", skin, bundle) for _ in range(2))
     whole = parts = 0
     for raw in raws:
-        *made, said = asked.process(raw, ASKED)
-        others = unasked.process(raw, UNASKED)
+        *made, said = asked.everything(raw, ASKED)
+        others = unasked.everything(raw, UNASKED)
         assert isinstance(said, JudgementsFrame) and (said.scan, said.part) == (raw.scan, raw.part)
         assert [pack(each) for each in made] == [pack(each) for each in others]
         whole, parts = whole + any(isinstance(each, DeltaFrame) for each in made), parts + (not made)
@@ -129,3 +132,9 @@ def test_what_is_no_number_makes_no_frame_invalid(number: float) -> None:
     back = unpack(pack(judged(DeltaFrame(skin="palm", valid=True), [judge("explained", number, 1.0)])))
     assert isinstance(back, JudgementsFrame) and back.valid and not back.reasons
     assert np.isfinite(back.ratios).all() and (back.ratios[0] >= 1) == (back.verdicts == ["refuse"])
+
+
+def test_each_row_names_the_file_that_judges_it() -> None:
+    folder = Path(judgement.__file__).parents[1]
+    for name, row in ROWS.items():
+        assert f'"{name}"' in (folder / f"{row.room}.py").read_text(encoding="utf-8"), f"{row.room}.py: no {name}"

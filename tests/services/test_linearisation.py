@@ -21,10 +21,10 @@ from models.shapes import Shape
 from protocol.frames import Frame, RawFrame
 from services import mounting
 from services.calibration.force_presses import of_file
-from services.contacts import calibration_file
-from services.contacts.force_curve import Curve
-from services.estimation.baseline import Baseline
+from services.contacts.force import calibration_file
+from services.contacts.force.curve import Curve
 from services.estimation.by_bundle import skin_tables
+from services.estimation.first.baseline import Baseline
 from services.linearisation import Linearisation
 from services.pipeline import Pipeline, Result
 from services.preprocessing import Preprocessing

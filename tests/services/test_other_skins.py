@@ -17,6 +17,7 @@ from models import bundle, geometry, manifest
 from models.forward import ForwardModel
 from models.linearise import linearise
 from protocol.frames import RawFrame
+from protocol.scan_setting import COHERENT
 from services.pipeline import Pipeline, Result
 from services.runtime.config import Skin
 
@@ -50,7 +51,7 @@ class Made:
         t = self.sheet.transfer(world)
         for _ in range(scans):
             self.scan += 1
-            z, status = self.analog.measure((t, t), self.sheet.skin.pattern, 128, 40_000.0, 0.0)
+            z, status = self.analog.measure((t, t), self.sheet.skin.pattern, COHERENT, 40_000.0, 0.0)
             stamps = {"sample": self.scan * 45_000_000, "read": self.scan * 45_000_000 + 1}
             scan = {"skin": "any", "scan": self.scan, "stamps": stamps, "source": "board", "valid_for_s": 0.5}
             result = self.pipeline.run(RawFrame(**scan, valid=True, z=z, status=status))

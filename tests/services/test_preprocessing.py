@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from copy import deepcopy
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +13,9 @@ import pytest
 from models.bundle import Bundle
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_OPEN, STATUS_RTIA, DeltaFrame, RawFrame, pack, unpack
 from services.describe import EVERY_S, MOVED
-from services.estimation import checks
-from services.estimation.baseline import Baseline, NoBaseline, disagreement, take
+from services.estimation.faults import checks
 from services.estimation.faults.wires import WireFault, WireKind, WireMaps
+from services.estimation.first.baseline import Baseline, NoBaseline, disagreement, take
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
 from services.runtime.stage import Refused
@@ -29,7 +30,7 @@ def stage(skin: Skin, bundle: Bundle) -> Preprocessing:
 
 
 def run(stage: Preprocessing, frame: RawFrame) -> DeltaFrame:
-    (out,) = stage.process(frame, WANTED)
+    (out,) = stage.everything(frame, WANTED)
     assert isinstance(out, DeltaFrame)
     assert np.isfinite(out.difference).all()
     return out
@@ -144,6 +145,40 @@ def test_a_touch_at_the_start_is_a_contact_where_an_old_baseline_is_trusted(stag
     assert not [run(stage, board.frame()) for _ in range(10)][-1].touched
 
 
+def test_who_goes_on_from_a_state_knows_the_old_baseline_by_which_it_starts(
+    stage: Preprocessing, board: Board, skin: Skin, bundle: Bundle
+) -> None:
+    saved = tared(stage, board).saved()
+    assert saved is not None
+    stage.reset()
+    with pytest.raises(Refused, match="held against it"):
+        stage.restore(saved, 1e5)
+    other, touch = Preprocessing("palm", skin, bundle), board.disc(0.5, -0.3, 0.2, 0.3)
+    frames = [board.frame(touch) for _ in range(80)]
+    for frame in frames[:20]:
+        run(stage, frame)
+    other.load(deepcopy(stage.state()))
+    first = run(stage, frames[20]), run(other, frames[20])
+    assert first[1].after == 0 and np.array_equal(first[0].difference, first[1].difference)
+    for frame in frames[21:]:
+        assert pack(run(stage, frame)) == pack(run(other, frame))
+    assert stage.baseline is not None and other.baseline is not None and other.baseline.restored
+    assert str(stage.baseline.to_dict()) == str(other.baseline.to_dict())
+
+
+def test_steps_of_the_gain_are_counted_by_who_saw_them(
+    stage: Preprocessing, board: Board, skin: Skin, bundle: Bundle
+) -> None:
+    tared(stage, board)
+    for _ in range(20):
+        run(stage, board.frame(0.02))
+    assert stage.health().counters["gain_steps"] == 1
+    other = Preprocessing("palm", skin, bundle)
+    other.load(stage.state())
+    run(other, board.frame(0.02))
+    assert other.health().counters.get("gain_steps", 0) == 0
+
+
 def test_identical_frames_tell_no_noise(stage: Preprocessing, board: Board, bundle: Bundle) -> None:
     """Without noise of its own a skin would be touched by anything."""
     z = np.asarray(board.m.z0, dtype=float)
@@ -193,6 +228,20 @@ def not_believed(frame: RawFrame, reason: str) -> RawFrame:
     """As acquisition sends it on."""
     frame.valid, frame.reasons = False, [reason]
     return received(frame)
+
+
+def test_what_a_scan_teaches_waits_until_its_frame_has_left(skin: Skin, bundle: Bundle, board: Board) -> None:
+    """And a stage that is never left the time learns the same with the next scan."""
+    hurried, other = (tared(Preprocessing("palm", skin, bundle), each) for each in (board, deepcopy(board)))
+    for frame in [received(board.frame()) for _ in range(8)]:
+        (first,) = hurried.process(frame, WANTED)
+        assert other.estimator.skin is not None
+        was = other.estimator.skin.drift.now.at_s
+        (second,) = other.process(frame, WANTED)
+        assert other.estimator.skin.drift.now.at_s == was
+        other.beside(WANTED)
+        assert other.estimator.skin.drift.now.at_s > was
+        assert pack(first) == pack(second)
 
 
 @pytest.mark.parametrize("reason", ["frozen", "clock"])
@@ -248,11 +297,18 @@ def test_no_false_touch_and_the_lightest_touch_is_seen(stage: Preprocessing, boa
     assert not run(stage, board.frame()).touched
 
 
-def test_untouched_frames_carry_no_stack(stage: Preprocessing, board: Board) -> None:
+def test_untouched_frames_are_not_reconstructed(stage: Preprocessing, board: Board) -> None:
     tared(stage, board)
-    assert run(stage, board.frame()).stack.size == 0
+    assert run(stage, board.frame()).averaged == 0
     stage.always_reconstruct = True
-    assert run(stage, board.frame()).stack.shape[0] == len(board.m.ladder)
+    assert run(stage, board.frame()).averaged == 1
+
+
+def test_a_frame_to_be_reconstructed_is_small(stage: Preprocessing, board: Board) -> None:
+    """What inference forms of it is not carried: nine images are ten times as much."""
+    tared(stage, board)
+    delta = run(stage, board.frame(board.disc(0.2, 0.1, 0.2, 0.3)))
+    assert delta.averaged == 1 and len(pack(delta)) < 8192
 
 
 def test_an_unchanged_touch_is_held_and_averaged(stage: Preprocessing, board: Board) -> None:
@@ -261,7 +317,8 @@ def test_an_unchanged_touch_is_held_and_averaged(stage: Preprocessing, board: Bo
     outs = [run(stage, board.frame(touch)) for _ in range(40)]
     reconstructed = [i + 1 for i, o in enumerate(outs) if not o.held]
     assert reconstructed == [1, 2, 4, 8, 16, 32]
-    assert all((o.stack.size > 0) == (not o.held) for o in outs)
+    assert [o.averaged for o in outs if o.averaged] == [1, 2, 4, 8, 16, 16]
+    assert all((o.averaged > 0) == (not o.held) for o in outs)
     scans = [o.scan for o in outs]
     assert [o.reconstructed for o in outs[7:10]] == [scans[7]] * 3
     expected = touch * np.asarray(board.m.z0) / stage.pre.normaliser(np.asarray(board.m.z0, float))
@@ -393,8 +450,19 @@ def test_state_continues_bit_by_bit(stage: Preprocessing, skin: Skin, bundle: Bu
     for n in range(20):
         frame = board.frame(touch if n < 15 else 0.0)
         a, b = run(stage, frame), run(twin, frame)
-        assert a.stack.tobytes() == b.stack.tobytes() and a.score == b.score and a.held == b.held
+        assert a.averaged == b.averaged and a.score == b.score and a.held == b.held
         assert a.difference.tobytes() == b.difference.tobytes()
+
+
+def test_a_state_of_an_earlier_layout_gives_its_baseline(
+    stage: Preprocessing, skin: Skin, bundle: Bundle, board: Board
+) -> None:
+    state = tared(stage, board).state()
+    state["estimator"]["layout"] -= 1
+    later = Preprocessing("palm", skin, bundle)
+    later.load(state)
+    assert run(later, board.frame()).valid and later.baseline is not None
+    assert later.baseline.z0.tobytes() == state["baseline"]["z0"].tobytes()
 
 
 @pytest.mark.parametrize(
@@ -421,7 +489,7 @@ def test_an_impossible_baseline_is_refused(
         ("tared.log_z0", np.full(120, np.nan)),
         ("tared.scatter", np.ones((3, 7))),
         ("scans.said", [1]),
-        ("parts", [1, 2]),
+        ("parts", [1, 2, 3]),
         ("references", {"row": []}),
         ("bundle", None),
         ("hold", {"reference": np.ones(7), "recent": np.zeros((0, 120)), "averaged": 1, "count": 1, "scan": 1}),
@@ -433,6 +501,7 @@ def test_a_state_of_another_shape_is_refused(
     """And nothing changes of the stage that refuses it."""
     twin = Preprocessing("palm", skin, bundle)
     twin.load(tared(stage, board).state())
+    stage.load(stage.state())
     state = stage.state()
     part, _, name = key.rpartition(".")
     if part:

@@ -24,7 +24,7 @@ from protocol.frames import (
     pack,
     unpack,
 )
-from services.contacts.outline import outline
+from services.contacts.images.outline import outline
 from services.publisher import Publishing
 from services.runtime import persistence
 from services.runtime.config import Skin
@@ -254,12 +254,12 @@ def test_a_touch_that_was_not_seen_to_begin_does_not_begin(stage: Publishing) ->
 
 def test_a_touch_is_a_contact_before_any_image_and_the_image_is_of_the_same(stage: Publishing) -> None:
     assert contacts(stage, seen(1)).contacts == []
-    made = stage.process(part(1, told(1, ONE)), ALL)
+    made = stage.everything(part(1, told(1, ONE)), ALL)
     assert [type(frame) for frame in made] == [ContactFrame, ForceFrame], "a shape needs an image"
     (c,) = contacts(stage, part(1, told(1, ONE))).contacts
     assert c.state == "begin" and c.position[:2] == pytest.approx([0.02, -0.01])
     assert c.force_n == pytest.approx(3.0, rel=0.1) and c.area_m2 == pytest.approx(math.pi * 0.01**2, rel=1e-6)
-    kept = stage.process(seen(2, told(1, ONE, age_s=0.045)), ALL)
+    kept = stage.everything(seen(2, told(1, ONE, age_s=0.045)), ALL)
     assert isinstance(kept[0], ContactFrame) and [each.id for each in kept[0].contacts] == [c.id]
     assert isinstance(kept[2], ShapeFrame) and kept[2].ids == [c.id]
 
@@ -269,6 +269,8 @@ def test_a_touch_is_a_contact_before_any_image_and_the_image_is_of_the_same(stag
     [
         {"position": [1e30, 0.0]},
         {"position": [math.nan, 0.0]},
+        {"position": [0.3, 0.0]},
+        {"drop": -0.1},
         {"radius_m": math.nan},
         {"drop": math.inf},
         {"strength": 1e300},
@@ -292,17 +294,17 @@ def test_an_id_never_holds_and_ends_in_one_frame(stage: Publishing) -> None:
 def test_force_and_shape_are_no_more_valid_than_the_contacts(stage: Publishing) -> None:
     touch = told(1, (0.0, 0.0, 0.02, 1.2))
     for image in (np.full((N, N), np.nan, np.float32), None):
-        out = stage.process(seen(1, touch, image=image), ALL)
+        out = stage.everything(seen(1, touch, image=image), ALL)
         assert [frame.valid for frame in out] == [False] * 3 and all(frame.reasons == out[0].reasons for frame in out)
 
 
 def test_force_and_shape_are_made_only_when_wanted(stage: Publishing, of_peak: Publishing) -> None:
     frame = seen(1, told(1, (-0.02, 0, 0.01, 0.5)), told(2, (0.02, 0.01, 0.01, 0.2)))
-    exact = of_peak.process(frame, ALL)[1]
+    exact = of_peak.everything(frame, ALL)[1]
     assert isinstance(exact, ForceFrame) and exact.force_n == pytest.approx(7.0, rel=0.01)
     assert exact.wrench[2] == pytest.approx(-7.0, rel=0.01)
-    assert len(stage.process(frame, CONTACT)) == 1
-    _, force, shape = stage.process(frame, ALL)
+    assert len(stage.everything(frame, CONTACT)) == 1
+    _, force, shape = stage.everything(frame, ALL)
     assert isinstance(force, ForceFrame) and isinstance(shape, ShapeFrame)
     assert force.force_n == pytest.approx(7.0, rel=0.08)
     assert force.wrench[2] == pytest.approx(-force.force_n, rel=1e-6)
@@ -325,7 +327,7 @@ def test_orientation_is_the_long_axis(stage: Publishing) -> None:
     u = (AXIS[None, :] + AXIS[:, None]) / math.sqrt(2)
     v = (-AXIS[None, :] + AXIS[:, None]) / math.sqrt(2)
     bar = np.where((abs(u) < 0.02) & (abs(v) < 0.005), 0.3, 0).astype(np.float32)
-    shape = stage.process(seen(1, told(1, (0.0, 0.0, 0.0113, 0.3)), image=bar), ALL)[2]
+    shape = stage.everything(seen(1, told(1, (0.0, 0.0, 0.0113, 0.3)), image=bar), ALL)[2]
     assert isinstance(shape, ShapeFrame)
     assert shape.orientation[0] == pytest.approx(math.pi / 4, abs=0.02)
 

@@ -16,9 +16,8 @@ from scipy import ndimage
 
 from models.bundle import Bundle
 from models.shapes import KINDS, Shape, drop_image
-from models.uncertainty import FLOOR, RELATIVE_FLOOR
 from protocol.frames import SHAPES, ContactFrame, ImageFrame, pack, unpack
-from services.contacts.segmentation import KERNEL, segment
+from services.contacts.images.segmentation import FLOOR, KERNEL, RELATIVE_FLOOR, segment
 from services.publisher import Publishing
 from services.runtime import persistence
 from services.runtime.config import Skin
@@ -117,7 +116,7 @@ def test_nothing_that_comes_in_makes_nan_come_out(skin_stage: Publishing, frames
     skin_stage.new_session()
     for scan, fields in enumerate(frames, 1):
         frame = ImageFrame(skin="palm", scan=scan, stamps={"sample": scan * FRAME_NS}, **fields)
-        for out in skin_stage.process(frame, ALL):
+        for out in skin_stage.everything(frame, ALL):
             back = unpack(pack(out))
             assert "non_finite" not in back.reasons or "non_finite" in out.reasons
             assert back.valid <= frame.valid
@@ -195,10 +194,10 @@ def test_the_stage_goes_on_from_its_state_as_itself(
         for scan, touches in enumerate([*before, *after], 1)
     ]
     for frame in frames[: len(before)]:
-        skin_stage.process(frame, ALL)
+        skin_stage.everything(frame, ALL)
     other.load(persistence.arrays(msgpack.unpackb(msgpack.packb(persistence.plain(skin_stage.state())))))
     for frame in frames[len(before) :]:
-        for one, two in zip(skin_stage.process(frame, ALL), other.process(frame, ALL), strict=True):
+        for one, two in zip(skin_stage.everything(frame, ALL), other.everything(frame, ALL), strict=True):
             assert dataclasses.asdict(one) == dataclasses.asdict(two)
 
 

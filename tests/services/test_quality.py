@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.shapes import Shape, drop_image
-from services.estimation.quality import Residual
+from services.estimation.images.quality import Residual
 from tests.services.stub_skin import StubSkin, transfer
 
 TOUCHES = [

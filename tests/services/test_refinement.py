@@ -16,7 +16,7 @@ from models.refine import RefineAnswer, RefineJob, Refiner, start_of
 from models.shapes import Shape
 from models.touch_response import TouchResponse
 from protocol.frames import Contact, RefinedTouch
-from services.contacts.force import Force
+from services.contacts.force.law import Force
 from services.contacts.refined import agrees, both, refined_outline, settled
 from services.describe import refinement
 from services.pipeline import Result
@@ -60,14 +60,14 @@ def test_a_round_touch_is_refined_and_its_uncertainties_hold() -> None:
     assert abs(contact.area_m2 - CIRCLE.area * UNIT**2) < 4 * contact.area_sigma_m2
     image = found.image
     assert image.refined is not None and image.refined.scan == found.delta.reconstructed
-    contacts, force, shape = stub.pipeline.publishing.process(image, FORCE)
+    contacts, force, shape = stub.pipeline.publishing.everything(image, FORCE)
     assert force.force_n == pytest.approx(contact.force_n) and force.refined and shape.refined  # type: ignore[attr-defined]
     assert force.force_sigma_n == pytest.approx(contact.force_sigma_n)  # type: ignore[attr-defined]
     outline = np.array(shape.outlines[0])  # type: ignore[attr-defined]
     assert np.hypot(*(outline - image.refined.centre).T) == pytest.approx(image.refined.radius_m)
     assert shape.ids == [contacts.contacts[0].id]  # type: ignore[attr-defined]
     image.refined.between_kinds = [0.0, 0.2]  # where the area is the image's, the outline is
-    contacts, _, shape = stub.pipeline.publishing.process(image, FORCE)
+    contacts, _, shape = stub.pipeline.publishing.everything(image, FORCE)
     x, y = np.array(shape.outlines[0]).T  # type: ignore[attr-defined]
     area = 0.5 * abs(float(x @ np.roll(y, 1) - y @ np.roll(x, 1)))
     assert len(x) != len(outline) and area == pytest.approx(contacts.contacts[0].area_m2, rel=0.05)

@@ -303,6 +303,28 @@ def passed(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     runner.close()
 
 
+class FailingBeside(Passing):
+    """Makes what can wait from a frame, or fails to."""
+
+    def beside(self, wanted: frozenset[str]) -> list[Frame]:
+        raise ValueError("what can wait")
+
+
+def test_what_can_wait_is_made_after_the_first_frame_has_left(
+    runtime: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    runner = Runner("acquisition", parse(PALM))
+    sent: list[RawFrame] = []
+    monkeypatch.setattr(runner.publisher, "send", sent.append)
+    try:
+        runner.add(FailingBeside("palm"), Waiting("palm", 0.1))
+        runner._serve(list(runner.channels.values()))
+        assert [f.scan for f in sent] == [0]
+        assert runner.channels["palm"].heartbeat.drops["failed"] == 1 and "what can wait" in caplog.text
+    finally:
+        runner.close()
+
+
 def test_what_is_late_is_skipped_and_the_newest_is_sent_all_the_same(passed: Callable[..., list[RawFrame]]) -> None:
     sent = passed(Waiting("palm", 9.0, 8.0, 1.0, 0.1, 7.0))
     assert [(f.scan, f.valid, f.reasons) for f in sent] == [(2, True, []), (3, True, []), (4, False, ["late"])]

@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from models.shapes import Shape, drop_image
-from models.uncertainty import FLOOR
-from services.contacts.segmentation import segment
+from services.contacts.images.segmentation import FLOOR, segment
 
 N = 96
 NOTHING = np.zeros((0, 0), np.float32)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from models.shapes import Shape
+from protocol.scan_setting import COHERENT
 from services.pipeline import Result
 from tests.services.stub_skin import StubSkin, sheet, transfer
 
@@ -94,7 +95,7 @@ def test_what_is_kept_goes_on_where_it_was(skin: StubSkin) -> None:
     other.pipeline.pre.load(pre.state())
     for k in range(30, 42):
         t = transfer((), ((4, 1 + PER_S * SCAN_S * k),))
-        z, status = skin.analog.measure((t, t), skin.pattern, 128, 40_000.0, 0.0)
+        z, status = skin.analog.measure((t, t), skin.pattern, COHERENT, 40_000.0, 0.0)
         ours, theirs = skin.run(z, status).delta, other.run(z, status).delta
         assert (ours.valid, ours.electrodes.tolist()) == (theirs.valid, theirs.electrodes.tolist())
     assert ours.electrodes[4] != 0

@@ -12,9 +12,8 @@ from models.bundle import Bundle
 from models.shapes import Shape
 from models.symmetries import symmetries
 from models.turns import TURNS, Turn
-from protocol.frames import DeltaFrame
 from services.describe import symmetry
-from services.networks import Network
+from services.networks import Network, Stack
 from services.runtime.config import Skin, TouchConfig
 from tests.services.stub_skin import StubSkin
 
@@ -44,8 +43,9 @@ def test_it_is_said_why_nothing_is_averaged(bundle: Bundle) -> None:
     assert info is not None and info["symmetry"] == "on"
 
 
-def turned(frame: DeltaFrame, turn: Turn) -> DeltaFrame:
-    return replace(frame, stack=np.ascontiguousarray(turn.image(frame.stack)))
+def turned(stack: Stack | None, turn: Turn) -> Stack:
+    assert stack is not None
+    return stack._replace(images=np.ascontiguousarray(turn.image(stack.images)))
 
 
 @pytest.mark.parametrize("turn", TURNS)
@@ -80,9 +80,8 @@ def test_a_held_touch_gets_the_mean_without_any_frame_that_waits() -> None:
     single = next(found for found in reversed(seen[:n]) if not found.delta.held)
     assert single.delta.scan == seen[n].image.reconstructed
     assert isinstance(inference._network, Network)
-    made = [
-        [turn.back.image(picture) for picture in inference._network.run(turned(single.delta, turn))] for turn in TURNS
-    ]
+    stack = inference.stack(single.delta)
+    made = [[turn.back.image(picture) for picture in inference._network.run(turned(stack, turn))] for turn in TURNS]
     mean = [np.mean(pictures, axis=0) for pictures in zip(*made, strict=True)]
     for found, expected in zip((seen[n].image.image, seen[n].image.sigma, seen[n].image.classes), mean, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
@@ -95,8 +94,10 @@ def test_a_held_touch_gets_the_mean_without_any_frame_that_waits() -> None:
 
 def test_nothing_is_averaged_where_an_electrode_is_missing(bundle: Bundle) -> None:
     stub = StubSkin(95.0, skin=Skin(port="stub", bundle="square16", frame_id="palm", touch=TouchConfig(symmetry=True)))
-    mean = stub.pipeline.inference._symmetry
-    assert mean is not None
-    frame = DeltaFrame(skin="palm", sigma=np.array([1e-4, np.inf], np.float32))
-    mean.begin(frame, (np.zeros((1, 1), np.float32),) * 3)  # type: ignore[arg-type]
+    inference, found = stub.pipeline.inference, stub.feel((TOUCH,))
+    mean = inference._symmetry
+    assert mean is not None and found.delta.averaged and mean.busy
+    found.delta.sigma[0] = np.inf
+    mean.forget()
+    inference.process(found.delta, frozenset({"image"}))
     assert not mean.busy and mean.step() is None

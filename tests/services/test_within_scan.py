@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from models.shapes import Shape
+from protocol.scan_setting import COHERENT
 from services.pipeline import Result
 from tests.services.stub_skin import TRANSFER, StubSkin, transfer
 
@@ -96,7 +97,7 @@ def test_what_stays_as_it_is_did_not_change(skin: StubSkin) -> None:
     for scan in pairwise(up):
         skin.see(*scan)
     skin.see(up[-1])
-    z, status = skin.analog.measure((up[1], up[0]), skin.pattern, 128, 40_000.0, 0.0)
+    z, status = skin.analog.measure((up[1], up[0]), skin.pattern, COHERENT, 40_000.0, 0.0)
     seen = []
     for _ in range(8):
         noise = 1 + 1e-4 * np.random.default_rng(skin.scan).standard_normal(len(z))

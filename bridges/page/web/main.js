@@ -13,9 +13,9 @@ import { Timeline } from "./timeline.js";
 import { judge } from "./trust.js";
 
 const { by } = panels;
-const TOPICS = ["contact", "image", "delta", "truth", "shape"];
+const TOPICS = ["contact", "image", "delta", "stack", "truth", "shape"];
 const PICTURE_MS = 28; // thirty a second
-const NO_PICTURES = { image: null, delta: null };
+const NO_PICTURES = { image: null, stack: null };
 const TRUTH_MS = 500;
 const WORDS_MS = 250;
 const SUMMARY_MS = 2000;
@@ -86,7 +86,7 @@ function take({ topic, frame, measured }) {
     know(frame.info);
   } else {
     state.newest[topic] = { frame, measured, heard: now };
-    ({ contact, image, delta, truth() {}, shape() {} })[topic]?.(frame, now);
+    ({ contact, image, delta, stack, truth() {}, shape() {} })[topic]?.(frame, now);
   }
 }
 
@@ -128,9 +128,10 @@ function image(frame) {
 
 function delta(frame) {
   if (!frame.touched || !state.noise) state.noise = panels.noiseOf(frame.sigma); // of one scan: a touch's may be of a mean
-  if (frame.stack.length) state.pictures.delta = frame;
-  else if (!frame.touched) state.pictures.delta = null;
+  if (!frame.touched) state.pictures.stack = null;
 }
+
+function stack(frame) { state.pictures.stack = frame; }
 
 /** Judge what is there, and say so. Called often, whether anything comes or not: silence is news too. */
 function look() {
@@ -202,8 +203,8 @@ function news(now) {
     surface.electrodes(change.frame.electrodes);
   }
   const none = !picture ? "Nothing has come yet." : picture.frame.touched ? "No image of this touch yet." : "Nothing touches.";
-  panels.compare({ delta: state.pictures.delta, image: state.pictures.image, stack: state.info?.stack, none });
-  panels.fade("one-step", state.pictures.delta !== null && change?.frame.stack.length === 0);
+  panels.compare({ made: state.pictures.stack, image: state.pictures.image, stack: state.info?.stack, none });
+  panels.fade("one-step", state.pictures.stack !== null && change?.frame.held === true);
 }
 
 function words(now) {

@@ -147,13 +147,13 @@ export function recorder(statuses, clock, host) {
   return { there, recording };
 }
 
-/** The same frame by two methods: {delta, image} that brought the pictures, or null where there is none; none: why. */
-export function compare({ delta, image, stack, none }) {
-  if (side("one-step", delta && stack ? "" : none)) {
-    const [, rows, columns] = delta.stack.shape, size = rows * columns;
-    const plane = delta.stack.subarray(size * stack.one_step, size * (stack.one_step + 1));
+/** The same frame by two methods: {made, image} that brought the pictures, or null where there is none; none: why. */
+export function compare({ made, image, stack, none }) {
+  if (side("one-step", made && stack ? "" : none)) {
+    const [, rows, columns] = made.stack.shape, size = rows * columns;
+    const plane = made.stack.subarray(size * stack.one_step, size * (stack.one_step + 1));
     paint(by("one-step"), plane, rows, columns, Math.max(1e-6, ...plane));
-    text("one-step-note", `λ = ${Math.sqrt(stack.lambda_squared[stack.one_step]).toPrecision(2)}, scan ${delta.scan}`);
+    text("one-step-note", `λ = ${Math.sqrt(stack.lambda_squared[stack.one_step]).toPrecision(2)}, scan ${made.scan}`);
   }
   if (side("network", image ? "" : none)) {
     const [rows, columns] = image.image.shape;

@@ -9,19 +9,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.course import TouchCourse
-from models.measurement.fit import FittedScan, FoundTouches, KnownWhitening, TouchFitter, Turned
-from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
+from models.measurement.course import SUDDEN_STEPS, TURN_STEPS, TouchCourse
+from models.measurement.covariance.noise import BURST_BLOCK, NoiseModel, in_blocks
+from models.measurement.covariance.whitening import Whitening
+from models.measurement.fit import LEAST_MEAN, FittedScan, FoundTouches, KnownWhitening, TouchFitter, Turned
 from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
-from models.measurement.tables import SkinTables
-from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, TouchPrior, anywhere, plain
-from models.measurement.whitening import Whitening
+from models.measurement.responses.tables import SkinTables
+from models.measurement.touch import (
+    ACTION,
+    AT_ONCE_S,
+    LOG_RADIUS,
+    PLACE,
+    RATE,
+    TouchPrior,
+    acting_steadily,
+    anywhere,
+    plain,
+)
 from services.estimation.asked.left_over import LeftOver, fresh
 from services.estimation.asked.question import (
     AS_IT_IS,
@@ -33,7 +43,6 @@ from services.estimation.asked.question import (
     ONSETS,
     Question,
     ScoredAnswer,
-    begun_at,
     likeliest,
     started,
     started_from,
@@ -46,8 +55,20 @@ Array = NDArray[np.float64]
 
 ON_ELECTRODE = ((0.03, 0.0), (0.03, 0.1), (0.03, -0.1))  # inside its edge and along it, where a search begins
 SMALL_RADIUS = 0.1  # where it begins
+RAMPS_S = (AT_ONCE_S, float(SUDDEN_STEPS[-1]), 2 * float(SUDDEN_STEPS[-1]))  # of a touch that ends within a scan
 CAUSE_STEPS = 1  # that touches which are known need beside another cause
 WIDER = (MEMORY, DRIFT, BURST, NOISE)
+
+
+@dataclass(frozen=True)
+class AChange:
+    """How strongly one of the touches that stand acts, changed at once. at_s: -inf: before the scan; inf: one that was
+    said to have ended goes on. left: what of it is left; 0: it ended.
+    """
+
+    touch: int
+    at_s: float
+    left: float
 
 
 class Hypotheses:
@@ -207,11 +228,12 @@ class Hypotheses:
 
     def _from_nothing(self, question: Question) -> list[ScoredAnswer]:
         """Touches where none were: first those that the scan before left open, as a search has no steps for all."""
-        found = list[ScoredAnswer]()
-        if len(question.candidates):
-            begun = [begun_at(state, question.span_s) for state in question.candidates]
-            found.append(self.fitted(question, begun, (-1,) * len(begun), n.STEPS_COLD))
-        return found if _settled(question, found) else [*found, *self.search(question, (), None)]
+        found, count = list[ScoredAnswer](), len(question.candidates)
+        for begun in (question.candidates, self._begun_otherwise(question, question.candidates)) if count else ():
+            if begun is not None and not _settled(question, found):
+                found.append(self.fitted(question, begun, (-1,) * count, n.STEPS_WARM))
+        settled = question.spent or (count == 1 and _settled(question, found))
+        return found if settled else [*found, *self.search(question, (), None)]
 
     def _of_standing(
         self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]
@@ -228,8 +250,11 @@ class Hypotheses:
             answers.append(self.fitted(question, begun, everyone, n.STEPS_COLD))
             if _settled(question, answers):
                 return answers
-        if (released := self._released(question, standing, answers[0])) is not None:
-            answers.append(released)
+        end, turn = self._changes(question, standing, answers[0])
+        late = end is None or end.at_s > _turns_s(question) + TURN_STEPS[0]
+        ways = (self._released, end), (self._turned, turn)
+        for how, change in reversed(ways) if late else ways:
+            answers += how(question, standing, change)
             if _settled(question, answers):
                 return answers
         answers.append(self.fitted(question, loose, everyone, n.STEPS_COLD))
@@ -345,10 +370,15 @@ class Hypotheses:
             x, y = self.grid.discs[disc, PLACE]
             new = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
             full, kept = [*full, new], (*kept, -1)
+            if fit is None and question.part and since_s > 0:  # the next parts tell one outline from two discs
+                found.append(self.fitted(question, full, kept, n.STEPS_COLD))
+                if found[0].explained:
+                    break
             disc_alone = self.fitted(question, [*started_from(fit), plain(new)], kept, n.STEPS_COLD)
             if disc_alone.score < score + n.ANOTHER:
                 break
             score, fit = disc_alone.score, disc_alone.fit
+            assert fit is not None
             pulled, white = disc_alone.pulled, disc_alone.white
             outlined = self.fitted(question, started(full, fit), kept, n.STEPS_COLD)
             found.append(outlined)
@@ -400,40 +430,98 @@ class Hypotheses:
             priors[k] = replace(priors[k], since_s=float(instants[at]))
         return priors
 
-    def _released(
+    def _turned(self, question: Question, standing: Sequence[TouchPrior], turn: AChange | None) -> list[ScoredAnswer]:
+        """How strongly they act changed at once: one of them in mid-scan, or any at its end, as they go or are pressed
+        harder.
+        """
+        priors = list(standing)
+        for k, prior in enumerate(standing):
+            # Until then it acts as it did, since a scan before this one: else two that begin would look like one.
+            if prior.until_s < np.inf or prior.since_s >= -1.5 * question.span_s:
+                continue
+            if turn is None:
+                steady = acting_steadily(prior, float(prior.start[ACTION]), question.span_s)
+                priors[k] = replace(steady, turns_s=_turns_s(question))
+            elif turn.touch == k:
+                most = max(1.0, turn.left) * float(prior.start[ACTION])
+                steady = acting_steadily(prior, most, question.span_s)
+                priors[k] = replace(steady, turns_s=turn.at_s, grows=turn.left > 1)
+        if all(now is before for now, before in zip(priors, standing, strict=True)):
+            return []
+        return [self.fitted(question, priors, tuple(range(len(priors))), n.STEPS_COLD)]
+
+    def _released(self, question: Question, standing: Sequence[TouchPrior], end: AChange | None) -> list[ScoredAnswer]:
+        """One of the touches ended at once within the scan, or before it; empty where none did."""
+        if end is None:
+            return []
+        priors, kept = list(standing), list(range(len(standing)))
+        if end.at_s > -np.inf:
+            went = priors[end.touch]
+            if end.at_s < np.inf:
+                went = acting_steadily(went, float(went.start[ACTION]), question.span_s)
+            priors[end.touch] = replace(went, until_s=end.at_s)
+        else:
+            del priors[end.touch], kept[end.touch]
+        if priors:
+            return [self.fitted(question, priors, tuple(kept), n.STEPS_COLD)]
+        nothing = self.untouched(question)
+        return [] if nothing is None else [nothing]
+
+    def _changes(
         self, question: Question, standing: Sequence[TouchPrior], answer: ScoredAnswer
-    ) -> ScoredAnswer | None:
-        """One of the touches ended at once within the scan, or before it: whichever leaves least. One that has ended
-        did so at another instant than the first values after it told.
+    ) -> tuple[AChange | None, AChange | None]:
+        """The end of one of the touches that leaves least of a scan, and the other change of one that leaves less than
+        half as much; None where none leaves half of what they leave as they are. One that has ended did so at another
+        instant than the first values after it told, or not at all.
         """
         course = TouchCourse(self.response, question.times_s, question.span_s)
         starts = np.stack([prior.start for prior in standing])
         each = [course.columns(starts[k : k + 1], [prior]).mean for k, prior in enumerate(standing)]
         whole = np.sum(each, axis=0)
-        best, least = None, 0.5 * answer.chi2 * max(int(question.live.sum()), 1)
+        within = np.concatenate([[-0.5 * question.span_s], question.instants])
+        end, turn = None, None
+        least = turned = 0.5 * self._unlike(question, answer, whole[:, None])[0]
         for k, prior in enumerate(standing):
-            lasting = each[k]
+            lasting, ends = each[k], within
             if prior.until_s < np.inf:
                 lasting = course.columns(starts[k : k + 1], [replace(prior, until_s=np.inf)]).mean
-            ends = np.concatenate([[-0.5 * question.span_s], question.instants])
-            change = (whole - each[k])[:, None] + lasting[:, None] * (question.times_s[:, None] < ends)
-            left = np.where(question.live, question.y, 0.0)[:, None] - np.log1p(np.maximum(change, -0.9))
-            left[~question.live] = 0.0
-            chi2 = np.sum(answer.white(left) ** 2, axis=0)
-            at = int(chi2.argmin())
-            if chi2[at] < least:
-                best, least = (k, at > 0, float(ends[at])), float(chi2[at])
-        if best is None:
-            return None
-        k, within, until_s = best
-        priors, kept = list(standing), list(range(len(standing)))
-        if within:
-            priors[k] = replace(priors[k], until_s=until_s)
-        else:
-            del priors[k], kept[k]
-        if not priors:
-            return self.untouched(question)
-        return self.fitted(question, priors, tuple(kept), n.STEPS_COLD)
+                ends = np.append(within, np.inf)
+            beside = (whole - each[k])[:, None] + lasting[:, None]
+            for ramp_s in RAMPS_S:
+                acts = np.clip(0.5 + (ends - question.times_s[:, None]) / ramp_s, 0.0, 1.0)
+                gone = lasting[:, None] * (acts - 1)
+                chi2 = self._unlike(question, answer, beside + gone)
+                at = int(chi2.argmin())
+                if chi2[at] < least:
+                    before = at == 0 and ramp_s == AT_ONCE_S
+                    end, least = AChange(k, -np.inf if before else float(ends[at]), 0.0), float(chi2[at])
+                if prior.until_s < np.inf:
+                    continue
+                share = self._share(question, answer, beside[:, 0], gone)
+                chi2 = self._unlike(question, answer, beside + share * gone)
+                at = int(chi2.argmin())
+                if chi2[at] < min(turned, 0.5 * least, 0.5 * chi2[0]):  # by more than one that changed before the scan
+                    turn, turned = AChange(k, float(ends[at]), 1 - float(share[at])), float(chi2[at])
+        return end, turn if turned < 0.5 * least or end is None else None
+
+    def _share(self, question: Question, answer: ScoredAnswer, change: Array, gone: Array) -> Array:
+        """(n,) of what would go (K, n) beside a change (K,), by which the residual is least."""
+        change = np.maximum(change, LEAST_MEAN)
+        counts = np.where(question.live, 1 / (1 + change), 0.0)
+        left = answer.white(np.where(question.live, question.y - np.log1p(change), 0.0))
+        columns = answer.white(gone * counts[:, None])
+        return np.asarray((left @ columns) / np.maximum(np.sum(columns**2, axis=0), 1e-12))
+
+    def _unlike(self, question: Question, answer: ScoredAnswer, changes: Array) -> Array:
+        """(n,) squared sigmas of what changes (K, n) leave of a scan, by the covariance of an answer."""
+        left = np.where(question.live, question.y, 0.0)[:, None] - np.log1p(np.maximum(changes, LEAST_MEAN))
+        left[~question.live] = 0.0
+        return np.asarray(np.sum(answer.white(left) ** 2, axis=0))
+
+
+def _turns_s(question: Question) -> float:
+    """About which touches may change at once: what does so earlier the scan or the part before has shown."""
+    return 0.5 * question.span_s + float(SUDDEN_STEPS[0])
 
 
 def _settled(question: Question, answers: Sequence[ScoredAnswer]) -> bool:

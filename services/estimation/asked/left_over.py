@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.covariance.noise import BURST_BLOCK
+from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FoundTouches
-from models.measurement.grid import DiscGrid
-from models.measurement.noise import BURST_BLOCK
-from models.measurement.whitening import Whitening
+from models.measurement.responses.grid import DiscGrid
 from services.estimation.asked.question import ONSETS, Question
 from services.estimation.values import numbers as n
 
@@ -22,6 +22,7 @@ class LeftOver:
 
     def __init__(self, grid: DiscGrid, wrong: float) -> None:
         self._grid, self._wrong = grid, wrong
+        self._squares = grid.responses**2
 
     def best(
         self,
@@ -35,25 +36,16 @@ class LeftOver:
         onsets: shares of the scan after which it may have begun. One that acts in the whole scan is so unless that
         leaves more than its response gets wrong.
         """
-        found = list[tuple[float, int, float, float]]()
-        precision = white.conditional_precisions() if onsets else np.zeros(0)
-        for share in (0.0, *onsets):
-            weight, since_s = None, -np.inf
-            information = question.information
-            if share:
-                since_s = (share - 0.5) * question.span_s
-                weight = (question.times_s >= since_s).astype(float)
-                information = information * self._grid_share(weight, precision)
-            _, disc, _ = self._grid.likeliest(pulled, information, weight)
-            column = self._grid.responses[disc].astype(float)
-            column = column if weight is None else column * weight
-            along = max(float(column @ pulled), 0.0)
-            if fit is None:
-                whitened = white(column)
-                exact = float(whitened @ whitened)
-            else:
-                exact = fit.information(column)
-            found.append((along**2 / exact - (n.ONSET_Z2 if share else 0.0), disc, along / exact, since_s))
+        since_s = np.array([-np.inf, *((share - 0.5) * question.span_s for share in onsets)])
+        acts = (question.times_s[:, None] >= since_s).astype(np.float32)  # (K, n)
+        shares = self._shares(acts, white) if onsets else np.ones((1, 1), np.float32)
+        along = np.maximum(self._grid.responses @ (acts * pulled[:, None].astype(np.float32)), 0)
+        discs = (along**2 / (question.information[:, None] * shares)).argmax(axis=0)  # (n,)
+        columns = self._grid.responses[discs].T.astype(float) * acts
+        exactly = np.maximum(pulled @ columns, 0.0)
+        exact = np.sum(white(columns) ** 2, axis=0) if fit is None else fit.informations(columns)
+        z2 = exactly**2 / exact - np.where(since_s > -np.inf, float(n.ONSET_Z2), 0.0)
+        found = list(zip(z2.tolist(), discs.tolist(), (exactly / exact).tolist(), since_s.tolist(), strict=True))
         if not onsets:
             return found[0]
         begun = self._sharper(question, pulled, white, fit, max(found))
@@ -82,11 +74,15 @@ class LeftOver:
             return best
         return float(z2[k]), best[1], float(along[k] / exact[k]), float(instants[k])
 
-    def _grid_share(self, weight: Array, precision: Array) -> NDArray[np.float32]:
-        """(A,) share of each disc's information that some measurements have, by their own precisions."""
-        squares = self._grid.responses**2
-        each = precision.astype(np.float32)
-        return np.asarray(squares @ (each * weight.astype(np.float32)) / (squares @ each) + 1e-3)
+    def _shares(self, acts: NDArray[np.float32], white: Whitening) -> NDArray[np.float32]:
+        """(A, n) share of each disc's information that the measurements have in which it acts (K, n), by their own
+        precisions; the first acts in all.
+        """
+        precision = white.conditional_precisions().astype(np.float32)
+        told = self._squares @ (precision[:, None] * acts)
+        shares = told / told[:, :1] + np.float32(1e-3)
+        shares[:, 0] = 1.0
+        return np.asarray(shares)
 
 
 def fresh(question: Question, pulled: Array, white: Whitening) -> float:

@@ -1,14 +1,16 @@
-"""A scan with what is needed to ask about it."""
+"""A scan with what is needed to ask about it, and what the one before it left open."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.estimation.asked.question import Question, StepBudget
+from models.measurement.touch import ACTION, PLACE, RATE, VELOCITY, TouchPrior
+from services.estimation.asked.question import Question, StepBudget, begun_at
 from services.estimation.values.scan import Scan
 
 Array = NDArray[np.float64]
@@ -33,6 +35,14 @@ class LookedAt:
         return self.scan.at_ns * 1e-9 - self.scan.duration_s / 2
 
     @property
+    def oldest_s(self) -> float:
+        return self.middle_s - self.span_s / 2
+
+    @property
+    def end_s(self) -> float:
+        return self.middle_s + self.span_s / 2
+
+    @property
     def said_s(self) -> float:
         """For when what touches is said, from the middle of the scan on."""
         return self.scan.sample_ns * 1e-9 - self.middle_s
@@ -54,7 +64,7 @@ class LookedAt:
         live: NDArray[np.bool_],
         times_s: Array,
         information: NDArray[np.float32],
-        candidates: Array,
+        candidates: tuple[TouchPrior, ...],
     ) -> Question:
         """About this scan."""
         return Question(
@@ -70,3 +80,19 @@ class LookedAt:
             budget=self.budget,
             candidates=candidates,
         )
+
+
+@dataclass(frozen=True)
+class OpenTouch:
+    """A touch that nearly explained the last scan, or did so and is not sure."""
+
+    state: Annotated[Array, "states"]
+    since_s: float  # host's clock
+
+    def begun(self, measured: LookedAt) -> TouchPrior:
+        """Anywhere in the next scan, searched from where it was at the end of that one: how it goes on nobody knows."""
+        state, half_s = self.state.copy(), measured.span_s / 2
+        state[PLACE] += half_s * state[VELOCITY]
+        state[ACTION] += half_s * state[RATE]
+        state[RATE:] = 0.0
+        return begun_at(state, measured.span_s, self.since_s - measured.middle_s)

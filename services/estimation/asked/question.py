@@ -9,15 +9,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, PLACE, TouchPrior, anywhere
-from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 
 ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
+JUST_BEFORE_S = 1e-5  # a value: the next scans, by whose clock its time is rounded, must not leave it out
 COSTS = {
     AS_IT_IS: 0.0,
     MEMORY: float(n.COST_MEMORY),
@@ -56,7 +57,7 @@ class Question:
     part: int  # that it ends with
     information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
     budget: StepBudget
-    candidates: Array  # (C, 7) touches that nearly explained the scan before
+    candidates: tuple[TouchPrior, ...]  # touches that nearly explained the scan before, or this one
     keeps: float = 0.0  # steps that are left to who asks next
 
     @property
@@ -67,7 +68,7 @@ class Question:
     def instants(self) -> Array:
         """(n,) before which values something may begin or end at once: what the last few alone say, the next tell."""
         times_s = np.sort(self.times_s)
-        return np.asarray(times_s[times_s <= (ONSETS[-1] - 0.5) * self.span_s])
+        return np.asarray(times_s[times_s <= (ONSETS[-1] - 0.5) * self.span_s]) - JUST_BEFORE_S
 
     def leaving(self, share: float) -> Question:
         """The same, which leaves so much of its steps to the next."""
@@ -122,10 +123,17 @@ def started(priors: Sequence[TouchPrior], fit: FoundTouches | None) -> list[Touc
     return [replace(prior, start=state.copy()) for prior, state in zip(priors, states, strict=True)]
 
 
-def begun_at(state: Array, span_s: float) -> TouchPrior:
+def begun_at(state: Array, span_s: float, since_s: float = -np.inf, until_s: float = np.inf) -> TouchPrior:
     """A touch that may be anywhere, searched from a state (7,)."""
     x, y = state[PLACE]
-    return replace(anywhere(float(x), float(y), float(state[ACTION]), span_s), start=state)
+    free = anywhere(float(x), float(y), float(state[ACTION]), span_s)
+    return replace(free, start=state, since_s=since_s, until_s=until_s)
+
+
+def begun_as(fit: FoundTouches, span_s: float) -> tuple[TouchPrior, ...]:
+    """The touches of a fit, each of them anywhere."""
+    found = zip(fit.states, fit.priors, strict=True)
+    return tuple(begun_at(state, span_s, prior.since_s, prior.until_s) for state, prior in found)
 
 
 def likeliest(answers: Sequence[ScoredAnswer]) -> ScoredAnswer:

@@ -19,7 +19,7 @@ from services.estimation.asked.question import (
     ONSETS,
     Question,
     ScoredAnswer,
-    begun_at,
+    begun_as,
     likeliest,
     started,
     started_from,
@@ -44,10 +44,7 @@ class Recount:
         """Other touches than those of an answer, where they are likelier: None where they are not."""
         assert answer.fit is not None
         ask, new = self._hypotheses, (-1,) * len(answer.fit)
-        begun = [
-            replace(begun_at(state, question.span_s), since_s=prior.since_s, until_s=prior.until_s)
-            for state, prior in zip(answer.fit.states, answer.fit.priors, strict=True)
-        ]
+        begun = begun_as(answer.fit, question.span_s)
         same = [ask.fitted(question, begun, new, n.STEPS_COLD)]
         if answer.cause:
             same += ask.with_cause(question, begun, new, answer.cause, answer.left)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.course import TouchCourse
+from models.measurement.covariance.noise import NoiseModel
 from models.measurement.fit import LEAST_MEAN
-from models.measurement.noise import NoiseModel
-from models.measurement.tables import SkinTables
+from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import ACTION, TouchPrior
 from services.estimation.asked.hypotheses import Hypotheses
-from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer
+from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, begun_as
 from services.estimation.faults.board import BoardFaults, BoardView, as_they_stand
 from services.estimation.faults.doubt import ContactDoubt
 from services.estimation.faults.wires import WireFault
@@ -99,27 +99,33 @@ class FaultAsking:
         odd = _doubtful(found.answer) or -1 in found.answer.kept
         if faults.now.wire is not None and odd and rewired(view):
             found = asked(look())
-        if faults.now.opens and faults.now.wire is None and odd:
+        if faults.now.opens and faults.now.wire is None and (odd or (at.whole and self._touches.in_doubt)):
             found = self._lifted(found, lambda: asked(look()))
         if faults.asks(found.answer):
-            found = self._changed(found, *self._change(standing, at), answering)
+            found = self._changed(found, at, *self._change(standing, at), answering)
         return self._doubted(found, at)
 
     def _lifted(self, found: Asked, ask: Callable[[], Asked]) -> Asked:
-        """Electrodes that are open may be off the skin, or on it and cut off: whichever explains the scan better."""
+        """Electrodes that are open may be off the skin, or on it and cut off: whichever explains the scan better. A
+        touch that has just come is not known well enough to decide by little: the scans that follow ask again.
+        """
         now = self._faults.now
         before, now.lifted = now.lifted, () if now.lifted else now.opens
         other = ask()
-        if (other.answer.holds, other.answer.score) > (found.answer.holds, found.answer.score + n.FAULT_SURE):
+        sure = n.WIRE_SURE if -1 in found.answer.kept else n.FAULT_SURE
+        if (other.answer.holds, other.answer.score) > (found.answer.holds, found.answer.score + sure):
             return other
         now.lifted = before
         return found
 
-    def _changed(self, found: Asked, touched: Array, nearby: Array, answering: Answering) -> Asked:
+    def _changed(self, found: Asked, at: AskedScan, touched: Array, nearby: Array, answering: Answering) -> Asked:
         hypotheses = self._seen(found.view)
 
+        fit = found.answer.fit
+        likely = () if fit is None else begun_as(fit, at.span_s)
+
         def ask(other: Question) -> ScoredAnswer:
-            return answering(hypotheses, other)
+            return answering(hypotheses, replace(other, candidates=likely))
 
         if found.view.slopes is not None:
             touched = np.maximum(found.view.slopes @ touched, LEAST_MEAN)

@@ -14,9 +14,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.tables import SkinTables
+from models.measurement.covariance.whitening import Whitening, leave_out
+from models.measurement.fit import FoundTouches
+from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
-from models.measurement.whitening import Whitening, leave_out
 from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer
 from services.estimation.faults import advice, wires
 from services.estimation.faults.decided import DecidedState
@@ -63,6 +64,7 @@ class FaultState:
     gain_since_s: float = -np.inf
     gain_said_s: float = -np.inf  # end of the scan in which it was found
     gain_steps: int = 0
+    log_gain_held: float = 0.0  # with which a scan was last explained that did not change it itself
     log_gain_sound: float = 0.0  # before a gross step
     gross_since_s: float = np.inf  # no sound board's gain is as this one since then; inf: it is
     unexplained_scans: int = 0
@@ -99,11 +101,15 @@ class BoardView:
         """(K, K) of y. skin: of what changes with the skin; own: of what the measurements add."""
         made: Array = self.through(skin) + own
         if self.apart:
-            scale = 1 + self.mean
-            made = made * scale[:, None] * scale + self.spread @ self.spread.T
+            made = made * self.grown[:, None] * self.grown + self.spread @ self.spread.T
             made[np.diag_indices_from(made)] += (n.CONTACT_MISFIT * self.mean) ** 2
         leave_out(made, self.live)
         return made
+
+    @property
+    def grown(self) -> Array:
+        """(K,) times what the skin changes by, in y."""
+        return 1 + self.mean if self.apart else np.ones_like(self.mean)
 
     def through(self, covariance: Array) -> Array:
         """(K, K) of the skin's log |Z|, as the wires show it."""
@@ -252,7 +258,8 @@ class BoardFaults:
         """Whether what explains a scan may as well be a fault."""
         if self.now.wire is not None and not self.exchanged:
             return False
-        new = answer.fit is not None and any(place < 0 for place in answer.kept)
+        fit, kept = answer.fit, answer.kept
+        new = fit is not None and any(kept[k] < 0 and self._may_be_a_contact(fit, k) for k in range(len(fit)))
         return new or not answer.holds or answer.cause != AS_IT_IS or self.shared_z2(answer) > n.GAIN_Z2
 
     def shared_z2(self, answer: ScoredAnswer) -> float:
@@ -344,8 +351,17 @@ class BoardFaults:
 
     def _reaches(self, state: Array, electrode: int) -> bool:
         """Whether a touch (7,) may change the contact impedance of an electrode."""
-        away = float(np.hypot(*(state[PLACE] - self._places[electrode])))
-        return away < float(np.exp(state[LOG_RADIUS])) + n.ON_ELECTRODE
+        return bool(self._gaps(state)[electrode] < n.ON_ELECTRODE)
+
+    def _gaps(self, state: Array) -> Array:
+        """(E,) from the edge of a touch (7,) to the middle of each electrode."""
+        return np.asarray(np.hypot(*(state[PLACE] - self._places).T) - np.exp(state[LOG_RADIUS]))
+
+    def _may_be_a_contact(self, fit: FoundTouches, k: int) -> bool:
+        """Whether a touch that was found is so near an electrode that a contact impedance may look like it."""
+        variance = fit.covariance[STATES * k : STATES * k + 2, STATES * k : STATES * k + 2]
+        unsure = 3 * float(np.sqrt(max(np.trace(variance), 0.0)))
+        return bool(self._gaps(fit.states[k]).min() < n.ON_ELECTRODE + unsure)
 
     def _likeliest(
         self,
@@ -381,14 +397,11 @@ class BoardFaults:
         return found
 
     def _every(self, scan: Unexplained, columns: ContactColumns) -> list[ContactChange | GainChange]:
-        always = np.full(len(self._places), -np.inf)
         gains = [gain_change(scan, -np.inf), gain_change(scan, gain_onset(scan))]
         found: list[ContactChange | GainChange] = [gain for gain in gains if abs(gain.log_factor) > n.GAIN_LEAST]
         if not self._predicted:
             return found or [gains[0]]
-        found += columns.likeliest(scan, always)
-        found += columns.likeliest(scan, columns.onsets(scan))
-        return found
+        return [*found, *columns.likeliest(scan)]
 
     def _with(
         self, question: Question, of_contacts: ContactColumns, change: ContactChange | GainChange
@@ -462,6 +475,7 @@ class BoardFaults:
             if now.unexplained_scans >= n.UNEXPLAINED_SCANS:
                 now.wire, now.unexplained_scans = None, 0
                 self.drop_contact()
+                self._gain_back()
             return
         now.unexplained_scans = 0
         if now.contact < 0:
@@ -485,6 +499,20 @@ class BoardFaults:
             # One scan's size is off by its noise, and nothing would take that back.
             now.size = home if back or now.doubt.stays(home) else now.doubt.lately(view.middle_s)
             self._settle()
+
+    def gain_holds(self, end_s: float) -> None:
+        """A scan that ends then is explained for sure with the gain as it is."""
+        if self.now.gain_said_s < end_s:
+            self.now.log_gain_held = self.now.log_gain
+
+    def _gain_back(self) -> None:
+        """A step of the gain is taken back that no scan after it confirmed."""
+        now = self.now
+        if now.log_gain == now.log_gain_held:
+            return
+        now.log_gain = now.log_gain_before = now.log_gain_held
+        now.gain_since_s = -np.inf
+        self._gross(now.gain_since_s)
 
     def _stays(self, passed_s: float) -> None:
         """For how long it has been still: by its way, as steps from part to part are small however it drifts."""

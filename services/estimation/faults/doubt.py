@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.covariance.whitening import leave_out
 from models.measurement.fit import FoundTouches
-from models.measurement.tables import SkinTables
-from models.measurement.whitening import leave_out
+from models.measurement.responses.tables import SkinTables
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.asked.question import AS_IT_IS, MEMORY, Question, ScoredAnswer, StepBudget
 from services.estimation.faults.board import LEAST, BoardFaults, BoardView
@@ -94,7 +94,7 @@ class ContactDoubt:
         columns = columns.with_change(now.contact, now.doubt.decided)
         whole = np.ones(len(asked.y))
         scan = Unexplained(asked.y, whole, asked.live, asked.times_s, asked.span_s, asked.white)
-        return columns.likeliest(scan, np.full(self._tables.electrodes, -np.inf))[now.contact]
+        return columns.changes(scan, np.array([now.contact]), np.array([-np.inf]))[0]
 
     def _touch(self, asked: Question) -> ScoredAnswer:
         k = self._faults.now.contact

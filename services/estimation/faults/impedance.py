@@ -6,7 +6,8 @@ a scan is measured the change may grow. With U and N the columns of the two (K, 
 
     log z = log z0 + log(1 + touches + U a + N (b + e) + u U s)
 
-Every electrode's likeliest (a, e, s) and its log evidence come from a few Gauss-Newton steps, all electrodes at once.
+The likeliest (a, e, s) of a few electrodes and their log evidence come from some Gauss-Newton steps, all of them at
+once: those that explain most where the law is a straight line.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.tables import SkinTables
-from models.measurement.whitening import Whitening
+from models.measurement.covariance.whitening import Whitening
+from models.measurement.responses.tables import SkinTables
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 STEPS = 3
 LEAST = -0.9  # relative change of an impedance: nothing takes all of it away
@@ -118,71 +120,99 @@ class ContactColumns:
         columns *= (acts * np.exp(-left))[:, None]
         return left + columns[:, 0] * size / n.CONTACT_CHANGES, columns
 
-    def onsets(self, scan: Unexplained) -> Array:
-        """(E,) since when a change would explain most, each measurement by itself [s]."""
-        own = (self.layer + self.rest) * scan.share[:, None]
-        return _onsets(scan, own)
+    def likeliest(self, scan: Unexplained) -> list[ContactChange]:
+        """The likeliest changes of contacts, be it before the scan or from some value of it on."""
+        count = len(self.settled)
+        electrodes, always = np.tile(np.arange(count), 2), np.full(count, -np.inf)
+        begin_s = np.concatenate([always, _onsets(scan, (self.layer + self.rest) * scan.share[:, None])])
+        columns, settled = self._acting(scan, electrodes, begin_s), self.settled[electrodes]
+        x, explains = self._first(scan, columns, settled)
+        left = scan.white(_left(scan, _changed(columns, x, settled)).T)
+        leaves = np.sum(left**2, axis=0)
+        few = int(n.CONTACTS_EXACT) // 2
+        best = np.unique([np.argsort(each, kind="stable")[:few] for each in (-explains, leaves)])
+        return self.changes(scan, electrodes[best], begin_s[best])
 
-    def likeliest(self, scan: Unexplained, begin_s: Array) -> list[ContactChange]:
-        """Of each electrode the likeliest change since then (E,), with its evidence."""
-        acts = np.stack([scan.since(at_s) for at_s in begin_s]) * scan.share  # (E, K)
-        layer, rest = self.layer.T * acts, self.rest.T * acts
-        columns = np.stack([layer, rest, layer * (2 * scan.times_s / scan.span_s)], axis=-1)  # (E, K, 3)
-        x = self._first(scan, columns)
+    def changes(self, scan: Unexplained, electrodes: Indices, begin_s: Array) -> list[ContactChange]:
+        """Of each of n electrodes the likeliest change since then (n,), with its evidence."""
+        columns, settled = self._acting(scan, electrodes, begin_s), self.settled[electrodes]
+        x, _ = self._first(scan, columns, settled)
         for _ in range(STEPS):
-            residual, design = self._linearised(scan, columns, x)
-            precision = self._precision(x)
-            normal = np.einsum("eki,ekj->eij", design, design) + _diagonal(precision)
-            slope = np.einsum("eki,ek->ei", design, residual) - precision * x
+            residual, design = _linearised(scan, columns, x, settled)
+            precision = _precision(x, settled)
+            normal = design.transpose(0, 2, 1) @ design + _diagonal(precision)
+            slope = (design.transpose(0, 2, 1) @ residual[:, :, None])[:, :, 0] - precision * x
             x = x + np.linalg.solve(normal, slope[:, :, None])[:, :, 0]
-            x[:, SIZE] = np.maximum(x[:, SIZE], LEAST - self.settled)
-        residual, design = self._linearised(scan, columns, x)
-        precision = self._precision(x)
-        normal = np.einsum("eki,ekj->eij", design, design) + _diagonal(precision)
+            x[:, SIZE] = np.maximum(x[:, SIZE], LEAST - settled)
+        residual, design = _linearised(scan, columns, x, settled)
+        precision = _precision(x, settled)
+        normal = design.transpose(0, 2, 1) @ design + _diagonal(precision)
         chi2 = (residual**2).sum(axis=1)
         occam = np.linalg.slogdet(normal)[1] - np.log(precision).sum(axis=1)
         score = scan.white.log_density - 0.5 * (chi2 + (precision * x**2).sum(axis=1) + occam)
         variance = np.linalg.inv(normal)[:, SIZE, SIZE]
-        forgiven = self._forgiven(scan, x)
+        forgiven = self._forgiven(scan, electrodes, x)
         count = max(int(scan.live.sum()), 1)
         return [
-            ContactChange(k, float(x[k, SIZE]), float(variance[k]), float(begin_s[k]), float(score[k]), float(c))
-            for k, c in enumerate(chi2 / count / forgiven)
+            ContactChange(int(k), float(a), float(v), float(since_s), float(told), float(c))
+            for k, a, v, since_s, told, c in zip(
+                electrodes, x[:, SIZE], variance, begin_s, score, chi2 / count / forgiven, strict=True
+            )
         ]
 
-    def _first(self, scan: Unexplained, columns: Array) -> Array:
-        """(E, 3) of a change that is no logarithm's: linear in the impedance itself."""
+    def _acting(self, scan: Unexplained, electrodes: Indices, begin_s: Array) -> Array:
+        """(n, K, 3) columns of changes that act from then on."""
+        acts = (scan.live & (scan.times_s >= begin_s[:, None])) * scan.share  # (n, K)
+        layer, rest = self.layer.T[electrodes] * acts, self.rest.T[electrodes] * acts
+        return np.stack([layer, rest, layer * (2 * scan.times_s / scan.span_s)], axis=-1)
+
+    @staticmethod
+    def _first(scan: Unexplained, columns: Array, settled: Array) -> tuple[Array, Array]:
+        """(n, 3) of a change that is no logarithm's, linear in the impedance itself, and how much it explains (n,)."""
         change = np.expm1(np.minimum(scan.y, np.log(n.FAR)))
-        weighted = columns[:, :, [SIZE]] + columns[:, :, [REST]]
-        design = _whitened(scan.white, weighted / (1 + change)[None, :, None])[:, :, 0]
+        weighted = (columns[:, :, SIZE] + columns[:, :, REST]) / (1 + change)
+        design = weighted @ scan.white.w.T
         seen = scan.white(change / (1 + change))
+        along, precision = design @ seen, (design**2).sum(axis=1) + n.CONTACT_CHANGES**-2
         x = np.zeros((len(columns), 3))
-        x[:, SIZE] = (design @ seen) / ((design**2).sum(axis=1) + n.CONTACT_CHANGES**-2)
-        x[:, SIZE] = np.maximum(x[:, SIZE], LEAST - self.settled)
-        return x
+        x[:, SIZE] = np.maximum(along / precision, LEAST - settled)
+        return x, along**2 / precision
 
-    def _linearised(self, scan: Unexplained, columns: Array, x: Array) -> tuple[Array, Array]:
-        """Whitened residuals (E, K) and slopes (E, K, 3) at x (E, 3)."""
-        rest = _rest_of(x[:, SIZE], self.settled)
-        law = np.stack([x[:, SIZE], rest + x[:, REST], x[:, COURSE]], axis=-1)
-        mean = np.maximum(np.einsum("eki,ei->ek", columns, law), LEAST)
-        slopes = columns.copy()
-        slopes[:, :, SIZE] += columns[:, :, REST] * _rest_slope(x[:, SIZE], self.settled)[:, None]
-        slopes /= (1 + mean)[:, :, None]
-        left = np.where(scan.live, scan.y - np.log1p(mean), 0.0)
-        both = _whitened(scan.white, np.concatenate([left[:, :, None], slopes], axis=2))
-        return both[:, :, 0], both[:, :, 1:]
-
-    def _precision(self, x: Array) -> Array:
-        """(E, 3) of the priors, at these sizes."""
-        size = np.full(len(x), n.CONTACT_CHANGES**-2)
-        course = np.maximum(n.COURSE_FLOOR, np.abs(x[:, SIZE])) ** -2
-        return np.stack([size, _rest_sd(x[:, SIZE], self.settled) ** -2, course], axis=-1)
-
-    def _forgiven(self, scan: Unexplained, x: Array) -> Array:
-        """(E,) by how much chi^2 may be larger, as columns are not exact."""
-        wrong = (n.CONTACT_MISFIT * self.layer * x[:, SIZE]) ** 2 * scan.live[:, None]
+    def _forgiven(self, scan: Unexplained, electrodes: Indices, x: Array) -> Array:
+        """(n,) by how much chi^2 may be larger, as columns are not exact."""
+        wrong = (n.CONTACT_MISFIT * self.layer[:, electrodes] * x[:, SIZE]) ** 2 * scan.live[:, None]
         return np.asarray(1 + (wrong * scan.white.conditional_precisions()[:, None]).sum(axis=0) / len(scan.live))
+
+
+def _changed(columns: Array, x: Array, settled: Array) -> Array:
+    """(n, K) relative changes of x (n, 3)."""
+    rest = _rest_of(x[:, SIZE], settled)
+    law = np.stack([x[:, SIZE], rest + x[:, REST], x[:, COURSE]], axis=-1)
+    return np.maximum((columns @ law[:, :, None])[:, :, 0], LEAST)
+
+
+def _left(scan: Unexplained, changed: Array) -> Array:
+    """(n, K) residuals of relative changes (n, K)."""
+    return np.where(scan.live, scan.y - np.log1p(changed), 0.0)
+
+
+def _linearised(scan: Unexplained, columns: Array, x: Array, settled: Array) -> tuple[Array, Array]:
+    """Whitened residuals (n, K) and slopes (n, K, 3) at x (n, 3)."""
+    both, mean = np.empty((*columns.shape[:2], 4)), _changed(columns, x, settled)
+    both[:, :, 0] = _left(scan, mean)
+    slopes = both[:, :, 1:]
+    slopes[:] = columns
+    slopes[:, :, SIZE] += columns[:, :, REST] * _rest_slope(x[:, SIZE], settled)[:, None]
+    slopes /= (1 + mean)[:, :, None]
+    both = scan.white.w @ both
+    return both[:, :, 0], both[:, :, 1:]
+
+
+def _precision(x: Array, settled: Array) -> Array:
+    """(n, 3) of the priors, at these sizes."""
+    size = np.full(len(x), n.CONTACT_CHANGES**-2)
+    course = np.maximum(n.COURSE_FLOOR, np.abs(x[:, SIZE])) ** -2
+    return np.stack([size, _rest_sd(x[:, SIZE], settled) ** -2, course], axis=-1)
 
 
 def gain_onset(scan: Unexplained) -> float:
@@ -210,13 +240,6 @@ def _onsets(scan: Unexplained, columns: Array) -> Array:
     information = np.cumsum(weight * column**2, axis=0)
     explains = np.where(information > 0, along**2 / np.maximum(information, 1e-12), 0.0)
     return np.asarray(scan.times_s[order[explains.argmax(axis=0)]])
-
-
-def _whitened(white: Whitening, values: Array) -> Array:
-    """values (E, K, c)"""
-    count, k, columns = values.shape
-    flat = np.moveaxis(values, 1, 0).reshape(k, -1)
-    return np.moveaxis(white(flat).reshape(k, count, columns), 0, 1)
 
 
 def _rest_of(size: Array | float, settled: Array | float) -> Array:

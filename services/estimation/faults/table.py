@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.grid import DiscGrid
+from models.measurement.covariance.whitening import Whitening
 from models.measurement.numbers import TYPICAL_DROP
+from models.measurement.responses.grid import DiscGrid
 from models.measurement.touch import area_of
-from models.measurement.whitening import Whitening
 from services.estimation.faults.wires import WireFault, WireMaps, blinded
 from services.estimation.values import numbers as n
 

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.course import TouchCourse
+from models.measurement.covariance.whitening import Whitening, leave_out
 from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
-from models.measurement.tables import SkinTables
+from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import PLACE, RATE, TouchPrior, anywhere
-from models.measurement.whitening import Whitening, leave_out
 from services.estimation.values import numbers as n
 from services.estimation.values.judgement import Judgement, Verdict, judge
 

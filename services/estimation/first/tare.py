@@ -12,9 +12,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.tables import FIELD_DEGREES, SkinTables
+from models.measurement.responses.tables import FIELD_DEGREES, SkinTables
 from protocol.errors import EitskinError
 from services.estimation.faults.wires import WireFault, WireKind
+from services.estimation.first.baseline import LEAST_NOISE, identical, untrained
 from services.estimation.first.start import EarlierBaseline, JudgedStart, StartJudge, StartSays
 from services.estimation.first.wiring import WiresAtStart
 from services.estimation.values import numbers as n
@@ -24,7 +25,6 @@ from services.estimation.values.scan import Scan
 Array = NDArray[np.float64]
 
 SHARED = 32  # scans that the scatter of all measurements counts as beside each one's own
-LEAST_SCATTER = 2e-6  # about half a step of the board's 18 bits
 WIRED_AFTER = 2  # scans, after which wires are asked first; then every TARE_RETRIES
 
 UNSURE = (
@@ -64,7 +64,7 @@ class AgreedScans(NamedTuple):
         n_own = len(self.residuals)
         together = float(np.median(own[self.live])) if self.live.any() else 0.0
         shrunk = (n_own * own + SHARED * together) / (n_own + SHARED)
-        return np.asarray(np.sqrt(np.maximum(shrunk, max(self.least_white, LEAST_SCATTER**2))))
+        return np.asarray(np.sqrt(np.maximum(shrunk, max(self.least_white, LEAST_NOISE**2))))
 
 
 class Agreement(NamedTuple):
@@ -127,7 +127,7 @@ class LatestScans:
         live: NDArray[np.bool_] = np.asarray(np.isfinite(scans).all(axis=0))
         scans = np.where(live, scans, 0.0)
         together = float(np.median(scans[:, live].var(axis=0, ddof=1))) if live.any() else 0.0
-        variance = np.full(len(live), max(together, LEAST_SCATTER**2) / len(scans))
+        variance = np.full(len(live), max(together, LEAST_NOISE**2) / len(scans))
         return scans.mean(axis=0), variance, live
 
     def agreed(self, tables: SkinTables, order: NDArray[np.intp] | None = None) -> AgreedScans:
@@ -323,15 +323,9 @@ class Taring:
         now.doubted = bool(turned)
         now.problem = ""
         if "identical" in turned:
-            now.problem = (
-                f"the {len(scans.residuals)} untouched frames are identical, as measured ones never are: a noise of "
-                f"{n.TARE_ASSUMED:g} of each measurement is assumed; check the source and run `skin tare`"
-            )
+            now.problem = identical(len(scans.residuals))
         if "noise_trained" in turned:
             noise = next(each.statistic for each in now.judgements if each.name == "noise_trained")
-            now.problem = (
-                f"the frames scatter by {100 * noise:.1f} %, networks were trained for {100 * n.TARE_UNTRAINED:.2f} % "
-                "at most: check grounding and cable, then run `skin tare`"
-            )
+            now.problem = untrained(noise)
         elif not now.problem and start is not None and start.says is StartSays.UNKNOWN:
             now.problem = UNSURE

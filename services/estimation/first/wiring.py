@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.tables import SkinTables
+from models.measurement.responses.tables import SkinTables
 from services.estimation.faults.table import BoardScan, WireTable, any_touches
 from services.estimation.faults.wires import WireFault, WireMaps
 from services.estimation.first.start import LADDER, grain, smooth_field

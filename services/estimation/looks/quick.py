@@ -10,9 +10,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.grid import DiscGrid
-from models.measurement.noise import BURST_BLOCK
-from models.measurement.whitening import Whitening
+from models.measurement.covariance.noise import BURST_BLOCK
+from models.measurement.covariance.whitening import Whitening
+from models.measurement.responses.grid import DiscGrid
 from services.estimation.values import numbers as n
 from services.estimation.values.scan import Scan
 
@@ -59,6 +59,7 @@ class Seen:
     chi2: float
     z2: float
     pulled: Array  # (K,)
+    y: Array  # (K,) what was looked at
 
 
 class QuickLook:
@@ -99,4 +100,4 @@ class QuickLook:
         fresh = float(own @ newest.energy @ own) - len(own)
         z2 = max(self._grid.likeliest(pulled, information)[0], fresh)
         even = float(pulled.sum()) ** 2 / known.told_of_even < n.GAIN_Z2
-        return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, chi2, z2, pulled)
+        return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, chi2, z2, pulled, y)

@@ -36,7 +36,7 @@ class Judgement(NamedTuple):
 
 @dataclass(frozen=True)
 class CheckRow:
-    """One check of the table. reason: what a frame says where it turned; empty: nothing."""
+    """One check of the table. room: the file that judges it; reason: what a frame says where it turned, or ""."""
 
     room: str
     turned: Verdict
@@ -45,30 +45,30 @@ class CheckRow:
 
 NOTE, REFUSE = Verdict.NOTE, Verdict.REFUSE
 ROWS: Mapping[str, CheckRow] = {
-    "believed": CheckRow("acquisition", REFUSE),  # its reasons came with the frame
-    "silent": CheckRow("faults/wires", REFUSE, "multiplexer"),
-    "stuck": CheckRow("faults/wires", NOTE, "multiplexer"),
-    "open": CheckRow("faults/wires", NOTE, "electrode_open"),
-    "short": CheckRow("faults/wires", NOTE, "electrode_short"),
-    "exchanged": CheckRow("faults/wires", NOTE, "electrode_swapped"),
-    "saturated": CheckRow("faults/wires", NOTE, "saturated"),
-    "fifo": CheckRow("faults/wires", NOTE, "fifo"),
-    "impedance": CheckRow("faults/impedance", NOTE, "electrode_drift"),
-    "gain": CheckRow("faults/impedance", NOTE, "gain"),
-    "gain_gross": CheckRow("faults/impedance", REFUSE, "gain"),
-    "degraded": CheckRow("enough", NOTE, "degraded"),
-    "too_many": CheckRow("enough", REFUSE),  # what is wrong with each of them is said
-    "gap": CheckRow("faults/gap", REFUSE, "gap"),
-    "seen": CheckRow("enough", REFUSE, "degraded"),
-    "baseline": CheckRow("baseline", REFUSE, "stale_baseline"),
+    "believed": CheckRow("estimator", REFUSE),  # its reasons came with the frame
+    "silent": CheckRow("faults/advice", REFUSE, "multiplexer"),
+    "stuck": CheckRow("faults/advice", NOTE, "multiplexer"),
+    "open": CheckRow("faults/advice", NOTE, "electrode_open"),
+    "short": CheckRow("faults/advice", NOTE, "electrode_short"),
+    "exchanged": CheckRow("faults/advice", NOTE, "electrode_swapped"),
+    "saturated": CheckRow("faults/advice", NOTE, "saturated"),
+    "fifo": CheckRow("faults/advice", NOTE, "fifo"),
+    "impedance": CheckRow("faults/advice", NOTE, "electrode_drift"),
+    "gain": CheckRow("estimator", NOTE, "gain"),
+    "gain_gross": CheckRow("estimator", REFUSE, "gain"),
+    "degraded": CheckRow("faults/advice", NOTE, "degraded"),
+    "too_many": CheckRow("faults/advice", REFUSE),  # what is wrong with each of them is said
+    "gap": CheckRow("estimator", REFUSE, "gap"),
+    "seen": CheckRow("estimator", REFUSE, "degraded"),
+    "baseline": CheckRow("first/tare", REFUSE, "stale_baseline"),
     "agrees": CheckRow("first/tare", REFUSE, "stale_baseline"),
     "noise_trained": CheckRow("first/tare", REFUSE, "stale_baseline"),
     "identical": CheckRow("first/tare", REFUSE, "stale_baseline"),
     "hidden": CheckRow("first/start", REFUSE, "stale_baseline"),
     "start": CheckRow("first/start", REFUSE, "touched_at_start"),
-    "touch": CheckRow("touch", NOTE),  # it says that something touches
-    "explained": CheckRow("touch", REFUSE, "out_of_distribution"),
-    "changing": CheckRow("touch", NOTE, "changing"),
+    "touch": CheckRow("estimator", NOTE),  # it says that something touches
+    "explained": CheckRow("estimator", REFUSE, "out_of_distribution"),
+    "changing": CheckRow("estimator", NOTE, "changing"),
 }
 """In the order in which reasons are said. A new fault is one row here and one file in faults/."""
 

@@ -84,6 +84,9 @@ ACTION_WALK = Number(0.05, "-", "of its action, from scan to scan, as it meets a
 MEET_S = Number(2.0, "s", "for which two are kept apart by what they were", "chosen: a second or two of crossing")
 GOES = Number(0.7, "-", "of its action, below which a touch is going", "chosen: above any relaxation")
 ENDED = Number(0.05, "-", "of its greatest action, below which it has ended", "derived: MEMORY_MOST")
+PLACED = Number(0.06, "unit", "standard deviation of a new touch's place with which it is shown", "derived: 3 mm, near")
+PLACED_Z2 = Number(9.0, "-", "z^2 of such a touch", "derived: 3 sigmas, as that it is there is known by SURE_Z2")
+BROAD = Number(0.41, "unit", "radius of a new touch that may as well be two", "derived: 20 mm, 1.5 AREA_LOG_SD up")
 SURE_Z2 = Number(44.0, "-", "z^2 of a new touch that is shown", "derived: FALSE_ALARM_Z2")
 """What touches do from scan to scan."""
 
@@ -123,7 +126,7 @@ START_FIELD = Number(0.05, "-", "log conductivity of an unknown sheet, uneven", 
 START_FIELD_LENGTH = Number(1.0, "unit", "over which it is even", "chosen: half a side")
 START_GRAIN = Number(0.05, "-", "by which it conducts better one way", "chosen: as START_FIELD")
 START_CONTACT = Number(0.3, "-", "a contact impedance of an unknown skin", "derived: as the networks were trained")
-START_LAYER = Number(0.03, "-", "a contact's part in series, against its rest", "measured: skin bench starts")
+START_LAYER = Number(0.03, "-", "a contact's part in series, against its rest", "measured: skin bench drift")
 START_ABSOLUTE = Number(3e-5, "-", "what no model of |Z| gets right", "measured: two meshes of one skin")
 START_COST_WIDE = Number(-2.3, "nat", "of a sheet that is uneven", "derived: one skin in ten")
 START_SEEN = Number(0.0063, "unit^2", "action of the touch that must not hide", "derived: half a newton on 10 mm")
@@ -200,6 +203,7 @@ REST_FLOOR = Number(0.01, "-", "of b, where nothing changes", "derived: a tenth 
 CONTACT_CHANGES = Number(1.5, "-", "change of a contact impedance, one sigma", "derived: up to 9 times is 5 of it")
 CONTACT_MOST = Number(100.0, "-", "its change at most: beyond it is open", "derived: more than any pair's own")
 COURSE_FLOOR = Number(0.02, "-", "its change within a scan, at least", "derived: 10 % a second, and 0.5")
+CONTACTS_EXACT = Number(6, "-", "changes of contacts fitted exactly", "derived: the likeliest, and its rivals")
 CONTACT_MISFIT = Number(2e-3, "-", "what its columns get wrong, relative", "measured: 0.5e-3 at 8 times, stub's mesh")
 GAIN_CHANGES = Number(0.1, "-", "log of a gain's step, one sigma", "data sheet: AD5940, RTIA and PGA")
 GAIN_LEAST = Number(5e-4, "-", "log of a gain's step that is one", "derived: five sigmas; drift explains smaller ones")

@@ -1,0 +1,60 @@
+"""A covariance as what is needed of it: one factor, by which everything of a frame is whitened once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from models.measurement.numbers import LEFT_OUT
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """W (K, K), lower triangular, with W S W^T = 1; log_density: of a frame at the mean, up to a constant."""
+
+    w: Array
+    log_density: float
+
+    @classmethod
+    def of(cls, covariance: Array) -> Whitening:
+        """Raises ValueError where it is no covariance."""
+        return cls(*factor(covariance))
+
+    def __call__(self, values: Array) -> Array:
+        """(K, ...) whitened."""
+        return np.asarray(self.w @ values)
+
+    def solve(self, values: Array) -> Array:
+        """S^-1 times (K, ...)."""
+        return np.asarray(self.w.T @ (self.w @ values))
+
+    def conditional_precisions(self) -> Array:
+        """(K,) of each measurement given all others: the diagonal of S^-1."""
+        return np.asarray((self.w**2).sum(axis=0))
+
+
+def factor(matrix: Array) -> tuple[Array, float]:
+    """W (K, K), lower triangular, with W S W^T = 1, and the logarithm of its determinant. Raises ValueError where S is
+    not positive.
+    """
+    root, info = lapack.dpotrf(matrix.T, lower=1, clean=1)  # transposed: laid out as LAPACK takes it
+    if info:
+        raise ValueError(f"a covariance that is none: its minor {info} is not positive")
+    w, _ = lapack.dtrtri(root, lower=1, overwrite_c=1)
+    return w, float(np.log(np.diag(w)).sum())
+
+
+def diagonal_of(matrix: Array) -> Array:
+    """(K,) of (K, K), contiguous: a view, to be changed in place."""
+    return matrix.reshape(-1)[:: len(matrix) + 1]
+
+
+def leave_out(covariance: Array, live: NDArray[np.bool_]) -> None:
+    """Give measurements that do not count no weight; covariance (K, K) is changed."""
+    dead = np.flatnonzero(~live)
+    covariance[dead, dead] += LEFT_OUT

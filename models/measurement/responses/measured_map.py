@@ -1,0 +1,100 @@
+"""A registered skin's measured map as a response: what a mean press does at each place, its slopes, and its error.
+
+An action of 1 is the registration's mean press. The map has no radius: how large a touch is, it does not tell. Its
+error is one dense covariance of a fixed size, from presses that were left out of it: as a diagonal, or in proportion to
+the touch, places are worse. Where measured presses were many, the locator's kernel machines say how far the
+likelihood's place is off, and how deep or how hard a press is; its ellipses are calibrated on presses left out.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from models.locator import Located, Locator
+from models.locator_arrays import LocatorArrays
+from models.measurement.numbers import TYPICAL_RADIUS
+from models.measurement.touch import ACTION, SHAPES, X, Y
+
+Array = NDArray[np.float64]
+
+
+class MeasuredMap:
+    """Of one registered skin; see models/measurement/responses/response.py."""
+
+    def __init__(self, arrays: LocatorArrays, metres_per_unit: float, mean_press: float = 1.0) -> None:
+        """mean_press: action of the registration's mean press."""
+        self._metres, self.mean_press = metres_per_unit, mean_press
+        self._locator = Locator(arrays)
+        rows, columns = (int(side) for side in arrays.shape)
+        allowed = arrays.allowed.reshape(rows, columns)
+        table = np.zeros((rows, columns, arrays.map.shape[1]))
+        table[allowed] = arrays.map / mean_press
+        nearest = distance_transform_edt(~allowed, return_distances=False, return_indices=True)
+        table = table[tuple(nearest)]  # beyond the presses, as where they end
+        self._corner = np.asarray(arrays.corner, float) / metres_per_unit
+        self._spacing = float(arrays.spacing) / metres_per_unit
+        slopes = [np.gradient(table, self._spacing, axis=axis) for axis in (1, 0)]
+        self._table: Array = np.stack([table, *slopes])  # (3, rows, columns, K)
+        self.measured: NDArray[np.bool_] = np.asarray(arrays.measured, bool)
+        self.error = _of_touches(np.asarray(arrays.error, float), np.asarray(arrays.noise, float))
+        iy, ix = np.nonzero(allowed)
+        places = self._corner + self._spacing * np.column_stack([ix, iy])
+        self._discs = np.column_stack([places, np.full(len(places), np.log(TYPICAL_RADIUS))])
+
+    def through(self, slopes: Array) -> MeasuredMap:
+        """The same seen through a fault of the wires; slopes (K, K)."""
+        seen = copy(self)
+        seen._table, seen.error = self._table @ slopes.T, slopes @ self.error @ slopes.T
+        return seen
+
+    @property
+    def discs(self) -> Array:
+        """(A, 3) all places of the map."""
+        return self._discs
+
+    def __call__(self, x: float, y: float, log_radius: float) -> Array:
+        """(K,)"""
+        return np.asarray(self.with_slopes(x, y, log_radius)[0])
+
+    def with_slopes(self, x: float, y: float, log_radius: float) -> Array:
+        """(4, K): response, its slopes to x and y, and 0 for the radius."""
+        rows, columns = self._table.shape[1:3]
+        across = np.clip((x - self._corner[0]) / self._spacing, 0, columns - 1.001)
+        along = np.clip((y - self._corner[1]) / self._spacing, 0, rows - 1.001)
+        ix, iy = int(across), int(along)
+        u, v = across - ix, along - iy
+        block = self._table[:, iy : iy + 2, ix : ix + 2]
+        weight = np.array([[(1 - u) * (1 - v), u * (1 - v)], [(1 - u) * v, u * v]])
+        found = np.zeros((4, self._table.shape[3]))
+        found[:3] = np.einsum("cyxk,yx->ck", block, weight)
+        return found
+
+    def directions(self, x: float, y: float, log_radius: float) -> Array:
+        """(9, K) of nothing: what touches differ by is in `error`."""
+        return np.zeros((SHAPES, self._table.shape[3]))
+
+    def located(self, difference: Array, sigma: Array, states: Array) -> list[Located]:
+        """Place with its calibrated ellipse, amplitude, depth or force of each touch, the others' response taken off.
+
+        difference (K,): of |Z|, relative; sigma (K,): its standard deviation, infinite where not measured; states
+        (T, 7): as fitted. Fewer touches come out where one explains nothing by itself, none where too little is left.
+        """
+        now = self._locator.condition(sigma)
+        if now is None:
+            return []
+        each = [state[ACTION] * self(state[X], state[Y], 0.0) for state in states]
+        whole = np.sum(each, axis=0)
+        found = [
+            self._locator.single(now, now.whiten @ (difference - whole + own)[now.live], len(each)) for own in each
+        ]
+        return [touch for touch in found if touch is not None]
+
+
+def _of_touches(error: Array, noise: Array) -> Array:
+    """The part of an error's covariance that is not noise, without negative variances."""
+    values, vectors = np.linalg.eigh(error - np.diag(noise**2))
+    return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T)

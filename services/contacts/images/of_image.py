@@ -1,0 +1,70 @@
+"""Touches of a skin whose measurements tell only that something touches: what its image shows, or where a registered
+skin's response map finds them. Each has the number of the one that was nearest to it in the image before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from models.bundle import Bundle
+from protocol.frames import EstimatedTouch, ImageFrame, LocatedTouch
+from services.contacts.images.segmentation import Segment, divided, readable, segment
+from services.contacts.reading import Appearance, Pixels
+
+SAME = 0.15  # of the skin's half side, within which a touch is the one before: 0.3 m/s, a scan of 5 cm
+
+
+@dataclass(frozen=True)
+class ImageTouch:
+    """One touch of an image."""
+
+    segment: Segment  # the part of the image that is its
+    looks: Appearance  # with its place [m]
+    reach_m: float  # from its middle to the farthest of it
+    located: LocatedTouch | None  # by the map of a registered skin
+
+
+class ImageTouches:
+    """Of one skin."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._same_m = SAME * bundle.half_width * bundle.metres_per_unit
+
+    def found(self, frame: ImageFrame, before: Mapping[int, Appearance]) -> list[ImageTouch]:
+        """Those of a new image, strongest first; before: where touches were, by their numbers."""
+        if not frame.image.size or not readable(frame.image):
+            return []
+        image = Pixels(frame.metres_per_pixel, frame.origin)
+        places = [touch.position for touch in frame.touches] or [[look.x, look.y] for look in before.values()]
+        pixels = [image.at(x, y) for x, y in places]
+        if not frame.touches:
+            return [self._touch(frame, s, None) for s in segment(frame.image, frame.sigma, pixels)]
+        parts = divided(frame.image, frame.sigma, pixels)
+        return [self._touch(frame, s, touch) for s, touch in zip(parts, frame.touches, strict=True)]
+
+    def estimated(self, looks: Appearance, estimates: Iterable[EstimatedTouch]) -> EstimatedTouch | None:
+        """A registered skin's touch as the measurements tell it: the nearest that is near enough to be the same."""
+        apart = [(math.hypot(t.position[0] - looks.x, t.position[1] - looks.y), k, t) for k, t in enumerate(estimates)]
+        distance, _, nearest = min(apart, default=(math.inf, 0, None))
+        return nearest if distance < self._same_m else None
+
+    def _touch(self, frame: ImageFrame, s: Segment, located: LocatedTouch | None) -> ImageTouch:
+        m, (x0, y0) = frame.metres_per_pixel, frame.origin
+        x, y = (x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m) if located is None else located.position
+        return ImageTouch(s, Pixels(m, frame.origin).appearance(s, frame, x, y), s.reach * m, located)
+
+    def same(self, touches: list[ImageTouch], before: Mapping[int, Appearance]) -> list[int]:
+        """Of each touch the number that it had before, the nearest pairs first; 0: it is new."""
+        apart = [
+            (math.hypot(touch.looks.x - look.x, touch.looks.y - look.y), k, number)
+            for k, touch in enumerate(touches)
+            for number, look in before.items()
+        ]
+        found, taken = [0] * len(touches), set[int]()
+        for distance, k, number in sorted(apart):
+            if distance < max(self._same_m, touches[k].reach_m) and not found[k] and number not in taken:
+                found[k] = number
+                taken.add(number)
+        return found

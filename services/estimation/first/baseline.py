@@ -1,0 +1,185 @@
+"""The untouched baseline: when frames agree well enough to be one, what their noise is, and whether the skin was
+really untouched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.prereconstruction import PreReconstructor, noise_of_frames
+from protocol.errors import EitskinError
+from services.estimation.values import numbers
+
+Array = NDArray[np.float64]
+
+TAKING = "taking the baseline"  # what the status says until there is one
+OUT_OF_PROPORTION = 1e3  # of a measurement over the median one: pairs of one sheet differ by 10
+IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
+LEAST_NOISE = 2e-6  # relative: about half a step of the board's 18 bits
+
+
+class NoBaseline(EitskinError, ValueError):
+    """Frames, or a saved state, do not make a baseline. The text says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """|Z0| of the untouched skin. K measurements."""
+
+    z0: Array  # (K,) unit of the raw frames
+    sigma: Array  # (K,) standard deviation of one frame's |Z|, same unit
+    frames: int  # how many it is the mean of
+    board: str  # unique id of the board
+    taken_ns: int  # `sample` of the newest frame in it
+    doubt: str = ""  # why the skin may have been touched meanwhile; empty: no doubt
+    taken_by: str = "start"  # or "command", "file"
+    restored: bool = False  # an earlier process took it
+    noise_frames: int = 0  # how many frames sigma was found from; 0: those of the mean
+
+    def __post_init__(self) -> None:
+        """Whoever holds a baseline holds what its hash says: the arrays are its own, and nobody writes to them."""
+        for name in ("z0", "sigma"):
+            array = np.array(getattr(self, name), dtype=float)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def hash(self) -> str:
+        return hashlib.sha256(self.z0.tobytes() + self.sigma.tobytes()).hexdigest()
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, saved: dict[str, Any], measurements: int) -> Baseline:
+        """Raises NoBaseline where `saved` is no baseline of that many measurements."""
+        try:
+            z0, sigma = np.array(saved["z0"], dtype=float), np.array(saved["sigma"], dtype=float)
+            rest = int(saved["frames"]), str(saved["board"]), int(saved["taken_ns"]), str(saved["doubt"])
+            provenance = str(saved.get("taken_by", "start")), bool(saved.get("restored", False))
+            noise_frames = int(saved.get("noise_frames", 0))
+        except (KeyError, TypeError, ValueError) as wrong:
+            raise NoBaseline(f"no baseline in the saved state ({wrong}): tare again") from None
+        if z0.shape != (measurements,) or sigma.shape != (measurements,):
+            raise NoBaseline(f"the saved baseline has {z0.size} measurements, this skin {measurements}: tare again")
+        if not (np.isfinite(z0).all() and (z0 >= 0).all() and (sigma > 0).all()):
+            raise NoBaseline("the saved baseline has impedances or noises that are not possible: tare again")
+        known = int(((z0 > 0) & np.isfinite(sigma)).sum())
+        if known < 0.5 * measurements:
+            raise NoBaseline(f"the saved baseline knows only {known} of {measurements} measurements: tare again")
+        return cls(z0, sigma, *rest, *provenance, noise_frames)
+
+
+def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Baseline:
+    """The baseline of (N, K) |Z|. Raises NoBaseline where the frames do not agree with each other.
+
+    A measurement that is not finite in every frame gets an infinite sigma: it is left out until the next tare.
+    """
+    live = np.isfinite(frames).all(axis=0) & (frames > 0).all(axis=0)
+    if live.any():  # what is out of all proportion is no impedance of the same sheet
+        typical = float(np.median(frames[0, live]))
+        live &= (frames < OUT_OF_PROPORTION * typical).all(axis=0) & (frames > typical / OUT_OF_PROPORTION).all(axis=0)
+    if live.sum() < 0.5 * frames.shape[1]:
+        raise NoBaseline(
+            f"only {int(live.sum())} of {frames.shape[1]} measurements give values: check the cable and the electrodes"
+        )
+    good = frames[:, live]
+    mean = good.mean(axis=0)
+    noise = float(np.median(good.std(axis=0, ddof=1) / mean))
+    if noise > numbers.TARE_NOISY:
+        raise NoBaseline(
+            f"the frames scatter by {100 * noise:.1f} % (at most {100 * numbers.TARE_NOISY:.0f} %): "
+            "check grounding and cable"
+        )
+    found, limit = disagreement(good)
+    if found > limit:
+        raise NoBaseline(
+            f"the frames disagree (statistic {found:.0f}, limit {limit:.0f}): something touched or moved meanwhile"
+        )
+    z0, sigma = np.zeros(frames.shape[1]), np.full(frames.shape[1], np.inf)
+    z0[live], sigma[live] = mean, noise_of_frames(good, mean)
+    sigma = plausible_noise(z0, sigma)
+    doubt = ""
+    if noise < numbers.TARE_IDENTICAL:
+        doubt = identical(len(frames))
+    doubt = noisy(z0, sigma, pre) or doubt
+    misfit = implausibility(z0, pre)
+    if misfit > IMPLAUSIBLE:
+        doubt = f"the baseline is {100 * misfit:.1f} % off what the bundle predicts: free the skin and run `skin tare`"
+    return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
+
+
+def noisy(z0: Array, sigma: Array, pre: PreReconstructor) -> str:
+    """ "" or why no touch that is measured with this noise is to be believed. A measured bundle knows its own noise."""
+    live = np.isfinite(sigma) & (z0 > 0)
+    share = float(np.median(sigma[live] / z0[live])) if live.any() else 0.0
+    if pre.m.normalisation != "model" or share <= numbers.TARE_UNTRAINED:
+        return ""
+    return untrained(share)
+
+
+def identical(count: int) -> str:
+    """Why so many untouched frames tell no noise, to a person."""
+    return (
+        f"the {count} untouched frames are identical, as measured ones never are: a noise of "
+        f"{numbers.TARE_ASSUMED:g} of each measurement is assumed; check the source and run `skin tare`"
+    )
+
+
+def untrained(noise: float) -> str:
+    """Why no network is to be believed beside this relative noise, to a person."""
+    return (
+        f"the frames scatter by {100 * noise:.1f} %, networks were trained for {100 * numbers.TARE_UNTRAINED:.2f} % at "
+        "most: check grounding and cable, then run `skin tare`"
+    )
+
+
+def plausible_noise(z0: Array, sigma: Array) -> Array:
+    """(K,) standard deviations of |Z|: at least LEAST_NOISE, and TARE_ASSUMED where none was found (identical frames,
+    NaN); infinite ones stay.
+    """
+    found = np.isfinite(sigma) & (sigma > numbers.TARE_IDENTICAL * np.abs(z0))
+    finite = np.where(found, np.maximum(sigma, LEAST_NOISE * np.abs(z0)), numbers.TARE_ASSUMED * np.abs(z0))
+    # A measurement that has no baseline either is not used.
+    return np.where(np.isposinf(sigma) | ~(np.abs(z0) > 0), np.inf, finite)
+
+
+def disagreement(frames: Array) -> tuple[float, float]:
+    """Chi-square statistic of the quarters' means against the noise within them, and the limit it keeps to when all
+    is quiet.
+    """
+    parts = int(numbers.TARE_QUARTERS)
+    n = len(frames) // parts * parts
+    quarters = frames[-n:].reshape(parts, n // parts, -1)
+    mean = frames.mean(axis=0)
+    # Presses that come and go make the quarters scatter within as well; from frame to frame they seldom do.
+    noise = np.minimum(quarters.var(axis=1, ddof=1).mean(axis=0), 0.5 * (np.diff(frames, axis=0) ** 2).mean(axis=0))
+    within = noise / (n // parts) + (numbers.TARE_HARMLESS * mean) ** 2
+    statistic = float((((quarters.mean(axis=1) - quarters.mean(axis=(0, 1))) ** 2).sum(axis=0) / within).sum())
+    dof_within = n - parts
+    f_mean = dof_within / (dof_within - 2)  # the noise within is estimated too
+    dof = (parts - 1) * frames.shape[1]
+    quantile = NormalDist().inv_cdf(1 - numbers.TARE_DISAGREES)
+    chi_square = dof * (1 - 2 / (9 * dof) + quantile * (2 / (9 * dof)) ** 0.5) ** 3  # Wilson-Hilferty
+    return statistic, float(chi_square * f_mean * (1 + 2 / dof_within))
+
+
+def implausibility(z0: Array, pre: PreReconstructor) -> float:
+    """rms relative misfit of |Z0| to the bundle's prediction, up to gain and contact impedances; 0 where the bundle
+    predicts none.
+    """
+    if pre.m.normalisation != "model":
+        return 0.0
+    live = z0 > 0
+    relative = z0[live] / pre.m.z0[live]
+    gain = float(np.median(relative))
+    residual = relative / gain - 1
+    columns = np.column_stack([np.ones(int(live.sum())), pre.m.contact[live]])
+    fitted, *_ = np.linalg.lstsq(columns, residual, rcond=1e-6)
+    return float(np.sqrt(np.mean((residual - columns @ fitted) ** 2)))
