@@ -13,10 +13,8 @@ EXTRAS ?=
 comma := ,
 WANTED := $(subst $(comma), ,$(EXTRAS))
 TORCH := $(shell grep -o 'torch==[0-9.]*' pyproject.toml)
-export OMP_NUM_THREADS ?= 1
-export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: up venv venv-dev ros-venv test test-all search golden lint site train lock clean
+.PHONY: up venv venv-dev ros-venv test check-all search golden lint site train lock clean
 
 up: venv
 	./skin up
@@ -65,23 +63,26 @@ $(ROS_VENV)/.done:
 	$(ROS_VENV)/bin/python -m pip install --disable-pip-version-check numpy $(ROS_PACKAGES:%=ros-$(ROS)-%)
 	@touch $@
 
-# Five minutes on two cores once all is installed. What is slow by nature is in test-all, which CI runs.
+# First what is deterministic, on all cores, then what is live (processes, sockets, the real clock), one at a time. Only a
+# live test is run again where it fails, and the last lines say so. What is slow or needs more is in check-all.
 test: venv-dev lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not live and not release"
+	$(BIN)/python -m pytest -n 1 --reruns 2 --reruns-delay 1 -rR -m "live and not release"
 
-test-all: venv-dev lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "slow or not slow"
+# All the rest, whatever fails on the way; ends with a table, which build/check-all.json keeps.
+check-all:
+	$(PYTHON) .ci/check_all.py $(ONLY)
 
-# Goes on searching where tests and CI try the same inputs every time: random examples, and each decoder for a minute.
+# Goes on searching where tests try the same inputs every time: random examples, and each decoder for a minute.
 search: venv-dev
-	EITSKIN_SEARCH=1 $(BIN)/python -m pytest -n 2 -m "slow or not slow" $$(grep -rlE --include="test_*.py" "from hypothesis|EITSKIN_SEARCH" tests)
+	EITSKIN_SEARCH=1 $(BIN)/python -m pytest -n auto -m "release or not release" $$(grep -rlE --include="test_*.py" "from hypothesis|EITSKIN_SEARCH" tests)
 	$(BIN)/python tests/fuzz/run.py --seconds 60
 
 # What recordings of tests/ give now is what they are to give from now on; git diff shows what changed.
 golden: venv-dev
 	./skin golden tests/recording/golden/*.mcap --accept
 
-# Without the extra train mypy takes what PyTorch gives as Any, and cannot be strict about what is made of it; CI can.
+# Without the extra train mypy takes what PyTorch gives as Any, and cannot be strict about what is made of it; check-all can.
 WITHOUT_TORCH := --allow-subclassing-any --allow-untyped-decorators --no-warn-return-any --no-warn-unused-ignores
 lint: venv-dev
 	$(BIN)/ruff check .

@@ -84,7 +84,12 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     )
     add("--listen", metavar="URL", help="socket://HOST:PORT instead of a pty; further skins take the ports after it")
     add("--leave", type=float, metavar="SECONDS", help="end when a host that was connected has been gone for so long")
-    add("--seed", type=int, help="of the noise (default: another one each time)")
+    add(
+        "--seed",
+        type=int,
+        default=os.environ.get("EITSKIN_STUB_SEED"),
+        help="of the noise (default: $EITSKIN_STUB_SEED, else another one each time)",
+    )
     add("--no-time", action="store_true", help="a firmware that does not answer TIME_ASK")
     add("--detached", action="store_true", help="go on when the parent process has ended")
     add("--faults", action="store_true", help="list what can go wrong on request, and end")

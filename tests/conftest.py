@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from tests import pinned
+
+pinned.pin()  # before anything imports numpy
+
+# ruff: noqa: E402
 import contextlib
 import os
 import shutil
@@ -9,7 +14,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,15 +22,16 @@ import hypothesis
 import pytest
 
 from tests.needs import pytest_make_collect_report, pytest_terminal_summary  # noqa: F401  (hooks of pytest)
+from tests.waiting import end, until
 
 ROOT = Path(__file__).resolve().parents[1]
-START_S = 120
 
 # The same examples every time, so that nothing fails by chance; `make search` looks for others.
 hypothesis.settings.register_profile(
     "fixed",
     derandomize=True,
     database=None,
+    deadline=None,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],  # says the load
 )
 if not os.environ.get("EITSKIN_SEARCH"):
@@ -51,9 +56,15 @@ class FailuresAtOnce:
 
 @pytest.hookimpl(trylast=True)
 def pytest_configure(config: pytest.Config) -> None:
+    os.environ.pop("EITSKIN_RUNTIME", None)
     terminal = config.pluginmanager.get_plugin("terminalreporter")
     if terminal is not None and not hasattr(config, "workerinput"):
         config.pluginmanager.register(FailuresAtOnce(terminal))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    pinned.seed()
 
 
 @pytest.fixture
@@ -63,6 +74,13 @@ def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("EITSKIN_RUNTIME", str(folder))
     yield folder
     shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(autouse=True)
+def _no_runtime_of_the_user(request: pytest.FixtureRequest) -> None:
+    """Every test has a runtime folder that no other test and no service of the user has."""
+    if "EITSKIN_RUNTIME" not in os.environ:  # a service that a file shares has set its own
+        request.getfixturevalue("runtime")
 
 
 def without_recorder(folder: Path, scan: str) -> Path:
@@ -88,14 +106,14 @@ def serving(folder: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
         process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
         try:
             reader = NewestReader("contact", "palm", f"ipc://{folder}/publisher.ipc")
-            end = time.monotonic() + START_S
-            while (frame := reader.recv(1.0)) is None or not frame.valid:
-                assert time.monotonic() < end and process.poll() is None, (folder / "log.txt").read_text()
+            try:
+                until(lambda: (frame := reader.recv(1.0)) is not None and frame.valid, process)
+            except AssertionError as error:
+                raise AssertionError((folder / "log.txt").read_text()) from error
             reader.close()
             yield process
         finally:
-            process.send_signal(signal.SIGTERM)
-            process.wait(10)
+            end(process)
 
 
 @pytest.fixture

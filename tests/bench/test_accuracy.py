@@ -134,7 +134,7 @@ def test_the_hyperparameter_that_fits_is_chosen():
     assert accuracy.tuned(method, frames, known, 1) == 2.0
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_pyeit_sees_a_touch_where_it_is():
     model = shared("square16", "inverse")
     rows = patterns.pattern("adjacent", 16)

@@ -70,7 +70,7 @@ def test_a_press_is_scored_by_the_nearest_contact_of_a_valid_frame() -> None:
     assert all(np.hypot(*np.maximum(np.abs([p.x, p.y]) + p.radius_mm * 1e-3 - 0.05, 0)) < 1e-9 for p in plan)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_short_form_meets_its_gates(tmp_path: Path) -> None:
     assert force.main(["--quick", "--scan", "full", "--seed", "5", "--out", str(tmp_path)]) == 0
     report = json.loads((tmp_path / "force.json").read_text())

@@ -283,7 +283,7 @@ def test_no_frame_after_a_fault_hides_a_touch_that_waits_to_be_confirmed(sheet):
     assert score.unseen == score.wrong == score.late == 0
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_gain_that_was_believed_while_nothing_was_explained_is_given_up(sheet):
     """Else nothing explains the scans after the fault, until a skin is too long unexplained."""
     row = row_of("fifo_overflow, silent")
@@ -292,14 +292,14 @@ def test_a_gain_that_was_believed_while_nothing_was_explained_is_given_up(sheet)
         assert score.wrong == score.late == 0
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_what_stands_beside_an_open_electrode_is_asked_whether_it_is_one(sheet):
     """An electrode off the skin changes the rest of it as a touch would: one such stood for eleven seconds."""
     found = availability.session(sheet, workers.pipeline(), "electrode dead", 1500, 5000).row()
     assert found["wrong"] == 0 and found["named_%"] == 100 and found["reported_%"] == 100
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("scan", ["full", "rolling"])
 def test_two_touches_that_begin_together_are_never_one_between_them(sheet, scan):
     touches = scenes.touches_at_random(16, 23)
@@ -333,12 +333,12 @@ def drifting_contact(sheet):
     return availability.session(sheet, workers.pipeline(), "electrode drifting", 1500, 11004).row()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_drift_is_followed_beside_touches_where_a_contact_has_changed_for_good(drifting_contact):
     assert drifting_contact["valid_%"] > 99 and drifting_contact["reported_%"] == 100
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_no_frame_is_wrong_where_a_contact_has_changed_for_good(drifting_contact):
     assert drifting_contact["wrong"] == 0
 

@@ -13,7 +13,7 @@ PERIOD_S = PRESSED_S + PAUSE_S + 0.013  # the taps begin at every phase of a sca
 RAMP_S = 0.001
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_taps_for_a_minute_leave_the_skin_untouched_in_between() -> None:
     """After a minute without a pause that counts, drift is read from touches: not from one that began in the scan."""
     places = np.random.default_rng(1).uniform(-0.043, 0.043, (20, 2))

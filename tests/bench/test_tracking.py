@@ -214,7 +214,7 @@ def test_a_few_seconds_of_the_real_thing(short):
     assert press["valid_%"] > 90  # frames in which it begins or ends may be refused
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_scans_in_parts_are_scored_by_scans(tmp_path):
     path = tmp_path / "short.toml"
     path.write_text(SCENE.partition("fault =")[0])

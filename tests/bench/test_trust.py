@@ -202,7 +202,7 @@ def test_a_scene_is_drawn_from_its_seed_within_its_bounds() -> None:
     assert "circle" in kinds and len(kinds) > 1
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_every_kind_of_fault_is_drawn_in_every_situation() -> None:
     sheet = table.sheet("plain", 1)
     found = [t for seed in range(8) for t in SceneDrawer(sheet, seed, 120.0).draw().troubles]
@@ -236,7 +236,7 @@ def test_the_service_differs_from_itself_in_nothing(tmp_path: Path, monkeypatch:
     assert today_score.counts["frames"] > 50 and today_score == again
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_blind_candidate_is_worse(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -245,7 +245,7 @@ def test_a_blind_candidate_is_worse(
     assert "phantom frames, the service 0" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_failing_session_is_kept_as_a_recording_that_replays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = runs.run(
         "plain", "rolling", "5", 0.14, session_s=8.4, folder=tmp_path,

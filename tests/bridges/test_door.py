@@ -20,6 +20,8 @@ import pytest
 
 from tests.bridges.conftest import FakeService, RunningBridge
 
+pytestmark = pytest.mark.live
+
 WAIT_S = 60.0
 PROTOCOL = "foxglove.sdk.v1"
 PAGE_PORT = 18300
@@ -141,7 +143,7 @@ async def idlers(doorway: Doorway, count: int) -> AsyncIterator[list[aiohttp.Cli
         yield found
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_64_idle_viewers_do_not_keep_the_owner_out(doorway: Doorway) -> None:
     async def test() -> None:
         async with idlers(doorway, 64) as idle:
@@ -160,7 +162,7 @@ def test_64_idle_viewers_do_not_keep_the_owner_out(doorway: Doorway) -> None:
     run(test)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_viewer_with_the_token_may_be_silent(doorway: Doorway) -> None:
     async def test() -> None:
         async with aiohttp.ClientSession() as session, doorway.connect(session, doorway.token) as viewer:
@@ -174,7 +176,7 @@ def test_a_viewer_with_the_token_may_be_silent(doorway: Doorway) -> None:
     run(test)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_1135_half_sent_requests_do_not_keep_the_owner_out(doorway: Doorway) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(max(soft, 4096), hard), hard))
@@ -196,7 +198,7 @@ def test_1135_half_sent_requests_do_not_keep_the_owner_out(doorway: Doorway) -> 
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_1135_requests_for_a_view_that_cannot_be_do_not_keep_the_owner_out(doorway: Doorway) -> None:
     """They pass the door, are told what they should have asked for, and stay connected."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

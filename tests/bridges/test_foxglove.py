@@ -18,6 +18,8 @@ from protocol.control import ControlServer
 from tests.bridges.conftest import FakeService, RunningBridge
 from tests.bridges.viewer import Viewer
 
+pytestmark = pytest.mark.live
+
 
 def started(folder: Path, section: str) -> tuple[RunningBridge, str, str]:
     """The bridge, the address that it printed, the token."""

@@ -29,6 +29,8 @@ from protocol.sockets import ControlServer, Publisher
 from protocol.transport import Transport
 from tests.bridges.page_server import SECRET, serving, settings
 
+pytestmark = pytest.mark.live
+
 WAIT_S = 20.0
 
 

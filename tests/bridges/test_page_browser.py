@@ -24,7 +24,7 @@ from protocol.frames import unpack
 from services.recordings.recording import RecordingReader
 from tests import needs
 
-pytestmark = pytest.mark.slow  # a browser beside the whole service, both on the cores that other tests want
+pytestmark = [pytest.mark.live, pytest.mark.release]
 
 ROOT = Path(__file__).resolve().parents[2]
 VECTORS = ROOT / "protocol" / "vectors"

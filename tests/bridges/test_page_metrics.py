@@ -22,6 +22,8 @@ from protocol.sockets import Publisher
 from tests.bridges import page_server
 from tests.bridges.page_server import SECRET
 
+pytestmark = pytest.mark.live
+
 
 def serving(**changes: Any) -> AbstractAsyncContextManager[PageServer]:
     return page_server.serving(**{"skins": ("palm",), "port": 18180, "metrics": True, **changes})

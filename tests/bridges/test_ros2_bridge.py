@@ -21,6 +21,8 @@ from protocol.frames import ReferenceFrame
 from protocol.sockets import AllReader
 from tests.bridges.conftest import FakeService, RunningBridge
 
+pytestmark = pytest.mark.live
+
 DOMAIN = 120 + os.getpid() % 80
 
 

@@ -27,6 +27,8 @@ from protocol.frames import ContactFrame, ImageFrame
 from protocol.sockets import AllReader
 from tests import needs
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).resolve().parents[2]
 BASE = "/eitskin/palm"
 CONFIG = """
@@ -168,8 +170,8 @@ def stub(command: str, **args: Any) -> dict[str, Any]:
     ("world", "seconds"),
     [
         pytest.param("rolling", 3.0, id="parts"),
-        pytest.param("rolling", 60.0, id="parts-minute", marks=pytest.mark.slow),
-        pytest.param("full", 3.0, id="whole", marks=pytest.mark.slow),
+        pytest.param("rolling", 60.0, id="parts-minute", marks=pytest.mark.release),
+        pytest.param("full", 3.0, id="whole", marks=pytest.mark.release),
     ],
     indirect=["world"],
 )

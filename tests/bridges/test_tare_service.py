@@ -16,6 +16,8 @@ import pytest
 from bridges.ros2 import rtps
 from bridges.ros2.tare_service import TareService
 
+pytestmark = pytest.mark.live
+
 PEER = b"\x01\x0f" + bytes(range(10))
 WRITER, READER = b"\x00\x00\x12\x03", b"\x00\x01\x04"
 OURS = struct.pack(">HBB", 0, 1, 0x04)

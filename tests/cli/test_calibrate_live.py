@@ -25,6 +25,8 @@ from protocol.sockets import AllReader, NewestReader
 from services.calibration.reference import ReferenceForce
 from tests.conftest import serving
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHER = Path(__file__).with_name("reference_publisher.py")
 STIFFER = 1.4  # this skin's foam needs so much more force than the shipped one
@@ -106,7 +108,7 @@ def config(folder: Path, more: str = "") -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_twenty_presses_teach_the_law_to_three_percent(runtime: Path) -> None:
     rng = np.random.default_rng(7)
     with (
@@ -134,7 +136,7 @@ def test_twenty_presses_teach_the_law_to_three_percent(runtime: Path) -> None:
 TIPS = {0.005: (0.5, 2.0), 0.012: (0.8, 4.5)}  # m: newtons
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_presses_of_two_tips_teach_a_law_that_covers_both(runtime: Path) -> None:
     """The second run goes on from the presses of the first and ends by itself; what it claims is one standard error, of
     which three are allowed: by two, one run of ten would fail by chance.
@@ -191,7 +193,7 @@ def said_over_pressed(
     reader.close()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_reference_that_says_nothing_sure_makes_no_press(runtime: Path) -> None:
     """Each is told, none is a press; once it is mended the next press counts."""
     press = {"x": 0.02, "y": -0.01, "radius": 0.01, "force": 2.0, "seconds": 60.0}

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.live, pytest.mark.release]
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -201,7 +201,7 @@ def test_what_nobody_can_mean_is_refused(skin, folder, name) -> None:  # type: i
     _none(found)
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in USUAL])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.release) if n in SLOW else n for n in USUAL])
 def test_what_is_odd_is_answered(skin, folder, name) -> None:  # type: ignore[no-untyped-def]
     usual = tuple(word.format(folder=folder) for word in USUAL[name])
     found = [complaint(skin, [*name.split(), *usual], False, "")]

@@ -18,6 +18,8 @@ import numpy as np
 import pytest
 from mcap.stream_reader import zstandard
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).resolve().parents[2]
 MAGIC = b"\x89MCAP0\r\n"
 MEGA = 2**20

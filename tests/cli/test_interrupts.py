@@ -14,6 +14,8 @@ import pytest
 
 from tests import needs
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).resolve().parents[2]
 LEFT = (130, -signal.SIGINT)
 RUNS = 0.7  # s before Ctrl-C: about when modules have been loaded, on a busy machine while they are

@@ -21,7 +21,7 @@ from protocol.sockets import NewestReader
 from services.runtime.config import ConfigError, load
 from services.runtime.supervision import programs, stub_arguments
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.live, pytest.mark.release]
 ROOT = Path(__file__).resolve().parents[2]
 
 

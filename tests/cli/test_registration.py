@@ -102,7 +102,7 @@ def test_real_presses_are_found_within_3_mm(bundle: Bundle, reference: Path) -> 
     assert np.abs(depth - test.value).mean() < 0.0017  # presses of 10, 15 and 20 mm; their mean depth is off by 4
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_an_uneven_skin_is_learned_from_differences_of_any_scale(bundle: Bundle, reference: Path) -> None:
     """Kernel ridge regression on 100 of these presses placed others to 5.8 mm median."""
     arrays = load_npz(reference / "hydrogel_vse_concentric.npz")
@@ -117,7 +117,7 @@ def test_an_uneven_skin_is_learned_from_differences_of_any_scale(bundle: Bundle,
     assert np.allclose(errors[0], errors[1], atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_many_presses_correct_what_the_likelihood_gets_wrong(bundle: Bundle, reference: Path) -> None:
     arrays = load_npz(reference / "hydrogel_vse_concentric.npz")
     order = np.random.default_rng(1).permutation(len(arrays["xy"]))
@@ -239,7 +239,7 @@ def test_presses_and_measurements_that_are_missing_are_left_out(bundle: Bundle) 
 
 
 @pytest.mark.parametrize("count", [2, 3])
-@pytest.mark.slow
+@pytest.mark.release
 def test_touches_add_up(bundle: Bundle, reference: Path, count: int) -> None:
     """Sums of real presses at places that are at least 50 mm apart: as many touches, each where its press was."""
     arrays = load_npz(reference / "hydrogel_disc16.npz")

@@ -23,6 +23,8 @@ from protocol.frames import ContactFrame, pack
 from protocol.sockets import ControlServer, NewestReader, Publisher
 from services.runtime.config import ROOT, load
 
+pytestmark = pytest.mark.live
+
 DOC = (ROOT / "docs" / "security.md").read_text()
 SKIN_TOML = (ROOT / "skin.toml").read_text()
 SKIN = '[skins.palm]\nport = "stub"\nbundle = "square16"\n'
@@ -189,7 +191,7 @@ def refused(folder: Path, more: str) -> str:
     return done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_up_refuses_what_a_process_would_die_of(runtime: Path, tmp_path: Path) -> None:
     address = '[sockets.addresses]\npublisher = "tcp://0.0.0.0:{}"\n'
     free, taken = free_ports()
@@ -217,7 +219,7 @@ def test_up_refuses_what_a_process_would_die_of(runtime: Path, tmp_path: Path) -
     assert "there is no such folder" in refused(tmp_path, nowhere)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_up_says_the_addresses_it_really_uses(runtime: Path, tmp_path: Path) -> None:
     port = free_ports()[0]
     (tmp_path / "skin.toml").write_text(SKIN + f'[sockets.addresses]\npublisher = "tcp://127.0.0.1:{port}"\n')

@@ -22,6 +22,8 @@ from protocol.frames import Contact, ContactFrame, ImageFrame, InfoFrame, RawFra
 from services.cli.monitor import Monitor
 from services.cli.screen import screen
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).resolve().parents[2]
 COLUMNS, LINES = 80, 24
 

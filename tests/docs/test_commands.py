@@ -21,6 +21,8 @@ from tests.docs.runners import CONFIGS, NOT_RUN, PROGRAMS, SCENES, TRIED_ELSEWHE
 from tests.docs.snippets import ROOT, Snippet, in_text, snippets
 from tests.docs.world import START_S, World, world
 
+pytestmark = pytest.mark.live
+
 CTRL_C = (130, -2)  # exit status, or ended by the signal, which a shell calls 130 too
 ALL = snippets()
 COMMANDS_SHOWN = [snippet for snippet in ALL if snippet.kind == "command"]
@@ -129,7 +131,7 @@ def test_it_runs_until_ctrl_c(place: World, untouched: None, snippet: Snippet) -
     assert "Traceback" not in ran.out, ran.out
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("snippet", shown("help"), ids=str)
 def test_its_program_knows_the_options(place: World, snippet: Snippet) -> None:
     """Benchmarks and training take minutes to hours: .ci/run has them in short form."""
@@ -203,7 +205,7 @@ def test_what_is_tried_elsewhere_is() -> None:
             assert document.split("/")[-1] in (ROOT / test).read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_make_up_from_nothing() -> None:
     """The first command of README, in a copy with no virtual environment; what it did not install says so."""
     with world(installed=False) as place, serving(place, "make up", start_s=900):
@@ -216,7 +218,7 @@ def test_make_up_from_nothing() -> None:
             assert ran.code != 0 and f"make venv EXTRAS={extra}" in ran.out and "Traceback" not in ran.out, ran.out
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("snippet", [s for s in shown("slow") if s.text.startswith("g++")], ids=str)
 def test_the_cpp_line(place: World, untouched: None, snippet: Snippet) -> None:
     needs.CPP.here()
@@ -225,7 +227,7 @@ def test_the_cpp_line(place: World, untouched: None, snippet: Snippet) -> None:
     assert re.search(row.says, ran.out, re.MULTILINE), ran.out
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_what_takes_longer_ends_well() -> None:
     """In the documents' order: one command reads what the one before it wrote."""
     those = [snippet for snippet in shown("slow") if not snippet.text.startswith(("g++", "make up"))]

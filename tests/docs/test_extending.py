@@ -13,6 +13,8 @@ import pytest
 
 from tests.docs.snippets import ROOT, in_text
 
+pytestmark = pytest.mark.live
+
 BLOCKS = [
     s for s in in_text((ROOT / "docs" / "extending.md").read_text("utf-8"), "docs/extending.md") if s.kind == "text"
 ]
@@ -96,7 +98,7 @@ def run(checkout: Path, *arguments: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_every_block_fits_and_what_it_adds_is_there(extended: Path) -> None:
     assert len(BLOCKS) >= 15
     run(extended, "-c", ADDED)

@@ -21,6 +21,8 @@ from tests import needs
 from tests.docs.snippets import FENCE, ROOT
 from tests.docs.world import START_S, Ran, World, world
 
+pytestmark = pytest.mark.live
+
 PAGE = "docs/your-skin.md"
 SKIN_UP = "./skin up --config mine.toml"
 GLOVE = """<svg xmlns="http://www.w3.org/2000/svg" width="100mm" height="100mm" viewBox="0 0 100 100">
@@ -153,14 +155,14 @@ def check(somebody: Reader, most_mm: float) -> None:
     assert json.loads(shown.read_text())
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_page_is_followed_without_training() -> None:
     needs.TRAIN.here()  # the program that makes bundles is the one that trains
     with world() as place:
         check(follow(place, SHORTER | LIVE), most_mm=2.0)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_page_is_followed_with_a_training() -> None:
     needs.TRAIN.here()
     with world() as place:

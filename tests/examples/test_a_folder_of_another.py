@@ -21,6 +21,8 @@ import zmq
 from tests import needs
 from tests.examples.compiled import ROOT, cpp_subscriber
 
+pytestmark = pytest.mark.live
+
 __all__ = ["cpp_subscriber"]
 ANOTHER = 65534
 WIRE = (ROOT / "protocol" / "WIRE.md").read_text()

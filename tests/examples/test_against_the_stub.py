@@ -34,6 +34,7 @@ SIGMAS = 3.44  # of a place: as few of a plane's lie beyond as beyond three of a
 PATIENT_S = "1.5"  # what counts as silence here: a busy machine that runs tests is no fault of the skin
 
 pytestmark = [
+    pytest.mark.live,
     pytest.mark.usefixtures("untouched"),
     pytest.mark.parametrize("service_that_nobody_hears", ["full", "rolling"], indirect=True),
 ]

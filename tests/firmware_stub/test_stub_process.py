@@ -16,6 +16,8 @@ from protocol import link
 from protocol.control import ControlClient, ControlError
 from protocol.sockets import NewestReader
 
+pytestmark = pytest.mark.live
+
 PAIRS = pattern("pairs").astype("u1")
 
 
@@ -237,7 +239,7 @@ def test_a_second_stub_does_not_take_over_the_first_ones_sockets(stub, folder):
     assert ControlClient("stub", 20.0).call("status")["plugged"] is True
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_stub_that_its_host_has_left_ends_where_it_is_told_to(other_folder):
     """In containers its network has gone with the host: started anew, it is in the host's new one."""
     stub = Process(other_folder, "--listen", "socket://127.0.0.1:0", "--leave", "1")

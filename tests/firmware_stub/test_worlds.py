@@ -31,7 +31,7 @@ def shown(rig: Rig, script: Script) -> Rig:
 
 
 @pytest.mark.parametrize(
-    "name", ["all", *(pytest.param(name, marks=pytest.mark.slow) for name in ("creep", "creep-power"))]
+    "name", ["all", *(pytest.param(name, marks=pytest.mark.release) for name in ("creep", "creep-power"))]
 )
 def test_what_is_interpolated_between_solutions_is_within_a_fifth_of_the_noise(name: str) -> None:
     script = Script("test", tracks=(track(1.0, 2.0), track(2.5, 3.0, (-0.02, 0.01))))
@@ -143,7 +143,7 @@ def test_slopes_of_contact_impedances_are_what_a_solution_finds(
     assert np.abs(four_terminal(slopes[4], rows) * 0.01 - changed).max() < 0.01 * np.abs(changed).max()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_flicker_and_jumps_have_the_size_that_their_world_says(
     disturbed: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:

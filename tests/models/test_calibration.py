@@ -43,7 +43,7 @@ def measured(mismatch: Mismatch, shapes: tuple[Shape, ...] = ()) -> np.ndarray:
     return np.abs(MismatchedSheet("square16", mismatch).solve(shapes).impedances())
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_are_those_of_the_forward_model(skin: geometry.SkinGeometry) -> None:
     modes, rng = FieldModes(skin), np.random.default_rng(0)
     nominal = Mounting.nominal(skin, modes.count)
@@ -65,7 +65,7 @@ def test_derivatives_are_those_of_the_forward_model(skin: geometry.SkinGeometry)
         assert np.linalg.norm(found - slopes[mesh][:, column]) < within * np.linalg.norm(found), column
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_fit_finds_anisotropy_contacts_and_shifts(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     mismatch = Mismatch(anisotropy=0.05, contacts=3, contact_factor=3.0)
     z0 = 7.3 * measured(mismatch)  # a board in any unit
@@ -92,7 +92,7 @@ def test_an_even_well_made_skin_is_left_as_it_is(skin: geometry.SkinGeometry, ma
     assert np.abs(mounting.field).max() < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(
     skin: geometry.SkinGeometry, matrices: Matrices
 ) -> None:
@@ -110,14 +110,14 @@ def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(
     assert (made.level == matrices.level).all() and made.scale_index == matrices.scale_index
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_linearising_about_the_file_gives_the_files_matrices(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     made = calibrated(matrices, skin, Mounting.nominal(skin, FieldModes(skin).count))
     for name in ("z0", "gram", "back", "jacobian", "contact"):
         np.testing.assert_allclose(getattr(made, name), getattr(matrices, name), rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_large_shifts_stay_bounded_and_never_make_it_worse(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     mismatch = named("shift3").seeded(1)
     z0 = measured(mismatch)
@@ -154,7 +154,7 @@ def test_a_pixel_knows_its_elements_without_a_plotting_library(skin: geometry.Sk
         assert (found[k] == -1) if not len(inside) else (found[k] in inside)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_fields_about_the_file_are_those_of_its_response_tables(skin: geometry.SkinGeometry) -> None:
     made, shipped = fields_as_mounted(skin, Mounting.nominal(skin, FieldModes(skin).count)), Bundle.load("square16")
     np.testing.assert_allclose(made, shipped.response().fields, rtol=2e-3, atol=2e-3)
@@ -174,7 +174,7 @@ def left_of_touches(tables: SkinTables, mismatch: Mismatch, z0: Array) -> float:
     return float(np.median(found))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_discs_of_a_calibrated_skin_leave_what_its_tables_say(skin: geometry.SkinGeometry, matrices: Matrices) -> None:
     """Of a skin that its file describes a few per cent wrong."""
     bundle, mismatch = Bundle.load("square16"), named("mild")

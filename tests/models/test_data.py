@@ -44,7 +44,7 @@ def test_a_run_can_be_stopped_and_taken_up(folder, tmp_path):
     assert not list(tmp_path.glob(".*.part"))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_local_dask_cluster_gives_the_same_files(folder, tmp_path):
     needs.PEERS.here()
     import distributed

@@ -17,7 +17,7 @@ from models.pruning import NoPart, part, worth  # noqa: E402
 from models.train import PART, Trainer, full_network  # noqa: E402
 from models.turns import TURNS  # noqa: E402
 
-pytestmark = pytest.mark.slow  # trains
+pytestmark = pytest.mark.release  # trains
 
 WHOLE = NetworkConfig(channels=(8, 12, 10), blocks=(1, 3, 2))
 

@@ -49,7 +49,7 @@ def off(found, expected):
 # --- against EIDORS ---
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_reference_mesh_against_eidors(fine, eidors):
     untouched = fine.solve()
     for name in PATTERNS:
@@ -79,7 +79,7 @@ def test_training_mesh_against_eidors(training, eidors):
     assert np.median([error for (_, name), error in touches.items() if name == "pairs"]) < 0.0015
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_training_mesh_against_reference_mesh(training, fine):
     shapes = [[Shape("rectangle", 0.5, -0.47, 0.25, 0.39, 2.91, 2.24)], [Shape("circle", -0.6, 0.6, 0.2, 0.15)]]
     relative = [

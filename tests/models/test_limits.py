@@ -168,7 +168,7 @@ def test_a_force_is_known_as_its_integral_is_until_the_foam_saturates():
     assert hard.force > 1.5 * hard.integral
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_smallest_force_that_is_shown_is_shown():
     """Frames of another mesh and other noise, at other places: nearly all are seen at that force, few at a third."""
     noise, radius_mm = MeasurementNoise(80.0), 10.0
@@ -202,7 +202,7 @@ def test_the_smallest_forces_take_no_option_that_they_would_not_heed(capsys, mor
     assert ended.value.code == 2 and f"found --forces and {more[0]}" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_command_line_of_the_smallest_forces(capsys):
     assert limits.main(["--forces", "--skin", "hexagon6"]) == 2
     assert limits.main(["--forces", "--snr", "80", "--grid", "2", "--json"]) == 0

@@ -81,7 +81,7 @@ MOST = {  # % of the change: a touch of radius 0.2 and drop 0.4
 }
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(("pattern", "fine"), KINDS)
 def test_what_a_disc_leaves_of_a_touch(tables, pattern: str, fine: bool) -> None:
     """Also where half of the impedances are negative, as with opposite drives."""

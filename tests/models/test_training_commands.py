@@ -24,7 +24,7 @@ from models.train import Trainer, full_network  # noqa: E402
 from models.warm_start import NoSuchNetwork  # noqa: E402
 from protocol.errors import EitskinError  # noqa: E402
 
-pytestmark = pytest.mark.slow  # trains, each time from nothing
+pytestmark = pytest.mark.release  # trains, each time from nothing
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {

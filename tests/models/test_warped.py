@@ -66,7 +66,7 @@ def simulated(bundle: Bundle, touches: list[Shape]) -> Samples:
     return Samples(d[None].astype(np.float32), *picture(rows), rows)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_simulated_press_comes_out_as_it_was_measured(registered: Bundle, model: warped.WarpedModel) -> None:
     assert registered.locator is not None
     locator = Locator(registered.locator)
@@ -140,7 +140,7 @@ def test_shapes_are_stated_only_where_they_were_told_apart(
     assert "out_of_distribution" not in image.reasons
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("grade", ["usable", "too little"])
 def test_a_registered_bundle_gets_a_network_where_that_is_better_than_none(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], grade: str

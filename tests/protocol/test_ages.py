@@ -15,6 +15,8 @@ from protocol.sockets import Publisher
 from .test_client import ago, frame
 from .test_sockets import subscribed, until
 
+pytestmark = pytest.mark.live
+
 AHEAD_NS = 7_000 * 10**9
 """Of the other host's clock: it has been up for longer."""
 

@@ -11,6 +11,8 @@ from protocol.sockets import Publisher
 
 from .test_sockets import run, subscribed, until
 
+pytestmark = pytest.mark.live
+
 RESTARTED = (
     "import time; from protocol.sockets import Publisher; from protocol.frames import ContactFrame\n"
     "p = Publisher('publisher'); print('ready', flush=True)\n"

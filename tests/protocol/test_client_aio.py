@@ -14,6 +14,8 @@ from protocol.sockets import Publisher
 from .test_client import RESTARTED, ago, frame
 from .test_sockets import run, subscribed
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture
 def publisher(runtime, context):

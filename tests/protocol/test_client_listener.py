@@ -12,6 +12,8 @@ from protocol.sockets import Publisher
 from .test_client import RESTARTED, frame
 from .test_sockets import run, subscribed, until
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture
 def publisher(runtime, context):

@@ -4,6 +4,7 @@ import selectors
 import socket
 import threading
 
+import pytest
 import zmq
 
 from protocol import transport
@@ -14,6 +15,8 @@ from tests import needs
 from .test_client import frame
 from .test_sockets import subscribed, until
 from .test_transport import back_to_default, free_port  # noqa: F401  (a fixture that every test here uses)
+
+pytestmark = pytest.mark.live
 
 
 def test_contacts_over_tcp_with_keys(runtime, tmp_path):

@@ -13,6 +13,8 @@ from protocol.fields import Bool, Float, Int, Text
 from protocol.runtime import control_endpoint
 from protocol.sockets import ControlClient, ControlError, ControlServer, clock_offset
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture
 def server(runtime, context):

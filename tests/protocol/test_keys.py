@@ -20,6 +20,8 @@ from protocol.transport import Transport, TransportError
 from .test_sockets import subscribed, until
 from .test_transport import back_to_default, free_port  # noqa: F401  (a fixture that every test here uses)
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture
 def site(tmp_path):

@@ -22,6 +22,8 @@ from protocol.transport import TransportError
 
 from .test_sockets import until
 
+pytestmark = pytest.mark.live
+
 FLOOD = Path(__file__).with_name("flood.py")
 CURED_S = 2.0
 PATIENCE = 5  # times as long on a machine that does other things too

@@ -11,6 +11,8 @@ from protocol.sockets import NewestReader, Publisher
 
 from .test_sockets import until
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture
 def log(monkeypatch):
@@ -80,7 +82,7 @@ def test_a_traceback_is_kept_and_bounded(log):
     assert "Traceback" in text and len(text) <= logs.LINE + 100
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_peer_that_sends_rubbish_cannot_fill_the_log(runtime, context, log):
     publisher = Publisher("publisher", context)
     reader = NewestReader("contact", "palm", context=context)

@@ -11,6 +11,8 @@ import pytest
 
 from protocol import runtime as rt
 
+pytestmark = pytest.mark.live
+
 
 def test_it_is_made_for_us_alone(monkeypatch, tmp_path):
     monkeypatch.setenv("EITSKIN_RUNTIME", str(tmp_path / "a" / "b"))

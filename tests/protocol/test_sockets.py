@@ -29,6 +29,8 @@ from protocol.runtime import endpoint
 from protocol.sockets import AllReader, NewestReader, Publisher, StageReader
 from protocol.transport import MAX_MESSAGE
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).parents[2]
 
 

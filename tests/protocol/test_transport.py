@@ -12,6 +12,8 @@ from tests import needs
 
 from .test_sockets import subscribed
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture(autouse=True)
 def back_to_default():

@@ -25,7 +25,7 @@ def rows(name: str) -> Input:
     return Input(measurements=z[None], untouched=untouched, reference=None)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_rows_of_an_anisotropic_skin_become_valid_and_right() -> None:
     data, bundle, said = rows("anisotropy15"), Bundle.load("square16"), list[str]()
     plain = reconstruct(data, SKIN, bundle, age_s=1.0)

@@ -24,6 +24,8 @@ from services.recordings.patient_file import PatientFile
 from services.recordings.recorder import Recorder
 from services.recordings.recording import RecordedMessage, RecordingError, RecordingReader, RecordingWriter
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).resolve().parents[2]
 
 

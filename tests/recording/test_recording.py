@@ -24,6 +24,8 @@ from services.recordings.recording import (
     RecordingWriter,
 )
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).resolve().parents[2]
 
 

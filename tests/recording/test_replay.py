@@ -26,6 +26,8 @@ from services.runtime import persistence
 from services.runtime.config import ROOT, Skin
 from tests.services.test_estimator import FREE_S, PARTS, Board, press
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture(scope="module")
 def touches() -> dict[str, np.ndarray]:
@@ -98,7 +100,7 @@ with RecordingWriter(Path(sys.argv[2])) as writer:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_scans_in_parts_of_which_some_were_lost_give_the_contacts_of_one_process(runtime: Path, tmp_path: Path) -> None:
     """Which image meets which part is decided by their numbers: images and parts come to publisher from two processes,
     and whichever is first, the contacts are bit by bit those of the stages called one after the other.
@@ -120,7 +122,7 @@ def test_scans_in_parts_of_which_some_were_lost_give_the_contacts_of_one_process
         assert msgpack.packb(a) == msgpack.packb(b), a["scan"]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_socket_file_deleted_during_a_replay_is_there_again_and_no_frame_is_lost(
     recording: Path, tmp_path: Path
 ) -> None:

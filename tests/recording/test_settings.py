@@ -25,6 +25,8 @@ from services.recordings.replay import ReplayError
 from services.recordings.replay_session import configuration_of, replay_file
 from services.runtime.config import BUNDLES, ROOT, ConfigFile, Skin, load, parse
 
+pytestmark = pytest.mark.live
+
 HERE = Path("recording.mcap")
 
 

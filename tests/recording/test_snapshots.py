@@ -29,6 +29,8 @@ from services.runtime.config import parse
 from services.runtime.config_sections import RecorderSection
 from tests.docs.snippets import snippets
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).resolve().parents[2]
 S = 1_000_000_000
 

@@ -30,6 +30,8 @@ from services.recordings.recording import RecordingWriter
 from services.runtime.config import Skin
 from tests.services.fake_board import FakeBoard, PtyBoard
 
+pytestmark = pytest.mark.live
+
 SCANNING = Scanning(pattern("pairs"), COHERENT, 40_000.0)
 
 

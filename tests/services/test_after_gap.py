@@ -74,7 +74,7 @@ def test_a_touch_that_ended_in_a_gap_is_not_shown_and_one_that_began_is(scan: st
     after_a_gap(scan, how, 0.8, what, seed=1)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(("scan", "how", "seconds", "what", "seed"), cases(range(1), FEW))
 def test_nothing_is_hidden_behind_a_gap(scan: str, how: str, seconds: float, what: str, seed: int) -> None:
     after_a_gap(scan, how, seconds, what, seed)
@@ -83,7 +83,7 @@ def test_nothing_is_hidden_behind_a_gap(scan: str, how: str, seconds: float, wha
 SEEDS = range(10, 30) if os.environ.get("EITSKIN_SEARCH") else range(10, 11)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(("scan", "how", "seconds", "what", "seed"), cases(SEEDS, MANY))
 def test_nothing_is_hidden_behind_any_gap(scan: str, how: str, seconds: float, what: str, seed: int) -> None:
     after_a_gap(scan, how, seconds, what, seed)
@@ -131,7 +131,7 @@ def test_in_parts_a_single_image_that_is_skipped_hides_nothing(stage: str) -> No
     assert host.frames[-1][1].valid and np.hypot(contact.position[0] - began.x, contact.position[1] - began.y) < FAR_M
 
 
-@pytest.mark.parametrize("scan", ["full", pytest.param("rolling", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scan", ["full", pytest.param("rolling", marks=pytest.mark.release)])
 @pytest.mark.parametrize("lag", [0.0, 0.005, 0.02])
 def test_touches_that_change_places_without_a_gap_are_not_hidden(scan: str, lag: float) -> None:
     """Before: what took another one's place waited for a second image in valid frames that showed nothing."""
@@ -149,7 +149,7 @@ def test_touches_that_change_places_without_a_gap_are_not_hidden(scan: str, lag:
         assert host.frames[-1][1].valid and [c.state for c in host.frames[-1][1].contacts] == ["hold"]
 
 
-@pytest.mark.parametrize("scan", ["full", pytest.param("rolling", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scan", ["full", pytest.param("rolling", marks=pytest.mark.release)])
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_stage_that_skips_most_frames_says_nothing_wrong_and_still_something(stage: str, scan: str) -> None:
     """Each of its frames comes after a gap."""

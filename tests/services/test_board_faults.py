@@ -142,7 +142,7 @@ DECIDED = 2  # scans in which a contact that changed may as well be a touch on i
 
 
 @pytest.mark.parametrize("held", [False, True])
-@pytest.mark.parametrize("times", [1.15, 4.0, *(pytest.param(times, marks=pytest.mark.slow) for times in (0.4, 20.0))])
+@pytest.mark.parametrize("times", [1.15, 4.0, *(pytest.param(n, marks=pytest.mark.release) for n in (0.4, 20.0))])
 def test_a_contact_that_changes_is_named_and_makes_no_touch(times: float, held: bool) -> None:
     skin, touch = tared(), PRESS if held else ()
     for _ in range(8):
@@ -281,7 +281,7 @@ def test_a_contact_that_drifts_is_named_all_the_while_and_not_long_after() -> No
     assert states(well[3]) and not states(well[-1])
 
 
-@pytest.mark.parametrize(("seeds", "most"), [((1,), 0), pytest.param(range(2, 14), 2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("seeds", "most"), [((1,), 0), pytest.param(range(2, 14), 2, marks=pytest.mark.release)])
 def test_a_second_disc_that_may_be_none_is_not_shown(seeds: Sequence[int], most: int) -> None:
     """A broad L is better explained by two discs, the second of which is as large as its own uncertainty. Which of many
     is two hangs on a processor's last digits: counted over 24, one or two.

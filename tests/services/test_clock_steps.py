@@ -19,6 +19,8 @@ from services.runtime.config import ROOT
 from tests import needs
 from tests.services.test_supervisor import UP, starts, wait_for
 
+pytestmark = pytest.mark.live
+
 HOUR_S = 3600
 CONFIG = '[skins.palm]\nport = "stub"\nbundle = "square16"\nnetwork = "none"\n'
 

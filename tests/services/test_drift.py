@@ -49,7 +49,7 @@ def directions(bundle: Bundle) -> Array:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.slow
+@pytest.mark.release
 def test_no_false_alarm_in_an_hour_of_drift(skin: Skin, bundle: Bundle, seed: int) -> None:
     """8e4 untouched frames over both seeds, 80 dB, noise and baseline of 64 frames. The sheet and every contact drift,
     steadily and at random, as fast as the configuration says and as far as it allows. Three hours, of scans in parts:
@@ -155,7 +155,7 @@ DRIFTS = pytest.param(
 
 
 @pytest.mark.parametrize("drifts", [False, DRIFTS])
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_touch_held_for_ten_minutes_does_not_fade(time: Time, solved: Callable[..., Array], drifts: bool) -> None:
     """Its strength, at the hold's begin and end; the drift is 3 % of every contact and 0.2 % of the
     sheet. A release after it leaves no touch behind.

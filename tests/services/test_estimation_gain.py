@@ -51,7 +51,7 @@ def sliding(skin: StubSkin, step: int) -> tuple[Shape, ...]:
 
 
 @pytest.mark.parametrize(
-    "gain", [-0.04, 0.002, *(pytest.param(gain, marks=pytest.mark.slow) for gain in (-0.002, 0.014, 0.05))]
+    "gain", [-0.04, 0.002, *(pytest.param(gain, marks=pytest.mark.release) for gain in (-0.002, 0.014, 0.05))]
 )
 def test_a_gain_step_under_a_touch_that_moves_is_taken_over_and_said(gain: float) -> None:
     skin = StubSkin(80.0)
@@ -121,7 +121,7 @@ def test_a_gain_step_in_the_midst_of_a_scan_is_taken_over_by_the_next(gain: floa
 
 
 @pytest.mark.parametrize("moves", [False, True])
-@pytest.mark.parametrize("gain", [-0.18, pytest.param(0.19, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("gain", [-0.18, pytest.param(0.19, marks=pytest.mark.release)])
 def test_a_gross_gain_under_a_touch_is_named_and_wrong_nowhere(gain: float, moves: bool) -> None:
     skin = StubSkin(80.0)
     steps = [sliding(skin, step if moves else 0) for step in range(120)]

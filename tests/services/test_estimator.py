@@ -266,7 +266,7 @@ def test_a_slide_keeps_its_id_and_its_place(parts: int) -> None:
         assert abs(frame.contacts[0].position[0] - there) < 3e-3
 
 
-@pytest.mark.parametrize("parts", [1, pytest.param(PARTS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("parts", [1, pytest.param(PARTS, marks=pytest.mark.release)])
 def test_what_a_touch_leaves_in_the_foam_is_no_touch(parts: int) -> None:
     touch = pressed("circle", 0.012, -0.018, 9e-3, 3.0)
     frames = run(press(touch, until_s=FREE_S + 1.0, left=0.03), FREE_S + 3.5, parts)
@@ -319,7 +319,7 @@ def test_a_touch_that_ends_says_so_for_fifty_milliseconds_and_is_gone() -> None:
     assert not any(frame.contacts for frame in between_s(frames, ended[-1] + 0.01, 99))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("refused_s", [4.0, 20.0])
 def test_after_refused_frames_the_skin_is_valid_again_within_two_seconds(refused_s: float) -> None:
     """Noise that no model has, and meanwhile the sheet has come to conduct 1 % better."""

@@ -29,7 +29,7 @@ def _private_runtime():
 
 
 @pytest.mark.xfail(strict=True, raises=AssertionError, reason="two parts do not tell it from a touch on its electrode")
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_contact_impedance_that_rises_within_a_scan_is_named_in_parts() -> None:
     """Each rises for 40 ms. Parts come every 4.4 ms: of 50 ms since its beginning two lie after its end."""
     rng = np.random.default_rng(4)
@@ -92,7 +92,7 @@ def test_holds_leave_no_more_than_their_share_in_the_baseline() -> None:
         ),
     ],
 )
-@pytest.mark.slow
+@pytest.mark.release
 def test_forces_and_places_of_moments_are_within_their_sigma(scan: str) -> None:
     """In a drawn session, beginnings, slides, releases, `coarse` and `changing` frames included."""
     skin = Skin.model_validate({"port": "stub", "bundle": "square16", "frame_id": "palm", "scan": scan})
@@ -105,7 +105,7 @@ def test_forces_and_places_of_moments_are_within_their_sigma(scan: str) -> None:
         assert sum(score.counts[f"{of} 6/{phase}"] for phase in PHASES) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_parts_of_a_calibrated_skin_stand_on_its_calibration() -> None:
     """A skin that is mounted wrong, after a tare that calibrates: a slide of 0.6 s is followed with every part, 229
     times a second, as on a skin that is its bundle's.

@@ -43,7 +43,7 @@ def same(a: Estimate, b: Estimate) -> bool:
 
 # Before the baseline, untouched, as a touch begins, held, just released and when its memory fades.
 @pytest.mark.parametrize("at_s", [1.0, FREE_S - 0.2, FREE_S + 0.06, FREE_S + 1.0, FREE_S + 1.62, FREE_S + 2.5])
-@pytest.mark.parametrize("parts", [1, pytest.param(PARTS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("parts", [1, pytest.param(PARTS, marks=pytest.mark.release)])
 def test_who_loads_a_state_goes_on_bit_by_bit(at_s: float, parts: int) -> None:
     first, second = Estimator(tables_of(bundle())), Estimator(tables_of(bundle()))
     since, touched = 0, False

@@ -227,7 +227,7 @@ def test_a_touch_surely_explains_a_start_under_it(
 MISMATCHED = ["mild", "field5", "field10", "shift1", "shift3", "anisotropy5", "anisotropy15", "contacts"]
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.release)])
 def test_a_skin_that_is_not_as_in_its_file_is_never_said_to_be_untouched(judge: StartJudge, seed: int) -> None:
     """Bare or under a hand; nor is one that is bare surely touched, so that its first tare needs no force."""
     says = Counter[str]()

@@ -82,7 +82,7 @@ def scored(skinny: Skinny, presses: SolvedPresses, frames: int = 1) -> tuple[np.
     return np.array(z), np.array(errors)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_most_presses_of_any_shape_fall_within_one_sigma(presses: SolvedPresses, bundle: Bundle) -> None:
     found = [scored(Skinny(configured(), bundle, presses.z0, db), presses) for db in (62.0, 75.0, 120.0)]
     z, errors = (np.concatenate(each) for each in zip(*found, strict=True))

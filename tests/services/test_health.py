@@ -14,6 +14,8 @@ import zmq
 from protocol.sockets import ControlError, ControlServer
 from services import health
 
+pytestmark = pytest.mark.live
+
 Answer = Callable[[dict[str, Any]], dict[str, Any]]
 
 

@@ -45,7 +45,7 @@ def test_what_lasts_goes_with_a_recording() -> None:
     assert states(first(later, 9 * MS)) == states(second(later, 9 * MS)) == {1: "end", 2: "begin"}
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_slow_reader_of_the_newest_frame_sees_every_touch_begin_and_end() -> None:
     rng = np.random.default_rng(5)
     with rolling_host(seed=6) as host:

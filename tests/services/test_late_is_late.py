@@ -24,6 +24,8 @@ from services.runtime.config import ROOT
 from services.runtime.stage import PROCESSES
 from tests.processes import pid_of
 
+pytestmark = pytest.mark.live
+
 STOPS_S = (0.45, 2.0)  # not much longer than a frame may be acted on, and much longer
 TOLERANCE_S = 0.1  # between the client's judgement and its callback
 PATIENCE_S = 90.0
@@ -72,7 +74,7 @@ def service(runtime: Path) -> Iterator[None]:
                 process.wait(20)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.usefixtures("service")
 def test_no_stopped_process_makes_a_controller_act_on_an_old_frame() -> None:
     robot = Controller()

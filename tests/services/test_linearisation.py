@@ -100,7 +100,7 @@ def forces(tmp_path: Path, bundle: Bundle) -> Path:
     return file
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(
     sheet: MismatchedSheet, bundle: Bundle, forces: Path
 ) -> None:
@@ -152,7 +152,7 @@ def test_a_tare_by_command_calibrates_and_a_restart_goes_on_with_it(
     assert bench.pipeline.pre.linearisation.name == "" and bench.feed().contact.valid
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_no_calibration_is_adopted_while_something_touches(sheet: MismatchedSheet) -> None:
     bench = Bench(sheet)
     bench.feed(frames=80)
@@ -170,7 +170,7 @@ def test_no_calibration_is_adopted_while_something_touches(sheet: MismatchedShee
 
 
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.6, 0.55), (-0.7, 0.1)])
-@pytest.mark.parametrize("newtons", [1.0, pytest.param(5.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("newtons", [1.0, pytest.param(5.0, marks=pytest.mark.release)])
 def test_a_start_under_a_touch_fits_nothing(x: float, y: float, newtons: float) -> None:
     for name in ("none", "mild"):
         bench = Bench(MismatchedSheet(BUNDLE, named(name), "inverse"))
@@ -223,7 +223,7 @@ def test_a_calibration_that_inference_cannot_find_makes_frames_invalid(sheet: Mi
     assert not image.valid and "stale_baseline" in image.reasons
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_calibration_that_arrives_late_is_used(sheet: MismatchedSheet, bundle: Bundle) -> None:
     z0 = np.abs(sheet.solve().impedances())
     packed = calibrate(bundle, z0, 1e-5 * z0)
@@ -258,7 +258,7 @@ def _raw(bench: Bench) -> RawFrame:
     )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_forces_are_calibrated_on_what_is_seen_after_a_tare(
     sheet: MismatchedSheet, bundle: Bundle, tmp_path: Path
 ) -> None:
@@ -279,7 +279,7 @@ def test_forces_are_calibrated_on_what_is_seen_after_a_tare(
         seen(tare=TareConfig(calibrate=False))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_calibration_of_another_bundle_or_a_damaged_one_is_refused(bundle: Bundle, sheet: MismatchedSheet) -> None:
     z0 = np.abs(sheet.solve().impedances())
     packed = calibrate(bundle, z0, 1e-5 * z0)

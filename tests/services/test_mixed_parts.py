@@ -53,7 +53,7 @@ def of_another_configuration(scan, before, rng):
     return [other, scan] if rng.random() < 0.3 else [scan]
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in range(2, 4))])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.release) for n in range(2, 4))])
 @pytest.mark.parametrize(
     "relay", [late, twice, swapped, of_an_earlier_scan, wrong_number, wrong_part, of_another_configuration]
 )

@@ -59,7 +59,7 @@ class Made:
 
 
 @pytest.fixture(
-    scope="module", params=["disc12", *(pytest.param(skin, marks=pytest.mark.slow) for skin in ("ell16", "disc32"))]
+    scope="module", params=["disc12", *(pytest.param(skin, marks=pytest.mark.release) for skin in ("ell16", "disc32"))]
 )
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Made:
     return Made(request.param, tmp_path_factory.mktemp("skins"))

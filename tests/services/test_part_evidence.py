@@ -44,7 +44,7 @@ def test_a_touch_reaches_a_controller_within_three_parts_and_so_does_its_end(hos
     assert samples == sorted(samples)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("x, y", [(0.037, -0.044), (-0.0137, 0.0436)])
 def test_a_touch_on_an_electrode_is_not_taken_for_its_contact_after_parts_had_told_them_apart(x, y):
     """The two whole scans after its beginning were of a contact that jumped, by what they show alone. A whole scan
@@ -78,7 +78,7 @@ def test_a_contact_that_jumps_as_a_touch_begins_elsewhere_is_named():
     assert named and named[0] < 0.2
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_no_whole_scan_is_made_of_values_from_before_and_after_a_release():
     """Of a release within the newest values too: such a scan looks like a contact that jumped, asking takes 20 ms."""
     host = SimulatedHost("rolling", snr_db=80.0, seed=9)

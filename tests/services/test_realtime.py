@@ -10,6 +10,8 @@ import pytest
 from services.runtime.config import ConfigError, parse
 from services.runtime.stage import Health
 
+pytestmark = pytest.mark.live
+
 SKINS = {"palm": {"port": "stub", "bundle": "square16"}}
 ASK = """
 import json, os, resource, sys

@@ -21,6 +21,8 @@ from services.calibration.reference import MOST_GAP_S, Doubtful, PressCourse, Re
 from services.calibration.seen import TouchReader
 from services.runtime.config import Skin
 
+pytestmark = pytest.mark.live
+
 BEGAN, ENDED, STEADY = 2.0, 6.0, (3.5, 5.0)
 RAMP_S, NEWTON, RATE_HZ = 0.2, 3.0, 100
 START_S = time.monotonic() - 60.0

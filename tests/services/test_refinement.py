@@ -24,6 +24,8 @@ from services.refine_process import RefineHere, RefineProcess
 from services.runtime.config import ConfigError, Indenter, Skin, parse
 from tests.services.stub_skin import StubSkin, transfer
 
+pytestmark = pytest.mark.live
+
 UNIT = 0.05  # metres
 FORCE, SHAPE = frozenset({"contact", "force", "shape"}), ("contact", "force", "shape")
 
@@ -188,7 +190,7 @@ class SlowFits(RefineHere):
             self._next()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_slide_is_refined_as_far_as_there_is_time_and_what_is_skipped_is_counted() -> None:
     """At 20 mm/s a touch is elsewhere when a fit from nothing is done: the next one begins where that ended."""
     stub, fits = StubSkin(80.0, skin=configured()), SlowFits()
@@ -263,7 +265,7 @@ def test_the_process_fits_the_newest_of_each_skin_and_counts_the_others(process:
     assert answered(process, "sole").number == 5
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_job_that_knows_the_answer_goes_before_one_that_did_not(process: RefineProcess, bundle: Bundle) -> None:
     process.offer(job(bundle, 1))
     process.offer(job(bundle, 2))  # made while the first is fitted

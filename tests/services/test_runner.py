@@ -25,6 +25,8 @@ from services.runtime.lateness import Lateness
 from services.runtime.stage import Stage
 from tests.services.conftest import Board
 
+pytestmark = pytest.mark.live
+
 PALM = {"skins": {"palm": {"port": "stub", "bundle": "square16"}}}
 CONFIG = '[skins.palm]\nport = "stub"\nbundle = "square16"\nnetwork = "none"\n'
 
@@ -214,7 +216,7 @@ class OneFrame:
         pass
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_tare_by_command_is_followed_by_a_calibration_that_outlives_a_crash(
     process: Process, board: Board, bundle: Bundle, runtime: Path
 ) -> None:

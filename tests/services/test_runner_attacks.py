@@ -16,6 +16,8 @@ from protocol.frames import DeltaFrame, StatusFrame
 from tests.services.conftest import Board
 from tests.services.test_runner import ROOT, Process, process  # noqa: F401  (a fixture)
 
+pytestmark = pytest.mark.live
+
 FLOOD = ROOT / "tests" / "protocol" / "flood.py"
 CURED_S = 2.0
 PATIENCE = 5  # times as long on a machine that does other things too
@@ -52,7 +54,7 @@ def keep_feeding(process: Process, board: Board, seconds: float) -> tuple[float,
     return max(longest, time.monotonic() - last), said
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_deleted_sockets_are_bound_anew(process: Process, board: Board, runtime: Path) -> None:  # noqa: F811
     process.connect(board)
     for name in ("preprocessing.ipc", "preprocessing.ctl"):
@@ -63,7 +65,7 @@ def test_deleted_sockets_are_bound_anew(process: Process, board: Board, runtime:
     assert process.control.call("status")["flowing"]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("kind", "socket", "count", "says"),
     [

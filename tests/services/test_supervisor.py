@@ -15,6 +15,8 @@ import pytest
 from services.runtime.config import ROOT, load
 from services.runtime.supervision import programs
 
+pytestmark = pytest.mark.live
+
 UP = """
 import sys
 from services.runtime.config import load

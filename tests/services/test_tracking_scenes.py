@@ -95,9 +95,9 @@ QUICK, REST, MANY = range(2), range(2, 6), range(2, 26)  # seeds: a scene costs 
         (crossing, QUICK, 0),
         (passing, QUICK, 0),
         (meeting, QUICK, 0),
-        pytest.param(crossing, MANY, 12, marks=pytest.mark.slow),
-        pytest.param(passing, REST, 0, marks=pytest.mark.slow),
-        pytest.param(meeting, REST, 0, marks=pytest.mark.slow),
+        pytest.param(crossing, MANY, 12, marks=pytest.mark.release),
+        pytest.param(passing, REST, 0, marks=pytest.mark.release),
+        pytest.param(meeting, REST, 0, marks=pytest.mark.release),
     ],
 )
 def test_ids_are_kept(kind: Callable[[np.random.Generator], Iterator[list[Shape]]], seeds: range, most: int) -> None:

@@ -10,6 +10,8 @@ import zmq
 from protocol.transport import Socket
 from services.runtime.waiting import Waiter
 
+pytestmark = pytest.mark.live
+
 MANY = 40
 
 

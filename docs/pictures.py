@@ -1,4 +1,4 @@
-"""Pictures of the real page for docs/, made beside a service that runs: python -m tests.bridges.pictures ADDRESS
+"""Pictures of the real page for docs/, made beside a service that runs: python docs/pictures.py ADDRESS
 
 page.png, page-narrow.png, and page.webp: ten seconds of a press, a slide, two fingers, and a board that is unplugged.
 
@@ -18,7 +18,7 @@ from typing import Any
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parent
 WEBGL = ["--use-angle=swiftshader-webgl", "--enable-unsafe-swiftshader"]  # drawn by software
 ARGUMENTS = ["--no-sandbox", "--disable-gpu-compositing", *WEBGL]
 SECONDS = 11.0
