@@ -86,7 +86,7 @@ golden: venv-dev
 WITHOUT_TORCH := --allow-subclassing-any --allow-untyped-decorators --no-warn-return-any --no-warn-unused-ignores
 lint: venv-dev
 	$(BIN)/ruff check .
-	$(BIN)/mypy protocol services bridges examples firmware_stub models bench \
+	$(BIN)/mypy protocol services bridges examples firmware_stub models bench simulation \
 	  $$($(BIN)/python -c 'import importlib.util as u; u.find_spec("torch") or print("$(WITHOUT_TORCH)")')
 
 # The documents as a site in build/site; a warning is an error. NO_MKDOCS_2_WARNING: advice of the theme's, not of ours.

@@ -22,8 +22,8 @@ ROOT = Path(__file__).resolve().parents[1]
 REPORT = ROOT / "build" / "check-all.json"
 PYTHON = ".venv/bin/python"
 PYTEST = f"{PYTHON} -m pytest"
-PACKAGES = "g++ libc6-dev cppzmq-dev libmsgpack-cxx-dev chromium fonts-dejavu-core faketime iptables"
-REQUIRED = ("REFERENCE", "BROWSER", "TRAIN", "PLOTS", "PEERS", "FAKETIME", "CPP", "ROS")  # tests/needs.py
+PACKAGES = "g++ libc6-dev cppzmq-dev libmsgpack-cxx-dev chromium fonts-dejavu-core iptables"
+REQUIRED = ("REFERENCE", "BROWSER", "TRAIN", "PLOTS", "PEERS", "CPP", "ROS")  # tests/needs.py
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from bench.speed.service import Outside, Service, running_square
-from bench.speed.simulated_host import SimulatedHost
 from models.pressure import FOAM, disc
 from services.runtime.config import ScanMode
+from simulation.host import SimulatedHost
 
 RADII_MM = (5.0, 10.0, 15.0, 20.0)
 NEWTONS = (0.5, 1.0, 2.0, 3.5, 5.0)

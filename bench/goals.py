@@ -1,10 +1,10 @@
-"""The targets of the benchmarks, beside the measured figures, in every report and on the page of all of them."""
+"""One figure of a report beside what is wanted of it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from rich.table import Table
@@ -12,10 +12,7 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Goal:
-    """One figure. at_most, at_least: its target, None where there is none.
-
-    gate: the same for a short run on a shared machine; only ratios and counts have one, never times. CI fails on it.
-    """
+    """at_most, at_least: the target, None where there is none. gate: what a program may fail on by itself."""
 
     figure: str
     value: float | None
@@ -24,17 +21,14 @@ class Goal:
     gate: float | None = None
 
     @property
-    def met(self) -> bool | None:
-        """None where there is no target."""
-        return self._within(self.at_most, self.at_least)
-
-    @property
     def passed(self) -> bool:
         """Whether the gate, if there is one, lets it through."""
-        if self.gate is None:
-            return True
         low = self.at_least is not None
-        return bool(self._within(None if low else self.gate, self.gate if low else None))
+        return self.gate is None or bool(self._within(None if low else self.gate, self.gate if low else None))
+
+    @property
+    def met(self) -> bool | None:
+        return self._within(self.at_most, self.at_least)
 
     def _within(self, most: float | None, least: float | None) -> bool | None:
         if most is None and least is None:
@@ -54,23 +48,15 @@ class Goal:
         return "not measured" if self.value is None else f"{self.value:.3g}"
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "figure": self.figure,
-            "value": self.value,
-            "at_most": self.at_most,
-            "at_least": self.at_least,
-            "gate": self.gate,
-            "met": self.met,
-            "passed": self.passed,
-        }
+        return asdict(self)
 
     @classmethod
     def from_dict(cls, found: dict[str, Any]) -> Goal:
-        return cls(*(found.get(key) for key in ("figure", "value", "at_most", "at_least", "gate")))  # type: ignore[arg-type]
+        return cls(found["figure"], found["value"], found.get("at_most"), found.get("at_least"))
 
 
 def table(goals: Sequence[Goal]) -> Table:
-    made = Table(title="targets", title_justify="left")
+    made = Table(title="beside targets", title_justify="left")
     for heading in ("figure", "measured", "target", ""):
         made.add_column(heading, justify="right" if heading == "measured" else "left")
     for goal in goals:

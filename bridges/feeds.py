@@ -106,7 +106,7 @@ class ContactFeed:
         if came:
             self._newest.woken(waited_ns)
         try:
-            frame = self._newest.fresh(None, valid=True)
+            frame = self._newest.fresh()
         except NotValid as why:
             self._heard = time.monotonic()
             self._pace.refused()
@@ -124,7 +124,7 @@ class ContactFeed:
         if self._newest is None or time.monotonic() - self._heard < self._newest.silence_s(None):
             return None
         try:
-            self._newest.judge(None, valid=True)
+            self._newest.judge()
         except Stale as why:
             return Refusal(str(why))
         return None

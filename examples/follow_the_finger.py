@@ -27,7 +27,7 @@ def follow(robot: Robot, skin: ContactSubscriber, max_age: float | None = None, 
     trusted: bool | None = None  # what was said last of the skin
     while then - began < seconds:
         try:
-            frame = skin.next_frame(max_age, valid=True)
+            frame = skin.next_frame(max_age)
         except Stale as why:
             if trusted is not False:
                 print(f"holding still: {why}", flush=True)
@@ -46,8 +46,6 @@ def push(contacts: list[Contact]) -> Vector:
     """The fingers' intention as a force [N] on the robot, dead bands taken off."""
     fx = fy = fz = 0.0
     for contact in contacts:
-        if contact.state == "end":
-            continue
         newtons = max(0.0, (contact.force_n or 0.0) - DEAD_N)
         x, y, _ = contact.position
         away = math.hypot(x, y)

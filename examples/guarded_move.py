@@ -25,8 +25,8 @@ EXPECTED_M = 0.025  # contact is expected so near the skin's centre
 def guarded_move(robot: Robot, skin: ContactSubscriber, newtons: float, max_age: float | None = None) -> int:
     try:
         while True:
-            frame = skin.next_frame(max_age, valid=True)
-            contacts = [c for c in frame.contacts if c.state != "end"]
+            frame = skin.next_frame(max_age)
+            contacts = frame.contacts
             if not all(map(expected, contacts)):
                 robot.stop()
                 print(f"contact where none is expected{ago(frame)}:", *map(describe, contacts))
@@ -47,7 +47,7 @@ def back_off(robot: Robot, skin: ContactSubscriber, max_age: float | None) -> in
     top = robot.position[2] + BACK_OFF_M
     while robot.position[2] < top:
         robot.move(BACK)
-        skin.next_frame(max_age, valid=True)
+        skin.next_frame(max_age)
     robot.stop()
     print(f"backed off by {1e3 * BACK_OFF_M:.0f} mm")
     return 2

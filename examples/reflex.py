@@ -65,7 +65,7 @@ def told_s(skin: ContactSubscriber, touch_ns: int, max_age: float | None = None)
     """
     while True:
         try:
-            frame = skin.next_frame(max_age, valid=True)
+            frame = skin.next_frame(max_age)
         except Stale:
             if time.monotonic_ns() < touch_ns - round(1e9 * BEGINS_S):
                 continue
@@ -73,7 +73,7 @@ def told_s(skin: ContactSubscriber, touch_ns: int, max_age: float | None = None)
         after_s = 1e-9 * (time.monotonic_ns() - touch_ns)
         if after_s > HELD_S:
             return None
-        if after_s > 0 and any(contact.state != "end" for contact in frame.contacts):
+        if after_s > 0 and frame.contacts:
             return after_s
 
 
@@ -112,7 +112,7 @@ def main() -> int:
     missed = 0
     try:
         with ContactSubscriber(given.skin, given.endpoint) as skin:
-            skin.latest(valid=True)
+            skin.latest()
             for speed in given.speeds:
                 arm = Arm(speed, given.deceleration, given.stiffness)
                 told = approaches(arm, skin, given.touches, given.seed, given.max_age)

@@ -29,11 +29,11 @@ def main() -> int:
     with ContactSubscriber(given.skin, given.endpoint) as skin:
         while not rospy.is_shutdown():
             try:
-                frame = skin.next_frame(given.max_age, valid=True)
+                frame = skin.next_frame(given.max_age)
             except Stale as why:
                 rospy.logwarn_throttle(1.0, f"nothing is published: {why}")
                 continue
-            contacts = [contact for contact in frame.contacts if contact.state != "end"]
+            contacts = frame.contacts
             if "uncalibrated_force" in frame.reasons or any(contact.force_n is None for contact in contacts):
                 rospy.logwarn_throttle(10.0, "nothing is published: the skin has no force law")
                 continue

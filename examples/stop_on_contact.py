@@ -16,7 +16,7 @@ VELOCITY: Vector = (0.05, 0.0, 0.0)  # m/s
 def stop_on_contact(robot: Robot, skin: ContactSubscriber, max_age: float | None = None) -> int:
     """Each frame, also an empty one, is the permission to move on until the next."""
     try:
-        while not (frame := skin.next_frame(max_age, valid=True)).contacts:
+        while not (frame := skin.next_frame(max_age)).contacts:
             robot.move(VELOCITY)
     except Stale as why:
         robot.stop()

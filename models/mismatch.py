@@ -1,6 +1,6 @@
 """Skins that are not the skin of their file: anisotropic, uneven, mounted off, soft at a touch's edge.
 
-`NAMED` is the set that `skin bench mismatch` measures and that `skin stub --mismatch NAME` simulates. Lengths are model
+`NAMED` is the set that `skin bench accuracy` measures and that `skin stub --mismatch NAME` simulates. Lengths are model
 units unless the name says otherwise; the same Mismatch gives the same sheet on every mesh.
 
     sheet = MismatchedSheet("square16", named("mild"), mesh="stub")

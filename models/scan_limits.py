@@ -28,8 +28,9 @@ Array = NDArray[np.float64]
 
 FORCE_N, RADIUS_M = 2.0, 0.010
 SIZES = (0.5, 1.0)
-"""Standard deviations of a touch's log radius and log drop before anything is measured. bench/speed/reaction_floor.py
-has them from here. Our choice: a fingertip or a tool, of which neither is known."""
+"""Standard deviations of a touch's log radius and log drop before anything is measured. Our choice: a fingertip or a
+tool, of which neither is known.
+"""
 CURRENT_A = 1e-5
 SIGNAL_V = 0.1
 """Amplitude of the least voltage that is measured: 0.01 mA through 10 kohm (docs/hardware.md, "Range")."""

@@ -1,7 +1,7 @@
 """The client for asyncio: as `client.ContactSubscriber`, with `await`.
 
 async with AsyncContactSubscriber("palm") as skin:
-    frame = await skin.latest(valid=True)
+    frame = await skin.latest()
     async for frame in skin: ...
 """
 
@@ -32,34 +32,36 @@ class AsyncContactSubscriber:
         return self._newest.replayed
 
     async def latest(
-        self, max_age: float | None = None, wait_s: float | None = None, *, valid: bool = False
+        self, max_age: float | None = None, wait_s: float | None = None, *, allow_invalid: bool = False
     ) -> ContactFrame:
         """The newest frame, within its own `valid_for_s` and `max_age`; waits for the first one, 1 s at most, or up to
-        `wait_s`. Raises Stale, with `valid` also NotValid.
+        `wait_s`. Raises Stale, or NotValid.
         """
         deadline = None if wait_s is None else time.monotonic() + wait_s
         while True:
             self._newest.take()
             try:
-                return self._newest.judge(max_age, valid)
+                return self._newest.judge(max_age, allow_invalid)
             except Stale:
                 if not await self._wait(self._newest.first_by() if deadline is None else deadline):
                     raise
 
-    async def next_frame(self, max_age: float | None = None, *, valid: bool = False) -> ContactFrame:
+    async def next_frame(self, max_age: float | None = None, *, allow_invalid: bool = False) -> ContactFrame:
         """A frame not given out before. Raises Stale where none has come for `max_age` seconds, or for as long as the
-        newest one was valid for.
+        newest one was valid for; NotValid where it must not be acted on.
         """
         deadline = time.monotonic() + self._newest.silence_s(max_age)
-        while (frame := self._newest.fresh(max_age, valid)) is None:
+        while (frame := self._newest.fresh(max_age, allow_invalid)) is None:
             if not await self._wait(deadline):
                 raise self._newest.stale(max_age)
         return frame
 
-    async def frames(self, max_age: float | None = None, *, valid: bool = False) -> AsyncIterator[ContactFrame]:
-        """`next_frame` for ever. Silence ends it with Stale; begin a new one to go on."""
+    async def frames(
+        self, max_age: float | None = None, *, allow_invalid: bool = False
+    ) -> AsyncIterator[ContactFrame]:
+        """`next_frame` for ever. Silence ends it with Stale, a frame that is not valid with NotValid."""
         while True:
-            yield await self.next_frame(max_age, valid=valid)
+            yield await self.next_frame(max_age, allow_invalid=allow_invalid)
 
     def __aiter__(self) -> AsyncIterator[ContactFrame]:
         return self.frames()

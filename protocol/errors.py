@@ -41,7 +41,6 @@ class EitskinError(Exception):
         ├── ParityError                       an exported network does not compute what PyTorch computes
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── WorldError (ValueError)           no world of this name for a stub's skin
-        ├── UnknownCandidate (ValueError)     no candidate of this name for `skin bench shadow`
         ├── ConfigError                       services: skin.toml cannot be used
         ├── Refused                           a stage does not carry out a command now
         ├── NoBaseline (ValueError)           frames, or a saved state, do not make a baseline
@@ -60,9 +59,7 @@ class EitskinError(Exception):
         ├── ReplayRefused                     the page does not record or replay now
         ├── NotUnderstood (ValueError)        what a page sent is no message
         ├── Malformed (ValueError)            bytes that are no RTPS message, or not one that the bridge reads
-        ├── CliError                          ends a command with one line and an exit code
-        ├── Broken                            bench: a promise was broken under changed bytes
-        └── RosMissing (RuntimeError)         bench: there is no ROS 2 to listen with
+        └── CliError                          ends a command with one line and an exit code
     """
 
 

@@ -73,8 +73,17 @@ def _empty(dtype: str, dimensions: int) -> Any:
 class Heard:
     """What a reader notes of a frame beside its fields: not on the wire, and not set on a frame that was made here."""
 
-    __slots__ = ("valid_as_sent",)
+    __slots__ = ("valid_as_sent", "_ended")
     valid_as_sent: bool  # by the producer, where the reader's `non_finite` hides it
+    _ended: list[Contact]
+
+    @property
+    def ended(self) -> list[Contact]:
+        """Contacts that have ended: a client (client.py) takes them out of `contacts`."""
+        return getattr(self, "_ended", [])
+
+    def note_ended(self, ended: list[Contact]) -> None:
+        self._ended = ended
 
     def note_valid(self, valid: bool) -> None:
         self.valid_as_sent = valid
@@ -101,6 +110,7 @@ class Frame(Heard):
         dict,
         always=True,
     )
+    time_ns: int = wire(Int(0, unit="ns"), "`sample` since 1970, by CLOCK_REALTIME; 0: not known", 0)
     sample_sigma_ns: int = wire(Int(0, unit="ns"), "standard uncertainty of `sample`", 0, always=True)
     source: str = wire(Text(choices=SOURCES), "where the measurements come from", "board", always=True)
     valid: bool = wire(Bool(), "whether the payload may be acted on; false where missing", False)

@@ -84,16 +84,15 @@ class NewestContacts:
         here = frame.host == host_id()  # a stamp of ours says when; one from the future would make it look new for long
         self._measured_ns = self._ages.measured_ns(frame, time.monotonic_ns() if here else received_ns)
         self._frame = frame
-        self._leave_out_unseen_ends(frame)
+        self._take_out_ended(frame)
         return True
 
-    def _leave_out_unseen_ends(self, frame: ContactFrame) -> None:
-        """Leave out the end of a touch that we were never told of."""
+    def _take_out_ended(self, frame: ContactFrame) -> None:
+        """What has ended goes to `ended`, or nowhere where nobody was told that it had begun."""
         if frame.session != self._session:
             self._session, self._seen = frame.session, {}
-        if not frame.contacts:
-            return
-        frame.contacts = [c for c in frame.contacts if c.state != "end" or c.id in self._seen]
+        frame.note_ended([c for c in frame.contacts if c.state == "end" and c.id in self._seen])
+        frame.contacts = [c for c in frame.contacts if c.state != "end"]
         self._seen.update(dict.fromkeys(c.id for c in frame.contacts))
         while len(self._seen) > MOST_SEEN:
             del self._seen[next(iter(self._seen))]
@@ -118,26 +117,26 @@ class NewestContacts:
             return max_age
         return max(SILENCE_S, self._frame.valid_for_s) if self._frame is not None else FIRST_S
 
-    def judge(self, max_age: float | None, valid: bool) -> ContactFrame:
+    def judge(self, max_age: float | None = None, allow_invalid: bool = False) -> ContactFrame:
         """The newest frame where it is at most `max_age` seconds old and within its own `valid_for_s`, else Stale;
-        with `valid`, NotValid where it is not.
+        NotValid where it must not be acted on, unless that is allowed.
         """
         frame, age = self._frame, self._age()
         if frame is None or age is None or not age <= self._limit(max_age):
             raise self.stale(max_age)
-        if valid and not frame.valid:
+        if not (frame.valid or allow_invalid):
             raise NotValid(frame, age)
         return frame
 
-    def fresh(self, max_age: float | None, valid: bool) -> ContactFrame | None:
+    def fresh(self, max_age: float | None = None, allow_invalid: bool = False) -> ContactFrame | None:
         """A frame that has arrived since the last look, as `judge` gives it; None where there is none, or where it is
-        old: it was measured long ago, or lay in the socket while nobody asked. With `valid`, NotValid, of an old one
-        too: it is news that nothing may be acted on.
+        old: it was measured long ago, or lay in the socket while nobody asked. NotValid of an old one too: it is news
+        that nothing may be acted on.
         """
         if not self.take() or self._frame is None:
             return None
         age = self._age()
-        if valid and not self._frame.valid:
+        if not (self._frame.valid or allow_invalid):
             raise NotValid(self._frame, age)
         return self._frame if age is not None and age <= self._limit(max_age) else None
 

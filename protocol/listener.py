@@ -1,6 +1,6 @@
 """Contacts by callback, from a thread of their own.
 
-with ContactListener("palm", on_contact=act, on_stale=lambda why: robot.stop()):
+with ContactListener("palm", on_frame=act, on_stale=lambda why: robot.stop()):
     ...
 """
 
@@ -19,14 +19,14 @@ log = logging.getLogger(__name__)
 
 
 class ContactListener:
-    """Calls `on_contact` with each new valid frame, also when nothing touches, and `on_stale` for each frame that is
+    """Calls `on_frame` with each new valid frame, also when nothing touches, and `on_stale` for each frame that is
     not valid (NotValid) and for every `max_age` seconds of silence: one of them at least every `max_age` seconds.
     Unless given, that is how long the newest frame was valid for (0.25 s of the demo; 1 s for the first frame).
 
     Begins at once; ends with `close`. Both are called from one background thread, one at a time, and should return
     within a frame's time: meanwhile newer frames overtake older ones.
 
-    An exception in `on_contact` is logged and ends the calls of it: a controller that failed is not trusted to go on.
+    An exception in `on_frame` is logged and ends the calls of it: a controller that failed is not trusted to go on.
     From then on `on_stale` is called instead, with the exception as its `__cause__`, and `close` (or the end of the
     `with`) raises it. An exception in `on_stale` is logged and raised in the same way; the calls of it go on.
     """
@@ -34,14 +34,14 @@ class ContactListener:
     def __init__(
         self,
         skin: str,
-        on_contact: Callable[[ContactFrame], object],
+        on_frame: Callable[[ContactFrame], object],
         on_stale: Callable[[Stale], object],
         max_age: float | None = None,
         endpoint: str | None = None,
         *,
         replay: bool = False,
     ) -> None:
-        self._on_contact, self._on_stale, self._max_age = on_contact, on_stale, max_age
+        self._on_frame, self._on_stale, self._max_age = on_frame, on_stale, max_age
         self._subscriber = ContactSubscriber(skin, endpoint, replay=replay)
         self.error: BaseException | None = None
         """The first exception that a callback raised."""
@@ -52,7 +52,7 @@ class ContactListener:
 
     def _serve(self) -> None:
         try:
-            self._subscriber.run(self._contact, self._stale, self._max_age, self._stop)
+            self._subscriber.run(self._frame, self._stale, self._max_age, self._stop)
         except BaseException as fault:  # of the client itself: still nobody may think that all is well
             log.exception("the contact listener ended")
             self._keep(fault)
@@ -60,16 +60,16 @@ class ContactListener:
         finally:
             self._subscriber.close()
 
-    def _contact(self, frame: ContactFrame) -> None:
+    def _frame(self, frame: ContactFrame) -> None:
         if self._failed is not None:
             self._stale(self._failed)
             return
         try:
-            self._on_contact(frame)
+            self._on_frame(frame)
         except BaseException as fault:
-            log.exception("on_contact failed at frame %d: it is not called again", frame.seq)
+            log.exception("on_frame failed at frame %d: it is not called again", frame.seq)
             self._keep(fault)
-            self._failed = _failure("on_contact failed and is not called again", fault)
+            self._failed = _failure("on_frame failed and is not called again", fault)
             self._stale(self._failed)
 
     def _stale(self, why: Stale) -> None:

@@ -114,14 +114,18 @@ class Publisher:
         return sizes.most_common(1)[0][0]
 
     def send(self, frame: Frame) -> bytes:
-        """Publish a frame; its schema, session and seq are set here, and its host where it has none yet: the stamps of
-        one that came from elsewhere are of that host's clock. Returns the message. Never blocks. Raises FrameError.
+        """Publish a frame; its schema, session and seq are set here, and host and time_ns where it has none yet: the
+        stamps of one that came from elsewhere are of that host's clock. Returns the message. Never blocks. Raises
+        FrameError.
         """
         topic = TOPIC_OF[type(frame)]
         name = wire_topic(topic.name, frame.skin)
         key = name.decode()
         frame.schema, frame.session, frame.seq = SCHEMA, self.session, self.sent[key]
-        frame.host = frame.host or host_id()
+        if not frame.host:
+            frame.host = host_id()
+        if not frame.time_ns and frame.host == host_id() and frame.source != "replay" and "sample" in frame.stamps:
+            frame.time_ns = frame.stamps["sample"] + time.time_ns() - time.monotonic_ns()
         message = pack(frame)
         self.poll()
         self.socket.send(message, zmq.NOBLOCK)

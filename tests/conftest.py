@@ -9,7 +9,6 @@ pinned.pin()  # before anything imports numpy
 # ruff: noqa: E402
 import contextlib
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -27,13 +26,9 @@ from tests.waiting import end, until
 ROOT = Path(__file__).resolve().parents[1]
 
 # The same examples every time, so that nothing fails by chance; `make search` looks for others.
-hypothesis.settings.register_profile(
-    "fixed",
-    derandomize=True,
-    database=None,
-    deadline=None,
-    suppress_health_check=[hypothesis.HealthCheck.too_slow],  # says the load
-)
+SAYS_THE_LOAD = [hypothesis.HealthCheck.too_slow]
+FIXED = {"derandomize": True, "database": None, "deadline": None, "suppress_health_check": SAYS_THE_LOAD}
+hypothesis.settings.register_profile("fixed", **FIXED)
 if not os.environ.get("EITSKIN_SEARCH"):
     hypothesis.settings.load_profile("fixed")
 
@@ -67,13 +62,16 @@ def pytest_runtest_setup() -> None:
     pinned.seed()
 
 
+def _folder(patch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A runtime folder with a path short enough for sockets."""
+    with tempfile.TemporaryDirectory(prefix="eit", dir="/tmp", ignore_cleanup_errors=True) as folder:
+        patch.setenv("EITSKIN_RUNTIME", folder)
+        yield Path(folder)
+
+
 @pytest.fixture
 def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A runtime folder of the test's own, with a path short enough for sockets."""
-    folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
-    monkeypatch.setenv("EITSKIN_RUNTIME", str(folder))
-    yield folder
-    shutil.rmtree(folder, ignore_errors=True)
+    yield from _folder(monkeypatch)
 
 
 @pytest.fixture(autouse=True)
@@ -104,35 +102,29 @@ def serving(folder: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
         command = [sys.executable, str(ROOT / "skin"), "up", *options]
         environment = {**os.environ, "EITSKIN_RUNTIME": str(folder)}
         process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+    try:
+        reader = NewestReader("contact", "palm", f"ipc://{folder}/publisher.ipc")
         try:
-            reader = NewestReader("contact", "palm", f"ipc://{folder}/publisher.ipc")
-            try:
-                until(lambda: (frame := reader.recv(1.0)) is not None and frame.valid, process)
-            except AssertionError as error:
-                raise AssertionError((folder / "log.txt").read_text()) from error
-            reader.close()
-            yield process
-        finally:
-            end(process)
+            until(lambda: (frame := reader.recv(1.0)) is not None and frame.valid, process)
+        except AssertionError as error:
+            raise AssertionError((folder / "log.txt").read_text()) from error
+        reader.close()
+        yield process
+    finally:
+        end(process)
 
 
 @pytest.fixture
 def service(runtime: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """The whole service, in a runtime folder of the test's own."""
     with serving(runtime) as process:
         yield process
 
 
 @contextlib.contextmanager
 def _shared(without: bool, scan: str = "full") -> Iterator[Path]:
-    folder = Path(tempfile.mkdtemp(prefix="eit", dir="/tmp"))
-    try:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("EITSKIN_RUNTIME", str(folder))
-            with serving(folder, *(("--config", str(without_recorder(folder, scan))) if without else ())):
-                yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with pytest.MonkeyPatch.context() as patch, contextlib.contextmanager(_folder)(patch) as folder:
+        with serving(folder, *(("--config", str(without_recorder(folder, scan))) if without else ())):
+            yield folder
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +136,5 @@ def shared_service() -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def service_that_nobody_hears(request: pytest.FixtureRequest) -> Iterator[Path]:
-    """The same without recorder. Parametrized by how it scans."""
     with _shared(without=True, scan=request.param) as folder:
         yield folder

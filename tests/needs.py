@@ -1,9 +1,6 @@
 """What tests need beyond the packages of `make venv-dev`. Where it is missing, a test is skipped with one line that
-says how to get it, and the end of the run counts what was skipped by what is missing. CI names in the environment what
-it must have ($EITSKIN_REQUIRE_TRAIN and so on): there a test that lacks it fails.
-
-    def test_the_line_compiles():
-        needs.CPP.here()
+says how to get it, and the end of the run counts what was skipped by what is missing. A run that must have something
+says so in the environment ($EITSKIN_REQUIRE_TRAIN and so on): there a test that lacks it fails.
 """
 
 from __future__ import annotations
@@ -24,26 +21,19 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Need:
-    """Packages, programs and files, all of which there must be. get: how. required: the variable by which CI
-    insists.
-    """
+    """Packages, programs and files, all of which there must be. required: the variable by which a run insists."""
 
     get: str
     required: str = ""
-    packages: Sequence[str] = ()  # as they are imported
+    packages: Sequence[str] = ()
     programs: Sequence[str] = ()
     files: Sequence[Path] = ()
 
-    def missing(self) -> list[str]:
-        return [
-            *(name for name in self.packages if importlib.util.find_spec(name) is None),
-            *(name for name in self.programs if shutil.which(name) is None),
-            *(str(file) for file in self.files if not file.is_file()),
-        ]
-
     def here(self) -> None:
         """Goes on where all is there; else skips the test, or the whole file that calls this while it is imported."""
-        if missing := self.missing():
+        missing = [name for name in self.packages if importlib.util.find_spec(name) is None]
+        missing += [name for name in self.programs if shutil.which(name) is None]
+        if missing := missing + [str(file) for file in self.files if not file.is_file()]:
             self.lack(", ".join(missing))
 
     def lack(self, what: str) -> None:
@@ -56,27 +46,18 @@ class Need:
 
 TRAIN = Need("`make venv-dev EXTRAS=train`", "EITSKIN_REQUIRE_TRAIN", packages=["torch"])
 PLOTS = Need("`make venv-dev EXTRAS=plots`", "EITSKIN_REQUIRE_PLOTS", packages=["matplotlib"])
-PEERS = Need("`make venv-dev EXTRAS=peers`", "EITSKIN_REQUIRE_PEERS", packages=["pyeit", "distributed", "zenoh"])
 RERUN = Need("`.venv/bin/pip install 'rerun-sdk>=0.41'`", "EITSKIN_REQUIRE_RERUN", packages=["rerun"])
-CHROMIUM = Need(
-    "`apt-get install chromium`, or $EITSKIN_CHROMIUM names one",
-    "EITSKIN_REQUIRE_BROWSER",
-    programs=[os.environ.get("EITSKIN_CHROMIUM") or "chromium"],
-)
+BROWSER = os.environ.get("EITSKIN_CHROMIUM") or "chromium"
+GET_BROWSER = "`apt-get install chromium`, or $EITSKIN_CHROMIUM names one"
+CHROMIUM = Need(GET_BROWSER, "EITSKIN_REQUIRE_BROWSER", programs=[BROWSER])
+NODE = Need("`apt-get install nodejs`", programs=["node"])
 SUPERUSER = Need("run the tests as root, in a container of their own")
-CPP = Need(
-    "`apt-get install g++ cppzmq-dev libmsgpack-cxx-dev`",
-    "EITSKIN_REQUIRE_CPP",
-    programs=["g++"],
-    files=[Path("/usr/include/zmq.hpp"), Path("/usr/include/msgpack.hpp")],
-)
+GET_CPP = "`apt-get install g++ cppzmq-dev libmsgpack-cxx-dev`"
+HEADERS = [Path("/usr/include/zmq.hpp"), Path("/usr/include/msgpack.hpp")]
+CPP = Need(GET_CPP, "EITSKIN_REQUIRE_CPP", programs=["g++"], files=HEADERS)
 ROS_PYTHON = Path(os.environ.get("EITSKIN_ROS_PYTHON") or ROOT / ".venv-ros" / "bin" / "python")
 ROS_2 = Need("`make ros-venv` (270 MB), or $EITSKIN_ROS_PYTHON names one", "EITSKIN_REQUIRE_ROS", files=[ROS_PYTHON])
-ROS_1 = Need("`apt-get install python3-rospy python3-roslaunch python3-geometry-msgs`", programs=["roscore"])
 SYSTEMD = Need("`apt-get install systemd`", programs=["systemd-analyze"])
-FAKETIME = Need("`apt-get install faketime`", "EITSKIN_REQUIRE_FAKETIME", programs=["faketime"])
-CURVE = Need("a pyzmq whose libzmq has it, as PyPI's wheels do")
-
 REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE") or ROOT / ".." / "shared" / "data").resolve()
 
 
@@ -89,7 +70,7 @@ def reference(name: str) -> Path:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, Any, Any]:
-    """A file that was skipped is named itself, not needs.py: tests in several processes count equal reports once."""
+    """A file that was skipped is named itself: tests in several processes count equal reports once."""
     report = yield
     if report.skipped:
         report.longrepr = (str(collector.path), *report.longrepr[1:])
@@ -97,13 +78,8 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, A
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """What was not run, counted by what is missing: the last lines of `make test`. A file counts once."""
-    tests: Counter[str] = Counter()
-    files: Counter[str] = Counter()
-    for report in terminalreporter.stats.get("skipped", []):
-        reason = report.longrepr[2] if isinstance(report.longrepr, Sequence) else str(report.longrepr)
-        (files if isinstance(report, pytest.CollectReport) else tests)[str(reason).removeprefix("Skipped: ")] += 1
-    for reason in sorted({*tests, *files}):
-        counts = ((tests[reason], "test"), (files[reason], "whole file"))
-        said = " and ".join(f"{n} {what}{'s' if n > 1 else ''}" for n, what in counts if n)
-        terminalreporter.write_line(f"not run, {said}: {reason}")
+    """What was not run, counted by what is missing: last lines of `make test`. A skipped file counts one."""
+    said = [report.longrepr for report in terminalreporter.stats.get("skipped", [])]
+    reasons = Counter(str(s[2] if isinstance(s, Sequence) else s).removeprefix("Skipped: ") for s in said)
+    for reason, count in sorted(reasons.items()):
+        terminalreporter.write_line(f"not run, {count}: {reason}")

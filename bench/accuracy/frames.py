@@ -4,11 +4,10 @@ Noise-free impedances of named groups of scenes, kept in bench/work under the ar
 
     shapes      one touch of each of the five shapes, sizes, drops and places of models.scenes.TARGETS
     hertz       one soft round touch
-    two, three  that many touches with gaps of at least 0.1
-    apart       two circles of radius 0.15 and drop 0.3 at gaps from 0.02 to 0.6
+    two, three, four  that many touches that begin together, with gaps of at least 0.1 (four: of radius 0.16 to 0.28)
     force       circles of radius 0.2, drops 0.1 to 0.5, anywhere
     ldci-S-D    the paper's 49 positions at spacing S, radius 0.2, drop D (ten solved, 49 by symmetry)
-    eidors      the single touches of shared/data/eidors_reference.npz, where it is there
+    eidors      the single touches of eidors_reference.npz in $EITSKIN_REFERENCE, where it is there
 """
 
 from __future__ import annotations
@@ -28,15 +27,20 @@ from models.scenes import TARGETS, random_scene
 from models.shapes import CLASSES, Array, Shape, from_rows, to_rows
 from models.symmetries import symmetries as skin_symmetries
 
-REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data")) / "eidors_reference.npz"
+DATA = Path(os.environ.get("EITSKIN_REFERENCE", "../shared/data"))
+"""The folder of data that nobody here made up."""
+EIDORS = DATA / "eidors_reference.npz"
 SKIN = "square16"
 NOISE_FREE = 1e-6
 LDCI = [(spacing, drop) for spacing in (0.2, 0.25) for drop in (0.15, 0.85)]
+MOST = 4  # touches of a scene
+SEVERAL = {"two": 2, "three": 3, "four": 4}
+SINGLE = ("shapes", "hertz", "force")
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """N scenes: group (N,) names, shapes (N, 3, 7), impedances of both patterns with each frame's own untouched ones.
+    """N scenes: group (N,) names, shapes (N, 4, 7), impedances of both patterns with each frame's own untouched ones.
 
     pairs, pairs0 (N, 120) and adjacent, adjacent0 (N, 208), ohm.
     """
@@ -58,6 +62,9 @@ class Frames:
     def scene(self, k: int) -> list[Shape]:
         return from_rows(self.shapes[k])
 
+    def part(self, index: NDArray[np.int64] | list[int]) -> Frames:
+        return Frames(*(getattr(self, f)[index] for f in self.__dataclass_fields__))
+
     def __add__(self, other: Frames) -> Frames:
         both = ((getattr(self, f), getattr(other, f)) for f in self.__dataclass_fields__)
         return Frames(*(np.concatenate(pair) for pair in both))
@@ -73,20 +80,15 @@ def scenes(seed: int, n: int, singles: int | None = None) -> list[tuple[str, lis
     for kind in CLASSES:
         made += [("shapes", random_scene(rng, replace(TARGETS, kinds=(kind,)), n=1)) for _ in range(singles)]
     made += [("hertz", random_scene(rng, replace(TARGETS, kinds=("hertz",)), n=1)) for _ in range(n // 2)]
-    for name, count in (("two", 2), ("three", 3)):
-        made += [(name, random_scene(rng, TARGETS, n=count)) for _ in range(n)]
-    for gap in np.linspace(0.02, 0.6, n):
-        turn, middle = rng.uniform(0, np.pi), rng.uniform(-0.2, 0.2, 2)
-        step = (0.3 + gap) / 2 * np.array([np.cos(turn), np.sin(turn)])
-        pair = [Shape("circle", x, y, 0.15, 0.3) for x, y in (middle - step, middle + step)]
-        made.append(("apart", pair))
+    for name in ("two", "three"):
+        made += [(name, random_scene(rng, TARGETS, n=SEVERAL[name])) for _ in range(n)]
     force = replace(TARGETS, kinds=("circle",), radius=(0.2, 0.2))
     made += [("force", random_scene(rng, force, n=1)) for _ in range(singles)]
     for spacing, drop in LDCI:
         places = metrics.ldci_positions(spacing)
         octant = places[(places[:, 0] >= -1e-9) & (places[:, 1] >= -1e-9) & (places[:, 0] >= places[:, 1] - 1e-9)]
         made += [(f"ldci-{spacing}-{drop}", [Shape("circle", x, y, 0.2, drop)]) for x, y in octant]
-    return made
+    return made + [("four", random_scene(rng, replace(TARGETS, radius=(0.16, 0.28)), n=4)) for _ in range(n)]
 
 
 def symmetries() -> list[tuple[Array, NDArray[np.int64]]]:
@@ -132,7 +134,7 @@ def _solve(wanted: list[tuple[str, list[Shape]]], mesh: str, path: Path) -> Fram
                 continue
             seen.add(place)
             z = [np.abs(solution.impedances(back[pattern])) for pattern in (pair, adjacent)]
-            rows.append((name, to_rows(moved), z[0], z[1]))
+            rows.append((name, to_rows(moved, MOST), z[0], z[1]))
         if k % 10 == 9 or k == len(wanted) - 1:
             group, shapes, pairs, adjacents = (np.array([r[i] for r in rows]) for i in range(4))
             partial = path.with_suffix(".part.npz")
@@ -157,11 +159,11 @@ def load(
     WORK.mkdir(exist_ok=True)
     wanted = [s for s in scenes(seed, n, singles) if not only or s[0] in only]
     many = f"-singles{singles}" if singles else ""
-    frames = _solve(wanted, mesh, WORK / f"frames-{'-'.join((mesh, *only))}-seed{seed}-n{n}{many}.npz")
+    frames = _solve(wanted, mesh, WORK / f"frames4-{'-'.join((mesh, *only))}-seed{seed}-n{n}{many}.npz")
     if only:
         return frames
     frames = _ordered(frames)
-    return frames + eidors() if REFERENCE.exists() else frames
+    return frames + eidors() if EIDORS.exists() else frames
 
 
 def _ordered(frames: Frames) -> Frames:
@@ -172,19 +174,18 @@ def _ordered(frames: Frames) -> Frames:
         places = frames.shapes[index, 0, 1:3]
         for place in metrics.ldci_positions(spacing):
             order.append(int(index[np.linalg.norm(places - place, axis=1).argmin()]))
-    return Frames(*(getattr(frames, f)[order] for f in frames.__dataclass_fields__))
+    return frames.part(order)
 
 
 def eidors() -> Frames:
     """The single touches of the EIDORS scenes; their untouched frame is A0."""
-    with np.load(REFERENCE) as file:
+    with np.load(EIDORS) as file:
         one = np.flatnonzero(np.isfinite(file["shapes"][:, 0, 0]) & ~np.isfinite(file["shapes"][:, 1, 0]))
         pairs, adjacent, shapes = np.abs(file["impedance_pairs"]), np.abs(file["impedance_adjacent"]), file["shapes"]
     n = len(one)
-    group = np.full(n, "eidors")
-    return Frames(
-        group, shapes[one], pairs[one], np.tile(pairs[0], (n, 1)), adjacent[one], np.tile(adjacent[0], (n, 1))
-    )
+    rows = np.array([to_rows(from_rows(shapes[k]), MOST) for k in one])
+    untouched = np.tile(pairs[0], (n, 1)), np.tile(adjacent[0], (n, 1))
+    return Frames(np.full(n, "eidors"), rows, pairs[one], untouched[0], adjacent[one], untouched[1])
 
 
 @dataclass(frozen=True)

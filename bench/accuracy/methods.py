@@ -17,6 +17,7 @@ from models.bundle import Bundle
 from models.forward import ForwardModel
 from models.prereconstruction import THRESHOLD_T, noise_of_frames
 from models.shapes import Array
+from services.runtime.config import Skin
 
 PUBLISHED = ROOT / "bench" / "published"
 N = 48  # pixels a side of the classical images
@@ -101,7 +102,9 @@ def classical() -> list[Method]:
 
 
 def peers() -> list[Method]:
-    """pyEIT's three, on the adjacent pattern's frames."""
+    """pyEIT's three, on the adjacent pattern's frames; none where it is not installed."""
+    if not _peers.installed():
+        return []
     made: dict[tuple[str, float | None], _peers.PyEIT] = {}
 
     def row(label: str, method: str, values: tuple[float, ...] = ()) -> Method:
@@ -150,25 +153,22 @@ def published(bundle: Bundle) -> list[Method]:
     return [row(name, PUBLISHED / file) for name, file in files.items() if (PUBLISHED / file).exists()]
 
 
-def shipped(bundle: Bundle) -> list[Method]:
-    """The bundle's networks as mere images, without the stages that make contacts of them."""
+def network_alone(bundle: Bundle) -> list[Method]:
+    """The image of the network that runs by default, without the stages that make contacts of it."""
+    path = bundle.network_path(Skin.model_fields["network"].default)
+    if path is None:
+        return []
+    network = session(path)
 
-    def row(variant: str) -> Method:
-        path = bundle.network_path(variant)
-        assert path is not None
-        network = session(path)
+    def build(tare: Tare, value: float | None) -> Image:
+        pre = bundle.prereconstructor()
+        operator = pre.condition(tare.sigma)
 
-        def build(tare: Tare, value: float | None) -> Image:
-            pre = bundle.prereconstructor()
-            operator = pre.condition(tare.sigma)
+        def image(z: Array) -> Array:
+            stack, context, scale = operator.stack(pre.difference(z, tare.pairs0))
+            drop = network.run(["drop"], {"stack": stack[None], "context": context[None]})[0]
+            return np.asarray(drop[0, 0] * scale)
 
-            def image(z: Array) -> Array:
-                stack, context, scale = operator.stack(pre.difference(z, tare.pairs0))
-                drop = network.run(["drop"], {"stack": stack[None], "context": context[None]})[0]
-                return np.asarray(drop[0, 0] * scale)
+        return image
 
-            return image
-
-        return Method(f"shipped, {variant}: image alone", build, gain=False)
-
-    return [row(variant) for variant in ("full", "fast") if bundle.network_path(variant) is not None]
+    return [Method("eitskin, its network alone", build, gain=False)]

@@ -6,6 +6,7 @@ impedances of its own model. Images come out in its own units; the benchmark sca
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from importlib.metadata import version
 
@@ -18,16 +19,18 @@ from models.shapes import Array
 SIDE_CELLS = 40  # electrodes at multiples of a quarter fall on nodes
 
 
+def installed() -> bool:
+    return importlib.util.find_spec("pyeit") is not None
+
+
 def name() -> str:
     return f"pyEIT {version('pyeit')}"
 
 
 class PyEIT:
-    """Three of pyEIT's methods on the square skin: "jac", "greit", "bp". `value`: its `lamb`. pairs: our pattern, in
-    which every pair of electrodes measures itself, instead of its own.
-    """
+    """Three of pyEIT's methods on the square skin: "jac", "greit", "bp". `value`: its `lamb`."""
 
-    def __init__(self, method: str, value: float | None = None, n: int = 48, pairs: bool = False) -> None:
+    def __init__(self, method: str, value: float | None = None, n: int = 48) -> None:
         import pyeit.eit.protocol as protocol
         from pyeit.eit.bp import BP
         from pyeit.eit.fem import EITForward
@@ -42,13 +45,8 @@ class PyEIT:
         el_pos = np.linalg.norm(nodes[None] - centres[:, None], axis=2).argmin(1)
         middle = (SIDE_CELLS // 2) * (SIDE_CELLS + 2)
         mesh = PyEITMesh(nodes, _triangles(SIDE_CELLS), 1.0, el_pos, int(middle))
-        if pairs:
-            both = patterns.pattern("pairs", 16)
-            plan = protocol.PyEITProtocol(both[:, :2], both[:, None, 2:], np.ones(len(both), dtype=bool))
-            self.rows = np.arange(len(both))
-        else:
-            plan = protocol.create(16, dist_exc=1, step_meas=1, parser_meas="std")
-            self.rows = _rows(plan)
+        plan = protocol.create(16, dist_exc=1, step_meas=1, parser_meas="std")
+        self.rows = _rows(plan)
         self.v0 = EITForward(mesh, plan).solve_eit()
         self.method, self.n = method, n
         if method == "jac":

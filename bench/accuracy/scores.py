@@ -1,4 +1,4 @@
-"""Figures of one method at one noise level, from its images of the test frames."""
+"""Figures of one method at one noise level: of its images of the test frames, and of the contacts that it makes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.accuracy import frames as _frames
-from bench.accuracy.frames import Frames
+from bench.accuracy.frames import LDCI, SEVERAL, SINGLE, Frames
 from models import metrics
-from models.shapes import Array
+from models.shapes import CLASSES, Array
 
 Row = dict[str, Any]
+METRES_PER_UNIT = 0.05  # of square16
+LARGE = 0.25  # radius from which on shape classes are scored
+FAR = 10.0  # per cent of the side: a contact that is so far off is told where nothing touches
 
 
 def score_mask(image: Array, frames: Frames, k: int) -> float:
@@ -22,8 +24,8 @@ def score_mask(image: Array, frames: Frames, k: int) -> float:
     return metrics.iou(np.any(metrics.touch_masks(image, scene), axis=0), truth)[0]
 
 
-def summarise(images: Array, frames: Frames, index: NDArray[np.int64], gain: tuple[float, float] | None) -> Row:
-    """Figures of a method at one noise level. gain: for the peak, and for the integrated drop."""
+def of_images(images: Array, frames: Frames, index: NDArray[np.int64], gain: tuple[float, float] | None = None) -> Row:
+    """index: of the frames that the images are of. gain: for the peak, and for the integrated drop."""
     group = frames.group[index]
     rows = [
         {} if g.startswith("ldci") else metrics.score(image, frames.scene(k))
@@ -34,44 +36,78 @@ def summarise(images: Array, frames: Frames, index: NDArray[np.int64], gain: tup
     def column(name: str, *groups: str) -> Array:
         return np.array([r[name] for r, g in zip(rows, group, strict=True) if g in groups and name in r])
 
-    position = metrics.of_side(column("position", "shapes", "hertz", "force"))
     force = np.flatnonzero(np.isin(group, ["force"]))
     scenes = [frames.scene(int(index[k]))[0] for k in force]
     peaks, sums = (np.array([f(images[k]) for k in force]) for f in (np.max, metrics.integrated))
-    force_error = metrics.relative_error(peaks * peak_gain, [s.drop for s in scenes])
-    integral_error = metrics.relative_error(sums * integral_gain, [s.integral for s in scenes])
-    out: Row = {
-        "frames": int(np.count_nonzero(~np.char.startswith(group, "ldci"))),
-        "mean_iou": column("mean_iou", "shapes").mean(),
-        "contact_iou": column("contact_iou", "shapes").mean(),
-        "mean_iou_eidors": column("mean_iou", "eidors").mean() if (group == "eidors").any() else None,
-        "position_%": position.mean(),
-        "position_rms_%": np.sqrt((position**2).mean()),
-        "position_p95_%": np.percentile(position, 95),
-        "force_%": force_error.mean(),
-        "force_rms_%": np.sqrt((force_error**2).mean()),
-        "integral_%": integral_error.mean(),
-        "integral_rms_%": np.sqrt((integral_error**2).mean()),
-        "correlation": column("correlation", "shapes").mean(),
-        "ssim": column("ssim", "shapes").mean(),
-        "count_%": 100 * np.mean(_right(rows, group)),
-    }
-    spread = {
+    values = {
         "mean_iou": column("mean_iou", "shapes"),
         "contact_iou": column("contact_iou", "shapes"),
-        "position_%": position,
-        "force_%": force_error,
-        "integral_%": integral_error,
+        "position_%": metrics.of_side(column("position", *SINGLE)),
+        "force_%": metrics.relative_error(peaks * peak_gain, [s.drop for s in scenes]),
+        "integral_%": metrics.relative_error(sums * integral_gain, [s.integral for s in scenes]),
     }
-    out |= {f"{name}_se": standard_error(values) for name, values in spread.items()}
-    for name in ("AR", "PE", "RES", "SD", "RNG"):
-        out[f"greit_{name}"] = column(f"greit_{name}", "shapes").mean()
-    out.update(_ldci(images.max((1, 2)), group))
-    apart = np.flatnonzero(group == "apart")
-    if apart.size > 3:
-        gaps = [gap_of(frames, int(index[k])) for k in apart]
-        out["separation"] = metrics.separation(gaps, [rows[k]["count"] == 2 for k in apart])
-    return {k: None if v is None else float(v) for k, v in out.items()}
+    row: Row = {"frames": int(np.count_nonzero(~np.char.startswith(group, "ldci")))}
+    row |= {name: float(of.mean()) for name, of in values.items()}
+    row |= {f"{name}_se": standard_error(of) for name, of in values.items()}
+    row |= {name.replace("%", "rms_%"): rms(of) for name, of in values.items() if name.endswith("%")}
+    row["position_p95_%"] = float(np.percentile(values["position_%"], 95))
+    for name in ("correlation", "ssim"):
+        row[name] = float(column(name, "shapes").mean())
+    if (group == "eidors").any():
+        row["mean_iou_eidors"] = float(column("mean_iou", "eidors").mean())
+    row |= counts(np.array([int(r.get("count", 0)) for r in rows]), group)
+    for spacing, drop in LDCI:
+        name = f"ldci-{spacing}-{drop}"
+        mine = images[group == name]
+        row[name] = metrics.ldci(mine.max((1, 2))) if len(mine) == 49 else None
+    return row
+
+
+def counts(counted: NDArray[np.int64], group: NDArray[np.str_]) -> Row:
+    """Shares of frames whose touches are counted right: of two or three together, and of one, two, three and four."""
+    wanted = {**dict.fromkeys(SINGLE, 1), **SEVERAL}
+    right = np.array([wanted.get(str(g)) == n for g, n in zip(group, counted, strict=True)])
+    row: Row = {}
+    for key, groups in (
+        ("count_%", ("two", "three")),
+        ("single_%", SINGLE),
+        *((f"{name}_%", (name,)) for name in SEVERAL),
+    ):
+        some = np.isin(group, groups)
+        row[key] = 100 * float(right[some].mean()) if some.any() else None
+    return row
+
+
+def of_contacts(found: dict[str, Array], frames: Frames) -> Row:
+    """Position, force, count and shape as `skin reconstruct` gives them; of touches that are shown, and how many are
+    not.
+    """
+    singles = [k for k in frames.of(*SINGLE) if found["count"][k] >= 1]
+    missed = len(frames.of(*SINGLE)) - len(singles)
+    off = [np.hypot(*(found["position"][k, 0] / METRES_PER_UNIT - frames.scene(k)[0].centroid)) for k in singles]
+    distance = metrics.of_side(np.array(off or [np.nan]))
+    newton = {k: frames.scene(k)[0].force(METRES_PER_UNIT) for k in singles}
+    force = [k for k in frames.of("force") if np.isfinite(found["force"][k, 0])]
+    errors = metrics.relative_error([found["force"][k, 0] for k in force], [newton[k] for k in force])
+    within = [abs(found["force"][k, 0] - newton[k]) <= found["force_sigma"][k, 0] for k in singles]
+    large = [k for k in singles if frames.group[k] == "shapes" and frames.scene(k)[0].radius >= LARGE]
+    named = np.array([CLASSES[frames.scene(k)[0].shape_class] == str(found["shape"][k, 0]) for k in large], dtype=float)
+    return {
+        **counts(found["count"].astype(int), frames.group),
+        "missed": missed,
+        "far": int((distance > FAR).sum()),
+        "not_valid": int((~found["valid"][frames.of(*SINGLE, *SEVERAL)].astype(bool)).sum()),
+        "position_%": float(distance.mean()),
+        "position_%_se": standard_error(distance),
+        "position_rms_%": rms(distance),
+        "position_p95_%": float(np.percentile(distance, 95)),
+        "force_%": float(errors.mean()) if len(errors) else None,
+        "force_%_se": standard_error(errors),
+        "force_rms_%": rms(errors),
+        "force_within_%": 100 * float(np.mean(within)) if within else None,
+        "shape_%": 100 * float(named.mean()) if len(named) else None,
+        "shape_%_se": 100 * standard_error(named),
+    }
 
 
 def standard_error(values: Array) -> float:
@@ -79,16 +115,5 @@ def standard_error(values: Array) -> float:
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
 
-def gap_of(frames: Frames, k: int) -> float:
-    a, b = frames.scene(k)
-    return float(np.hypot(a.x - b.x, a.y - b.y) - a.radius - b.radius)
-
-
-def _right(rows: list[dict[str, float]], group: NDArray[np.str_]) -> list[bool]:
-    wanted = {"two": 2, "three": 3}
-    return [r["count"] == wanted[g] for r, g in zip(rows, group, strict=True) if g in wanted]
-
-
-def _ldci(peaks: Array, group: NDArray[np.str_]) -> dict[str, float | None]:
-    names = [f"ldci-{spacing}-{drop}" for spacing, drop in _frames.LDCI]
-    return {name: metrics.ldci(peaks[group == name]) if (group == name).sum() == 49 else None for name in names}
+def rms(values: Array) -> float:
+    return float(np.sqrt((values**2).mean())) if len(values) else float("nan")

@@ -1,16 +1,18 @@
-"""Latency: from the last byte of a scan that the board writes to a controller's recv, hop by hop, beside the floor.
+"""Latency, CPU and scale: what a contact's way costs, of one skin and of many.
 
-    skin bench latency [--seconds 20] [--controllers 1 4 16] [--parts-only]
+    skin bench latency [--quick] [--sections hops stages scale] [--seconds 20]
 
-Real processes, the stub's board behind its serial device, a plain pyzmq controller; then the same with a real-time
-priority, where this machine grants one. The floor is the same stages on the same frames in one process without
-sockets, each frame as it arrives: equally cold, and under the same load of the machine. Scans in parts are measured
-too, with the CPU that they cost (latency_parts.py). Prints tables, writes latency.json and draws latency.png.
+hops: real processes, the stub's board behind its serial device, a plain pyzmq controller: from the last byte of a scan
+or part that the board writes to the controller's recv, hop by hop, and the CPU of the four processes; whole scans and
+parts; with 16 controllers too, one of them stopped. stages: the same stages in one process, with and without the rules
+that skip work, and their memory. scale: many skins on one set of processes, each a recording of the stub's board played
+at its own rate (bench/speed/scale.py). Prints tables, writes latency.json and draws latency.png.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import signal
 import subprocess
@@ -18,12 +20,11 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import zmq
 from rich.console import Console
 from rich.table import Table
 
@@ -32,27 +33,34 @@ from bench import goals as _goals
 from bench.goals import Goal
 from bench.json_file import drawn, write_json
 from bench.machine import machine, provenance
-from bench.speed import latency_parts
-from bench.speed.service import BEGIN, Outside, Service, end_on_sigterm, running_square
+from bench.speed import scale
+from bench.speed.recorded import QUIET_S, SCENES, recorded
+from bench.speed.service import BEGIN, Service, end_on_sigterm, running_square
+from models.bundle import Bundle
 from models.command import real, whole
-from protocol.frames import RawFrame, TruthFrame
-from protocol.sockets import AllReader
-from services.pipeline import Pipeline
-from services.runtime.config import Skin
+from protocol.frames import ContactFrame, Frame, RawFrame, TruthFrame, pack, unpack
+from protocol.transport import Context
+from services.pipeline import build_stages
+from services.runtime.config import ScanMode, Skin, TouchConfig
 from services.runtime.stage import PROCESSES
 
+SECTIONS = ("hops", "stages", "scale")
+SCANS: tuple[ScanMode, ...] = ("full", "rolling")
 HOPS = ("acquire", "preprocess", "infer", "publish", "receive")
-TARGET_MS = {"p50": 2.0, "p99": 5.0}
-HOP_MS = 0.15  # what a hop between processes may cost
+TARGET_MS = {"p50_ms": 2.0, "p99_ms": 5.0}
+CORES = {"untouched": 0.30, "still": 0.5, "moving": 1.0}  # of the four processes, scans in parts
 UNNOTICED = 1.1  # p50 with more controllers over one's
-FLOORS, NOTICED = 10.0, 2.0  # a short run's gates: p50 over the floor's, p50 with more controllers over one's
-PRIORITY = 20  # SCHED_FIFO, of the rows that say so
-REFUSED = "Not measured: a real-time priority, which this machine refuses (`ulimit -r`, CAP_SYS_NICE)."
-SETTLE_S = 2.0
-TARE_S = 6.0
+CONTROLLERS = 16
+SETTLE_S = 3.0
+ROUNDS = 3  # the least CPU of so many counts
+VARIANTS = {
+    "all rules": TouchConfig(),
+    "no rule": TouchConfig(skip_untouched=False, hold=False),
+    "held images averaged over symmetries": TouchConfig(symmetry=True),
+}
+PLAIN = frozenset({"delta", "image", "contact"})  # what somebody subscribes to
 CONTROLLER = """
 import sys, zmq
-from models.command import real, whole
 s = zmq.Context.instance().socket(zmq.SUB)
 s.setsockopt(zmq.CONFLATE, 1)
 s.connect(sys.argv[1])
@@ -62,69 +70,83 @@ while True:
 """
 
 
-@dataclass
-class Sample:
-    """n frames: hops (n, 5) and floor (n,), ms. Hops add up to what was seen outside."""
+# -- hops -------------------------------------------------------------------------------------------------------------
+def hops(seconds: float, more: int) -> list[dict[str, Any]]:
+    """A row for each scan mode and scene; of a moving touch in whole scans, one with `more` controllers too."""
+    rows = []
+    for scan in SCANS:
+        with running_square(scan) as service:
+            socket = Context.instance().socket(zmq.SUB)
+            socket.setsockopt(zmq.RCVHWM, 100_000)
+            for process, topic in (("publisher", b"contact/palm\0"), ("stub", b"truth/palm\0")):
+                socket.connect(f"ipc://{service.folder}/{process}.ipc")
+                socket.subscribe(topic)
+            for scene, begin in BEGIN.items():
+                begin(service)
+                heard(socket, SETTLE_S)
+                rows.append({"scan": scan, "scene": scene, **of_one(service, socket, seconds)})
+            if more > 1 and scan == "full":
+                with controllers(more - 1, service):
+                    heard(socket, SETTLE_S)
+                    name = f"moving, {more} controllers, one stopped"
+                    rows.append({"scan": scan, "scene": name, **of_one(service, socket, seconds)})
+            socket.close(0)
+    return rows
 
-    hops: NDArray[np.float64]
-    floor: NDArray[np.float64]
 
-    @property
-    def outside(self) -> NDArray[np.float64]:
-        return np.asarray(self.hops.sum(axis=1))
-
-
-class Watch:
-    """A controller, and the floor beside it."""
-
-    def __init__(self, service: Service) -> None:
-        self.contacts = Outside("contact", "palm", service.folder)
-        self.others = AllReader(["raw", "truth"], "palm")
-        self.floor = Pipeline(Skin(port="stub", bundle="square16", frame_id="palm"))
-
-    def sample(self, seconds: float) -> Sample:
-        raw: dict[int, RawFrame] = {}
-        written: dict[int, int] = {}
-        seen: dict[int, tuple[dict[str, int], int]] = {}  # scan -> stamps, when received
-        hops, floor = [], []
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            if got := self.contacts.recv(0.2):
-                seen[got[0]["scan"]] = got[0]["stamps"], got[1]
-            while frame := self.others.recv():
-                if isinstance(frame, RawFrame):
-                    raw[frame.scan] = frame
-                elif isinstance(frame, TruthFrame):
-                    written[frame.scan] = frame.stamps["publish"]
-            for scan in seen.keys() & raw.keys() & written.keys():
-                hops.append(chain(*seen.pop(scan), written.pop(scan)))
-                began = time.perf_counter()
-                self.floor.run(raw.pop(scan))
-                floor.append((time.perf_counter() - began) * 1e3)
-                self.floor.prepare()
-        return Sample(np.array(hops), np.array(floor))
-
-    def close(self) -> None:
-        self.contacts.close()
-        self.others.close()
+def of_one(service: Service, socket: zmq.Socket[bytes], seconds: float) -> dict[str, Any]:
+    cpu, began = service.cpu_s(), time.monotonic()
+    messages = heard(socket, seconds)
+    took = time.monotonic() - began
+    used = {name: (after - cpu[name]) / took for name, after in service.cpu_s().items()}
+    written, received = dict[int, int](), dict[int, tuple[dict[str, int], int]]()
+    for message, at_ns in messages:
+        frame = unpack(message)
+        if isinstance(frame, TruthFrame):
+            written[frame.scan] = frame.stamps["publish"]
+        elif isinstance(frame, ContactFrame):
+            received[frame.scan] = frame.stamps, at_ns
+    found = [chain(*received[scan], written[scan]) for scan in received.keys() & written.keys()]
+    each = np.array(found or [[np.inf] * len(HOPS)])
+    whole_ms = each.sum(axis=1)
+    return {
+        "frames": len(found),
+        "rate_hz": len(received) / took,
+        "backwards": int((each < 0).any(axis=1).sum()),
+        "p50_ms": float(np.percentile(whole_ms, 50)),
+        "p99_ms": float(np.percentile(whole_ms, 99)),
+        "hops_p50_ms": dict(zip(HOPS, np.median(each, axis=0).tolist(), strict=True)),
+        "cores": sum(used[name] for name in PROCESSES),
+        "cores_by_process": used,
+    }
 
 
 def chain(stamps: dict[str, int], received: int, written: int) -> list[float]:
-    """Milliseconds of each of HOPS; the first is from the board's last byte to acquisition's frame."""
+    """Milliseconds of each of HOPS; the first is from the board's last byte to acquisition's frame. A part goes to the
+    publisher without inference, which takes no time of it.
+    """
+    stamps = {"infer": stamps["preprocess"], **stamps}
     times = [written, *(stamps[key] for key in ("read", "preprocess", "infer", "publish")), received]
-    hops = [b - a for a, b in zip(times, times[1:], strict=False)]
-    return [hop * 1e-6 for hop in hops]
+    return [1e-6 * (b - a) for a, b in zip(times, times[1:], strict=False)]
+
+
+def heard(socket: zmq.Socket[bytes], seconds: float) -> list[tuple[bytes, int]]:
+    """(message, when it came) of so long; nothing is decoded meanwhile."""
+    found, end = [], time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        if socket.poll(int(1000 * left) + 1):
+            found.append((socket.recv(), time.monotonic_ns()))
+    return found
 
 
 @contextmanager
-def controllers(n: int, service: Service, stopped: bool = False) -> Iterator[None]:
+def controllers(n: int, service: Service) -> Iterator[None]:
     """n further controllers, each a process of its own; one of them stopped by SIGSTOP."""
     address = f"ipc://{service.folder}/publisher.ipc"
     made = [subprocess.Popen([sys.executable, "-c", CONTROLLER, address]) for _ in range(n)]
     try:
         time.sleep(SETTLE_S)
-        if stopped:
-            made[0].send_signal(signal.SIGSTOP)
+        made[0].send_signal(signal.SIGSTOP)
         yield
     finally:
         for process in made:
@@ -132,121 +154,111 @@ def controllers(n: int, service: Service, stopped: bool = False) -> Iterator[Non
             process.wait()
 
 
-def run(seconds: float, counts: list[int], priority: bool) -> tuple[dict[str, Sample], list[str]]:
-    """(sample of each condition, what could not be measured)"""
-    found: dict[str, list[Sample]] = {}
-    with running_square("full") as service:
-        watch = Watch(service)
-        watch.sample(TARE_S)  # the floor takes its baseline
-        for _ in range(2):  # each condition twice: the machine's load changes
-            _scenes(service, watch, seconds / 2, found)
-            many = [n for n in counts if n > 1]
-            for n, stopped in [*((n, False) for n in many), *((n, True) for n in many[-1:])]:
-                name = f"moving, {n} controllers" + (", one stopped" if stopped else "")
-                BEGIN["moving"](service)
-                with controllers(n - 1, service, stopped):
-                    watch.sample(SETTLE_S)
-                    found.setdefault(name, []).append(watch.sample(seconds / 2))
-            service.stub("release")
-            service.stub("scene", name="demo")
-        watch.close()
-    left_out = [REFUSED] if priority and not _with_priority(seconds, found) else []
-    return {
-        name: Sample(np.concatenate([p.hops for p in parts]), np.concatenate([p.floor for p in parts]))
-        for name, parts in found.items()
-    }, left_out
-
-
-def _scenes(service: Service, watch: Watch, seconds: float, found: dict[str, list[Sample]], how: str = "") -> None:
-    for scene, begin in BEGIN.items():
-        begin(service)
-        watch.sample(SETTLE_S)
-        found.setdefault(scene + how, []).append(watch.sample(seconds))
-
-
-def _with_priority(seconds: float, found: dict[str, list[Sample]]) -> bool:
-    """The scenes with [realtime] priority; False where the processes did not get it."""
-    with running_square("full", f"[realtime]\npriority = {PRIORITY}\n") as service:
-        pids = service.pids()
-        if any(os.sched_getscheduler(pids[name]) != os.SCHED_FIFO for name in PROCESSES):
-            return False
-        watch = Watch(service)
-        watch.sample(TARE_S)
-        _scenes(service, watch, seconds, found, f", SCHED_FIFO {PRIORITY}")
-        watch.close()
-    return True
-
-
-def figures(sample: Sample) -> dict[str, Any]:
-    p50, p99 = (float(np.percentile(sample.outside, q)) for q in (50, 99))
-    floor = float(np.median(sample.floor))
-    return {
-        "frames": len(sample.hops),
-        "backwards": int((sample.hops < 0).any(axis=1).sum()),
-        "p50_ms": p50,
-        "p99_ms": p99,
-        "floor_p50_ms": floor,
-        "floor_p99_ms": float(np.percentile(sample.floor, 99)),
-        "hops_p50_ms": dict(zip(HOPS, np.median(sample.hops, axis=0).tolist(), strict=True)),
-        "hops_p99_ms": dict(zip(HOPS, np.percentile(sample.hops, 99, axis=0).tolist(), strict=True)),
-        "per_hop_above_floor_ms": (p50 - floor) / 4,
-    }
-
-
-def goals(rows: dict[str, dict[str, Any]]) -> list[Goal]:
-    """The gates are ratios: to the floor of the same run, and of one condition to another."""
-    found = []
-    for name, row in rows.items():
-        found.append(Goal(f"{name}: p50, ms", row["p50_ms"], at_most=TARGET_MS["p50"]))
-        found.append(Goal(f"{name}: p99, ms", row["p99_ms"], at_most=TARGET_MS["p99"]))
-        found.append(Goal(f"{name}: stamps that go backwards", row["backwards"], at_most=0, gate=0))
-        if "SCHED_FIFO" in name:  # the floor has the usual priority
-            continue
-        found.append(Goal(f"{name}: p50 above the floor, ms a hop", row["per_hop_above_floor_ms"], at_most=HOP_MS))
-        found.append(Goal(f"{name}: p50 of floor's", row["p50_ms"] / row["floor_p50_ms"], gate=FLOORS))
-    alone = rows["moving"]["p50_ms"]
-    for name, row in rows.items():
-        if "controllers" in name:
-            figure = f"{name}: p50, of one controller's"
-            found.append(Goal(figure, row["p50_ms"] / alone, at_most=UNNOTICED, gate=NOTICED))
-    return found
-
-
-def table(rows: dict[str, dict[str, Any]]) -> Table:
-    made = Table(title=f"board's last byte to controller's recv, ms, {machine()}", title_justify="left")
-    for heading in ("", "frames", "p50", "p99", "floor p50", "floor p99", "a hop above it", *HOPS):
-        made.add_column(heading, justify="left" if not heading else "right")
-    for name, row in rows.items():
-        cells = [row["p50_ms"], row["p99_ms"], row["floor_p50_ms"], row["floor_p99_ms"], row["per_hop_above_floor_ms"]]
-        cells += row["hops_p50_ms"].values()
-        made.add_row(name, str(row["frames"]), *(f"{v:.2f}" for v in cells))
+def hops_table(rows: list[dict[str, Any]]) -> Table:
+    made = Table(title=f"board's last byte to a controller's recv, ms, {machine()}", title_justify="left")
+    for heading in ("scan", "scene", "frames/s", "p50", "p99", *HOPS, "cores"):
+        made.add_column(heading, justify="left" if heading in ("scan", "scene") else "right")
+    for row in rows:
+        cells = [row["rate_hz"], row["p50_ms"], row["p99_ms"], *row["hops_p50_ms"].values(), row["cores"]]
+        made.add_row(row["scan"], row["scene"], *(f"{value:.2f}" for value in cells))
     return made
+
+
+# -- stages -----------------------------------------------------------------------------------------------------------
+def stages(seconds: float, rounds: int) -> dict[str, Any]:
+    """CPU ms of a whole scan's frame by variant and scene, the stages in one process, frames packed and unpacked
+    between them as on the wire; and by how much resident memory grows between the first round and the last.
+    """
+    bundle, scenes = Bundle.load("square16"), {name: recorded("full", name, seconds) for name in SCENES}
+    used: dict[str, dict[str, float]] = {}
+    memory = []
+    for _ in range(rounds):  # the variants in turns: the machine's load changes
+        for name, touch in VARIANTS.items():
+            for scene in SCENES:
+                skin, row = Skin(port="stub", bundle="square16", touch=touch), used.setdefault(name, {})
+                ms = one_process(scenes[scene], skin, bundle)
+                row[scene] = min(ms, row.get(scene, np.inf))
+        gc.collect()
+        memory.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6)
+    frames = rounds * len(VARIANTS) * sum(len(each) for each in scenes.values())
+    return {"cpu_ms": used, "frames": frames, "memory_mb": memory, "growth": memory[-1] / memory[0] - 1}
+
+
+def one_process(frames: list[RawFrame], skin: Skin, bundle: Bundle) -> float:
+    """CPU ms a frame, after the quiet time."""
+    chained, used = build_stages("palm", skin, bundle), []
+    for raw in frames:
+        data = pack(raw)
+        began = time.thread_time()
+        for stage in chained:
+            made: list[Frame] = stage.everything(unpack(data), PLAIN)
+            for frame in made:
+                frame.stamps.setdefault(stage.stamp, time.monotonic_ns())
+            data = [pack(frame) for frame in made][0]
+        if raw.stamps["sample"] * 1e-9 > QUIET_S:
+            used.append(time.thread_time() - began)
+        for stage in chained:
+            stage.prepare()
+    return 1e3 * float(np.mean(used))
+
+
+def stages_table(found: dict[str, Any]) -> Table:
+    made = Table(title=f"stages with their wire in one process, CPU ms a whole scan, {machine()}", title_justify="left")
+    for heading in ("", *SCENES):
+        made.add_column(heading, justify="right" if heading else "left")
+    for name, row in found["cpu_ms"].items():
+        made.add_row(name, *(f"{row[scene]:.2f}" for scene in SCENES))
+    return made
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+def goals(found: dict[str, Any]) -> list[Goal]:
+    made = []
+    for row in found.get("hops", []):
+        name = f"{'whole scans' if row['scan'] == 'full' else 'in parts'}, {row['scene']}"
+        made += [Goal(f"{name}: {key[:3]}, ms", row[key], at_most=most) for key, most in TARGET_MS.items()]
+        most = CORES.get(row["scene"]) if row["scan"] == "rolling" else None
+        made.append(Goal(f"{name}: cores, four processes", row["cores"], at_most=most))
+        made.append(Goal(f"{name}: stamps that go backwards", row["backwards"], at_most=0))
+        if "controllers" in name:
+            alone = next(r for r in found["hops"] if r["scan"] == row["scan"] and r["scene"] == "moving")
+            made.append(Goal(f"{name}: p50, of one controller's", row["p50_ms"] / alone["p50_ms"], at_most=UNNOTICED))
+    if "stages" in found:
+        ours = found["stages"]["cpu_ms"]["all rules"]
+        for scene, most in (("untouched", 0.25), ("still", 0.5)):
+            made.append(Goal(f"stages, {scene}: CPU of a moving touch's", ours[scene] / ours["moving"], at_most=most))
+        made.append(Goal("growth of the stages' memory", found["stages"]["growth"], at_most=0.01))
+    return made + scale.goals(found.get("scale", []))
 
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench latency", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=list(SECTIONS))
     parser.add_argument("--seconds", type=real(), default=20.0, help="of each condition")
-    parser.add_argument("--controllers", type=whole(), nargs="+", default=[1, 4, 16])
-    parser.add_argument("--parts-only", action="store_true", help="scans in parts alone; writes no report")
-    parser.add_argument("--usual-priority", action="store_true", help="without the rows of a real-time priority")
+    parser.add_argument("--skins", type=whole(), nargs="+", default=[1, 4, 16, 32], help="whole scans")
+    parser.add_argument("--in-parts", type=whole(), nargs="+", default=[1, 2, 4, 8], help="skins whose scans come so")
+    parser.add_argument("--touched", type=real(itself=True), default=0.25, help="share of the skins")
+    parser.add_argument("--quick", action="store_true", help="4 s of each condition, fewer skins and controllers")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
     end_on_sigterm()
-    parts = latency_parts.measured(args.seconds)
-    Console(width=150).print(latency_parts.table(parts))
-    if args.parts_only:
-        Console(width=150).print(_goals.table(latency_parts.goals(parts)))
-        return 0
-    samples, left_out = run(args.seconds, sorted(args.controllers), not args.usual_priority)
-    rows = {name: figures(sample) for name, sample in samples.items()}
-    Console(width=150).print(table(rows))
-    wanted = [*goals(rows), *latency_parts.goals(parts)]
-    Console(width=150).print(_goals.table(wanted))
-    for line in left_out:
-        print(line)
-    report = {**provenance("latency", argv), "targets": [goal.to_dict() for goal in wanted], "rows": rows}
-    report |= {"left_out": left_out, "parts": parts}
-    write_json(args.out / "latency.json", report)
+    console, found = Console(width=150), dict[str, Any]()
+    seconds, more = (4.0, 4) if args.quick else (args.seconds, CONTROLLERS)
+    if "hops" in args.sections:
+        found["hops"] = hops(seconds, more)
+        console.print(hops_table(found["hops"]))
+    if "stages" in args.sections:
+        found["stages"] = stages(seconds, 2 if args.quick else ROUNDS)
+        console.print(stages_table(found["stages"]))
+    if "scale" in args.sections:
+        counts = {"full": [1, 4], "rolling": [1]} if args.quick else {"full": args.skins, "rolling": args.in_parts}
+        found["scale"] = [scale.scaled(n, s, args.touched, seconds) for s in SCANS for n in counts[s]]
+        console.print(scale.table(found["scale"]))
+    wanted = goals(found)
+    console.print(_goals.table(wanted))
+    write_json(
+        args.out / "latency.json", provenance("latency", argv) | {"targets": [g.to_dict() for g in wanted]} | found
+    )
     drawn(args.out / "latency.json")
     print(f"wrote {args.out / 'latency.json'}")
     return 0

@@ -1,70 +1,81 @@
-"""Reaction: from the instant a touch begins, or ends, to the contact frame that says so, live on the stub's board.
+"""Reaction: from the instant a touch begins, or ends, to the contact frame that says so.
 
-    skin bench reaction [--steps 500] [--modes full rolling] [--simulated] [--quick]
-    skin bench reaction --steps 100 --more    so many other touches, added to those of the last report (in parts alone:
-                                              --modes rolling)
+    skin bench reaction [--steps 90] [--modes full rolling] [--quick]      in simulated time
+    skin bench reaction --live [--priority 20] [--busy] [--baud 2000000]   real processes and a plain controller
 
-Real processes and a plain controller. The stub plays a scene that it has solved beforehand and says when it began, so
-every onset is known on this host's clock. A touch is *in place* with the first valid frame, neither `changing` nor
-`coarse`, from which every frame until the release is within 3 % of the side. It is *seen near* with the first valid
-frame that has a contact so near, `changing` and `coarse` ones included; that frame's stamps say where its time went.
---simulated: board and stages in one process and in simulated time, 2 ms after the board's last byte, whatever else the
-machine does. Prints the tables, writes reaction.json and reaction.png, or reaction_simulated.json and
-reaction_simulated.png.
+A touch is *in place* with the first valid frame, neither `changing` nor `coarse`, from which every frame until the
+release is within 3 % of the side. It is *seen near* with the first valid frame that has a contact so near, `changing`
+and `coarse` ones included. In simulated time board and stages are in one process, whose answer comes 2 ms after the
+board's last byte, whatever else the machine does. Live, the stub plays a scene that it has solved beforehand and says
+when it began, so every onset is known on this host's clock, and the frame's stamps say where its time went; --priority:
+of the processes, as [realtime] of skin.toml; --busy: beside one program for each core that does nothing but count.
+Prints the tables, writes reaction.json, or reaction_live.json, and draws it.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import subprocess
+import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zmq
+from numpy.typing import NDArray
 from rich.console import Console
+from rich.table import Table
 
 from bench import REPORTS
 from bench import goals as _goals
-from bench.json_file import write_json
-from bench.machine import provenance
-from bench.speed.reaction_events import SIDE_M, Reaction, SeenFrame, TouchEvent, events, react, scene
-from bench.speed.reaction_pieces import Piece, joined, keep, kept, piece_seed
-from bench.speed.reaction_report import (
-    FAST_RAMP,
-    LIGHT,
-    SEVERAL,
-    SLIDING,
-    SLOW_RAMP,
-    SNR_DB,
-    STEP,
-    draw,
-    goals,
-    rows,
-    stated,
-    stated_table,
-    sums,
-    sums_table,
-    table,
-)
+from bench.goals import Goal
+from bench.json_file import drawn, write_json
+from bench.machine import machine, provenance
+from bench.speed.reaction_events import KINDS, Reaction, SeenFrame, TouchEvent, events, react, scene
 from bench.speed.service import Service, end_on_sigterm, running_square
-from bench.speed.simulated_host import SimulatedHost
-from models import manifest
 from models.command import whole
 from protocol.frames import ContactFrame, unpack
 from protocol.sockets import ControlClient
 from protocol.transport import Context
 from services.runtime.config import ScanMode
+from simulation.host import SimulatedHost
 
 MODES: tuple[ScanMode, ...] = ("full", "rolling")
-STEPS, RAMPS, SLIDES, PAIRS = 500, 40, 40, 40
-QUICK = 8
+STEP, LIGHT = KINDS[0].name, KINDS[1].name
+STEPS, QUICK = 90, 8
+SHARES = {STEP: 1.0, LIGHT: 0.2}  # of the steps; of every other kind OTHERS
+OTHERS = 0.08
+SNR_DB = 80.0
 IDLE_S = 0.35
 """Between two touches."""
 SOLVE_S = 600.0
 BASELINE_S = 7.0
+# of scans in parts: key, what, target ms
+TARGETS = {
+    STEP: (
+        ("contact_p50_ms", "to a valid contact, median", 12.0),
+        ("contact_p99_ms", "the same, p99", 25.0),
+        ("gone_p50_ms", "release, median", 15.0),
+        ("gone_p99_ms", "release, p99", 30.0),
+    ),
+    LIGHT: (("contact_p50_ms", "to a valid contact, median", 18.0), ("contact_p90_ms", "the same, p90", 35.0)),
+    **{
+        kind.name: (("near_p50_ms", "all near, median", 40.0), ("contact_p50_ms", "all in place, median", 40.0))
+        for kind in KINDS
+        if kind.touches > 1
+    },
+}
+PIECES = ("to its middle", "line", "preprocessing", "inference", "publisher", "recv")
+"""Between an onset, the steps of STEPS_TO_RECV and recv: until the middle of the scan or part that tells of the touch
+was measured; the rest of it, the line and acquisition; each stage with the hop to it; the hop to the controller.
+"""
+Found = list[tuple[TouchEvent, Reaction]]
 
 
 class Ear(threading.Thread):
@@ -93,11 +104,8 @@ class Ear(threading.Thread):
         return self.heard
 
 
-def measured(
-    mode: ScanMode, counts: dict[str, int], seed: int, more: str = ""
-) -> tuple[list[tuple[TouchEvent, Reaction]], int]:
+def live(mode: ScanMode, plan: list[TouchEvent], more: str) -> tuple[Found, int]:
     """What a controller saw of each event, and how often the stub had no pose ready. more: sections of skin.toml."""
-    plan = events(counts, IDLE_S, seed)
     with tempfile.TemporaryDirectory(prefix="eitskin-reaction") as folder:
         script = Path(folder) / "reaction.toml"
         script.write_text(scene(plan))
@@ -111,12 +119,16 @@ def measured(
                 time.sleep(0.2)
             late = int(stub.call("status")["late_poses"]) - late
             heard = ear.end()
-    return scored(plan, [(at - start_ns, message) for at, message in heard], start_ns), late
+    frames: list[SeenFrame] = []
+    for at, message in heard:
+        frame = unpack(message)
+        assert isinstance(frame, ContactFrame)
+        frames.append(SeenFrame((at - start_ns) * 1e-9, (frame.stamps["sample"] - start_ns) * 1e-9, frame))
+    return by_event(plan, frames), late
 
 
-def simulated(mode: ScanMode, counts: dict[str, int], seed: int) -> tuple[list[tuple[TouchEvent, Reaction]], int]:
-    """The same without processes: what `SimulatedHost` would have handed to a controller."""
-    plan = events(counts, IDLE_S, seed)
+def simulated(mode: ScanMode, plan: list[TouchEvent], seed: int) -> tuple[Found, int]:
+    """The same without processes."""
     host = SimulatedHost(mode, snr_db=SNR_DB, seed=seed)
     host.until(BASELINE_S)
     with tempfile.TemporaryDirectory(prefix="eitskin-reaction") as folder:
@@ -130,17 +142,7 @@ def simulated(mode: ScanMode, counts: dict[str, int], seed: int) -> tuple[list[t
     return by_event(plan, seen), host.rig.field.late
 
 
-def scored(plan: list[TouchEvent], heard: list[tuple[int, bytes]], start_ns: int) -> list[tuple[TouchEvent, Reaction]]:
-    """heard: (ns of the scene, message), in order."""
-    frames: list[SeenFrame] = []
-    for at, message in heard:
-        frame = unpack(message)
-        assert isinstance(frame, ContactFrame)
-        frames.append(SeenFrame(at * 1e-9, (frame.stamps["sample"] - start_ns) * 1e-9, frame))
-    return by_event(plan, frames)
-
-
-def by_event(plan: list[TouchEvent], frames: list[SeenFrame]) -> list[tuple[TouchEvent, Reaction]]:
+def by_event(plan: list[TouchEvent], frames: list[SeenFrame]) -> Found:
     received = [seen.received for seen in frames]
     ends = [event.onset for event in plan[1:]] + [plan[-1].end + 1.0]
     found = []
@@ -150,71 +152,130 @@ def by_event(plan: list[TouchEvent], frames: list[SeenFrame]) -> list[tuple[Touc
     return found
 
 
+@contextmanager
+def counting(programs: int) -> Iterator[None]:
+    """So many programs do nothing but count until the block ends."""
+    running = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(programs)]
+    try:
+        yield
+    finally:
+        for each in running:
+            each.kill()
+            each.wait()
+
+
+def rows(mode: str, found: Found, is_live: bool) -> list[dict[str, Any]]:
+    """is_live: stages stamped their frames by the clock of the scene."""
+    made = []
+    for kind in KINDS:
+        of = [reaction for event, reaction in found if event.kind is kind]
+        if not of:
+            continue
+        row: dict[str, Any] = {"mode": mode, "kind": kind.name, "touches": len(of), **waited(of)}
+        row["wrong"] = sum(each.wrong for each in of)
+        row["late"] = sum(each.late for each in of)
+        for name, key in (("errors_m", "moving_mm"), ("held_m", "held_mm"), ("held_force", "held_force")):
+            values = np.array([value for each in of for value in getattr(each, name)])
+            row[key] = (1e3 if key.endswith("mm") else 1.0) * _quantile(values, 50)
+        if ends := [[0.0, *r.near_after_s, r.near_s] for r in of if r.near_after_s and is_live]:
+            pieces = 1e3 * np.median(np.diff(ends, axis=1), axis=0)
+            row["pieces_ms"] = dict(zip(PIECES, pieces.tolist(), strict=True))
+        made.append(row)
+    return made
+
+
+def waited(of: Sequence[Reaction]) -> dict[str, Any]:
+    """How long until each was in place, near and gone [ms]; one that never was counts as after every other."""
+    row: dict[str, Any] = {}
+    for what in ("contact", "near", "gone"):
+        ms = 1e3 * np.array([getattr(each, f"{what}_s") for each in of])
+        ms = np.where(np.isnan(ms), np.inf, ms)
+        row |= {f"{what}_seen": int(np.isfinite(ms).sum())}
+        row |= {f"{what}_p{q}_ms": _quantile(ms, q) for q in (50, 90, 99)}
+    return row
+
+
+def _quantile(values: NDArray[np.float64], q: float) -> float:
+    return float(np.percentile(values, q, method="higher")) if len(values) else float("nan")
+
+
+def goals(table: Sequence[dict[str, Any]], late: dict[str, int]) -> list[Goal]:
+    found = []
+    for row in table:
+        name = f"{row['mode']}: {row['kind']}"
+        found.append(Goal(f"{name}: share seen in place", row["contact_seen"] / row["touches"], at_least=1.0))
+        if row["mode"] == "rolling":  # the other is what it is compared with
+            found += [Goal(f"{name}: {w}, ms", row[key], at_most=m) for key, w, m in TARGETS.get(row["kind"], ())]
+        found.append(Goal(f"{name}: contacts before it, off by over 3 sigma", row["wrong"], at_most=0))
+    for mode, count in late.items():
+        found.append(Goal(f"{mode}: poses that the stub had not solved", count, at_most=0))
+    return found
+
+
+def tables(of: Sequence[dict[str, Any]]) -> list[Table]:
+    made = Table(title=f"force leaves zero (or is back) to a controller's recv, ms, {machine()}", title_justify="left")
+    headings = ("scan", "touch", "n", "in place", "p50", "p90", "p99", "first near p50", "p99", "release p50", "p99")
+    for heading in (*headings, "off > 3 sigma", "late", "mm at recv, moving", "held mm", "force"):
+        made.add_column(heading, justify="left" if heading in ("scan", "touch") else "right")
+    parts = Table(title="force leaves zero to the first frame near it: medians of the pieces, ms", title_justify="left")
+    for heading in ("scan", "touch", *PIECES):
+        parts.add_column(heading, justify="left" if heading in ("scan", "touch") else "right")
+    for row in of:
+        times = [row[f"contact_p{q}_ms"] for q in (50, 90, 99)]
+        times += [row[f"{what}_p{q}_ms"] for what in ("near", "gone") for q in (50, 99)]
+        errors = [f"{row[key]:.2f}" if np.isfinite(row[key]) else "" for key in ("moving_mm", "held_mm", "held_force")]
+        cells = [f"{value:.1f}" if np.isfinite(value) else "-" for value in times]
+        seen = f"{row['contact_seen']}/{row['touches']}"
+        counts = str(row["wrong"]), str(row["late"])
+        made.add_row(row["mode"], row["kind"], str(row["touches"]), seen, *cells, *counts, *errors)
+        if "pieces_ms" in row:
+            parts.add_row(row["mode"], row["kind"], *(f"{ms:.1f}" for ms in row["pieces_ms"].values()))
+    return [made, parts] if parts.row_count else [made]
+
+
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="skin bench reaction", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--steps", type=whole(), default=STEPS, help="of 2 N; the others in proportion")
     parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES))
-    parser.add_argument("--simulated", action="store_true", help="in simulated time, without processes")
-    parser.add_argument("--baud", type=whole(), help="of the board's line; default: as skin.toml's")
+    parser.add_argument("--live", action="store_true", help="real processes, in real time")
+    parser.add_argument("--baud", type=whole(), help="of the live board's line")
+    parser.add_argument("--priority", type=whole(1), help="of the live processes (SCHED_FIFO)")
+    parser.add_argument("--busy", action="store_true", help="a program that counts on each core, live")
     parser.add_argument("--seed", type=whole(0), default=1)
-    parser.add_argument("--more", action="store_true", help="add so many other touches to those of the last report")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} steps and a few of the others")
     parser.add_argument("--out", type=Path, default=REPORTS)
     args = parser.parse_args(argv)
+    if not args.live and (args.baud or args.priority or args.busy):
+        parser.error("--baud, --priority and --busy are of --live")
     end_on_sigterm()
-    if args.simulated and args.baud:
-        parser.error("--baud is of the live board's line: without --simulated")
-    name, before = "reaction_simulated" if args.simulated else "reaction", list[Piece]()
-    if args.more:
-        try:
-            before = kept(name, args.seed, args.modes)
-        except ValueError as why:
-            parser.error(str(why))
-    pieces = [*before, _piece(args, len(before))]
-    if not args.quick:
-        keep(pieces, name)
-    found, late = joined(pieces)
-    result = [row for mode, each in found.items() for row in rows(mode, each)]
-    Console(width=190).print(table(result))
-    pieces_of = [row for mode, each in found.items() for row in sums(mode, each)]
-    if pieces_of:
-        Console(width=150).print(sums_table(pieces_of))
-    honest = [row for mode, each in found.items() for row in stated(mode, each)]
-    Console(width=150).print(stated_table(honest))
-    listed = goals(result, late)
-    Console(width=150).print(_goals.table(listed))
-    report = {**provenance("reaction", argv), "targets": [goal.to_dict() for goal in listed], "rows": result}
-    report |= {"stated": honest, "sums": pieces_of, "runs": [piece.row() for piece in pieces]}
-    report |= {"side_m": SIDE_M, "simulated": args.simulated}
-    report |= {
-        "contact_ms": {m: [1e3 * r.contact_s for e, r in each if e.kind.name == STEP] for m, each in found.items()}
-    }
-    write_json(args.out / f"{name}.json", report)
-    draw(found, args.out / f"{name}.png")
-    for said in report["runs"]:
-        print(
-            f"{said['steps']} steps, {' and '.join(said['modes'])}; {sum(said['late_poses'].values())} late poses; "
-            f"load of the machine {said['load'][0]:.1f} to {said['load'][1]:.1f}"
-        )
-    print(f"wrote {args.out / name}.json and {name}.png")
-    return 0
-
-
-def _piece(args: argparse.Namespace, number: int) -> Piece:
-    """One run."""
     steps = QUICK if args.quick else args.steps
-    wanted = {STEP: STEPS, LIGHT: STEPS // 5, FAST_RAMP: RAMPS, SLOW_RAMP: RAMPS}
-    wanted |= dict.fromkeys(SLIDING, SLIDES) | dict.fromkeys(SEVERAL, PAIRS)
-    counts = {name: max(2, round(n * steps / STEPS)) for name, n in wanted.items()}
-    piece = Piece(piece_seed(args.seed, number), counts[STEP], load=[os.getloadavg()[0]], commit=manifest.commit())
+    plan = events({k.name: max(2, round(steps * SHARES.get(k.name, OTHERS))) for k in KINDS}, IDLE_S, args.seed)
+    more = f"baud = {args.baud}\n" if args.baud else ""
+    more += f"[realtime]\npriority = {args.priority}\n" if args.priority else ""
+    found: dict[str, Found] = {}
+    late: dict[str, int] = {}
     for mode in args.modes:  # each on the same touches
-        if args.simulated:
-            piece.found[mode], piece.late[mode] = simulated(mode, counts, piece.seed)
-        else:
-            baud = f"baud = {args.baud}\n" if args.baud else ""
-            piece.found[mode], piece.late[mode] = measured(mode, counts, piece.seed, baud)
-        piece.load.append(os.getloadavg()[0])
-    return piece
+        with counting(len(os.sched_getaffinity(0)) if args.busy else 0):
+            found[mode], late[mode] = live(mode, plan, more) if args.live else simulated(mode, plan, args.seed)
+    result = [row for mode, each in found.items() for row in rows(mode, each, args.live)]
+    console = Console(width=190)
+    for table in tables(result):
+        console.print(table)
+    listed = goals(result, late)
+    console.print(_goals.table(listed))
+    steps_ms = {
+        mode: {
+            what: [1e3 * getattr(r, f"{what}_s") for e, r in each if e.kind.name == STEP]
+            for what in ("contact", "gone")
+        }
+        for mode, each in found.items()
+    }
+    report = {**provenance("reaction", argv), "targets": [goal.to_dict() for goal in listed], "rows": result}
+    path = args.out / f"reaction{'_live' if args.live else ''}.json"
+    write_json(path, {**report, "live": args.live, "steps_ms": steps_ms})
+    drawn(path)
+    print(f"wrote {path}")
+    return 0
 
 
 if __name__ == "__main__":

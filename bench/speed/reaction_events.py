@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -47,7 +47,6 @@ KINDS = (
 )
 SLIDE_M = 0.05
 APART_M = 0.03  # at least, from middle to middle of touches that begin at once
-ONSET_S = 0.02
 HELD_S = 0.15  # from its onset on, after which a step is held
 SETTLED_S = 0.2  # a sliding touch stays still for so long before it moves
 
@@ -76,11 +75,6 @@ class TouchEvent:
     def at(self, t: float) -> tuple[float, float]:
         since = max(0.0, min(t, self.end) - self.moves)
         return self.x + since * self.velocity[0], self.y + since * self.velocity[1]
-
-    def force(self, t: float) -> float:
-        """At t s of the scene."""
-        times, forces = [key[0] for key in self.keys], [key[3] for key in self.keys]
-        return float(np.interp(t, times, forces, left=0.0, right=0.0))
 
     @property
     def released(self) -> float:
@@ -151,24 +145,6 @@ def scene(of: Sequence[TouchEvent]) -> str:
     return "\n".join(parts) + "\n"
 
 
-PHASES: dict[str, Callable[[TouchEvent, float], bool]] = {
-    "onset, 20 ms": lambda event, t: t < event.onset + ONSET_S,
-    "held": lambda event, t: event.onset + HELD_S + event.kind.ramp_s < t < min(event.moves, event.released),
-    "sliding": lambda event, t: event.moves < t < event.released,
-}
-
-
-@dataclass(frozen=True)
-class StatedError:
-    """Of one valid contact that is not `changing`: squared distance from the truth and error of force, in standard
-    deviations that it states.
-    """
-
-    phase: str
-    place: float
-    force: float
-
-
 @dataclass
 class Reaction:
     """What a controller saw of one event; times in s after force left zero, or came back to it. NaN: never."""
@@ -178,13 +154,10 @@ class Reaction:
     gone_s: float = np.nan  # the first of the valid frames without it, after the release
     wrong: int = 0  # valid frames before `contact_s` that are off by more than 3 of their own standard deviations
     late: int = 0  # frames that say so, from the onset until the next touch
-    unstated: int = 0  # valid ones before it, neither changing nor coarse, off by more than 3 % and without a sigma
     errors_m: list[float] = field(default_factory=list)  # of valid frames in place, while moving: against recv
-    slip: list[float] = field(default_factory=list)  # relative error of their velocity
     held_m: list[float] = field(default_factory=list)  # while the touch holds still: how far off valid contacts are
     held_force: list[float] = field(default_factory=list)  # relative error of their force
     near_after_s: list[float] = field(default_factory=list)  # of `near_s`, to each of STEPS_TO_RECV
-    stated: list[StatedError] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -205,7 +178,7 @@ class SeenFrame:
         return bool(set(DOUBTFUL) & set(self.frame.reasons))
 
     def after(self, onset: float) -> list[float]:
-        """[s] from an onset to each of STEPS_TO_RECV; empty where no stage set its stamp, as in simulated time."""
+        """[s] from an onset to each of STEPS_TO_RECV; empty where no stage set its stamp."""
         stamps = self.frame.stamps
         if "publish" not in stamps:
             return []
@@ -246,8 +219,6 @@ def react(event: TouchEvent, until: float, frames: Sequence[SeenFrame]) -> React
             off = seen.off(contact, event)
             if contact.position_sigma is not None:
                 found.wrong += off > SIGMAS * max(contact.position_sigma[:2])
-            elif not seen.doubtful:
-                found.unstated += off > NEAR * SIDE_M
     after = [seen for seen in frames if event.released <= seen.received < until]
     free = _last_run([seen.frame.valid and not seen.present for seen in after])
     if free < len(after):
@@ -258,29 +229,11 @@ def react(event: TouchEvent, until: float, frames: Sequence[SeenFrame]) -> React
         if seen.received > event.moves:
             (contact,) = seen.present
             found.errors_m.append(float(np.hypot(*np.subtract(contact.on_sheet, event.at(seen.received)))))
-            wrong = np.hypot(*np.subtract(contact.velocity[:2], event.velocity))
-            found.slip.append(float(wrong) / event.kind.speed)
         elif seen.received > event.onset + HELD_S and not event.kind.ramp_s:
             (contact,) = seen.present
             found.held_m.append(seen.off(contact, event))
             found.held_force.append(abs((contact.force_n or 0.0) / event.kind.force - 1.0))
-    found.stated = [error for seen in during if (error := _stated(seen, event)) is not None]
     return found
-
-
-def _stated(seen: SeenFrame, event: TouchEvent) -> StatedError | None:
-    """The errors of a contact that states both of its uncertainties; None in other phases."""
-    if event.others or len(seen.present) != 1 or "changing" in seen.frame.reasons:
-        return None
-    (contact,), at = seen.present, max(seen.sampled, event.onset)
-    phase = next((name for name, during in PHASES.items() if during(event, seen.received)), None)
-    if phase is None or not contact.position_sigma or not contact.force_sigma_n or contact.force_n is None:
-        return None
-    long, short, angle = contact.position_sigma
-    dx, dy = np.subtract(contact.on_sheet, event.at(at))
-    along, across = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
-    place = float((along / long) ** 2 + (across / short) ** 2)
-    return StatedError(phase, place, (contact.force_n - event.force(at)) / contact.force_sigma_n)
 
 
 def _last_run(good: Sequence[bool]) -> int:

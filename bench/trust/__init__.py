@@ -1,3 +1,1 @@
-"""Simulated minutes of every world, judged against the truth: `skin bench trust`, and two estimators beside each other:
-`skin bench shadow`.
-"""
+"""Simulated minutes, judged against the truth: `skin bench trust`."""

@@ -1,16 +1,22 @@
-"""Tables, targets and gates of `skin bench trust` and `skin bench shadow`."""
+"""Tables, targets and gates of `skin bench trust`, and its report."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from rich.console import Console
+from rich.table import Table
+
 from bench.goals import Goal
-from bench.reliability.report import console, table_of
 from firmware_stub.worlds.table import WORLDS
 
-WRONG = (  # heading, key, format
+Column = tuple[str, str, str]  # heading, key, format
+Rows = Mapping[str, Mapping[str, Any]]
+WRONG: tuple[Column, ...] = (
     ("minutes", "minutes", "{:.1f}"),
     ("frames", "frames", "{:.0f}"),
     ("touches", "touches", "{:.0f}"),
@@ -28,11 +34,13 @@ WRONG = (  # heading, key, format
     ("named", "named", "{:.0f}"),
     ("late", "late", "{:.0f}"),
     ("false frames", "false", "{:.0f}"),
+    ("valid again late", "back late", "{:.0f}"),
 )
-ERRORS = (
+ERRORS: tuple[Column, ...] = (
     ("valid untouched %", "valid untouched %", "{:.1f}"),
     ("touched %", "valid touched %", "{:.1f}"),
     ("in faults %", "valid in faults %", "{:.1f}"),
+    ("again after s", "back s", "{:.2f}"),
     ("changing %", "changing %", "{:.1f}"),
     ("coarse %", "coarse %", "{:.1f}"),
     ("force > 3 sigma %", "force 3 %", "{:.2f}"),
@@ -45,35 +53,57 @@ ERRORS = (
     ("sigma mm", "place sigma mm", "{:.2f}"),
     ("held", "place sigma held mm", "{:.2f}"),
     ("log score", "place log", "{:.2f}"),
+    ("CPU s", "cpu s", "{:.1f}"),
 )
 GATES: dict[str, float] = {"refused": 0, "aged": 0}
 """What holds today in the short form. Figures that are not here have no gate yet."""
+COUNTED = (
+    "phantom frames", "phantom incidents", "wrong counts", "hidden", "hidden briefly", "never shown", "ids", "refused",
+    "aged", "late", "false", "back late", "force 6", "place 6",
+)  # fmt: skip
+SHARES = ("valid untouched %", "valid touched %", "valid in faults %")
+LESS_VALID = 0.1  # percentage points
 
 
-def show(rows: Mapping[str, Mapping[str, Any]], title: str) -> None:
-    console().print(table_of(f"{title}: what must not be", "world, scan", WRONG, rows.items()))
-    console().print(table_of(f"{title}: what refusing or a wide sigma would hide", "world, scan", ERRORS, rows.items()))
+def console() -> Console:
+    return Console(width=200) if not sys.stdout.isatty() else Console()
 
 
-def show_floor(found: Mapping[str, Mapping[float, Mapping[str, Any]]]) -> None:
-    """found: by scan and radius [m], as floor.measured gives it."""
-    columns = (
-        ("shown in 99.9 % from, N", "shown_n", "{:.2f}"),
-        ("sigma below a quarter from, N", "sure_n", "{:.2f}"),
-    )
-    rows = [(f"{scan}, {1e3 * radius:.0f} mm", row) for scan, each in found.items() for radius, row in each.items()]
-    console().print(table_of("the skin's own floor, plain world, discs", "scan, radius", columns, rows))
+def show(rows: Rows, title: str) -> None:
+    console().print(table_of(f"{title}: what must not be", WRONG, rows.items()))
+    console().print(table_of(f"{title}: what refusing or a wide sigma would hide", ERRORS, rows.items()))
 
 
-def goals(rows: Mapping[str, Mapping[str, Any]], quick: bool) -> list[Goal]:
-    """Over all worlds, but for the shares of the plain one. Gates are of the short form only."""
-    total = {key: sum(row[key] for row in rows.values()) for _, key, form in WRONG if form == "{:.0f}"}
+def table_of(title: str, columns: Sequence[Column], rows: Iterable[tuple[str, Mapping[str, Any]]]) -> Table:
+    made = Table(title=title, title_justify="left")
+    made.add_column("", no_wrap=True)
+    for heading, _, _ in columns:
+        made.add_column(heading, justify="right")
+    for name, row in rows:
+        made.add_row(name, *("" if row.get(key) is None else form.format(row[key]) for _, key, form in columns))
+    return made
+
+
+def show_beside(ours: Mapping[str, Any], other: Mapping[str, Any]) -> None:
+    """Every figure over all rows, beside that of the other checkout."""
+    made = Table(title="all rows, beside the other checkout", title_justify="left")
+    for heading in ("", "here", "other"):
+        made.add_column(heading, justify="right" if heading else "left")
+    for _, key, form in (*WRONG, *ERRORS):
+        made.add_row(key, *("" if row[key] is None else form.format(row[key]) for row in (ours, other)))
+    console().print(made)
+
+
+def goals(rows: Rows, quick: bool) -> list[Goal]:
+    """Over all rows, but for the shares of the plain world. Gates are of the short form only."""
+    total = rows["all"]
     made = [
         ("refused", Goal("valid contacts on a refused image, frames", total["refused"], at_most=0)),
         ("aged", Goal("valid frames that are older than they may be", total["aged"], at_most=0)),
         ("phantom", Goal(f"valid frames with a phantom, of {total['frames']}", total["phantom frames"], at_most=0)),
         ("hidden", Goal(f"touches hidden for more than 0.3 s, of {total['touches']}", total["hidden"], at_most=0)),
         ("unnamed", Goal(f"faults not named, of {total['faults']}", total["faults"] - total["named"], at_most=0)),
+        ("back late", Goal("troubles after which frames are valid again too late", total["back late"], at_most=0)),
     ]
     for name, row in rows.items():
         if name.startswith("plain,"):
@@ -81,6 +111,19 @@ def goals(rows: Mapping[str, Mapping[str, Any]], quick: bool) -> list[Goal]:
                 share = row[f"valid {kind} %"]
                 made.append((kind, Goal(f"{name}: frames valid, {kind}, nothing wrong, %", share, at_least=99.5)))
     return [replace(goal, gate=GATES.get(key) if quick else None) for key, goal in made]
+
+
+def compared(name: str, other: Mapping[str, Any], ours: Mapping[str, Any]) -> list[Goal]:
+    """The gates against another checkout: no more of what must not be, beyond what chance would."""
+    made = []
+    for key in COUNTED:
+        most = other[key] + 2 * math.sqrt(other[key] + 1) if other[key] else 0.0
+        made.append(Goal(f"{name}: {key}, the other {other[key]:g}", ours[key], at_most=most, gate=most))
+    for key in SHARES:
+        if other[key] is not None and ours[key] is not None:
+            least = other[key] - LESS_VALID
+            made.append(Goal(f"{name}: {key}, the other {other[key]:.2f}", ours[key], at_least=least, gate=least))
+    return made
 
 
 def about_worlds() -> str:

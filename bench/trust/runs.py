@@ -1,43 +1,100 @@
-"""Sessions on several cores, one score for each world and kind of scan."""
+"""Sessions on several cores, one score for each row, kind of scan and checkout that is judged."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, TypeVar
 
-from bench.reliability import workers
-from bench.trust import candidates as of_name
-from bench.trust.candidate import Candidate
-from bench.trust.kept import KeptScore, session_seed
+from bench import ROOT
+from bench.json_file import write_json
+from bench.trust.plans import PLANS
 from bench.trust.score import WORST, TrustScore
 from bench.trust.session import PlayedSession, SessionPlan
+from bench.trust.stages import Judged, OtherCheckout, Today
 from firmware_stub.worlds import table
 from models.bundle import Bundle
 from services.runtime.config import Skin
 
 SCANS = ("full", "rolling")
-SESSION_S, QUICK_S = 60.0, 13.0
-RECORDINGS = 3  # of a world and kind of scan: its worst sessions
+OURS = ""  # the checkout that runs the benchmark, beside the paths of others
+CODE = ("protocol", "models", "services", "firmware_stub", "simulation", "bench/trust")
+SAY_EVERY_S = 20.0
+
+Task = TypeVar("Task")
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
 class SessionTask:
-    """One session: for which candidates, name -> MODULE:CLASS, and where its recording goes if it fails."""
+    """One session: for which checkouts, and where its recording goes if it fails."""
 
     plan: SessionPlan
     scan: str
     bundle: str
-    candidates: tuple[tuple[str, str], ...]
-    recording: Path | None
+    checkouts: tuple[str, ...]
+    recording: Path | None = None
+
+    def key(self, checkout: str) -> str:
+        """Everything that a score depends on but the code that makes it."""
+        each = self.plan
+        of = f"{each.plan} {each.row} {each.number} {each.seed} {each.seconds:g} {each.apart_m:g}"
+        return f"{code(checkout)} {of} {self.scan} {self.bundle}"
+
+
+class KeptScores:
+    """Scores of sessions in a JSON file. None that other code made is used."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        text = path.read_text(encoding="utf-8") if path is not None and path.is_file() else "{}"
+        self._known: dict[str, Any] = json.loads(text)
+
+    def found(self, key: str) -> TrustScore | None:
+        return TrustScore.of(self._known[key]) if key in self._known else None
+
+    def keep(self, key: str, score: TrustScore) -> None:
+        self._known[key] = score.to_dict()
+        if self._path is not None:
+            write_json(self._path, self._known)
 
 
 @lru_cache(maxsize=4)
-def _made(name: str, text: str, scan: str, bundle: str) -> Candidate:
-    """The candidate of this name: two that are of one class are two."""
-    return of_name.kind_of(text)(skin_of(scan, bundle), Bundle.load(bundle))
+def code(checkout: str) -> str:
+    """A hash of the checkout's code, and of what plays and judges here."""
+    digest = hashlib.sha256()
+    for root in {ROOT, Path(checkout) if checkout else ROOT}:
+        for file in sorted(file for name in CODE for file in (root / name).rglob("*.py")):
+            digest.update(file.read_bytes())
+        for manifest in sorted((root / "models" / "bundles").glob("*/manifest.json")):
+            digest.update(manifest.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def published_seed() -> str:
+    """The commit that is checked out: the parent of the one that publishes what was found with it. Raises ValueError
+    where there is none.
+    """
+    try:
+        found = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        raise ValueError("this is no git checkout, which would say the seed: give --seed TEXT") from None
+    return found.stdout.strip()
+
+
+def session_seed(seed: str, row: str, number: int) -> int:
+    """Of one session: from the sha256 of the seed's text, the row's name and the session's number."""
+    return int.from_bytes(hashlib.sha256(f"{seed} {row} {number}".encode()).digest()[:4], "big")
 
 
 def skin_of(scan: str, bundle: str) -> Skin:
@@ -45,11 +102,20 @@ def skin_of(scan: str, bundle: str) -> Skin:
     return Skin.model_validate({"port": "stub", "bundle": bundle, "frame_id": "palm", "scan": scan})
 
 
+@lru_cache(maxsize=4)
+def _stages(checkout: str, scan: str, bundle: str) -> Judged:
+    skin = skin_of(scan, bundle)
+    return OtherCheckout(Path(checkout), skin) if checkout else Today(skin, Bundle.load(bundle))
+
+
 def play(task: SessionTask) -> dict[str, TrustScore]:
-    """Play one session; a failing one is recorded."""
-    sheet = table.sheet(task.plan.world, task.plan.seed)
-    played = PlayedSession(task.plan, sheet, skin_of(task.scan, task.bundle), Bundle.load(task.bundle))
-    scores = played.judged({name: _made(name, text, task.scan, task.bundle) for name, text in task.candidates})
+    """One session, by checkout; a failing one is recorded, if anything is."""
+    plan = task.plan
+    sheet = table.sheet(plan.world, plan.seed)
+    scene = PLANS[plan.plan].scene(plan, sheet)
+    skin, keep = skin_of(task.scan, task.bundle), task.recording is not None
+    played = PlayedSession(plan, scene, sheet, skin, Bundle.load(task.bundle), keep)
+    scores = played.judged({each: _stages(each, task.scan, task.bundle) for each in task.checkouts})
     if task.recording is not None and any(failures(score) for score in scores.values()):
         played.record(task.recording)
     return scores
@@ -63,51 +129,71 @@ def failures(score: TrustScore) -> tuple[int, ...]:
     return found if any(found) else ()
 
 
-def run(
-    world: str,
-    scan: str,
-    seed: str,
-    minutes: float,
-    *,
-    candidates: Sequence[tuple[str, str]] = (("today", of_name.TODAY),),
-    session_s: float = SESSION_S,
-    apart_m: float = 0.028,
-    bundle: str = "square16",
-    cores: int = 1,
-    folder: Path | None = None,
-) -> dict[str, TrustScore]:
-    """Simulate until each candidate's score has so many minutes, those of earlier runs included."""
-    of = f"{world}-{scan}-{session_s:.0f}s-{1e3 * apart_m:.0f}mm"
-    names = " ".join(text for _, text in candidates)
-    shadow = "" if len(candidates) == 1 else f"-of-{hashlib.sha256(names.encode()).hexdigest()[:12]}"
-    places = {name: f"{of}{shadow}" + f"-{at}" * bool(shadow) for at, (name, _) in enumerate(candidates)}
-    kept = {name: KeptScore(place, seed, folder) for name, place in places.items()}
-    first = min(each.number for each in kept.values())
-    wanted = round(60 * minutes / session_s)
-    where = kept[candidates[0][0]].recordings
-    tasks = [
-        SessionTask(
-            SessionPlan(world, session_seed(seed, world, n), session_s, apart_m),
-            scan,
-            bundle,
-            tuple(candidates),
-            where / f"{n}.mcap",
-        )
-        for n in range(first, wanted)
-    ]
-    rated: list[tuple[tuple[int, ...], Path]] = []
-    for n, scores in enumerate(workers.spread(play, tasks, cores, f"{world}, {scan}"), first):
-        for name, score in scores.items():
-            if kept[name].number == n:
-                kept[name].add(score)
-        rated.append((max(failures(score) for score in scores.values()), where / f"{n}.mcap"))
-        rated = _pruned(rated)
-    return {name: each.score for name, each in kept.items()}
+@dataclass(frozen=True)
+class TrustRun:
+    """What the command line asks for. seconds: of a session of worlds, where not the plan's."""
+
+    plan: str
+    seed: str
+    minutes: float
+    checkouts: tuple[str, ...] = (OURS,)
+    seconds: float | None = None
+    apart_m: float = 0.028
+    bundle: str = "square16"
+    cores: int = 1
+    recordings: Path | None = None
+
+    def tasks(self, row: str, scan: str) -> list[SessionTask]:
+        worlds, made = self.plan == "worlds", list[SessionTask]()
+        seconds = self.seconds if self.seconds and worlds else PLANS[self.plan].seconds
+        world = row if worlds else "plain"
+        for n in range(max(1, round(60 * self.minutes / seconds))):
+            plan = SessionPlan(world, session_seed(self.seed, row, n), seconds, self.apart_m, self.plan, row, n)
+            where = self.recordings / f"{row}-{scan}-{n}.mcap".replace(" ", "-") if self.recordings else None
+            made.append(SessionTask(plan, scan, self.bundle, self.checkouts, where))
+        return made
+
+    def scores(
+        self, rows: Sequence[str], scans: Sequence[str], kept: KeptScores
+    ) -> dict[tuple[str, str], dict[str, TrustScore]]:
+        """(row, kind of scan) -> the score of each checkout; sessions that are kept count without being played."""
+        total = {(row, scan): {each: TrustScore() for each in self.checkouts} for row in rows for scan in scans}
+        lacking: list[SessionTask] = []
+        for task in (task for row, scan in total for task in self.tasks(row, scan)):
+            found = {each: kept.found(task.key(each)) for each in self.checkouts}
+            for each, score in found.items():
+                if score is not None:
+                    total[task.plan.row, task.scan][each].add(score)
+            if lacks := tuple(each for each, score in found.items() if score is None):
+                lacking.append(replace(task, checkouts=lacks))
+        for task, scores in zip(lacking, spread_work(play, lacking, self.cores, self.plan), strict=True):
+            for each, score in scores.items():
+                kept.keep(task.key(each), score)
+                total[task.plan.row, task.scan][each].add(score)
+        return total
 
 
-def _pruned(rated: list[tuple[tuple[int, ...], Path]]) -> list[tuple[tuple[int, ...], Path]]:
-    """The worst recordings of this run; the others are deleted."""
-    order = sorted((each for each in rated if each[0]), reverse=True)
-    for _, path in order[RECORDINGS:]:
-        path.unlink(missing_ok=True)
-    return order[:RECORDINGS]
+def spread_work(work: Callable[[Task], Found], tasks: list[Task], cores: int, what: str) -> Iterator[Found]:
+    """The results of all tasks, in their order. One core: in this process."""
+    began = said = time.perf_counter()
+    for done, result in enumerate(_results(work, tasks, cores), 1):
+        if time.perf_counter() - said > SAY_EVERY_S:
+            said = time.perf_counter()
+            print(f"{what}: {done} of {len(tasks)} in {said - began:.0f} s", file=sys.stderr)
+        yield result
+
+
+def usable_cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _results(work: Callable[[Task], Found], tasks: list[Task], cores: int) -> Iterator[Found]:
+    if cores <= 1 or len(tasks) <= 1:
+        yield from map(work, tasks)
+        return
+    context = multiprocessing.get_context("spawn")  # threads and network sessions do not survive a fork
+    with ProcessPoolExecutor(min(cores, len(tasks)), mp_context=context) as pool:
+        try:
+            yield from pool.map(work, tasks)
+        finally:
+            pool.shutdown(cancel_futures=True)  # whoever ends us does not wait for the rest

@@ -13,6 +13,7 @@ from firmware_stub.faults import MUXES
 from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import Cue, PiecewiseLinear, Script, TouchPath
 from firmware_stub.world import Touch, World
+from simulation.scenes import JUMP_S, ramp, step
 
 TARE_S = 5.0  # nothing touches and nothing fails before; then a person tares
 BEGIN_S = TARE_S + 1.0
@@ -38,7 +39,8 @@ TRIES = 200
 @dataclass(frozen=True)
 class Trouble:
     """A fault, or what happens to messages, from `begin` to `end` [s]. names: reasons of a frame that name it within
-    `within_s`; empty: nobody needs to.
+    `within_s`; board: what acquisition says of the board does too; neither: nobody needs to. recovers_s: after its end,
+    within which frames are to be valid again.
     """
 
     what: str
@@ -47,16 +49,28 @@ class Trouble:
     end: float
     names: tuple[str, ...] = ()
     within_s: float = 0.2
+    board: bool = False
+    recovers_s: float | None = None
+
+    @property
+    def nameable(self) -> bool:
+        return bool(self.names) or self.board
 
 
 @dataclass(frozen=True)
 class TrustScene:
-    """Times are seconds of the session."""
+    """Times are seconds of the session. acts: (when, what is done to the stages), see stages.ACTS. begin: from when on
+    frames are judged.
+    """
 
     seconds: float
     script: Script
-    troubles: tuple[Trouble, ...]
-    tares: tuple[float, ...]  # whether something touches or not
+    troubles: tuple[Trouble, ...] = ()
+    acts: tuple[tuple[float, str], ...] = ()
+    begin: float = BEGIN_S - 0.5
+
+    def nothing_wrong(self, t: float) -> bool:
+        return not any(each.begin <= t <= each.end + RECOVERS_S for each in self.troubles if each.what != "none")
 
 
 class SceneDrawer:
@@ -87,7 +101,8 @@ class SceneDrawer:
                 elif kind < FAULTS + LINKS + TARES:
                     self.tares.append(float(self.rng.uniform(begin, self.t + 0.5)))
         script = Script("trust", tracks=tuple(self.tracks), cues=tuple(self.cues), contact=tuple(self.contacts))
-        return TrustScene(self.seconds, script, tuple(self.troubles), tuple(t for t in self.tares if t < self.seconds))
+        tares = tuple((t, "tare") for t in self.tares if t < self.seconds)  # whether something touches or not
+        return TrustScene(self.seconds, script, tuple(self.troubles), tares)
 
     # --- touches ---
 
@@ -184,52 +199,30 @@ class SceneDrawer:
             touches = [beside] if beside else self._touches(2 if situation == "two" else 1)
             end = self._press(touches, at, 0.8 + lasts + 1.0, situation == "sliding")
             at, self.t = at + (0.0 if situation == "begins" else 0.8), end + RECOVERS_S
-        kinds = list(FAULT_KINDS)
-        FAULT_KINDS[kinds[self.rng.integers(len(kinds))]](self, situation, at, lasts, electrode)
+        kind = FAULT_KINDS[self.rng.integers(len(FAULT_KINDS))]
+        if kind.startswith("impedance"):
+            self._impedance(kind, situation, at, lasts, electrode)
+        elif kind == "none":
+            self.troubles.append(Trouble("none", situation, at, at + lasts))
+        else:
+            name, args = CUED[kind]
+            self._cue(situation, at, lasts, kind, (name,), **args(self.rng, electrode))
 
     def _cue(self, situation: str, at: float, lasts: float, fault: str, names: tuple[str, ...], **args: object) -> None:
         self.cues.append(Cue(at, fault, args, lasts))
         self.troubles.append(Trouble(fault, situation, at, at + lasts, names))
 
-    def _impedance_steps(self, situation: str, at: float, lasts: float, electrode: int) -> None:
+    def _impedance(self, kind: str, situation: str, at: float, lasts: float, electrode: int) -> None:
         times = float(1.5 * (8 / 1.5) ** self.rng.random())
-        curve = PiecewiseLinear((at, at + 1e-3, at + lasts, at + lasts + 1e-3), (1.0, times, times, 1.0))
-        self.contacts.append((electrode, curve))
-        self.troubles.append(Trouble("impedance steps", situation, at, at + lasts, CONTACT_NAMES))
-
-    def _impedance_drifts(self, situation: str, at: float, lasts: float, electrode: int) -> None:
-        times, rises_s = float(1.5 * (8 / 1.5) ** self.rng.random()), float(self.rng.uniform(3.0, 10.0))
+        if kind == "impedance steps":
+            self.contacts.append(step(electrode, times, at + JUMP_S, at + lasts + JUMP_S))
+            self.troubles.append(Trouble(kind, situation, at, at + lasts, CONTACT_NAMES))
+            return
+        rises_s = float(self.rng.uniform(3.0, 10.0))
         end = at + 2 * rises_s
-        self.contacts.append((electrode, PiecewiseLinear((at, at + rises_s, end), (1.0, times, 1.0))))
-        self.troubles.append(Trouble("impedance drifts", situation, at, end, CONTACT_NAMES, within_s=rises_s))
+        self.contacts.append((electrode, ramp((at, 1.0), (at + rises_s, times), (end, 1.0))))
+        self.troubles.append(Trouble(kind, situation, at, end, CONTACT_NAMES, within_s=rises_s))
         self.t = max(self.t, end + RECOVERS_S)
-
-    def _gain(self, situation: str, at: float, lasts: float, electrode: int) -> None:
-        factor = float(1 + self.rng.choice([-1, 1]) * 0.05 * 50.0 ** -self.rng.random())
-        self._cue(situation, at, lasts, "gain", ("gain",), factor=factor)
-
-    def _gross_gain(self, situation: str, at: float, lasts: float, electrode: int) -> None:
-        gain = float(1 + self.rng.choice([-1, 1]) * self.rng.uniform(0.05, 0.2))
-        self._cue(situation, at, lasts, "stale_rtia", ("gain",), gain=gain)
-
-    def _stuck_bit(self, situation: str, at: float, lasts: float, electrode: int) -> None:
-        bit, value = int(self.rng.integers(4)), int(self.rng.integers(2))
-        mux = MUXES[self.rng.integers(4)]
-        self._cue(situation, at, lasts, "mux_stuck", ("multiplexer",), mux=mux, bit=bit, value=value)
-
-    def _open(self, situation: str, at: float, lasts: float, electrode: int) -> None:
-        self._cue(situation, at, lasts, "electrode_open", ("electrode_open",), electrode=electrode)
-
-    def _short(self, situation: str, at: float, lasts: float, electrode: int) -> None:
-        two = [electrode, int((electrode + self.rng.integers(1, 16)) % 16)]
-        self._cue(situation, at, lasts, "electrodes_shorted", ("electrode_short",), electrodes=two)
-
-    def _exchanged(self, situation: str, at: float, lasts: float, electrode: int) -> None:
-        two = [electrode, int((electrode + self.rng.integers(1, 16)) % 16)]
-        self._cue(situation, at, lasts, "electrodes_swapped", ("electrode_swapped",), electrodes=two)
-
-    def _none(self, situation: str, at: float, lasts: float, electrode: int) -> None:
-        self.troubles.append(Trouble("none", situation, at, at + lasts))
 
     def _link(self, begin: float, end: float) -> None:
         """Messages that are lost, late or repeated, at some time in an event."""
@@ -247,16 +240,31 @@ class SceneDrawer:
             self._cue("", at, 2.0, "repeated_frames", (), fraction=float(self.rng.uniform(0.05, 0.5)))
 
 
+def _stuck_bit(rng: np.random.Generator, electrode: int) -> dict[str, object]:
+    bit, value = int(rng.integers(4)), int(rng.integers(2))
+    return {"mux": MUXES[rng.integers(4)], "bit": bit, "value": value}
+
+
+def _another(rng: np.random.Generator, electrode: int) -> dict[str, object]:
+    return {"electrodes": [electrode, int((electrode + rng.integers(1, 16)) % 16)]}
+
+
+def _gain(rng: np.random.Generator, electrode: int) -> dict[str, object]:
+    return {"factor": float(1 + rng.choice([-1, 1]) * 0.05 * 50.0 ** -rng.random())}
+
+
+def _gross_gain(rng: np.random.Generator, electrode: int) -> dict[str, object]:
+    return {"gain": float(1 + rng.choice([-1, 1]) * rng.uniform(0.05, 0.2))}
+
+
 CONTACT_NAMES = ("electrode_drift", "electrode_open")
-FaultDrawer = Callable[[SceneDrawer, str, float, float, int], None]
-FAULT_KINDS: dict[str, FaultDrawer] = {
-    "impedance steps": SceneDrawer._impedance_steps,
-    "impedance drifts": SceneDrawer._impedance_drifts,
-    "gain": SceneDrawer._gain,
-    "gross gain": SceneDrawer._gross_gain,
-    "stuck bit": SceneDrawer._stuck_bit,
-    "open": SceneDrawer._open,
-    "short": SceneDrawer._short,
-    "exchanged": SceneDrawer._exchanged,
-    "none": SceneDrawer._none,
+Arguments = Callable[[np.random.Generator, int], dict[str, object]]
+CUED: dict[str, tuple[str, Arguments]] = {
+    "gain": ("gain", _gain),
+    "stale_rtia": ("gain", _gross_gain),
+    "mux_stuck": ("multiplexer", _stuck_bit),
+    "electrode_open": ("electrode_open", lambda rng, electrode: {"electrode": electrode}),
+    "electrodes_shorted": ("electrode_short", _another),
+    "electrodes_swapped": ("electrode_swapped", _another),
 }
+FAULT_KINDS = ("impedance steps", "impedance drifts", *CUED, "none")

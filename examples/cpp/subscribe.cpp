@@ -135,7 +135,8 @@ bool print(const std::string& message) {
   out += !fresh ? "STALE" : replay ? "REPLAY" : valid ? "valid" : "INVALID";
   for (const auto& reason : field(frame, "reasons").as<std::vector<std::string>>()) out += " " + reason;
   out += "\n";
-  for (const auto& contact : field(frame, "contacts").as<std::vector<Map>>()) out += describe(contact);
+  for (const auto& contact : field(frame, "contacts").as<std::vector<Map>>())
+    if (field(contact, "state").as<std::string>() != "end") out += describe(contact);  // else it has gone
   std::fputs(out.c_str(), stdout);
   std::fflush(stdout);
   return fresh;

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ from protocol.frame_types import REASONS
 from protocol.frames import ContactFrame, InfoFrame, RawFrame
 from protocol.runtime import CONFIG_LINK, AlreadyRunning, lock, runtime_dir
 from protocol.sockets import AllReader, ControlClient, ControlError, NewestReader
-from services.cli.judged import turned
+from services.cli.judged import judgements, turned
 from services.estimation.first.baseline import TAKING
 from services.runtime.config import Skin
 from services.runtime.stage import HARMLESS, PROCESSES
@@ -123,34 +124,44 @@ def wait_for_baseline(name: str) -> None:
 
 
 def contacts(name: str) -> Iterator[Finding]:
-    """Whether contact frames may be acted on: the share of the last seconds' that is valid, and why the others are not,
-    the most frequent reason first.
-    """
-    what, reader = f"{name}: contacts", AllReader(["contact"], name)
-    end, count, reasons = time.monotonic() + LISTEN_S, Counter[bool](), Counter[str]()
-    unwell = False
+    """Whether contact frames may be acted on, and which judgements turned where frames have reasons."""
+    reader, frames = AllReader(["contact"], name), list[ContactFrame]()
+    end = time.monotonic() + LISTEN_S
     try:
         while (left := end - time.monotonic()) > 0:
             frame = reader.recv(left)
             if isinstance(frame, ContactFrame):
-                count[frame.valid] += 1
-                unwell |= not frame.valid or not HARMLESS.issuperset(frame.reasons)
-                reasons.update([] if frame.valid else set(frame.reasons) or {"no reason"})
+                frames.append(frame)
     finally:
         reader.close()
-    total = count.total()
+    yield from validity(name, frames)
+    if any(not frame.valid or not HARMLESS.issuperset(frame.reasons) for frame in frames):
+        level = validity_level(frames)
+        for check, numbers in turned(judgements(name, JUDGED_S)).items():
+            yield Finding(level, f"{name}: judged", f"{check}: {numbers}")
+
+
+def validity_level(frames: Sequence[ContactFrame]) -> str:
+    """By the share of valid frames."""
+    share = sum(frame.valid for frame in frames) / len(frames)
+    return "OK" if share >= WELL else "WARN" if share >= BADLY else "FAIL"
+
+
+def validity(name: str, frames: Sequence[ContactFrame]) -> Iterator[Finding]:
+    """The share of frames that is valid, and why the others are not, the most frequent reason first."""
+    what, total = f"{name}: contacts", len(frames)
     if not total:
         yield Finding("FAIL", what, f"no contact frame came within {LISTEN_S:g} s: see the lines above")
         return
-    share = count[True] / total
-    level = "OK" if share >= WELL else "WARN" if share >= BADLY else "FAIL"
-    text = f"{count[True]} of {total} frames of {LISTEN_S:g} s are valid ({100 * share:.0f} %)"
+    level, valid = validity_level(frames), sum(frame.valid for frame in frames)
+    text = f"{valid} of {total} frames of {LISTEN_S:g} s are valid ({100 * valid / total:.0f} %)"
     yield Finding(level, what, text)
-    for reason, times in reasons.most_common() if level != "OK" else ():
+    if level == "OK":
+        return
+    unwell = (set(frame.reasons) or {"no reason"} for frame in frames if not frame.valid)
+    for reason, times in Counter(itertools.chain.from_iterable(unwell)).most_common():
         meaning, todo = REASONS.get(reason, ""), ADVICE.get(reason, "")
         yield Finding(level, f"{name}: not valid", f"{reason} in {times} of {total}: {meaning}. {todo}".rstrip(": ."))
-    for check, numbers in turned(name, JUDGED_S).items() if unwell else ():
-        yield Finding(level, f"{name}: judged", f"{check}: {numbers}")
 
 
 def _status(process: str, name: str) -> Finding:

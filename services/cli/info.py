@@ -35,7 +35,7 @@ def info(
         from models import not_installed
 
         try:
-            from bench.session_picture import draw
+            from services.recordings.session_picture import draw
         except ImportError as missing:
             fail(f"--png: {not_installed(missing) or missing}", USAGE)
         try:

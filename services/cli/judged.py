@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterable, Iterator
 
 from protocol.frames import JudgementsFrame
 from protocol.sockets import AllReader
@@ -28,20 +29,28 @@ def lines(frame: JudgementsFrame) -> list[str]:
     return [f"    {each.verdict.value:9s} {each.name:13s} {_numbers(each)}" for each in said(frame)]
 
 
-def turned(skin: str, seconds: float) -> dict[str, str]:
-    """What the judgements of the next `seconds` say that is wrong, by their names, as it was when it was furthest from
-    its limit; empty where nothing is, or no frame comes.
-    """
-    worst, end = dict[str, Judgement](), time.monotonic() + seconds
+def judgements(skin: str, seconds: float) -> Iterator[JudgementsFrame]:
+    """Those of the next `seconds`."""
+    end = time.monotonic() + seconds
     reader = AllReader(["judgements"], skin)
     try:
         while (left := end - time.monotonic()) > 0:
             frame = reader.recv(left)
-            for each in said(frame) if isinstance(frame, JudgementsFrame) else ():
-                if _wrong(each) and (each.name not in worst or each.ratio > worst[each.name].ratio):
-                    worst[each.name] = each
+            if isinstance(frame, JudgementsFrame):
+                yield frame
     finally:
         reader.close()
+
+
+def turned(frames: Iterable[JudgementsFrame]) -> dict[str, str]:
+    """What judgements say that is wrong, by their names, as it was when it was furthest from its limit; empty where
+    nothing is.
+    """
+    worst = dict[str, Judgement]()
+    for frame in frames:
+        for each in said(frame):
+            if _wrong(each) and (each.name not in worst or each.ratio > worst[each.name].ratio):
+                worst[each.name] = each
     return {name: f"{_numbers(each)}: {TURNED[each.verdict]}" for name, each in worst.items()}
 
 

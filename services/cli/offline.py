@@ -191,16 +191,11 @@ def bench(
     names = commands()
     if name in ("", "--help"):
         print("skin bench NAME [options], NAME one of: " + ", ".join(names))
-        print("Those of `skin bench all` have a short form: --quick. `skin bench NAME --help` shows the other options.")
+        print("--quick is the short form; `skin bench NAME --help` shows the other options.")
         return
     if name not in names:
         fail(f"no benchmark {name!r}: expected one of {', '.join(names)}", USAGE)
-    arguments = context.args
-    if "--quick" in arguments:
-        from bench.all import short_form
-
-        arguments = short_form(name, arguments)
-    _dispatch(names[name], arguments)
+    _dispatch(names[name], context.args)
 
 
 def _dispatch(module: str, args: list[str]) -> None:

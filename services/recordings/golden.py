@@ -1,14 +1,15 @@
 """Golden recordings: whether a recording's raw frames still give the contacts that somebody accepted.
 
 Beside FILE.mcap lies FILE.golden: a line of JSON for each frame, so that version control shows what changed. The frames
-run through the very stages of the service, in this process. Numbers are compared within tolerances, which cover what
-another processor rounds otherwise; ids, validity, reasons and shapes must be the same.
+run through the very stages of the service, in this process. What is compared are events: which contacts there are, when
+each begins and ends, where and how strong it is while it is held, when the skin is not valid and for which reasons.
+Times may differ by one scan and numbers by their tolerances, which cover what another processor rounds otherwise; so
+may a flag of a few frames, and in how many frames an image was held.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -28,6 +29,7 @@ from services.runtime.persistence import arrays
 from services.runtime.stage import STAGES, Refused
 
 SUFFIX = ".golden"
+Line = dict[str, Any]
 MOST_BYTES = 64 * 1024 * 1024
 
 
@@ -52,12 +54,15 @@ TOLERANCES = {
     "confidence": Tolerance(0.02),
     "quality": Tolerance(0.02),
 }
-"""All else is compared as it is."""
+"""Of a contact while it is held, and of a valid frame."""
+
+FEW, SHARE = 2, 0.01
+"""Frames in which a flag may be another one: so many, and this share of all."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One field of one frame. by, tolerance: of numbers."""
+    """One event, or one field of one frame. by, tolerance: of numbers, and of times in scans."""
 
     scan: int
     at_s: float
@@ -143,7 +148,7 @@ def _lines(source: Iterator[Step], pipelines: dict[str, Pipeline]) -> Iterator[d
         else:
             mark(step.raw)
             if (contact := pipeline.step(step.raw)) is not None:
-                yield _line(contact, (step.at_ns - first_ns) * 1e-9)
+                yield _line(contact, (step.at_ns - first_ns) * 1e-9, step.raw.parts)
             pipeline.prepare()
         begun.add(step.skin)
 
@@ -158,11 +163,12 @@ def _load(pipeline: Pipeline, states: dict[str, Any], wanted: tuple[str, ...]) -
                 stage.reset()
 
 
-def _line(frame: ContactFrame, at_s: float) -> dict[str, Any]:
-    """A frame as it is kept: what a controller acts on."""
+def _line(frame: ContactFrame, at_s: float, parts: int) -> dict[str, Any]:
+    """A frame as it is kept: what a controller acts on. parts: of a scan, each of which has a number of its own."""
     return {
         "skin": frame.skin,
         "scan": frame.scan,
+        **({"parts": parts} if parts > 1 else {}),
         "at_s": round(at_s, 3),
         "valid": frame.valid,
         "reasons": sorted(set(frame.reasons) - {"replay"}),
@@ -209,42 +215,114 @@ def accepted(recording: Path) -> list[dict[str, Any]]:
     raise RecordingError(f"{file} holds no lines that `skin golden --accept` has written: accept them anew")
 
 
-def compare(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> Comparison:
-    """All fields of all frames, in order."""
+def compare(before: list[Line], now: list[Line]) -> Comparison:
+    """The events of two runs, in order."""
     found = Comparison(len(now))
-    old = {(line["skin"], line["scan"]): line for line in before}
-    new = {(line["skin"], line["scan"]): line for line in now}
-    for key in sorted(old.keys() | new.keys(), key=lambda k: (new.get(k) or old[k])["at_s"]):
-        one, other = old.get(key), new.get(key)
-        if one is None or other is None:
-            there = "there", "not there"
-            said = there[::-1] if one is None else there
-            found.differences.append(Difference(key[1], (one or other or {})["at_s"], key[0], "frame", *said))
-            continue
-        found.differences += _differences(one, other)
+    for skin in dict.fromkeys(line["skin"] for line in (*before, *now)):
+        runs = ({line["scan"]: line for line in lines if line["skin"] == skin} for lines in (before, now))
+        found.differences += _Runs(*runs).all()
+    found.differences.sort(key=lambda d: d.at_s)
     return found
 
 
-def _differences(one: dict[str, Any], other: dict[str, Any]) -> Iterator[Difference]:
-    where = other["scan"], other["at_s"], other["skin"]
-    a, b = _fields(one), _fields(other)
-    for name in [*b, *(name for name in a if name not in b)]:
-        was, is_now = a.get(name), b.get(name)
-        limit = TOLERANCES.get(name.rpartition(" ")[2])
-        if limit is not None and isinstance(was, (int, float)) and isinstance(is_now, (int, float)):
-            by = abs(is_now - was)
-            if not by <= limit.of(was):
-                yield Difference(*where, name, was, is_now, by if math.isfinite(by) else math.inf, limit.of(was))
-        elif was != is_now:
-            yield Difference(*where, name, was, is_now)
+class _Runs:
+    """What was accepted of one skin and what is found now: scan -> line."""
+
+    def __init__(self, old: dict[int, Line], new: dict[int, Line]) -> None:
+        self.old, self.new, self.lines = old, new, {**old, **new}
+        self.scan = max(line.get("parts", 1) for line in self.lines.values())  # numbers that one scan takes
+        self.allowed = max(FEW, SHARE * len(self.lines))
+
+    def all(self) -> list[Difference]:
+        flags = list(self._flags())
+        few = len({d.scan for d in flags}) <= self.allowed
+        return [*self._touches(), *([] if few else flags), *self._counts()]
+
+    def _at(self, scan: int, name: str, accepted: Any, found: Any, limit: float | None = None) -> Difference:
+        where = scan, self.lines[scan]["at_s"], self.lines[scan]["skin"], name, accepted, found
+        return Difference(*where) if limit is None else Difference(*where, abs(found - accepted), limit)
+
+    def _touches(self) -> Iterator[Difference]:
+        """Which contacts there are, when they begin and end, and their numbers while both are held."""
+        old, new = _touches(self.old), _touches(self.new)
+        for key in sorted(old.keys() | new.keys()):
+            name = f"contact {key}"
+            if key not in old or key not in new:
+                there = (True, False) if key in old else (False, True)
+                yield self._at(min(old.get(key) or new[key]), name, *there)
+                continue
+            one, other = old[key], new[key]
+            spans = (min(one), max(one)), (min(other), max(other))
+            for what, was, found in zip(("begins at scan", "ends at scan"), *spans, strict=True):
+                if abs(was - found) > self.scan:
+                    yield self._at(found, f"{name} {what}", was, found, self.scan)
+            told = [sorted({contact["state"] for contact in run.values()}) for run in (one, other)]
+            if told[0] != told[1]:
+                yield self._at(max(other), f"{name} states", told[0], told[1])
+            same = spans[0] == spans[1]
+            first = max(min(one), min(other)) + (0 if same else self.scan)
+            last = min(max(one), max(other)) - (0 if same else self.scan)
+            for scan in sorted(one.keys() & other.keys()):
+                if first <= scan <= last and one[scan]["state"] == other[scan]["state"] == "hold":
+                    yield from self._numbers(scan, f"{name} ", one[scan], other[scan])
+        for scan in sorted(self.old.keys() & self.new.keys()):
+            if self.old[scan].get("valid") and self.new[scan].get("valid"):
+                yield from self._numbers(scan, "", self.old[scan], self.new[scan])
+
+    def _numbers(self, scan: int, name: str, one: Line, other: Line) -> Iterator[Difference]:
+        for key, tolerance in TOLERANCES.items():
+            was, found = one.get(key), other.get(key)
+            if was is None or found is None:
+                if was is not found:
+                    yield self._at(scan, name + key, was, found)
+            elif not abs(found - was) <= (limit := tolerance.of(was)):
+                yield self._at(scan, name + key, was, found, limit)
+
+    def _flags(self) -> Iterator[Difference]:
+        """Frames where something is said that the other run says of no frame within one scan."""
+        old, new = _said(self.old), _said(self.new)
+        for name in old.keys() | new.keys():
+            there = old.get(name, set()), new.get(name, set())
+            for scan in sorted(there[0] ^ there[1]):
+                other = there[scan in there[0]]
+                if not any(near in other for near in range(scan - self.scan, scan + self.scan + 1)):
+                    yield self._at(scan, name, scan in there[0], scan in there[1])
+
+    def _counts(self) -> Iterator[Difference]:
+        """In how many frames each thing is said: a span may be longer or shorter by a scan at each of its ends."""
+        old, new = _said(self.old), _said(self.new)
+        for runs, said in ((self.old, old), (self.new, new)):
+            said["held"] = {scan for scan, line in runs.items() if line.get("held")}
+            said["changing"] = {scan for scan, line in runs.items() if "changing" in line.get("reasons", ())}
+        for name in old.keys() | new.keys():
+            was, found = old.get(name, set()), new.get(name, set())
+            spans = sum(not any(near in was for near in range(scan - self.scan, scan)) for scan in was)
+            limit = self.allowed + (0 if name in ("held", "changing") else 2 * self.scan * spans)
+            if abs(len(found) - len(was)) > limit:
+                scan = min(was ^ found)
+                yield self._at(scan, f"frames with {name}", len(was), len(found), limit)
 
 
-def _fields(line: dict[str, Any]) -> dict[str, Any]:
-    """name -> value; of a contact by its id, "contact 3 force_n"."""
-    found = {k: v for k, v in line.items() if k not in ("contacts", "scan", "skin", "at_s")}
-    found["contacts"] = [c["id"] for c in line["contacts"]]
-    for c in line["contacts"]:
-        found |= {f"contact {c['id']} {k}": v for k, v in c.items() if k != "id"}
+def _touches(lines: dict[int, Line]) -> dict[int, dict[int, Line]]:
+    """id -> scan -> contact."""
+    found: dict[int, dict[int, Line]] = {}
+    for scan, line in lines.items():
+        for contact in line["contacts"]:
+            found.setdefault(contact["id"], {})[scan] = contact
+    return found
+
+
+def _said(lines: dict[int, Line]) -> dict[str, set[int]]:
+    """What is said of a frame beside numbers -> the scans of those frames."""
+    found: dict[str, set[int]] = {}
+    for scan, line in lines.items():
+        said = ["frame", *(reason for reason in line.get("reasons", ()) if reason != "changing")]
+        said += [] if line.get("valid") else ["not valid"]
+        for contact in line["contacts"]:
+            shape = [f"contact {contact['id']} {contact['shape']}"] if contact["state"] == "hold" else []
+            said += [f"contact {contact['id']} is there", *shape]
+        for name in said:
+            found.setdefault(name, set()).add(scan)
     return found
 
 

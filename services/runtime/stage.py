@@ -148,6 +148,7 @@ def inherited(frame: Frame) -> dict[str, Any]:
         "scan": frame.scan,
         "part": frame.part,
         "stamps": dict(frame.stamps),
+        "time_ns": frame.time_ns,
         "sample_sigma_ns": frame.sample_sigma_ns,
         "source": frame.source,
         "valid": frame.valid,

@@ -1,280 +1,122 @@
-"""The doors of the page and of Foxglove, from outside: real processes, asked over sockets of the loopback by those who
-may, by another web page, and by who only takes up places.
-"""
+"""The page's door, from outside: asked by those who may, by another web page, and by who only takes up places."""
 
 from __future__ import annotations
 
 import asyncio
 import re
-import resource
-import socket
-import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import aiohttp
-import msgpack
 import pytest
 
-from tests.bridges.conftest import FakeService, RunningBridge
+from bridges import door
+from bridges.page.server import PageServer
+from bridges.process import openable
+from tests.bridges.page_server import SECRET, looking, run, server_of, serving
+from tests.waiting import WAIT_S
 
-pytestmark = pytest.mark.live
-
-WAIT_S = 60.0
-PROTOCOL = "foxglove.sdk.v1"
-PAGE_PORT = 18300
-
-
-@dataclass
-class Doorway:
-    """A running bridge: where it listens, its token, and how its own clients look."""
-
-    bridge: RunningBridge
-    port: int
-    token: str
-
-    @property
-    def is_page(self) -> bool:
-        return self.bridge.name == "page"
-
-    def url(self, token: str = "", host: str = "127.0.0.1") -> str:
-        query = f"?token={token}" if token else ""
-        return f"http://{host}:{self.port}/{'live' if self.is_page else ''}{query}"
-
-    @property
-    def headers(self) -> dict[str, str]:
-        """Of a viewer on this host: the page's browser, or a program that speaks Foxglove's protocol."""
-        return {"Origin": f"http://127.0.0.1:{self.port}"} if self.is_page else {}
-
-    def connect(
-        self, session: aiohttp.ClientSession, token: str = "", **headers: str
-    ) -> aiohttp.client._WSRequestContextManager:
-        protocols = () if self.is_page else (PROTOCOL,)
-        return session.ws_connect(self.url(token), headers={**self.headers, **headers}, protocols=protocols)
-
-    async def looks(self, token: str = "", **headers: str) -> None:
-        """Looks once, and is told something."""
-        async with aiohttp.ClientSession() as session, asyncio.timeout(WAIT_S):
-            async with self.connect(session, token, **headers) as viewer:
-                first = await viewer.receive()
-                assert first.type in (aiohttp.WSMsgType.BINARY, aiohttp.WSMsgType.TEXT), first
-
-    async def refused(self, token: str = "", **headers: str) -> int:
-        """The status with which a viewer is refused; 0 where it is not."""
-        try:
-            await self.looks(token, **headers)
-        except aiohttp.WSServerHandshakeError as why:
-            return why.status
-        return 0
+pytestmark = [pytest.mark.live, pytest.mark.usefixtures("runtime")]
+TOKEN = f"?token={SECRET}"
 
 
-@pytest.fixture(params=["page", "foxglove"])
-def doorway(request: pytest.FixtureRequest, runtime: Path, fake: FakeService) -> Iterator[Doorway]:
-    name = request.param
-    bridge = RunningBridge(name, runtime, f"port = {PAGE_PORT if name == 'page' else 0}")
+async def refused(server: PageServer, query: str = "", **headers: str) -> int:
+    """The status with which a browser is refused; 0 where it is not."""
     try:
-        bridge.status()
-        pattern = r"at http://[^:]+:(\d+)/#(\S+)" if name == "page" else r'open ws://[^:]+:(\d+).*"token": "(\S+)"'
-        found = re.search(pattern, bridge.said())
-        assert found, bridge.said()
-        yield Doorway(bridge, int(found[1]), found[2])
-        said = bridge.said()
-        assert "Traceback" not in said and "Unhandled" not in said, said
-    finally:
-        bridge.close()
+        async with looking(server, query, **headers):
+            return 0
+    except aiohttp.WSServerHandshakeError as why:
+        return why.status
 
 
-def run(what: Callable[[], Awaitable[None]]) -> None:
-    asyncio.run(asyncio.wait_for(what(), 2 * WAIT_S))
-
-
-def test_another_web_page_reads_nothing(doorway: Doorway) -> None:
+def test_asked_by_another_name_from_another_page_or_beyond_the_loopback_it_refuses() -> None:
     async def test() -> None:
-        await doorway.looks()
-        await doorway.looks(doorway.token)
-        for origin in (
-            "http://evil.com",
-            "https://evil.com",
-            "null",
-            "file://",
-            f"http://127.0.0.1.evil:{doorway.port}",
-        ):
-            assert await doorway.refused(Origin=origin) == 403, origin
-            assert await doorway.refused("wrong", Origin=origin) == 403, origin
+        async with serving() as server, aiohttp.ClientSession() as session:
+            own = f"127.0.0.1:{server.door.port}"
+            for path, host, expected in (
+                *(("/", host, 200) for host in (own, f"localhost:{server.door.port}")),
+                *(("/", host, 421) for host in ("evil.com", f"evil.com:{server.door.port}", "127.0.0.1:1")),
+                *((path, own, 404) for path in ("/server.py", "/../server.py", "/%2e%2e/server.py", "/etc/passwd")),
+            ):
+                async with session.get(f"http://{own}{path}", headers={"Host": host}) as answer:
+                    assert answer.status == expected, (path, host)
+                    policy = answer.headers.get("Content-Security-Policy", "")
+                    assert expected != 200 or ("default-src 'none'" in policy and "unsafe" not in policy)
+            for token in ("", "?token=wrong", TOKEN):
+                wrong = "http://evil.com", f"https://{own}", "null", "file://", "", f"http://127.0.0.1.evil:{own[10:]}"
+                assert {await refused(server, token, Origin=origin) for origin in wrong} == {403}
+                # a name that its owner points at this host (DNS rebinding)
+                assert await refused(server, token, Host="evil.com", Origin="http://evil.com") == 421
+            assert await refused(server) == 0
+            async with serving(port=server.door.port) as second:
+                assert server.door.port < second.door.port < server.door.port + 20, "the first that is free"
+
+        async with serving(host="0.0.0.0", names=("robot.lan",)) as server:  # beyond the loopback
+            assert await refused(server) == await refused(server, "?token=wrong") == 403
+            named = {"Host": f"robot.lan:{server.door.port}", "Origin": f"http://robot.lan:{server.door.port}"}
+            assert await refused(server, TOKEN) == await refused(server, TOKEN, **named) == 0
 
     run(test)
 
 
-def test_asked_by_the_name_of_another_it_refuses_also_with_the_token(doorway: Doorway) -> None:
-    """A name that its owner points at this host (DNS rebinding)."""
+def test_viewers_without_the_token_fill_only_their_own_places_and_must_say_what_they_want(monkeypatch) -> None:
+    monkeypatch.setitem(door.PLACES, False, 3)
+    monkeypatch.setattr(door, "SAY_S", 0.5)
 
     async def test() -> None:
-        for host in ("evil.com", f"evil.com:{doorway.port}", "127.0.0.1:1"):
-            for token in ("", doorway.token):
-                assert await doorway.refused(token, Host=host, Origin=f"http://{host}") == 421, host
-        await doorway.looks(Host=f"localhost:{doorway.port}")
+        async with serving() as server, looking(server, TOKEN) as silent:
+            async with looking(server) as idle, looking(server), looking(server):
+                assert await refused(server) == 503, "the places of those without the token are full"
+                assert await refused(server, TOKEN) == 0
+                message = await idle.socket.receive(WAIT_S)
+                assert idle.socket.close_code == 1008 and "token" in str(message.extra), "who says nothing is sent away"
+            while await refused(server):  # and makes room
+                await asyncio.sleep(0.01)
+            await silent.say({"ping": 12.5})
+            assert (await silent.hear("pong"))["ping"] == 12.5, "who has the token may be silent"
 
     run(test)
 
 
-def test_foxglove_itself_comes_with_the_printed_address(doorway: Doorway) -> None:
-    """Its website and its application have origins of their own; the page's is the page's alone."""
+def test_connections_that_do_not_look_make_room_for_newer_ones(monkeypatch) -> None:
+    monkeypatch.setattr(door, "MOST_WAITING", 8)
+    monkeypatch.setattr(door, "HEAD_S", 3600.0)
 
     async def test() -> None:
-        for origin in ("https://app.foxglove.dev", "file://"):
-            assert await doorway.refused(doorway.token, Origin=origin) == (403 if doorway.is_page else 0)
+        async with serving() as server:
+            peers = [await asyncio.open_connection("127.0.0.1", server.door.port) for _ in range(40)]
+            for _, writer in peers:
+                writer.write(b"GET /live HTTP/1.1\r\nX: ")  # half of a request
+            for reader, _ in peers[:32]:
+                await asyncio.wait_for(asyncio.gather(reader.read(), return_exceptions=True), WAIT_S)
+            assert await refused(server, TOKEN) == 0 and not peers[-1][0].at_eof()
 
     run(test)
 
 
-@asynccontextmanager
-async def idlers(doorway: Doorway, count: int) -> AsyncIterator[list[aiohttp.ClientWebSocketResponse[bool]]]:
-    """So many viewers that bring no token and say nothing, or as many as are let in; yields them."""
-    async with AsyncExitStack() as stack:
-        session = await stack.enter_async_context(aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)))
-        found = []
-        for _ in range(count):
-            try:
-                found.append(await stack.enter_async_context(doorway.connect(session)))
-            except (aiohttp.WSServerHandshakeError, aiohttp.ServerDisconnectedError) as why:
-                assert getattr(why, "status", 503) == 503
-        yield found
+BIG = f'{{"command": "tare", "skin": "palm", "args": {{}}, "id": {-(2**70)}}}'
+DEEP = '{"ping": ' + "[" * 3000 + "]" * 3000 + "}"
+MALFORMED = ['{"ping": "\\ud800"}', '{"want": ["contact"], "skin": "\\udfff"}', BIG, DEEP, "[]", "no JSON"]
 
 
-@pytest.mark.release
-def test_64_idle_viewers_do_not_keep_the_owner_out(doorway: Doorway) -> None:
+def test_malformed_messages_end_in_a_reason() -> None:
     async def test() -> None:
-        async with idlers(doorway, 64) as idle:
-            assert idle, "without the token one may look here"
-            assert await doorway.refused() == 503, "the places of those without the token are full"
-            await doorway.looks(doorway.token)
-            end = time.monotonic() + WAIT_S
-            first = idle[0]
-            while (message := await first.receive()).type in (1, 2):
-                pass
-            assert first.close_code == 1008 and "token" in str(message.extra), "who says nothing is sent away"
-            while await doorway.refused():
-                assert time.monotonic() < end, "and makes room"
-                await asyncio.sleep(0.2)
-
-    run(test)
-
-
-@pytest.mark.release
-def test_a_viewer_with_the_token_may_be_silent(doorway: Doorway) -> None:
-    async def test() -> None:
-        async with aiohttp.ClientSession() as session, doorway.connect(session, doorway.token) as viewer:
-            with pytest.raises(TimeoutError):
-                async with asyncio.timeout(13.0):  # longer than SAY_S
-                    while (message := await viewer.receive()).type in (1, 2):
-                        pass
-                    raise AssertionError(message)
-            assert not viewer.closed
-
-    run(test)
-
-
-@pytest.mark.release
-def test_1135_half_sent_requests_do_not_keep_the_owner_out(doorway: Doorway) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (min(max(soft, 4096), hard), hard))
-    half = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{doorway.port}\r\nX: ".encode()
-    try:
-        with ExitStack() as stack:
-            for _ in range(1135):
-                peer = stack.enter_context(socket.socket())
-                peer.settimeout(10)
-                peer.connect(("127.0.0.1", doorway.port))
-                peer.sendall(half)
-            run(lambda: doorway.looks(doorway.token))
-            assert len(list(Path(f"/proc/{doorway.bridge.process.pid}/fd").iterdir())) < 400
-            peer.settimeout(WAIT_S)
-            with suppress(ConnectionError):
-                while peer.recv(4096):
-                    pass  # the last one, for which nobody had to make room, is ended too
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-@pytest.mark.release
-def test_1135_requests_for_a_view_that_cannot_be_do_not_keep_the_owner_out(doorway: Doorway) -> None:
-    """They pass the door, are told what they should have asked for, and stay connected."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (min(max(soft, 4096), hard), hard))
-    head = f"GET /live HTTP/1.1\r\nHost: 127.0.0.1:{doorway.port}\r\nOrigin: http://127.0.0.1:{doorway.port}\r\n"
-    if not doorway.is_page:
-        head += "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
-        head += "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: other\r\n"
-    try:
-        with ExitStack() as stack:
-            for _ in range(1135):
-                peer = stack.enter_context(socket.socket())
-                peer.settimeout(10)
-                peer.connect(("127.0.0.1", doorway.port))
-                peer.sendall(head.encode() + b"\r\n")
-                assert b" 400 " in peer.recv(4096)
-                assert len(list(Path(f"/proc/{doorway.bridge.process.pid}/fd").iterdir())) < 400
-            run(lambda: doorway.looks(doorway.token))
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-MALFORMED = [
-    '{"ping": "\\ud800"}',
-    f'{{"ping": {2**70}}}',
-    '{"want": ["contact"], "skin": "\\udfff"}',
-    '{"command": "tare", "skin": "palm", "args": {}, "id": "\\ud800", "token": "\\ud800"}',
-    f'{{"command": "tare", "skin": "palm", "args": {{}}, "id": {-(2**70)}}}',
-    '{"ping": ' + "[" * 3000 + "]" * 3000 + "}",
-    "[]",
-    "{}",
-    "no JSON",
-]
-
-
-@pytest.mark.parametrize("doorway", ["page"], indirect=True)
-def test_malformed_messages_end_in_a_reason(doorway: Doorway) -> None:
-    async def test() -> None:
-        async with aiohttp.ClientSession() as session:
+        async with serving() as server:
             for text in MALFORMED:
-                async with doorway.connect(session) as viewer:
-                    await viewer.send_str(text)
-                    while (message := await viewer.receive(WAIT_S)).type is aiohttp.WSMsgType.BINARY:
-                        assert msgpack.unpackb(message.data)["kind"] == "hello"
-                    assert message.type is aiohttp.WSMsgType.CLOSE, (text[:60], message)
-                    assert message.data == 1007, text[:60]
+                async with looking(server) as viewer:
+                    await viewer.socket.send_str(text)
+                    message = await viewer.socket.receive(WAIT_S)
+                    assert (message.type, message.data) == (aiohttp.WSMsgType.CLOSE, 1007), (text[:60], message)
                     assert re.search("found .* expected", message.extra or ""), text[:60]
-            async with doorway.connect(session) as viewer:
-                await viewer.send_str('{"ping": 12.5}')
-                while (answer := msgpack.unpackb(await viewer.receive_bytes(timeout=WAIT_S)))["kind"] != "pong":
-                    pass
-                assert answer["ping"] == 12.5
 
     run(test)
 
 
-def test_foxglove_says_what_it_expected(runtime: Path, fake: FakeService) -> None:
-    """Of a plain request, and of a viewer that speaks an older protocol."""
-    bridge = RunningBridge("foxglove", runtime, "port = 0")
-    try:
-        bridge.status()
-        port = int(re.search(r"ws://127.0.0.1:(\d+)", bridge.said())[1])  # type: ignore[index]
-
-        async def test() -> None:
-            upgrade = {
-                "Connection": "Upgrade",
-                "Upgrade": "websocket",
-                "Sec-WebSocket-Version": "13",
-                "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
-                "Sec-WebSocket-Protocol": "foxglove.websocket.v1",
-            }
-            async with aiohttp.ClientSession() as session:
-                for headers, expected in (({}, "a WebSocket"), (upgrade, PROTOCOL)):
-                    async with session.get(f"http://127.0.0.1:{port}/", headers=headers) as answer:
-                        assert answer.status == 400 and f"expected {expected}" in await answer.text()
-
-        run(test)
-    finally:
-        bridge.close()
+def test_the_token_is_kept_for_its_owner_alone_and_the_printed_address_is_answered_to(runtime: Path) -> None:
+    first = door.kept_token("page")
+    assert len(first) >= 16 and door.kept_token("page") == first != door.kept_token("foxglove")
+    assert (runtime / "page.token").stat().st_mode & 0o777 == 0o600
+    (runtime / "page.token").write_text("short")
+    assert door.kept_token("page") not in ("short", first)
+    shown = {"127.0.0.1": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "[::1]", "fe80::1": "[fe80::1]", "lan": "lan"}
+    for host, name in shown.items():
+        assert openable(host) == name and f"{name}:0" in server_of(host=host).door.names

@@ -1,11 +1,11 @@
-"""The bridge to ROS 2 as a process, heard over DDS: who wants what, what is published and what is not."""
+"""The bridge to ROS 2 as a process, heard over DDS: who wants what, what is published; and its service `tare`."""
 
 from __future__ import annotations
 
-import json
-import os
+import random
+import socket
+import struct
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,189 +15,107 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
-from bridges.process import INTERRUPTED, Bridge, BridgeError, Handed, main
-from bridges.ros2 import dds
-from protocol.frames import ReferenceFrame
+from bridges.ros2 import dds, rtps
+from bridges.ros2.tare_service import TareService
 from protocol.sockets import AllReader
 from tests.bridges.conftest import FakeService, RunningBridge
+from tests.waiting import until
 
 pytestmark = pytest.mark.live
 
-DOMAIN = 120 + os.getpid() % 80
+SECTION = 'interface = "lo"\ndomain = {}\nreference.palm = {{ topic = "/ft/wrench", axis = "-z" }}'
+PEER, WRITER, OURS = b"\x01\x0f" + bytes(range(10)), b"\x00\x00\x12\x03", struct.pack(">HBB", 0, 1, 0x04)
 
 
 class Listener:
-    """Reads one topic as ROS would."""
-
-    participant: DomainParticipant | None = None
-
-    def __init__(self, name: str, message: str, latched: bool = False, best_effort: bool = False) -> None:
-        if Listener.participant is None:
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setenv("CYCLONEDDS_URI", "")
-                dds.configure("lo")
-                Listener.participant = DomainParticipant(DOMAIN)
-        durability = Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile
+    def __init__(self, participant: DomainParticipant, name: str, message: str) -> None:
         qos = Qos(
-            Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(100_000_000),
+            Policy.Reliability.BestEffort if "PointCloud" in message else Policy.Reliability.Reliable(100_000_000),
             Policy.History.KeepLast(10),
-            durability,
+            Policy.Durability.TransientLocal if "static" in name else Policy.Durability.Volatile,
             Policy.DataRepresentation(use_cdrv0_representation=True),
         )
-        topic: Topic[Any] = Topic(Listener.participant, f"rt{name}", dds.idl_type(message))
-        self._reader: DataReader[Any] = DataReader(Listener.participant, topic, qos)
+        self.reader: Any = DataReader(participant, Topic(participant, f"rt{name}", dds.idl_type(message)), qos)
         self.heard: list[Any] = []
 
     def poll(self) -> list[Any]:
-        self.heard += self._reader.take(100)
+        self.heard += self.reader.take(100)
         return self.heard
 
-    def close(self) -> None:
-        del self._reader
 
-
-def wait_for(what: Callable[[], object]) -> None:
-    end = time.monotonic() + 40
-    while not what():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.02)
-
-
-@pytest.fixture
-def bridge(runtime: Path, fake: FakeService) -> Iterator[RunningBridge]:
-    running = RunningBridge("ros2", runtime, f'interface = "lo"\ndomain = {DOMAIN}')
-    try:
-        running.status()
-        yield running
-    finally:
-        running.close()
-
-
-def test_only_what_is_wanted_is_subscribed_to(fake: FakeService, bridge: RunningBridge) -> None:
-    time.sleep(0.5)
+def test_what_is_wanted_is_published_while_it_is_valid_and_nothing_else_is_subscribed_to(
+    runtime: Path, fake: FakeService, domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", "")
+    dds.configure("lo")
+    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
+    assert (dds.domain_id(None), dds.domain_id(7)) == (42, 7)
+    participant, bridge = DomainParticipant(domain), RunningBridge("ros2", runtime, SECTION.format(domain))
     assert bridge.status()["idle"] is True and not any(fake.subscribers.values())
-    wrench = Listener("/eitskin/palm/wrench", "geometry_msgs/WrenchStamped")
-    wait_for(wrench.poll)
-    found = wrench.heard[0]
+    moved = until(Listener(participant, "/tf_static", "tf2_msgs/TFMessage").poll)[0].transforms[0]  # sent long before
+    assert (moved.header.frame_id, moved.child_frame_id, moved.transform.translation.x) == ("wrist", "palm", 0.1)
+    wrench = Listener(participant, "/eitskin/palm/wrench", "geometry_msgs/WrenchStamped")
+    found = until(wrench.poll)[0]
     assert (found.wrench.force.z, found.wrench.torque.y, found.header.frame_id) == (-3.0, 0.06, "palm")
     assert fake.subscribers["contact"] == 1 and not fake.subscribers["image"] and not fake.subscribers["shape"]
-    status = bridge.status()
-    assert status["flowing"] is True and status["idle"] is False
-    wrench.close()
-    wait_for(lambda: not any(fake.subscribers.values()))
-    assert bridge.status()["idle"] is True
-
-
-def test_what_is_not_valid_is_not_published_and_valid_says_so(fake: FakeService, bridge: RunningBridge) -> None:
-    wrench = Listener("/eitskin/palm/wrench", "geometry_msgs/WrenchStamped")
-    valid = Listener("/eitskin/palm/valid", "std_msgs/Bool")
-    cloud = Listener("/eitskin/palm/pressure", "sensor_msgs/PointCloud2", best_effort=True)
-    for each in (wrench, valid, cloud):
-        wait_for(each.poll)
-    assert valid.heard[-1].data is True
+    valid = Listener(participant, "/eitskin/palm/valid", "std_msgs/Bool")
+    cloud = Listener(participant, "/eitskin/palm/pressure", "sensor_msgs/PointCloud2")
+    until(cloud.poll)
+    assert until(valid.poll)[-1].data is True
     fake.valid = False
-    wait_for(lambda: valid.poll()[-1].data is False)
-    time.sleep(0.5)
-    for each in (wrench, valid, cloud):
-        each.poll()
-    offset = time.time() - time.monotonic()
-    sampled = {scan: (at * 1e-9 + offset, good) for scan, at, good in fake.sent}
-    first_bad = min(at for at, good in sampled.values() if not good)
-    for each in (wrench, cloud):
-        stamps = [m.header.stamp.sec + m.header.stamp.nanosec * 1e-9 for m in each.heard]
-        assert max(stamps) < first_bad - 0.01
-    said = len(valid.heard)
-    fake.silent = True
-    wait_for(lambda: len(valid.poll()) > said + 3)
+    until(lambda: valid.poll()[-1].data is False)
+    said, fake.silent = len(valid.heard), True
+    until(lambda: len(valid.poll()) > said + 3)
     assert valid.heard[-1].data is False and "not published" in str(bridge.status()["messages"])
     fake.valid, fake.silent = True, False
-    wait_for(lambda: valid.poll()[-1].data is True)
-    before = len(wrench.poll())
-    wait_for(lambda: len(wrench.poll()) > before)
-    for each in (wrench, valid, cloud):
-        each.close()
-
-
-def test_a_wrench_of_the_robot_becomes_the_reference_of_the_skin(runtime: Path, fake: FakeService) -> None:
-    """By its own stamps; a stamp of another clock is never a time."""
-    section = f'interface = "lo"\ndomain = {DOMAIN}\nreference.palm = {{ topic = "/ft/wrench", axis = "-z" }}'
-    running = RunningBridge("ros2", runtime, section)
+    until(lambda: valid.poll()[-1].data is True)
+    before = len(wrench.poll()), len(cloud.poll())
+    until(lambda: len(wrench.poll()) > before[0] and len(cloud.poll()) > before[1])
+    offset = time.time() - time.monotonic()
+    bad = [at * 1e-9 + offset for _, at, good in fake.sent if not good]
+    for each in (wrench, cloud):
+        stamps = [m.header.stamp.sec + m.header.stamp.nanosec * 1e-9 for m in each.heard]
+        assert not [at for at in stamps if min(abs(at - b) for b in bad) < 5e-3]
     reader = AllReader(["reference"], "palm")
-    try:
-        running.status()
-        Listener("/somewhere", "std_msgs/Bool").close()  # there is a participant
-        assert Listener.participant is not None
-        sensor = dds.RosWriter(Listener.participant, "/ft/wrench", "geometry_msgs/WrenchStamped", "state")
-        wait_for(lambda: sensor.wanted)
-
-        def heard(stamp_ns: int) -> ReferenceFrame:
-            header = {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": "ft"}
-            while reader.recv(0.3) is not None:  # what was sent before
-                pass
-            for _ in range(50):  # best effort: what comes before the two have found each other is lost
-                sensor.write({"header": header, "wrench": {"force": {"x": 1.0, "y": 2.0, "z": -2.5}}})
-                frame = reader.recv(0.4)
-                if isinstance(frame, ReferenceFrame):
-                    assert frame.force_n == 2.5
-                    return frame
-            raise AssertionError(f"no reference came: {running.said()}")
-
-        measured = time.monotonic_ns() - 40_000_000
-        stamped = heard(measured + time.time_ns() - time.monotonic_ns())
-        assert stamped.valid and stamped.stamps["sample"] == pytest.approx(measured, abs=2_000_000)
-        unstamped = heard(0)
-        assert unstamped.valid and 0 < time.monotonic_ns() - unstamped.stamps["sample"] < 5e9
-        simulated = heard(5 * 10**9)
-        assert not simulated.valid and simulated.reasons == ["clock"]
-    finally:
-        reader.close()
-        running.close()
+    robots = dds.RosWriter(participant, "/ft/wrench", "geometry_msgs/WrenchStamped", "state")
+    pressed = until(lambda: (robots.write({"wrench": {"force": {"z": -2.5}}}), reader.recv(0.1))[1])
+    assert (pressed.force_n, pressed.valid) == (2.5, True)
+    reader.close()
+    wrench.reader = valid.reader = cloud.reader = None
+    until(lambda: not any(fake.subscribers.values()) and bridge.status()["idle"] is True)
+    bridge.close()
 
 
-def test_the_pose_is_there_for_who_comes_late(bridge: RunningBridge) -> None:
-    time.sleep(1.0)
-    place = Listener("/tf_static", "tf2_msgs/TFMessage", latched=True)
-    wait_for(place.poll)
-    moved = place.heard[0].transforms[0]
-    assert (moved.header.frame_id, moved.child_frame_id, moved.transform.translation.x) == ("wrist", "palm", 0.1)
-    place.close()
+def test_a_request_is_carried_out_once_answered_by_its_number_and_nothing_that_arrives_stops_it(domain: int) -> None:
+    calls: list[int] = []
+    running = TareService(domain, "lo", {"/eitskin/palm": lambda: (calls.append(1) is None, "done")})
+    peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    peer.bind(("127.0.0.1", 0))
+    peer.settimeout(0.1)
+    here, lease = rtps.locator(peer.getsockname()), struct.pack("<iI", 20, 0)
+    told = [(rtps.METATRAFFIC_LOCATOR, here), (rtps.DEFAULT_LOCATOR, here), (rtps.LEASE, lease)]
 
+    def say(*subs: bytes) -> None:
+        peer.sendto(rtps.message(PEER, subs), ("127.0.0.1", running.port))
 
-def test_settings_that_are_none_are_refused_in_a_line() -> None:
-    for text in ("", "{", "[]", '{"skins": {}}', "nonsense"):
-        with pytest.raises(BridgeError, match="skin bridge NAME"):
-            Handed.read(text)
+    def answer(number: int) -> bytes | None:
+        """To a request, where it comes; asked again, as a reliable writer does."""
+        say(rtps.data(rtps.SPDP_READER, rtps.SPDP_WRITER, 1, rtps.PL_CDR + rtps.parameter_list(told)))
+        say(rtps.data(OURS, WRITER, number, b"\0\1\0\0\0\0\0\0"))
+        try:
+            found = [rtps.read_data(each) for each in rtps.parse(peer.recv(65536))[1] if each.kind == rtps.DATA]
+        except TimeoutError:
+            return None
+        of = {got.inline[rtps.RELATED_OF_FAST_DDS][0][:24]: got.payload for got in found if got.writer[3] == 0x03}
+        return of.get(PEER + WRITER + rtps.number_bytes(number))
 
-
-def test_a_domain_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", "many")
-    with pytest.raises(ValueError, match="ROS_DOMAIN_ID is 'many', expected a number from 0 to 232"):
-        dds.domain_id(None)
-    assert dds.domain_id(7) == 7
-    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
-    assert dds.domain_id(None) == 42
-
-
-def test_what_the_user_says_of_cyclone_comes_after_ours(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CYCLONEDDS_URI", "<General/>")
-    dds.configure("")
-    ours, theirs = os.environ["CYCLONEDDS_URI"].split(",")
-    assert "IgnoreTypeInformation" in ours and "Interfaces" not in ours and theirs == "<General/>"
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    dds.configure("")
-    assert "NetworkInterface" not in os.environ["CYCLONEDDS_URI"]
-    monkeypatch.setenv("CYCLONEDDS_URI", "")
-    dds.configure("")
-    assert 'NetworkInterface name="lo"' in os.environ["CYCLONEDDS_URI"]
-
-
-def test_ctrl_c_while_it_is_being_made_ends_it_without_a_word(
-    runtime: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def make(handed: Handed) -> Bridge:
-        raise KeyboardInterrupt
-
-    reach = {"addresses": {}, "secret_key": None, "server_keys": {}, "clients": None, "operators": None}
-    told = {"skins": {}, "transport": {**reach, "insecure": False}, "options": {}, "log_level": "info"}
-    monkeypatch.setenv("EITSKIN_BRIDGE", json.dumps(told))
-    assert main("ros2", make) == INTERRUPTED and capsys.readouterr().err == ""
+    say(rtps.data(OURS, WRITER, 1, b"\0\1\0\0\0\0\0\0"))  # from nobody that we know
+    first = until(lambda: answer(7))
+    assert first is not None and first[4:5] == b"\1" and rtps.read_text(first[8:]) == "done"
+    for _ in range(500):
+        kind = random.choice([rtps.ACKNACK, rtps.HEARTBEAT, rtps.GAP, rtps.INFO_DST, rtps.DATA, 0x16, 0x99])
+        say(rtps.sub(kind, random.randbytes(random.randrange(64)), random.randrange(256)))
+    assert len(calls) == 1, "the request was sent again, and not carried out again"
+    until(lambda: answer(9))
+    assert len(calls) == 2
+    running.close()

@@ -1,6 +1,4 @@
-"""Fixtures of the command line's tests: `skin` run in this process, the reference data."""
-
-from __future__ import annotations
+"""Fixtures of the command line's tests: `skin` run in this process."""
 
 import os
 import sys
@@ -9,10 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-
-from tests import needs
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass
@@ -38,9 +32,3 @@ def skin(runtime: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
         return Ran(code, captured.out, captured.err)
 
     return call
-
-
-@pytest.fixture(scope="session")
-def reference() -> Path:
-    """The folder of the reference data."""
-    return needs.reference("hydrogel_disc16.npz").parent

@@ -10,13 +10,13 @@ aiohttp, as a stranger would write it. Exit 0 when all was seen; needs the right
 
 import asyncio
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 
 import aiohttp
@@ -28,14 +28,6 @@ ENGINE = "docker" if subprocess.run(["docker", "info"], capture_output=True).ret
 KILLED = ("acquisition", "preprocessing", "inference", "publisher")
 
 
-def contacts() -> zmq.Socket:
-    socket = zmq.Context.instance().socket(zmq.SUB)
-    socket.setsockopt(zmq.CONFLATE, 1)
-    socket.connect(f"ipc://{RUNTIME}/publisher.ipc")
-    socket.subscribe(b"contact/palm\0")
-    return socket
-
-
 def receive(socket: zmq.Socket, timeout_s: float) -> dict | None:
     if not socket.poll(int(timeout_s * 1000)):
         return None
@@ -45,34 +37,33 @@ def receive(socket: zmq.Socket, timeout_s: float) -> dict | None:
 
 def collect(socket: zmq.Socket, seconds: float) -> list[dict]:
     end, frames = time.monotonic() + seconds, []
-    while time.monotonic() < end:
-        frame = receive(socket, max(0.01, end - time.monotonic()))
-        if frame:
-            frames.append(frame)
-    return frames
+    while (left := end - time.monotonic()) > 0:
+        frames.append(receive(socket, left))
+    return [frame for frame in frames if frame]
 
 
-def until_valid(socket: zmq.Socket, timeout_s: float) -> float:
-    """Seconds until a valid frame came."""
-    start = time.monotonic()
-    while time.monotonic() - start < timeout_s:
-        frame = receive(socket, 0.2)
-        if frame and frame["valid"]:
-            return time.monotonic() - start
-    sys.exit(f"no valid contact frame within {timeout_s:.0f} s")
+def until(what: Callable[[], object], seconds: float, missing: str) -> float:
+    """Seconds until it was so."""
+    start, why = time.monotonic(), ""
+    while time.monotonic() - start < seconds:
+        try:
+            if what():
+                return time.monotonic() - start
+        except (OSError, TimeoutError, TypeError, aiohttp.ClientError) as found:  # TypeError: a socket that closes
+            why = f": {type(found).__name__}: {found}"
+        time.sleep(0.02)
+    sys.exit(f"{missing} within {seconds:g} s{why}")
 
 
-def press() -> None:
-    """The stub's control socket takes {command, args} as msgpack."""
+def ask(process: str, command: str, timeout_ms: int, **args: object) -> bool:
+    """Whether a process carried out a command: its control socket takes {command, args} as msgpack."""
     request = zmq.Context.instance().socket(zmq.REQ)
     request.setsockopt(zmq.LINGER, 0)
-    request.connect(f"ipc://{RUNTIME}/stub.ctl")
-    request.send(msgpack.packb({"command": "press", "args": {"x": 0.02, "y": -0.01, "force": 3.0, "seconds": 10.0}}))
-    if not request.poll(5000):
-        sys.exit("the stub did not answer the press")
-    reply = msgpack.unpackb(request.recv())
-    if not reply["ok"]:
-        sys.exit(f"the stub refused the press: {reply}")
+    request.connect(f"ipc://{RUNTIME}/{process}.ctl")
+    request.send(msgpack.packb({"command": command, "args": args}))
+    reply = msgpack.unpackb(request.recv()) if request.poll(timeout_ms) else {"ok": False}
+    request.close()
+    return bool(reply["ok"])
 
 
 def kill(name: str) -> None:
@@ -101,81 +92,52 @@ async def page_shows(base: str) -> bool:
     return True
 
 
-def status_of(address: str) -> int:
-    try:
-        with urllib.request.urlopen(address, timeout=2) as answer:
-            return int(answer.status)
-    except urllib.error.HTTPError as refused:
-        return refused.code
-
-
-def heartbeat(name: str) -> bool:
-    """Whether a process answers the command `status`."""
-    request = zmq.Context.instance().socket(zmq.REQ)
-    request.setsockopt(zmq.LINGER, 0)
-    request.connect(f"ipc://{RUNTIME}/{name}.ctl")
-    request.send(msgpack.packb({"command": "status", "args": {"skin": "palm"}}))
-    answered = bool(request.poll(1000)) and msgpack.unpackb(request.recv())["ok"]
-    request.close()
-    return answered
-
-
 def works(bridge: str) -> bool:
     if bridge == "page":
-        base = f"http://127.0.0.1:{os.environ.get('EITSKIN_PAGE_PORT', '8080')}"
-        return status_of(base) == 200 and asyncio.run(page_shows(base))
+        return asyncio.run(page_shows(f"http://127.0.0.1:{os.environ.get('EITSKIN_PAGE_PORT', '8080')}"))
     if bridge == "foxglove":
-        return status_of("http://127.0.0.1:8765") == 403  # its door asks for a token
-    return heartbeat(bridge)
-
-
-def until_works(bridge: str) -> float:
-    """Seconds until a bridge does what it is for."""
-    start, why = time.monotonic(), ""
-    while time.monotonic() - start < 30:
         try:
-            if works(bridge):
-                return time.monotonic() - start
-        except (OSError, TimeoutError, TypeError, aiohttp.ClientError) as found:  # TypeError: it closes
-            why = f": {type(found).__name__}: {found}"
-        time.sleep(0.1)
-    sys.exit(f"{bridge} does not work within 30 s{why}")
+            urllib.request.urlopen("http://127.0.0.1:8765", timeout=2).close()
+        except urllib.error.HTTPError as refused:
+            return refused.code == 403  # its door asks for a token
+    return ask(bridge, "status", 1000, skin="palm") if bridge == "ros2" else False
 
 
 def main() -> None:
     if unknown := set(sys.argv[1:]) - {"page", "ros2", "foxglove"}:
-        sys.exit(f"no bridge {', '.join(sorted(unknown))}: expected page, ros2, foxglove")
-    if not shutil.which(ENGINE):
-        sys.exit("neither docker nor podman found: run this beside a running compose project")
-    socket = contacts()
-    print(f"first valid frame after {until_valid(socket, 60):.1f} s")
+        sys.exit(f"no bridge {', '.join(sorted(unknown))}: expected page, ros2 or foxglove")
+    socket = zmq.Context.instance().socket(zmq.SUB)
+    socket.setsockopt(zmq.CONFLATE, 1)
+    socket.connect(f"ipc://{RUNTIME}/publisher.ipc")
+    socket.subscribe(b"contact/palm\0")
+
+    def until_valid(seconds: float) -> float:
+        return until(lambda: (receive(socket, 0.2) or {}).get("valid"), seconds, "no valid contact frame")
+
+    print(f"first valid frame after {until_valid(60):.1f} s")
     rate = len(collect(socket, 4)) / 4
-    print(f"untouched: {rate:.1f} frames/s")
-    press()
+    if not ask("stub", "press", 5000, x=0.02, y=-0.01, force=3.0, seconds=10.0):
+        sys.exit("the stub did not take the press")
     seen = [c for frame in collect(socket, 3) for c in frame["contacts"]]
     if not seen:
         sys.exit("the press was not seen")
     x, y, _ = seen[-1]["position"]
-    force = seen[-1]["force_n"]
-    print(f"pressed at (20.0, -10.0) mm with 3 N, seen at ({x * 1e3:.1f}, {y * 1e3:.1f}) mm with {force:.2f} N")
+    print(f"{rate:.1f} frames/s; pressed at (20.0, -10.0) mm, seen at ({x * 1e3:.1f}, {y * 1e3:.1f}) mm")
     if rate < 15 or abs(x - 0.02) > 0.003 or abs(y + 0.01) > 0.003:
         sys.exit("rate below 15 frames/s or position off by more than 3 mm")
     for name in KILLED:
         session = collect(socket, 1)[-1]["session"]
         kill(name)
-        time.sleep(0.3)
-        collect(socket, 0.1)
-        back = until_valid(socket, 20)
-        again = receive(socket, 2)
-        new = bool(again) and again["session"] != session
-        print(f"{name} killed: valid frames again after {0.4 + back:.1f} s" + (", new session" if new else ""))
-        if name == "publisher" and not new:
+        collect(socket, 0.4)  # what was on its way
+        print(f"{name} killed: valid frames again after {0.4 + until_valid(20):.1f} s")
+        if name == "publisher" and (receive(socket, 2) or {"session": session})["session"] == session:
             sys.exit("the publisher came back with its old session")
     for name in sys.argv[1:]:
-        until_works(name)
+        until(lambda name=name: works(name), 30, f"{name} does not work")
         kill(name)
         time.sleep(0.3)
-        print(f"{name} works; killed: works again after {0.3 + until_works(name):.1f} s")
+        again = until(lambda name=name: works(name), 30, f"{name} does not work again")
+        print(f"{name} works; killed: works again after {0.3 + again:.1f} s")
 
 
 if __name__ == "__main__":

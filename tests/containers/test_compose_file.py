@@ -13,9 +13,8 @@ from services.runtime.config import load
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def services(name: str) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / name).read_text())["services"]
-    return found
+def services(name: str) -> Any:
+    return yaml.safe_load((ROOT / name).read_text())["services"]
 
 
 def test_no_process_has_a_network_and_the_stub_shares_acquisitions_loopback() -> None:
@@ -24,10 +23,8 @@ def test_no_process_has_a_network_and_the_stub_shares_acquisitions_loopback() ->
     bridges = {name: modes.pop(name) for name in ("page", "ros2", "foxglove")}
     assert bridges == {"page": "bridge", "ros2": "host", "foxglove": "bridge"}
     assert set(modes.values()) == {"none"}
-
-
-def test_a_board_on_the_network_gives_acquisition_a_network_and_nothing_else() -> None:
-    assert services("docker-compose.network-board.yml") == {"acquisition": {"network_mode": "bridge"}}
+    with_network = services("docker-compose.network-board.yml")
+    assert with_network == {"acquisition": {"network_mode": "bridge"}}, "for a board on it, and nothing else"
 
 
 def test_only_the_helper_is_root_and_it_only_hands_folders_over() -> None:

@@ -7,10 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.docs.snippets import FENCE, INLINE, ROOT, documents
-
-LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
-HEADING = re.compile(r"^#{1,6} +(.+?) *$", re.MULTILINE)
+from tests.docs.snippets import FENCE, INLINE, ROOT
 
 
 class Link(NamedTuple):
@@ -24,8 +21,7 @@ class Link(NamedTuple):
     @property
     def path(self) -> Path:
         """The file or folder that it leads to."""
-        file = self.target.partition("#")[0]
-        page = ROOT / self.page
+        file, page = self.target.partition("#")[0], ROOT / self.page
         return (page.parent / file).resolve() if file else page
 
     @property
@@ -35,19 +31,14 @@ class Link(NamedTuple):
 
 def links_of(page: Path) -> Iterator[Link]:
     prose = INLINE.sub("", FENCE.sub("", page.read_text(encoding="utf-8")))
-    for found in LINK.finditer(prose):
-        yield Link(str(page.relative_to(ROOT)), found[1])
-
-
-def links() -> Iterator[Link]:
-    for page in documents():
-        yield from links_of(page)
+    for target in re.findall(r"!?\[[^\]]*\]\(([^)\s]+)\)", prose):
+        yield Link(str(page.relative_to(ROOT)), target)
 
 
 def anchors(text: str) -> set[str]:
     """Of every heading: lower case, without punctuation, a hyphen for each space; a second one of the name gets -1."""
     found: set[str] = set()
-    for heading in HEADING.findall(FENCE.sub("", text)):
+    for heading in re.findall(r"^#{1,6} +(.+?) *$", FENCE.sub("", text), re.MULTILINE):
         plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading)
         name = re.sub(r"[^\w\- ]", "", plain.lower()).replace(" ", "-")
         found.add(next(n for n in (name, *(f"{name}-{k}" for k in range(1, 100))) if n not in found))

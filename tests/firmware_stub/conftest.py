@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 import pytest
 
+from firmware_stub.board import MeasuredScan
 from firmware_stub.rig import Rig
 from firmware_stub.sheet import Sheet
 from models.patterns import pattern
@@ -32,7 +33,6 @@ class Host:
         self.rig.feed(link.encode(message), self.now)
 
     def wait(self, seconds: float, step: float = 0.005) -> list[link.Message]:
-        """Messages that arrive in the next seconds."""
         end, new = self.now + seconds, []
         while self.now < end - 1e-9:
             self.now = min(self.now + step, end)
@@ -41,15 +41,18 @@ class Host:
         return new
 
     def ask(self, message: link.Message) -> link.Message:
-        """The answer to a command."""
         self.wait(0.02)
         self.send(message)
         (answer,) = (m for m in self.wait(0.05) if isinstance(m, (link.Ack, link.Nak, link.Ident, link.Time)))
         return answer
 
-    def start(self, scan: np.ndarray = PAIRS, points: int = 128, config: int = 1) -> None:
-        assert isinstance(self.ask(link.Config(config, points, 80e3, scan)), link.Ack)
-        assert isinstance(self.ask(link.Start(config)), link.Ack)
+    def start(self, scan: np.ndarray = PAIRS, points: int = 128) -> Host:
+        return self.started(link.Config(1, points, 80e3, scan))
+
+    def started(self, config: link.Config) -> Host:
+        for message in (config, link.Start(config.config)):
+            assert isinstance(self.ask(message), link.Ack)
+        return self
 
     def frames(self, seconds: float) -> list[link.ScanFrame]:
         return [m for m in self.wait(seconds) if isinstance(m, link.ScanFrame)]
@@ -60,13 +63,10 @@ class Host:
 
 
 @pytest.fixture
-def host() -> Iterator[Callable[..., Host]]:
-    made: list[Host] = []
+def host() -> Callable[..., Host]:
+    return lambda **options: Host(Rig(shared_sheet(), seed=1, **options))
 
-    def make(**options: object) -> Host:
-        made.append(Host(Rig(shared_sheet(), seed=1, **options)))  # type: ignore[arg-type]
-        return made[-1]
 
-    yield make
-    for one in made:
-        one.rig.close()
+def middles(scan: MeasuredScan, count: int = 120) -> np.ndarray:
+    """Instants [s] of a scan's measurements."""
+    return scan.start + (np.arange(count) + 0.5) / count * (scan.end - scan.start)

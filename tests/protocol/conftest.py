@@ -1,22 +1,22 @@
-import shutil
-import tempfile
-
 import pytest
 import zmq
 
-
-@pytest.fixture
-def runtime(monkeypatch):
-    """A runtime folder of the test's own, its path short enough for sockets."""
-    folder = tempfile.mkdtemp(prefix="skin", dir="/tmp")
-    monkeypatch.setenv("EITSKIN_RUNTIME", folder)
-    yield folder
-    shutil.rmtree(folder, ignore_errors=True)
+from protocol import transport
+from protocol.sockets import Publisher
 
 
 @pytest.fixture
 def context():
-    """A ZeroMQ context of the test's own: what the test leaves open is closed with it."""
+    """What the test leaves open is closed with it; the transport that it configures is put back."""
     own = zmq.Context()
     yield own
+    transport.configure(transport.Transport())
+    transport.stop_gate(own)
     own.destroy(linger=0)
+
+
+@pytest.fixture
+def publisher(runtime, context):
+    made = Publisher("publisher", context)
+    yield made
+    made.close()

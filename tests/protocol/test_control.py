@@ -1,5 +1,9 @@
-"""Commands: typed answers, whatever is asked; and no caller that hangs."""
+"""Commands: typed answers, whatever is asked. The runtime folder: whose it is; what is logged of others' text."""
 
+import io
+import logging
+import os
+import stat
 import threading
 import time
 
@@ -7,97 +11,66 @@ import msgpack
 import pytest
 import zmq
 
+from protocol import control, logs
+from protocol import runtime as rt
 from protocol.commands import COMMANDS, Argument, Command, Content
-from protocol.control import BUSY
+from protocol.control import BUSY, SPOKEN_OF_S
 from protocol.fields import Bool, Float, Int, Text
-from protocol.runtime import control_endpoint
+from protocol.logs import foreign
+from protocol.runtime import control_endpoint, host_id
 from protocol.sockets import ControlClient, ControlError, ControlServer, clock_offset
+from tests.waiting import until
+
+from .line import AHEAD_NS, Clock
+from .peers import another, served
 
 pytestmark = pytest.mark.live
+
+PRESS = {"x": Argument(Float(unit="m"), ""), "shape": Argument(Text(), ""), "n": Argument(Int(), "")}
+TABLE = {
+    "needs": Command("test", "", {"x": Argument(Int(), "a number", needed=True)}),
+    "press": Command("test", "", PRESS),
+    **{name: Command("test", "") for name in ("fail", "refuse", "slow", "odd")},
+}
 
 
 @pytest.fixture
 def server(runtime, context):
+    go_on = threading.Event()
+
     def fail(args):
         raise FileNotFoundError("no bundle `x`: see models/bundles")
 
     def refuse(args):
         raise ControlError("busy", "taring")
 
-    def slow(args):
-        time.sleep(0.5)
-        return {}
-
-    own = ControlServer(
-        "stub",
-        {
-            "needs": lambda a: {"got": a["x"]},
-            "press": lambda a: {"got": a},
-            "fail": fail,
-            "refuse": refuse,
-            "slow": slow,
-            "odd": lambda a: {"x": object()},
-        },
-        context=context,
-        commands={
-            "needs": Command("test", "", {"x": Argument(Int(), "a number", needed=True)}),
-            "press": Command(
-                "test",
-                "",
-                {"x": Argument(Float(unit="m"), ""), "shape": Argument(Text(), ""), "n": Argument(Int(), "")},
-            ),
-            **{name: Command("test", "") for name in ("fail", "refuse", "slow", "odd")},
-        },
-    )
-    stop = threading.Event()
-
-    def serve():
-        while not stop.is_set():
-            own.serve_once(0.02)
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    yield own
-    stop.set()
-    thread.join()
-
-
-def test_a_command_is_answered(server, context):
-    client = ControlClient("stub", context=context)
-    assert client.call("press", x=0.02, shape="circle") == {"got": {"x": 0.02, "shape": "circle"}}
-    assert client.call("press") == {"got": {}}
-
-
-@pytest.mark.parametrize(
-    ("command", "kind", "says"),
-    [
-        ("tear", "unknown_command", "it has: clock, fail, needs, odd, press, refuse, slow"),
-        ("fail", "FileNotFoundError", "see models/bundles"),
-        ("refuse", "busy", "taring"),
-        ("odd", "TypeError", "serialize"),
-        ("needs", "bad_request", "needs, argument x: found none, expected a whole number: a number"),
-    ],
-)
-def test_a_failing_command_is_a_typed_error_and_the_server_lives(server, context, command, kind, says):
-    client = ControlClient("stub", context=context)
-    with pytest.raises(ControlError, match=says) as caught:
-        client.call(command)
-    assert caught.value.kind == kind
-    assert client.call("press") == {"got": {}}
+    handlers = {"fail": fail, "refuse": refuse, "slow": lambda _: go_on.wait(60) and {}}
+    handlers |= {"odd": lambda _: {"x": object()}, "needs": lambda args: {"got": args["x"]}}
+    own = ControlServer("stub", handlers | {"press": lambda args: {"got": args}}, context=context, commands=TABLE)
+    with served(own):
+        own.go_on = go_on.set
+        yield own
 
 
 @pytest.fixture
-def all_commands(runtime, context):
-    """Every command of the table, each of which notes with what it was carried out; gives those notes."""
-    carried_out = []
-    handlers = {name: lambda args, name=name: carried_out.append((name, args)) or {} for name in COMMANDS}
-    own, stop = ControlServer("stub", handlers, context=context), threading.Event()
-    thread = threading.Thread(target=lambda: [own.serve_once(0.02) for _ in iter(stop.is_set, True)])
-    thread.start()
-    yield carried_out
-    stop.set()
-    thread.join()
-    own.close()
+def client(context):
+    return ControlClient("stub", 60.0, context=context)
+
+
+def refused(kind, says, of, command, **args):
+    with pytest.raises(ControlError, match=says) as caught:
+        of.call(command, **args)
+    assert caught.value.kind == kind and len(str(caught.value)) < 300, args
+
+
+def test_a_failing_command_is_a_typed_error_and_the_server_lives(server, client):
+    refused("unknown_command", "it has: clock, fail, needs, odd, press, refuse, slow", client, "tear")
+    refused("FileNotFoundError", "see models/bundles", client, "fail")
+    refused("busy", "taring", client, "refuse")
+    refused("TypeError", "serialize", client, "odd")
+    refused("bad_request", "argument x: found none, expected a whole number: a number", client, "needs")
+    assert client.call("press") == {"got": {}}
+    assert client.call("press", x=0.02, shape="circle") == {"got": {"x": 0.02, "shape": "circle"}}
 
 
 RIGHT = {Bool: True, Float: 1.5, Int: 1, Text: "x", Content: {"a": 1}}
@@ -108,131 +81,183 @@ WRONG = {
     Text: (1, True, ["x"], {}, b"x", "x" * 5000),
     Content: ("x", 1, True, []),
 }
-ARGUMENTS = [(name, key) for name, command in COMMANDS.items() for key in command.arguments]
-
-
-def right(name):
-    return {key: RIGHT[type(argument.check)] for key, argument in COMMANDS[name].arguments.items()}
-
-
-@pytest.mark.parametrize(("name", "key"), ARGUMENTS)
-def test_an_argument_of_another_type_carries_nothing_out(all_commands, context, name, key):
-    """`tare` with force: "no" is no tare by force."""
-    client = ControlClient("stub", context=context)
-    for wrong in WRONG[type(COMMANDS[name].arguments[key].check)]:
-        with pytest.raises(ControlError, match=f"{name}, argument {key}: found .*, expected ") as refused:
-            client.call(name, **{**right(name), key: wrong})
-        assert refused.value.kind == "bad_request" and len(str(refused.value)) < 300, wrong
-    assert not all_commands
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_arguments_of_their_types_are_handed_on(all_commands, context, name):
-    client, given = ControlClient("stub", context=context), right(name)
-    client.call(name, **given)
-    needed = {key for key, argument in COMMANDS[name].arguments.items() if argument.needed}
-    client.call(name, **{key: value if key in needed else None for key, value in given.items()})
-    with pytest.raises(ControlError, match=f"{name}: found the argument forse, expected (only|no argument)"):
-        client.call(name, **given, forse=True)
-    for key in needed:
-        for without in ({k: v for k, v in given.items() if k != key}, {**given, key: None}):
-            with pytest.raises(ControlError, match=f"{name}, argument {key}: found none, expected "):
-                client.call(name, **without)
-    if name != "clock":  # which is the server's own
-        assert all_commands == [(name, given), (name, {key: given[key] for key in needed})]
+def test_a_command_is_carried_out_with_arguments_of_their_types_or_not_at_all(runtime, context, client, name):
+    """`tare` with force: "no" is no tare by force."""
+    carried_out, arguments = [], COMMANDS[name].arguments
+    handlers = {each: lambda args, each=each: carried_out.append((each, args)) or {} for each in COMMANDS}
+    given = {key: RIGHT[type(argument.check)] for key, argument in arguments.items()}
+    needed = {key: given[key] for key, argument in arguments.items() if argument.needed}
+    with served(ControlServer("stub", handlers, context=context)):
+        for key, argument in arguments.items():
+            for wrong in WRONG[type(argument.check)]:
+                says = f"{name}, argument {key}: found .*, expected "
+                refused("bad_request", says, client, name, **{**given, key: wrong})
+        says = f"{name}: found the argument forse, expected (only|no argument)"
+        refused("bad_request", says, client, name, **given, forse=True)
+        for key in needed:
+            for less in ({k: v for k, v in given.items() if k != key}, {**given, key: None}):
+                refused("bad_request", f"{name}, argument {key}: found none, expected ", client, name, **less)
+        assert not carried_out
+        client.call(name, **given)
+        client.call(name, **{key: needed.get(key) for key in given})
+    assert carried_out == [(name, given), (name, needed)] or name == "clock"  # which is the server's own
 
 
-def test_a_command_without_its_arguments_in_the_table_is_not_taken(runtime, context):
-    with pytest.raises(ValueError, match="no command melt in protocol/commands.py"):
-        ControlServer("stub", {"melt": lambda args: {}}, context=context)
+def test_nobody_there_is_found_out_and_the_request_is_not_carried_out_later(runtime, context, client):
+    refused("unreachable", "is the service running", ControlClient("stub", 0.1, context=context), "press")
+    pressed = []
+    with served(ControlServer("stub", {"press": pressed.append}, context=context)):
+        client.call("clock")
+    assert not pressed
 
 
-@pytest.mark.parametrize("message", ["", "  "])
-def test_a_refusal_without_a_word_says_at_least_of_what(runtime, context, message):
-    socket = context.socket(zmq.REP)
-    socket.bind(control_endpoint("stub"))
-
-    def answer():
-        assert socket.poll(3000)
-        socket.recv()
-        socket.send(msgpack.packb({"ok": False, "error": {"type": "refused", "message": message}}))
-
-    thread = threading.Thread(target=answer)
-    thread.start()
-    with pytest.raises(ControlError, match="stub refused tare without saying why .refused.") as refused:
-        ControlClient("stub", context=context).call("tare")
-    assert refused.value.kind == "refused"
-    thread.join()
-    socket.close(0)
-
-
-def test_nobody_there_is_found_out_in_time(runtime, context):
-    began = time.monotonic()
-    with pytest.raises(ControlError, match="is the service running") as caught:
-        ControlClient("stub", 0.3, context=context).call("press")
-    assert caught.value.kind == "unreachable"
-    assert time.monotonic() - began < 1.0
-
-
-def test_a_request_given_up_is_not_carried_out_later(runtime, context):
-    with pytest.raises(ControlError):
-        ControlClient("stub", 0.1, context=context).call("press")
-    server = ControlServer("stub", {"press": lambda a: {}}, context=context)
-    assert server.serve_once(0.3) is False
-
-
-def test_no_answer_in_time_and_the_late_one_is_not_taken_for_the_next(server, context):
-    client = ControlClient("stub", 0.2, context=context)
-    with pytest.raises(ControlError, match="did not answer slow within 0.2 s") as caught:
-        client.call("slow")
-    assert caught.value.kind == "timeout"
-    time.sleep(0.5)
+def test_no_answer_in_time_and_the_late_one_is_not_taken_for_the_next(server, context, client):
+    refused("timeout", "did not answer slow within 1 s", ControlClient("stub", 1.0, context=context), "slow")
+    server.go_on()
     assert client.call("press", n=1) == {"got": {"n": 1}}
 
 
 def test_any_req_socket_can_ask_and_nonsense_is_refused(server, context):
-    socket = context.socket(zmq.REQ)
-    socket.connect(control_endpoint("stub"))
-    for request in (
-        b"",
-        b"\xc1",
-        msgpack.packb([1]),
-        msgpack.packb({"args": {}}),
-        msgpack.packb({"command": "press", "args": 1}),
-    ):
-        socket.send(request)
-        assert socket.poll(1000)
-        reply = msgpack.unpackb(socket.recv())
-        assert reply["ok"] is False and reply["error"]["type"] == "bad_request"
-    socket.send(msgpack.packb({"command": "press"}))
-    assert socket.poll(1000) and msgpack.unpackb(socket.recv()) == {"ok": True, "result": {"got": {}}}
-    dealer = context.socket(zmq.DEALER)
-    dealer.connect(control_endpoint("stub"))
+    def sent(request):
+        asking.send(request)
+        assert asking.poll(60_000)
+        return msgpack.unpackb(asking.recv())
+
+    dealer, asking = context.socket(zmq.DEALER), context.socket(zmq.REQ)
+    for each in (dealer, asking):
+        each.connect(control_endpoint("stub"))
+    for request in (b"", b"\xc1", *map(msgpack.packb, ([1], {"args": {}}, {"command": "press", "args": 1}))):
+        assert sent(request)["error"]["type"] == "bad_request"
     dealer.send(b"no delimiter")
-    assert not dealer.poll(100)
-    assert server.malformed == 6
+    dealer.send_multipart([b"", msgpack.packb({"command": "clock"})])
+    assert dealer.poll(60_000) and dealer.recv_multipart()[0] == b"", "the first of them has no answer"
+    assert sent(msgpack.packb({"command": "press"})) == {"ok": True, "result": {"got": {}}}
+    assert server.malformed == 6 and not dealer.poll(0)
 
 
-def test_what_a_replay_asks_after_each_part_is_no_flood(runtime, context):
-    parts = {command: lambda args: {"seen": True} for command in ("part", "status")}
-    control = ControlServer("preprocessing", parts, context=context)
-    socket = context.socket(zmq.REQ)
-    socket.connect(control_endpoint("preprocessing"))
+def test_a_flood_is_named_and_what_a_replay_asks_after_each_part_is_none(runtime, context, monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(control, "time", clock)
+    seen = {command: lambda args: {"seen": True} for command in ("part", "status")}
+    server = ControlServer("preprocessing", seen, context=context)
+    asking = context.socket(zmq.REQ)
+    asking.connect(control_endpoint("preprocessing"))
 
-    def ask(command):
-        for _ in range(2 * BUSY + 1):  # of which BUSY are in one second, unless they take more than two
-            socket.send(msgpack.packb({"command": command, "args": {"scan": 1} if command == "part" else {}}))
-            assert control.serve_once(1.0)
-            assert socket.poll(1000) and msgpack.unpackb(socket.recv())["ok"]
+    def ask(command, count):
+        for _ in range(count):
+            asking.send(msgpack.packb({"command": command, "args": {"scan": 1} if command == "part" else {}}))
+            assert server.serve_once(60.0) and msgpack.unpackb(asking.recv())["ok"]
+        return " ".join(server.problems)
 
-    ask("part")
-    assert control.problems == []
-    ask("status")
-    assert "control requests a second" in control.problems[0]
-    socket.close(0)
-    control.close()
+    assert BUSY == 100 and ask("part", 2 * BUSY) == ask("status", BUSY - 1) == ""
+    clock.go(1.0)
+    assert ask("status", BUSY - 1) == "", "within a second"
+    assert f"more than {BUSY} control requests a second" in ask("status", 1)
+    clock.go(SPOKEN_OF_S + 0.1)
+    assert ask("status", 1) == ""
+    server.close()
 
 
-def test_the_clock_of_another_process(server, context):
-    offset, uncertainty = clock_offset(ControlClient("stub", context=context))
-    assert abs(offset) <= uncertainty < 50_000_000  # the same clock: the true offset is 0
+def test_the_clock_of_another_process(server, client, context):
+    assert abs((of := clock_offset(client, host=host_id()))[0]) <= of[1], "the same clock: the true offset is 0"
+    with pytest.raises(ControlError, match="another host than third") as caught:
+        clock_offset(client, host="third")
+    assert caught.value.kind == "other_host"
+    ahead = {"clock": lambda _: {"monotonic_ns": time.monotonic_ns() + AHEAD_NS}}
+    with served(ControlServer("publisher", ahead, context=context)):
+        offset, uncertainty = clock_offset(ControlClient("publisher", 60.0, context=context))
+    assert abs(offset - AHEAD_NS) <= uncertainty
+
+
+def test_it_is_made_for_us_alone_where_the_environment_says(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("EITSKIN_RUNTIME", raising=False)
+    assert rt.runtime_dir() == tmp_path / "eitskin"
+    monkeypatch.setenv("EITSKIN_RUNTIME", str(tmp_path / "a" / "b"))
+    assert stat.S_IMODE(rt.runtime_dir().stat().st_mode) == 0o700
+    assert rt.endpoint("publisher") == f"ipc://{tmp_path}/a/b/publisher.ipc"
+    assert rt.control_endpoint("stub") == f"ipc://{tmp_path}/a/b/stub.ctl"
+    monkeypatch.setenv("EITSKIN_RUNTIME", str(tmp_path / ("x" * 100)))
+    with pytest.raises(rt.RuntimeDirError, match="at most 107"):
+        rt.endpoint("publisher")
+
+
+def test_an_unsafe_folder_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setenv("EITSKIN_RUNTIME", str(path := tmp_path / "run"))
+
+    def refused(make, says):
+        make()
+        with pytest.raises(rt.RuntimeDirError, match=says):
+            rt.runtime_dir()
+
+    refused(lambda: path.mkdir(mode=0o755), "mode 0755, expected 0700: chmod 700")
+    path.chmod(0o700)
+    refused(lambda: monkeypatch.setattr(os, "geteuid", lambda: 12345), "expected 12345")
+    monkeypatch.undo()
+    monkeypatch.setenv("EITSKIN_RUNTIME", str(path))
+    path.rmdir()
+    refused(lambda: path.symlink_to(tmp_path), "symbolic link")
+
+
+HOLDING = "import time; from protocol.runtime import lock\nwith lock(): print('held', flush=True); time.sleep(600)"
+
+
+@pytest.mark.live
+def test_a_second_service_is_refused_and_the_lock_goes_with_its_process(runtime):
+    with another("-c", HOLDING) as holder:
+        with pytest.raises(rt.AlreadyRunning, match=f"in use by process {holder.pid}"), rt.lock():
+            pass
+        with rt.lock(process="publisher"):  # another one
+            pass
+
+    def ours():
+        try:
+            with rt.lock() as folder:
+                return (folder / "lock").read_text() == f"{os.getpid()}\n"
+        except rt.AlreadyRunning:  # the kernel has not quite let go
+            return False
+
+    until(ours)
+
+
+@pytest.fixture
+def log(monkeypatch):
+    """A process's log; gives a function that returns the lines since the last call."""
+    root, stream = logging.getLogger(), io.StringIO()
+    monkeypatch.setattr(root, "handlers", [])
+    monkeypatch.setattr(root, "level", root.level)
+    monkeypatch.setattr("sys.stderr", stream)
+    logs.setup("here: %(message)s")
+
+    def lines():
+        text = stream.getvalue()
+        stream.seek(0)
+        stream.truncate()
+        return text.splitlines()
+
+    return lines
+
+
+def test_foreign_text_is_one_short_line_without_control_characters():
+    assert foreign("two\nlines: ä\x1b[31m red\r") == r"two\nlines: ä\x1b[31m red\r"
+    assert foreign(b"\xff\x00bytes") == r"\xff\x00bytes" and foreign("right\u202eto left") == r"right\u202eto left"
+    assert foreign("x" * 10**6) == "x" * (logs.TEXT - 3) + "..."
+
+
+def test_what_is_logged_is_bounded_in_lines_and_in_length(log, monkeypatch):
+    monkeypatch.setattr(logs, "time", clock := Clock())
+
+    def hostile(times):
+        for number in range(times):
+            logging.getLogger("t").warning("message\n%d", number)
+        return log()
+
+    assert len(lines := hostile(1000)) <= 2 * logs.BURST and lines[0] == "here: message"
+    logging.getLogger("t").warning("another place %s\x1b[2J", "y" * 10**6)
+    (line,) = log()
+    assert line.startswith("here: another place") and len(line) <= logs.LINE + len("here: ")
+    clock.go(logs.EVERY_S + 1)
+    assert f"{1000 - logs.BURST} more like it" in " ".join(hostile(1))

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 import services  # noqa: F401  (one thread for the numerical libraries, before numpy starts them)
 from models.bundle import Bundle
-from protocol.frames import RawFrame
+from protocol.frames import DeltaFrame, RawFrame
+from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
 from tests import needs
 
@@ -68,6 +69,49 @@ class Board:
 @pytest.fixture
 def board(bundle: Bundle) -> Board:
     return Board(bundle)
+
+
+class Fed:
+    """Preprocessing, and the board that feeds it."""
+
+    def __init__(self, skin: Skin, bundle: Bundle, board: Board) -> None:
+        self.stage, self.board, self.skin, self.bundle = Preprocessing("palm", skin, bundle), board, skin, bundle
+
+    def run(self, frame: RawFrame) -> DeltaFrame:
+        (out,) = self.stage.everything(frame, frozenset({"delta"}))
+        assert isinstance(out, DeltaFrame) and np.isfinite(out.difference).all()
+        return out
+
+    def feel(
+        self, difference: NDArray[np.floating] | float = 0.0, scans: int = 1, source: str = "board"
+    ) -> list[DeltaFrame]:
+        return [self.run(self.board.frame(difference, source=source)) for _ in range(scans)]
+
+    def tared(self) -> Fed:
+        out = self.feel(scans=72)[-1]
+        assert out.valid and not out.touched
+        return self
+
+    def again(self) -> Fed:
+        """Another that is fed by the same board."""
+        return Fed(self.skin, self.bundle, self.board)
+
+    def tare(self, **args: object) -> dict[str, object]:
+        return self.stage.command("tare", args)
+
+    @property
+    def problem(self) -> str:
+        return (self.stage.health().messages or [""])[0]
+
+
+@pytest.fixture
+def fed(skin: Skin, bundle: Bundle, board: Board) -> Fed:
+    return Fed(skin, bundle, board)
+
+
+@pytest.fixture
+def tared(fed: Fed) -> Fed:
+    return fed.tared()
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import deepcopy
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +16,21 @@ from firmware_stub.faults import Faults
 from firmware_stub.sheet import Sheet
 from models.bundle import Bundle
 from models.shapes import Shape
-from protocol.frames import RawFrame
+from protocol.frames import ELECTRODE_STATES, Contact, ContactFrame, DeltaFrame, RawFrame
 from protocol.scan_setting import COHERENT
 from services.pipeline import Pipeline, Result
 from services.runtime.config import Skin
 
 TRANSFER = NDArray[np.float64]
+Contacts = tuple[tuple[int, float], ...]  # electrodes, and the factors on their contact impedances
+SCAN_S = 0.045
+METRES = 0.05  # per unit of the bundle's model
+TARE_SCANS = 72
+
+
+@cache
+def bundle_of_square16() -> Bundle:
+    return Bundle.load("square16")
 
 
 @cache
@@ -26,8 +39,8 @@ def sheet() -> Sheet:
 
 
 @cache
-def transfer(shapes: tuple[Shape, ...] = (), contacts: tuple[tuple[int, float], ...] = ()) -> TRANSFER:
-    """(16, 16) ohm of the stub's sheet, touched; contacts: electrode and the factor on its contact impedance."""
+def transfer(shapes: tuple[Shape, ...] = (), contacts: Contacts = ()) -> TRANSFER:
+    """(16, 16) ohm of the stub's sheet, touched."""
     impedance = sheet().skin.contact_impedance.copy()
     for electrode, factor in contacts:
         impedance[electrode] *= factor
@@ -35,29 +48,53 @@ def transfer(shapes: tuple[Shape, ...] = (), contacts: tuple[tuple[int, float], 
 
 
 class StubSkin:
-    """Multiplexers, converter and firmware's arithmetic of the stub, then the stages of square16."""
+    """Multiplexers, converter and firmware's arithmetic of the stub, then the stages of square16. One that is tared
+    goes on from the state of another that was, which takes 0.05 s.
+    """
 
-    def __init__(self, snr_db: float, tare: bool = True, skin: Skin | str = "square16") -> None:
-        bundle = Bundle.load("square16")
-        self.pattern, self.faults, self.scan = np.asarray(bundle.pattern), Faults(), 0
-        self.analog = Analog(BoardNoise.of_db(snr_db), self.faults, np.random.default_rng(3))
-        self.pipeline = Pipeline(skin, name="palm")
-        if tare:
-            result = self.rest(72)
-            assert result.contact.valid and not result.delta.touched
+    def __init__(self, snr_db: float = 80.0, tare: bool = True, skin: Skin | str = "square16") -> None:
+        self.pattern, self.faults, self.scan = np.asarray(bundle_of_square16().pattern), Faults(), 0
+        copied = tare and skin == "square16"
+        self.analog = Analog(BoardNoise.of_db(snr_db), self.faults, np.random.default_rng(4 if copied else 3))
+        self.pipeline = Pipeline(skin, name="palm", bundle=bundle_of_square16())
+        if copied:
+            for stage, state in zip(self.stages, deepcopy(_tared(snr_db)), strict=True):
+                stage.load(state)
+            self.scan = TARE_SCANS
+        elif tare:
+            self.tare()
+
+    def tare(self) -> None:
+        result = self.rest(TARE_SCANS)
+        assert result.contact.valid and not result.delta.touched
+
+    @property
+    def stages(self) -> tuple[Any, ...]:
+        return self.pipeline.pre, self.pipeline.inference, self.pipeline.publishing
+
+    @contextmanager
+    def fault(self, name: str, **args: Any) -> Iterator[None]:
+        self.faults.inject(name, args, 0.0, 1e9)
+        yield
+        self.faults.clear(name)
 
     def rest(self, frames: int) -> Result:
         for _ in range(frames):
             result = self.feel()
         return result
 
-    def feel(self, shapes: tuple[Shape, ...] = (), contacts: tuple[tuple[int, float], ...] = ()) -> Result:
+    def feel(self, shapes: tuple[Shape, ...] = (), contacts: Contacts = ()) -> Result:
         return self.see(transfer(shapes, contacts))
+
+    def felt(self, scans: int, shapes: tuple[Shape, ...] = (), contacts: Contacts = ()) -> list[Result]:
+        return [self.feel(shapes, contacts) for _ in range(scans)]
 
     def see(self, t: TRANSFER, end: TRANSFER | None = None) -> Result:
         """One scan of a sheet with these transfer impedances; end: with those when it ends, changing steadily."""
-        z, status = self.analog.measure((t, t if end is None else end), self.pattern, COHERENT, 40_000.0, 0.0)
-        return self.run(z, status)
+        return self.run(*self.measured(t, end))
+
+    def measured(self, t: TRANSFER, end: TRANSFER | None = None) -> tuple[NDArray[np.complex64], NDArray[np.uint8]]:
+        return self.analog.measure((t, t if end is None else end), self.pattern, COHERENT, 40_000.0, 0.0)
 
     def run(self, z: NDArray[np.complex64], status: NDArray[np.uint8] | None = None) -> Result:
         self.scan += 1
@@ -66,3 +103,36 @@ class StubSkin:
         return self.pipeline.run(
             RawFrame(skin="palm", scan=self.scan, stamps=stamps, source="board", valid=True, z=z, status=status)
         )
+
+
+@cache
+def _tared(snr_db: float) -> list[dict[str, Any]]:
+    skin = StubSkin(snr_db, tare=False)
+    skin.tare()
+    return [stage.state() for stage in skin.stages]
+
+
+def lasting(frame: ContactFrame) -> list[Contact]:
+    return [contact for contact in frame.contacts if contact.state != "end"]
+
+
+def present(result: Result) -> list[Contact]:
+    """What is said to press."""
+    return lasting(result.contact)
+
+
+def places(result: Result) -> list[list[float]]:
+    """Of what presses, m."""
+    return [contact.position[:2] for contact in present(result)]
+
+
+def off_m(result: Result, shape: Shape) -> float:
+    """How far the one contact is from a touch."""
+    (contact,) = present(result)
+    return float(np.hypot(contact.position[0] - METRES * shape.x, contact.position[1] - METRES * shape.y))
+
+
+def states(result: Result | DeltaFrame) -> dict[str, list[int]]:
+    """The electrodes in each state but ok."""
+    found = (result.delta if isinstance(result, Result) else result).electrodes
+    return {name: np.flatnonzero(found == k).tolist() for k, name in enumerate(ELECTRODE_STATES) if k and k in found}

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from models.measurement.number import Number
 from protocol.frame_types import REASONS, VERDICTS
 from protocol.frames import RawFrame
-from services.estimation.values import numbers
 from services.estimation.values.judgement import ROWS, Verdict, judge, reasons, valid
 from services.estimation.values.scan import Scan
 
@@ -31,31 +29,19 @@ def part(number: int) -> RawFrame:
     return frame
 
 
-def test_a_whole_scan_is_new_and_its_values_are_in_the_patterns_order() -> None:
-    first = Scan.of(whole(1))
-    second = Scan.of(whole(2), first)
-    assert second.complete and second.part == 0
+def test_a_whole_scan_is_new_and_of_parts_what_the_newest_ones_brought() -> None:
+    second = Scan.of(whole(2), Scan.of(whole(1)))
+    assert second.complete and second.part == 0 and (np.diff(second.ages_s) < 0).all()
     assert second.duration_s == pytest.approx(PERIOD_US * 1e-6, rel=1e-3)
-    assert (np.diff(second.ages_s) < 0).all()
     assert second.times_s.mean() == pytest.approx(0.0, abs=1e-5)  # `sample` is its middle
-
-
-def test_of_parts_the_newest_twelve_values_are_new() -> None:
     before = Scan.of(part(20))
     scan = Scan.of(part(21), before)
     assert scan.new.sum() == 12 and not scan.complete
     assert scan.ages_s[scan.new].max() < scan.ages_s[~scan.new].min()
     assert scan.times_s[scan.new].mean() == pytest.approx(0.0, abs=1e-5)  # `sample` is the newest part's middle
-
-
-def test_what_a_skipped_message_brought_is_new_too() -> None:
-    scan = Scan.of(part(23), Scan.of(part(20)))
-    assert scan.new.sum() == 36
-    assert Scan.of(part(30), Scan.of(part(20))).complete
-
-
-def test_after_the_boards_clock_began_anew_every_value_is_new() -> None:
-    assert Scan.of(part(3), Scan.of(part(2000))).complete
+    assert Scan.of(part(23), before).new.sum() == 36, "what a skipped message brought is new too"
+    assert Scan.of(part(30), before).complete
+    assert Scan.of(part(3), Scan.of(part(2000))).complete  # the board's clock began anew
 
 
 def test_a_frame_is_valid_unless_a_judgement_refuses_and_says_its_reasons_in_order() -> None:
@@ -64,27 +50,10 @@ def test_a_frame_is_valid_unless_a_judgement_refuses_and_says_its_reasons_in_ord
     turned = [judge("explained", 3.2, 1.6), judge("baseline", 1.0, 1.0)]
     assert [each.ratio for each in turned] == [2.0, 1.0]
     assert not valid(turned) and reasons(turned) == ["stale_baseline", "out_of_distribution"]
-    noted = judge("explained", 3.2, 1.6, turned=Verdict.NOTE)
-    assert valid([noted])
-
-
-def test_what_is_not_a_number_turns() -> None:
+    assert valid([judge("explained", 3.2, 1.6, turned=Verdict.NOTE)])
     assert judge("explained", float("nan"), 1.6).verdict is Verdict.REFUSE
 
 
-def test_every_number_says_its_unit_its_meaning_and_where_it_comes_from() -> None:
-    kinds = ("derived: ", "measured: ", "data sheet: ", "chosen: ")
-    found = dict(numbers.number.numbers_of(numbers)) | dict(numbers.number.numbers_of(numbers.measurement))
-    assert found and all(isinstance(each, Number) for each in found.values())
-    for name, each in found.items():
-        assert each.unit and each.meaning, name
-        assert each.origin.startswith(kinds), f"{name}: {each.origin}"
-    assert all(name in numbers.table() for name in found)
-
-
-def test_the_wire_has_a_word_for_every_verdict() -> None:
+def test_verdicts_and_reasons_are_those_of_the_wire() -> None:
     assert tuple(each.value for each in Verdict) == VERDICTS
-
-
-def test_every_reason_of_the_table_is_one_that_frames_explain() -> None:
     assert {row.reason for row in ROWS.values() if row.reason} <= set(REASONS)

@@ -1,9 +1,8 @@
-"""Force and its uncertainty, through the real stages, on presses solved on a mesh that no training uses."""
+"""Force and its uncertainty, through the real stages, on presses solved on a mesh that no training uses; its law."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,15 +19,19 @@ from services.contacts.force.law import ForceLaw, Look
 from services.contacts.force.of_disc import SATURATED, flat_drop
 from services.estimation.first.baseline import take
 from services.pipeline import Pipeline
-from services.runtime.config import ConfigError, Indenter, Skin
+from services.runtime.config import ConfigError, Skin
+from tests.services.stub_skin import METRES, present
 
 FRAME_NS = 45_000_000
-METRES = 0.05  # per model unit
+
+
+def disc_area(radius_m: float) -> float:
+    return float(np.pi * radius_m**2)
 
 
 @pytest.fixture(scope="module")
 def presses() -> SolvedPresses:
-    return solve(geometry.load("square16"), 150, seed=99)
+    return solve(geometry.load("square16"), 40, seed=99)
 
 
 class Skinny:
@@ -45,22 +48,27 @@ class Skinny:
         self.pipeline.reset()
         self.pipeline.pre.set_baseline(replace(self.baseline, z0=self.baseline.z0.copy()))
 
-    def press(self, d: np.ndarray) -> Contact | None:
-        self.scan += 1
-        z = self.z0 * (1 + d) * (1 + self.noise * self.rng.standard_normal(len(d)))
-        raw = RawFrame(
-            skin="skin",
-            scan=self.scan,
-            z=z.astype(np.complex64),
-            status=np.zeros(len(z), np.uint8),
-            stamps={"sample": self.scan * FRAME_NS},
-            source="replay",
-            valid=True,
-            board="b",
-        )
-        out = self.pipeline.run(raw)
-        found = [c for c in out.contact.contacts if c.state != "end"]
-        return found[0] if out.delta.touched and len(found) == 1 else None
+    def press(self, d: np.ndarray, frames: int = 1) -> Contact | None:
+        """The one contact of the last frame, on a skin that was free."""
+        self.release()
+        for _ in range(frames):
+            self.scan += 1
+            z = (self.z0 * (1 + d) * (1 + self.noise * self.rng.standard_normal(len(d)))).astype(np.complex64)
+            stamps = {"sample": self.scan * FRAME_NS}
+            raw = RawFrame(skin="skin", scan=self.scan, stamps=stamps, z=z, status=np.zeros(len(z), np.uint8))
+            raw.source, raw.valid, raw.board = "replay", True, "b"
+            out = self.pipeline.run(raw)
+        return present(out)[0] if out.delta.touched and len(present(out)) == 1 else None
+
+
+class Mesh:
+    def __init__(self, skin: str, mesh: str) -> None:
+        self.model = shared(skin, mesh)
+        self.z0 = np.abs(self.model.solve(1.0).impedances())
+
+    def change(self, *shapes: Shape) -> np.ndarray:
+        """(K,) relative."""
+        return np.asarray(np.abs(self.model.solve(self.model.touched(list(shapes))).impedances()) / self.z0 - 1)
 
 
 def configured(**more: object) -> Skin:
@@ -71,10 +79,7 @@ def scored(skinny: Skinny, presses: SolvedPresses, frames: int = 1) -> tuple[np.
     """(error / sigma, relative error) of the presses that are seen."""
     z, errors = [], []
     for shape, d in zip(presses.touches(), presses.difference, strict=True):
-        skinny.release()
-        for _ in range(frames):
-            c = skinny.press(d)
-        if c is not None:
+        if (c := skinny.press(d, frames)) is not None:
             assert c.force_n is not None and c.force_sigma_n is not None
             true = shape.force(METRES)
             z.append((c.force_n - true) / c.force_sigma_n)
@@ -82,72 +87,71 @@ def scored(skinny: Skinny, presses: SolvedPresses, frames: int = 1) -> tuple[np.
     return np.array(z), np.array(errors)
 
 
-@pytest.mark.release
-def test_most_presses_of_any_shape_fall_within_one_sigma(presses: SolvedPresses, bundle: Bundle) -> None:
-    found = [scored(Skinny(configured(), bundle, presses.z0, db), presses) for db in (62.0, 75.0, 120.0)]
-    z, errors = (np.concatenate(each) for each in zip(*found, strict=True))
-    # This draw and another have 86 and 88 %, with a standard error of 1.6: a sigma is of soft edges too, and these
-    # are sharp. One that is a quarter wider has 91.
-    assert len(z) > 400 and 0.61 < (np.abs(z) < 1).mean() < 0.9
-    assert (np.abs(z) < 3).mean() > 0.985
-    assert abs(np.median(errors)) < 0.02 and np.sqrt(np.mean(errors**2)) < 0.06
-
-
-def test_held_presses_are_no_worse_than_they_say(presses: SolvedPresses, bundle: Bundle) -> None:
-    some = SolvedPresses(presses.shapes[:60], presses.difference[:60], presses.z0)
-    z, _ = scored(Skinny(configured(), bundle, presses.z0, 66.0, hold=True), some, frames=8)
-    assert 0.5 < (np.abs(z) < 1).mean() < 0.9 and (np.abs(z) < 3).mean() > 0.96
+def test_presses_of_any_shape_are_no_worse_than_they_say(presses: SolvedPresses, bundle: Bundle) -> None:
+    """A sigma is of soft edges too, and these are sharp: 86 to 88 % lie within one in draws of 450."""
+    for decibel, frames in ((75.0, 1), (66.0, 4)):
+        z, errors = scored(Skinny(configured(), bundle, presses.z0, decibel, hold=frames > 1), presses, frames)
+        assert len(z) > 34 and (np.abs(z) < 1).mean() > 0.6 and (np.abs(z) < 3).mean() > 0.96
+        assert np.sqrt(np.mean(z**2)) > 0.3  # nor far better
+        assert abs(np.median(errors)) < 0.03 and np.sqrt(np.mean(errors**2)) < 0.12
 
 
 def test_a_known_indenter_takes_the_trade_off_away(bundle: Bundle) -> None:
-    model = shared("square16", "stub")
-    z0 = np.abs(model.solve(1.0).impedances())
-    rng = np.random.default_rng(3)
-    shapes = [Shape("circle", *rng.uniform(-0.75, 0.75, 2), 0.2, rng.uniform(0.1, 0.5)) for _ in range(30)]
-    d = np.array([np.abs(model.solve(model.touched([s])).impedances()) / z0 - 1 for s in shapes])
-    presses = SolvedPresses(np.array([s.as_row() for s in shapes]), d, z0)
-    prior = configured(indenter={"radius_m": 0.01})
-    z, known = scored(Skinny(prior, bundle, z0, 70.0), presses)
-    _, unknown = scored(Skinny(configured(), bundle, z0, 70.0), presses)
-    assert np.abs(known).mean() < 0.035 and np.abs(unknown).mean() < 0.06
-    assert np.abs(known).mean() < 0.8 * np.abs(unknown).mean()
-    assert 0.45 < (np.abs(z) < 1).mean() < 0.9
+    mesh, rng = Mesh("square16", "stub"), np.random.default_rng(3)
+    shapes = [Shape("circle", *rng.uniform(-0.75, 0.75, 2), 0.2, rng.uniform(0.1, 0.5)) for _ in range(16)]
+    presses = SolvedPresses(np.array([s.as_row() for s in shapes]), np.array([mesh.change(s) for s in shapes]), mesh.z0)
+    z, known = scored(Skinny(configured(indenter={"radius_m": 0.01}), bundle, mesh.z0, 70.0), presses)
+    _, unknown = scored(Skinny(configured(), bundle, mesh.z0, 70.0), presses)
+    assert np.abs(known).mean() < min(0.035, 0.8 * np.abs(unknown).mean()) and np.abs(unknown).mean() < 0.06
+    assert 0.3 < (np.abs(z) < 1).mean()
 
 
 def test_the_force_of_a_press_is_told_whatever_its_size(bundle: Bundle) -> None:
-    """Sizes, places and a mesh that the estimate's constants were not measured on; the peak read alone as published."""
-    model, rng = shared("square16", "inverse"), np.random.default_rng(11)
-    z0, table = np.abs(model.solve(1.0).impedances()), []
-    cases = [(mm, newton) for mm in (6.0, 8.5, 12.0, 18.0) for newton in (1.0, 2.0, 4.0) for _ in range(4)]
-    default, peak = Skinny(configured(), bundle, z0, 80.0), Skinny(configured(), bundle, z0, 80.0)
-    peak.pipeline.publishing._writer.law = replace(peak.pipeline.publishing.law, reads="peak", curve=Curve(10.0))
-    for mm, newton in cases:
+    """Sizes, places and a mesh that the estimate's constants were not measured on."""
+    mesh, rng, table = Mesh("square16", "inverse"), np.random.default_rng(11), []
+    skinny = Skinny(configured(), bundle, mesh.z0, 80.0)
+    for mm, newton in ((mm, newton) for mm in (6.0, 8.5, 12.0, 18.0) for newton in (1.0, 2.0, 4.0) for _ in range(2)):
         radius = mm * 1e-3
-        drop = FOAM.flat_drop(newton, np.pi * radius**2)
+        drop = FOAM.flat_drop(newton, disc_area(radius))
         x, y = rng.uniform(-1 + radius / METRES, 1 - radius / METRES, 2)
-        press = Shape("circle", x, y, radius / METRES, drop)
-        d = np.abs(model.solve(model.touched([press])).impedances()) / z0 - 1
-        default.release()
-        peak.release()
-        for _ in range(6):
-            c, other = default.press(d), peak.press(d)
-        assert c is not None and other is not None and c.force_sigma_n is not None
+        c = skinny.press(mesh.change(Shape("circle", x, y, radius / METRES, drop)), 6)
+        assert c is not None and c.force_n is not None and c.force_sigma_n is not None
         assert c.pressure_pa is not None and c.pressure_sigma_pa is not None
-        hard = float(FOAM.pressure(drop))
-        over, sigma, hidden = c.force_n / newton, c.force_sigma_n / newton, drop > SATURATED
-        table.append((mm, over, (c.force_n - newton) / c.force_sigma_n, other.force_n / newton, sigma, hidden))
-        assert abs(c.pressure_pa - hard) < 4 * c.pressure_sigma_pa
-    found = np.array(table)
-    for mm in np.unique(found[:, 0]):
-        assert np.median(found[found[:, 0] == mm, 1]) == pytest.approx(1.0, abs=0.05), mm
+        table.append((mm, c.force_n / newton, (c.force_n - newton) / c.force_sigma_n, c.force_sigma_n / newton, drop))
+        assert abs(c.pressure_pa - float(FOAM.pressure(drop))) < 4 * c.pressure_sigma_pa
+    sizes, over, sigmas, sigma, drops = np.array(table).T
+    assert all(np.median(over[sizes == mm]) == pytest.approx(1.0, abs=0.06) for mm in np.unique(sizes))
     # A press that saturates the foam has a force from below only: how far off it may be its sigma says.
-    told = found[:, 5] == 0
-    assert told.sum() >= 40 and np.sqrt(np.mean((found[told, 1] - 1) ** 2)) < 0.07
-    assert (np.abs(found[:, 2]) < 3).all()
+    told = drops <= SATURATED
+    assert told.sum() >= 18 and np.sqrt(np.mean((over[told] - 1) ** 2)) < 0.07
     # A sigma is of touches of any shape and edge, so discs lie well within; what they may not be is useless.
-    assert np.median(found[:, 4]) < 0.06
-    assert 0.25 < np.sqrt(np.mean(found[:, 2] ** 2)) < 1.2
-    assert np.sqrt(np.mean((found[:, 3] - 1) ** 2)) > 0.5
+    assert (np.abs(sigmas) < 3).all() and np.median(sigma) < 0.06 and 0.2 < np.sqrt(np.mean(sigmas**2)) < 1.2
+
+
+def test_the_peak_alone_is_right_for_the_published_indenter_and_wrong_for_others(bundle: Bundle) -> None:
+    """3 N through 10 mm, which both laws are anchored at, and through 20 mm, where they differ by a factor of 4. Noise
+    of 90 dB lets a peak be known to a few per cent.
+    """
+    mesh = Mesh("square16", "stub")
+    peak = Skinny(configured(reads="peak"), bundle, mesh.z0, 90.0)
+    for radius, expected in ((0.01, 3.0), (0.02, 0.75)):
+        drop = FOAM.flat_drop(3.0, disc_area(radius))
+        c = peak.press(mesh.change(Shape("circle", 0.1, 0.1, radius / METRES, drop)))
+        assert c is not None and c.force_n == pytest.approx(expected, rel=0.1) and c.pressure_pa is None
+
+
+def test_discs_that_act_alike_look_the_same_to_the_electrodes() -> None:
+    mesh, small, large, strong = Mesh("square16", "inverse"), 0.10, 0.15, 0.6
+    reference, share = mesh.change(Shape("circle", 0.2, -0.1, small, strong)), small**2 / large**2
+
+    def off(drop: float) -> float:
+        seen = mesh.change(Shape("circle", 0.2, -0.1, large, drop))
+        return float(np.linalg.norm(seen - reference) / np.linalg.norm(reference))
+
+    assert off(flat_drop(strong / (1 - strong / 2) * share)) < 0.04 < 0.15 < off(strong * share)
+
+
+# the law
 
 
 def look(**more: float) -> Look:
@@ -156,150 +160,77 @@ def look(**more: float) -> Look:
 
 def of_images(**more: object) -> ForceLaw:
     """Of a skin whose images alone tell its touches, calibrated by a foam like the shipped one."""
-    skin = Skin.model_validate({"port": "stub", "bundle": "disc16", "frame_id": "sole", **more})
+    skin = configured(bundle="disc16", **more)
     return replace(ForceLaw.of(skin, Bundle.load("disc16")), curve=Curve(1.0), calibrated=True)
 
 
-def test_the_kinds_law_says_it_is_no_calibration(bundle: Bundle) -> None:
-    law = ForceLaw.of(configured(), bundle)
-    assert not law.calibrated and law.exists and law.describe()["calibrated"] is False  # type: ignore[index]
-    assert not ForceLaw.of(Skin(port="stub", bundle="disc16"), Bundle.load("disc16")).exists
+def with_law(bundle: Bundle, **said: object) -> Bundle:
+    return replace(bundle, manifest={**bundle.manifest, "force_law": said})
 
 
-def test_an_image_tells_the_foams_pressure_and_its_patch() -> None:
-    for radius, drop in ((0.01, 0.3), (0.005, 0.7), (0.02, 0.1)):
-        area = np.pi * radius**2
-        force = of_images().force(look(peak=drop, peak_sigma=0.03 * drop, integral=area * drop))
-        assert force.newton == pytest.approx(FOAM.force("circle", drop, area))
-        assert force.pressure == pytest.approx(float(FOAM.pressure(drop)))
-        assert force.sigma == pytest.approx(0.03 * float(FOAM.gain(drop)) * force.newton)
-        assert force.pressure_sigma == pytest.approx(0.03 * float(FOAM.gain(drop)) * force.pressure)
-
-
-def test_forces_of_a_measured_bundle_are_its_images() -> None:
-    """A scan to a contact, without a network: one-step images of presses from 10 to 20 mm, whose error nobody says."""
-    bundle, model = Bundle.load("disc16"), shared("disc16", "stub")
-    z0 = np.abs(model.solve(1.0).impedances())
-    skinny = Skinny(Skin(port="stub", bundle="disc16"), bundle, z0, 90.0)
-    skinny.pipeline.publishing._writer.law = of_images()
-    for mm in (10.0, 15.0, 20.0):
-        for newton in (2.0, 4.0):
-            drop = FOAM.flat_drop(newton, np.pi * (1e-3 * mm) ** 2)
-            pressed = model.touched([Shape("circle", 0.2, -0.1, 1e-3 * mm / bundle.metres_per_unit, drop)])
-            skinny.release()
-            c = skinny.press(np.abs(model.solve(pressed).impedances()) / z0 - 1)
-            assert c is not None and c.force_n == pytest.approx(newton, rel=0.25), (mm, newton)
-            assert c.pressure_pa is not None and c.force_sigma_n is None and c.pressure_sigma_pa is None
+@pytest.mark.parametrize(("radius", "drop"), [(0.01, 0.3), (0.005, 0.7), (0.02, 0.1)])
+def test_an_image_tells_the_foams_pressure_and_its_patch(radius: float, drop: float) -> None:
+    area, gain = disc_area(radius), 0.03 * float(FOAM.gain(drop))
+    force = of_images().force(look(peak=drop, peak_sigma=0.03 * drop, integral=area * drop))
+    assert force.newton == pytest.approx(FOAM.force("circle", drop, area))
+    assert force.pressure == pytest.approx(float(FOAM.pressure(drop)))
+    assert (force.sigma, force.pressure_sigma) == pytest.approx((gain * force.newton, gain * force.pressure))
 
 
 def test_a_force_of_saturated_foam_says_so() -> None:
     law = of_images()
-    force = law.force(look(peak=0.8, peak_sigma=0.12))
-    assert law.saturates(force.pressure)
+    assert law.saturates(law.force(look(peak=0.8, peak_sigma=0.12)).pressure)
     assert not law.saturates(float(FOAM.pressure(0.5))) and not law.saturates(None)
     beyond, most = (law.force(look(peak=peak)) for peak in (1.5, 0.97))
     assert beyond.newton == pytest.approx(most.newton) and beyond.pressure == most.pressure  # no image tells more
 
 
 def test_of_a_known_indenter_an_image_tells_only_how_strongly_it_acts() -> None:
-    area, drop = np.pi * 0.005**2, FOAM.flat_drop(2.0, np.pi * 0.005**2)
-    law = of_images(indenter={"radius_m": 0.005})
+    area, law = disc_area(0.005), of_images(indenter={"radius_m": 0.005})
+    drop = FOAM.flat_drop(2.0, area)
     force = law.force(look(peak=drop, peak_sigma=0.03, integral=area * drop))
-    assert force.newton == pytest.approx(2.0, rel=0.01)
-    assert force.pressure == pytest.approx(2.0 / area, rel=0.01)
+    assert (force.newton, force.pressure) == pytest.approx((2.0, 2.0 / area), rel=0.01)
     assert force.sigma == pytest.approx(2.0 * float(FOAM.gain(drop)) * 0.03 / drop, rel=0.01)
     blurred = law.force(look(peak=0.5 * drop, integral=area * drop * (1 - drop / 4) / (1 - drop / 2)))
     assert blurred.newton == pytest.approx(2.0, rel=0.01)
     peak = replace(law, reads="peak", curve=Curve(10.0)).force(look(peak=drop, integral=area * drop))
-    assert peak.newton == pytest.approx(10.0 * drop) and peak.pressure == pytest.approx(10.0 * drop / area)
+    assert (peak.newton, peak.pressure) == pytest.approx((10.0 * drop, 10.0 * drop / area))
 
 
-def test_a_law_may_read_the_peak(bundle: Bundle) -> None:
-    manifest = {**bundle.manifest, "force_law": {"of": "peak"}}
-    law = ForceLaw.of(configured(), replace(bundle, manifest=manifest))
+def test_a_law_may_read_the_peak_or_the_integral(bundle: Bundle) -> None:
+    law = ForceLaw.of(configured(), with_law(bundle, of="peak"))
     force = law.force(look())
     assert force.newton == pytest.approx(3.0) and force.pressure is None and str(law) == "10 N per S/m, to 5 N"
+    integral = {"of": "integral", "newtons_per_siemens_metre": 3e4, "most_n": 4}
+    law = ForceLaw.of(configured(), with_law(bundle, **integral))
+    assert law.force(look(peak=0.1)).newton == pytest.approx(3.0) and law.most_n == 4
+    with pytest.raises(ConfigError, match="newtons_per_siemens_metre"):
+        ForceLaw.of(configured(), with_law(bundle, of="integral", most_n=4))
 
 
 def test_skin_toml_chooses_what_forces_are_read_from(bundle: Bundle) -> None:
-    said = {"of": "peak", "newtons_per_siemens": 8.0}
-    its_own = replace(bundle, manifest={**bundle.manifest, "force_law": said})
+    its_own, disc16 = with_law(bundle, of="peak", newtons_per_siemens=8.0), Bundle.load("disc16")
     for reads, of, newton in (("peak", bundle, 3.0), ("peak", its_own, 2.4), (None, its_own, 2.4)):
         assert ForceLaw.of(configured(reads=reads), of).force(look()).newton == pytest.approx(newton)
-    assert ForceLaw.of(configured(reads="pressure"), its_own).describe() == ForceLaw.of(configured(), bundle).describe()
+    law = ForceLaw.of(configured(), bundle)
+    assert ForceLaw.of(configured(reads="pressure"), its_own).describe() == law.describe()
+    assert not law.calibrated and law.exists and not ForceLaw.of(Skin(port="stub", bundle="disc16"), disc16).exists
     with pytest.raises(ConfigError, match=r"skins\.sole\.reads: found 'peak', .* disc16 have no scale"):
-        ForceLaw.of(Skin(port="stub", bundle="disc16", reads="peak"), Bundle.load("disc16"), "sole")
+        ForceLaw.of(Skin(port="stub", bundle="disc16", reads="peak"), disc16, "sole")
 
 
-def test_the_peak_alone_is_right_for_the_published_indenter_and_wrong_for_others(bundle: Bundle) -> None:
-    """A scan to a contact: 3 N through 10 mm, which both laws are anchored at, and through 20 mm.
-
-    Noise of 90 dB lets a peak be known to a few per cent; the laws differ by a factor of 4 at 20 mm.
-    """
-    model = shared("square16", "stub")
-    z0 = np.abs(model.solve(1.0).impedances())
-    peak = Skinny(configured(reads="peak"), bundle, z0, 90.0)
-    for mm, expected in ((10.0, 3.0), (20.0, 0.75)):
-        drop = FOAM.flat_drop(3.0, np.pi * (1e-3 * mm) ** 2)
-        pressed = model.touched([Shape("circle", 0.1, 0.1, 1e-3 * mm / METRES, drop)])
-        peak.release()
-        c = peak.press(np.abs(model.solve(pressed).impedances()) / z0 - 1)
-        assert c is not None and c.force_n == pytest.approx(expected, rel=0.1) and c.pressure_pa is None
-
-
-def test_a_law_may_read_the_integral(bundle: Bundle) -> None:
-    manifest = {**bundle.manifest, "force_law": {"of": "integral", "newtons_per_siemens_metre": 3e4, "most_n": 4}}
-    law = ForceLaw.of(configured(), replace(bundle, manifest=manifest))
-    assert law.force(look(peak=0.1)).newton == pytest.approx(3.0) and law.most_n == 4
-    del manifest["force_law"]["newtons_per_siemens_metre"]
-    with pytest.raises(ConfigError, match="newtons_per_siemens_metre"):
-        ForceLaw.of(configured(), replace(bundle, manifest=manifest))
-
-
-def test_what_the_image_says_of_its_error_is_passed_on() -> None:
+def test_the_images_error_and_the_calibrations_own_are_passed_on() -> None:
     law = replace(of_images(), reads="peak", curve=Curve(10.0))
-    assert law.force(look()).sigma == pytest.approx(0.3)
-    assert law.force(look(peak_sigma=0.0)).sigma is None
-
-
-def test_the_calibrations_own_error_adds_to_the_images() -> None:
-    law = replace(of_images(), reads="peak", curve=Curve(10.0, 2.0), own_error=0.15)
-    force = law.force(look())
+    assert law.force(look()).sigma == pytest.approx(0.3) and law.force(look(peak_sigma=0.0)).sigma is None
+    force = replace(law, curve=Curve(10.0, 2.0), own_error=0.15).force(look())
     assert force.newton == pytest.approx(0.9) and force.sigma == pytest.approx(0.9 * 0.25)  # hypot(2 * 10 %, 15 %)
 
 
-@pytest.mark.parametrize(("name", "half"), [("square16", "0.05"), ("disc16", "0.08")])
-def test_an_indenter_that_cannot_press_this_skin_is_refused(name: str, half: str) -> None:
-    of = Bundle.load(name)
+def test_an_indenter_that_cannot_press_this_skin_is_refused(bundle: Bundle) -> None:
     for radius in (1e-9, 0.5):
-        skin = configured(indenter={"radius_m": radius})
-        with pytest.raises(
-            ConfigError, match=rf"skins\.palm\.indenter\.radius_m: found {radius:g} m; expected 0\.000.* to {half} m"
-        ):
-            ForceLaw.of(skin, of, "palm")
-    for radius in (0.001, float(half)):
-        assert ForceLaw.of(configured(indenter={"radius_m": radius}), of).indenter_m2 == pytest.approx(
-            np.pi * radius**2
-        )
-
-
-def test_an_indenter_is_checked(tmp_path: Path) -> None:
-    assert Indenter(radius_m=0.01).kind == "circle"
-    with pytest.raises(ValueError, match="greater than 0"):
-        Indenter(radius_m=0.0)
-
-
-def test_discs_that_act_alike_look_the_same_to_the_electrodes() -> None:
-    model = shared("square16", "inverse")
-    z0 = np.abs(model.solve(1.0).impedances())
-
-    def seen(radius: float, drop: float) -> np.ndarray:
-        return np.abs(model.solve(model.touched([Shape("circle", 0.2, -0.1, radius, drop)])).impedances()) / z0 - 1
-
-    def off(from_: np.ndarray) -> float:
-        return float(np.linalg.norm(from_ - reference) / np.linalg.norm(reference))
-
-    small, large, strong = 0.10, 0.15, 0.6
-    reference, share = seen(small, strong), small**2 / large**2
-    same = flat_drop(strong / (1 - strong / 2) * share)
-    assert off(seen(large, same)) < 0.04 < 0.15 < off(seen(large, strong * share))
+        said = rf"skins\.palm\.indenter\.radius_m: found {radius:g} m; expected 0\.000.* to 0.05 m"
+        with pytest.raises(ConfigError, match=said):
+            ForceLaw.of(configured(indenter={"radius_m": radius}), bundle, "palm")
+    for radius in (0.001, 0.05):
+        law = ForceLaw.of(configured(indenter={"radius_m": radius}), bundle)
+        assert law.indenter_m2 == pytest.approx(disc_area(radius))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.shapes import Shape, drop_image
 from services.estimation.images.quality import Residual
-from tests.services.stub_skin import StubSkin, transfer
+from tests.services.stub_skin import StubSkin, present, transfer
 
 TOUCHES = [
     (Shape("circle", 0.2, -0.3, 0.2, 0.15),),
@@ -25,11 +25,6 @@ def clean(bundle: Bundle, shapes: tuple[Shape, ...]) -> NDArray[np.float64]:
     """(K,) |Z| of the stub's sheet."""
     t, (i, j) = transfer(shapes), np.asarray(bundle.pattern)[:, :2].T
     return np.asarray(t[i, i] + t[j, j] - 2 * t[i, j])
-
-
-@pytest.fixture(scope="module")
-def skin() -> StubSkin:
-    return StubSkin(80.0)
 
 
 @pytest.mark.parametrize("shapes", TOUCHES)
@@ -55,46 +50,38 @@ def test_what_it_cannot_tell_is_none(bundle: Bundle) -> None:
     d, sigma = np.zeros(120, np.float32), np.full(120, 1e-4, np.float32)
     assert residual(d, np.full(120, np.inf, np.float32), np.zeros((96, 96), np.float32)) is None
     assert residual(d[:64], sigma[:64], np.zeros((96, 96), np.float32)) is None
-    assert residual(d, sigma, np.zeros((0, 0), np.float32)) is None
     assert residual(d, sigma, np.zeros((95, 95), np.float32)) is None
     assert residual(d, sigma, np.zeros((96, 96), np.float32)) == 0
 
 
-def test_touches_have_quality(skin: StubSkin) -> None:
-    for shapes in TOUCHES:
-        result = skin.feel(shapes)
-        assert result.contact.valid and result.contact.quality is not None and result.contact.quality > 0.8
-        held = skin.feel(shapes)
-        assert held.contact.valid and held.contact.quality is not None and held.contact.quality > 0.8
-        assert skin.rest(2).contact.quality is None
-
-
-def test_random_frames_make_no_valid_contact(skin: StubSkin, bundle: Bundle) -> None:
+def test_touches_have_quality_and_random_frames_make_no_valid_contact(bundle: Bundle) -> None:
     """Noise of any size, channels and electrodes exchanged, other skins, one value, clipped, falling."""
+    skin = StubSkin()
+    for shapes in TOUCHES:
+        for contact in (result.contact for result in skin.felt(2, shapes)):
+            assert contact.valid and contact.quality is not None and contact.quality > 0.8
+        assert skin.rest(4).contact.quality is None
     rng, z0, seen = np.random.default_rng(1), clean(bundle, ()), 0
     place = {frozenset(row[:2]): k for k, row in enumerate(bundle.pattern.tolist())}
-    for _ in range(4):
+    for _ in range(3):
         z = clean(bundle, TOUCHES[rng.integers(len(TOUCHES))])
         d, size, order = z / z0 - 1, 10 ** rng.uniform(-3.0, -0.3), rng.permutation(16)
         electrodes = [place[frozenset(order[row[:2]].tolist())] for row in bundle.pattern]
         for frame in (
             z0 * (1 + size * rng.standard_normal(120)),
-            z0 * (1 + size * np.abs(rng.standard_normal(120))),
             z0 * (1 + rng.permutation(d)),
             z0 * (1 + d[electrodes]),
             z0 * np.exp(0.3 * rng.standard_normal(120)),
             np.full(120, 10 ** rng.uniform(-2, 4)),
             np.minimum(z, np.quantile(z0, rng.uniform(0, 0.6))),
             z0 * (1 - d),
-            z0 * (1 - 0.1 * d),
         ):
             noisy = frame * (1 + 1e-4 * rng.standard_normal(120))
             result = skin.run(noisy.astype(np.complex64))
-            contacts = [c for c in result.contact.contacts if c.state != "end"]
-            assert not (result.contact.valid and contacts)
+            assert not (result.contact.valid and present(result))
             seen += result.image.residual is not None and result.image.residual > 0.5
             skin.rest(4)
-    assert seen > 8  # it is the residual that refuses many of them
+    assert seen > 4  # it is the residual that refuses many of them
     assert skin.rest(3).contact.valid
 
 

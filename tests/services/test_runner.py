@@ -1,168 +1,121 @@
-"""The runner, as a process of its own: what comes out of its sockets, what it does about silence and rubbish."""
+"""The runner: what comes out of its sockets, what it does about silence, lateness, failures and rubbish."""
 
-from __future__ import annotations
-
+import contextlib
 import dataclasses
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
-from typing import ClassVar
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from models.bundle import Bundle
-from models.mismatch import MismatchedSheet, named
-from protocol.frames import DeltaFrame, Frame, ImageFrame, InfoFrame, RawFrame, StatusFrame, pack
+from protocol.frames import DeltaFrame, ImageFrame, InfoFrame, RawFrame, StatusFrame, pack
 from protocol.sockets import AllReader, ControlClient, ControlError, Publisher
 from services.runner import Runner
+from services.runtime import lateness
 from services.runtime.config import ROOT, parse
 from services.runtime.lateness import Lateness
 from services.runtime.stage import Stage
-from tests.services.conftest import Board
+from tests.waiting import WAIT_S, until
 
-pytestmark = pytest.mark.live
-
-PALM = {"skins": {"palm": {"port": "stub", "bundle": "square16"}}}
+PALM = {"port": "stub", "bundle": "square16"}
 CONFIG = '[skins.palm]\nport = "stub"\nbundle = "square16"\nnetwork = "none"\n'
 
 
-def just_measured(frame: RawFrame, ago_s: float = 0.01) -> RawFrame:
+def measured(frame, ago_s=0.01):
     """With stamps of now; the bound is generous, for a machine that runs tests may be slow."""
     now = time.monotonic_ns()
-    frame.stamps = {"sample": now - int(ago_s * 1e9), "read": now}
-    frame.valid_for_s = 2.0
+    frame.stamps, frame.valid_for_s = {"sample": now - int(ago_s * 1e9), "read": now}, 20.0
     return frame
 
 
 class Process:
-    """preprocessing, fed by us in acquisition's place."""
+    """preprocessing as a process of its own, fed by us in acquisition's place."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         (folder / "skin.toml").write_text(CONFIG)
-        self.env = dict(os.environ, EITSKIN_CONFIG=str(folder / "skin.toml"))
-        self.upstream = Publisher("acquisition")
+        self.upstream, self.log = Publisher("acquisition"), open(folder / "log", "w+")
         self.out = AllReader(["delta", "status", "info"], "palm", endpoint=f"ipc://{folder}/preprocessing.ipc")
-        self.control = ControlClient("preprocessing", 10.0)
-        self.log = open(folder / "log", "w+")
-        self.start()
+        self.control = ControlClient("preprocessing", WAIT_S)
+        self.env = dict(os.environ, EITSKIN_CONFIG=str(folder / "skin.toml"))
 
-    def start(self) -> None:
+    def start(self, board):
         command = [sys.executable, "-m", "services.preprocessing"]
         self.popen = subprocess.Popen(command, cwd=ROOT, env=self.env, stderr=self.log)
+        self.connect(board)
 
-    def feed(self, board: Board, n: int, difference: np.ndarray | float = 0.0) -> list[DeltaFrame]:
+    def connect(self, board):
+        until(lambda: self.send(board.frame()) and isinstance(self.out.recv(0.1), DeltaFrame), self.popen)
+
+    def send(self, frame, ago_s=0.01):
+        self.upstream.poll(), self.upstream.send(measured(frame, ago_s))
+        return frame.scan
+
+    def feed(self, board, n, difference=0.0, ago_s=0.01):
         """Send frames, each when the one before has come out; what came out."""
-        outs = []
-        for _ in range(n):
-            frame = just_measured(board.frame(difference))
-            self.upstream.send(frame)
-            outs.append(self.until(DeltaFrame, lambda f, scan=frame.scan: f.scan == scan))
-        return outs
+        scans = (self.send(board.frame(difference), ago_s) for _ in range(n))
+        return [self.until(DeltaFrame, lambda f, scan=scan: f.scan == scan) for scan in scans]
 
-    def connect(self, board: Board) -> None:
-        """Send frames until one comes out."""
-        end = time.monotonic() + 20
-        while time.monotonic() < end:
-            self.upstream.send(just_measured(board.frame()))
-            if any(isinstance(f, DeltaFrame) for f in self.take(0.1)):
-                return
-        raise AssertionError("no frame came through: " + self.logged())
+    def until(self, kind, fits):
+        return until(lambda: isinstance(f := self.out.recv(0.5), kind) and fits(f) and f, self.popen)
 
-    def take(self, seconds: float) -> list[Frame]:
-        found, end = [], time.monotonic() + seconds
-        while (frame := self.out.recv(max(0.0, end - time.monotonic()))) is not None:
-            found.append(frame)
-        return found
+    def refused(self, match, kind, command, **args):
+        with pytest.raises(ControlError, match=match) as refused:
+            self.control.call(command, **args)
+        assert refused.value.kind == kind
 
-    def until(self, kind: type, fits=lambda frame: True, timeout_s: float = 15.0):
-        end = time.monotonic() + timeout_s
-        while time.monotonic() < end:
-            frame = self.out.recv(0.5)
-            if isinstance(frame, kind) and fits(frame):
-                return frame
-        raise AssertionError(f"no such {kind.__name__}: {self.logged()}")
-
-    def logged(self) -> str:
-        self.log.seek(0)
-        return self.log.read()
-
-    def close(self) -> None:
-        self.popen.kill()
-        self.popen.wait()
-        self.upstream.close()
-        self.out.close()
-        self.log.close()
+    def kill(self):
+        self.popen.kill(), self.popen.wait()
 
 
 @pytest.fixture
-def process(runtime: Path) -> Iterator[Process]:
+def process(runtime, board):
     made = Process(runtime)
+    made.start(board)
     yield made
-    made.close()
+    made.kill()
+    for each in (made.upstream, made.out, made.log):
+        each.close()
 
 
-def test_frames_commands_silence_and_a_crash(process: Process, board: Board, bundle: Bundle) -> None:
+@pytest.mark.live
+def test_frames_commands_silence_and_a_crash(process, board, bundle, runtime):
     """One process, all the way: it takes seconds to start, so what can be looked at together is."""
-    process.connect(board)
     outs = process.feed(board, 80)
     first, last = outs[0], outs[-1]
-    assert last.valid and not last.touched
+    assert last.valid and not last.touched and last.source == "board" and last.valid_for_s == 20.0
     assert last.session == first.session and last.seq == first.seq + 79
     assert last.stamps["sample"] < last.stamps["read"] < last.stamps["preprocess"] <= time.monotonic_ns()
-    assert last.source == "board" and last.valid_for_s == 2.0
+    latched = AllReader(["info"], "palm")
+    info = until(lambda: (f := latched.recv(1)) and isinstance(f, InfoFrame) and "baseline" in f.info and f.info)
+    assert info["bundle_hash"] == bundle.hash and len(info["baseline"]) == 120
+    latched.close()
 
-    late = AllReader(["info"], "palm")
-    info = late.recv(10)  # latched
-    while isinstance(info, InfoFrame) and "baseline" not in info.info:  # the tick that says of the tare may be to come
-        info = late.recv(10)
-    late.close()
-    assert isinstance(info, InfoFrame)
-    assert info.info["bundle_hash"] == bundle.hash and len(info.info["baseline"]) == 120
-
-    for rubbish in (b"raw/palm\0", b"raw/palm\0\xc1", b"raw/palm\0" + os.urandom(300), pack(board.frame())[:-7]):
+    for rubbish in (b"raw/palm\0\xc1", b"raw/palm\0" + bytes(range(256)), pack(board.frame())[:-7]):
         process.upstream.socket.send(rubbish)
-        time.sleep(0.05)
-    old = just_measured(board.frame(), ago_s=3.0)
-    process.upstream.send(old)
-    late = process.until(DeltaFrame, lambda f: f.scan == old.scan)
+        assert process.feed(board, 1)[0].valid
+    (late,) = process.feed(board, 1, ago_s=30.0)
     assert not late.valid and "late" in late.reasons, "not silence, and not to be acted on"
     assert process.feed(board, 1)[0].valid
     status = process.until(StatusFrame, lambda f: f.counters["late"] == 1 and f.drops["malformed"] > 0)
-    assert "3.0 s after they were measured" in " ".join(status.messages) and status.level != "OK"
+    assert "30.0 s after they were measured" in " ".join(status.messages) and status.level != "OK"
     assert status.process == "preprocessing" and 0 < status.rates["delta"] and status.latency["work_p50"] > 0
 
     touch = board.disc(0.0, 0.0, 0.2, 0.3)
     assert process.feed(board, 3, touch)[-1].touched
-    with pytest.raises(ControlError, match="touched") as refused:
-        process.control.call("tare", skin="palm")
-    assert refused.value.kind == "refused"
-    for truthy in ("no", "false", 1, [0]):
-        with pytest.raises(ControlError, match="argument force: found .*, expected true or false") as refused:
-            process.control.call("tare", skin="palm", force=truthy)
-        assert refused.value.kind == "bad_request"
+    process.refused("touched", "refused", "tare", skin="palm")
+    process.refused("configured: palm", "bad_request", "tare", skin="plam")
     assert process.feed(board, 1, touch)[-1].touched  # by the baseline that it had
-    with pytest.raises(ControlError, match="configured: palm"):
-        process.control.call("tare", skin="plam")
-    for no_name in ([1], {"palm": 1}, 7):
-        with pytest.raises(ControlError, match="argument skin: found .*, expected text") as refused:
-            process.control.call("status", skin=no_name)
-        assert refused.value.kind == "bad_request"
-    assert process.control.call("status")["flowing"]
 
     silent = process.until(StatusFrame, lambda f: f.level == "STALE")
-    assert "no raw/palm" in " ".join(silent.messages)
-    assert not [f for f in process.take(0.3) if isinstance(f, DeltaFrame)]
-    assert not process.control.call("status")["flowing"]
+    assert "no raw/palm" in " ".join(silent.messages) and not process.control.call("status")["flowing"]
 
-    process.popen.kill()
-    process.popen.wait()
-    process.start()
-    process.connect(board)
+    process.kill()
+    process.start(board)
     again = process.feed(board, 1, touch)[0]
     assert again.valid and again.touched  # by the baseline of before the crash, although touched all the while
     assert again.session != last.session
@@ -173,295 +126,161 @@ def test_frames_commands_silence_and_a_crash(process: Process, board: Board, bun
     assert not out.valid and out.session == session and out.seq == 0
     process.control.call("load", skin="palm", state=state)
     assert process.feed(board, 1)[0].valid
-    with pytest.raises(ControlError, match="does not fit"):
-        process.control.call("load", skin="palm", state={"bundle": bundle.hash, "baseline": 3})
-    with pytest.raises(ControlError, match="does not fit"):
-        process.control.call("load", skin="palm", state=state | {"hold": 3, "window": {}, "seen": []})
-
-    began = time.monotonic()
+    process.refused("does not fit", "refused", "load", skin="palm", state=state | {"hold": 3, "window": {}})
     process.popen.send_signal(signal.SIGTERM)
-    assert process.popen.wait(5) == 0 and time.monotonic() - began < 3
-    assert "Traceback" not in process.logged()
+    assert process.popen.wait(WAIT_S) == 0 and "Traceback" not in (runtime / "log").read_text()
 
 
-class Counting(Stage):
-    """Says which frames came together."""
-
-    reads, writes, stamp = "raw", ("delta",), "preprocess"
-    groups: ClassVar[list[int]] = []
-
-    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
-        return [DeltaFrame(skin=self.skin, scan=frame.scan)]
-
-    @classmethod
-    def together(cls, work: Sequence[tuple[Stage, Frame]]) -> None:
-        cls.groups.append(len(work))
-
-
-class OneFrame:
-    """A feed that holds one frame."""
+class Feed:
+    """Frames that the test gives, all at once."""
 
     malformed = skipped = 0
 
-    def __init__(self, skin: str) -> None:
-        self.socket = object()
-        z, status = np.ones(120, np.complex64), np.zeros(120, np.uint8)
-        stamps = {"read": time.monotonic_ns()}
-        self.waiting: list[Frame] = [RawFrame(skin=skin, stamps=stamps, valid=True, z=z, status=status)]
+    def __init__(self):
+        self.socket, self._waiting = os.eventfd(0, os.EFD_NONBLOCK), []
+        self.close = lambda: os.close(self.socket)
 
-    def recv(self) -> Frame | None:
-        return self.waiting.pop() if self.waiting else None
+    def give(self, *frames):
+        self._waiting += frames
+        os.eventfd_write(self.socket, 1)
 
-    def close(self) -> None:
-        pass
-
-
-@pytest.mark.release
-def test_a_tare_by_command_is_followed_by_a_calibration_that_outlives_a_crash(
-    process: Process, board: Board, bundle: Bundle, runtime: Path
-) -> None:
-    """The fit runs in a process of its own: frames go on meanwhile, and name it once it is in use."""
-    off = np.abs(MismatchedSheet("square16", named("mild"), "stub").solve().impedances()) / bundle.z0 - 1
-    process.connect(board)
-    assert process.feed(board, 80, off)[-1].calibration == ""
-    assert process.control.call("tare", skin="palm", force=True)["calibrating"]
-    end, out = time.monotonic() + 240, None
-    while time.monotonic() < end and (out is None or not out.calibration):
-        out = process.feed(board, 1, off)[0]
-        time.sleep(0.05)
-    assert out is not None and out.calibration and out.valid, process.logged()
-    latched = AllReader(["info"], "palm", endpoint=f"ipc://{runtime}/preprocessing.ipc")
-    frame = latched.recv(15.0)
-    latched.close()
-    assert isinstance(frame, InfoFrame) and frame.info["bundle_hash"] == out.calibration
-    assert frame.info["mounting"]["bundle_hash"] == bundle.hash
-    time.sleep(2.0)  # ticks, in which it is kept
-    process.popen.kill()
-    process.popen.wait()
-    process.start()
-    process.connect(board)
-    assert process.feed(board, 3, off)[-1].calibration == out.calibration
+    def recv(self):
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self.socket)
+        return self._waiting.pop(0) if self._waiting else None
 
 
-@pytest.mark.parametrize("skip", [True, False])
-def test_rules_that_no_skin_owns_have_their_switches(runtime: Path, skip: bool) -> None:
-    skins = {name: {"port": "stub", "bundle": "square16"} for name in ("palm", "arm")}
-    runner = Runner("preprocessing", parse({"skins": skins, "skip": {"batch": skip, "unwanted": skip}}))
-    try:
-        Counting.groups.clear()
-        for name in skins:
-            runner.add(Counting(name), OneFrame(name))
-        assert runner._wanted(runner.channels["arm"].stage) == (frozenset() if skip else {"delta"})
-        runner._serve(list(runner.channels.values()))
-        assert Counting.groups == ([2] if skip else [])
-        assert runner.publisher.sent == {"delta/palm": 1, "delta/arm": 1}
-    finally:
-        runner.close()
-
-
-class Waiting(OneFrame):
-    """A feed in which frames have queued up, measured so many seconds ago."""
-
-    def __init__(self, skin: str, *ages: float, source: str = "board") -> None:
-        super().__init__(skin)
-        (first,), now = self.waiting, time.monotonic_ns()
-        self.waiting = [
-            dataclasses.replace(
-                first,
-                scan=n,
-                source=source,
-                valid_for_s=2.0,
-                reasons=[],
-                stamps={"sample": now - int(age * 1e9), "read": now},
-            )
-            for n, age in enumerate(ages)
-        ][::-1]  # `pop` takes the oldest
-        self.count = len(ages)
+def raws(*ages_s, source="board"):
+    """Frames that have queued up, measured so many seconds ago."""
+    z, status = np.ones(120, np.complex64), np.zeros(120, np.uint8)
+    frames = (RawFrame(skin="palm", scan=n, valid=True, z=z, status=status, source=source) for n in range(len(ages_s)))
+    return [measured(frame, age) for frame, age in zip(frames, ages_s, strict=True)]
 
 
 class Passing(Stage):
-    """What comes in goes out."""
+    """What comes in goes out. Notes what the runner tells it."""
 
     reads, writes, stamp = "", ("raw",), "read"
+    fails = 0  # so many frames fail in what can wait
 
-    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
-        return [frame]
+    def __init__(self, skin):
+        super().__init__(skin)
+        self.wanted, self.told = [], []
+        self.joined, self.wake = self.told.append, lambda: self.told.append("awake")
+
+    def process(self, frame, wanted):
+        self.wanted.append(wanted)
+        return [dataclasses.replace(frame, skin=self.skin)]
+
+    def beside(self, wanted):
+        if self.fails:
+            self.fails -= 1
+            raise ValueError(f"what can wait of scan {self.fails}")
+        return []
 
 
 @pytest.fixture
-def passed(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., list[RawFrame]]]:
-    """What a runner sends of what has queued up."""
-    runner = Runner("acquisition", parse({"skins": {"palm": {"port": "stub", "bundle": "square16"}}}))
-    sent: list[RawFrame] = []
-    monkeypatch.setattr(runner.publisher, "send", sent.append)
+def driven(runtime):
+    """Runs a runner, as a process would, while a thread does its steps; then ends it by a signal."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
-    def serve(feed: Waiting, stood: bool = False) -> list[RawFrame]:
-        runner.add(Passing("palm"), feed)
-        runner._serve(list(runner.channels.values()), stood)
-        assert sum(runner.channels["palm"].heartbeat.drops.values()) == feed.count - len(sent)
-        return sent
+    def drive(runner, steps):
+        with ThreadPoolExecutor() as pool:
+            done = pool.submit(steps)
+            done.add_done_callback(lambda _: os.kill(os.getpid(), signal.SIGTERM))
+            runner.run()
+            done.result()
 
-    yield serve
-    runner.close()
-
-
-class FailingBeside(Passing):
-    """Makes what can wait from a frame, or fails to."""
-
-    def beside(self, wanted: frozenset[str]) -> list[Frame]:
-        raise ValueError("what can wait")
+    yield drive
+    signal.set_wakeup_fd(-1)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
-def test_what_can_wait_is_made_after_the_first_frame_has_left(
-    runtime: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    runner = Runner("acquisition", parse(PALM))
-    sent: list[RawFrame] = []
-    monkeypatch.setattr(runner.publisher, "send", sent.append)
-    try:
-        runner.add(FailingBeside("palm"), Waiting("palm", 0.1))
-        runner._serve(list(runner.channels.values()))
-        assert [f.scan for f in sent] == [0]
-        assert runner.channels["palm"].heartbeat.drops["failed"] == 1 and "what can wait" in caplog.text
-    finally:
-        runner.close()
+@pytest.mark.live
+@pytest.mark.parametrize("skip", [True, False])
+def test_what_queued_up_is_judged_and_what_fails_is_counted(driven, caplog, skip):
+    runner = Runner("acquisition", parse({"skins": {"palm": PALM}, "skip": {"unwanted": skip}}))
+    stage, feed = Passing("palm"), Feed()
+    runner.add(stage, feed)
+    out, control = AllReader(["raw"], "palm"), ControlClient("acquisition", WAIT_S)
+
+    def sent(*frames, count):
+        feed.give(*frames)
+        seen = [until(lambda: out.recv(0.1)) for _ in range(count)]
+        return [(frame.scan, frame.valid, frame.reasons) for frame in seen]
+
+    def steps():
+        until(lambda: "raw" in stage.told)
+        late = sent(*raws(90, 80, 1, 0.1, 70), count=3)
+        assert late == [(2, True, []), (3, True, []), (4, False, ["late"])]
+        assert control.call("status")["drops"] == {"late": 2, "failed": 0, "malformed": 0, "skipped": 0}
+        replayed = sent(*raws(90, 80, source="replay"), count=2)
+        assert replayed == [(0, True, []), (1, True, [])], "the same frames however slow the machine"
+        assert stage.wanted[-1] == {"raw"}
+        stage.fails = 3
+        assert len(sent(*raws(0.1, 0.1, 0.1, 0.1), count=4)) == 4, "what can wait fails after the first has left"
+        status = until(lambda: (said := control.call("status"))["failures"] == 3 and said)
+        assert status["drops"]["failed"] == 3 and status["unlogged"] == 2 and "what can wait" in caplog.text
+
+        out.close()
+        until(lambda: runner.publisher.sent["status/palm"] > 1)  # nobody subscribes any more
+        until(lambda: (feed.give(*raws(0.1)), stage.wanted[-1] == (frozenset() if skip else {"raw"}))[1])
+
+    driven(runner, steps)
 
 
-def test_what_is_late_is_skipped_and_the_newest_is_sent_all_the_same(passed: Callable[..., list[RawFrame]]) -> None:
-    sent = passed(Waiting("palm", 9.0, 8.0, 1.0, 0.1, 7.0))
-    assert [(f.scan, f.valid, f.reasons) for f in sent] == [(2, True, []), (3, True, []), (4, False, ["late"])]
-
-
-def test_a_process_that_stood_still_takes_the_newest_only(passed: Callable[..., list[RawFrame]]) -> None:
-    assert [f.scan for f in passed(Waiting("palm", 1.0, 0.5, 0.1), True)] == [2]
-
-
-def test_replayed_frames_are_neither_late_nor_skipped(passed: Callable[..., list[RawFrame]]) -> None:
-    """A replay gives the same frames however slow the machine."""
-    sent = passed(Waiting("palm", 9e3, 8e3, 7e3, source="replay"), True)
-    assert [(f.scan, f.valid) for f in sent] == [(0, True), (1, True), (2, True)]
-
-
-class Lacking(Passing):
-    """Wants again what upstream sends only once, and notes what the runner tells it."""
-
-    reads, writes, sleeps = "image", ("contact",), True
-
-    def __init__(self, skin: str) -> None:
-        super().__init__(skin)
-        self.told: list[str] = []
-
-    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
-        self.lacks = True
-        return []
-
-    def joined(self, topic: str) -> None:
-        self.told.append(topic)
-
-    def wake(self) -> None:
-        self.told.append("awake")
-
-
-def test_who_subscribes_is_told_of_and_what_is_lacking_is_asked_for_by_subscribing(runtime: Path) -> None:
-    upstream = Publisher("inference")
-    asked: list[bytes] = []
+@pytest.mark.live
+def test_who_subscribes_is_told_of_and_what_is_lacking_is_asked_for_by_subscribing(driven):
+    upstream, asked = Publisher("inference"), []
     upstream.on_join = asked.append
-    runner = Runner("publisher", parse({"skins": {"palm": {"port": "stub", "bundle": "square16"}}}))
-    contacts = AllReader(["contact"], "palm")
-    stage = Lacking("palm")
+    runner, stage = Runner("publisher", parse({"skins": {"palm": PALM}})), Passing("palm")
+    stage.reads, stage.writes, stage.sleeps, stage.lacks = "image", ("contact",), True, True
+    stage.process = lambda frame, wanted: []
+    contacts, control = AllReader(["contact"], "palm"), ControlClient("publisher", WAIT_S)
+    runner.add(stage)
 
-    def until(what: Callable[[], object]) -> None:
-        end = time.monotonic() + 20
-        while not what():
-            assert time.monotonic() < end
-            runner._tick()
-            upstream.poll()
-            upstream.send(ImageFrame(skin="palm"))
-            runner._serve(list(runner.channels.values()))
-            time.sleep(0.01)
+    def pumped(what):
+        until(lambda: (upstream.poll(), upstream.send(ImageFrame(skin="palm")), what())[2])
 
-    try:
-        runner.add(stage)
-        until(lambda: "contact" in stage.told)
-        until(lambda: len(asked) >= 5 and set(asked) == {b"image/palm\0", b"part/palm\0"})
+    def steps():
+        pumped(lambda: "contact" in stage.told)
+        pumped(lambda: len(asked) >= 5 and set(asked) == {b"image/palm\0", b"part/palm\0"})
         contacts.close()
-        until(lambda: runner.channels["palm"].asleep)
+        pumped(lambda: control.call("status")["idle"])
         asked.clear()
-        contacts = AllReader(["contact"], "palm")
-        until(lambda: asked)
-        assert "awake" in stage.told[stage.told.index("contact") + 1 :]
-    finally:
-        contacts.close()
-        runner.close()
-        upstream.close()
+        again = AllReader(["contact"], "palm")
+        pumped(lambda: asked and "awake" in stage.told[stage.told.index("contact") + 1 :])
+        again.close()
+
+    driven(runner, steps)
+    upstream.close()
 
 
-def test_a_stop_and_a_sleep_of_the_host_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the loop's own time; and by the clock that goes on while the host is suspended."""
-    now, slept, naps = [100.0], [0.0], []
-    monkeypatch.setattr("services.runtime.lateness.time.monotonic", lambda: now[0])
-    monkeypatch.setattr("services.runtime.lateness.pause", naps.append)
-    monkeypatch.setattr("protocol.ages._slept_ns", lambda: int(slept[0] * 1e9))
-    lateness = Lateness()
+def test_a_stop_and_a_sleep_of_the_host_are_noticed_and_the_newest_is_taken_only(monkeypatch):
+    """By the loop's own time; and by the clock that goes on while the host is suspended. Ages are of the real one."""
+    clock = SimpleNamespace(now=1000.0, slept=0.0, naps=[], monotonic_ns=time.monotonic_ns)
+    clock.monotonic = lambda: clock.now
+    monkeypatch.setattr(lateness, "time", clock)
+    monkeypatch.setattr(lateness, "pause", clock.naps.append)
+    monkeypatch.setattr("protocol.ages._slept_ns", lambda: int(clock.slept * 1e9))
+    judge = Lateness()
 
-    def after(seconds: float, timeout_s: float) -> bool:
-        now[0] += seconds
-        return lateness.stood_still(timeout_s)
+    def after(seconds, timeout_s):
+        clock.now += seconds
+        return judge.stood_still(timeout_s)
 
-    assert not after(0.2, 0.2) and not after(0.01, -3.0) and not naps
-    assert after(2.0, 0.2) and len(naps) == 1
-    assert not after(0.2, 0.2)
-    frame = RawFrame(skin="palm", z=np.ones(1, "c8"), status=np.zeros(1, "u1"), valid_for_s=2.0)
-    frame.stamps = {"sample": time.monotonic_ns()}
-    assert not lateness.late(frame)
-    slept[0] = 30.0
+    def news(stood, source="board"):
+        return [frame.scan for frame in judge.news(raws(30.0, 1.0, 0.5, 25.0, source=source), stood)]
+
+    assert news(stood=False) == [1, 2, 3] and news(stood=True) == [3]
+    assert news(stood=True, source="replay") == [0, 1, 2, 3]
+    assert not after(0.2, 0.2) and not after(0.01, -3.0) and not after(0.29, 0.2) and not clock.naps
+    assert after(0.31, 0.2) and len(clock.naps) == 1 and not after(0.2, 0.2)
+    (frame,) = raws(0.1)
+    assert not judge.late(frame)
+    clock.slept = 30.0
     assert after(0.0, 0.2), "the monotonic clock stood still"
-    assert lateness.late(frame), "measured before the host slept"
-    frame.stamps = {"sample": time.monotonic_ns()}
-    assert not lateness.late(frame) and not after(0.2, 0.2)
-
-
-class Failing(Stage):
-    reads, writes, stamp = "image", ("contact",), "publish"
-    text = ""
-
-    def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
-        raise ValueError(self.text)
-
-
-def test_failures_are_logged_however_many_there_were_and_all_are_counted(
-    runtime: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    runner, stage, now = Runner("publisher", parse(PALM)), Failing("palm"), [time.monotonic()]
-    lines = 0
-
-    def fail(text: str) -> int:
-        caplog.clear()
-        stage.text = text
-        runner._handle(runner.channels["palm"], ImageFrame(skin="palm"))
-        return len(caplog.records)
-
-    def words(k: int) -> str:
-        return "".join(chr(ord("a") + int(digit)) for digit in str(k))
-
-    try:
-        runner.add(stage)
-        monkeypatch.setattr("services.runtime.said_once.time.monotonic", lambda: now[0])
-        assert fail("scan 1 is odd") == 1 and fail("scan 2 is odd") == 0, "the same failure of another scan"
-        lines = sum(fail(words(k)) for k in range(200))
-        assert 10 <= lines <= 50, "a flood of different ones does not fill the disk"
-        now[0] += 120.0
-        assert fail("of another kind") == 1 and fail("scan 3 is odd") == 1, "nor does it silence what comes later"
-        said = runner._commands.handlers()["status"]({})
-        assert said["failures"] == 204 and said["unlogged"] == 204 - 3 - lines
-    finally:
-        runner.close()
-
-
-def test_a_configuration_that_is_wrong_ends_in_one_clear_line(runtime: Path) -> None:
-    (runtime / "skin.toml").write_text(CONFIG.replace("square16", "square17"))
-    env = dict(os.environ, EITSKIN_CONFIG=str(runtime / "skin.toml"))
-    command = [sys.executable, "-m", "services.inference"]
-    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1
-    assert "square17" in done.stderr and "Traceback" not in done.stderr
+    assert judge.late(frame), "measured before the host slept"
+    assert not judge.late(raws(0.0)[0]) and not after(0.2, 0.2)
+    judge.close()

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from models.shapes import Shape
-from protocol.scan_setting import COHERENT
 from services.pipeline import Result
-from tests.services.stub_skin import TRANSFER, StubSkin, transfer
+from tests.services.stub_skin import METRES, TRANSFER, StubSkin, present, transfer
 
 TOUCHES = (
     Shape("circle", 0.8, 0.4, 0.25, 0.22),
@@ -19,21 +18,20 @@ TOUCHES = (
     Shape("circle", 0.1, 0.25, 0.12, 0.3),
 )
 RAMP = (0.0, 0.35, 0.79, 1.0)  # share of the force at the ends of the scans that a ramp of 0.1 s is in
-METRES = 0.05
 
 
 def levels(touch: Shape, shares: tuple[float, ...]) -> list[TRANSFER]:
     return [transfer((replace(touch, drop=share * touch.drop),) if share else ()) for share in shares]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def skin() -> StubSkin:
-    return StubSkin(80.0)
+    return StubSkin()
 
 
 @pytest.mark.parametrize("touch", TOUCHES)
 def test_a_touch_that_comes_and_goes_is_where_it_is_or_says_changing(skin: StubSkin, touch: Shape) -> None:
-    skin.rest(20)
+    skin.rest(3)
     up = levels(touch, RAMP)
     begin = [skin.see(*scan) for scan in pairwise(up)]
     held = [skin.see(up[-1]) for _ in range(8)]
@@ -58,21 +56,17 @@ def test_a_touch_that_comes_and_goes_is_where_it_is_or_says_changing(skin: StubS
     assert not any(hides(r) for r in [*begin, *end]), [r.contact.reasons for r in [*begin, *end]]
 
 
-def present(result: Result) -> list[object]:
-    return [c for c in result.contact.contacts if c.state != "end"]
-
-
 def hides(result: Result) -> bool:
     """Whether a person would take the frame for one in which nothing touches."""
     return result.contact.valid and not present(result) and "changing" not in result.contact.reasons
 
 
 @pytest.mark.parametrize("touch", TOUCHES)
-@pytest.mark.parametrize("shares", [(1.0, 0.6, 0.15, 0.0), (1.0, 0.93, 0.5, 0.06), (1.0, 0.3, 0.0)])
+@pytest.mark.parametrize("shares", [(1.0, 0.93, 0.5, 0.06), (1.0, 0.3, 0.0)])
 def test_no_frame_hides_a_touch_that_goes_while_it_is_scanned(
     skin: StubSkin, touch: Shape, shares: tuple[float, ...]
 ) -> None:
-    skin.rest(20)
+    skin.rest(3)
     down = levels(touch, shares)
     for _ in range(6):
         skin.see(down[0])
@@ -85,23 +79,3 @@ def test_no_frame_hides_a_touch_that_goes_while_it_is_scanned(
 
 def says_changing(results: list[Result]) -> int:
     return sum("changing" in r.contact.reasons for r in results)
-
-
-def test_what_stays_as_it_is_did_not_change(skin: StubSkin) -> None:
-    """The same odd frame again and again, of a touch that goes while it is scanned: something shakes there, or a fault
-    looks like it. It is no free skin, and no touch elsewhere.
-    """
-    touch = TOUCHES[1]
-    skin.rest(20)
-    up = levels(touch, RAMP)
-    for scan in pairwise(up):
-        skin.see(*scan)
-    skin.see(up[-1])
-    z, status = skin.analog.measure((up[1], up[0]), skin.pattern, COHERENT, 40_000.0, 0.0)
-    seen = []
-    for _ in range(8):
-        noise = 1 + 1e-4 * np.random.default_rng(skin.scan).standard_normal(len(z))
-        seen.append(skin.run((z * noise).astype(np.complex64), status))
-    assert not any(hides(r) for r in seen)
-    near = METRES * np.array([touch.x, touch.y])
-    assert all(np.hypot(*(np.array(c.position[:2]) - near)) < 5e-3 for r in seen if r.contact.valid for c in present(r))
