@@ -134,7 +134,7 @@ class Preprocessing(Stage):
             return [self._unusable(out, "stale_baseline")]
         scan = Scan.of(frame, self._before)
         if self.each_alone:
-            scan = replace(scan, separate=True)
+            scan = scan.alone()
         self._before = scan
         estimate = self.estimator.step(scan)
         self._look_at_baseline()

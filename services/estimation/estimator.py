@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
@@ -52,7 +53,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 18  # of a kept state
+LAYOUT = 19  # of a kept state
 
 
 @dataclass
@@ -141,7 +142,7 @@ class Estimator:
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
         self.skin = TaredSkin(self._tables, baseline.log_z0, baseline.live, baseline.scatter, baseline.frames)
         age_s = min(max(age_s, 0.0), float(n.OLDEST_S))
-        self.skin.adopt(next_id, min(contact_per_s * age_s, n.START_CONTACT), age_s)
+        self.skin.adopt(next_id, contact_per_s, age_s)
         self.now = EstimatorState(adopted_age_s=age_s)
         self.taring.adopted(baseline.doubt)
 
@@ -221,7 +222,9 @@ class Estimator:
         judgements = [judge("believed", float(not scan.believed), 1.0)]
         judgements += self.taring.judgements(self.skin is not None)
         if self.skin is not None and now.adopted_age_s is not None:
-            self.skin.drift.now.at_s = measured.middle_s - now.adopted_age_s
+            for state in self.skin.aged:
+                state.at_s += measured.middle_s
+            self.skin.drift.now = self.skin.aged[-1]
             now.adopted_age_s = None
         if self.skin is None:
             self._first()
@@ -332,7 +335,7 @@ class Estimator:
         if vague := skin.touches.drop_the_vague(skin.faults.in_question):
             self.now.candidates = [OpenTouch(track.state, track.since_s) for track in vague]
         scan, steps = measured.scan, skin.faults.now.gain_steps
-        asked, at = self._explaining(skin, measured)
+        asked, at = self._likeliest_age(skin, measured)
         if asked.answer.holds and (pressed := skin.refused.explained(measured.oldest_s)):
             skin.remember(pressed)
             asked, at = self._explaining(skin, measured)  # again: what is left may be memory
@@ -389,6 +392,23 @@ class Estimator:
         skin.held.keep(alike, middle_s, skin.touches.ids, question, answer)
         if answer.fit is None:
             skin.quick.keep(alike, middle_s, question.white, skin.drift.even_variance(middle_s))
+
+    def _likeliest_age(self, skin: TaredSkin, measured: LookedAt) -> tuple[Asked, AskedScan]:
+        """What explains a scan: the first one after a baseline was adopted tells how far the skin has drifted. In doubt
+        further: who takes drift for a touch is worse off than who is unsure.
+        """
+        if len(skin.aged) < 2:
+            return self._explaining(skin, measured)
+        found, faults, budget = [], skin.faults.now, measured.budget.left
+        for state in skin.aged:
+            skin.drift.now, skin.faults.now, self.now.information = state, deepcopy(faults), None
+            measured.budget.left = budget
+            found.append((*self._explaining(skin, measured), state, skin.faults.now))
+        holding = [each for each in found if each[0].answer.holds] or found
+        enough = max(each[0].answer.score for each in holding) - n.YOUNGER
+        asked, at, skin.drift.now, skin.faults.now = [each for each in holding if each[0].answer.score >= enough][-1]
+        skin.aged = []
+        return asked, at
 
     def _explaining(self, skin: TaredSkin, measured: LookedAt) -> tuple[Asked, AskedScan]:
         """What explains a scan, and the scan as it was asked about."""

@@ -68,6 +68,7 @@ class TaredState:
     slow: SlowState
     adrift: float
     wide: bool
+    aged: list[FilterState]  # of a baseline that was adopted, by how old it may be; empty after the first scan
 
 
 class TaredSkin:
@@ -86,6 +87,7 @@ class TaredSkin:
         self.slow = SlowLook(self.drift)
         self.refused = RefusedChange(tables.measurements)
         self.quick, self.held = QuickLook(self.hypotheses.grid), HeldLook()
+        self.aged = list[FilterState]()
         self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
         self.asking = FaultAsking(self.tables, self.noise, self.touches, self.hypotheses, self.faults)
 
@@ -96,14 +98,22 @@ class TaredSkin:
         self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / self.frames)
         self.touches.now.next_id = next_id
 
-    def adopt(self, next_id: int, contact_sd: float, age_s: float) -> None:
-        """The baseline was taken earlier, and nobody watched since: contact_sd, relative, of what each contact
-        impedance may have changed by meanwhile.
+    def adopt(self, next_id: int, contact_per_s: float, age_s: float) -> None:
+        """The baseline was taken age_s before the next scan, and nobody watched since. How far the skin has drifted is
+        a mixture: as far as in each of AGES of that time. The first scan weighs them (`aged`). contact_per_s: relative,
+        by which contact impedances change.
         """
         self.noise.now.white = float(np.median(self.scatter[self.live] ** 2))
-        self.drift.begin(0.0, np.full(self.tables.electrodes, n.CONTACT_START**2 + contact_sd**2), age_s)
-        bends = n.CONTACT_BENDS * contact_sd * np.linalg.norm(self.tables.contact, axis=1)
-        self.drift.now.remainder_variance += self.scatter**2 / self.frames + bends**2
+        self.aged = []
+        for share in n.AGES if age_s else n.AGES[-1:]:
+            self.drift.begin(0.0, np.zeros(self.tables.electrodes), share * age_s)
+            contact_sd = min(contact_per_s * share * age_s, float(n.START_CONTACT))
+            contacts = np.arange(self.drift.contacts.start, self.drift.contacts.stop)
+            self.drift.now.p[contacts, contacts] = n.CONTACT_START**2 + contact_sd**2
+            bends = n.CONTACT_BENDS * contact_sd * np.linalg.norm(self.tables.contact, axis=1)
+            self.drift.now.remainder_variance += self.scatter**2 / self.frames + bends**2
+            self.drift.now.at_s = -share * age_s
+            self.aged.append(self.drift.now)
         self.touches.now.next_id, self.touches.now.watched = next_id, False
 
     def with_tables(self, tables: SkinTables) -> TaredSkin:
@@ -146,6 +156,7 @@ class TaredSkin:
             slow=self.slow.now,
             adrift=self.hypotheses.adrift,
             wide=self.hypotheses.wide,
+            aged=self.aged,
         )
 
     def load(self, state: TaredState) -> None:
@@ -160,4 +171,4 @@ class TaredSkin:
         self.drift.now, self.touches.now = state.drift, state.touches
         self.learning.now, self.faults.now, self.refused.now = state.learning, state.faults, state.refused
         self.slow.now = state.slow
-        self.hypotheses.adrift, self.hypotheses.wide = state.adrift, state.wide
+        self.hypotheses.adrift, self.hypotheses.wide, self.aged = state.adrift, state.wide, state.aged

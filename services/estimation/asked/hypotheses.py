@@ -40,7 +40,6 @@ from services.estimation.asked.question import (
     DRIFT,
     MEMORY,
     NOISE,
-    ONSETS,
     Question,
     ScoredAnswer,
     likeliest,
@@ -364,7 +363,7 @@ class Hypotheses:
             pulled, white = fit.pulled, fit.white
         score, full = -np.inf, started_from(fit)
         while (len(fit) if fit else 0) < n.MOST_TOUCHES and not question.spent:
-            z2, disc, action, since_s = self.left_over.best(question, pulled, white, fit, ONSETS)
+            z2, disc, action, since_s = self.left_over.best(question, pulled, white, fit, question.onsets)
             if z2 < n.FALSE_ALARM_Z2:
                 break
             x, y = self.grid.discs[disc, PLACE]

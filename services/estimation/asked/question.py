@@ -70,6 +70,11 @@ class Question:
         times_s = np.sort(self.times_s)
         return np.asarray(times_s[times_s <= (ONSETS[-1] - 0.5) * self.span_s]) - JUST_BEFORE_S
 
+    @property
+    def onsets(self) -> tuple[float, ...]:
+        """Shares of the scan after which a disc is looked for: none where all values are of one instant."""
+        return ONSETS if np.ptp(self.times_s) > 0 else ()
+
     def leaving(self, share: float) -> Question:
         """The same, which leaves so much of its steps to the next."""
         return replace(self, keeps=self.keeps + share * max(0.0, self.budget.left - self.keeps))

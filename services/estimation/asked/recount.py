@@ -16,7 +16,6 @@ from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anywhere, plain
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.asked.question import (
-    ONSETS,
     Question,
     ScoredAnswer,
     begun_as,
@@ -66,7 +65,7 @@ class Recount:
     def _one_more(self, question: Question, begun: Sequence[TouchPrior], discs: ScoredAnswer) -> list[ScoredAnswer]:
         """A disc beside discs. begun: the touches of those discs, with their outlines."""
         left = self._hypotheses.left_over
-        z2, disc, action, since_s = left.best(question, discs.pulled, discs.white, discs.fit, ONSETS)
+        z2, disc, action, since_s = left.best(question, discs.pulled, discs.white, discs.fit, question.onsets)
         if z2 < n.FALSE_ALARM_Z2 or len(begun) >= n.MOST_TOUCHES:
             return []
         x, y = self._hypotheses.grid.discs[disc, PLACE]

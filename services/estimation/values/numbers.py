@@ -152,6 +152,12 @@ TARE_UNTRAINED = Number(
     0.0056, "-", "noise beyond which no network was trained", "derived: 45 dB, models/augmentation.py"
 )
 TARE_DRIFTS = Number(3e-3, "-", "log conductivity, change while they come", "derived: a degree in 3 s")
+AGES = (
+    Number(0.0, "-", "of a baseline's age, that its skin has drifted by: as if just taken", "derived: the least"),
+    Number(0.1, "-", "the same: a tenth as far as its rates say", "derived: half way, in decades, to noise"),
+    Number(1.0, "-", "the same: as far as its rates say", "derived: the most"),
+)
+YOUNGER = Number(10.0, "nat", "by which less drift must be likelier", "chosen: 30 counts 7 of 80 rows worse at 70 dB")
 OLDEST_S = Number(600.0, "s", "age of a baseline beyond which it is no older", "derived: FIELD_RATE makes 12 % of it")
 TARE_IDENTICAL = Number(1e-12, "-", "noise below which scans are the same", "derived: arithmetic of their mean")
 TARE_ASSUMED = Number(1e-3, "-", "noise where scans tell none", "chosen: 60 dB, ten times the board's")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -46,6 +46,10 @@ class Scan:
     def times_s(self) -> Array:
         """(K,) when each value was measured, from `sample_ns` on (below 0: before)."""
         return (self.at_ns - self.sample_ns) * 1e-9 - self.ages_s
+
+    def alone(self) -> Scan:
+        """The same of a scan that stands by itself: whoever measured it waited, and nobody knows in which order."""
+        return replace(self, separate=True, ages_s=np.full(len(self.values), self.duration_s / 2))
 
     @classmethod
     def of(cls, frame: RawFrame, before: Scan | None = None) -> Scan:
