@@ -23,7 +23,7 @@ REPORT = ROOT / "build" / "check-all.json"
 PYTHON = ".venv/bin/python"
 PYTEST = f"{PYTHON} -m pytest"
 PACKAGES = "g++ libc6-dev cppzmq-dev libmsgpack-cxx-dev chromium fonts-dejavu-core iptables"
-REQUIRED = ("REFERENCE", "BROWSER", "TRAIN", "PLOTS", "PEERS", "CPP", "ROS")  # tests/needs.py
+REQUIRED = ("REFERENCE", "BROWSER", "TRAIN", "PLOTS", "CPP", "ROS")  # tests/needs.py
 
 
 @dataclass(frozen=True)

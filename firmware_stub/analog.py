@@ -46,10 +46,6 @@ class BoardNoise:
     relative: float = 1e-4
     floor: float = 0.0
 
-    @classmethod
-    def of_db(cls, snr_db: float) -> BoardNoise:
-        return cls(10 ** (-snr_db / 20))
-
     def sigma(self, z: NDArray[np.float64], setting: ScanSetting) -> NDArray[np.float64]:
         return np.asarray(np.hypot(self.relative * np.abs(z), self.floor) * noise_over_papers(setting))
 

@@ -1,15 +1,13 @@
 """Figures of merit of a reconstruction, in the field's definitions.
 
 Images are conductivity drops [S/m], (n, n) on the square [-1, 1]^2, row 0 at the lowest y, positive where touched.
-Lengths are model units unless named otherwise (`millimetres`, `of_side` convert). Equation numbers are those of the
-MM-CNN paper; the GREIT figures follow Adler et al., "GREIT: a unified approach to 2D linear EIT reconstruction of lung
-images" (2009).
+Lengths are model units unless named otherwise (`of_side` converts). Equation numbers are those of the
+MM-CNN paper.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -136,10 +134,6 @@ def of_side(distance: ArrayLike) -> Array:
     return np.asarray(np.asarray(distance, float) / SIDE * 100)
 
 
-def millimetres(distance: ArrayLike, metres_per_unit: float = 0.05) -> Array:
-    return np.asarray(np.asarray(distance, float) * metres_per_unit * 1e3)
-
-
 # -- force ------------------------------------------------------------------------------------------------------------
 def relative_error(estimate: ArrayLike, truth: ArrayLike) -> Array:
     """Per cent, without sign: force error where force is linear in the (peak or integrated) drop."""
@@ -150,36 +144,6 @@ def relative_error(estimate: ArrayLike, truth: ArrayLike) -> Array:
 def integrated(image: Array) -> float:
     """Integrated drop, S/m times square model units."""
     return float(image.sum() * (SIDE / len(image)) ** 2)
-
-
-# -- GREIT ------------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class Greit:
-    """Amplitude response, position error (target further out than its image: positive), resolution, shape deformation,
-    ringing. The set q of pixels above a quarter of the maximum stands for the target's image."""
-
-    AR: float
-    PE: float
-    RES: float
-    SD: float
-    RNG: float
-
-
-def greit(image: Array, shape: Shape) -> Greit:
-    """GREIT's five figures for one target. At best AR is 1 and PE, SD, RNG are 0; RES is sqrt(area of q / of skin)."""
-    n = len(image)
-    q = image > image.max() / 4
-    pixel = (SIDE / n) ** 2
-    middle = centroid(np.where(q, image, 0.0))
-    distance = np.hypot(*np.moveaxis(pixel_centres(n) - middle, -1, 0))
-    circle = distance <= np.sqrt(q.sum() * pixel / np.pi)
-    return Greit(
-        AR=integrated(image) / shape.integral,
-        PE=float(np.hypot(*shape.centroid) - np.hypot(*middle)),
-        RES=float(np.sqrt(q.sum() / q.size)),
-        SD=float((q & ~circle).sum() / q.sum()),
-        RNG=float(-image[~circle & (image < 0)].sum() / image[circle].sum()),
-    )
 
 
 # -- likeness of images -----------------------------------------------------------------------------------------------
@@ -207,41 +171,11 @@ def ssim(image: Array, truth: Array, sigma: float = 1.5) -> float:
     return float(index.mean())
 
 
-# -- counts -----------------------------------------------------------------------------------------------------------
-def confusion(true: ArrayLike, predicted: ArrayLike, n: int = 5) -> NDArray[np.int64]:
-    """(n, n) counts, row = true class."""
-    matrix = np.zeros((n, n), int)
-    np.add.at(matrix, (np.asarray(true, int), np.asarray(predicted, int)), 1)
-    return matrix
-
-
-def accuracy(matrix: NDArray[np.int64]) -> float:
-    """Per cent of a confusion matrix on its diagonal; NaN for an empty one."""
-    return float(100 * np.trace(matrix) / matrix.sum()) if matrix.sum() else float("nan")
-
-
-def separation(gaps: ArrayLike, counted: ArrayLike, share: float = 0.95) -> float:
-    """Smallest gap between two touches from which on at least `share` of wider ones are counted as two; inf if none."""
-    order = np.argsort(-np.asarray(gaps, float))
-    gap, right = np.asarray(gaps, float)[order], np.asarray(counted, bool)[order]
-    good = np.cumsum(right) / np.arange(1, len(right) + 1) >= share
-    fails = np.flatnonzero(~good)
-    last = (fails[0] if fails.size else len(good)) - 1
-    return float(gap[last]) if last >= 0 else float("inf")
-
-
-def false_touches_per_hour(touched: ArrayLike, rate_hz: float) -> float:
-    """Touches that begin in frames (N,) of a skin that nobody touches, per hour at `rate_hz` frames a second."""
-    flags = np.concatenate([[False], np.asarray(touched, bool)])
-    begins = int((flags[1:] & ~flags[:-1]).sum())
-    return begins * rate_hz * 3600 / (len(flags) - 1)
-
-
 # -- one frame --------------------------------------------------------------------------------------------------------
 def score(image: Array, shapes: Sequence[Shape], truth: Array | None = None) -> dict[str, float]:
     """All image figures of one frame of touches `shapes`; `truth` (n, n) saves rasterising it.
 
-    position, force, integral and GREIT only for a single touch; position in model units, errors in per cent.
+    position, force and integral only for a single touch; position in model units, errors in per cent.
     """
     truth = drop_image(shapes, len(image)) if truth is None else truth
     masks = touch_masks(image, shapes)
@@ -262,6 +196,4 @@ def score(image: Array, shapes: Sequence[Shape], truth: Array | None = None) -> 
         found["peak"] = float(image.max())
         found["force_error"] = float(relative_error(image.max(), shape.drop))
         found["integral_error"] = float(relative_error(integrated(image), shape.integral))
-        if image.max() > 0:
-            found.update({f"greit_{k}": v for k, v in vars(greit(image, shape)).items()})
     return found

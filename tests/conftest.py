@@ -1,7 +1,5 @@
 """Fixtures that more than one folder of tests uses."""
 
-from __future__ import annotations
-
 from tests import pinned
 
 pinned.pin()  # before anything imports numpy
@@ -20,7 +18,7 @@ from typing import Any
 import hypothesis
 import pytest
 
-from tests.needs import pytest_make_collect_report, pytest_terminal_summary  # noqa: F401  (hooks of pytest)
+from tests.needs import pytest_terminal_summary  # noqa: F401  (a hook of pytest)
 from tests.waiting import end, until
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,7 +61,7 @@ def pytest_runtest_setup() -> None:
 
 
 def _folder(patch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A runtime folder with a path short enough for sockets."""
+    """With a path short enough for sockets."""
     with tempfile.TemporaryDirectory(prefix="eit", dir="/tmp", ignore_cleanup_errors=True) as folder:
         patch.setenv("EITSKIN_RUNTIME", folder)
         yield Path(folder)

@@ -3,13 +3,11 @@ says how to get it, and the end of the run counts what was skipped by what is mi
 says so in the environment ($EITSKIN_REQUIRE_TRAIN and so on): there a test that lacks it fails.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import shutil
 from collections import Counter
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,14 +28,12 @@ class Need:
     files: Sequence[Path] = ()
 
     def here(self) -> None:
-        """Goes on where all is there; else skips the test, or the whole file that calls this while it is imported."""
         missing = [name for name in self.packages if importlib.util.find_spec(name) is None]
         missing += [name for name in self.programs if shutil.which(name) is None]
         if missing := missing + [str(file) for file in self.files if not file.is_file()]:
             self.lack(", ".join(missing))
 
     def lack(self, what: str) -> None:
-        """Skips or fails for the lack of this, as found by the test itself."""
         said = f"no {what}: {self.get}"
         if self.required and os.environ.get(self.required, "0") not in ("", "0"):
             pytest.fail(f"{said} (${self.required} is set)", pytrace=False)
@@ -57,28 +53,16 @@ HEADERS = [Path("/usr/include/zmq.hpp"), Path("/usr/include/msgpack.hpp")]
 CPP = Need(GET_CPP, "EITSKIN_REQUIRE_CPP", programs=["g++"], files=HEADERS)
 ROS_PYTHON = Path(os.environ.get("EITSKIN_ROS_PYTHON") or ROOT / ".venv-ros" / "bin" / "python")
 ROS_2 = Need("`make ros-venv` (270 MB), or $EITSKIN_ROS_PYTHON names one", "EITSKIN_REQUIRE_ROS", files=[ROS_PYTHON])
-SYSTEMD = Need("`apt-get install systemd`", programs=["systemd-analyze"])
 REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE") or ROOT / ".." / "shared" / "data").resolve()
 
 
 def reference(name: str) -> Path:
-    """A file of the reference data, which nobody here made up."""
     path = REFERENCE / name
     Need("$EITSKIN_REFERENCE names the folder of the reference data", "EITSKIN_REQUIRE_REFERENCE", files=[path]).here()
     return path
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, Any, Any]:
-    """A file that was skipped is named itself: tests in several processes count equal reports once."""
-    report = yield
-    if report.skipped:
-        report.longrepr = (str(collector.path), *report.longrepr[1:])
-    return report
-
-
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """What was not run, counted by what is missing: last lines of `make test`. A skipped file counts one."""
     said = [report.longrepr for report in terminalreporter.stats.get("skipped", [])]
     reasons = Counter(str(s[2] if isinstance(s, Sequence) else s).removeprefix("Skipped: ") for s in said)
     for reason, count in sorted(reasons.items()):

@@ -5,8 +5,6 @@ do the workers of pytest-xdist, which is how PYTHONHASHSEED takes effect. EITSKI
 as the machine has them, so that pinning hides nothing from users (`make check-all` runs once so).
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random

@@ -1,8 +1,4 @@
-"""Who may import whom: protocol <- models <- services; firmware_stub uses protocol and models, never services; and no
-circle of files or folders. The project's exceptions are one tree, and a class name is there once.
-
-The running services read bundles and do pure numerics; they must start without PyTorch or a mesh.
-"""
+"""Who may import whom, without circles. The running services must start without PyTorch or a mesh."""
 
 import ast
 import builtins
@@ -49,14 +45,12 @@ class Source(NamedTuple):
 
 @cache
 def sources() -> dict[str, Source]:
-    """Module -> what its file says; a package is its __init__. Every file is read once."""
     files = [p.relative_to(ROOT) for folder in (*ALLOWED, "bench") for p in sorted((ROOT / folder).rglob("*.py"))]
     names = {".".join(p.with_suffix("").parts).removesuffix(".__init__"): p for p in files if "work" not in p.parts}
     return {name: source(path, names.keys()) for name, path in names.items()}
 
 
 def source(path: pathlib.Path, modules: set[str]) -> Source:
-    """`from package import part` imports the part where that is a module, else the package."""
     found = Source(set(), [])
     todo: list[ast.AST] = [ast.parse((ROOT / path).read_text(encoding="utf-8"))]
     for node in todo:  # statements alone: an expression imports nothing
@@ -82,7 +76,6 @@ def of(folder: str) -> dict[str, Source]:
 
 @cache
 def graph() -> dict[str, set[str]]:
-    """Module -> the modules of ours that it imports, whether for types only or not."""
     found = {name: {i for i in each.imports if i in sources()} - {name} for name, each in sources().items()}
     return found | {"protocol": set()}  # which only lends names of its modules, each loaded when it is first used
 
@@ -124,7 +117,6 @@ def test_no_circle_of_files_or_folders() -> None:
 
 
 def test_estimation_imports_numerics_only_and_stands_in_its_order() -> None:
-    """What reads files, keeps states and answers commands stays outside, and outside of the measurement model."""
     for name, each in (of("services.estimation") | of("models.measurement")).items():
         more = {n for n in graph()[name] - {"services"} if not f"{n}.".startswith(tuple(f"{ok}." for ok in NUMERICS))}
         assert not more or name.startswith("models"), f"{name} imports {sorted(more)}: estimation imports numerics only"

@@ -1,7 +1,5 @@
 """Waiting for what a live test is about to see: no test asserts how long it took."""
 
-from __future__ import annotations
-
 import subprocess
 import time
 from collections.abc import Callable

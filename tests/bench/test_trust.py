@@ -1,7 +1,6 @@
 """`skin bench trust`: what is counted, and that nothing of it is counted of what is right."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -143,9 +142,7 @@ def test_every_plan_draws_its_rows_from_seed_and_number() -> None:
 
 @pytest.mark.live
 @pytest.mark.release
-def test_another_checkout_says_the_same_of_the_same_frames_and_what_is_kept_is_not_played_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_checkout_says_the_same_of_the_same_frames_and_what_is_kept_is_not_played_again(tmp_path, monkeypatch):
     """Its stages in a process of their own, an act included."""
     run = runs.TrustRun("worlds", "5", 0.15, ("", str(ROOT)), seconds=9.0)
     found = run.scores(["plain"], ["full"], runs.KeptScores(tmp_path / "kept.json"))

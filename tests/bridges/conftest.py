@@ -1,7 +1,5 @@
 """A service that says what a test wants it to say: the sockets are real, the frames made up."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """The page's server on a port of its own, for programs that ask it as a browser would."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager

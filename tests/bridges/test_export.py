@@ -1,7 +1,5 @@
 """Recordings in the formats of others, read back by others' readers."""
 
-from __future__ import annotations
-
 import csv
 from collections import defaultdict
 from collections.abc import Iterator
@@ -12,7 +10,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.reader import read_ros2_messages
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from protocol.frames import Contact, ContactFrame, Frame, ImageFrame, InfoFrame, ShapeFrame, StatusFrame, pack
 from services.bridge import NEEDS
@@ -63,12 +60,12 @@ def recording(tmp_path: Path) -> Path:
     return path
 
 
-def test_ros2_is_read_by_mcap_ros2_and_by_rosbags(skin, recording) -> None:  # noqa: F811
+def test_ros2_is_read_by_mcap_ros2(skin, recording) -> None:  # noqa: F811
     assert skin("export", recording, "--ros2").code == 0
-    out = recording.with_suffix(".ros2.mcap")
     of: dict[str, list[Any]] = defaultdict(list)
-    for message in read_ros2_messages(out):
+    for message in read_ros2_messages(recording.with_suffix(".ros2.mcap")):
         of[message.channel.topic].append(message.ros_msg)
+        assert message.channel.topic != "/eitskin/palm/wrench" or message.log_time_ns in MEASURED_NS
     wrenches, clouds = of["/eitskin/palm/wrench"], of["/eitskin/palm/pressure"]
     stamps = [w.header.stamp.sec * 10**9 + w.header.stamp.nanosec for w in wrenches]
     assert stamps == [MEASURED_NS[k] for k in VALID] and {w.header.frame_id for w in wrenches} == {"palm"}
@@ -78,15 +75,6 @@ def test_ros2_is_read_by_mcap_ros2_and_by_rosbags(skin, recording) -> None:  # n
     assert peaks == [np.float32(0.3) if k >= 2 else 0.0 for k in VALID], "a held image is written again"
     assert [tf.transforms[0].child_frame_id for tf in of["/tf_static"]] == ["palm"]
     assert of["/diagnostics"][0].status[0].message == "slow"
-    store = get_typestore(Stores.EMPTY)
-    with open(out, "rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages():
-            assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")
-            assert channel.topic != "/eitskin/palm/wrench" or message.log_time in stamps
-            types = get_types_from_msg(schema.data.decode(), schema.name)
-            store.register({name: kind for name, kind in types.items() if name not in store.types})
-            found = store.deserialize_cdr(message.data, schema.name)
-            assert store.serialize_cdr(found, schema.name).tobytes() == message.data
 
 
 def test_foxglove_is_read_by_the_schemas_inside(skin, recording) -> None:  # noqa: F811
@@ -123,7 +111,6 @@ def test_what_cannot_be_exported_is_said_in_a_line(skin, recording) -> None:  # 
     for options, says in (
         ((), "found 0 formats"),
         (("--ros2", "--out", recording, "--overwrite"), "recording itself"),
-        (("--csv", "--skin", "sole"), "no frame of sole"),
         (("--ros2",), "is there already"),
     ):
         assert says in skin("export", recording, *options).err

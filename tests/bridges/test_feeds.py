@@ -1,7 +1,5 @@
 """What bridges read of a skin: at most so often, and what is new at once."""
 
-from __future__ import annotations
-
 import pytest
 
 from bridges.clock import WallClock

@@ -1,7 +1,5 @@
 """The bridge to Foxglove, spoken to as the application does."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import re
@@ -20,6 +18,7 @@ from tests.waiting import WAIT_S, until
 
 pytestmark = pytest.mark.live
 
+
 @pytest.fixture
 def bridge(request: pytest.FixtureRequest, runtime: Path, fake: FakeService) -> Iterator[Any]:
     """The bridge, the address that it printed, the token."""
@@ -34,7 +33,9 @@ def bridge(request: pytest.FixtureRequest, runtime: Path, fake: FakeService) -> 
 
 def run(address: str, test: Callable[[Viewer], Awaitable[None]]) -> None:
     async def with_viewer() -> None:
-        await asyncio.wait_for(test(await Viewer.connect(address)), 3 * WAIT_S)
+        viewer = await Viewer.connect(address)
+        await asyncio.wait_for(test(viewer), 3 * WAIT_S)
+        viewer.close()
 
     asyncio.run(with_viewer())
 
@@ -78,11 +79,12 @@ def test_what_is_looked_at_is_shown_while_it_is_valid_and_nothing_else_is_asked_
 
 def test_services_ask_for_the_token(fake: FakeService, bridge) -> None:
     _, address, token = bridge
+
     async def call(viewer: Viewer) -> None:
         for service, says, args in (
             *(("/palm/tare", "token", wrong) for wrong in ({}, {"token": "x"}, {"token": ""}, {"token": None})),
             ("/record", "token", {"on": True}),
-            ("/record", "no recorder runs", {"token": token, "on": True}),
+            ("/palm/tare", "unknown: force", {"token": token, "force": True}),
         ):
             answer = await viewer.call(service, **args)
             assert answer["success"] is False and says in answer["message"], answer

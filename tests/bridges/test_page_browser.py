@@ -1,7 +1,5 @@
 """The page in a real browser beside the whole service: Debian's chromium, without a screen, driven by playwright."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil
@@ -24,6 +22,7 @@ pytestmark = [pytest.mark.live, pytest.mark.release]
 FLAT = ["--no-sandbox", "--disable-gpu", "--disable-3d-apis"]
 SOLID = ["--no-sandbox", "--disable-gpu-compositing", "--use-angle=swiftshader-webgl", "--enable-unsafe-swiftshader"]
 Open = Callable[..., Any]
+
 
 @pytest.fixture(scope="module")
 def browsers() -> Iterator[dict[bool, Any]]:

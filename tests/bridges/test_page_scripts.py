@@ -1,7 +1,5 @@
 """The page's own scripts that need no browser, run by node: its reader of messages, and what its banner says."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
@@ -77,7 +75,6 @@ def same(got: Any, expected: Any, where: str) -> None:
     else:
         number = isinstance(expected, (int, float)) and not isinstance(expected, bool)
         assert got == (pytest.approx(expected, rel=1e-6) if number else expected), where
-
 
 
 CABLE = "/dev/ttyACM0 is not there: plug the board in, or correct `port` in skin.toml"

@@ -1,7 +1,5 @@
 """A Foxglove viewer for tests: its WebSocket protocol, with messages decoded by the schemas that the server sends."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json
@@ -31,14 +29,14 @@ class Viewer:
     """Connected to one server; `channels` and `services` by name, once it has told."""
 
     def __init__(self, connection: WebSocketClientConnection) -> None:
-        self._connection = connection
+        self._connection, self.close = connection, connection.close
         self.channels: dict[str, dict[str, Any]] = {}
         self.services: dict[str, int] = {}
         self.times: dict[str, list[int]] = defaultdict(list)  # [ns] of what has come, by topic
         self._subscribed: dict[int, str] = {}
 
     @staticmethod
-    async def connect(url: str) -> Viewer:
+    async def connect(url: str):
         return Viewer(await websocket_connect(url, subprotocols=[PROTOCOL]))
 
     async def message(self, wanted: str = "") -> Any:

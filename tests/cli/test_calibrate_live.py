@@ -30,8 +30,6 @@ LIGHT, FIRM = (0.5, 2.0), (0.8, 4.5)  # N
 
 
 class Program:
-    """A program whose lines are read as they come."""
-
     def __init__(self, *command: object) -> None:
         pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         self.process = subprocess.Popen(list(map(str, command)), text=True, **pipes)
@@ -141,4 +139,5 @@ def test_the_program_of_the_page_is_a_reference(runtime: Path) -> None:
             assert (frame.force_n, frame.valid, frame.host) == (2.5, True, host_id())
             reference.take(frame, time.monotonic())
             assert reference.trouble(time.monotonic()) == ""
+    reader.close()
     reference.close()

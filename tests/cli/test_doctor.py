@@ -85,7 +85,6 @@ def test_a_port_is_looked_at(doctor, tmp_path: Path) -> None:
     ],
 )
 def test_the_board_is_asked_for_its_firmware(doctor, schema: int, ends: int, says: str) -> None:
-    """A board behind a pty that answers HELLO with its IDENT, of our firmware version or of another."""
     ours, theirs = pty.openpty()
     tty.setraw(ours)
     tty.setraw(theirs)
@@ -138,7 +137,6 @@ def test_contacts_are_judged_by_the_share_of_valid_frames(valid, gap, late, leve
 
 
 def test_which_judgement_turned_is_said_as_it_was_at_its_worst() -> None:
-    """That something touches, and what is believed, is not wrong."""
     frames = []
     for opened, lost in ((1.0, 2.0), (0.0, 3.0), (0.0, 2.5)):
         found = [judge("believed", 0.0, 1.0), judge("open", opened, 1.0, 5 if opened else -1), judge("gap", lost, 1.0)]

@@ -1,7 +1,4 @@
-"""Every command that reads a file, fed with files of every kind: one clear line, a status other than 0, in bounded
-memory, nothing made of it. This file itself is the program that runs the commands, in a process whose memory is
-bounded and that may not read what is not ours.
-"""
+"""Every command that reads files, fed with any kind: one clear line, bounded memory, nothing made."""
 
 import contextlib
 import ctypes

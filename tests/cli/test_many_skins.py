@@ -1,6 +1,4 @@
-"""`skin up` and what talks to it, as a user would: real processes, two skins on the stub, the second one that of
-skin.toml's comments. $EITSKIN_TRAINED names another bundle to try instead.
-"""
+"""`skin up` as a user has it: real processes, two stub skins. $EITSKIN_TRAINED names a bundle for the second."""
 
 import json
 import os
@@ -9,6 +7,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import pytest
@@ -34,7 +33,7 @@ class Service:
     """The commands of a user who says where the service runs: `call` runs them in this process."""
 
     def __init__(self, folder: Path, call=None) -> None:
-        self.folder, self.call = folder, call
+        self.folder, self.call, self.pid = folder, call, 0
         self.readers = {s: NewestReader("contact", s, f"ipc://{folder}/publisher.ipc") for s in ("palm", "sole")}
 
     def start(self, *words: object, **more) -> subprocess.Popen:
@@ -62,6 +61,7 @@ def running():
         (made.folder / "two.toml").write_text(two_skins())
         with open(made.folder / "log.txt", "wb") as log:
             process = made.start("up", "--config", made.folder / "two.toml", stdout=log, stderr=log)
+            made.pid = process.pid
             try:
                 until(lambda: made.readers["sole"].recv(0.5), process)
                 # a bundle that cannot tell a touch at the start wants one: docs/operations.md
@@ -74,6 +74,8 @@ def running():
                 assert "Traceback" not in (made.folder / "log.txt").read_text()
             finally:
                 end(process)
+                for reader in made.readers.values():
+                    reader.close()
 
 
 @pytest.fixture
@@ -105,6 +107,27 @@ def test_two_skins_feel_their_own_presses_and_doctor_says_what_is_wrong(service:
         assert {found[f"sole: {of}"][0] for of in ("port", "acquisition", "baseline")} == {"OK"}
     finally:
         service.skin("fault --clear")
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("process", ["acquisition", "preprocessing", "inference", "publisher"])
+def test_a_process_that_was_stopped_shows_nothing_old_as_fresh(service: Service, process: str) -> None:
+    """What pressed goes while it stands: none of its frames of later shows it."""
+    reader, seen = service.readers["palm"], []
+    children = Path(f"/proc/{service.pid}/task/{service.pid}/children").read_text().split()
+    (pid,) = (int(c) for c in children if f"services.{process}\0" in Path(f"/proc/{c}/cmdline").read_text())
+    service.skin("press --x 0.02 --y 0.01 --force 4 --seconds 600 --skin palm")
+    until(lambda: (frame := reader.recv(0.5)) is not None and frame.valid and frame.contacts)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        service.skin("release --skin palm")
+        gone_ns = time.monotonic_ns()
+        until(lambda: seen.append(reader.recv(0.1)) or time.monotonic_ns() > gone_ns + 15e8)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    until(lambda: seen.append(reader.recv(0.1)) or sum(f is not None and f.valid for f in seen[-30:]) > 20)
+    late = [f for f in seen if f is not None and f.valid and f.stamps["sample"] > gone_ns + 3e8]
+    assert late and not [f for f in late if any(contact.state != "end" for contact in f.contacts)]
 
 
 @pytest.mark.live

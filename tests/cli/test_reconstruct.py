@@ -5,7 +5,7 @@ import pytest
 
 from models.bundle import Bundle
 from services.recordings.npz_file import Input, read_input
-from services.recordings.reconstruction import reconstruct
+from services.recordings.reconstruction import baseline_of, reconstruct
 from services.runtime.config import Skin
 from tests import needs
 
@@ -125,3 +125,11 @@ def test_untouched_rows_that_are_computed_or_few(noisy) -> None:
     said: list[str] = []
     reconstructed(Input(rows[:2], noisy["untouched"][:1], None), warn=said.append)
     assert len(said) == 1 and "one row" in said[0]
+
+
+def test_what_is_no_impedance_in_untouched_rows_is_no_baseline():
+    rows = np.random.default_rng(0).uniform(1.0, 1.001, (3, 120))
+    rows[:, 0], rows[:, 1], rows[:, 2] = 0.0, -1.0, np.nan
+    baseline = baseline_of(rows, None, print)
+    assert not baseline.z0[:3].any() and np.isinf(baseline.sigma[:3]).all()
+    assert (baseline.z0[3:] > 0.9).all() and (baseline.sigma[3:] < 1e-3).all()

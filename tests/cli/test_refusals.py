@@ -63,7 +63,7 @@ def test_mistakes_are_answered(skin, folder: Path, words: str, code: int, says: 
 
 def test_a_service_that_is_not_there_is_named(skin, folder: Path, runtime: Path) -> None:
     """By the folder and the configuration that were given, alike in each command, and at once."""
-    (folder / "other").mkdir(mode=0o700)
+    (other := runtime / "other").mkdir(mode=0o700)  # its path is short enough for sockets
     (folder / "mine.toml").write_text(STUB.replace("palm", "sole"))
     for command in map(str.split, TALKERS):
         refused(skin(*command, "--runtime", folder / "nowhere"), 2, f"no folder {folder / 'nowhere'}")
@@ -71,8 +71,8 @@ def test_a_service_that_is_not_there_is_named(skin, folder: Path, runtime: Path)
         assert ran.code == 2 and "none.toml" in ran.err and "expected a configuration" in ran.err, command
     for command in map(str.split, PRESS_AND_WATCH):
         refused(skin(*command), 3, "skin up")
-        ran = skin(*command, "--runtime", folder / "other", "--config", folder / "mine.toml")
-        refused(ran, 3, str(folder / "other"))
+        ran = skin(*command, "--runtime", other, "--config", folder / "mine.toml")
+        refused(ran, 3, str(other))
     runtime.chmod(0o755)  # others could forge contacts there
     refused(skin("press", "--x", 0, "--y", 0, "--force", 1), 2, "chmod 700")
 

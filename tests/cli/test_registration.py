@@ -111,7 +111,6 @@ def test_what_is_told_of_a_skin_is_kept(bundle: Bundle) -> None:
 
 
 def test_a_skin_is_no_larger_than_physics_allows(bundle: Bundle) -> None:
-    """Presses within a third of the skin: it would be three times their radius."""
     arrays = presses_of(bundle, PLAIN, n=80, reach=0.35)
     made = register(read_presses(arrays, bundle), bundle)
     xy = arrays["xy"]
@@ -193,7 +192,6 @@ def test_contacts_of_a_registered_skin_say_how_deep_and_how_sure(bundle: Bundle,
 
 
 def test_forces_are_told_where_the_file_has_them(bundle: Bundle) -> None:
-    """Presses whose effect grows with their force."""
     force = np.random.default_rng(5).uniform(1, 5, 120)
     presses = read_presses(presses_of(bundle, PLAIN, n=120, strength=force / 3) | {"force": force}, bundle)
     made, _, crossed = build(presses, register(presses, bundle).similarity, bundle)

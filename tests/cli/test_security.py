@@ -91,6 +91,7 @@ def test_new_keys_are_secret_from_the_first_moment_and_never_overwritten(skin, t
     assert made.code == 0 and "security.clients" in made.out
     assert stat.S_IMODE(secret.parent.stat().st_mode) == 0o700 and stat.S_IMODE(secret.stat().st_mode) == 0o600
     before = secret.read_bytes()
+    secret.with_suffix(".key").rename(tmp_path / "at the other end")
     again = skin("keys", "new", "robot", "--folder", tmp_path / "keys")
     assert again.code == 2 and "is there already" in again.err and secret.read_bytes() == before
     assert skin("keys", "new", "../robot", "--folder", tmp_path / "keys").code == 2

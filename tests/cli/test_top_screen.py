@@ -30,7 +30,6 @@ NOW = 1000.0  # s
 
 @pytest.fixture
 def monitor(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Monitor:
-    """Begun at NOW - 2; its clock stands at NOW."""
     made = Monitor("palm")
     made.started_s = NOW - 2
     monkeypatch.setattr(of_monitor.time, "monotonic", lambda: NOW)
@@ -153,3 +152,5 @@ def test_q_leaves_and_gives_the_terminal_back(runtime: Path) -> None:
     finally:
         process.kill()
     assert process.returncode == 0 and termios.tcgetattr(theirs) == before
+    os.close(ours)
+    os.close(theirs)

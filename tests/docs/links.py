@@ -1,7 +1,5 @@
 """The links of the documents, and the anchors that they may lead to, as GitHub makes them of headings."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

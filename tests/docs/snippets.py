@@ -1,7 +1,5 @@
 """Everything that README, WIRE.md and the other documents show as something to type, found in their text."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

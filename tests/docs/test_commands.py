@@ -43,9 +43,7 @@ def test_readme_s_commands_and_the_programs_of_clients_work_beside_the_service()
 
 
 def prints(place: World, file: str, shows: tuple[str, str]) -> bool:
-    """As an outsider's script, with the wheel's `eitskin` alone. Then Ctrl-C. False: it ended since a busy machine lost
-    frames, as it rightly does.
-    """
+    """As an outsider's script, until Ctrl-C. False: it ended since a busy machine lost frames, as it rightly does."""
     marker, says = shows
     (code,) = (s.text for s in snippets() if s.file == file and s.kind == "python" and marker in s.text)
     (place.checkout / f"{marker}_.py").write_text(code.replace("...  #", "print(frame.seq, flush=True)  #"))

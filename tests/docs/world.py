@@ -1,7 +1,5 @@
 """The place that the documents' commands are run in: a checkout or a copy of one, an empty home."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """The C++ example, compiled once for the tests of a file."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

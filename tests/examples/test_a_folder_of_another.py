@@ -1,10 +1,4 @@
-"""A runtime folder that another user made, or could have, with a forged publisher in it: no example takes its contacts.
-
-What `runtime_dir()` refuses, each client refuses before it connects: README's and WIRE.md's programs, the typed client,
-which the controllers stand on, C++.
-"""
-
-from __future__ import annotations
+"""A runtime folder that another user made, with a forged publisher in it: no example takes its contacts."""
 
 import contextlib
 import os
@@ -61,9 +55,7 @@ def forging(folder: Path) -> Iterator[None]:
 
 @pytest.mark.parametrize("forged", ["of another user", "open to others", "a link"])
 @pytest.mark.parametrize("language", ["python", "cpp"])
-def test_no_client_takes_a_folder_that_is_not_its_own(
-    request: pytest.FixtureRequest, runtime: Path, forged: str, language: str
-) -> None:
+def test_no_client_takes_a_folder_that_is_not_its_own(request, runtime, forged, language) -> None:
     commands = COMMANDS
     if language == "cpp":
         commands = {"subscribe.cpp": (str(request.getfixturevalue("cpp_subscriber")), "palm", "5", "3")}

@@ -1,10 +1,4 @@
-"""The examples as they are, against the running service: real processes, the stub board, a press by its control socket.
-
-What a controller makes of a frame is in test_controllers.py. Every example is tried in parts by `make test`, and in
-whole scans by `make check-all`.
-"""
-
-from __future__ import annotations
+"""The examples as they are, against the running service and the stub; whole scans in `make check-all` alone."""
 
 import ast
 import contextlib
@@ -62,7 +56,7 @@ def release() -> None:
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Start an example as a user would; max_age: a busy machine that runs tests is no fault of the skin."""
+    """Its exit status, and what it printed after the press. Begun anew where a busy machine loses frames."""
     running: list[subprocess.Popen[str]] = []
 
     def begin(name: str, *options: str, max_age: str = "1.5") -> subprocess.Popen[str]:

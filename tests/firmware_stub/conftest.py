@@ -1,7 +1,5 @@
 """Rigs in simulated time, with a host at the other end of the line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 
@@ -46,10 +44,10 @@ class Host:
         (answer,) = (m for m in self.wait(0.05) if isinstance(m, (link.Ack, link.Nak, link.Ident, link.Time)))
         return answer
 
-    def start(self, scan: np.ndarray = PAIRS, points: int = 128) -> Host:
+    def start(self, scan: np.ndarray = PAIRS, points: int = 128):
         return self.started(link.Config(1, points, 80e3, scan))
 
-    def started(self, config: link.Config) -> Host:
+    def started(self, config: link.Config):
         for message in (config, link.Start(config.config)):
             assert isinstance(self.ask(message), link.Ack)
         return self

@@ -26,6 +26,12 @@ def test_a_scan_takes_the_settings_time_and_has_its_noise(host, name):
     assert (z.std(0) / z.mean(0)).mean() == pytest.approx(10 ** (-70 / 20) * noise(setting), rel=0.06)
 
 
+def test_a_config_carries_its_setting():
+    for setting in (*NAMED.values(), NO_WINDOW, ScanSetting(50_000, 32, 2, "none", 60e-6)):
+        (got,) = link.Decoder().feed(link.encode(link.Config.of(setting, config=3, rtia_ohm=80e3, scan=PAIRS[:4])))
+        assert isinstance(got, link.Config) and got.setting == setting
+
+
 def test_a_bad_setting_is_refused_with_its_reason_and_the_board_goes_on(host):
     board = host().start()
     for given, says in (

@@ -213,7 +213,6 @@ def test_a_fault_that_makes_no_sense_is_refused(host):
 def test_a_status_frame_says_faults_in_words_and_how_long_it_holds(host):
     for name, args, words in (
         ("electrode_open", {"electrode": 5, "second": 0}, "the wire of electrode 5 is broken, and that of electrode 0"),
-        ("gain", {"factor": 1.02}, "an amplifier's gain has jumped: impedances times 1.02"),
         *((name, {}, "") for name in FAULTS),
     ):
         rig, before = host().rig, time.monotonic_ns()

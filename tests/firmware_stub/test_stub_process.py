@@ -1,6 +1,5 @@
 """The stub as a process: behind its pty or TCP port, its control socket, its signals."""
 
-import os
 import subprocess
 import sys
 import time
@@ -72,14 +71,13 @@ def test_frames_and_truth_over_the_pty_and_a_second_stub_takes_over_nothing(run,
     assert first.device_us * 1e3 < true.stamps["sample"] < time.monotonic_ns()
     assert client.call("release") == {"released": 1, "scene_ended": None, "faults": {}}
     assert stub.decoder.counts["good"] > 3 and stub.decoder.bad == 0
-    for command, args, says in (
-        ("press", {"x": 1.0, "y": 0.0, "force": 1.0}, "not on the skin"),
-        ("press", {"y": 0.0, "force": 1.0}, "argument x: found none, expected a finite number .m."),
-        ("press", {"x": 0.0, "y": 0.0, "force": 1.0, "skin": "sole"}, "no skin 'sole': expected one of palm"),
-        ("scene", {"name": "nowhere"}, "paper_49"),
+    for args, says in (
+        ({"x": 1.0, "y": 0.0}, "not on the skin"),
+        ({"y": 0.0}, "argument x: found none, expected a finite number .m."),
+        ({"x": 0.0, "y": 0.0, "skin": "sole"}, "no skin 'sole': expected one of palm"),
     ):
         with pytest.raises(ControlError, match=says):
-            client.call(command, **args)
+            client.call("press", force=1.0, **args)
     second = run()
     assert second.process.wait(WAIT_S) == 2 and "another stub runs" in second.line
     last = stub.next(link.ScanFrame)
@@ -120,7 +118,7 @@ def test_it_ends_with_its_parent(runtime):
     until((runtime / "board-palm").is_symlink, parent)
     parent.kill()
     parent.wait()
-    until(lambda: not os.path.exists(child) or child.read_text().rsplit(")", 1)[1].split()[0] == "Z")
+    until(lambda: not child.exists() or child.read_text().rsplit(")", 1)[1].split()[0] == "Z")
 
 
 def test_options_are_those_of_one_skin_or_of_everyone_and_wrong_ones_are_explained(capsys):
@@ -128,12 +126,7 @@ def test_options_are_those_of_one_skin_or_of_everyone_and_wrong_ones_are_explain
     assert arguments([*skins, "--mismatch", "b=mild"]).mismatches == {"a": "none", "b": "mild"}
     assert arguments([*skins, "--mismatch", "field5"]).mismatches == {"a": "field5", "b": "field5"}
     assert arguments([*skins, "--world", "b=creep"]).worlds == {"a": "", "b": "creep"}
-    for options, says in (
-        (("--geometry", "triangle99"), "square16"),
-        (("--listen", "serial://x:7"), "socket://HOST:PORT"),
-        (("--mismatch", "sole=mild"), "no skin 'sole'; expected one of palm"),
-        (("--world", "creep", "--mismatch", "mild"), "a world has a sheet of its own"),
-    ):
+    for options, says in (("--geometry=triangle99", "square16"), ("--mismatch=sole=mild", "expected one of palm")):
         with pytest.raises((SystemExit, ValueError)) as refused:
-            _open(arguments([*options]), {})
+            _open(arguments([options]), {})
         assert says in f"{refused.value} {capsys.readouterr().err}"

@@ -83,8 +83,8 @@ def test_a_hand_warms_its_place_and_the_sheet_conducts_better_there() -> None:
     warm = four_terminal(rig.sheet.transfer(rig.field.at(21.0)), rig.sheet.skin.pattern)
     assert (warm < cold).all()
     rig = shown("warming")
-    before, later = rig.field.at(table.WARMS_S), rig.field.at(table.WARMS_S + 60.0)
-    assert 0.4 < (later.background - before.background) / table.PER_DEGREE < 0.55, "degrees in the first minute"
+    cold, before, later = (rig.field.at(t).background for t in (3.0, 6.0, 66.0))
+    assert before == pytest.approx(cold, abs=1e-4) and 0.008 < later - before < 0.011
 
 
 def test_slopes_of_contact_impedances_are_what_a_solution_finds() -> None:
@@ -121,6 +121,5 @@ def test_interference_is_a_line_a_sweep_or_bursts() -> None:
     assert share(Hum(2e-4, 50.0), 0, 40, 50) > 0.99
     sweep = Hum(2e-4, 30.0, 300.0)
     assert share(sweep, 0.0, 1.0, 37) > 0.9 and share(sweep, 19.0, 20.0, 293) > 0.9
-    assert share(sweep, 30.0, 31.0, 158) > 0.9
     bursts = Hum(1e-3, 120.0, on_s=0.05)
     assert bursts.on(t, 5).mean() == pytest.approx(0.025, rel=0.1)

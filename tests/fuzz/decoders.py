@@ -1,8 +1,4 @@
-"""Everything that reads bytes of others, each as a function of bytes that must not raise. A decoder's own error is the
-right answer to rubbish, and is swallowed here; anything else is a fault.
-"""
-
-from __future__ import annotations
+"""What reads bytes of others, as functions of bytes: an error of its own is swallowed, anything else is a fault."""
 
 import atexit
 import contextlib

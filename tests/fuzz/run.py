@@ -6,8 +6,6 @@ Without --seconds 5000 inputs each, the same every time. Exits 1 where a decoder
 longer than 10 s or more than 2 GB for one input; the input lies in build/fuzz then: small ones belong into corpus/.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os

@@ -88,9 +88,7 @@ def test_a_frame_of_no_skin_never_makes_it_worse(skin, bundle: Bundle) -> None:
     assert found.after <= found.before and (np.abs(found.mounting.shift) <= most_shift(skin) + 1e-12).all()
 
 
-def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(
-    skin, bundle: Bundle, mild: CalibrationFit
-) -> None:
+def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(skin, bundle, mild) -> None:
     touch, matrices, off = (Shape("circle", 0.45, 0.3, 0.2, 0.05),), bundle.matrices, []
     z0, z = measured(named("mild")), measured(named("mild"), touch)
     made = calibrated(matrices, skin, mild.mounting)

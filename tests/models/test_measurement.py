@@ -154,9 +154,7 @@ def test_the_grid_tells_a_disc_its_action_and_how_sure_it_is() -> None:
 
 
 def measured_map(mean_press: float = 2.0) -> tuple[MeasuredMap, np.ndarray]:
-    """5 x 7 places, 4 mm apart, of 10 measurements that rise evenly along x and y, but for one corner; and (3, 10): at
-    the origin, and their slopes [1/m].
-    """
+    """5 x 7 places, 4 mm apart, of 10 even slopes but for one corner; and (3, 10): at the origin, slopes [1/m]."""
     even = np.random.default_rng(3).standard_normal((3, 10)) * [[0.01], [0.5], [0.3]]
     iy, ix = np.divmod(np.arange(35), 7)
     allowed, noise = np.arange(35) > 0, np.where(np.arange(10) == 9, 2e-3, 1e-3)

@@ -173,6 +173,9 @@ def test_a_touchs_misfit_and_values_that_do_not_count_make_it_less_sure() -> Non
     assert_allclose(np.diag(added), 0.5**2 * unsure.known.size2 / 120, rtol=1e-3)
     assert 0.4 < unsure.size**2 / unsure.known.size2 < 2.5 and unsure.size == pytest.approx(sure.size, rel=0.2)
     assert (np.diag(unsure.covariance)[PLACE] > 2 * np.diag(sure.covariance)[PLACE]).all()
+    white = TouchFitter(scan, [replace(prior, until_s=0.01)], 0.0).fit(10).white.w  # it may end a little later
+    added = np.diag(np.linalg.inv(white.T @ white)) - 1e-8
+    assert added[np.abs(TIMES_S - 0.01) < 0.006].max() > 1e-8 > 1e-12 > np.abs(added[TIMES_S > 0.016]).max()
     dead = np.where(np.arange(120) < 60, y, 0.0)
     fewer = TouchFitter(replace(scan, y=dead, live=60), [prior], 0.0).fit(10)
     assert not fewer.left[60:].any() and not fewer.design[60:].any() and fewer.chi2 < 0.1

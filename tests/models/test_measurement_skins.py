@@ -1,6 +1,4 @@
-"""Skins of other outlines, patterns and numbers of electrodes: what is left of a touch at its true disc, and where a
-fit finds it, by finite elements of another mesh.
-"""
+"""Skins of other outlines, patterns and electrodes, by finite elements: what a touch leaves, where a fit finds it."""
 
 from functools import cache
 from pathlib import Path

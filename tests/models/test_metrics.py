@@ -7,7 +7,7 @@ from models import metrics
 from models.shapes import Shape, drop_image
 
 
-def test_ldci_iou_confusion_separation_and_false_touches_worked_out_by_hand():
+def test_ldci_and_iou_worked_out_by_hand():
     peaks = np.full(49, 2.0)
     assert metrics.ldci(peaks) == 0
     peaks[[0, 48]] = 1.0, 2.8  # one half too low, one 0.4 too high
@@ -17,14 +17,6 @@ def test_ldci_iou_confusion_separation_and_false_touches_worked_out_by_hand():
     a, b = np.zeros((2, 10, 10), bool)
     a[:4, :5], b[2:6, :5] = True, True  # 20 pixels each, 10 shared: contact 10/30, background 70/90
     assert metrics.iou(a, b) == pytest.approx(((1 / 3 + 7 / 9) / 2, 1 / 3)) and metrics.iou(a, a) == (1.0, 1.0)
-    matrix = metrics.confusion([0, 0, 1, 2, 4], [0, 3, 1, 2, 4])
-    assert matrix[0, 3] == 1 and metrics.accuracy(matrix) == pytest.approx(80)
-    gaps = np.linspace(0.01, 1.0, 100)
-    assert metrics.separation(gaps, gaps > 0.305, share=1.0) == pytest.approx(0.31)
-    assert metrics.separation(gaps, gaps > 2) == float("inf")
-    touched = np.zeros(7200, bool)
-    touched[100:130] = touched[4000] = True  # two touches in 720 s at 10 frames a second
-    assert metrics.false_touches_per_hour(touched, 10.0) == pytest.approx(10)
     assert metrics.relative_error(0.45, 0.5) == pytest.approx(10) and metrics.of_side(0.02) == pytest.approx(1.0)
 
 
@@ -40,7 +32,7 @@ def test_a_perfect_image_scores_perfectly_and_others_by_what_they_lack():
     shape = Shape("L", 0.2, -0.3, 0.35, 0.3, 0.4)
     found = metrics.score(drop_image([shape], 96), [shape])
     assert found["mean_iou"] > 0.99 and found["contact_iou"] > 0.98 and found["count"] == 1
-    assert [found[key] for key in ("correlation", "ssim", "greit_AR", "greit_RNG")] == pytest.approx([1, 1, 1, 0])
+    assert (found["correlation"], found["ssim"]) == pytest.approx((1, 1))
     assert found["position"] < 0.003 and found["force_error"] < 1e-6 and found["integral_error"] < 1e-6
     shape = Shape("circle", 0.25, 0.25, 0.25, 0.3)
     moved = drop_image([Shape("circle", 0.25 + 4 / 24, 0.25, 0.25, 0.3)], 48)  # four pixels of 2/48 to the right

@@ -53,6 +53,9 @@ def test_what_is_no_plain_array_is_refused(tmp_path):
             read_npz(archive(tmp_path / "a.npz", members))
     with pytest.raises(FileError, match="expected deflate"):
         read_npz(archive(tmp_path / "a.npz", {"a.npy": npy((2**17,), "<f8", bytes(2**20))}, zipfile.ZIP_LZMA))
+    np.save(tmp_path / "a.npy", np.ones(3))
+    with pytest.raises(FileError, match="one bare array, expected named ones"):
+        read_npz(tmp_path / "a.npy")
     path = archive(tmp_path / "a.npz", {"a.npy": npy((2**22,), "<f8", bytes(2**25))})
     content, real = path.read_bytes(), struct.pack("<I", 2**25 + 128)
     assert content.count(real) == 2

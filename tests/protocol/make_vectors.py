@@ -1,6 +1,4 @@
-"""Makes protocol/vectors/*/*.bin from the JSON beside each, as WIRE.md says, with none of the package's code, which
-test_frames.py holds against them: `python tests/protocol/make_vectors.py`.
-"""
+"""Makes protocol/vectors/*/*.bin from the JSON beside each as WIRE.md says, without the package's code."""
 
 import json
 import struct

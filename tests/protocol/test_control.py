@@ -172,15 +172,15 @@ def test_the_clock_of_another_process(server, client, context):
     assert abs(offset - AHEAD_NS) <= uncertainty
 
 
-def test_it_is_made_for_us_alone_where_the_environment_says(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def test_it_is_made_for_us_alone_where_the_environment_says(monkeypatch, runtime):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     monkeypatch.delenv("EITSKIN_RUNTIME", raising=False)
-    assert rt.runtime_dir() == tmp_path / "eitskin"
-    monkeypatch.setenv("EITSKIN_RUNTIME", str(tmp_path / "a" / "b"))
+    assert rt.runtime_dir() == runtime / "eitskin"
+    monkeypatch.setenv("EITSKIN_RUNTIME", str(runtime / "a" / "b"))
     assert stat.S_IMODE(rt.runtime_dir().stat().st_mode) == 0o700
-    assert rt.endpoint("publisher") == f"ipc://{tmp_path}/a/b/publisher.ipc"
-    assert rt.control_endpoint("stub") == f"ipc://{tmp_path}/a/b/stub.ctl"
-    monkeypatch.setenv("EITSKIN_RUNTIME", str(tmp_path / ("x" * 100)))
+    assert rt.endpoint("publisher") == f"ipc://{runtime}/a/b/publisher.ipc"
+    assert rt.control_endpoint("stub") == f"ipc://{runtime}/a/b/stub.ctl"
+    monkeypatch.setenv("EITSKIN_RUNTIME", str(runtime / ("x" * 100)))
     with pytest.raises(rt.RuntimeDirError, match="at most 107"):
         rt.endpoint("publisher")
 

@@ -1,6 +1,4 @@
-"""TCP and its keys: nobody reads who is not listed, nobody is believed who is not the service, nobody changes anything
-who is no operator, and who is listed is not disturbed. In clear never beyond this host unless told.
-"""
+"""TCP and its keys: nobody reads, changes or is believed who is not listed; in clear only within this host."""
 
 import shutil
 

@@ -226,6 +226,7 @@ def test_a_peer_that_breaks_the_protocol_leaves_no_reader_deaf_and_a_good_connec
     until(lambda: both_hear(0.0))
     for _ in range(10):  # ZeroMQ has connected again by itself: making it anew would lose what is sent meanwhile
         both_hear(0.4)
+        [reader.mind() for reader in readers]
     assert renewed == [reader._connections.renewed for reader in readers] and any(renewed)
     for each in (*readers, rightful):
         each.close()

@@ -1,7 +1,5 @@
 """A recorder that is fed in simulated time: no socket, thread, process or clock."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from pathlib import Path

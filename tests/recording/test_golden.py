@@ -1,7 +1,5 @@
 """Recordings still give what somebody accepted; `skin info`: what is in one; how rows were measured."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
@@ -106,9 +104,7 @@ def test_by_command(skin: Callable[..., Ran], tmp_path: Path) -> None:  # noqa: 
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """200 frames, 0.05 s apart: a touch from 2 to 4 s that grows to 4 N, an open electrode from 5 to 6 s, those of
-    7 to 8 s missing, and one that is no frame; acquisition fails at 7 s.
-    """
+    """200 frames at 20 Hz: a touch of 2 to 4 s, electrode 5 open from 5 to 6 s, none from 7 to 8 s; one is no frame."""
 
     def put(frame: Frame, at_s: float) -> None:
         topic, _, data = pack(frame).partition(b"\0")

@@ -1,7 +1,5 @@
 """The recorder, its snapshots, rotation and memory: in simulated time what it writes and says; live, as a process."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -155,9 +153,7 @@ def test_a_full_disk_is_named_and_recording_goes_on_when_there_is_room(service: 
     assert [frame.seq for frame in contacts_in(file)] == list(range(101))
 
 
-def test_what_does_not_fit_is_kept_up_to_a_bound_then_dropped_and_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: list[int], clock: Clock
-) -> None:
+def test_what_does_not_fit_is_kept_up_to_a_bound_then_dropped_and_counted(tmp_path, monkeypatch, disk, clock) -> None:
     monkeypatch.setattr(patient_file, "KEPT_BYTES", 100_000)
     disk[0], writer = 10_000, RecordingWriter(tmp_path / "a.mcap")
     data = [msgpack.packb({"n": n, "noise": os.urandom(1000)}) for n in range(1000)]

@@ -1,7 +1,5 @@
 """Replaying gives the same contacts each time. What a recording carries of its configuration."""
 
-from __future__ import annotations
-
 import json
 import os
 import tomllib

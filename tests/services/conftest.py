@@ -1,7 +1,5 @@
 """Fixtures of the services' tests: frames made by the bundle's own linear model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +12,7 @@ from protocol.frames import DeltaFrame, RawFrame
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin
 from tests import needs
+from tests.services.stub_skin import whole_scan
 
 FRAME_NS = 45_000_000
 
@@ -45,25 +44,12 @@ class Board:
         pixels = inside.reshape(self._block).mean(axis=(1, 3)) * drop
         return np.asarray(self.m.jacobian @ pixels.ravel())
 
-    def frame(
-        self, difference: NDArray[np.floating] | float = 0.0, board: str = "b1", source: str = "board"
-    ) -> RawFrame:
+    def frame(self, difference=0.0, board="b1", source="board") -> RawFrame:
         """The next frame, `difference` (K,) relative to the untouched skin."""
-        self.scan += 1
+        self.scan, self._now = self.scan + 1, self._now + self.frame_ns
         z = self.m.z0 * (1 + difference) * (1 + self.sigma * self.rng.standard_normal(len(self.m.z0)))
-        self._now += self.frame_ns
-        now = self._now
-        return RawFrame(
-            skin="palm",
-            scan=self.scan,
-            stamps={"sample": now, "read": now + 1_000_000},
-            source=source,
-            valid=True,
-            valid_for_s=0.135,
-            z=z.astype(np.complex64),
-            status=np.zeros(len(z), np.uint8),
-            board=board,
-        )
+        stamps = {"sample": self._now, "read": self._now + 1_000_000}
+        return whole_scan(z, self.scan, stamps=stamps, source=source, board=board)
 
 
 @pytest.fixture
@@ -82,17 +68,15 @@ class Fed:
         assert isinstance(out, DeltaFrame) and np.isfinite(out.difference).all()
         return out
 
-    def feel(
-        self, difference: NDArray[np.floating] | float = 0.0, scans: int = 1, source: str = "board"
-    ) -> list[DeltaFrame]:
+    def feel(self, difference=0.0, scans=1, source="board") -> list[DeltaFrame]:
         return [self.run(self.board.frame(difference, source=source)) for _ in range(scans)]
 
-    def tared(self) -> Fed:
+    def tared(self):
         out = self.feel(scans=72)[-1]
         assert out.valid and not out.touched
         return self
 
-    def again(self) -> Fed:
+    def again(self):
         """Another that is fed by the same board."""
         return Fed(self.skin, self.bundle, self.board)
 
@@ -105,12 +89,12 @@ class Fed:
 
 
 @pytest.fixture
-def fed(skin: Skin, bundle: Bundle, board: Board) -> Fed:
+def fed(skin: Skin, bundle: Bundle, board: Board):
     return Fed(skin, bundle, board)
 
 
 @pytest.fixture
-def tared(fed: Fed) -> Fed:
+def tared(fed: Fed):
     return fed.tared()
 
 

@@ -1,8 +1,4 @@
-"""A skin solved by finite elements on a mesh of its own, whose |Z| runs along a curve: raw frames in, contact frames
-out. What is the same in all runs, the untouched skin until FREE_S, is gone through once.
-"""
-
-from __future__ import annotations
+"""A skin solved by finite elements whose |Z| runs along a curve: raw frames in, contact frames out."""
 
 from collections.abc import Callable, Iterator
 from copy import deepcopy
@@ -39,8 +35,8 @@ def sheet() -> Sheet:
 
 
 @cache
-def impedance(*touches: Touch, background: float = 1.0, contact: tuple[float, ...] = ()) -> np.ndarray:
-    return np.abs(sheet().model.read(sheet().transfer(World(touches, background=background, contact=contact))))
+def impedance(*touches: Touch, background: float = 1.0) -> np.ndarray:
+    return np.abs(sheet().model.read(sheet().transfer(World(touches, background=background))))
 
 
 @cache
@@ -91,16 +87,13 @@ class Board:
             if np.isfinite(measured).all() and number >= first:
                 yield self._frame(number, (number + 1) * part_s, part_s, z, measured, own)
 
-    def _frame(
-        self, number: int, end_s: float, part_s: float, z: np.ndarray, measured: np.ndarray, own: np.ndarray
-    ) -> RawFrame:
+    def _frame(self, number: int, end_s: float, part_s: float, z: np.ndarray, at: np.ndarray, own: Any) -> RawFrame:
         frame = RawFrame(skin="palm", scan=number, z=z.astype(np.complex64), status=np.zeros(120, np.uint8))
         frame.valid, frame.device_us = True, round((end_s - part_s) * 1e6)
         frame.stamps = {"sample": round((end_s - part_s / 2) * 1e9)}
         if self.parts > 1:
             frame.parts, frame.part = self.parts, number % self.parts + 1
-            frame.age_us = ((end_s - measured) * 1e6).astype(np.float32)
-            frame.new = np.zeros(120, np.uint8)
+            frame.age_us, frame.new = ((end_s - at) * 1e6).astype(np.float32), np.zeros(120, np.uint8)
             frame.new[own] = 1
         return frame
 

@@ -1,7 +1,5 @@
 """The stages behind the stub's sheet and analogue part, without board, link and time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
@@ -28,6 +26,14 @@ METRES = 0.05  # per unit of the bundle's model
 TARE_SCANS = 72
 
 
+def whole_scan(z: NDArray[Any], number: int, status: NDArray[np.uint8] | None = None, **more: Any) -> RawFrame:
+    """A believed frame of a board that scans every 45 ms."""
+    now = number * 45_000_000
+    said = {"stamps": {"sample": now, "read": now + 1}, "source": "board", "valid": True, "valid_for_s": 0.5, **more}
+    status = np.zeros(len(z), np.uint8) if status is None else status
+    return RawFrame(**{"skin": "palm", "scan": number, "z": z.astype(np.complex64), "status": status, **said})
+
+
 @cache
 def bundle_of_square16() -> Bundle:
     return Bundle.load("square16")
@@ -48,25 +54,19 @@ def transfer(shapes: tuple[Shape, ...] = (), contacts: Contacts = ()) -> TRANSFE
 
 
 class StubSkin:
-    """Multiplexers, converter and firmware's arithmetic of the stub, then the stages of square16. One that is tared
-    goes on from the state of another that was, which takes 0.05 s.
-    """
+    """The stub's analogue part, then the stages of square16; a tared one takes over the state of another."""
 
     def __init__(self, snr_db: float = 80.0, tare: bool = True, skin: Skin | str = "square16") -> None:
         self.pattern, self.faults, self.scan = np.asarray(bundle_of_square16().pattern), Faults(), 0
         copied = tare and skin == "square16"
-        self.analog = Analog(BoardNoise.of_db(snr_db), self.faults, np.random.default_rng(4 if copied else 3))
+        self.analog = Analog(BoardNoise(10 ** (-snr_db / 20)), self.faults, np.random.default_rng(4 if copied else 3))
         self.pipeline = Pipeline(skin, name="palm", bundle=bundle_of_square16())
         if copied:
             for stage, state in zip(self.stages, deepcopy(_tared(snr_db)), strict=True):
                 stage.load(state)
             self.scan = TARE_SCANS
         elif tare:
-            self.tare()
-
-    def tare(self) -> None:
-        result = self.rest(TARE_SCANS)
-        assert result.contact.valid and not result.delta.touched
+            assert self.rest(TARE_SCANS).contact.valid
 
     @property
     def stages(self) -> tuple[Any, ...]:
@@ -96,19 +96,15 @@ class StubSkin:
     def measured(self, t: TRANSFER, end: TRANSFER | None = None) -> tuple[NDArray[np.complex64], NDArray[np.uint8]]:
         return self.analog.measure((t, t if end is None else end), self.pattern, COHERENT, 40_000.0, 0.0)
 
-    def run(self, z: NDArray[np.complex64], status: NDArray[np.uint8] | None = None) -> Result:
+    def run(self, z: NDArray[Any], status: NDArray[np.uint8] | None = None) -> Result:
         self.scan += 1
-        stamps = {"sample": self.scan * 45_000_000, "read": self.scan * 45_000_000 + 1}
-        status = np.zeros(len(z), np.uint8) if status is None else status
-        return self.pipeline.run(
-            RawFrame(skin="palm", scan=self.scan, stamps=stamps, source="board", valid=True, z=z, status=status)
-        )
+        return self.pipeline.run(whole_scan(z, self.scan, status))
 
 
 @cache
 def _tared(snr_db: float) -> list[dict[str, Any]]:
     skin = StubSkin(snr_db, tare=False)
-    skin.tare()
+    assert not skin.rest(TARE_SCANS).delta.touched
     return [stage.state() for stage in skin.stages]
 
 
@@ -119,11 +115,6 @@ def lasting(frame: ContactFrame) -> list[Contact]:
 def present(result: Result) -> list[Contact]:
     """What is said to press."""
     return lasting(result.contact)
-
-
-def places(result: Result) -> list[list[float]]:
-    """Of what presses, m."""
-    return [contact.position[:2] for contact in present(result)]
 
 
 def off_m(result: Result, shape: Shape) -> float:

@@ -279,6 +279,8 @@ def test_a_delay_from_the_start_is_seen_by_asking_and_said():
     assert all(s.stated_age_s >= s.true_age_s - 0.005 for s in seen.frames), "rather too old than too young"
     seen = Seen(5.0, answers_time=False)
     assert all(s.usable for s in seen.frames) and seen.messages == [UNTIMED] and seen.off_s() < 0.004
+    doubted = ["clock" in s.frame.reasons for s in seen.frames]
+    assert doubted[0] and not doubted[-1] and doubted == sorted(doubted, reverse=True), "until its line is settled"
 
 
 @pytest.mark.parametrize("by", [-5.0, 5.0])

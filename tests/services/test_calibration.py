@@ -31,9 +31,7 @@ def seen(peak, area, x=0.0, y=0.0, relative=0.03):
 
 
 def presses(n, seed=0, scatter=0.02):
-    """Of a made-up skin, 40 N per (S/m)^0.8, weaker foam towards its edge; areas of all sizes, so that the integral is
-    no measure of force.
-    """
+    """Of a made-up skin, 40 N per (S/m)^0.8, weaker foam towards its edge; areas of all sizes."""
     rng, made = np.random.default_rng(seed), []
     for k in range(n):
         peak, x, y, area = rng.uniform(0.05, 0.5), *rng.uniform(-0.03, 0.03, 2), rng.uniform(1e-4, 5e-4)

@@ -1,12 +1,15 @@
-"""A scan's times and what is new in it, and how judgements become `valid` and `reasons`."""
+"""A scan's times and what is new in it, how sure a place is, and how judgements become `valid` and `reasons`."""
 
 import numpy as np
 import pytest
 
 from protocol.frame_types import REASONS, VERDICTS
 from protocol.frames import RawFrame
+from services.estimation.touches import roughly
+from services.estimation.values.estimate import TouchEstimate
 from services.estimation.values.judgement import ROWS, Verdict, judge, reasons, valid
 from services.estimation.values.scan import Scan
+from services.preprocessing import on_the_wire
 
 PERIOD_US = 43_700
 
@@ -42,6 +45,17 @@ def test_a_whole_scan_is_new_and_of_parts_what_the_newest_ones_brought() -> None
     assert Scan.of(part(23), before).new.sum() == 36, "what a skipped message brought is new too"
     assert Scan.of(part(30), before).complete
     assert Scan.of(part(3), Scan.of(part(2000))).complete  # the board's clock began anew
+
+
+def test_the_ellipse_of_a_place_points_as_its_covariance_says_and_one_not_explained_is_rough_in_x_and_y() -> None:
+    turn = np.array([[np.cos(0.6), -np.sin(0.6)], [np.sin(0.6), np.cos(0.6)]])
+    covariance = np.diag([0.0, 0.0, 0.04, 0.01])
+    covariance[:2, :2] = turn @ np.diag([0.1**2, 0.02**2]) @ turn.T
+    touch = TouchEstimate(1, True, 1.0, 0.1, -0.2, 0.0, 0.0, -2.3, 0.3, covariance, 9.0, 0.1, 0.01, 0.1, 0.01, 0.0)
+    *axes, angle = on_the_wire(touch, 0.05).sigma
+    assert [*axes, angle % np.pi] == pytest.approx([0.005, 0.001, 0.6], rel=0.05)
+    more = roughly(touch, 0.045).covariance - covariance
+    assert 0 < more[0, 0] == pytest.approx(more[1, 1]) and np.count_nonzero(more) == 2
 
 
 def test_a_frame_is_valid_unless_a_judgement_refuses_and_says_its_reasons_in_order() -> None:

@@ -1,15 +1,12 @@
 """What touches a skin solved on a mesh of its own: raw frames in, contact frames out, in whole scans and in parts."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from firmware_stub.world import World, pressed
-from firmware_stub.worlds import table
-from models.measurement.responses.tables import tables_of
-from protocol.frames import ContactFrame, ImageFrame
+from firmware_stub.world import pressed
+from protocol.frames import ContactFrame
 from services.preprocessing import Preprocessing
 from simulation.host import tared
 from simulation.scenes import ContactCurves, ramp, script
@@ -62,18 +59,6 @@ def test_a_press_is_shown_where_it_is_and_as_strong_as_it_is(parts: int, radius:
     assert np.median(away) < 3 and np.max(away) < 6
 
 
-@pytest.mark.parametrize(("radius", "force"), [(4.5e-3, 2.0), (8e-3, 3.0)])
-def test_forces_on_other_foams_lie_within_four_sigma(radius: float, force: float) -> None:
-    """How large a patch is that saturates decides its force."""
-    soft, touch = table.sheet("soft-3", 1), pressed("circle", 0.012, -0.018, radius, force)
-    none, full = (np.abs(soft.model.read(soft.transfer(World(each)))) for each in ((), (touch,)))
-    curve = between((0, none), (FREE_S, none), (FREE_S + 0.1, full), (60, full))
-    shown = between_s(said(new_pipeline(), Board(curve).frames(FREE_S + 0.8)), FREE_S + 0.3)
-    assert shows(shown, 1)
-    for contact in (frame.contacts[0] for frame in shown):
-        assert contact.force_n and contact.force_sigma_n and abs(contact.force_n - force) < 4 * contact.force_sigma_n
-
-
 def test_a_touch_keeps_its_number_while_nothing_explains_the_scans() -> None:
     """0.09 s of an error in every measurement, beside a touch that is held: frames say `changing`, and go on."""
     steady, wrong_s = press(TOUCH), FREE_S + 0.6
@@ -99,20 +84,6 @@ def test_a_touch_begins_is_held_and_ends_with_one_id_and_an_image(parts: int) ->
     assert FREE_S + 0.6 < ended[0] < FREE_S + 0.6 + 1.5 * SCAN_S
     assert parts == 1 or 0.03 < ended[-1] - ended[0] < 0.06
     assert shows(between_s(frames, ended[-1] + 0.01), 0)
-
-
-def test_two_touches_have_outlines_in_the_order_of_their_contacts() -> None:
-    pipeline = free()
-    *before, last = Board(press(TOUCH, pressed("circle", -0.025, 0.02, 8e-3, 1.5))).frames(FREE_S + 0.6, FREE_S)
-    said(pipeline, before)
-    (delta,) = pipeline.pre.process(last, frozenset({"delta"}))
-    (image,) = pipeline.inference.process(delta, frozenset({"image"}))
-    assert isinstance(image, ImageFrame)
-    contact, shape = pipeline.publishing.everything(image, frozenset({"contact", "shape"}))
-    assert isinstance(contact, ContactFrame)
-    assert shape.ids == [each.id for each in contact.contacts] and len(shape.ids) == 2  # type: ignore[attr-defined]
-    for each, line in zip(contact.contacts, shape.outlines, strict=True):  # type: ignore[attr-defined]
-        assert np.hypot(*(np.mean(line, axis=0) - each.position[:2])) < 0.005
 
 
 # several touches
@@ -171,9 +142,7 @@ def test_a_slide_keeps_its_id_and_its_place(parts: int) -> None:
 
 @BOTH
 @pytest.mark.parametrize(("first_n", "then_n", "ramp_s", "later_s"), [(5.0, 2.5, 0.02, 0.034), (2.5, 5, 1e-3, 0.0067)])
-def test_a_touch_whose_force_changes_at_once_goes_on(
-    parts: int, first_n: float, then_n: float, ramp_s: float, later_s: float
-) -> None:
+def test_a_touch_whose_force_changes_at_once_goes_on(parts, first_n, then_n, ramp_s, later_s) -> None:
     """It is there in every frame, with its id. Half gone is no release, and what comes to it is no other touch."""
     first, then = (impedance(pressed("circle", 0.012, -0.018, 9e-3, force_n)) for force_n in (first_n, then_n))
     at = FREE_S + 0.4 + later_s
@@ -186,16 +155,6 @@ def test_a_touch_whose_force_changes_at_once_goes_on(
 def test_what_a_touch_leaves_in_the_foam_is_no_touch(parts: int) -> None:
     frames = run(press(TOUCH, until_s=FREE_S + 1.0, left=0.03), FREE_S + (3.5 if parts == 1 else 2.5), parts)
     assert shows(between_s(frames, FREE_S + 1.4), 0)
-
-
-def test_where_a_touch_stayed_before_it_slid_the_foam_remembers_it() -> None:
-    """It stays for 2 s, slides 25 mm away in 0.5 s and goes: 3 % stay where it was, and 1 % where it went."""
-    none, begin, slid = impedance(), FREE_S + 2.0, way(-0.006, -0.031, 0.01, 9)
-    (_, here), *_, (_, there) = slid
-    rest = none + 0.03 * (here - none) + 0.01 * (there - none)
-    points = [(0.0, none), (FREE_S, none), (FREE_S + 0.05, here), *((begin + 0.5 * u, z) for u, z in slid)]
-    points += [(begin + 0.9, there), (begin + 1.0, rest), (begin + 20.0, none)]
-    assert shows(between_s(run(between(*points), begin + 2.0), begin + 1.2), 0)
 
 
 def test_after_refused_frames_the_skin_is_valid_again_within_two_seconds() -> None:
@@ -227,24 +186,6 @@ def test_measurements_that_the_board_marks_are_left_out(parts: int, since: float
     shown = between_s(frames, FREE_S + 0.3)
     assert shows(shown, 1) and all(far_off(frame.contacts[0], TOUCH) < 2e-3 for frame in shown)
     assert since or shows(between_s(frames, FREE_S - 0.3, FREE_S - SCAN_S), 0)
-
-
-def test_other_tables_of_the_same_skin_change_nothing_of_what_is_expected_untouched() -> None:
-    """As a calibration of the mounting gives them, while the sheet warms: then a touch is shown as it is."""
-    warm_s, until_s = FREE_S + 1.0, FREE_S + 2.0
-    warm, full = impedance(background=1.002), impedance(TOUCH, background=1.002)
-    curve = between((0, impedance()), (FREE_S, impedance()), (warm_s, warm), (until_s, warm), (until_s + 0.1, full))
-    pipeline, tables = free(), tables_of(bundle())
-    row = np.exp(0.02 * np.random.default_rng(3).standard_normal(120))
-    frames = []
-    for raw in Board(curve).frames(until_s + 1.0, FREE_S):
-        if 0 <= at_s(raw) - warm_s < SCAN_S:
-            assert not pipeline.pre.estimator.touched
-            pipeline.pre.estimator.use(replace(tables, z0=tables.z0 * row))
-        frames += said(pipeline, [raw])
-    assert shows(between_s(frames, FREE_S, until_s - SCAN_S), 0)
-    shown = between_s(frames, until_s + 0.3)
-    assert shows(shown, 1) and all(far_off(frame.contacts[0], TOUCH) < 2e-3 for frame in shown)
 
 
 def test_a_restart_under_a_touch_shows_it_at_once_under_another_id_and_does_not_say_that_it_began() -> None:

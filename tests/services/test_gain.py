@@ -1,12 +1,10 @@
 """Steps of the board's gain: named, told from touches, and taken over by the baseline."""
 
-from __future__ import annotations
-
 import pytest
 
 from models.shapes import Shape
 from services.pipeline import Result
-from tests.services.stub_skin import StubSkin, lasting, off_m, present, states, transfer
+from tests.services.stub_skin import StubSkin, lasting, present, states, transfer
 
 PRESS = (Shape("circle", 0.3, -0.2, 0.2, 0.3),)
 
@@ -78,9 +76,7 @@ def test_a_step_in_the_midst_of_a_scan_is_taken_over_by_the_next(skin: StubSkin,
 
 @pytest.mark.parametrize(("factor", "before", "rest"), [(0.9983, 1, 8), (1.002, 4, 8)])
 def test_a_small_step_is_no_drift_that_goes_on(skin: StubSkin, factor: float, before: int, rest: int) -> None:
-    """Scans of before it was told explain it as drift, a fast one: learnt from, that would go on while something
-    touches, and more steps of the gain would take it back again and again.
-    """
+    """Scans of before it was told explain it as a fast drift: learnt from, that would go on under a touch."""
     skin.rest(before)
     deep = (Shape("circle", -0.4, 0.27, 0.19, 0.53),)
     with skin.fault("gain", factor=factor):
@@ -132,21 +128,12 @@ def test_a_gross_gain_under_a_touch_is_named_and_wrong_nowhere(skin: StubSkin, m
 
 
 @pytest.mark.parametrize("gain", [0.9, 1.2])
-def test_a_gain_resistor_that_is_not_what_was_calibrated(skin: StubSkin, gain: float) -> None:
-    """It comes and goes: no touch, and the baseline stays as it was; what presses meanwhile is where it is. It stays:
-    never a touch, and a tare takes it as it is.
-    """
-    before = skin.rest(60)
-    for k in range(8):
-        touch = PRESS if k == 4 else ()
+def test_a_gain_resistor_that_is_not_what_was_calibrated_is_no_touch_and_a_tare_takes_it(skin, gain) -> None:
+    for _ in range(3):  # it comes and goes
         with skin.fault("stale_rtia", gain=gain):
-            faulty = skin.felt(4, touch)
+            faulty = skin.felt(4)
         assert {"gain", "out_of_distribution"} & set(faulty[0].contact.reasons)
-        assert all(len(present(r)) == len(touch) for r in faulty if r.contact.valid)
-        assert all(off_m(r, PRESS[0]) < 0.003 for r in faulty if r.contact.valid and touch)
-        assert all(not present(r) for r in skin.felt(5)[1:] if r.contact.valid)
-    after = skin.felt(60)
-    assert free(after) and abs(after[-1].delta.difference).max() < 2 * abs(before.delta.difference).max()
+        assert not any(present(r) for r in (*faulty, *skin.felt(5)[1:]) if r.contact.valid)
     with skin.fault("stale_rtia", gain=gain):
         assert not any(r.contact.valid and r.contact.contacts for r in skin.felt(80))
         skin.pipeline.pre.command("tare", {"force": True})

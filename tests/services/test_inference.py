@@ -118,6 +118,7 @@ def test_a_held_frame_has_the_image_of_the_one_reconstructed(stage, delta):
     twin.load(stage.state())
     carried = run(twin, delta(12, reconstructed=1))
     assert carried.reconstructed == 1 and (carried.image == first.image).all() and runs(stage) == 1
+    assert carried.residual == first.residual is not None
 
 
 def test_what_nobody_wants_is_not_run_but_made_up_for(stage, delta):

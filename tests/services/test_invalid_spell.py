@@ -1,7 +1,5 @@
 """Frames that stay invalid are a problem of the skin, which status and doctor say."""
 
-from __future__ import annotations
-
 from services.contacts.invalid_spell import LASTS_S, InvalidSpell
 
 S = 10**9

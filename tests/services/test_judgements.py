@@ -1,7 +1,5 @@
 """Why a frame says what it says, as the topic `judgements`: raw frames in, frames out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -54,9 +52,7 @@ def test_nothing_is_wrong_with_an_untouched_or_a_pressed_skin(fed: Fed, board: B
     assert delta.touched and said.valid and verdicts(said)["touch"] == "note", "a press refuses nothing"
 
 
-def test_an_electrode_that_comes_off_turns_open_and_the_contact_frame_says_so(
-    tared: Fed, skin: Skin, bundle: Bundle, board: Board
-) -> None:
+def test_an_electrode_that_comes_off_turns_open_and_the_contact_frame_says_so(tared, skin, bundle, board) -> None:
     inference, publishing = Inference("palm", skin, bundle), Publishing("palm", skin, bundle)
     delta, said = run(tared.stage, without(bundle, board, 5))
     (image,) = inference.process(delta, frozenset({"image"}))
@@ -68,9 +64,7 @@ def test_an_electrode_that_comes_off_turns_open_and_the_contact_frame_says_so(
     assert not said.valid and verdicts(said)["too_many"] == "refuse"
 
 
-def test_nothing_is_made_that_nobody_asked_for_or_that_cannot_be_judged(
-    fed: Fed, bundle: Bundle, board: Board
-) -> None:
+def test_nothing_is_made_that_nobody_asked_for_or_that_cannot_be_judged(fed, bundle, board) -> None:
     for frame in (*(board.frame() for _ in range(72)), without(bundle, board, 5)):
         (made,) = fed.stage.everything(frame, UNASKED)
         assert isinstance(made, DeltaFrame)

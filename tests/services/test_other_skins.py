@@ -1,8 +1,4 @@
-"""Skins of other outlines and numbers of electrodes: made, measured by the stub's board, pressed; contacts are where
-the presses are. One-step images, no network: what any skin has before a training.
-"""
-
-from __future__ import annotations
+"""Skins of other outlines and electrodes, without a network: made, measured by the stub's board, pressed."""
 
 from pathlib import Path
 
@@ -16,10 +12,10 @@ from firmware_stub.world import Touch, World
 from models import bundle, geometry, manifest
 from models.forward import ForwardModel
 from models.linearise import linearise
-from protocol.frames import RawFrame
 from protocol.scan_setting import COHERENT
 from services.pipeline import Pipeline, Result
 from services.runtime.config import Skin
+from tests.services.stub_skin import whole_scan
 
 ELL = [[0, 0], [100, 0], [100, 50], [50, 50], [50, 100], [0, 100]]  # mm
 SKINS = {
@@ -41,7 +37,7 @@ class Made:
         matrices = linearise(ForwardModel(skin), "model")
         bundle.write(folder / name, manifest.describe(name, skin, matrices), matrices)
         self.sheet = Sheet(str(folder / name))
-        self.analog = Analog(BoardNoise.of_db(80.0), Faults(), np.random.default_rng(1))
+        self.analog = Analog(BoardNoise(1e-4), Faults(), np.random.default_rng(1))
         config = Skin(port="stub", bundle=str(folder / name), frame_id=name, network="none")
         self.pipeline, self.scan = Pipeline(config, name=name), 0
 
@@ -50,9 +46,7 @@ class Made:
         for _ in range(scans):
             self.scan += 1
             z, status = self.analog.measure((t, t), self.sheet.skin.pattern, COHERENT, 40_000.0, 0.0)
-            stamps = {"sample": self.scan * 45_000_000, "read": self.scan * 45_000_000 + 1}
-            scan = {"skin": "any", "scan": self.scan, "stamps": stamps, "source": "board", "valid_for_s": 0.5}
-            result = self.pipeline.run(RawFrame(**scan, valid=True, z=z, status=status))
+            result = self.pipeline.run(whole_scan(z, self.scan, status))
         return result
 
 

@@ -1,7 +1,5 @@
 """Preprocessing: touch decision, hold, what is left out of a scan, what the baseline follows, and what info says."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 
@@ -92,22 +90,11 @@ def test_nothing_is_learnt_from_frames_that_acquisition_does_not_believe(tared: 
     assert abs(np.mean(even[-20:])) < 0.2e-4 and np.mean(even[:2]) > 0.5e-4
 
 
-def test_steps_of_the_gain_are_counted_by_who_saw_them(tared: Fed) -> None:
-    tared.feel(0.02, 20)
-    assert tared.stage.health().counters["gain_steps"] == 1
-    other = tared.again()
-    other.stage.load(tared.stage.state())
-    other.feel(0.02)
-    assert other.stage.health().counters.get("gain_steps", 0) == 0
-
-
 # what is left out of a scan
 
 
 @pytest.mark.parametrize(("valid", "reasons"), [(True, []), (False, []), (True, ["gap", "clock"]), (False, ["clock"])])
-def test_failed_measurements_do_not_change_what_the_producer_says(
-    tared: Fed, board: Board, valid: bool, reasons: list[str]
-) -> None:
+def test_failed_measurements_do_not_change_what_the_producer_says(tared, board, valid, reasons) -> None:
     frame = board.frame()
     frame.z[7], frame.valid, frame.reasons = np.nan, valid, reasons
     heard = received(frame)

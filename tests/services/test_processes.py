@@ -8,13 +8,14 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zmq
 
 from protocol.sockets import ControlError, ControlServer
 from services import health
-from services.runtime import realtime
+from services.runtime import realtime, supervision
 from services.runtime.config import ROOT, load
 from services.runtime.config_sections import RealTime
 from services.runtime.stage import Health
@@ -94,6 +95,16 @@ def test_a_program_that_keeps_failing_is_retried_ever_more_slowly(up, runtime):
     until(lambda: len(starts(log)) >= 5, service)
     gaps = [b - a for a, b in pairwise(starts(log))]
     assert all(gap > 0.95 * least_s for gap, least_s in zip(gaps, (0.1, 0.2, 0.4, 0.8), strict=False))
+
+
+def test_the_first_retry_comes_after_a_tenth_of_a_second_and_the_later_ones_within_five(monkeypatch):
+    monkeypatch.setattr(supervision.Subprocess, "change_state", lambda *_: True)
+    monkeypatch.setattr(supervision, "time", SimpleNamespace(monotonic=lambda: 100.0))
+    stage, after = object.__new__(supervision._Stage), []
+    for stage.backoff in range(1, 9):
+        stage.change_state(supervision.ProcessStates.BACKOFF)
+        after.append(stage.delay - 100.0)
+    assert after == pytest.approx([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0])
 
 
 @pytest.mark.live

@@ -274,6 +274,12 @@ def test_frames_that_stay_invalid_are_a_warning(stage):
     assert stage.health().level == "OK"
 
 
+def test_a_touch_of_a_preprocessing_that_began_anew_is_another_one(stage):
+    first, held = (only(stage, seen(scan, told(1, age_s=0.045 * scan))) for scan in (1, 2))
+    new, ended = contacts(stage, seen(3, told(1))).contacts
+    assert first.id == held.id == ended.id != new.id and ended.state == "end"
+
+
 touched = st.sets(st.integers(1, 4), max_size=3)  # ids that preprocessing gave
 happenings = st.one_of(touched, touched, st.sampled_from(["lost", "reset", "reload", "anew"]))
 

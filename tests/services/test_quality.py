@@ -1,7 +1,5 @@
 """The forward residual: touches are explained, anything else is not, and makes no valid contact."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -46,12 +44,11 @@ def test_the_true_image_explains_another_meshs_frame(bundle: Bundle, shapes: tup
 
 
 def test_what_it_cannot_tell_is_none(bundle: Bundle) -> None:
-    residual = Residual(bundle, to_scale=True)
+    residual, image = Residual(bundle, to_scale=True), np.zeros((96, 96), np.float32)
     d, sigma = np.zeros(120, np.float32), np.full(120, 1e-4, np.float32)
-    assert residual(d, np.full(120, np.inf, np.float32), np.zeros((96, 96), np.float32)) is None
-    assert residual(d[:64], sigma[:64], np.zeros((96, 96), np.float32)) is None
-    assert residual(d, sigma, np.zeros((95, 95), np.float32)) is None
-    assert residual(d, sigma, np.zeros((96, 96), np.float32)) == 0
+    for wrong in ((d, np.full_like(d, np.inf), image), (d[:64], sigma[:64], image), (d, sigma, image[:95])):
+        assert residual(*wrong) is None
+    assert residual(d, sigma, image) == 0
 
 
 def test_touches_have_quality_and_random_frames_make_no_valid_contact(bundle: Bundle) -> None:

@@ -69,9 +69,7 @@ scenes = st.lists(shapes, min_size=1, max_size=3)
 @settings(max_examples=50)
 @given(scenes, scenes, st.booleans())
 def test_every_pixel_above_the_floor_is_one_touchs(scene, others, known):
-    """However a patch is split, nothing of the integrated drop is lost or counted twice; nor is a mask empty. What
-    reaches the floor by single pixels only, which smoothing levels, is no touch.
-    """
+    """However a patch is split, nothing of the drop is lost or counted twice; single pixels are no touch."""
     picture, n = drop_image([*scene, *others], 48).astype(np.float32), 48
     centres = [((s.x + 1) / 2 * n - 0.5, (s.y + 1) / 2 * n - 0.5) for s in scene]
     touches, alone = segment(picture, NOTHING, centres if known else []), segment(picture, NOTHING)

@@ -1,7 +1,5 @@
 """Files of separate scans: what touches is found live as it is offline, whatever the order of the rows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -43,9 +41,7 @@ def skin_of(bundle: Bundle, port: str = "stub") -> Skin:
 
 
 def live(data: Input, bundle: Bundle, twin: Pipeline | None = None) -> Iterator[tuple[RawFrame, ContactFrame]]:
-    """What the processes make of the file's frames, as they come from a port or a replay. twin: goes on from the state
-    in the middle, and says the same.
-    """
+    """What the stages make of the file's frames. twin: goes on from the state in the middle."""
     pipeline = Pipeline(skin_of(bundle), bundle=bundle)
     for scan, (values, kind) in enumerate(frames_of(data), start=1):
         frame = file_frame("skin", "opposite", scan, values, kind, scan * 45_000_000, data.separate)
@@ -139,9 +135,7 @@ def test_a_scan_whose_reference_was_lost_is_not_valid(touches: Arrays) -> None:
     assert pipeline.pre.health().messages == []
 
 
-def test_ports_and_recordings_give_the_same_frames(
-    touches: Arrays, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ports_and_recordings_give_the_same_frames(touches, tmp_path, monkeypatch) -> None:
     """`port = "FILE.npz"` of presses in an order of its own, and `port = "FILE.mcap"` of what `skin import` made."""
     monkeypatch.setattr(file_source, "FILE_RATE_HZ", 1e4)
     bundle = Bundle.load("square16")

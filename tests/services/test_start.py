@@ -1,7 +1,5 @@
 """The first baseline and tares, through preprocessing; and the judge of a start on the stub's own mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,9 +11,9 @@ from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
 from protocol.frames import JudgementsFrame, RawFrame, pack, unpack
 from services.estimation.first.baseline import NoBaseline, disagreement, take
-from services.estimation.first.start import EarlierBaseline, JudgedStart, StartJudge, StartSays
+from services.estimation.first.start import JudgedStart, StartJudge, StartSays
 from services.estimation.first.tare import agreement
-from services.runtime.config import Skin, TareConfig
+from services.runtime.config import TareConfig
 from services.runtime.stage import Refused
 from tests.services.conftest import Board, Fed
 
@@ -67,9 +65,7 @@ def test_a_touch_at_the_start_is_named_and_ends_without_a_command(fed: Fed, boar
     assert found.valid and not found.touched and fed.stage.health().level == "OK"
 
 
-def test_a_tare_under_a_touch_that_the_start_found_needs_force_and_ends_by_another(
-    skin: Skin, bundle: Bundle, board: Board
-) -> None:
+def test_a_tare_under_a_touch_that_the_start_found_needs_force_and_ends_by_another(skin, bundle, board) -> None:
     """Who forces it is believed. What comes then is refused after two scans that may be a touch that changes."""
     fed = Fed(skin.model_copy(update={"tare": TareConfig(frames=12, calibrate=False)}), bundle, board)
     fed.feel(hand(board), 20)
@@ -122,9 +118,7 @@ def test_a_tare_waits_for_scans_and_for_the_touch_to_end(fed: Fed, board: Board)
 @pytest.mark.parametrize(
     ("snr_db", "words"), [(400.0, "identical"), (30.0, "trained for 0.56 %"), (40.0, "scatter by 1.0 %"), (50.0, "")]
 )
-def test_scans_that_are_the_same_or_too_noisy_are_doubted(
-    skin: Skin, bundle: Bundle, snr_db: float, words: str
-) -> None:
+def test_scans_that_are_the_same_or_too_noisy_are_doubted(skin, bundle, snr_db, words) -> None:
     """Not even after a tare on command are they valid: looking at the skin does not mend it."""
     fed = Fed(skin, bundle, Board(bundle, snr_db))
     found = fed.feel(scans=80)[-1]
@@ -225,11 +219,11 @@ def solved(*shapes: Shape, background: float = 1.0, contact: Array | float = 1.0
     return np.asarray(np.abs(model.solve(conductivity, model.contact_impedance * contact).impedances()))
 
 
-def judged(z: Array, rng: np.random.Generator, earlier: EarlierBaseline | None = None) -> JudgedStart:
+def judged(z: Array, rng: np.random.Generator) -> JudgedStart:
     sigma = NOISE / np.sqrt(SCANS)
     mean = np.log(z) + sigma * rng.standard_normal(len(z))
     judge = StartJudge(tables_of(Bundle.load("square16")))
-    return judge(mean, np.full(len(z), sigma**2), np.ones(len(z), bool), earlier)
+    return judge(mean, np.full(len(z), sigma**2), np.ones(len(z), bool), None)
 
 
 def any_skin(rng: np.random.Generator) -> dict[str, Array | float]:
@@ -267,14 +261,3 @@ def test_a_skin_that_is_not_as_in_its_file_is_never_said_to_be_untouched(name: s
     bare = judged(np.abs(sheet.solve().impedances()), rng)
     touched = judged(np.abs(sheet.solve([Shape("circle", 0.3, -0.2, 0.1, 0.3)]).impedances()), rng)
     assert bare.says is not StartSays.UNTOUCHED and not bare.sure and touched.says is not StartSays.UNTOUCHED
-
-
-def test_an_earlier_baseline_tells_where_the_bundle_cannot() -> None:
-    rng, tables = np.random.default_rng(5), tables_of(Bundle.load("square16"))
-    odd = 1 + 0.01 * rng.standard_normal(120)
-    assert judged(solved() * odd, rng).says is StartSays.UNKNOWN
-    field = tables.field[:, :3]  # even, along x and y
-    drifted = 0.01**2 * field @ field.T + 0.2**2 * tables.contact @ tables.contact.T
-    earlier = EarlierBaseline(np.log(solved() * odd), drifted)
-    for shapes, says in (((), StartSays.UNTOUCHED), ((Shape("circle", 0.2, 0.1, 0.1, 0.1),), StartSays.TOUCHED)):
-        assert judged(solved(*shapes, background=1.02, contact=1.05) * odd, rng, earlier).says is says

@@ -1,7 +1,5 @@
 """The stages' state: kept at any moment it is gone on from as its own stages do, and what is none is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import asdict
 from functools import reduce
@@ -22,7 +20,7 @@ from services.runtime.persistence import arrays, plain
 from services.runtime.stage import Refused
 from simulation.host import SimulatedHost, tared
 from simulation.scenes import DiscPress, script, step
-from tests.services.conftest import Board, Fed
+from tests.services.conftest import Fed
 from tests.services.curves import FREE_S, SKIN, between_s, bundle, impedance, press, said, stages_of
 from tests.services.curves import Board as CurveBoard
 
@@ -151,9 +149,7 @@ def test_an_impossible_baseline_is_refused(tared: Fed, key: str, value: float) -
         ("hold", dict(reference=np.ones(7), recent=np.ones((0, 120)), averaged=1, count=1, scan=1)),
     ],
 )
-def test_a_state_of_another_shape_is_refused_and_changes_nothing(
-    tared: Fed, board: Board, keys: str, value: Any
-) -> None:
+def test_a_state_of_another_shape_is_refused_and_changes_nothing(tared, board, keys, value) -> None:
     twin = tared.again()
     twin.stage.load(*kept([tared.stage.state()]))
     tared.stage.load(tared.stage.state())

@@ -42,6 +42,8 @@ def pressed(**fields):
     stub = StubSkin(80.0, skin=FLAT.model_copy(update=fields))
     frame = [stub.feel((Shape("circle", 0.5, -0.3, 0.25, 0.3),)).contact for _ in range(6)][-1]
     (contact,) = frame.contacts
+    (ended,) = [c for _ in range(4) for c in stub.feel(()).contact.contacts if c.state == "end"]
+    assert ended.sheet == contact.sheet and ended.normal == contact.normal, "it ends where it was"
     return contact, frame.frame_id
 
 

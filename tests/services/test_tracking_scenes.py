@@ -1,7 +1,5 @@
 """Id switches in scenes of touches that slide, cross, pass and meet: scans of the stub's sheet in, contacts out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -37,14 +35,6 @@ def crossing(rng: np.random.Generator) -> Iterator[list[Shape]]:
     second = first + rng.uniform(0.7, math.pi)
     for t in np.arange(-0.65 / speed, 0.65 / speed, SCAN_S):
         yield [make(n, direction(a) * speed * t) for n, a in enumerate((first, second))]
-
-
-def passing(rng: np.random.Generator) -> Iterator[list[Shape]]:
-    """One stays, another one slides past it, edge to edge."""
-    make, angle, speed = touches(rng), rng.uniform(0, 6), rng.uniform(0.5, 1.1)
-    aside = direction(angle + math.pi / 2) * (make(0, np.zeros(2)).radius + make(1, np.zeros(2)).radius + 0.05)
-    for t in np.arange(-0.65 / speed, 0.65 / speed, SCAN_S):
-        yield [make(0, np.zeros(2)), make(1, aside + direction(angle) * speed * t)]
 
 
 def meeting(rng: np.random.Generator) -> Iterator[list[Shape]]:
@@ -83,7 +73,7 @@ def switches(skin: StubSkin, scene: Scene, rng: np.random.Generator) -> tuple[in
 NO_NETWORK = Skin(port="stub", bundle="square16", frame_id="palm", network="none")
 
 
-@pytest.mark.parametrize("kind", [crossing, passing, meeting])
+@pytest.mark.parametrize("kind", [crossing, meeting])
 def test_ids_are_kept(kind: Callable[[np.random.Generator], Iterator[list[Shape]]]) -> None:
     """Where touches inside a patch are not followed, every crossing has a switch."""
     skin, changed, made = StubSkin(skin=NO_NETWORK), 0, 0

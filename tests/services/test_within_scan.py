@@ -1,7 +1,5 @@
 """Touches that come, go and change while they are scanned: valid, `changing`, and nothing else is taken for one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -63,9 +61,7 @@ def hides(result: Result) -> bool:
 
 @pytest.mark.parametrize("touch", TOUCHES)
 @pytest.mark.parametrize("shares", [(1.0, 0.93, 0.5, 0.06), (1.0, 0.3, 0.0)])
-def test_no_frame_hides_a_touch_that_goes_while_it_is_scanned(
-    skin: StubSkin, touch: Shape, shares: tuple[float, ...]
-) -> None:
+def test_no_frame_hides_a_touch_that_goes_while_it_is_scanned(skin, touch, shares) -> None:
     skin.rest(3)
     down = levels(touch, shares)
     for _ in range(6):
