@@ -64,12 +64,16 @@ class Answering:
         """
         if not self._measured.whole or answer.fit is None or any(prior.until_s < np.inf for prior in answer.fit.priors):
             return answer
-        if not (_strained(answer) or self._skin.touches.odd):
-            return answer
         scan = self._measured.scan
+        if not (_strained(answer) or self._skin.touches.odd or scan.separate):
+            return answer
         budget = StepBudget.of(max(float(scan.new.mean()), float(n.RECOUNTS)), scan.separate)
         own = replace(question, budget=budget, keeps=0.0)
-        found = Recount(hypotheses)(own, answer)
+        recount = Recount(hypotheses)
+        other = found = recount(own, answer)
+        while scan.separate and other is not None:
+            other = recount(own, other)
+            found = other or found
         if found is None or found.fit is None:
             return answer
         kept = self._skin.touches.recognised(found.fit, found.kept)

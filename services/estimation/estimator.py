@@ -405,8 +405,9 @@ class Estimator:
             measured.budget.left = budget
             found.append((*self._explaining(skin, measured), state, skin.faults.now))
         holding = [each for each in found if each[0].answer.holds] or found
-        enough = max(each[0].answer.score for each in holding) - n.YOUNGER
-        asked, at, skin.drift.now, skin.faults.now = [each for each in holding if each[0].answer.score >= enough][-1]
+        best = max((each[0].answer for each in holding), key=lambda answer: answer.score)
+        nearly = [each for each in holding if _nearly_as_likely(each[0].answer, best)]
+        asked, at, skin.drift.now, skin.faults.now = nearly[-1]
         skin.aged = []
         return asked, at
 
@@ -571,6 +572,11 @@ class Estimator:
         return Estimate(
             measured.scan, measured.whole, (), electrodes, measured.live, nothing, nothing, tuple(judgements)
         )
+
+
+def _nearly_as_likely(older: ScoredAnswer, likeliest: ScoredAnswer) -> bool:
+    """Whether an answer of an older baseline is to be preferred: it may be less likely, the more touches it saves."""
+    return older.score >= likeliest.score - n.YOUNGER * max(1, likeliest.count - older.count)
 
 
 def _strange(question: Question, answer: ScoredAnswer) -> bool:

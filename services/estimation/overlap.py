@@ -85,3 +85,9 @@ def neighbours(states: Array, kept: Sequence[int]) -> tuple[int, int] | None:
         if kept[a] < 0 or kept[b] < 0:
             return (int(a), int(b)) if kept[b] < 0 else (int(b), int(a))
     return None
+
+
+def apart(states: Array, kept: Sequence[int]) -> bool:
+    """Whether no touch that is new lies on another one: such two are one, as nobody saw them apart."""
+    new = np.array(kept) < 0
+    return bool((gaps(states)[new] > n.NEIGHBOURS).all())

@@ -28,7 +28,7 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         memories += touches.settle(answer.fit, kept, middle_s, span_s, whole=measured.whole, explained=answer.explained)
         _make_sure(skin, answer, measured)
         rest = replace(question, keeps=0.0)
-        if measured.whole and not answer.recounted:
+        if measured.whole and not (answer.recounted or measured.scan.separate):
             _doubt(skin, rest, answer, measured, strange=unexplained_s > n.CHANGING_S)
     skin.remember(memories)
     wide = answer.fit is not None and answer.wide
@@ -44,6 +44,8 @@ def _make_sure(skin: TaredSkin, answer: ScoredAnswer, measured: LookedAt) -> Non
     if not (answer.explained or measured.scan.separate) or 2 * answer.over < n.SURE_Z2:
         return
     least = float(n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2)
+    if measured.scan.separate:  # how many press was asked of evidence
+        least = float(n.ACTS_Z2)
     if not skin.tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
         least = 0.0
     may_wait = skin.tables.predicted and not measured.scan.separate

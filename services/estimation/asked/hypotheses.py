@@ -47,7 +47,7 @@ from services.estimation.asked.question import (
     started_from,
 )
 from services.estimation.filter import SkinFilter
-from services.estimation.overlap import neighbours
+from services.estimation.overlap import apart, neighbours
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -352,8 +352,11 @@ class Hypotheses:
         question.budget.left -= (fit.steps + 1) * len(fit)
         z2 = self.left_over.best(question, fit.pulled, fit.white, fit)[0]
         cost = n.COST_WIDE if wide and not self.wide else COSTS[cause]
-        score = fit.evidence + cost + n.COST_TOUCH * sum(place < 0 for place in kept)
-        return ScoredAnswer(cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left, wide=wide)
+        score = fit.evidence + cost + question.begins * sum(place < 0 for place in kept)
+        near = question.separate and not apart(fit.states, kept)
+        return ScoredAnswer(
+            cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left, near=near, wide=wide
+        )
 
     def search(self, question: Question, kept: tuple[int, ...], fit: FoundTouches | None) -> list[ScoredAnswer]:
         """Further touches, one after the other: plain discs find them, their own outlines and evidence decide."""
@@ -364,7 +367,7 @@ class Hypotheses:
         score, full = -np.inf, started_from(fit)
         while (len(fit) if fit else 0) < n.MOST_TOUCHES and not question.spent:
             z2, disc, action, since_s = self.left_over.best(question, pulled, white, fit, question.onsets)
-            if z2 < n.FALSE_ALARM_Z2:
+            if z2 < (n.ANOTHER_Z2 if question.separate else n.FALSE_ALARM_Z2):
                 break
             x, y = self.grid.discs[disc, PLACE]
             new = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
@@ -374,18 +377,31 @@ class Hypotheses:
                 if found[0].explained:
                     break
             disc_alone = self.fitted(question, [*started_from(fit), plain(new)], kept, n.STEPS_COLD)
-            if disc_alone.score < score + n.ANOTHER:
+            if disc_alone.score < score + question.another:
                 break
             score, fit = disc_alone.score, disc_alone.fit
             assert fit is not None
             pulled, white = disc_alone.pulled, disc_alone.white
-            outlined = self.fitted(question, started(full, fit), kept, n.STEPS_COLD)
-            found.append(outlined)
-            assert outlined.fit is not None
-            if (pair := neighbours(outlined.fit.states, kept)) is not None:
-                found.append(self.merged(question, outlined, *pair))
-            if disc_alone.explained:
+            found += self._outlined(question, full, kept, disc_alone)
+            if disc_alone.explained and not question.separate:
                 break
+        return found
+
+    def _outlined(
+        self, question: Question, priors: Sequence[TouchPrior], kept: tuple[int, ...], discs: ScoredAnswer
+    ) -> list[ScoredAnswer]:
+        """Touches that were found as discs with outlines of their own. In a row each may be a disc, or odder than
+        outlines go.
+        """
+        outlined = self.fitted(question, started(priors, discs.fit), kept, n.STEPS_COLD)
+        assert outlined.fit is not None
+        found = [outlined]
+        if question.separate:
+            found[0] = replace(outlined, score=max(outlined.score, discs.score))
+            if outlined.chi2 > n.GOOD:
+                found.append(self.fitted(question, started(priors, outlined.fit), kept, n.STEPS_COLD, wide=True))
+        if (pair := neighbours(outlined.fit.states, kept)) is not None:
+            found.append(self.merged(question, outlined, *pair))
         return found
 
     def merged(self, question: Question, answer: ScoredAnswer, a: int, b: int) -> ScoredAnswer:

@@ -79,6 +79,7 @@ class LookedAt:
             information=information,
             budget=self.budget,
             candidates=candidates,
+            separate=self.scan.separate,
         )
 
 

@@ -58,11 +58,22 @@ class Question:
     information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
     budget: StepBudget
     candidates: tuple[TouchPrior, ...]  # touches that nearly explained the scan before, or this one
+    separate: bool = False  # no scan follows that tells more: how many touch is decided now
     keeps: float = 0.0  # steps that are left to who asks next
 
     @property
     def spent(self) -> bool:
         return self.budget.left <= self.keeps
+
+    @property
+    def begins(self) -> float:
+        """Log prior of a touch that begins [nat]."""
+        return n.COST_TOUCH + (n.WIDE_START if self.separate else 0.0)
+
+    @property
+    def another(self) -> float:
+        """Evidence that a further touch must add [nat]."""
+        return 0.0 if self.separate else float(n.ANOTHER)
 
     @cached_property
     def instants(self) -> Array:
@@ -98,12 +109,17 @@ class ScoredAnswer:
     pulled: Array  # (K,) S^-1 of the residual
     left: Array  # (K,)
     recounted: bool = False  # its touches are others than those that stood
+    near: bool = False  # a new touch lies on another one: such two are one
     wide: bool = False  # by a response that is wrong by more than it should be
     over: float = np.inf  # by how much it is likelier than that nothing touches, where nothing did before [nat]
 
     @property
     def explained(self) -> bool:
-        return self.chi2 < n.GOOD and self.left_z2 < n.FALSE_ALARM_Z2
+        return self.chi2 < n.GOOD and self.left_z2 < n.FALSE_ALARM_Z2 and not self.near
+
+    @property
+    def count(self) -> int:
+        return 0 if self.fit is None else len(self.fit)
 
     @property
     def quiet(self) -> bool:
@@ -144,4 +160,5 @@ def begun_as(fit: FoundTouches, span_s: float) -> tuple[TouchPrior, ...]:
 def likeliest(answers: Sequence[ScoredAnswer]) -> ScoredAnswer:
     """Of those that explain the scan, if there are any."""
     explained = [answer for answer in answers if answer.explained]
-    return max(explained or answers, key=lambda answer: answer.score)
+    apart = [answer for answer in answers if not answer.near]
+    return max(explained or apart or answers, key=lambda answer: answer.score)

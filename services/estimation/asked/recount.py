@@ -45,16 +45,20 @@ class Recount:
         ask, new = self._hypotheses, (-1,) * len(answer.fit)
         begun = begun_as(answer.fit, question.span_s)
         same = [ask.fitted(question, begun, new, n.STEPS_COLD)]
+        if answer.wide:
+            same.append(ask.fitted(question, begun, new, n.STEPS_COLD, wide=True))
         if answer.cause:
             same += ask.with_cause(question, begun, new, answer.cause, answer.left)
         discs = ask.fitted(question, [plain(prior) for prior in begun], new, n.STEPS_COLD)
-        found, enough = [discs, *self._one_more(question, begun, discs)], max(each.score for each in same) + n.ANOTHER
+        found = [discs, *self._one_more(question, begun, discs)]
+        enough = max(each.score for each in same) + question.another
         assert same[0].fit is not None
         if (pair := neighbours(same[0].fit.states, new)) is not None:
             found.append(ask.merged(question, same[0], *pair))
         elif not any(other.explained and other.score > enough for other in found):
-            oddest = int(np.argmax([oddness(shape) for shape in answer.fit.shapes]))
-            found += self._halved(question, begun, discs, oddest)
+            oddest = np.argsort([-oddness(shape) for shape in answer.fit.shapes])
+            for one in oddest if question.separate else oddest[:1]:
+                found += self._halved(question, begun, discs, int(one))
         if not any(other.explained for other in found):
             found += ask.search(question, (), None)
         others = [other for other in found if other.explained and _others(other.fit, answer.fit)]

@@ -92,6 +92,10 @@ SURE_Z2 = Number(44.0, "-", "z^2 of a new touch that is shown", "derived: FALSE_
 
 ONSET_Z2 = Number(7.0, "-", "z^2 that a touch which began within a scan must have beyond", "derived: 2 ln of 33 onsets")
 ANOTHER = Number(15.0, "nat", "evidence that a further touch adds", "derived: 650 discs in 1e4 frames, and 2")
+ANOTHER_Z2 = Number(16.0, "-", "z^2 of a further disc that a row is tried with", "chosen: 4 sigmas; evidence decides")
+WIDE_START = Number(
+    4.1, "nat", "log prior that a new touch's wide start lacks", "derived: places 1.9 (sheet), actions 2.2 (1 to 100)"
+)
 COST_TOUCH = Number(-3.5, "nat", "log prior of a touch that begins in a scan", "derived: one in 30 scans")
 COST_DRIFT = Number(-7.0, "nat", "of faster drift", "derived: one in 1000 scans")
 COST_MEMORY = Number(-1.0, "nat", "of memories as large as foam's may be", "derived: one touch in three leaves more")
@@ -157,7 +161,9 @@ AGES = (
     Number(0.1, "-", "the same: a tenth as far as its rates say", "derived: half way, in decades, to noise"),
     Number(1.0, "-", "the same: as far as its rates say", "derived: the most"),
 )
-YOUNGER = Number(10.0, "nat", "by which less drift must be likelier", "chosen: 30 counts 7 of 80 rows worse at 70 dB")
+YOUNGER = Number(
+    10.0, "nat", "by which less drift must be likelier, for each touch more", "chosen: 30 counts 7 of 80 rows worse"
+)
 OLDEST_S = Number(600.0, "s", "age of a baseline beyond which it is no older", "derived: FIELD_RATE makes 12 % of it")
 TARE_IDENTICAL = Number(1e-12, "-", "noise below which scans are the same", "derived: arithmetic of their mean")
 TARE_ASSUMED = Number(1e-3, "-", "noise where scans tell none", "chosen: 60 dB, ten times the board's")
