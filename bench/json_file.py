@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import models
+from protocol.whole_file import write_whole
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Writes a report; its folder is made where there is none."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(_strict(dict(content)), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_whole(path, json.dumps(_strict(dict(content)), indent=1, allow_nan=False) + "\n")
 
 
 def drawn(report: Path) -> None:

@@ -23,7 +23,6 @@ import json
 import os
 import re
 import sys
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -41,6 +40,7 @@ from models.prereconstruction import Matrices, PreReconstructor
 from models.response_file import arrays_of_tables, tables_of
 from models.touch_response import ResponseTables
 from protocol.errors import EitskinError
+from protocol.whole_file import whole_file, write_whole
 
 SCHEMA = 1
 BUNDLES = Path(__file__).parent / "bundles"
@@ -200,37 +200,40 @@ def write(
     new one, never a mixture that passes.
     """
     path.mkdir(parents=True, exist_ok=True)
-    arrays: dict[str, Any] = {f.name: np.asarray(getattr(matrices, f.name)) for f in fields(Matrices)}
-    np.savez_compressed(path / "matrices.npz", **arrays)
     networks = networks or {}
-    for variant, name in NETWORKS.items():
-        (path / name).unlink(missing_ok=True)
-        if variant in networks:
-            (path / name).write_bytes(networks[variant])
-    names = ["matrices.npz", *(NETWORKS[v] for v in networks)]
-    (path / LOCATOR).unlink(missing_ok=True)
+    arrays: dict[str, Mapping[str, Any]] = {"matrices.npz": _fields(matrices)}
     if locator is not None:
-        own: dict[str, Any] = {f.name: np.asarray(getattr(locator, f.name)) for f in fields(LocatorArrays)}
-        np.savez_compressed(path / LOCATOR, **own)
-        names.append(LOCATOR)
-    (path / RESPONSE).unlink(missing_ok=True)
+        arrays[LOCATOR] = _fields(locator)
     if response is not None:
-        np.savez_compressed(path / RESPONSE, **arrays_of_tables(response))
-        names.append(RESPONSE)
-    size = sum((path / name).stat().st_size for name in names)
-    if size > MAX_BYTES:
-        raise BundleError(
-            f"{path}: {size / 2**20:.1f} MB, a bundle may have {MAX_BYTES // 2**20} MB: ship a smaller network"
-        )
+        arrays[RESPONSE] = arrays_of_tables(response)
+    with contextlib.ExitStack() as places:  # all files take their place together, or none does
+        parts = {}
+        for name in (*arrays, *(NETWORKS[variant] for variant in networks)):
+            parts[name] = places.enter_context(whole_file(path / name))
+        for name, held in arrays.items():
+            np.savez_compressed(parts[name], **held)
+        for variant, content in networks.items():
+            parts[NETWORKS[variant]].write_bytes(content)
+        size = sum(part.stat().st_size for part in parts.values())
+        if size > MAX_BYTES:
+            raise BundleError(
+                f"{path}: {size / 2**20:.1f} MB, a bundle may have {MAX_BYTES // 2**20} MB: ship a smaller network"
+            )
+    for name in {*NETWORKS.values(), LOCATOR, RESPONSE} - parts.keys():
+        (path / name).unlink(missing_ok=True)
     return replace_manifest(
-        path, {"schema": SCHEMA, **manifest, "files": {name: sha256(path / name) for name in names}}
+        path, {"schema": SCHEMA, **manifest, "files": {name: sha256(path / name) for name in parts}}
     )
+
+
+def _fields(of: Matrices | LocatorArrays) -> dict[str, Any]:
+    return {f.name: np.asarray(getattr(of, f.name)) for f in fields(of)}
 
 
 def add_response(bundle: Bundle, response: ResponseTables) -> Bundle:
     """The bundle there is, with these tables."""
-    packed = arrays_of_tables(response)
-    np.savez_compressed(bundle.path / RESPONSE, **packed)
+    with whole_file(bundle.path / RESPONSE) as part:
+        np.savez_compressed(part, **arrays_of_tables(response))
     files = {**bundle.manifest["files"], RESPONSE: sha256(bundle.path / RESPONSE)}
     added = replace_manifest(bundle.path, {**bundle.manifest, "files": files})
     added.response()
@@ -240,14 +243,14 @@ def add_response(bundle: Bundle, response: ResponseTables) -> Bundle:
 def replace_network(bundle: Bundle, variant: str, content: bytes, said: Mapping[str, Any]) -> Bundle:
     """The bundle there is with another network of this variant. said: the manifest's `network`, of all variants."""
     name = NETWORKS[variant]
-    (bundle.path / name).write_bytes(content)
+    write_whole(bundle.path / name, content)
     files = {**bundle.manifest["files"], name: sha256(bundle.path / name)}
     return replace_manifest(bundle.path, {**bundle.manifest, "network": said, "files": files})
 
 
 def replace_manifest(path: Path, full: Mapping[str, Any]) -> Bundle:
     """Another manifest for the files that are there, at once, and loads the bundle back."""
-    _replace(path / "manifest.json", json.dumps(full, indent=2, allow_nan=False) + "\n")
+    write_whole(path / "manifest.json", json.dumps(full, indent=2, allow_nan=False) + "\n", 0o644)
     seal(path)
     return Bundle.load(path)
 
@@ -255,17 +258,8 @@ def replace_manifest(path: Path, full: Mapping[str, Any]) -> Bundle:
 def seal(path: Path) -> str:
     """Writes the bundle's hash beside its manifest, and returns it."""
     found = sha256(path / "manifest.json")
-    _replace(path / SEAL, f"{found}  manifest.json\n")
+    write_whole(path / SEAL, f"{found}  manifest.json\n", 0o644)
     return found
-
-
-def _replace(path: Path, text: str) -> None:
-    """The file's new content, at once."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}")
-    with os.fdopen(handle, "w", encoding="utf-8") as out:
-        out.write(text)
-    os.chmod(temporary, 0o644)
-    os.replace(temporary, path)
 
 
 def sha256(path: Path) -> str:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import os
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -36,6 +35,7 @@ from models.npz import read_npz
 from models.scenes import TRAINING, random_scene
 from models.shapes import Shape, drop_image, from_rows, to_rows
 from protocol.errors import EitskinError
+from protocol.whole_file import whole_file, write_whole
 
 
 class OtherScenes(EitskinError, ValueError):
@@ -192,10 +192,8 @@ def generate(
             batch = todo[start : start + max(1, 2 * jobs)]
             made = joblib.Parallel(n_jobs=jobs)(joblib.delayed(make_chunk)(s) for s in batch)
             for spec, arrays in zip(batch, made, strict=True):
-                partial = folder / f".{spec.file}.part"
-                with partial.open("wb") as file:
-                    np.savez_compressed(file, **arrays)
-                os.replace(partial, folder / spec.file)
+                with whole_file(folder / spec.file) as part:
+                    np.savez_compressed(part, **arrays)
                 progress.advance(bar, spec.size)
     return sum(s.size for s in todo)
 
@@ -227,7 +225,7 @@ def _check_same_run(folder: Path, spec: ChunkSpec) -> None:
     wanted = {"schema": SCHEMA, "skin": spec.skin, "mesh": spec.mesh, "seed": spec.seed, "chunk": spec.size}
     path = folder / "data.json"
     if not path.exists():
-        path.write_text(json.dumps(wanted | {"geometry": digest}, indent=1) + "\n")
+        write_whole(path, json.dumps(wanted | {"geometry": digest}, indent=1) + "\n")
     found = json.loads(path.read_text())
     if found.pop("geometry", digest) != digest:  # older folders do not say
         raise OtherScenes(

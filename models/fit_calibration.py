@@ -25,6 +25,7 @@ from models.geometry import SkinGeometry
 from models.mounted import FieldModes
 from models.npz import read_npz
 from protocol.errors import EitskinError
+from protocol.whole_file import write_whole
 
 Array = NDArray[np.float64]
 
@@ -117,9 +118,7 @@ def main(argv: list[str] | None = None) -> int:
     except (EitskinError, KeyError, ValueError) as why:
         print(why, file=sys.stderr)
         return 1
-    fresh = Path(f"{out}.part")
-    fresh.write_bytes(packed)
-    os.replace(fresh, out)
+    write_whole(Path(out), packed)
     return 0
 
 

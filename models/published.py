@@ -31,6 +31,7 @@ from models.export import exported
 from models.network import CBAM, laid_out
 from models.prereconstruction import THRESHOLD_T, Array, Drift, Operator, PreReconstructor
 from models.symmetries import Symmetry, symmetries
+from protocol.whole_file import write_whole
 
 IN, OUT = 48, 96
 FOLDER = Path(__file__).parents[1] / "bench" / "published"
@@ -132,7 +133,7 @@ def main(argv: list[str] | None = None) -> None:
     model, said = train(pre, skin, scenes, args.minutes, not args.no_attention)
     FOLDER.mkdir(parents=True, exist_ok=True)
     target = FOLDER / ("cnn.onnx" if args.no_attention else "mmcnn.onnx")
-    target.write_bytes(to_onnx(model, said))
+    write_whole(target, to_onnx(model, said))
     print(f"{target}: {target.stat().st_size / 1024:.0f} kB")
 
 

@@ -17,6 +17,7 @@ from models.forward import ForwardModel
 from models.prereconstruction import TARE_FRAMES, Array, Drift, Operator, PreReconstructor
 from models.scenes import Prior, random_shape
 from models.shapes import KINDS, Shape
+from protocol.whole_file import whole_file
 
 PRIOR = Prior(radius=(0.08, 0.50), drop=(0.10, 0.50), tail=0.0)  # 1 to 5 N
 MESH = "stub"  # no training sees it, and the accuracy benchmark uses another again
@@ -64,7 +65,8 @@ def solve(
     difference = np.array([np.abs(model.solve(model.touched([s])).impedances()) / z0 - 1 for s in each])
     if cache is not None:
         cache.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(cache, shapes=rows, difference=difference, z0=z0, mesh=mesh)
+        with whole_file(cache) as part:
+            np.savez_compressed(part, shapes=rows, difference=difference, z0=z0, mesh=mesh)
     return SolvedPresses(rows, difference, z0)
 
 

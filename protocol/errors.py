@@ -63,6 +63,12 @@ class EitskinError(Exception):
     """
 
 
+INCOMPLETE = 4
+"""Exit code of a command that did its work, but not all of it is there: messages that were not recorded, or cannot be
+read.
+"""
+
+
 def interrupted(error: BaseException) -> bool:
     """Whether Ctrl-C caused an error: a compiled module that is interrupted while it loads says `initialization
     failed`.

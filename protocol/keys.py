@@ -17,6 +17,7 @@ import zmq
 from zmq.utils import z85
 
 from .errors import EitskinError
+from .whole_file import whole_file
 
 MAX_FILE = 64 * 1024
 _LINE = re.compile(rb'^\s*(public|secret)-key\s*=\s*"([^"]*)"', re.MULTILINE)
@@ -35,15 +36,10 @@ def write_keys(folder: Path, name: str) -> tuple[Path, Path]:
     public, secret = folder / f"{name}.key", folder / f"{name}.key_secret"
     public_line, secret_line = f'    public-key = "{public_key}"\n', f'    secret-key = "{secret_key}"\n'
     note = "# Secret: it stays on this host, readable by its owner only."
-    _write(secret, f"{note}\ncurve\n{public_line}{secret_line}", 0o600)
-    _write(public, f"# Public: for the other end.\ncurve\n{public_line}", 0o644)
+    with whole_file(secret, 0o600) as one, whole_file(public, 0o644) as other:  # both or none: they are a pair
+        one.write_text(f"{note}\ncurve\n{public_line}{secret_line}", encoding="ascii")
+        other.write_text(f"# Public: for the other end.\ncurve\n{public_line}", encoding="ascii")
     return public, secret
-
-
-def _write(path: Path, text: str, mode: int) -> None:
-    path.unlink(missing_ok=True)  # an older file's mode and links would stay
-    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode), "w", encoding="ascii") as file:
-        file.write(text)
 
 
 def read_pair(path: Path) -> tuple[bytes, bytes]:

@@ -19,6 +19,7 @@ from types import FrameType
 from typing import Any
 
 from protocol import logs, transport
+from protocol.errors import INCOMPLETE
 from protocol.metering import StatusBeat
 from protocol.runtime import AlreadyRunning, RuntimeDirError, lock, runtime_dir
 from protocol.sockets import ControlServer, Publisher
@@ -43,15 +44,13 @@ class RecorderService:
 
     def __init__(self, recorder: Recorder, folder: Path, skins: list[str]) -> None:
         self.recorder, self.folder = recorder, folder
-        self.gave_up = ""
-        """Why the last recording ended by itself."""
         commands = {"status": lambda _: self.status(), "record": self._record, "snapshot": self._snapshot}
         self.control = ControlServer(RECORDER, commands)
         self.publisher = Publisher(RECORDER)
         self._beats = {skin: StatusBeat(RECORDER, skin) for skin in skins}
 
     def turn(self) -> None:
-        """Record for a moment, answer commands, say how it goes. Raises OSError where the disk is broken."""
+        """Record for a moment, answer commands, say how it goes."""
         self.recorder.step()
         self.control.mind()
         for _ in range(COMMANDS_AT_ONCE):
@@ -61,26 +60,19 @@ class RecorderService:
         self.publisher.poll()
         self._say()
 
-    def give_up(self, why: OSError) -> None:
-        """The recording cannot go on; the recorder can."""
-        path = self.recorder.writer.path if self.recorder.writer is not None else self.folder
-        self.gave_up = f"the recording {path} ended: {why.strerror or why}"
-        log.error("%s", self.gave_up)
-        with contextlib.suppress(OSError):  # what it could not write it will not write now
-            self.recorder.stop()
-
     def _record(self, args: dict[str, Any]) -> dict[str, Any]:
         if args["on"]:
             self.folder.mkdir(PRIVATE, parents=True, exist_ok=True)
             self.recorder.record(file_in(self.folder), named_by_time=True)
-            self.gave_up = ""
-            _wanted().write_text(str(os.getppid()))
+            with contextlib.suppress(OSError):  # a crash ends it then
+                _wanted().write_text(str(os.getppid()))
             return self.status()
         self.recorder.look(now=True)
         before = self.status()
-        _wanted().unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            _wanted().unlink(missing_ok=True)
         self.recorder.stop()
-        return {**before, "recording": False}
+        return {**self.status(), "file": before["file"]}
 
     def _snapshot(self, args: dict[str, Any]) -> dict[str, Any]:
         snapshots = self.recorder.snapshots
@@ -103,7 +95,7 @@ class RecorderService:
         """`level` and `problems` as in status frames; `lost`: messages that are in no file."""
         recorder, snapshots = self.recorder, self.recorder.snapshots
         writer = recorder.writer
-        problems = [text for text in (recorder.problem, self.gave_up) if text]
+        problems = [recorder.problem] if recorder.problem else []
         problems += self.control.problems + self.publisher.problems
         stuck = writer is not None and (writer.full or writer.nowhere)
         found: dict[str, Any] = {
@@ -112,7 +104,7 @@ class RecorderService:
             "file": str(writer.path) if writer is not None and not writer.nowhere else "",
             "messages": {f"{topic}/{skin}": n for (topic, skin), n in recorder.heard.items()},
             "gaps": recorder.gaps,
-            "lost": writer.lost if writer is not None else 0,
+            "lost": recorder.lost + (snapshots.lost if snapshots else 0),
             "files": writer.files if writer is not None else 0,
             "deleted": (writer.deleted if writer is not None else 0) + (snapshots.deleted if snapshots else 0),
             "level": "ERROR" if stuck else "WARN" if problems else "OK",
@@ -227,20 +219,19 @@ def _run(args: argparse.Namespace, config: ConfigFile, stop: threading.Event) ->
         full = False
         try:
             while not stop.is_set():
-                try:
-                    process.turn()
-                except OSError as error:  # the disk is broken, or gone
-                    process.give_up(error)
-                    if not args.wait:
-                        return 1
+                process.turn()
                 if bool(recorder.problem) != full:
                     full = not full
                     log.log(logging.ERROR if full else logging.INFO, "%s", recorder.problem or "recording goes on")
-            _wanted().unlink(missing_ok=True)  # nobody wants it after an ordered end
+            with contextlib.suppress(OSError):
+                _wanted().unlink(missing_ok=True)  # nobody wants it after an ordered end
         finally:
             process.close()
     counts = recorder.writer.counts if recorder.writer is not None else {}
     log.info("recorded %s", ", ".join(f"{topic} {n}" for topic, n in counts.items()) or "nothing")
+    if recorder.writer is not None and recorder.writer.problems:
+        log.error("%s", recorder.problem)
+        return INCOMPLETE
     return 0
 
 

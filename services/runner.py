@@ -247,7 +247,7 @@ class Runner:
                 channel.stage.between_frames()
             except Exception as why:  # what could not be adopted is not in use
                 self._log_failure(channel, why, "%s: could not adopt (further such failures are counted)")
-            health = channel.stage.health().with_problems(problems)
+            health = channel.stage.health().with_problems([*problems, *([channel.unkept] if channel.unkept else [])])
             status = beat.status(health, silent, now, HEARTBEAT_S, asleep=channel.asleep)
             if status is not None:
                 self._send(channel, status)
@@ -262,7 +262,7 @@ class Runner:
                     channel, InfoFrame(skin=channel.stage.skin, process=self.process, valid=True, info=info | age)
                 )
             if channel.stage.persists and (saved := channel.stage.saved()) is not None:
-                persistence.save(self.process, channel.stage.skin, saved)
+                channel.unkept = persistence.save(self.process, channel.stage.skin, saved)
 
     def _sleep_or_wake(self, channel: Channel) -> None:
         """A stage whose frames nobody reads does not read either, so that upstream need not work for it."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import foxglove
@@ -16,13 +18,23 @@ from protocol.frames import ContactFrame, ImageFrame, InfoFrame, ShapeFrame
 from .entries import Entry
 
 
+@contextlib.contextmanager
+def _opened(path: Path, context: Context) -> Iterator[None]:
+    """The file. Raises OSError, where the package raises errors of its own."""
+    try:
+        with foxglove.open_mcap(path, context=context):
+            yield
+    except RuntimeError as why:
+        raise OSError(errno.EIO, f"{why}: is there room on the disk?") from None
+
+
 def write_foxglove(entries: Iterable[Entry], path: Path) -> Counter[str]:
     """Write all entries; how many messages of each topic. The file must not be there."""
     context = Context()
     shown: dict[str, FoxgloveChannels] = {}
     outlines: dict[str, tuple[str, int, Outlines]] = {}  # of each skin: session, scan, outline of each contact
     said: dict[str, str] = {}
-    with foxglove.open_mcap(path, context=context):
+    with _opened(path, context):
         for entry in entries:
             frame, ns, skin = entry.frame, entry.ns, entry.skin
             if skin not in shown:

@@ -15,7 +15,7 @@ from typing import Any
 
 from mcap.reader import make_reader
 
-from protocol.errors import EitskinError
+from protocol.errors import INCOMPLETE, EitskinError
 
 REPLAY = "replay"
 """What the replay is called among the skins: no skin may be called so while it plays."""
@@ -68,7 +68,7 @@ class Replay:
     def state(self) -> dict[str, Any]:
         """Whether it still plays, and whether it has failed."""
         code = self._process.poll()
-        return {"playing": code is None, "failed": bool(code)}
+        return {"playing": code is None, "failed": code not in (None, 0, INCOMPLETE)}
 
     def close(self) -> None:
         """End it; its stages end with it."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import ImageFrame, RawFrame
+from protocol.whole_file import whole_file, write_whole
 from services.calibration.force_fit import CalibrationError
 from services.calibration.force_presses import PATIENCE_S, Reader, Steady
 from services.calibration.seen import SeenTouch, TouchReader
@@ -134,16 +135,17 @@ def write(path: Path, collected: Sequence[Collected], pattern: NDArray[Any]) -> 
     """The npz that `skin register` reads, and beside it, where every press has a force, the CSV that
     `skin calibrate force --csv FILE.csv --measurements FILE.npz` reads; returns that one. Raises OSError.
     """
-    np.savez(
-        path,
-        touched=np.array([c.touched for c in collected]),
-        untouched=np.array([c.untouched for c in collected]),
-        xy=np.array([(c.x, c.y) for c in collected]),
-        pattern=np.asarray(pattern),
-    )
+    with whole_file(path) as part:
+        np.savez(
+            part,
+            touched=np.array([c.touched for c in collected]),
+            untouched=np.array([c.untouched for c in collected]),
+            xy=np.array([(c.x, c.y) for c in collected]),
+            pattern=np.asarray(pattern),
+        )
     if any(c.force_n is None for c in collected):
         return None
     beside = path.with_suffix(".csv")
     rows = [f"{c.force_n:g},{k}" for k, c in enumerate(collected)]
-    beside.write_text("force_n,row\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    write_whole(beside, "force_n,row\n" + "\n".join(rows) + "\n")
     return beside

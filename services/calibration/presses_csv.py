@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from models.files import FileError, read_text
+from protocol.whole_file import whole_file
 from services.calibration.force_fit import CalibrationError, Press
 from services.calibration.seen import SeenTouch
 from services.contacts.force.calibration_file import Of
@@ -103,7 +104,7 @@ def _press(
 
 def write(path: Path, presses: Sequence[Press], indenter_m: float | None = None) -> None:
     """The first form of the file. indenter_m: radius that skin.toml names. Raises OSError."""
-    with path.open("w", encoding="utf-8", newline="") as out:
+    with whole_file(path) as part, part.open("w", encoding="utf-8", newline="") as out:
         lines = csv.writer(out)
         lines.writerow(COLUMNS)
         for p in presses:

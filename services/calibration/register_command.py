@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
+from protocol.whole_file import write_whole
 from services.calibration.locating import build
 from services.calibration.presses import Presses, RegistrationError, part, read_presses
 from services.calibration.registration import FEWEST, KnownPose, Registration, Similarity, register
@@ -38,7 +39,7 @@ def register_presses(
     report |= {"left_out": crossed.report(presses.quantity)}
     report |= {"correlation_length_m": response.assumed.length_m}
     made = write_corrected(out, presses, response, locator, report)
-    (out / "skin.toml").write_text(configuration(made, found.similarity), encoding="utf-8")
+    write_whole(out / "skin.toml", configuration(made, found.similarity))
     return {**report, "bundle": str(out)}
 
 

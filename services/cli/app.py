@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import sys
@@ -27,6 +28,8 @@ from services.cli import (
     watch,
 )
 from services.cli.common import FAILED, USAGE, expected_code, with_values
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 class _Commands(TyperGroup):
@@ -102,6 +105,9 @@ def run() -> int:
         if isinstance(error, OSError) and error.filename and not os.environ.get("EITSKIN_DEBUG"):
             print(f"skin: {error.filename}: {error.strerror or error}: name another file or folder", file=sys.stderr)
             return USAGE
+        if isinstance(error, OSError) and error.errno in NO_ROOM and not os.environ.get("EITSKIN_DEBUG"):
+            print(f"skin: {error.strerror} where the output goes: send it to another file", file=sys.stderr)
+            return FAILED
         code = expected_code(error)
         if os.environ.get("EITSKIN_DEBUG"):
             raise

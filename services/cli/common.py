@@ -12,11 +12,14 @@ import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from protocol.errors import EitskinError
+from protocol.errors import INCOMPLETE, EitskinError
+
+if TYPE_CHECKING:
+    from services.recordings.damage import Damage
 
 ROOT = Path(__file__).resolve().parents[2]
 FAILED, USAGE, NOT_RUNNING = 1, 2, 3
@@ -122,6 +125,12 @@ def nobody(skin: str, seconds: float, topic: str = "") -> str:
         return f"{found}: start the service with `skin up`, or name its folder with --runtime"
     skins = ", ".join(_configuration().get("skins", {}))
     return f"{found}: `skin doctor` says why (skins of {config_file()}: {skins})"
+
+
+def check_whole(file: Path, damage: Damage) -> None:
+    """Ends a command that has done its work with a file, with an exit code of its own, where the file is not whole."""
+    if not damage.whole:
+        fail(f"{file}: {damage}", INCOMPLETE)
 
 
 EXPECTED = {

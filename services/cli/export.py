@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 from collections import Counter
 from collections.abc import Iterator
@@ -10,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from services.cli.common import USAGE, JsonOption, emit, fail
+from protocol.whole_file import whole_file
+from services.cli.common import USAGE, JsonOption, check_whole, emit, fail
 
 if TYPE_CHECKING:
     from bridges.export.entries import Logged
+    from services.recordings.recording import RecordingReader
 
 SUFFIXES = {"foxglove": ".foxglove.mcap", "ros2": ".ros2.mcap", "csv": ".csv", "rerun": ".rrd"}
 NEEDS = {"foxglove": ("foxglove", "make venv EXTRAS=foxglove"), "rerun": ("rerun", ".venv/bin/pip install rerun-sdk")}
@@ -55,32 +58,30 @@ def export(
 
 
 def _written(kind: str, file: Path, skin: str, made: list[Path], as_json: bool) -> None:
-    """Write under other names first: what is there already stays until the new one is whole."""
-    parts = [path.with_name(f".{path.name}.part") for path in made]
-    for part in parts:
-        part.unlink(missing_ok=True)
+    """What is there already stays until the new one is whole."""
+    from services.recordings.recording import RecordingReader
+
+    reader = RecordingReader(file)
     try:
-        counts = _write(kind, file, skin, parts)
-        if not counts:
-            fail(f"{file}: found no frame{f' of {skin}' if skin else ''} that --{kind} could write", USAGE)
-        for part, path in zip(parts, made, strict=True):
-            part.replace(path)
+        with contextlib.ExitStack() as places:
+            parts = [places.enter_context(whole_file(path)) for path in made]
+            counts = _write(kind, reader, skin, parts)
+            if not counts:
+                fail(f"{file}: found no frame{f' of {skin}' if skin else ''} that --{kind} could write", USAGE)
     except OSError as error:
         fail(f"cannot write {made[0]}: {error.strerror}")
-    finally:
-        for part in parts:
-            part.unlink(missing_ok=True)
     if as_json:
         emit({"files": [str(path) for path in made], "messages": dict(counts)})
     else:
         said = ", ".join(f"{topic} {n}" for topic, n in counts.items())
         print(f"{', '.join(map(str, made))}: {said}")
+    check_whole(file, reader.damage)
 
 
-def _write(kind: str, file: Path, skin: str, parts: list[Path]) -> Counter[str]:
+def _write(kind: str, reader: RecordingReader, skin: str, parts: list[Path]) -> Counter[str]:
     from bridges.export.entries import timed
 
-    entries = timed(lambda: _frames(file, skin))
+    entries = timed(lambda: _frames(reader, skin))
     if kind == "csv":
         from bridges.export.to_table import write_table
 
@@ -99,12 +100,11 @@ def _write(kind: str, file: Path, skin: str, parts: list[Path]) -> Counter[str]:
     return write_rerun(entries, parts[0])
 
 
-def _frames(file: Path, skin: str) -> Iterator[Logged]:
+def _frames(reader: RecordingReader, skin: str) -> Iterator[Logged]:
     """The frames of a recording, of one skin or all; what is none is left out."""
     from protocol.frames import FrameError, unpack
-    from services.recordings.recording import RecordingReader
 
-    for message in RecordingReader(file).messages({"contact", "image", "shape", "status", "info"}):
+    for message in reader.messages({"contact", "image", "shape", "status", "info"}):
         try:
             frame = unpack(message.wire)
         except FrameError:

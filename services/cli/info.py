@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from services.cli.common import USAGE, JsonOption, emit, fail
+from services.cli.common import USAGE, JsonOption, check_whole, emit, fail
 
 if TYPE_CHECKING:
     from services.recordings.summary import SessionSummary, Span
@@ -33,13 +33,15 @@ def info(
     found = summarise(file)
     if png is not None:
         from models import not_installed
+        from protocol.whole_file import whole_file
 
         try:
             from services.recordings.session_picture import draw
         except ImportError as missing:
             fail(f"--png: {not_installed(missing) or missing}", USAGE)
         try:
-            draw(found, png)
+            with whole_file(png) as part:
+                draw(found, part)
         except OSError as why:
             fail(f"cannot write {png}: {why.strerror}")
     if as_json:
@@ -47,6 +49,7 @@ def info(
     else:
         for line in _told(found, 10**6 if everything else ROWS):
             print(line)
+    check_whole(file, found.damage)
 
 
 def _plain(found: SessionSummary) -> dict[str, Any]:
@@ -55,7 +58,10 @@ def _plain(found: SessionSummary) -> dict[str, Any]:
         "bytes": found.bytes,
         "start": found.start_ns * 1e-9,
         "seconds": found.duration_s,
-        "damage": found.damage,
+        "damage": str(found.damage),
+        "cannot_be_read": dict(found.damage.missing),
+        "scans": [span._asdict() for span in found.damage.scans],
+        "could_not_be_written": dict(found.damage.unwritten),
         "event": found.metadata.get("event", ""),
         "topics": {
             name: {
@@ -94,12 +100,13 @@ def _gaps(found: SessionSummary) -> list[tuple[str, float, float]]:
 def _told(found: SessionSummary, rows: int) -> list[str]:
     from services.recordings.summary import strip
 
+    size, state = f"{found.bytes / 1e6:.2f} MB", "not whole" if not found.damage.whole else str(found.damage)
+    if not found.topics:
+        return [f"{found.path}: it holds no message, {size}, {state}"]
     began = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(found.start_ns * 1e-9))
-    lines = [f"{found.path}: {found.duration_s:.1f} s from {began} UTC, {found.bytes / 1e6:.2f} MB, {found.damage}"]
+    lines = [f"{found.path}: {found.duration_s:.1f} s from {began} UTC, {size}, {state}"]
     if event := found.metadata.get("event"):
         lines.append(f"a snapshot: {event}")
-    if not found.topics:
-        return [*lines, "it holds no message"]
     lines += ["", f"{'topic':<18}{'messages':>9}{'per second':>12}{'missing':>9}{'MB':>8}"]
     for name, topic in sorted(found.topics.items()):
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f}"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from protocol.whole_file import write_whole
 from services.cli.common import ROOT, USAGE, JsonOption, emit, fail
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def new(
         build(skin, "inverse")  # whether its features can be meshed
     except (geometry.GeometryError, PatternError, MeshError) as why:
         fail(str(why), USAGE)
-    path.write_text(text, encoding="utf-8")
+    write_whole(path, text)
     said = _said(skin, found, path)
     emit(said) if as_json else print(_sentence(said))
 

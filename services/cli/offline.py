@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from protocol.errors import interrupted
+from protocol.whole_file import whole_file
 from services.cli.common import FAILED, USAGE, JsonOption, emit, fail, load_npz
 
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
@@ -82,7 +83,8 @@ def reconstruct(
         calibrate=calibrate,
     )
     try:
-        np.savez(target, **out)  # type: ignore[arg-type]
+        with whole_file(target) as part:
+            np.savez(part, **out)  # type: ignore[arg-type]
     except OSError as error:
         fail(f"cannot write {target}: {error.strerror}", FAILED)
     result = {"rows": len(out["count"]), "touched": int(out["touched"].sum()), "valid": int(out["valid"].sum())}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from protocol.errors import INCOMPLETE
 from protocol.pause import pause
 from services.cli.common import (
     USAGE,
@@ -94,12 +95,10 @@ def record(
                 said = f"  {recorder.problem}" if recorder.problem else ""
                 status.update(f"{what}: {_counted(recorder) or 'nothing yet'}{said}  (Ctrl-C ends it)")
     result: dict[str, Any] = {"file": str(file), "messages": _counts(recorder), "gaps": recorder.gaps}
-    if recorder.writer is not None:
-        result |= {"bytes": recorder.writer.bytes, "files": recorder.writer.files, "deleted": recorder.writer.deleted}
+    if (writer := recorder.writer) is not None:
+        result |= {"bytes": writer.bytes, "files": writer.files, "deleted": writer.deleted, "unwritten": writer.lost}
     if (taken := recorder.snapshots) is not None:
-        result |= {"snapshots": taken.taken, "missed": taken.missed, "deleted": taken.deleted}
-    if recorder.problem:
-        print(f"skin: {file}: {recorder.problem}", file=sys.stderr)
+        result |= {"snapshots": taken.taken, "missed": taken.missed, "deleted": taken.deleted, "unwritten": taken.lost}
     if as_json:
         emit(result)
     elif taken is not None:
@@ -107,7 +106,10 @@ def record(
     else:
         files = f" in {result['files']} files" if result["files"] > 1 else ""
         size = f"{result['bytes'] / 1e6:.1f} MB{files}"
-        print(f"{file}: {_counted(recorder) or 'nothing'}; {size}; {recorder.gaps} messages missed")
+        missed = f"{recorder.gaps} messages missed, {result['unwritten']} not written"
+        print(f"{file}: {_counted(recorder) or 'nothing'}; {size}; {missed}")
+    if recorder.problem:
+        fail(f"{file}: {recorder.problem}", INCOMPLETE)
     if not recorder.heard:
         fail("nothing was recorded: is the service running (`skin up`)?", 3)
 
@@ -139,12 +141,12 @@ def snapshot(
         if time.monotonic() > end:
             fail(f"{made['file']} is still being written: `skin top` shows how the recorder does")
         pause(0.1)
-    for problem in now.get("problems", []):
-        print(f"skin: {problem}", file=sys.stderr)
     if as_json:
         emit(made)
     else:
         print(made["file"])
+    if problems := now.get("problems", []):
+        fail("\n".join(problems), INCOMPLETE)
 
 
 def replay(
@@ -176,8 +178,10 @@ def replay(
     else:
         said = "{frames} frames in {seconds:.1f} s, {contacts} contact frames, {valid} of them valid, {touched} touched"
         print(said.format(**report))
-        if report["damage"] != "whole":
-            print(f"the file is {report['damage']}")
+    if report["unwritten"]:
+        fail("{}: {why}: {unwritten} contact frames are not in it".format(out, **report), INCOMPLETE)
+    if not report["whole"]:
+        fail(f"{file}: {report['damage']}", INCOMPLETE)
 
 
 def _bar(contacts: Iterator[ContactFrame], total: int) -> Iterator[ContactFrame]:

@@ -19,6 +19,7 @@ from typing import Any
 from models.bundle import Bundle
 from models.files import FileError, read_text
 from protocol.frames import ContactFrame
+from protocol.whole_file import write_whole
 from services.pipeline import Pipeline
 from services.recordings import settings
 from services.recordings.recording import RecordingError, RecordingReader
@@ -116,6 +117,8 @@ def run(recording: Path) -> list[dict[str, Any]]:
     skins = list(skins_in(reader))
     if not skins:
         raise RecordingError(f"{recording} holds no raw frames: nothing to run")
+    if not reader.damage.whole:
+        raise RecordingError(f"{recording}: {reader.damage}: a golden recording is whole")
     with tempfile.TemporaryDirectory(prefix="golden-") as folder:
         file, _ = configuration_of(skins, reader, _bundle(reader, skins), Path(folder))
         config = load(file)
@@ -197,7 +200,7 @@ def _rounded(value: float | None) -> float | None:
 def accept(recording: Path, lines: list[dict[str, Any]]) -> Path:
     """Keep these lines as what is right; the file."""
     file = golden_file(recording)
-    file.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    write_whole(file, "".join(json.dumps(line) + "\n" for line in lines))
     return file
 
 

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from protocol.errors import EitskinError
 from protocol.frames import pack
+from protocol.whole_file import whole_file
 from services.recordings import settings
 from services.recordings.file_source import file_frame
 from services.recordings.npz_file import InputError, frames_of, read_scans
 from services.recordings.reconstruction import find_skin
-from services.recordings.recording import RecordingWriter
+from services.recordings.recording import RecordingError, RecordingWriter
 from services.runtime.config import SKIN_NAME
 from services.runtime.stage import valid_for_s
 
@@ -48,7 +49,9 @@ def import_arrays(
     carried = settings.text_of({skin: configured})
     metadata = {"origin": "import", "of": source.name, "skin": skin, settings.KEY: carried}
     step_ns, count = int(1e9 / rate_hz), 0
-    with RecordingWriter(target, metadata, overwrite) as writer:
+    if target.exists() and not overwrite:
+        raise RecordingError(f"{target} is there already: choose another name, or say --overwrite")
+    with whole_file(target) as part, RecordingWriter(part, metadata) as writer:
         for count, (values, kind) in enumerate(frames_of(data), start=1):
             now_ns = count * step_ns
             frame = file_frame(
@@ -59,4 +62,7 @@ def import_arrays(
             writer.write(f"raw/{skin}", pack(frame).partition(b"\0")[2], EPOCH_NS + now_ns)
             if count % ROWS_PER_CHUNK == 0:
                 writer.flush()
+        writer.close()
+        if writer.why:
+            raise RecordingError(f"cannot write {target}: {writer.why}")
     return {"file": str(target), "frames": count, "measurements": len(bundle.pattern), "seconds": count / rate_hz}

@@ -1,39 +1,63 @@
-"""A file that waits for a full disk: what does not fit stays in memory, up to a limit, and is written when there is
-room again. Nothing that was accepted is lost or written in part, so its writers need not know of it.
+"""A file that waits where nothing can be written: a full disk, a quota, a limit, a read-only or broken medium. What
+cannot be written stays in memory, up to a limit, and is written when it can be again; so its writers need not know.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import time
 from pathlib import Path
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 KEPT_BYTES = 4 * 1024 * 1024
-"""Kept in memory while the disk is full; beyond, the caller is to drop messages (`room` says so)."""
+"""Kept in memory while nothing can be written; beyond, the caller is to drop messages (`room` says so)."""
 RETRY_S = 0.5
+_NO_SYNC = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)  # file systems that cannot
 
 
 class PatientFile:
-    """Append only. Raises OSError for anything but a full disk."""
+    """Append only. Raises OSError only where it cannot be opened."""
 
     def __init__(self, path: Path, overwrite: bool = False) -> None:
-        kind = os.O_TRUNC if overwrite else os.O_EXCL
+        """overwrite: it has another name until `replace`."""
         if path.exists() and not (path.is_file() or path.is_dir()):  # its mode is not ours to change: /dev/null is one
             raise OSError(errno.EINVAL, "it is a device, a pipe or a socket, expected a file")
-        self._path = path
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | kind, 0o600)
-        os.fchmod(self._fd, 0o600)  # one that is overwritten too: who pressed where is nobody else's business
-        self._written = 0
+        if overwrite and path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        self._path = Path(os.path.realpath(path)) if overwrite else path
+        self._now = self._path.with_name(f".{self._path.name}.{os.getpid()}") if overwrite else path
+        self._fd = os.open(self._now, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_EXCL, 0o600)
+        os.fchmod(self._fd, 0o600)  # whatever the umask: who pressed where is nobody else's business
+        self.written = 0
+        """Bytes that the system has taken."""
         self._waiting = bytearray()
         self._retry_at = 0.0
         self.full = ""
         """Why nothing can be written now, as the system says it; "" while all is well."""
         self.closed = False
 
+    def replace(self) -> bool:
+        """Take the place of the file that is to be overwritten; where that cannot be, this one is gone."""
+        if not self.full:
+            try:
+                os.replace(self._now, self._path)
+                self._now = self._path
+                return True
+            except OSError as bad:
+                self.full = os.strerror(bad.errno or 0)
+        self.closed = True
+        os.close(self._fd)
+        self.remove()
+        return False
+
+    def remove(self) -> None:
+        """Delete it: nothing is in it."""
+        with contextlib.suppress(OSError):
+            self._now.unlink()
+
     def tell(self) -> int:
-        return self._written + len(self._waiting)
+        return self.written + len(self._waiting)
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
         self._waiting += data
@@ -47,17 +71,19 @@ class PatientFile:
     @property
     def elsewhere(self) -> str:
         """ "" while the file is where it was made, else "deleted" or "moved"."""
-        ours = os.fstat(self._fd)
         try:
+            ours = os.fstat(self._fd)
             there = os.stat(self._path)
-        except OSError:  # no such file, no such folder
+        except (FileNotFoundError, NotADirectoryError):
             return "deleted" if ours.st_nlink == 0 else "moved"
+        except OSError:  # the medium does not answer: `full` says so
+            return ""
         same = (there.st_dev, there.st_ino) == (ours.st_dev, ours.st_ino)
         return "" if same else "deleted" if ours.st_nlink == 0 else "moved"
 
     def flush(self, now: bool = False) -> None:
-        """Hand what waits to the operating system, as far as there is room. While the disk is full it is tried every
-        RETRY_S, or `now`.
+        """Hand what waits to the operating system, as far as it takes it. While it does not it is asked every RETRY_S,
+        or `now`.
         """
         if self.full and not now and time.monotonic() < self._retry_at:
             return
@@ -65,19 +91,37 @@ class PatientFile:
             try:
                 count = os.write(self._fd, bytes(self._waiting[: 1 << 20]))
             except OSError as bad:
-                if bad.errno not in FULL:
-                    raise
                 self.full, self._retry_at = os.strerror(bad.errno or 0), time.monotonic() + RETRY_S
                 return
-            self._written += count
+            self.written += count
             del self._waiting[:count]
         self.full = ""
 
+    def ends_with(self, end: int, ending: bytes) -> bool:
+        """Whether `ending` could be written behind the first `end` bytes, instead of all that came after those. Raises
+        OSError where these cannot be taken away.
+        """
+        os.ftruncate(self._fd, end)
+        os.lseek(self._fd, end, os.SEEK_SET)
+        self._waiting.clear()
+        self.written = end
+        self._waiting += ending
+        self.flush(now=True)
+        return not self._waiting
+
     def close(self) -> None:
-        """Write what there is room for, and close."""
-        if not self.closed:
-            self.closed = True
-            try:
-                self.flush(now=True)
-            finally:
-                os.close(self._fd)
+        """Write what can be, down to the medium, and close; `full` then says whether that failed."""
+        if self.closed:
+            return
+        self.closed = True
+        self.flush(now=True)
+        self._waiting.clear()
+        try:
+            os.fsync(self._fd)
+        except OSError as bad:  # what the system took before may not be on the medium
+            if bad.errno not in _NO_SYNC:
+                self.full = os.strerror(bad.errno or 0)
+        try:
+            os.close(self._fd)
+        except OSError as bad:
+            self.full = os.strerror(bad.errno or 0)

@@ -60,6 +60,7 @@ class Recorder:
         """What the recording goes to; None while none is made."""
         self.heard: Counter[tuple[str, str]] = Counter()
         """Messages that came, by topic and skin."""
+        self._ended: RotatingWriter | None = None  # what the last one went to
         self._latched: dict[str, RecordedMessage] = {}
         self._skins: dict[str, float] = {}  # when each was last asked for the stages' state
         self._baselines: dict[str, Any] = {}
@@ -100,10 +101,16 @@ class Recorder:
             self._ask_for_file()
 
     def stop(self) -> None:
-        """End the recording."""
-        found, self.writer = self.writer, None
-        if found is not None:
-            found.close()
+        """End the recording. Until the next one begins `problem` and `lost` say what is not in it."""
+        if self.writer is not None:
+            self.writer.close()
+            self._ended, self.writer = self.writer, None
+
+    @property
+    def lost(self) -> int:
+        """Messages that are in no file of this recording, or of the last one."""
+        writer = self.writer or self._ended
+        return writer.lost if writer is not None else 0
 
     def step(self, seconds: float = POLL_S) -> int:
         """Takes what arrives within `seconds`; how many messages that was."""
@@ -175,17 +182,8 @@ class Recorder:
     def problem(self) -> str:
         """What is wrong, and what to do; "" while all is well."""
         found = [self.snapshots.problem] if self.snapshots is not None and self.snapshots.problem else []
-        if (writer := self.writer) is not None:
-            lost = f"{writer.lost} messages are lost so far" if writer.lost else "nothing is lost yet"
-            if writer.full:
-                folder = writer.path.resolve().parent
-                found += [
-                    f"{writer.full}: make room in {folder}; {lost}, recording goes on by itself when there is room"
-                ]
-            elif writer.lost and not writer.torn:
-                found += [f"{lost}: the disk was full"]
-            found += [text for text in (writer.problem, writer.torn) if text]
-        return "; ".join(found)
+        writer = self.writer or self._ended
+        return "; ".join([*found, *(writer.problems if writer is not None else [])])
 
     @property
     def gaps(self) -> int:

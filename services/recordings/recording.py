@@ -2,41 +2,47 @@
 
 One channel a topic (``raw/palm``), message encoding ``msgpack``, the msgpack map of a frame as its data: any MCAP tool
 reads it. ``state/<skin>`` holds what the stages' state was, by process. Nothing stays in memory longer than `FLUSH_S`,
-so a killed recorder loses no more. A file that ends anywhere can be read up to its last whole chunk: `RecordingReader`
-never needs the index at the end. A file may come from anybody, so the size of a chunk is checked before it is unpacked.
+so a killed recorder loses no more. `RecordingReader` reads what is left of a damaged one, and counts what is not.
 """
 
 from __future__ import annotations
 
-import io
+import contextlib
 import struct
 import time
 import zlib
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import IO, Any, BinaryIO, cast
+from typing import IO, BinaryIO, cast
 
+from mcap._chunk_builder import ChunkBuilder
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Metadata
-from mcap.stream_reader import lz4, zstandard  # type: ignore[attr-defined]  # what the library unpacks with
+from mcap.records import Channel, DataEnd, Footer, Metadata
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from models.files import FileError, open_file
 from protocol.errors import EitskinError
+from protocol.frames import FrameError, read_map, unpack
+from protocol.topics import TOPICS
+from services.recordings.damage import Damage, MissingMessages
+from services.recordings.mcap_scan import END, WINDOW, McapScan, ScannedRecord, inner_records, parsed
 from services.recordings.patient_file import PatientFile
 
 FLUSH_S = 0.5  # each scan in parts repeats most of the one before: a chunk of 0.1 s packs half as well
 CHUNK_BYTES = 1024 * 1024
+MOST_UNPACKED = 2**62  # never reached: the library is to close no chunk by itself
+MOST_CUT = 16  # chunks that may go so that a file on a full disk has an end
 PROFILE = "eitskin"
+UNWRITTEN = "eitskin unwritten"
+"""Metadata of a file that lacks messages: how many of each topic there was no room for."""
+CHECKSUM = "checksum"
 STATE_TOPIC = "state"
 MAX_FILE = 2**40
-MAX_RECORD = 16 * 1024 * 1024
-"""Bytes of a record of the file, and of what a chunk unpacks to: the largest message and more."""
-RATIO, SMALL = 100, 16 * 1024 * 1024
-"""All chunks together may unpack to SMALL bytes, or to RATIO times the file: measurements never pack so well."""
-
-_RECORD_HEAD = struct.Struct("<BQ")
+LOOKED_AT = 64 * 1024 * 1024
+"""Bytes of a file without MCAP's mark in which a record is looked for."""
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
@@ -59,9 +65,14 @@ class RecordedMessage:
 
 
 class RecordingWriter:
-    """Writes a recording; call `flush_if_due` at least every `FLUSH_S`, also when nothing arrives."""
+    """Writes a recording; call `flush_if_due` at least every `FLUSH_S`, also when nothing arrives.
+
+    Nothing that goes wrong with the medium raises: `full` says it while it lasts, `why` afterwards, and `unwritten`
+    counts the messages that are not in the file.
+    """
 
     def __init__(self, path: Path, metadata: dict[str, str] | None = None, overwrite: bool = False) -> None:
+        """overwrite: the file that is there stays until the new one has begun. Raises RecordingError."""
         try:
             self._file = PatientFile(path, overwrite)
         except FileExistsError:
@@ -69,37 +80,51 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f"cannot write {path}: {error.strerror}") from None
         # What the library asks of a stream, a PatientFile has: write and tell.
-        self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        # The library closes a chunk by its size only; this is the method it does that with.
-        self._close_chunk: Callable[[], None] = getattr(self._writer, "_Writer__finalize_chunk")  # noqa: B009
-        self._writer.start(profile=PROFILE)
-        self._channels: dict[str, int] = {}
-        self._sequence: dict[str, int] = {}
+        stream = cast(IO[bytes], self._file)
+        self._writer = Writer(stream, chunk_size=MOST_UNPACKED, compression=CompressionType.ZSTD)
+        # The library closes a chunk by its size only, and describes a channel in the first one only.
+        self._end_of_chunk: Callable[[], None] = getattr(self._writer, "_Writer__finalize_chunk")  # noqa: B009
+        self._chunk: ChunkBuilder = getattr(self._writer, "_Writer__chunk_builder")  # noqa: B009
+        self._channels: dict[str, Channel] = {}
+        self._sequence: Counter[str] = Counter()
         self._oldest: float | None = None
-        self._open = 0  # bytes of messages in the chunk that is not closed yet
-        self.lost = 0
-        """Messages that there was no room for."""
+        self._open: Counter[str] = Counter()  # messages of the chunk that is not closed yet
+        self._chunks: deque[tuple[int, Counter[str]]] = deque()  # where the last ones end, and what they hold
+        self.unwritten: Counter[str] = Counter()
+        """Messages by topic that are not in the file: there was no room for them, or the medium failed."""
+        self.why = ""
+        """What stood in the way, as the system says it."""
+        self._metadata = {**metadata, CHECKSUM: checksum_of(metadata)} if metadata else {}
+        self._writer.start(profile=PROFILE)
         if metadata:
-            self._writer.add_metadata(PROFILE, metadata)
+            self._writer.add_metadata(PROFILE, self._metadata)
+        self._begin = self._file.tell()
         self._file.flush()
+        if overwrite and not self._file.replace():
+            raise RecordingError(f"cannot write {path}: {self.full}; what was there stays")
 
     def write(self, topic: str, data: bytes, log_time_ns: int) -> None:
-        """Takes one message; it is in the file (safe from a kill) after at most `FLUSH_S`. While the disk is full some
-        megabytes are kept in memory; then messages are dropped, and counted in `lost`.
+        """Takes one message; it is in the file (safe from a kill) after at most `FLUSH_S`. While nothing can be written
+        some megabytes are kept in memory; then messages are dropped, and counted in `unwritten`.
         """
         if not self._file.room:
-            self.lost += 1
+            self.unwritten[topic] += 1
+            self.why = self.full
             self.flush_if_due()
             return
         if topic not in self._channels:
             name, _, skin = topic.partition("/")
-            self._channels[topic] = self._writer.register_channel(topic, "msgpack", 0, {"topic": name, "skin": skin})
-        sequence = self._sequence[topic] = self._sequence.get(topic, 0) + 1
-        written = self._file.tell()
-        self._writer.add_message(self._channels[topic], log_time_ns, data, log_time_ns, sequence)
-        self._open = self._open + len(data) if self._file.tell() == written else 0
+            said = {"topic": name, "skin": skin}
+            number = self._writer.register_channel(topic, "msgpack", 0, said)
+            self._channels[topic] = Channel(number, topic, "msgpack", said, 0)
+        self._sequence[topic] += 1
+        self._open[topic] += 1
+        number, sequence = self._channels[topic].id, self._sequence[topic]
+        self._writer.add_message(number, log_time_ns, data, log_time_ns, sequence)
         if self._oldest is None:
             self._oldest = time.monotonic()
+        if self._chunk.count > CHUNK_BYTES:
+            self._close_chunk()
         self.flush_if_due()
 
     def flush_if_due(self) -> None:
@@ -112,7 +137,20 @@ class RecordingWriter:
         """Closes the chunk and hands it to the operating system."""
         self._close_chunk()
         self._file.flush()
-        self._oldest, self._open = None, 0
+        self._oldest = None
+        self.why = self.full or self.why
+
+    def _close_chunk(self) -> None:
+        """Each chunk describes its channels, so that it can be read without those before it."""
+        if not self._open:
+            return
+        self._end_of_chunk()
+        self._chunks.append((self._file.tell(), self._open))
+        self._open = Counter()
+        while len(self._chunks) > MOST_CUT and self._chunks[-MOST_CUT][0] <= self._file.written:
+            self._chunks.popleft()
+        for channel in self._channels.values():
+            self._chunk.add_channel(channel)
 
     @property
     def full(self) -> str:
@@ -127,17 +165,56 @@ class RecordingWriter:
     @property
     def bytes(self) -> int:
         """Size of the file, with what still waits to be written; what is not packed yet counts as it is."""
-        return self._file.tell() + self._open
+        return self._file.tell() + (self._chunk.count if self._open else 0)
+
+    @property
+    def lost(self) -> int:
+        """Messages that are not in the file."""
+        return self.unwritten.total()
 
     @property
     def counts(self) -> dict[str, int]:
-        """Messages taken so far, by topic."""
+        """Messages by topic that are in the file, or still wait to be written."""
         return dict(self._sequence)
 
     def close(self) -> None:
-        if not self._file.closed:
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.close()
+        """Ends the file, which is whole then: what could not be written is cut off, and the file says how much."""
+        if self._file.closed:
+            return
+        self._close_chunk()
+        if self.unwritten:
+            self._writer.add_metadata(UNWRITTEN, self._unwritten())
+        if self._metadata:
+            self._writer.add_metadata(PROFILE, self._metadata)  # again, lest a damaged beginning lose it
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.flush(now=True)
+        self.why = self.full or self.why
+        if self.full:
+            self._cut_back()
+        self._file.close()
+        self.why = self.full or self.why
+
+    def _cut_back(self) -> None:
+        """Leave out the last chunks, as many as must go so that the rest has an end."""
+        while self._chunks and self._chunks[-1][0] > self._file.written:
+            self._leave_out(self._chunks.pop())
+        for _ in range(MOST_CUT):
+            end = self._chunks[-1][0] if self._chunks else self._begin
+            try:
+                if end <= self._file.written and self._file.ends_with(end, _ending(self._unwritten())):
+                    return
+            except OSError:  # it can be neither written nor cut
+                return
+            if not self._chunks:
+                return self._file.remove()
+            self._leave_out(self._chunks.pop())
+
+    def _leave_out(self, chunk: tuple[int, Counter[str]]) -> None:
+        self.unwritten += chunk[1]
+        self._sequence -= chunk[1]
+
+    def _unwritten(self) -> dict[str, str]:
+        return {topic: str(count) for topic, count in self.unwritten.items()}
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -146,29 +223,20 @@ class RecordingWriter:
         self.close()
 
 
-@dataclass(slots=True)
-class Damage:
-    """What a reader had to leave out."""
-
-    truncated: bool = False
-    lost_bytes: int = 0
-    bad_chunks: int = 0
-    too_large: int = 0
-
-    def __str__(self) -> str:
-        last = f"the last {self.lost_bytes} bytes are not a whole chunk" if self.lost_bytes else "after a whole chunk"
-        parts = [f"cut short: {last}"] if self.truncated else []
-        parts += [f"{self.bad_chunks} chunk(s) with a wrong checksum left out"] if self.bad_chunks else []
-        parts += [f"{self.too_large} record(s) of more than {MAX_RECORD} bytes left out"] if self.too_large else []
-        return "; ".join(parts) or "whole"
+def _ending(unwritten: dict[str, str]) -> bytes:
+    """The shortest end of a file, which says what is not in it."""
+    builder = RecordBuilder()
+    for record in (Metadata(UNWRITTEN, unwritten), DataEnd(0), Footer(0, 0, 0)):
+        record.write(builder)
+    return bytes(builder.end()) + MCAP0_MAGIC  # type: ignore[no-untyped-call]
 
 
 @dataclass(slots=True)
 class RecordingReader:
-    """Reads a recording from its beginning, whole or cut short at any byte.
+    """Reads a recording from its beginning, whole or damaged at any byte.
 
-    Raises RecordingError where the file is missing or is no MCAP file. `damage` is complete once `messages` has run to
-    its end.
+    Raises RecordingError where the file is missing or holds no record of MCAP. `damage` is complete once `messages` has
+    run to its end.
     """
 
     path: Path
@@ -178,9 +246,15 @@ class RecordingReader:
     def __post_init__(self) -> None:
         with self._open() as file:
             head = file.read(len(MCAP0_MAGIC))
-            if head == MCAP0_MAGIC:
-                self._read_metadata(file)
-        if head != MCAP0_MAGIC:
+            known = head == MCAP0_MAGIC
+            for record in McapScan(file, Damage(), unpack=False, most=MAX_FILE if known else LOOKED_AT).records():
+                known = known or record.kind != END
+                said = _own_metadata(record.body) if record.kind == Opcode.METADATA else {}
+                if said.pop(CHECKSUM, None) == checksum_of(said) and known:
+                    self.metadata = said
+                    break
+                self.metadata = self.metadata or said  # older files have no checksum
+        if not known:
             what = "is empty" if not head else f"starts with {head[:8]!r}"
             raise RecordingError(f"{self.path} {what}: not a recording of `skin record` or `skin import` (MCAP)")
 
@@ -190,134 +264,148 @@ class RecordingReader:
         except FileError as why:
             raise RecordingError(str(why)) from None
 
-    def _read_metadata(self, file: BinaryIO) -> None:
-        for opcode, body in _records(file, Damage()):
-            if opcode == Opcode.METADATA:
-                record = _parse(Metadata, body)
-                if record is not None and record.name == PROFILE:
-                    self.metadata = dict(record.metadata)
-            elif opcode == Opcode.CHUNK:
-                return
-
     def messages(self, topics: set[str] | None = None, start_s: float = 0.0) -> Iterator[RecordedMessage]:
         """Messages in file order; of those topics only (names without the skin), from `start_s` after the first one.
 
         Raises RecordingError where the file unpacks to more than any recording does.
         """
         self.damage = Damage()
-        names: dict[int, str] = {}
         first_ns: int | None = None
         with self._open() as file:
-            size = file.seek(0, io.SEEK_END)
-            left = max(SMALL, RATIO * size)
-            for opcode, body in _records(file, self.damage):
-                if opcode == Opcode.DATA_END:
-                    return
-                if opcode == Opcode.CHUNK:
-                    chunk = _parse(Chunk, body)
-                    if chunk is not None and chunk.uncompressed_size > MAX_RECORD:
-                        self.damage.too_large += 1
-                        continue
-                    left -= chunk.uncompressed_size if chunk is not None else 0
-                    if left < 0:
-                        raise RecordingError(
-                            f"{self.path}: its {size} bytes unpack to more than {max(SMALL, RATIO * size)}: "
-                            "no recording of measurements does"
-                        )
-                    body = self._unpacked(chunk)
-                for record in _contents(opcode, body):
-                    if isinstance(record, Channel):
-                        names[record.id] = record.topic
-                        continue
-                    channel, log_time_ns, data = record
-                    first_ns = log_time_ns if first_ns is None else first_ns
-                    topic = names.get(channel)
-                    if topic is None or log_time_ns - first_ns < start_s * 1e9:
-                        continue
-                    if topics is None or topic.partition("/")[0] in topics:
-                        yield RecordedMessage(topic, log_time_ns, data)
-
-    def _unpacked(self, chunk: Chunk | None) -> bytes:
-        """The records of a chunk; none where it is damaged."""
-        data = _decompressed(chunk) if chunk is not None else None
-        if data is None:
-            self.damage.bad_chunks += 1
-        return data or b""
+            scan = McapScan(file, self.damage)
+            for message in _MessageReading(scan).messages():
+                first_ns = message.log_time_ns if first_ns is None else first_ns
+                if message.log_time_ns - first_ns < start_s * 1e9:
+                    continue
+                if topics is None or message.topic.partition("/")[0] in topics:
+                    yield message
+            if scan.left < 0:
+                raise RecordingError(
+                    f"{self.path}: its {scan.size} bytes unpack to more than {scan.most}: "
+                    "no recording of measurements does"
+                )
 
 
-def _decompressed(chunk: Chunk) -> bytes | None:
-    """What a chunk holds; None where that is not what it declares. The compressed stream's own word for its size is
-    never asked for.
-    """
-    size = chunk.uncompressed_size
-    try:
-        if chunk.compression == "zstd":
-            with zstandard.ZstdDecompressor(max_window_size=MAX_RECORD).stream_reader(chunk.data) as stream:
-                data = stream.read(size + 1)
-        elif chunk.compression == "lz4":
-            data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-        elif not chunk.compression:
-            data = chunk.data
-        else:
-            return None
-    except Exception:  # zstandard and lz4 each raise their own: all mean that this chunk is bad
-        return None
-    intact = len(data) == size and chunk.uncompressed_crc in (0, zlib.crc32(data))
-    return bytes(data) if intact else None
+class _MessageReading:
+    """The state of one read through, of one recording or of several that were joined."""
 
+    def __init__(self, scan: McapScan) -> None:
+        self.scan, self.damage = scan, scan.damage
+        self._begin_ns = 0
+        self._begin()
 
-def _contents(opcode: int, body: bytes) -> Iterator[Channel | tuple[int, int, bytes]]:
-    """Channels, and (channel, log time, data) of messages: of one record of the file, or of those of a chunk."""
-    if opcode == Opcode.MESSAGE:
-        if len(body) >= _MESSAGE_HEAD.size:
-            channel, _, log_time_ns, _ = _MESSAGE_HEAD.unpack_from(body)
-            yield channel, log_time_ns, body[_MESSAGE_HEAD.size :]
-    elif opcode == Opcode.CHANNEL:
-        record = _parse(Channel, body)
-        if record is not None:
-            yield record
-    elif opcode == Opcode.CHUNK:
-        at, end = 0, len(body)
-        while at + _RECORD_HEAD.size <= end:
-            inner, length = _RECORD_HEAD.unpack_from(body, at)
-            at += _RECORD_HEAD.size
-            if length > end - at:
+    def _begin(self) -> None:
+        self._index = 0  # where the index begins
+        self._chunked = False
+        self._topics: dict[int, str] = {}
+        self._said: dict[int, int] | None = None  # messages of each channel, as the file's own statistics say
+        self._ended = self._confirmed = False
+        self._missing = MissingMessages(self.damage)
+
+    def messages(self) -> Iterator[RecordedMessage]:
+        for record in self.scan.records():
+            if record.kind == Opcode.CHUNK:
+                self._chunked = True
+                for kind, body in inner_records(record.body):
+                    yield from self._contents(record.at, kind, body)
+            elif record.kind == Opcode.CHANNEL or (record.kind == Opcode.MESSAGE and not self._chunked):
+                yield from self._contents(record.at, record.kind, record.body)
+            else:
+                self._note(record)
+        self._end()
+
+    def _note(self, record: ScannedRecord) -> None:
+        """What says something of the file."""
+        if record.kind == Opcode.HEADER and (self._missing.seen or self._ended):
+            self._end()
+            self.damage.recordings += 1
+            self._begin()
+        elif record.kind == Opcode.METADATA:
+            found = parsed(Opcode.METADATA, record.body)
+            if found is not None and found.name == UNWRITTEN:
+                self.damage.unwritten += Counter({k: int(n) for k, n in found.metadata.items() if n.isdecimal()})
+        elif record.kind == Opcode.STATISTICS:
+            self._said = parsed(Opcode.STATISTICS, record.body).channel_message_counts
+        elif record.kind == Opcode.DATA_END:
+            self._index = record.at + 9 + len(record.body)
+        elif record.kind == Opcode.FOOTER:
+            self._ended, self._confirmed = True, self._index_is_intact(record)
+
+    def _index_is_intact(self, footer: ScannedRecord) -> bool:
+        """Whether what stands between data and footer is as it was written."""
+        (checksum,) = struct.unpack_from("<I", footer.body, 16)
+        begin, end = self._index, footer.at + 9 + 16  # what the footer says of places is wrong in a joined file
+        if not checksum:
+            return self._said is None
+        found = 0
+        for at in range(begin, end, WINDOW):
+            found = zlib.crc32(self.scan.read(at, min(WINDOW, end - at)), found)
+        return begin < end and found == int(checksum)
+
+    def _end(self) -> None:
+        """The recording ends: what does it say that is not there?"""
+        if self._confirmed and self._said is not None:
+            self._missing.end({self._topics.get(key, f"channel {key}"): n for key, n in self._said.items()})
+        self.damage.truncated |= not self._ended
+        self.damage.index |= self._ended and not self._confirmed
+        self.damage.confirmed &= self._confirmed
+
+    def _contents(self, at: int, kind: int, body: bytes) -> Iterator[RecordedMessage]:
+        """Messages; channels are noted. at: of the record of the file."""
+        if kind == Opcode.CHANNEL:
+            if (channel := parsed(Opcode.CHANNEL, body)) is not None:
+                self._topics[channel.id] = channel.topic
+        elif kind == Opcode.MESSAGE and len(body) >= _MESSAGE_HEAD.size:
+            key, sequence, log_time_ns, _ = _MESSAGE_HEAD.unpack_from(body)
+            data = body[_MESSAGE_HEAD.size :]
+            if key not in self._topics:
+                self._topics = {key: _topic_of(data)} | self._topics_at_the_end(at) | self._topics
+            topic = self._topics[key]
+            if not topic:
+                self.damage.nameless += 1
                 return
-            if inner in (Opcode.CHANNEL, Opcode.MESSAGE):
-                yield from _contents(inner, body[at : at + length])
-            at += length
+            self._missing.take(topic, sequence, data)
+            yield RecordedMessage(topic, log_time_ns, data)
+
+    def _topics_at_the_end(self, at: int) -> dict[int, str]:
+        """The channels that are repeated in the index: those of the first chunk, where this is lost."""
+        found: dict[int, str] = {}
+        for record in self.scan.skim().records(at):
+            if record.kind == Opcode.HEADER:
+                break
+            if record.kind == Opcode.CHANNEL:
+                channel = parsed(Opcode.CHANNEL, record.body)
+                found[channel.id] = channel.topic
+        return found
 
 
-def _records(file: BinaryIO, damage: Damage) -> Iterator[tuple[int, bytes]]:
-    """(opcode, body) of each whole record; what remains of a cut one goes to `damage`."""
-    size = file.seek(0, io.SEEK_END)
-    position = len(MCAP0_MAGIC)
-    while position < size:
-        file.seek(position)
-        head = file.read(_RECORD_HEAD.size)
-        opcode, length = _RECORD_HEAD.unpack(head) if len(head) == _RECORD_HEAD.size else (0, size)
-        if opcode == 0 or length > size - position - _RECORD_HEAD.size:
-            break
-        if length > MAX_RECORD:
-            damage.too_large += 1
-        else:
-            yield opcode, file.read(length)
-        if opcode == Opcode.FOOTER:
-            return
-        position += _RECORD_HEAD.size + length
-    damage.truncated = True
-    damage.lost_bytes = size - position
+def _own_metadata(body: bytes) -> dict[str, str]:
+    """What a recording says of itself; {} where it is damaged, or somebody else's."""
+    found = parsed(Opcode.METADATA, body)
+    if found is None or found.name != PROFILE:
+        return {}
+    said = dict(found.metadata)
+    checksum = said.pop(CHECKSUM, "")
+    if checksum not in ("", checksum_of(said)):
+        return {}
+    return said | ({CHECKSUM: checksum} if checksum else {})
 
 
-def _stream(body: bytes) -> Any:
-    from mcap.data_stream import ReadDataStream
+def checksum_of(said: dict[str, str]) -> str:
+    """Of metadata, for which MCAP has none."""
+    return f"{zlib.crc32(repr(sorted(said.items())).encode()):08x}"
 
-    return ReadDataStream(io.BytesIO(body))
 
-
-def _parse(kind: Any, body: bytes) -> Any:
-    """One record, or None where its body does not hold one."""
+def _topic_of(data: bytes) -> str:
+    """The topic of a message whose channel is lost, by its fields; "" where it is none of ours."""
     try:
-        return kind.read(_stream(body))
-    except Exception:  # struct.error, EndOfFile, UnicodeDecodeError: a body that does not hold what its opcode says
-        return None
+        keys = read_map(data, "message")
+    except FrameError:
+        return ""
+    skin = keys.get("skin")
+    near = sorted(TOPICS, key=lambda name: len(keys.keys() ^ {f.name for f in fields(TOPICS[name].frame)}))
+    for topic in (f"{name}/{skin}" for name in near[:3]):
+        with contextlib.suppress(FrameError, UnicodeEncodeError):
+            unpack(f"{topic}\0".encode() + data)
+            return topic
+    return ""

@@ -38,7 +38,8 @@ def replay_file(
     progress: Progress = lambda contacts, total: contacts,
     bundle: Path | None = None,
 ) -> dict[str, Any]:
-    """Replays `file`; the report's keys: frames, contacts, valid, touched, seconds, damage, warnings.
+    """Replays `file`; the report's keys: frames, contacts, valid, touched, seconds, warnings, whole and damage of
+    `file`, and how many contact frames could not be written to `out`.
 
     bundle: to use instead of the one that the recording names by its hash.
 
@@ -47,7 +48,7 @@ def replay_file(
     reader = RecordingReader(file)
     skins = skins_in(reader)
     if not skins:
-        damage = "" if str(reader.damage) == "whole" else f"; it is damaged ({reader.damage})"
+        damage = "" if reader.damage.whole else f"; it is damaged ({reader.damage})"
         raise ReplayError(f"{file} holds no raw frames: nothing to replay{damage}")
     if skin and skin not in skins:
         raise ReplayError(f"{file} holds no skin {skin!r}, only {', '.join(skins)}")
@@ -64,8 +65,10 @@ def replay_file(
             if writer is not None:
                 writer.flush_if_due()
         seconds = time.monotonic() - began
-    counts = {key: replayer.counts[key] for key in ("frames", "contacts", "valid", "touched")}
-    return counts | {"seconds": seconds, "damage": str(reader.damage), "warnings": [*warnings, *replayer.warnings]}
+    counts: dict[str, Any] = {key: replayer.counts[key] for key in ("frames", "contacts", "valid", "touched")}
+    counts |= {"seconds": seconds, "whole": reader.damage.whole, "damage": str(reader.damage)}
+    counts |= {"unwritten": writer.lost if writer else 0, "why": writer.why if writer else ""}
+    return counts | {"warnings": [*warnings, *replayer.warnings]}
 
 
 @contextlib.contextmanager

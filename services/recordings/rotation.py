@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
+import errno
 import logging
+import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
@@ -15,6 +16,9 @@ from services.recordings.recording import RecordedMessage, RecordingError, Recor
 RETRY_S = 10.0
 LOOK_S = 0.3  # how often it is looked whether the file is still there
 PRIVATE = 0o700  # of a folder of recordings
+ADVICE = dict.fromkeys(map(os.strerror, (errno.ENOSPC, errno.EDQUOT)), "make room in {}")
+ADVICE[os.strerror(errno.EFBIG)] = "begin another file, smaller ones with --file-mb or file_mb of [recorder]"
+"""What to do where nothing can be written, by what the system says."""
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +52,7 @@ class RotatingWriter:
         self._files = deque([path])
         self._counts: Counter[str] = Counter()
         self._lost = self._bytes = 0
+        self._why = ""
         self.files, self.deleted = 1, 0
         """Files begun, and files deleted since."""
         self.problem = ""
@@ -57,6 +62,7 @@ class RotatingWriter:
         self._tear, self._looked_s = "", self._began_s
         self.nowhere = False
         """Whether the file is gone and no other could begin: nothing is recorded."""
+        self.ended = False
 
     def write(self, message: RecordedMessage) -> bool:
         """Takes one message; whether a new file begins with it, which then lacks the stages' state."""
@@ -83,13 +89,10 @@ class RotatingWriter:
 
     def _let_go(self, how: str) -> None:
         """The file is no longer under its name; what a deleted one held is lost."""
+        self._close_file()
         held = sum(self._writer.counts.values())
-        self._counts += Counter(self._writer.counts)
-        self._lost += self._writer.lost + (held if how == "deleted" else 0)
+        self._lost += held if how == "deleted" else 0
         self.nowhere = True
-        with contextlib.suppress(OSError):  # its disk may be gone too
-            self._writer.close()
-        self._bytes += self._writer.bytes
         lost = f": its {held} messages are lost" if how == "deleted" else ""
         self._tear = f"{self.path} was {how} while it was recorded{lost}"
         log.error("%s", self._tear)
@@ -116,7 +119,8 @@ class RotatingWriter:
     def _due(self) -> bool:
         now, limit = time.monotonic(), self._rotation
         large = 0 < limit.file_bytes <= self._writer.bytes
-        return (large or 0 < limit.file_s <= now - self._began_s) and now >= self._retry_s
+        wanted = large or 0 < limit.file_s <= now - self._began_s
+        return wanted and now >= self._retry_s and not self._writer.full  # what waits for room is this file's
 
     def _turn(self) -> bool:
         """Begin the next file; where that cannot be, go on with this one."""
@@ -127,13 +131,17 @@ class RotatingWriter:
             self.problem, self._retry_s = f"{why}; recording goes on in {self.path}", time.monotonic() + RETRY_S
             log.error("%s", self.problem)
             return False
-        self._counts += Counter(self._writer.counts)
-        self._lost += self._writer.lost
-        self._writer.close()
-        self._bytes += self._writer.bytes
+        self._close_file()
         self._writer, self.path, self.problem = following, path, ""
         self._begin_file(path)
         return True
+
+    def _close_file(self) -> None:
+        self._writer.close()
+        self._counts += Counter(self._writer.counts)
+        self._lost += self._writer.lost
+        self._bytes += self._writer.bytes
+        self._why = self._writer.why or self._why
 
     def _begin_file(self, path: Path) -> None:
         self._began_s = time.monotonic()
@@ -167,7 +175,23 @@ class RotatingWriter:
         """Messages taken so far, by topic, in all files."""
         return dict(self._counts + Counter({} if self.nowhere else self._writer.counts))
 
+    @property
+    def problems(self) -> list[str]:
+        """What is wrong, and what to do."""
+        lost, why = self.lost, (self.full or self._writer.why or self._why)
+        found = [text for text in (self.problem, self.torn) if text]
+        if self.ended:
+            said = f"{lost} of {lost + sum(self.counts.values())} messages are not in {self.path.parent}"
+            said = said if lost else f"it is not known whether all of {self.path} is on the medium"
+            return [f"{why or 'a file was taken away'}: {said}", *found] if lost or self.full else found
+        if self.full:
+            said = f"{lost} messages are lost so far" if lost else "nothing is lost yet"
+            advice = ADVICE.get(self.full, "see what is wrong with {}").format(self.path.resolve().parent)
+            return [f"{self.full}: {advice}; {said}, recording goes on by itself when it can", *found]
+        return [f"{lost} messages are lost so far: {why}", *found] if lost and not self.torn else found
+
     def close(self) -> None:
+        self.ended = True
         if not self.nowhere:
             self._writer.close()
 

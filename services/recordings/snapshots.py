@@ -79,7 +79,7 @@ class Snapshots:
         self.ring.add(heard)
         if self._open is not None and not heard.again:
             message = heard.message
-            self._guarded(lambda one: one.writer.write(message.topic, message.data, message.log_time_ns))
+            self._open.writer.write(message.topic, message.data, message.log_time_ns)
         if event is not None:
             kind, what = event
             try:
@@ -145,32 +145,22 @@ class Snapshots:
     def mind(self, now_ns: int) -> None:
         """End what is long enough, and write what is due."""
         if self._open is not None:
-            self._guarded(lambda one: one.writer.flush_if_due())
+            self._open.writer.flush_if_due()
         if self._open is not None and now_ns >= self._open.end_ns:
             self._end()
-
-    def _guarded(self, act: Callable[[OpenSnapshot], None]) -> None:
-        assert self._open is not None
-        try:
-            act(self._open)
-        except OSError as why:  # the disk is broken, or gone
-            path = self._open.path
-            self._end()
-            self._failed(f"the snapshot {path} ends early: {why.strerror or why}")
 
     def _end(self) -> None:
         found, self._open = self._open, None
         if found is None:
             return
-        try:
-            if how := found.writer.elsewhere:
-                self._failed(f"the snapshot {found.path} was {how} while it was written")
-            found.writer.close()
-        except OSError as why:
-            self._failed(f"the snapshot {found.path} has no end: {why.strerror or why}")
-        self.lost += found.writer.lost
-        if found.writer.full or found.writer.lost:
-            self._failed(f"the snapshot {found.path} is not whole: the disk was full")
+        how, writer = found.writer.elsewhere, found.writer
+        writer.close()
+        self.lost += writer.lost
+        if how:
+            self._failed(f"the snapshot {found.path} was {how} while it was written")
+        elif writer.lost or writer.full:
+            lacks = f"{writer.lost} of {writer.lost + sum(writer.counts.values())} messages are not in it"
+            self._failed(f"the snapshot {found.path} is not whole: {writer.why}; {lacks}")
 
     def _failed(self, why: str) -> None:
         if why != self.problem:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from protocol.frames import ContactFrame, Frame, FrameError, StatusFrame, unpack
+from services.recordings.damage import Damage
 from services.recordings.recording import STATE_TOPIC, RecordedMessage, RecordingReader
 from services.recordings.triggers import NO_FAULTS
 
@@ -102,7 +103,7 @@ class SessionSummary:
     metadata: dict[str, str]
     start_ns: int = 0
     duration_s: float = 0.0
-    damage: str = "whole"
+    damage: Damage = field(default_factory=Damage)
     topics: dict[str, TopicCount] = field(default_factory=dict)
     faults: list[Span] = field(default_factory=list)
     contacts: list[ContactSpan] = field(default_factory=list)
@@ -182,7 +183,7 @@ def summarise(path: Path) -> SessionSummary:
     reading = _Reading(found)
     for message in reader.messages():
         reading.take(message)
-    found.damage = str(reader.damage)
+    found.damage = reader.damage
     return found
 
 

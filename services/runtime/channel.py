@@ -35,3 +35,4 @@ class Channel:
         self.asleep = False
         self.wanted: frozenset[str] = frozenset()  # topics somebody subscribes to, as of the last tick
         self.failures = SaidOnce()
+        self.unkept = ""  # why the stage's state could not be kept

@@ -30,8 +30,10 @@ AHEAD_S = 1.0  # by how much a clock that is being set right may go back between
 log = logging.getLogger(__name__)
 
 
-def save(process: str, skin: str, state: dict[str, Any]) -> None:
-    """Keep a state, with its checksum before it; what a crash leaves behind is the old one or the new one."""
+def save(process: str, skin: str, state: dict[str, Any]) -> str:
+    """Keep a state, with its checksum before it; what a crash or a full disk leaves behind is the old one or the new
+    one. Returns why it could not be kept; "" where it is.
+    """
     name = f"{process}-{skin}.msgpack"
     fresh = f"{name}.{os.getpid()}"
     when = {"saved_unix_s": time.time(), "boot": host_id(), "saved_boot_s": time.clock_gettime(BOOTTIME)}
@@ -41,11 +43,20 @@ def save(process: str, skin: str, state: dict[str, Any]) -> None:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(fresh, dir_fd=folder)
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-            with os.fdopen(os.open(fresh, flags, 0o600, dir_fd=folder), "wb") as file:
-                file.write(hashlib.sha256(packed).digest() + packed)
-            os.replace(fresh, name, src_dir_fd=folder, dst_dir_fd=folder)
+            try:
+                with os.fdopen(os.open(fresh, flags, 0o600, dir_fd=folder), "wb") as file:
+                    file.write(hashlib.sha256(packed).digest() + packed)
+                os.replace(fresh, name, src_dir_fd=folder, dst_dir_fd=folder)
+            except OSError:
+                with contextlib.suppress(OSError):
+                    os.unlink(fresh, dir_fd=folder)
+                raise
     except (OSError, ValueError) as why:
-        log.warning("%s: the state could not be kept (%s): after a crash there will be a new tare", skin, why)
+        said = getattr(why, "strerror", None) or why
+        problem = f"the state could not be kept in {_place()} ({said}): after a crash there will be a new tare"
+        log.warning("%s: %s", skin, problem)
+        return problem
+    return ""
 
 
 def restore(process: str, skin: str) -> tuple[dict[str, Any], float] | None:

@@ -1,5 +1,6 @@
 """The recorder, its snapshots, rotation and memory: in simulated time what it writes and says; live, as a process."""
 
+import errno
 import os
 import shutil
 import signal
@@ -124,18 +125,29 @@ def test_a_recording_that_is_taken_away_is_said_and_goes_on(service: RecorderSer
     assert last != first and len(contacts_in(last)) == 20 and RecordingReader(last).metadata
 
 
+FULL, BROKEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), (errno.EIO, errno.EROFS, errno.ENODEV)
+
+
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    room, real = [10**9], os.write
+    """Bytes that may still be written, and the error of those beyond."""
+    room, real, real_cut = [10**9, errno.ENOSPC], os.write, os.ftruncate
 
     def write(descriptor: int, data: bytes) -> int:
         if room[0] <= 0:
-            raise OSError(28, "No space left on device")
+            raise OSError(room[1], os.strerror(room[1]))
         count = real(descriptor, data[: room[0]])
         room[0] -= count
         return count
 
+    def ftruncate(descriptor: int, size: int) -> None:
+        if room[1] in BROKEN:
+            raise OSError(room[1], os.strerror(room[1]))
+        room[0] += os.fstat(descriptor).st_size - size
+        real_cut(descriptor, size)
+
     monkeypatch.setattr(patient_file.os, "write", write)
+    monkeypatch.setattr(patient_file.os, "ftruncate", ftruncate)
     return room
 
 
@@ -151,6 +163,23 @@ def test_a_full_disk_is_named_and_recording_goes_on_when_there_is_room(service: 
     assert turn(service, touched(seq=100))["level"] == "OK"
     command(service, "record", on=False)
     assert [frame.seq for frame in contacts_in(file)] == list(range(101))
+
+
+@pytest.mark.parametrize("number", FULL + BROKEN)
+def test_what_cannot_be_written_to_the_end_is_counted_in_the_status_and_in_the_file(
+    service: RecorderService, disk: list[int], number: int
+) -> None:
+    file = Path(command(service, "record", on=True)["file"])
+    disk[:] = [3000, number]
+    for k in range(100):
+        assert turn(service, touched(seq=k))["recording"]
+    said, reader = command(service, "record", on=False), RecordingReader(file)
+    left = len(list(reader.messages()))
+    assert 0 < left < 101 and said["lost"] == 101 - left  # a state among them
+    assert f"{os.strerror(number)}: {101 - left} of 101 messages are not in {file.parent}" in said["problems"][0]
+    assert reader.damage.unwritten.total() == (101 - left) * (number in FULL)
+    assert reader.damage.truncated == (number in BROKEN)
+    assert service.status()["lost"] == 101 - left and not reader.damage.whole
 
 
 def test_what_does_not_fit_is_kept_up_to_a_bound_then_dropped_and_counted(tmp_path, monkeypatch, disk, clock) -> None:
@@ -170,7 +199,7 @@ def test_what_does_not_fit_is_kept_up_to_a_bound_then_dropped_and_counted(tmp_pa
     writer.close()
     reader = RecordingReader(tmp_path / "a.mcap")
     assert [message.data for message in reader.messages()] == data[: 500 - lost] + data[500:] and writer.lost == lost
-    assert str(reader.damage) == "whole"
+    assert str(reader.damage) == f"{lost} message(s) could not be written when it was recorded (contact/palm {lost})"
 
 
 def test_a_killed_recorder_loses_at_most_half_a_second(tmp_path: Path, clock: Clock) -> None:

@@ -14,13 +14,13 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from models.bundle import Bundle
 from models.files import FileError, read_text
+from protocol.whole_file import write_whole
 from services.contacts.force.curve import Curve
 from services.runtime.config import ConfigError, Skin
 
@@ -63,9 +63,7 @@ def save(path: Path, found: Calibration, name: str, skin: Skin, bundle: Bundle) 
         **found.said,
     }
     text = json.dumps({**content, "sha256": _digest(content)}, indent=1, allow_nan=False) + "\n"
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, text)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
