@@ -262,7 +262,11 @@ def main(argv: list[str] | None = None) -> None:
         matrices, held_out = physics(skin, work, model)
     pre, made, said = PreReconstructor(matrices), dict[str, bytes](), dict[str, Any]()
     print(f"physics ready after {time.perf_counter() - began:.0f} s", flush=True)
+    tables = None
+    if registered is None and matrices.normalisation == "model":
+        tables = response_tables(ForwardModel(skin))
     if not args.no_network:
+        bundle.check_room(out, matrices, tables)
         if not args.package:
             scenes = _scenes(work, "train", pre, model)
             start = None if registered is None else warped.start(registered)
@@ -304,7 +308,6 @@ def main(argv: list[str] | None = None) -> None:
             print(f"verdict: {judged.text}\n{registered.path} is left as it was, the checkpoint is in {work}")
             return
     if registered is None or model is None:
-        tables = response_tables(ForwardModel(skin)) if matrices.normalisation == "model" else None
         about = manifest.describe(skin.name, skin, matrices, network=said or None)
         written = bundle.write(out, about, matrices, made, response=tables)
     else:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import os
 import re
@@ -38,13 +39,13 @@ from models.npz import read_npz
 from models.onnx_external import external_data
 from models.prereconstruction import Matrices, PreReconstructor
 from models.response_file import arrays_of_tables, tables_of
+from models.skin_limits import BUNDLE_BYTES, NAME, NETWORKS_BYTES
 from models.touch_response import ResponseTables
 from protocol.errors import EitskinError
 from protocol.whole_file import whole_file, write_whole
 
 SCHEMA = 1
 BUNDLES = Path(__file__).parent / "bundles"
-MAX_BYTES = 8 * 1024 * 1024
 MAX_MANIFEST = 1024 * 1024
 MAX_MATRICES = 64 * 1024 * 1024  # unpacked
 SEAL = "SHA256"
@@ -166,7 +167,7 @@ class Bundle:
                 raise BundleError(
                     f"{path / name} is missing, though the manifest lists it: restore it or build the bundle again"
                 )
-            content = _read(path / name, MAX_BYTES)
+            content = _read(path / name, BUNDLE_BYTES)
             found = hashlib.sha256(content).hexdigest()
             if found != expected:
                 raise BundleError(
@@ -215,10 +216,7 @@ def write(
         for variant, content in networks.items():
             parts[NETWORKS[variant]].write_bytes(content)
         size = sum(part.stat().st_size for part in parts.values())
-        if size > MAX_BYTES:
-            raise BundleError(
-                f"{path}: {size / 2**20:.1f} MB, a bundle may have {MAX_BYTES // 2**20} MB: ship a smaller network"
-            )
+        _check_size(path, size)
     for name in {*NETWORKS.values(), LOCATOR, RESPONSE} - parts.keys():
         (path / name).unlink(missing_ok=True)
     return replace_manifest(
@@ -228,6 +226,26 @@ def write(
 
 def _fields(of: Matrices | LocatorArrays) -> dict[str, Any]:
     return {f.name: np.asarray(getattr(of, f.name)) for f in fields(of)}
+
+
+def check_room(path: Path, matrices: Matrices, response: ResponseTables | None = None, more: int = 0) -> None:
+    """Before a training: whether the bundle will have room for what it makes. Raises BundleError.
+
+    more: bytes of other files.
+    """
+    packed = io.BytesIO()
+    np.savez_compressed(packed, **_fields(matrices))
+    if response is not None:
+        np.savez_compressed(packed, **arrays_of_tables(response))
+    _check_size(path, packed.getbuffer().nbytes + NETWORKS_BYTES + more)
+
+
+def _check_size(path: Path, size: int) -> None:
+    if size > BUNDLE_BYTES:
+        raise BundleError(
+            f"{path}: {size / 2**20:.1f} MB, a bundle may have {BUNDLE_BYTES // 2**20} MB: take a pattern with fewer "
+            "measurements, or a smaller network"
+        )
 
 
 def add_response(bundle: Bundle, response: ResponseTables) -> Bundle:
@@ -275,7 +293,7 @@ def _read(path: Path, most: int) -> bytes:
 
 def read_network(path: Path) -> bytes:
     """The content of an ONNX file that holds all of its weights. Raises BundleError."""
-    content = _read(path, MAX_BYTES)
+    content = _read(path, BUNDLE_BYTES)
     try:
         _whole(path, content)
     except ValueError as why:
@@ -310,7 +328,7 @@ def _manifest(path: Path, text: bytes) -> dict[str, Any]:
             raise BundleError(
                 f"{place}: files: found {file!r:.80}, expected names of {', '.join(known)} and their sha256"
             )
-    if "matrices.npz" not in files or not (isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", name)):
+    if "matrices.npz" not in files or not (isinstance(name, str) and re.fullmatch(NAME, name)):
         raise BundleError(
             f"{place}: found the name {name!r:.80} and files {', '.join(files) or 'none'}; "
             "expected a name of letters, digits, - . _ and at least matrices.npz: build the bundle again"

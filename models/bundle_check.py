@@ -15,11 +15,9 @@ import numpy as np
 from models import geometry
 from models.patterns import PatternError
 from models.prereconstruction import Matrices
+from models.skin_limits import MOST_ELECTRODES, MOST_MEASUREMENTS, MOST_PIXELS
 from protocol.errors import EitskinError
 
-MAX_MEASUREMENTS = 512  # of a board's scan list
-MAX_ELECTRODES = 256
-MAX_PIXELS = 256  # along a side
 MAX_LADDER = 64
 MAX_DEPTH = 32
 NORMALISATIONS = ("model", "measured")
@@ -70,14 +68,14 @@ def all_finite(value: Any, place: str = "", depth: int = 0) -> None:
 def check_matrices(m: Matrices) -> None:
     """Shapes against each other, and numbers that the arithmetic of a scan can bear."""
     k, e = len(m.pattern) if m.pattern.ndim else 0, m.contact.shape[-1] if m.contact.ndim else 0
-    if not (1 <= k <= MAX_MEASUREMENTS and 2 <= e <= MAX_ELECTRODES and m.inside.ndim == 2):
+    if not (1 <= k <= MOST_MEASUREMENTS and 2 <= e <= MOST_ELECTRODES and m.inside.ndim == 2):
         raise Wrong(
             "matrices.npz",
             f"{k} measurements, {e} electrodes, pixels {m.inside.shape}",
-            f"1 to {MAX_MEASUREMENTS}, 2 to {MAX_ELECTRODES}, (h, w)",
+            f"1 to {MOST_MEASUREMENTS}, 2 to {MOST_ELECTRODES}, (h, w)",
         )
-    if max(m.inside.shape) > MAX_PIXELS or not m.inside.size:
-        raise Wrong("matrices.npz: inside", f"{m.inside.shape}", f"1 to {MAX_PIXELS} pixels along a side")
+    if max(m.inside.shape) > MOST_PIXELS or not m.inside.size:
+        raise Wrong("matrices.npz: inside", f"{m.inside.shape}", f"1 to {MOST_PIXELS} pixels along a side")
     c = len(m.ladder) if m.ladder.ndim else 0
     shapes = {
         "pattern": (k, 4),

@@ -1,8 +1,8 @@
 """The smallest forces that a skin shows, and that it measures, by the radius of what presses.
 
-Shown: a frame whose detection score (models/prereconstruction.py) is beyond what an untouched frame exceeds with the
-services' false-alarm rate, in 99.9 % of frames, over places and noise. Measured: from where the Bayesian floor of the
-force (models/fisher.py), its size unknown, is below a quarter of it. Both are of one frame; a held touch is averaged.
+Shown: the best disc of the estimator's grid has z^2 beyond FALSE_ALARM_Z2 in 99.9 % of whole scans soon after a tare,
+over places and noise. Measured: from where the Bayesian floor of the force (models/fisher.py), its size unknown, is
+below a quarter of it. Both are of one scan; a held touch is averaged.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import numpy as np
 from models.bundle import Bundle
 from models.fisher import MeasurementNoise, SizePrior, floors, mean_floor
 from models.forward import shared
-from models.prereconstruction import Drift
+from models.measurement.covariance.whitening import Whitening
+from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START
+from models.measurement.responses.tables import tables_of
 from models.pressure import FOAM, disc
 from models.shapes import Array, Shape
 
 RADII_MM = (5.0, 10.0, 15.0, 20.0)
 SIZES = SizePrior(radius=(0.1, 0.4), drop=(0.01, 0.97))  # model units, S/m: 5 to 20 mm on square16, 0.5 to 5 N
 SHOWN = 0.999  # of the frames
-FALSE_ALARM = 1e-7  # per untouched frame, as services by default
-SINCE_TARE = Drift(2e-5, 1e-4)  # what services allow for soon after an untouched frame
 SIGMA = 0.25  # of the force
 LIGHT = 0.02  # S/m: a drop to which everything is linear
 FIRST_N = 0.3  # the force that the floor is first looked at
-DRAWS, PER_SIDE = 2000, 4
+DRAWS, PER_SIDE = 500, 4
 
 
 @dataclass(frozen=True)
@@ -62,24 +62,21 @@ def smallest(skin: str, noise: MeasurementNoise, radius_mm: float, per_side: int
 
 def _shown(skin: str, noise: MeasurementNoise, radius: float, points: Array) -> float:
     """How many times LIGHT."""
-    model, pre = shared(skin, "inverse"), Bundle.load(skin).prereconstructor()
+    model, tables = shared(skin, "inverse"), tables_of(Bundle.load(skin))
     z0 = np.abs(model.solve(1.0).impedances())
-    normaliser = pre.normaliser(z0)
     touched = [model.solve(model.touched([Shape("circle", x, y, radius, LIGHT)])).impedances() for x, y in points]
-    signal = (np.abs(touched) - z0) / normaliser
-    sigma = noise.sigma(z0) / np.abs(normaliser)
-    operator = pre.condition(sigma, drift=SINCE_TARE)
-    limit = operator.threshold(FALSE_ALARM, int(noise.tare_frames))
-    rng = np.random.default_rng(1)
-    free = (operator.whiten @ (sigma[:, None] * rng.standard_normal((len(sigma), DRAWS)))).T
-    whitened = signal @ operator.whiten.T
-    each = operator.detection
-    constant = np.broadcast_to((free**2 @ each)[None], (len(points), DRAWS))
-    linear, square = 2 * (whitened * each) @ free.T, (whitened**2 @ each)[:, None]
-    low, high = 1e-4, 1e4
+    signal = np.log(np.abs(touched) / z0)
+    drift = np.hstack([tables.field * FIELD_START, tables.contact * (CONTACT_START / np.sqrt(noise.tare_frames))])
+    cov = np.diag((noise.sigma(z0) / z0) ** 2 * (1 + 1 / noise.tare_frames)) + drift @ drift.T
+    white, rng = Whitening.of(cov), np.random.default_rng(1)
+    each = tables.grid.responses / np.sqrt(tables.grid.information(white))[:, None]
+    free = each @ white.w.T @ rng.standard_normal((len(z0), DRAWS))  # z of each disc, untouched
+    z = each @ white.solve(signal.T)
+    low, high = 1e-3, 1e3
     while high / low > 1.005:
         times = np.sqrt(low * high)
-        seen = float((constant + times * linear + times**2 * square > limit).mean())
+        best = np.array([(times * of[:, None] + free).max(axis=0) for of in z.T])
+        seen = float((np.maximum(best, 0) ** 2 > FALSE_ALARM_Z2).mean())
         low, high = (low, times) if seen >= SHOWN else (times, high)
     return float(high)
 

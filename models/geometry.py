@@ -7,8 +7,11 @@ TOML with `unit = "mm"` (or m, cm, inch) in its place gives its lengths in that 
 from __future__ import annotations
 
 import json
+import logging
+import re
 import tomllib
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from models import patterns
 from models.outline import Array, GeometryError, Outline
+from models.skin_limits import LARGEST_M, LEAST_ELECTRODES, MOST_ELECTRODES, NAME, SMALLEST_M
 
 __all__ = ["GeometryError", "Outline", "SkinGeometry", "from_dict", "load", "shipped"]
 
@@ -25,7 +29,6 @@ MANIFEST = "manifest.json"  # of a bundle's folder, which holds its skin too
 ON_OUTLINE = 1e-6  # how far from the outline an electrode's centre may be given, model units
 DRAWN_ON_OUTLINE = 0.02  # the same where lengths were drawn or measured: 0.6 mm of a disc of 60 mm
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
-SMALLEST_M, LARGEST_M = 5e-3, 3.0  # a skin's longer side; beyond it a length was given in another unit than is said
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +50,8 @@ class SkinGeometry:
     def __post_init__(self) -> None:
         where = f"skin '{self.name}': "
         n = self.n_electrodes
-        if n < 4:
-            raise GeometryError(f"{where}at least four electrodes are needed, found {n}")
+        if not LEAST_ELECTRODES <= n <= MOST_ELECTRODES:
+            raise GeometryError(f"{where}found {n} electrodes, expected {LEAST_ELECTRODES} to {MOST_ELECTRODES}")
         for values, what in ((self.widths, "width"), (self.contact_impedance, "contact_impedance")):
             if values.shape != (n,):
                 raise GeometryError(f"{where}{what} has {values.size} entries for {n} electrodes")
@@ -197,6 +200,8 @@ def from_dict(data: dict[str, Any]) -> SkinGeometry:
     for wrong, what in ((needed - set(data), "missing"), (set(data) - known, "unknown")):
         if wrong:
             raise GeometryError(f"{where}{what} key {min(wrong)!r}; expected {', '.join(sorted(known))}")
+    if not re.fullmatch(NAME, str(data["name"])) or not str(data["name"]).strip("."):
+        raise GeometryError(f"name: found {data['name']!r:.80}, expected at most 64 letters, digits, - . and _")
     if ("outline" in data) == ("radius" in data):
         raise GeometryError(f"{where}give either outline (a polygon) or radius (a disc)")
     if not isinstance(data["electrodes"], dict):
@@ -222,7 +227,8 @@ def from_dict(data: dict[str, Any]) -> SkinGeometry:
             centres = float(spec.get("first", 0.0)) + np.arange(n) * curve.perimeter / n
         else:
             points = np.array(spec["centre"], dtype=float).reshape(-1, 2)
-            centres = _on_curve(curve, points, on_outline, float(data["metres_per_unit"]))
+            most = on_outline, min(DRAWN_ON_OUTLINE, _rounding(data["electrodes"]["centre"]))
+            centres = _on_curve(curve, points, most, float(data["metres_per_unit"]), where)
         widths, contact = (_each(value, len(centres)) for value in (spec["width"], data["contact_impedance"]))
         drive = data.get("pattern", "pairs")
         pattern = patterns.pattern(drive, len(centres))
@@ -271,15 +277,40 @@ def _in_model_units(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def _count(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 1000:
-        raise ValueError(f"[electrodes] count: found {value!r}, expected a whole number of electrodes")
+    if isinstance(value, bool) or not isinstance(value, int) or not LEAST_ELECTRODES <= value <= MOST_ELECTRODES:
+        raise ValueError(
+            f"[electrodes] count: found {value!r}, expected a whole number of {LEAST_ELECTRODES} to {MOST_ELECTRODES}"
+        )
     return value
 
 
-def _on_curve(curve: Outline, points: Array, most: float, metres: float) -> Array:
-    """Arc lengths of electrode centres that must lie on the outline, or no further from it than `most`."""
+def _rounding(values: Any) -> float:
+    """How far from its place a point may be that was rounded to the decimals of these coordinates, the most that any
+    has; 0 where all are whole numbers.
+    """
+    decimals = max(
+        len(np.format_float_positional(v, trim="-").partition(".")[2]) for v in np.ravel(np.array(values, dtype=float))
+    )
+    return 10.0**-decimals / np.sqrt(2) if decimals else 0.0
+
+
+@cache
+def _say(text: str) -> None:
+    """Once in a process, however often a skin is loaded."""
+    logging.getLogger(__name__).warning(text)
+
+
+def _on_curve(curve: Outline, points: Array, most: tuple[float, float], metres: float, where: str) -> Array:
+    """Arc lengths of electrode centres that must lie on the outline, or no further from it than `most`: in silence, and
+    with a word.
+    """
     off = curve.distance(points)
-    if off.size and not off.max() <= most:
+    if off.size and most[0] < off.max() <= most[1]:
+        _say(
+            f"{where}electrode centres up to {1e6 * off.max() * metres:.2g} um beside the outline, as far as they are "
+            "rounded, are put on it"
+        )
+    elif off.size and not off.max() <= max(most):
         bad = int(off.argmax())
         raise GeometryError(
             f"electrode {bad} at {points[bad].tolist()} is {off[bad]:.3g} away from the outline "

@@ -66,9 +66,7 @@ def map_floors(case: Case, radius: float, drop: float, per_side: int = 9) -> tup
 
 def rank_patterns(case: Case, radius: float = 0.2, drop: float = 0.15, per_side: int = 5) -> list[tuple[str, Floor]]:
     """Drive patterns, best first by the Bayesian floor of position, root mean square over the skin."""
-    names = [
-        name for name in patterns.NAMES if name != "opposite" or not shared(case.skin, "inverse").skin.n_electrodes % 2
-    ]
+    names = patterns.fitting(shared(case.skin, "inverse").skin.n_electrodes)
     found = []
     for name in names:
         _, by_kind = map_floors(Case(case.skin, name, case.noise, case.prior, case.drift), radius, drop, per_side)
@@ -234,7 +232,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if options.forces:
         print(f"{options.skin}, {_noise(case.noise)}, one frame, size unknown; newtons, by radius:")
-        print("shown in 99.9 % of frames, and from where the force's standard deviation can be below a quarter of it")
+        print(
+            "shown in 99.9 % of whole scans, and from where the force's standard deviation can be below a quarter of it"
+        )
         _print(rows)
         return 0
     size = "known" if options.known_radius else "unknown"

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from models.forward import ForwardModel
-from models.prereconstruction import Array, Matrices
+from models.prereconstruction import MODEL_ERROR, Array, Matrices
 
 GRID = 24
 LADDER = 10.0 ** -np.arange(0.0, 9.0)  # lambda^2, relative to the mean eigenvalue
@@ -19,7 +19,7 @@ def linearise(
     model: ForwardModel,
     normalisation: str = "model",
     grid: int = GRID,
-    model_error: float = 1e-4,
+    model_error: float = MODEL_ERROR,
     conductivity: Array | None = None,
 ) -> Matrices:
     """Matrices of the untouched skin, even or of a conductivity (n_elements, 3) as xx, xy, yy. A drop is the share that

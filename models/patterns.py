@@ -6,15 +6,15 @@ drive-; the impedance is the voltage of sense+ over sense-. Needs only numpy.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from models.skin_limits import MOST_MEASUREMENTS
 from protocol.errors import EitskinError
-
-NAMES = ("pairs", "adjacent", "opposite")
 
 
 class PatternError(EitskinError, ValueError):
@@ -46,17 +46,43 @@ def opposite(n: int = 16) -> NDArray[np.int64]:
     return np.array(rows, dtype=np.int64)
 
 
+NAMED = {"pairs": pairs, "adjacent": adjacent, "opposite": opposite}
+NAMES = tuple(NAMED)
+
+
 def pattern(spec: str | ArrayLike, n: int = 16) -> NDArray[np.int64]:
     """The (K, 4) array of a name in NAMES or of a custom list of [drive+, drive-, sense+, sense-]; checked.
 
-    Raises PatternError for an unknown name, an electrode that does not exist, or a pattern that measures too little.
+    Raises PatternError for an unknown name, an electrode that does not exist, or a pattern that measures too little, or
+    more than can be served.
     """
-    if isinstance(spec, str):
-        try:
-            return {"pairs": pairs, "adjacent": adjacent, "opposite": opposite}[spec](n)
-        except KeyError:
-            raise PatternError(f"unknown pattern {spec!r}: expected one of {', '.join(NAMES)} or a list") from None
-    return check(spec, n)
+    if isinstance(spec, str) and spec not in NAMES:
+        raise PatternError(f"unknown pattern {spec!r}: expected one of {', '.join(NAMES)} or a list")
+    rows = NAMED[spec](n) if isinstance(spec, str) else check(spec, n)
+    if len(rows) > MOST_MEASUREMENTS:
+        raise PatternError(_too_many(spec if isinstance(spec, str) else "", len(rows), n))
+    return rows
+
+
+def fitting(n: int) -> list[str]:
+    """Names of the patterns with which so many electrodes can be served."""
+    found = []
+    for name, rows in NAMED.items():
+        with contextlib.suppress(PatternError):  # of an even number of electrodes alone
+            found += [name] if len(rows(n)) <= MOST_MEASUREMENTS else []
+    return found
+
+
+def _too_many(name: str, found: int, n: int) -> str:
+    todo = [f"the pattern {other!r} ({len(NAMED[other](n))})" for other in fitting(n)]
+    if name:
+        fewer = next(m for m in range(n - 1, 0, -1) if name in fitting(m))
+        todo.append(f"at most {fewer} electrodes with {name!r}")
+    what = f"{n} electrodes with the pattern {name!r} are" if name else "the pattern has"
+    return (
+        f"{what} {found} measurements, at most {MOST_MEASUREMENTS} can be served (a board's scan list, and what can be "
+        f"estimated within a scan): choose {' or '.join(todo) or 'fewer electrodes'}"
+    )
 
 
 def check(spec: ArrayLike, n: int = 16, minimum_rank: int | None = None) -> NDArray[np.int64]:

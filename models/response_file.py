@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from models.bundle_check import MAX_PIXELS, Wrong
+from models.bundle_check import Wrong
+from models.skin_limits import MOST_PIXELS
 from models.touch_response import ResponseTables
 
 MODES = 128
@@ -40,7 +41,7 @@ def tables_of(arrays: Mapping[str, npt.NDArray[Any]], electrodes: int) -> Respon
         raise Wrong("response.npz", f"no {', '.join(missing)}", "fields, modes, strength, inside")
     fields, modes, strength, inside = (arrays[name] for name in ("fields", "modes", "strength", "inside"))
     n = inside.shape[0] if inside.ndim == 2 and inside.shape[0] == inside.shape[1] else 0
-    if not 2 <= n <= MAX_PIXELS or inside.dtype.kind != "b" or not inside.any():
+    if not 2 <= n <= MOST_PIXELS or inside.dtype.kind != "b" or not inside.any():
         raise Wrong("response.npz: inside", f"{inside.dtype} {inside.shape}", "booleans of a square grid, some true")
     fine = round(fields.shape[1] ** 0.5) if fields.ndim == 3 else 0
     ranks = len(strength) if strength.ndim == 1 else 0

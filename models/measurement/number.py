@@ -34,4 +34,4 @@ def numbers_of(module: ModuleType) -> Iterator[tuple[str, Number]]:
 def table(*modules: ModuleType) -> str:
     """The numbers of some modules as lines of text: name, value, unit, meaning, origin."""
     rows = [(name, f"{each:g}", each.unit, each.meaning, each.origin) for m in modules for name, each in numbers_of(m)]
-    return "\n".join("  ".join(row) for row in rows)
+    return "\n".join(dict.fromkeys("  ".join(row) for row in rows))  # a module may lend from one before it

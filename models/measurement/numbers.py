@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from models.measurement.number import Number
 
+FALSE_ALARM_Z2 = Number(44.0, "-", "z^2 of the best disc that is a touch", "derived: 2 (ln 650 discs + ln 1e6) + 3")
+FIELD_START = Number(1e-5, "-", "the field at the tare", "derived: 64 frames at 80 dB")
+CONTACT_START = Number(1e-3, "-", "a contact impedance in a frame of the tare", "derived: 64 frames at 80 dB")
+"""What is a touch, on a skin that was just tared."""
+
 MISFIT = Number(0.004, "-", "what the linear disc leaves of a touch's change", "measured: 0.05 to 0.6 % on both meshes")
 MISFIT_WIDE = Number(0.03, "-", "the same near electrodes and at deep touches", "measured: 3.4 % at most")
 MISFIT_FAR = Number(

@@ -12,6 +12,7 @@ from protocol import link
 from protocol.frames import STATUS_OPEN, STATUS_RTIA
 from services.board.clock import GOOD_NS, DeviceClock
 from services.board.line_pace import LinePace
+from services.board.other_end import OtherEnd, printable
 from services.board.scan_check import ScanCheck
 from services.board.scanning import Scanning, unfit
 from services.board.time_questions import TimeQuestions
@@ -29,13 +30,14 @@ NO_CURRENT = STATUS_OPEN | STATUS_RTIA
 
 class BoardLink:
     """One connection. `state` is hello, config, start, running or refused. `scanning`: what the board scans; whole
-    where its firmware knows no parts.
+    where its firmware knows no parts. other_end: what names it where it is no board.
 
     `clock` maps the board's time to this host's. It begins anew only where START and its answer say so.
     """
 
-    def __init__(self, scanning: Scanning, now_s: float) -> None:
+    def __init__(self, scanning: Scanning, now_s: float, other_end: OtherEnd | None = None) -> None:
         self.scanning = scanning
+        self._other_end = other_end or OtherEnd()
         self.knows_no_parts = False  # and so scans whole, although parts were wanted
         self.decoder = link.Decoder()
         self.clock = DeviceClock()
@@ -72,6 +74,8 @@ class BoardLink:
         scans = []
         waited, bad = self.decoder.waiting, self.decoder.bad
         messages = self.decoder.feed(data)
+        if self.state == "hello":
+            self._other_end.took(data, messages)
         dropped, waits = self.decoder.bad > bad, self.decoder.waiting
         began_s = self._pace.first_byte_s(now_s, waited=waited, dropped=dropped, complete=bool(messages), waits=waits)
         self.reasons.clear()
@@ -111,8 +115,8 @@ class BoardLink:
             return b""
         if self.state == "hello":
             self._due_s = now_s + HELLO_EVERY_S
-            if now_s - self._asked_since > EXPLAIN_AFTER_S and not self.problem:
-                self.problem = self._why_no_answer()
+            if now_s - self._asked_since > EXPLAIN_AFTER_S:
+                self.problem = self._other_end.sentence()
             return link.encode(link.Hello(schema_hash=link.SCHEMA_HASH))
         if self.state in ("config", "start"):
             self._tries += 1
@@ -142,6 +146,10 @@ class BoardLink:
         self.scanning = scanning
         if self.state in ("start", "running"):
             self._to(now_s, "config")
+
+    def lost(self, why: str) -> str:
+        """What stands in the way once the port is gone for this reason: of no board, what was there instead."""
+        return self._other_end.closed(why) if self.ident is None else why
 
     def suspended(self, now_s: float) -> None:
         """This machine was suspended, and its clock with it, while the board's went on."""
@@ -173,6 +181,7 @@ class BoardLink:
         self._heard_s, self._start_s = now_s, None
         if state == "hello":
             self._asked_since = now_s
+            self._other_end = OtherEnd(self._other_end.url, self._other_end.baud)
 
     def _restart(self, now_s: float, why: str) -> None:
         self.counts["restarts"] += 1
@@ -220,7 +229,7 @@ class BoardLink:
         if nak.of == 0 and nak.reason != link.NakReason.SCHEMA:
             self.counts["garbled"] += 1
             return
-        self._refuse(f"the board refuses: {nak.text or _reason(nak.reason)}", now_s)
+        self._refuse(f"the board refuses: {printable(nak.text) or _reason(nak.reason)}", now_s)
 
     def _refuse(self, why: str, now_s: float) -> None:
         self.problem = why
@@ -229,7 +238,9 @@ class BoardLink:
     def _happened(self, event: link.Event, now_s: float) -> None:
         self.counts["events"] += 1
         if event.code in (link.EventCode.BOOT, link.EventCode.BROWN_OUT):
-            self._restart(now_s, f"the board lost its configuration ({event.text or link.EventCode(event.code).name})")
+            self._restart(
+                now_s, f"the board lost its configuration ({printable(event.text) or link.EventCode(event.code).name})"
+            )
 
     def _watch(self, scan: link.ScanFrame, now_s: float) -> None:
         """Looks for a brown-out that lost the registers without a word: then no measurement has a current."""
@@ -256,13 +267,6 @@ class BoardLink:
         self.counts["missing"] += self._check.missing
         self.counts["frozen"] += self._check.frozen
         return True
-
-    def _why_no_answer(self) -> str:
-        if self.decoder.bad:
-            return (
-                f"no answer to HELLO, only noise ({self.decoder.last_error}): is it the board, and at this baud rate?"
-            )
-        return "no answer to HELLO: is it the board, and is its firmware running?"
 
 
 def _ns(seconds: float) -> int:

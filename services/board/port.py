@@ -4,12 +4,15 @@ in again.
 
 from __future__ import annotations
 
+import errno
 import os
-import re
 import select
+import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import serial
 from serial.tools import list_ports
@@ -17,6 +20,7 @@ from serial.tools import list_ports
 from protocol.errors import EitskinError
 from protocol.part_size import BAUD
 from protocol.runtime import runtime_dir
+from services.board.other_end import NETWORK, RFC2217, OtherEnd
 
 STUB_LINKS = "board-"  # and the skin's name: the link to the stub's pty in the runtime folder
 
@@ -31,9 +35,16 @@ class Port:
     def __init__(self, url: str, baud: int = BAUD) -> None:
         self.url = url
         try:
-            self._serial: Any = serial.serial_for_url(url, baudrate=baud, timeout=0, write_timeout=1, exclusive=True)
-        except (serial.SerialException, OSError, ValueError, LookupError, re.error) as why:  # by the kind of URL
-            raise PortError(explain(url, why)) from None
+            made = serial.serial_for_url(url, baudrate=baud, timeout=0, exclusive=True, do_not_open=True)
+            if not url.lower().startswith(RFC2217):  # which has none
+                made.write_timeout = 1
+            if url.lower().startswith("socket://"):  # pyserial would throw away what the other end says first
+                made.reset_input_buffer = lambda: None
+            made.open()
+        except Exception as why:  # by the kind of URL nearly any
+            raise PortError(explain(url, why, baud)) from None
+        self._serial: Any = made
+        self._failed: Exception | None = None  # a write: what came before it is read first
         try:
             self._serial.set_low_latency_mode(True)
         except Exception:  # not every driver has it: ptys, sockets, other systems
@@ -50,21 +61,23 @@ class Port:
         try:
             if self._fd < 0:
                 data: bytes = self._serial.read(1)
-                return data + self._serial.read(self._serial.in_waiting) if data else data
-            if not select.select([self._fd], [], [], timeout_s)[0]:
-                return b""
-            data = os.read(self._fd, 65536)
-        except (OSError, ValueError, TypeError, serial.SerialException) as why:
-            raise PortError(f"{self.url} is gone ({_plain(why)}): is the cable plugged in?") from None
-        if not data:
-            raise PortError(f"{self.url} is gone (ready to read, but nothing to be read): is the cable plugged in?")
+                data += self._serial.read(self._serial.in_waiting) if data else b""
+                ready = bool(data)
+            else:
+                ready = bool(select.select([self._fd], [], [], 0.0 if self._failed else timeout_s)[0])
+                data = os.read(self._fd, 65536) if ready else b""
+        except Exception as why:  # of the system, and of a pyserial whose port was closed
+            raise PortError(self._gone(self._failed or why)) from None
+        if not data and (ready or self._failed):
+            raise PortError(self._gone(self._failed))
         return data
 
     def write(self, data: bytes) -> None:
+        """Where it fails, the next `read` says so, once it has given all that came before."""
         try:
             self._serial.write(data)
-        except (OSError, serial.SerialException) as why:
-            raise PortError(f"{self.url} is gone ({_plain(why)}): is the cable plugged in?") from None
+        except Exception as why:
+            self._failed = why
 
     def close(self) -> None:
         try:
@@ -72,11 +85,25 @@ class Port:
         except Exception:  # a device that is gone may fail in any way
             pass
 
+    def _gone(self, why: Exception | None) -> str:
+        if isinstance(why, serial.SerialTimeoutException):
+            return f"{self.url} takes no more bytes: nothing reads them at its other end; is that the board?"
+        system = _system(why)
+        said = f" ({system.strerror.lower()})" if system is not None and system.strerror else ""
+        if self.url.lower().startswith(NETWORK):
+            return f"{self.url} is gone{said}: did the gateway restart, or another program take its port?"
+        return f"{self.url} is gone{said}: is the cable plugged in?"
 
-def _plain(why: Exception) -> str:
-    """What the system says, without its number; pyserial puts a failure of the system into a text of its own."""
-    system = why if isinstance(why, OSError) and why.strerror else why.__context__
-    return system.strerror.lower() if isinstance(system, OSError) and system.strerror else str(why)
+
+def _system(why: BaseException | None) -> OSError | None:
+    """The failure of the system behind an exception: pyserial puts it into a text of its own."""
+    while why is not None:
+        if isinstance(why, OSError) and (why.errno or isinstance(why, TimeoutError)):
+            return why
+        if type(why).__module__ == "termios":
+            return OSError(*why.args)
+        why = why.__context__
+    return None
 
 
 def candidates(port: str, skin: str, usb_serial: str | None, known_board: bool) -> Iterator[str]:
@@ -111,15 +138,76 @@ def usb_serial_number(url: str) -> str | None:
     return next((p.serial_number for p in list_ports.comports() if p.device == real), None)
 
 
-def explain(url: str, why: Exception) -> str:
+def explain(url: str, why: Exception, baud: int = BAUD) -> str:
     """Returns what a failure to open means and what to do about it."""
-    text, number = str(why), getattr(why, "errno", None)
-    if "exclusively lock" in text or number in (11, 16):
-        return f"{url} is held by another program: close that one (`fuser {url}` names it)"
-    if number == 2 or "No such file" in text:
+    text, system = str(why), _system(why)
+    number = None if system is None else system.errno
+    if number in (errno.ENOENT, errno.ENOTDIR):
         if url.startswith(str(runtime_dir() / STUB_LINKS)):
             return "waiting for the stub board, which `skin up` starts"
         return f"{url} is not there: plug the board in, or correct `port` in skin.toml"
-    if number == 13 or "Permission denied" in text:
-        return f"{url} may not be opened: add yourself to its group (`ls -l {url}`; usually dialout) and log in again"
-    return f"{url} cannot be opened: {text}"
+    if isinstance(system, socket.gaierror):
+        return f"{url}: no computer has that name: correct `port` in skin.toml, or give the number of its address"
+    if isinstance(system, TimeoutError) or number in UNREACHED:
+        return f"{url} does not answer: is that computer on, and can this one reach it?"
+    if url.lower().startswith(RFC2217) and (said := _without_telnet(url)):
+        return said
+    for numbers, words, said in FAILURES:
+        if number in numbers or any(word in text for word in words):
+            return said.format(url=url, baud=baud)
+    return f"{url} cannot be opened ({text[:200]}): is it the board's port? Correct `port` in skin.toml"
+
+
+def _without_telnet(url: str) -> str:
+    """What is at the other end of an address that does not speak RFC 2217, by what it says of itself; "" where nothing
+    is said.
+    """
+    parts, end = urlsplit(url), OtherEnd(url)
+    try:
+        with socket.create_connection((parts.hostname, parts.port or 0), LISTEN_S) as raw:
+            until = time.monotonic() + LISTEN_S
+            while data := raw.recv(4096):
+                end.took(data, [])
+                if time.monotonic() > until:
+                    return end.sentence()
+    except OSError:
+        return end.sentence() if end.heard else ""
+    return end.closed("")
+
+
+LISTEN_S = 0.5
+UNREACHED = (errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
+FAILURES: tuple[tuple[tuple[int, ...], tuple[str, ...], str], ...] = (  # error numbers, or words of pyserial's text
+    (
+        (errno.EBUSY, errno.EAGAIN),
+        ("exclusively lock",),
+        "{url} is held by another program: close that one (`fuser {url}` names it)",
+    ),
+    (
+        (errno.EACCES, errno.EPERM),
+        (),
+        "{url} may not be opened: add yourself to its group (`ls -l {url}`; usually dialout) and log in again",
+    ),
+    (
+        (errno.ECONNREFUSED,),
+        (),
+        "nobody listens at {url}: start the gateway there, or correct `port` in skin.toml",
+    ),
+    (
+        (errno.ECONNRESET, errno.EPIPE, errno.ECONNABORTED),
+        (),
+        "{url} closes the connection at once: is it in use by another program? Close that one",
+    ),
+    (
+        (errno.ENOTTY, errno.EISDIR, errno.EINVAL, errno.ENXIO, errno.ENODEV),
+        (),
+        "{url} is no serial device that works: correct `port` in skin.toml, or plug the board in again",
+    ),
+    ((), ("regexp",), "{url} matches no port: plug the board in (`python -m serial.tools.list_ports -v` lists ports)"),
+    (
+        (),
+        ("RFC2217", "RFC 2217", "baud"),
+        "{url} does not let itself be set to {baud} baud: of a gateway that does not speak RFC 2217 write "
+        "socket://HOST:PORT; else correct `baud` in skin.toml",
+    ),
+)

@@ -23,6 +23,7 @@ from services.board.boardlink import BoardLink
 from services.board.clock import UNSETTLED_NS
 from services.board.host_time import STOOD_STILL_S, HostTime, Suspensions
 from services.board.newest_values import NewestValues
+from services.board.other_end import NETWORK, OtherEnd
 from services.board.remarks import Remarks
 from services.board.rolling_order import parts_of, rolling_order
 from services.board.scanning import Scanning
@@ -31,6 +32,7 @@ from services.runtime.stage import Health, add_reason, valid_for_s
 
 POLL_S = 0.1
 REOPEN_S = 0.2  # between attempts to open a port
+MOST_REOPEN_S = 5.0  # the same where no board was found behind it, again and again: twice as long each time
 INTRODUCE_S = 0.6  # for a board under another name to say who it is
 COUNT_EVERY_S = 0.1
 MOST_WAITING = 4_000_000  # bytes read in one go after a standstill
@@ -94,6 +96,7 @@ class BoardSource(Source):
         self._port: ports.Port | None = None
         self._board = ""  # unique id of the board that we know
         self._usb_serial: str | None = None
+        self._strangers = 0  # connections in a row that were lost before a scan came, or that a network refused
 
     def frames(self) -> Iterator[RawFrame | None]:
         while True:
@@ -102,6 +105,7 @@ class BoardSource(Source):
                     self._port = self.open_port(url)
                 except ports.PortError as why:
                     self._trouble(str(why) if n == 0 else self.problem)  # the configured name is the one to speak of
+                    self._strangers += self.skin.port.lower().startswith(NETWORK)
                     continue
                 try:
                     stranger = yield from self._connection(self._port, must_be=self._board if n else "")
@@ -113,7 +117,12 @@ class BoardSource(Source):
                 finally:
                     self.close()
                 break
-            self.host.sleep(REOPEN_S)
+            yield from self._wait_to_reopen()
+
+    def _wait_to_reopen(self) -> Iterator[None]:
+        again = self._now() + min(MOST_REOPEN_S, REOPEN_S * 2 ** min(self._strangers, 8))
+        while not self.ending.is_set() and (left := again - self._now()) > 0:
+            self.host.sleep(min(REOPEN_S, left))
             yield None
 
     def open_port(self, url: str) -> ports.Port:
@@ -133,7 +142,8 @@ class BoardSource(Source):
         `must_be` (returns True).
         """
         opened = last = self._now()
-        board, suspensions = BoardLink(self.scanning, opened), Suspensions(self.host)
+        board = BoardLink(self.scanning, opened, OtherEnd(port.url, self.skin.baud))
+        suspensions = Suspensions(self.host)
         newest, whole = self.newest(), False
         seen: Counter[str] = Counter()
         counted = 0.0
@@ -162,7 +172,7 @@ class BoardSource(Source):
                     return True
                 if board.state == "running" and self._board != board.board:
                     self._board, self._usb_serial = board.board, ports.usb_serial_number(port.url)
-                if board.problem != self.problem:
+                if board.problem or board.state == "running":  # until then what was the matter is
                     self._trouble(board.problem)
                 came = bool(scans)
                 if stood_s > STOOD_STILL_S:
@@ -176,6 +186,9 @@ class BoardSource(Source):
                 yield from (frame for frame in frames if frame is not None)
                 if not came:
                     yield None
+        except ports.PortError as why:
+            self._strangers = 0 if board.counts["scans"] else self._strangers + 1
+            raise ports.PortError(board.lost(str(why))) from None
         finally:
             self._count(board, seen)
 

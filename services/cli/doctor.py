@@ -19,6 +19,7 @@ from protocol.part_size import line_load
 from protocol.runtime import RuntimeDirError, runtime_dir
 from services.board import port as ports
 from services.board.boardlink import BoardLink
+from services.board.other_end import OtherEnd
 from services.board.scanning import Scanning
 from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
@@ -219,17 +220,15 @@ def _line(name: str, skin: Skin, bundle: Bundle) -> Iterator[Finding]:
 def _board(name: str, skin: Skin, bundle: Bundle, port: ports.Port) -> Finding:
     """Ask the board who it is; it is not started."""
     what, began = f"{name}: board", time.monotonic()
-    link = BoardLink(Scanning(bundle.pattern, skin.setting, skin.rtia_ohm), began)
+    link = BoardLink(Scanning(bundle.pattern, skin.setting, skin.rtia_ohm), began, OtherEnd(port.url, skin.baud))
     try:
         while (now := time.monotonic()) < began + BOARD_S and link.ident is None:
             if link.state == "hello" and (due := link.to_send(now)):
                 port.write(due)
             link.received(port.read(0.05), time.monotonic())
     except ports.PortError as why:
-        return Finding("FAIL", what, str(why))
-    if link.ident is None:
-        return Finding("FAIL", what, link.problem or f"no answer within {BOARD_S:g} s: is this the board's port?")
-    if link.state == "refused":
+        return Finding("FAIL", what, link.lost(str(why)))
+    if link.ident is None or link.state == "refused":
         return Finding("FAIL", what, link.problem)
     ours = f"{link.board}, firmware {link.ident.firmware!r}, schema {SCHEMA_HASH:08x} as ours"
     rate = 1 / skin.setting.scan_s(len(bundle.pattern))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +10,7 @@ import typer
 
 from protocol.whole_file import write_whole
 from services.cli.common import ROOT, USAGE, JsonOption, emit, fail
+from services.runtime.config import SKIN_NAME
 
 if TYPE_CHECKING:
     from models.drawing import Drawing
@@ -47,7 +47,7 @@ def new(
     from models.meshing import MeshError, build
     from models.patterns import NAMES, PatternError
 
-    if not re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,31}", name):
+    if not SKIN_NAME.fullmatch(name):
         fail(f"found the name {name!r}, expected lower-case letters, digits, - and _, at most 32", USAGE)
     if (disc > 0) == (outline is not None):
         fail("give either --disc METRES (its diameter) or --outline FILE (.dxf or .svg)", USAGE)
@@ -75,12 +75,13 @@ def new(
 def _text(name: str, found: Drawing, count: int, width: float, first: float, pattern: str) -> str:
     from models import drawing
     from models.outline import GeometryError
+    from models.skin_limits import LEAST_ELECTRODES, MOST_ELECTRODES
 
     perimeter = found.perimeter
     n = len(found.electrodes) or count
-    if not 4 <= n <= 64:
+    if not LEAST_ELECTRODES <= n <= MOST_ELECTRODES:
         where = "the drawing has" if len(found.electrodes) else "--electrodes"
-        raise GeometryError(f"{where} {n} electrodes: expected 4 to 64")
+        raise GeometryError(f"{where} {n} electrodes: expected {LEAST_ELECTRODES} to {MOST_ELECTRODES}")
     if not 0 <= width < perimeter:
         raise GeometryError(f"--width {width:g}: expected metres, less than the outline's {perimeter:.3g} m")
     if len(found.electrodes) and first:

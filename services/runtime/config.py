@@ -23,6 +23,7 @@ from protocol.part_size import BAUD, FASTEST_BAUD, SLOWEST_BAUD
 from protocol.scan_setting import NAMED, WITH_POINTS, ScanSetting, SettingName
 from protocol.topics import BRIDGES
 from protocol.transport import Transport
+from services.runtime import port_url
 from services.runtime.config_sections import (
     Count,
     FoxgloveSection,
@@ -173,9 +174,10 @@ class Skin(Section):
     @field_validator("port")
     @classmethod
     def some_port(cls, port: str) -> str:
-        if port.startswith(BY_NAME):
-            _pattern(port.removeprefix(BY_NAME).partition("&")[0])
-        if port == "stub" or port.startswith("/") or "://" in port or Path(port).suffix in RECORDINGS:
+        if "://" in port:
+            port_url.check(port)
+            return port
+        if port == "stub" or port.startswith("/") or Path(port).suffix in RECORDINGS:
             return port
         raise ValueError(
             '"stub", a device path (/dev/ttyACM0), a pyserial URL (socket://host:4000), a recording (*.mcap) or a file '
@@ -225,17 +227,7 @@ class Skin(Section):
 
 
 RECORDINGS = (".mcap", ".npz")
-BY_NAME = "hwgrep://"
 MOST_SKINS = 64  # of one service
-
-
-def _pattern(text: str) -> None:
-    try:
-        re.compile(text)
-    except (re.error, RecursionError, OverflowError) as why:
-        raise ValueError(
-            f"{BY_NAME} and a regular expression that a port's name matches (found {text!r}: {why})"
-        ) from why
 
 
 def _one_board(port: str, other: str) -> bool:

@@ -32,6 +32,11 @@ def test_a_disc_and_a_drawing(skin, tmp_path):
     [
         ("mine --disc 60", "found 60 m x 60 m, expected a longer side of 0.005 to 3 m: --disc takes metres"),
         ("mine --disc 0.06 --electrodes 3", "--electrodes 3 electrodes: expected 4 to 64"),
+        (
+            "mine --disc 0.12 --electrodes 32 --pattern adjacent",
+            r"'adjacent' are 928 measurements, at most 512 .* 'pairs' \(496\) or at most 24 electrodes with 'adjacent'",
+        ),
+        ("mine --disc 0.12 --electrodes 33", "are 528 measurements, at most 512 .* choose at most 32 electrodes with"),
         ("mine", "give either --disc METRES .* or --outline FILE"),
         ("My_Skin --disc 0.06", "found the name 'My_Skin', expected lower-case letters"),
     ],

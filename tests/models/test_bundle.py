@@ -10,6 +10,7 @@ from models.bundle import Bundle, BundleError
 from models.bundle_check import Wrong
 from models.response_file import arrays_of_tables, tables_of
 from models.shapes import Shape
+from models.skin_limits import BUNDLE_BYTES
 from models.touch_response import TouchResponse
 from tests.models.test_prereconstruction import matrices
 
@@ -102,7 +103,7 @@ def test_shipped_bundles_load_and_another_name_lists_them():
     for name in ("square16", "disc16"):
         loaded = Bundle.load(name)
         assert loaded.name == name and len(loaded.z0) == len(loaded.pattern)
-        assert sum(f.stat().st_size for f in loaded.path.iterdir()) <= bundle.MAX_BYTES
+        assert sum(f.stat().st_size for f in loaded.path.iterdir()) <= BUNDLE_BYTES
     with pytest.raises(BundleError, match=r"no bundle 'nowhere'.*square16.*make train SKIN=nowhere"):
         Bundle.load("nowhere")
 

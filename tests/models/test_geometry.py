@@ -69,6 +69,8 @@ def test_skins_drawn_in_millimetres():
         (square(contact_impedance=0.0), "contact_impedance of electrode 0 must be positive"),
         (square(electrodes={"width": 0.55, "count": 16}), "electrodes 0 and 1 overlap by 0.05"),
         (square(electrodes={"width": 0.1, "centre": [[0.0, 0.5]]}), "electrode 0 at .* is 0.5 away from the outline"),
+        (drawn(electrodes={"width": 1, "count": 65}), "count: found 65, expected a whole number of 4 to 64"),
+        (drawn(name="../mine"), r"name: found '../mine', expected at most 64 letters, digits"),
         (drawn(unit="miles"), "unit: found 'miles', expected one of m, cm, mm, inch"),
         (drawn(electrodes={"width": 20, "count": 12}), r"overlap by .* \(4.3 mm\): expected a gap .* width smaller"),
     ],
@@ -76,6 +78,24 @@ def test_skins_drawn_in_millimetres():
 def test_skins_that_cannot_be(data, message):
     with pytest.raises(ValueError, match=message):
         geometry.from_dict(data)
+
+
+def rounded(decimals):
+    at = np.pi * np.arange(16) / 8 + 0.2
+    centres = np.round(np.column_stack([np.cos(at), np.sin(at)]), decimals).tolist()
+    disc = {"name": f"d{decimals}", "radius": 1.0, "metres_per_unit": 0.06, "contact_impedance": 0.01}
+    return disc | {"electrodes": {"width": 0.1, "centre": centres}}
+
+
+@pytest.mark.parametrize("decimals", [2, 3, 5, 8])
+def test_an_electrode_as_far_from_the_outline_as_it_is_rounded_is_on_it(decimals, caplog):
+    skin = geometry.from_dict(rounded(decimals))
+    assert np.abs(np.diff(skin.electrodes) - np.pi / 8).max() < 2 * 10.0**-decimals
+    assert ("as far as they are rounded, are put on it" in caplog.text) == (decimals < 6)
+    moved = rounded(decimals)
+    moved["electrodes"]["centre"][3][1] += 0.03
+    with pytest.raises(GeometryError, match=r"electrode 3 at .* away from the outline"):
+        geometry.from_dict(moved)
 
 
 def test_a_length_in_another_unit_than_is_said_and_a_name_that_is_none(tmp_path):

@@ -3,13 +3,17 @@
 import contextlib
 import os
 import select
+import socket
 import threading
 import time
 import tty
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import serial
+import serial.rfc2217
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,7 +23,11 @@ from protocol.frames import STATUS_OPEN, RawFrame, pack
 from protocol.scan_setting import COHERENT
 from services.acquisition import SourceFeed, open_source
 from services.board.boardlink import BoardLink
+from services.board.host_time import HostTime
+from services.board.other_end import OtherEnd
+from services.board.port import Port
 from services.board.scanning import Scanning
+from services.board.source import BoardSource
 from services.recordings.recording import RecordingWriter
 from tests.waiting import until
 
@@ -201,8 +209,9 @@ def test_what_a_board_says_of_itself_and_a_silent_or_dead_one():
     host, board, now = running()
     host.received(link.encode(link.Nak(of=0, reason=link.NakReason.UNKNOWN, text="what?")), now)
     assert host.state == "running" and not host.problem and host.counts["garbled"] == 1
-    host.received(link.encode(link.Nak(of=link.Config.number, reason=99)), now)
-    assert host.state == "refused" and host.problem == "the board refuses: reason 99"
+    for text, said in (("", "reason 99"), ("no\x1b[2J", "no\\x1b[2J")):
+        host.received(link.encode(link.Nak(of=link.Config.number, reason=99, text=text)), now)
+        assert host.state == "refused" and host.problem == f"the board refuses: {said}"
     host, board, now = running()
     host.received(link.encode(link.Event(code=link.EventCode.BROWN_OUT, text="3.1 V")), now)
     assert host.state == "hello" and "3.1 V" in host.problem
@@ -220,14 +229,91 @@ def test_what_a_board_says_of_itself_and_a_silent_or_dead_one():
     board.status = 0
     talk(host, board, now, 0.3)
     assert host.state == "running" and sum(isinstance(m, link.Config) for m in board.heard) == 4
-    host, board = BoardLink(SCANNING, 0.0), FakeBoard()
-    board.deaf = True
-    talk(host, board, 0.0, 3.0)
-    assert "no answer to HELLO" in host.problem
-    host.received(b"\0garbage that is no message\0" * 3, 3.0)
-    host.problem = ""
-    talk(host, board, 3.0, 1.0)
-    assert "only noise" in host.problem
+
+
+def sent(n, schema=link.SCHEMA_HASH):
+    """A scan as some board sends it, of other values each time."""
+    z = np.random.default_rng(n).normal(size=120).astype(np.complex64)
+    return link.encode(link.ScanFrame(n, n * 4000, 4000, 7, z, np.zeros(120, np.uint8)), schema)
+
+
+def slower(data, times=8):
+    """What a receiver makes of bytes whose bits take so many of its own."""
+    bits = [b for byte in data for b in (0, *(byte >> i & 1 for i in range(8)), 1) for _ in range(times)] + [1] * 10
+    out, at = bytearray(), 0
+    while 0 in bits[at:]:
+        at = bits.index(0, at)
+        out.append(sum(bit << i for i, bit in enumerate((bits[at + 1 : at + 9] + [1] * 8)[:8])))
+        at += 10
+    return bytes(out)
+
+
+NMEA = b"$GPGGA,092750.000,5321.6802,N,00630.3372,W,1,8,1.03,61.7,M,55.2,M,,*76\r\n"
+# what a device or a network sends -> what is said of it, and what more where it closes the connection
+AT_PORTS = {
+    "silence": (b"", "", "no answer to HELLO, and nothing else comes"),
+    "a plug": (b"\0\xff", "", "no answer to HELLO, and nothing else comes"),
+    "low line": (b"\0" * 50, "", "nothing but bytes of 0 or 255"),
+    "text": (b"1.50 2.25 [red]\x1b[31m\r\n" * 9, "", 'found text, "1.50 2.25 [red]\\x1b[31m": is it the board'),
+    "nmea": (NMEA * 3, "", '(NMEA), which sends "$GPGGA,092750.000,5321.6802,N,00630.3372,W,1,8,1.03,61.7,..."'),
+    "echo": (link.encode(link.Hello(schema_hash=link.SCHEMA_HASH)), "", "our own HELLO comes back"),
+    "noise": (np.random.default_rng(1).bytes(4000), "", "neither text nor a board's, "),
+    "slower": (slower(sent(1)), "", "a line slower than our 921600 baud"),
+    "one way": (sent(1) + sent(2), "", "does not answer HELLO: look at the wire"),
+    "schema": (sent(1, 0xBAD0F00D) + sent(2, 0xBAD0F00D), "", "frames of schema bad0f00d"),
+    "cut": (b"".join(sent(n)[:200] + sent(n)[260:] for n in range(4)), "", "none of them whole"),
+    "held": (b"", "socket://h:1", "the connection is taken and nothing is said"),
+    "busy": (b"Port already in use\r\n", "socket://h:1", 'busy gateway, which sends "Port already in use", and closes'),
+    "telnet": (b"\xff\xfd\x18login: ", "socket://h:1", "found a telnet server"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", AT_PORTS)
+def test_what_is_no_board_is_named_by_what_it_sends(name):
+    data, url, says = AT_PORTS[name]
+    host = BoardLink(SCANNING, 0.0, OtherEnd(url or "/dev/ttyACM0"))
+    for at in range(0, len(data), 900):
+        host.received(data[at : at + 900], 0.1)
+    host.to_send(1.0)
+    assert host.problem == ""
+    host.to_send(2.0)
+    closed = host.lost("/dev/ttyACM0 is gone")
+    assert says in (closed if "closes" in says else host.problem) and host.problem.startswith("no board at ")
+    assert f", and {'closes the connection' if url else 'is gone'}: " in closed or len(data) < 3, closed
+
+
+class Quick(HostTime):
+    slept_s = 0.0  # which takes no time
+
+    def now_ns(self):
+        return super().now_ns() + round(self.slept_s * 1e9)
+
+    def sleep(self, seconds):
+        self.slept_s += seconds
+
+
+@pytest.mark.live
+def test_a_gateway_that_closes_is_heard_out_and_asked_less_and_less_often(skin, bundle):
+    with socket.create_server(("127.0.0.1", 0)) as gateway:
+
+        def answer():
+            for _ in range(4):
+                client, _ = gateway.accept()
+                client.sendall(b"Port already in use\r\n")
+                client.close()
+
+        threading.Thread(target=answer, daemon=True).start()
+        url = f"socket://127.0.0.1:{gateway.getsockname()[1]}"
+        source, said, slept_s = BoardSource("palm", skin.model_copy(update={"port": url}), bundle, Quick()), set(), {}
+        for _ in source.frames():
+            said.add(source.problem)
+            slept_s.setdefault(source.counts["disconnects"], source.host.slept_s)
+            if source.counts["disconnects"] == 4:
+                break
+        source.close()
+    (one,) = said - {""}
+    assert 'found a busy gateway, which sends "Port already in use", and closes the connection' in one
+    assert (np.diff(list(slept_s.values()), 2) > 0).all() and slept_s[4] > 2.0
 
 
 u8, u32, u64, config = *(st.integers(0, 2**bits - 1) for bits in (8, 32, 64)), st.just(SCANNING.config)
@@ -254,6 +340,26 @@ def test_garbage_and_intact_messages_with_any_fields_do_no_harm(pieces, started)
     host.received(b"\0", now)
     now = talk(host, board, now + 2.0, 3.0)
     assert host.state == "running" and len(host.received(board.scan(), now)) == 1
+
+
+@pytest.mark.live
+def test_a_port_of_another_computer_is_opened_by_rfc2217():
+    """Through pyserial's own gateway, with a loopback plug for a board."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def gateway():
+            client, _ = server.accept()
+            plug = serial.serial_for_url("loop://", timeout=0)
+            manager = serial.rfc2217.PortManager(plug, SimpleNamespace(write=client.sendall))
+            with client, contextlib.suppress(OSError):
+                while data := client.recv(1024):
+                    plug.write(b"".join(manager.filter(data)))
+                    client.sendall(b"".join(manager.escape(plug.read(4096))))
+
+        threading.Thread(target=gateway, daemon=True).start()
+        with contextlib.closing(Port(f"rfc2217://127.0.0.1:{server.getsockname()[1]}")) as port:
+            port.write(b"hello")
+            assert until(lambda: port.read(0.1)) == b"hello"
 
 
 @pytest.mark.live

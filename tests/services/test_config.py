@@ -16,7 +16,15 @@ BOARD = PALM | {"port": "socket://board:4000"}
 OF_A_SKIN = [
     ({"port": 5}, "skins.palm.port: found 5; allowed: a valid string"),
     ({"port": "com1"}, "skins.palm.port: found 'com1'; allowed: "),
-    ({"port": "hwgrep://("}, "skins.palm.port: found 'hwgrep://('; allowed: hwgrep:// and a regular expression"),
+    *(({"port": url}, f"skins.palm.port: found '{url}'; allowed: {allowed}") for url, allowed in {
+        "hwgrep://(": "hwgrep:// and a regular expression", "hwgrep://a&n=1": "hwgrep:// and a regular expression",
+        "hwgrep://": "hwgrep:// and a regular expression that a port's name matches (found no expression)",
+        "socket://h": "socket://HOST:PORT (found the host h, the port missing)", "socket://:1": "socket://HOST:PORT",
+        "socket://h:x": "socket://HOST:PORT", "socket://[::1": "socket://HOST:PORT", "socket://h:70000": "socket://HO",
+        "rfc2217://h": "rfc2217://HOST:PORT", "rfc2217://h:1?timeout=x": "rfc2217://HOST:PORT (found timeout=x",
+        "spy://ttyUSB0": "spy:///dev/ttyACM0", "alt:///dev/a?class=os": "alt:///dev/ttyACM0 (found class=os",
+        "loop://?x": "loop:// (found x=", "cp2110://x": "cp2110:// and", "tcp://h:1": "a pyserial URL, one of socket:",
+    }.items()),
     ({"pot": "stub"}, "skins.palm.pot: unknown key; allowed here: port, bundle"),
     ({"dft_points": 100}, "dft_points: found 100; allowed: 128, 256 or 512"),
     ({"scan_setting": "slow"}, "scan_setting: found 'slow'; allowed: 'coherent', 'paper'"),

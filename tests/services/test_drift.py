@@ -101,7 +101,7 @@ def time(skin: Skin, bundle: Bundle) -> Time:
 
 
 def test_the_lightest_press_of_the_paper_is_seen_at_the_centre(time: Time) -> None:
-    """1 N of the 10 mm indenter, 80 dB: in every frame, also after twenty seconds of it."""
+    """1 N of the indenter 10 mm across, 80 dB: in every frame, also after twenty seconds of it."""
     press = solved(Touch("circle", 0.0, 0.0, 0.005, 0.1))
     assert all(out.touched for out in time.frames(press, 3.0))
     assert all(out.touched for out in time.frames(press, 20.0, 0.2))

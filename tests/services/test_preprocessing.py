@@ -35,7 +35,7 @@ def left_out(sigma: np.ndarray) -> list[int]:
 
 def test_no_false_touch_and_the_lightest_touch_is_seen(tared: Fed, board: Board) -> None:
     assert not any(out.touched for out in tared.feel(scans=300))
-    light = board.disc(0.0, 0.0, 0.1, 0.1)  # 1 N of the 10 mm indenter at the centre
+    light = board.disc(0.0, 0.0, 0.1, 0.1)  # 1 N of the indenter 10 mm across at the centre
     assert all(out.touched for out in tared.feel(light, 5))
     assert not tared.feel(scans=2)[-1].touched
 

@@ -7,8 +7,10 @@ import sys
 from models.measurement import number
 from models.measurement import numbers as measurement
 from models.measurement.number import Number
+from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START
 
-FALSE_ALARM_Z2 = Number(44.0, "-", "z^2 of the best disc that is a touch", "derived: 2 (ln 650 discs + ln 1e6) + 3")
+__all__ = ["CONTACT_START", "FALSE_ALARM_Z2", "FIELD_START"]  # beside this module's own
+
 GLANCE_Z2 = Number(36.0, "-", "the same at a first look", "derived: the whitening is 0.5 s old, 10 % of z")
 GLANCE_S = Number(0.5, "s", "for which a whitening does for a first look", "derived: drift beyond is 1e-5")
 SURER = Number(0.5, "-", "of a variance then, below which a whitening is made anew", "derived: 40 % of a sigma")
@@ -30,8 +32,6 @@ FIELD_FASTER = Number(1e-3, "-", "faster drift than that, in one scan", "derived
 SLOPE_FASTER = Number(5e-4, "-", "the same across the sheet", "derived: half of FIELD_FASTER")
 FASTER_STAYS = Number(0.05, "-", "of that variance, in value and rate from then on", "chosen: 20 such scans")
 CONTACT_FASTER = Number(2e-3, "-", "faster change of a contact impedance in one scan", "derived: ten of CONTACT_WALK")
-FIELD_START = Number(1e-5, "-", "the field at the tare", "derived: 64 frames at 80 dB")
-CONTACT_START = Number(1e-3, "-", "a contact impedance at the tare", "derived: 64 frames at 80 dB")
 CONTACT_WALK = Number(2e-4, "1/sqrt(s)", "a contact impedance", "measured: drifts of 0.1 to 1 %/s, 0 to 1 phantom")
 CONTACT_RATE = Number(8e-4, "1/s", "the same while nobody watches", "derived: a quarter in 5 minutes; skin.toml's own")
 CONTACT_BENDS = Number(1e-3, "-", "of such a change: what its columns leave", "measured: 4e-4 at 30 %, EIDORS")
@@ -133,7 +133,7 @@ START_CONTACT = Number(0.3, "-", "a contact impedance of an unknown skin", "deri
 START_LAYER = Number(0.03, "-", "a contact's part in series, against its rest", "measured: trust --plan drift")
 START_ABSOLUTE = Number(3e-5, "-", "what no model of |Z| gets right", "measured: two meshes of one skin")
 START_COST_WIDE = Number(-2.3, "nat", "of a sheet that is uneven", "derived: one skin in ten")
-START_SEEN = Number(0.0063, "unit^2", "action of the touch that must not hide", "derived: half a newton on 10 mm")
+START_SEEN = Number(0.0063, "unit^2", "action of the touch that must not hide", "derived: half a newton, 10 mm radius")
 START_SEEN_SHARE = Number(0.2, "-", "of the places and sizes where it may", "chosen: four of five are seen")
 START_PAST = Number(10.0, "nat", "of a touch's evidence lost, beyond which none is sought", "derived: less than e^-10")
 START_TOUCHES = Number(3.0, "-", "touches at a start at most", "chosen: as networks were trained")
