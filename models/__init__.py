@@ -8,6 +8,7 @@ from protocol.errors import interrupted
 
 OURS = ("bench", "examples", "firmware_stub", "models", "protocol", "services", "tests")
 
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read when onnxruntime is loaded
 
 EXTRAS = {
     "offline": ("ezdxf", "svgpathtools"),

@@ -10,7 +10,7 @@ import io
 import math
 import os
 import zipfile
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,19 +65,25 @@ def _check_sizes(entries: list[zipfile.ZipInfo], packed: int, name: str, most: i
 
 
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> NDArray[Any]:
-    """One member. Its header is compared with its size before anything is allocated."""
     with archive.open(entry) as member:
-        version = np.lib.format.read_magic(member)
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
-        shape, fortran, dtype = read(member)
-        if dtype.kind not in "biufcU" or dtype.hasobject:
-            raise FileError(f"{name}: array {entry.filename!r} is {dtype}, expected numbers")
-        if len(shape) > MAX_DIMENSIONS or any(n < 0 for n in shape):
-            raise ValueError(shape)
-        size, left = dtype.itemsize * math.prod(shape), entry.file_size - member.tell()
-        if size != left or math.prod(n or 1 for n in shape) > MAX_NPZ:
-            raise FileError(f"{name}: array {entry.filename!r} of shape {shape} has {left} bytes, expected {size}")
-        data = member.read()
+        return plain_array(member, entry.file_size, f"{name}: array {entry.filename!r}")
+
+
+def plain_array(member: IO[bytes], length: int, name: str) -> NDArray[Any]:
+    """One array as numpy.save writes it, of `length` bytes with its header, which is compared with them before anything
+    is allocated. `name` is for errors. Raises FileError, and ValueError, KeyError or EOFError where it is damaged.
+    """
+    version = np.lib.format.read_magic(member)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+    shape, fortran, dtype = read(member)
+    if dtype.kind not in "biufcU" or dtype.hasobject:
+        raise FileError(f"{name} is {dtype}, expected numbers")
+    if len(shape) > MAX_DIMENSIONS or any(n < 0 for n in shape):
+        raise ValueError(shape)
+    size, left = dtype.itemsize * math.prod(shape), length - member.tell()
+    if size != left or math.prod(n or 1 for n in shape) > MAX_NPZ:
+        raise FileError(f"{name} of shape {shape} has {left} bytes, expected {size}")
+    data = member.read()
     if len(data) != size:
         raise ValueError(len(data))
     if not dtype.itemsize:  # an empty text

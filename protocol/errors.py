@@ -42,6 +42,7 @@ class EitskinError(Exception):
         ├── SceneError (ValueError)           firmware_stub: a scene cannot be played
         ├── WorldError (ValueError)           no world of this name for a stub's skin
         ├── ConfigError                       services: skin.toml cannot be used
+        ├── NoRoom                            the system allows too few descriptors, processes, or too little memory
         ├── Refused                           a stage does not carry out a command now
         ├── NoBaseline (ValueError)           frames, or a saved state, do not make a baseline
         ├── TareRefused (ValueError)          the latest scans make no baseline

@@ -107,7 +107,12 @@ def lock(folder: Path | None = None, process: str = "") -> Iterator[Path]:
     """
     folder = folder or runtime_dir()
     name = f"{process}.lock" if process else "lock"
-    fd = os.open(folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    try:
+        fd = os.open(folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    except OSError as bad:
+        raise RuntimeDirError(
+            f"runtime folder {folder} cannot be written to ({bad.strerror}): set EITSKIN_RUNTIME to another one"
+        ) from None
     try:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame, Frame, ImageFrame, RawFrame
+from services.estimation.values.judgement import Judgement
 from services.inference import Inference
 from services.preprocessing import Preprocessing
 from services.publisher import Publishing
@@ -20,6 +21,7 @@ class Result(NamedTuple):
     delta: DeltaFrame
     image: ImageFrame
     contact: ContactFrame
+    judgements: tuple[Judgement, ...] = ()
 
 
 def build_stages(name: str, skin: Skin, bundle: Bundle | None = None) -> tuple[Preprocessing, Inference, Publishing]:
@@ -59,7 +61,7 @@ class Pipeline:
         contact = self._passed(self.publishing, image)[0]
         delta = made[0]
         assert isinstance(delta, DeltaFrame) and isinstance(image, ImageFrame) and isinstance(contact, ContactFrame)
-        return Result(delta, image, contact)
+        return Result(delta, image, contact, self.pre.judgements)
 
     def step(self, raw: RawFrame) -> ContactFrame | None:
         """The contacts alone; None for a part of a scan that only preprocessing takes note of."""

@@ -152,6 +152,11 @@ class Preprocessing(Stage):
         self._judged = out, estimate.judgements
         return made
 
+    @property
+    def judgements(self) -> tuple[Judgement, ...]:
+        """Of the frame processed last."""
+        return () if self._judged is None else self._judged[1]
+
     def beside(self, wanted: frozenset[str]) -> list[Frame]:
         self.estimator.learn()
         return [judged(*self._judged)] if self._judged is not None and "judgements" in wanted else []

@@ -12,7 +12,7 @@ from protocol import logs
 from protocol.runtime import AlreadyRunning, RuntimeDirError, lock
 from protocol.transport import TransportError
 from services.runner import Runner
-from services.runtime import realtime
+from services.runtime import realtime, room
 from services.runtime.config import ConfigError, Skin, load
 from services.runtime.stage import Stage
 
@@ -33,6 +33,11 @@ def main(process: str, setup: Callable[[Runner], None]) -> int:
                 runner.run()
     except (AlreadyRunning, ConfigError, BundleError, RuntimeDirError, TransportError) as why:
         print(f"{process}: {why}", file=sys.stderr)
+        return 1
+    except Exception as why:
+        if not (lacking := room.sentence(why)):
+            raise
+        print(f"{process}: {lacking}", file=sys.stderr)
         return 1
     return 0
 

@@ -15,8 +15,10 @@ from protocol.frames import Frame, ImageFrame
 from services.calibration.force_fit import CalibrationError
 from services.calibration.seen import SeenTouch, SeenTouches, TouchReader, mean
 from services.pipeline import Pipeline
-from services.recordings.npz_file import InputError, load_npz, read_input
+from services.recordings.npz_file import load_npz, read_input
 from services.recordings.reconstruction import baseline_of, mounted_bundle, raw_frame
+from services.rows.columns import read_columns
+from services.rows.order import InputError
 from services.runtime.config import Skin
 
 STEADY_S = 1.5  # how long a press must have been steady
@@ -96,13 +98,15 @@ def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None])
     Raises CalibrationError.
     """
     try:
-        arrays = load_npz(path)
+        arrays, understood = read_columns(load_npz(path), bundle)
         if "measurements" not in arrays and "touched" in arrays:
             arrays = {**arrays, "measurements": arrays["touched"]}
         data = read_input({k: arrays[k] for k in ("measurements", "untouched") if k in arrays}, len(bundle.pattern))
     except InputError as why:
         raise CalibrationError(str(why) if str(path) in str(why) else f"{path}: {why}") from None
     assert data.untouched is not None  # read_input sees to it
+    if understood:
+        warn(f"{path} read as: {understood}")
     skin = skin.model_copy(update={"calibration": None})
     if skin.tare.calibrate:
         bundle = mounted_bundle(data.untouched, bundle, warn)

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.errors import EitskinError
 from services.estimation.first.references import noise_of_references
-from services.recordings.npz_file import InputError, delta_unit, measurement_order
+from services.recordings.npz_file import delta_unit
+from services.rows.columns import read_columns
+from services.rows.order import InputError
 
 Array = NDArray[np.float64]
 
@@ -42,6 +44,7 @@ class Presses:
     from_delta: bool = False
     unit: float = 1.0  # what `delta` was multiplied by
     left_out: int = 0  # presses of the file that could not be used
+    understood: str = ""  # what of the file is not as documented, and was read all the same
 
     def __getitem__(self, rows: Any) -> Presses:
         value = None if self.value is None else self.value[rows]
@@ -67,7 +70,7 @@ def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
             "untouched in any unit; and xy (n, 2) in metres"
         )
     try:
-        order = measurement_order(arrays, bundle)
+        arrays, understood = read_columns(arrays, bundle)
     except InputError as why:
         raise RegistrationError(str(why)) from None
     values = {name: np.asarray(arrays[name]) for name in PER_PRESS if name in arrays}
@@ -86,12 +89,12 @@ def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
     with np.errstate(all="ignore"):
         if signal == ("delta",):
             unit = _unit(values["delta"])
-            difference, before = values["delta"][:, order].astype(float) * unit, None
+            difference, before = values["delta"].astype(float) * unit, None
             if bundle.matrices.normalisation == "model":
                 difference *= bundle.z0.mean() / bundle.z0
         else:
-            unit, before = 1.0, np.abs(values["untouched"][:, order]).astype(float)
-            difference = _difference(np.abs(values["touched"][:, order]).astype(float), before, bundle)
+            unit, before = 1.0, np.abs(values["untouched"]).astype(float)
+            difference = _difference(np.abs(values["touched"]).astype(float), before, bundle)
     rows, measured = usable(difference, xy)
     difference, xy = np.where(measured, difference, 0.0)[rows], xy[rows].astype(float)
     noise = _noise(difference, None if before is None else before[rows], measured)
@@ -100,7 +103,7 @@ def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
     left_out = n - len(rows)
     strength = _strength(difference, value)
     made = Presses(difference, xy, strength, noise, measured, value, quantity, signal == ("delta",), unit, left_out)
-    return made[sequence]
+    return replace(made[sequence], understood=understood)
 
 
 def part(arrays: Mapping[str, NDArray[Any]], rows: Any) -> dict[str, NDArray[Any]]:

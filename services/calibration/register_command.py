@@ -47,6 +47,7 @@ def said(presses: Presses, found: Registration, measurements: int) -> dict[str, 
     """What is known of the presses and the pose."""
     similarity = found.similarity
     return {
+        "understood": presses.understood,
         "presses": len(presses),
         "unusable_presses": presses.left_out,
         "unusable_measurements": measurements - int(presses.measured.sum()),

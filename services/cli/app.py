@@ -28,6 +28,7 @@ from services.cli import (
     watch,
 )
 from services.cli.common import FAILED, USAGE, expected_code, with_values
+from services.runtime import room
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
@@ -91,6 +92,8 @@ def run() -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name need not be text, nor a terminal UTF-8
     try:
+        for lacking in room.memory():
+            raise room.NoRoom(lacking)
         app()
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0 if end.code is None else FAILED
@@ -102,6 +105,9 @@ def run() -> int:
     except Exception as error:
         if interrupted(error):
             return 130
+        if (lacking := room.sentence(error)) and not os.environ.get("EITSKIN_DEBUG"):
+            print(f"skin: {lacking}", file=sys.stderr)
+            return FAILED
         if isinstance(error, OSError) and error.filename and not os.environ.get("EITSKIN_DEBUG"):
             print(f"skin: {error.filename}: {error.strerror or error}: name another file or folder", file=sys.stderr)
             return USAGE

@@ -139,6 +139,7 @@ EXPECTED = {
     ("protocol.frames", "FrameError"): FAILED,
     ("protocol.sockets", "ControlError"): FAILED,
     ("services.runtime.config", "ConfigError"): USAGE,
+    ("services.runtime.room", "NoRoom"): FAILED,
     ("services.recordings.recording", "RecordingError"): USAGE,
     ("services.recordings.replay", "ReplayError"): FAILED,
     ("services.recordings.importing", "ImportRefused"): USAGE,
@@ -260,10 +261,11 @@ def control(process: str, command: str, *, timeout_s: float = 2.0, **args: Any) 
 
 
 def load_npz(path: Path) -> dict[str, Any]:
-    """All arrays of an npz file. CliError where it is none, or holds pickled objects."""
+    """All arrays of a file. CliError where it is damaged, of no known kind, or holds pickled objects."""
     from services.recordings import npz_file
+    from services.rows.order import InputError
 
     try:
         return npz_file.load_npz(path)
-    except npz_file.InputError as error:
+    except InputError as error:
         fail(str(error), USAGE)

@@ -29,7 +29,10 @@ from services.contacts.placing import placement
 from services.describe import ON, geometry, refinement, symmetry
 from services.estimation.faults import checks
 from services.estimation.first.baseline import implausibility
+from services.runtime import room
 from services.runtime.config import RECORDINGS, ConfigError, Skin, config_path, load
+from services.runtime.stage import PROCESSES
+from services.runtime.supervision import programs
 
 BOARD_S = 2.5  # for a board to say who it is
 LATENCY_TIMER_MS = 1
@@ -53,6 +56,8 @@ def _examine(path: Path | None) -> Iterator[Finding]:
         return
     try:
         folder = runtime_dir()
+        for process in PROCESSES:
+            transport.current().control_address(process)  # a socket's path may be too long
     except RuntimeDirError as why:
         yield Finding("FAIL", "runtime folder", str(why))
         return
@@ -61,6 +66,9 @@ def _examine(path: Path | None) -> Iterator[Finding]:
     yield Finding("OK", "runtime folder", f"{folder}, {'a service runs' if running else 'no service runs'} there")
     if running:
         yield from live.configuration(config.path)
+    else:
+        lacking = room.lacking(len(programs(config)) + 1, len(config.skins), folder)
+        yield from (Finding("FAIL", "room", each) for each in lacking)
     yield _clock()
     for name, skin in config.skins.items():
         yield from _skin(name, skin, running, ours)

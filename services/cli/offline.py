@@ -11,6 +11,15 @@ import typer
 from protocol.errors import interrupted
 from protocol.whole_file import whole_file
 from services.cli.common import FAILED, USAGE, JsonOption, emit, fail, load_npz
+from services.cli.rows import (
+    ColumnsOption,
+    PatternOption,
+    UntouchedOption,
+    counts,
+    read_rows,
+    say_understood,
+    verdicts,
+)
 
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
@@ -26,7 +35,7 @@ def _no_recording(source: Path) -> Path:
     """Refuses one before anything else that is missing on the line is asked for."""
     if source.suffix == ".mcap":
         fail(
-            f"found {source}, expected IN.npz: `skin replay {source} --fast --private --out OUT.mcap` "
+            f"found {source}, expected a file of rows: `skin replay {source} --fast --private --out OUT.mcap` "
             "runs the stages over a recording, and `skin export OUT.mcap --csv` makes a table of its contacts",
             USAGE,
         )
@@ -34,7 +43,7 @@ def _no_recording(source: Path) -> Path:
 
 
 def reconstruct(
-    source: Annotated[Path, typer.Argument(metavar="IN.npz", readable=False, is_eager=True, callback=_no_recording)],
+    source: Annotated[Path, typer.Argument(metavar="IN", readable=False, is_eager=True, callback=_no_recording)],
     target: Annotated[Path, typer.Argument(metavar="OUT.npz")],
     skin: Annotated[str, typer.Option("--skin", metavar="NAME", help="A configured skin, or a bundle.")],
     sequence: Annotated[
@@ -48,26 +57,27 @@ def reconstruct(
         bool,
         typer.Option(help="First fit how the skin is mounted from `untouched`, where the bundle is off (seconds)."),
     ] = True,
+    columns: ColumnsOption = "",
+    pattern: PatternOption = "",
+    untouched: UntouchedOption = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Run the runtime stages over the rows of a file, without sockets.
+    """Run the runtime stages over the rows of a file (npz, npy, mat, csv, each gzipped or not), without sockets.
 
     IN: measurements (n, k), and untouched (m, k) or reference (n, k); or delta (n, k), touched less untouched in any
-    unit. OUT: image (n, 96, 96) float32 conductivity drop
-    [S/m], row 0 at the lowest y; touched, valid, count (n,); position (n, 8, 2) [m], force and force_sigma (n, 8) [N],
-    strongest first, padded with NaN; shape (n, 8).
+    unit. Other forms are read where they can mean one thing only, and the line printed says what was understood. OUT:
+    image (n, 96, 96) float32 conductivity drop [S/m], row 0 at the lowest y; touched, valid, count (n,); position
+    (n, 8, 2) [m], force and force_sigma (n, 8) [N], strongest first, padded with NaN; shape (n, 8); reasons (n,),
+    parted by blanks; check, statistic, limit (n,): what decided; assumed (5, 2): what was taken for known, and what of
+    it.
     """
     import numpy as np
 
-    from services.recordings.npz_file import InputError, read_scans
-    from services.recordings.reconstruction import UNKNOWN_AGE_S, find_skin
+    from services.recordings.reconstruction import find_skin
     from services.recordings.reconstruction import reconstruct as run
 
     found, bundle = find_skin(skin)
-    try:
-        data = read_scans(load_npz(source), bundle)
-    except InputError as error:
-        fail(f"{source}: {error}", USAGE)
+    data = read_rows(source, bundle, columns, pattern, untouched)
     if target.suffix != ".npz":  # numpy would add it and the file would not be where it was asked for
         fail(f"found {target.name}, expected a name ending in .npz", USAGE)
     if not target.parent.is_dir():
@@ -79,7 +89,7 @@ def reconstruct(
         sequence,
         warn=lambda text: print(f"skin: {text}", file=sys.stderr),
         progress=_bar,
-        age_s=UNKNOWN_AGE_S if age is None else age,
+        age_s=age,
         calibrate=calibrate,
     )
     try:
@@ -88,7 +98,13 @@ def reconstruct(
     except OSError as error:
         fail(f"cannot write {target}: {error.strerror}", FAILED)
     result = {"rows": len(out["count"]), "touched": int(out["touched"].sum()), "valid": int(out["valid"].sum())}
-    emit(result) if as_json else print("{rows} rows, {touched} touched, {valid} valid".format(**result))
+    if as_json:
+        refused, noted = counts(out["reasons"], out["valid"])
+        emit(result | {"not_valid": refused, "noted": noted, "assumed": dict(out["assumed"].tolist())})
+        return
+    print("{rows} rows, {touched} touched, {valid} valid".format(**result))
+    for line in verdicts(out["reasons"], out["valid"]):
+        print(line)
 
 
 def _bar(rows):  # type: ignore[no-untyped-def]
@@ -149,6 +165,7 @@ def register_frame(
     if as_json:
         emit(report)
         return
+    say_understood(report["understood"])
     x, y = report["offset_m"]
     seen = "numbered the other way round (seen from behind)" if report["mirrored"] else "numbered as the bundle's"
     print(

@@ -23,6 +23,7 @@ from services.cli.common import (
     skin_name,
     use_configured_sockets,
 )
+from services.cli.rows import ColumnsOption, PatternOption, UntouchedOption, say_understood, told_of
 
 DAYS_S = 1e7  # of a recording, at most
 
@@ -195,17 +196,20 @@ def _bar(contacts: Iterator[ContactFrame], total: int) -> Iterator[ContactFrame]
 
 
 def import_file(
-    source: Annotated[Path, typer.Argument(metavar="FILE.npz", readable=False)],
+    source: Annotated[Path, typer.Argument(metavar="FILE", readable=False)],
     target: Annotated[Path, typer.Argument(metavar="OUT.mcap")],
     skin: Annotated[
         str,
         typer.Option("--skin", help="A configured skin, or a bundle; default: the first of skin.toml.", metavar="NAME"),
     ] = "",
     rate: Annotated[float, typer.Option(min=1e-3, help="Frames per second to give the recording.")] = 10.0,
+    columns: ColumnsOption = "",
+    pattern: PatternOption = "",
+    untouched: UntouchedOption = "",
     overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Turn an npz of measurements into a recording that replays like any other.
+    """Turn a file of measurements (npz, npy, mat, csv) into a recording that replays like any other.
 
     Either measurements (n, k) with untouched (m, k), which then are one scan after the other, or with reference (n, k);
     or presses as published with the hydrogel skin: untouched (n, k), touched (n, k). These and references are separate
@@ -213,7 +217,9 @@ def import_file(
     """
     from services.recordings.importing import import_arrays
 
-    report = import_arrays(load_npz(source), source, target, skin or skin_name(""), rate, overwrite)
+    told = told_of(columns, pattern, untouched)
+    report = import_arrays(load_npz(source), source, target, skin or skin_name(""), rate, overwrite, told)
+    say_understood(report["understood"])
     if as_json:
         emit(report)
     else:

@@ -27,8 +27,9 @@ def up(
     no_board: Annotated[bool, typer.Option("--no-board", help="Stages only: `skin replay` is the board.")] = False,
 ) -> None:
     """Start all processes and keep them alive, in the foreground; Ctrl-C or SIGTERM stops them all."""
-    from protocol.runtime import lock
+    from protocol.runtime import lock, runtime_dir
     from services.bridge import check
+    from services.runtime import room
     from services.runtime.config import load
     from services.runtime.supervision import programs
     from services.runtime.supervision import up as supervise
@@ -39,6 +40,7 @@ def up(
     for name in found.bridges:
         check(name)
     wanted = [p for p in programs(found, record) if not (no_board and p.name in ("acquisition", "stub"))]
+    room.check(len(wanted) + 1, len(found.skins), runtime_dir())
     with lock():  # said before anything else where a service runs here already
         contacts = _addresses(found.transport(), [program.name for program in wanted])
     names, first = ", ".join(found.skins), next(iter(found.skins))

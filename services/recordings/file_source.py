@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,8 +13,11 @@ from numpy.typing import NDArray
 from protocol.frames import FrameError, RawFrame, unpack
 from protocol.pause import pause
 from services.board.source import POLL_S, Source
-from services.recordings.npz_file import InputError, frames_of, load_npz, read_scans
+from services.recordings.npz_file import frames_of, load_npz, read_scans
+from services.rows.order import InputError
 from services.runtime.stage import SEPARATE, valid_for_s
+
+log = logging.getLogger(__name__)
 
 FILE_RATE_HZ = 22.0  # at which frames of a file without times are given
 LONGEST_PAUSE_S = 1.0  # between two recorded frames
@@ -70,6 +74,8 @@ class FileSource(Source):
         except InputError as why:
             text = str(why)
             yield from self._ended(text if self.skin.port in text else f"{self.skin.port}: {text}")
+        if data.understood:
+            log.info("%s: %s read as: %s", self.name, self.skin.port, data.understood)
         for scan, (values, kind) in enumerate(frames_of(data)):
             due += 1 / FILE_RATE_HZ
             yield from _wait_until(due)

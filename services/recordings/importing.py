@@ -13,9 +13,11 @@ from protocol.frames import pack
 from protocol.whole_file import whole_file
 from services.recordings import settings
 from services.recordings.file_source import file_frame
-from services.recordings.npz_file import InputError, frames_of, read_scans
+from services.recordings.npz_file import frames_of, read_scans
 from services.recordings.reconstruction import find_skin
 from services.recordings.recording import RecordingError, RecordingWriter
+from services.rows.columns import NOTHING_SAID, Said
+from services.rows.order import InputError
 from services.runtime.config import SKIN_NAME
 from services.runtime.stage import valid_for_s
 
@@ -29,9 +31,16 @@ class ImportRefused(EitskinError, ValueError):
 
 
 def import_arrays(
-    arrays: Mapping[str, NDArray[Any]], source: Path, target: Path, skin: str, rate_hz: float, overwrite: bool = False
+    arrays: Mapping[str, NDArray[Any]],
+    source: Path,
+    target: Path,
+    skin: str,
+    rate_hz: float,
+    overwrite: bool = False,
+    told: Said = NOTHING_SAID,
 ) -> dict[str, Any]:
-    """Writes `target`; the report's keys: file, frames, measurements, seconds. Raises ImportRefused, RecordingError.
+    """Writes `target`; the report's keys: file, frames, measurements, seconds, understood. Raises ImportRefused,
+    RecordingError.
 
     A file with `touched` and `untouched` of equal shape holds presses: each gets its untouched frame just before it,
     and none follows another in time.
@@ -41,7 +50,7 @@ def import_arrays(
     configured, bundle = find_skin(skin)
     skin = skin if SKIN_NAME.fullmatch(skin) else bundle.name  # a bundle given by its path
     try:
-        data = read_scans(arrays, bundle)
+        data = read_scans(arrays, bundle, told)
     except InputError as error:
         raise ImportRefused(f"{source}: {error}") from None
     if not SKIN_NAME.fullmatch(configured.frame_id):
@@ -65,4 +74,5 @@ def import_arrays(
         writer.close()
         if writer.why:
             raise RecordingError(f"cannot write {target}: {writer.why}")
-    return {"file": str(target), "frames": count, "measurements": len(bundle.pattern), "seconds": count / rate_hz}
+    report = {"file": str(target), "frames": count, "measurements": len(bundle.pattern), "seconds": count / rate_hz}
+    return report | {"understood": data.understood}

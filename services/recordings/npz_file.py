@@ -1,23 +1,25 @@
-"""Files of measurements (npz). Only this module reads and checks them. It says in which order their rows are frames,
-and whether these follow each other in time.
+"""Files of measurements, checked: in which order their rows are frames, and whether these follow each other in time.
+
+services/rows/ says which of their arrays and columns are what.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models import npz
 from models.bundle import Bundle
 from models.files import FileError
-from protocol.errors import EitskinError
 from services.estimation.first.references import alike
+from services.rows.columns import NOTHING_SAID, Said, read_columns
+from services.rows.files import read_arrays
+from services.rows.order import ORDERS, InputError
 
 Array = NDArray[np.float64]
 
@@ -25,14 +27,11 @@ LEAST = 1e-60
 """|Z| below this is no measurement, in whatever unit."""
 DELTA_LEVEL = 0.02
 """Root mean square of the relative changes that differences in unknown units are taken for."""
+UNIT_UNKNOWN = "not said: `delta` is taken as large as touches usually are, so no force is given"
 TARE_ROWS = 64
 """Rows of `reference` that come first as frames, from which the noise is found: those most alike, in whatever order the
 rows stand.
 """
-
-
-class InputError(EitskinError, ValueError):
-    """The file's arrays are not what is needed; says which, what was found and what is expected."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +41,8 @@ class Input:
     measurements: NDArray[Any]  # (N, K) real or complex
     untouched: Array | None  # (M, K) |Z|
     reference: Array | None  # (N, K) |Z|
+    understood: str = ""  # what of the file is not as documented, and was read all the same
+    unit: str = "any: only ratios to the untouched values count"
 
     @property
     def separate(self) -> bool:
@@ -50,26 +51,57 @@ class Input:
 
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an npz file. Raises InputError where it is none, is damaged, too large, or holds objects."""
+    """All arrays of a file. Raises InputError where it is damaged, too large, holds objects, or is of no known kind."""
     try:
-        return npz.read_npz(path)
+        return read_arrays(path)
     except FileError as why:
         raise InputError(str(why)) from None
 
 
-def read_scans(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Input:
-    """The same as `read_input`, with columns in the order of the bundle's measurements. It also reads files of presses
-    (`touched` and `untouched`, a row of each for a press). Raises InputError.
+def said(columns: str, pattern: str, untouched: str) -> Said:
+    """What the options of these names say. Raises InputError."""
+    order: str | NDArray[Any] = pattern
+    if pattern and pattern not in ORDERS:
+        if not Path(pattern).exists():
+            raise InputError(f"--pattern: found {pattern!r}, expected a file, or one of {', '.join(ORDERS)}")
+        order = _one_of(Path(pattern), ("pattern", "measurements"))
+    if not untouched or untouched.isdecimal():
+        return Said(columns, order, int(untouched[:9] or 0))
+    return Said(columns, order, _one_of(Path(untouched), ("untouched", "measurements", "reference")))
+
+
+def _one_of(path: Path, names: tuple[str, ...]) -> NDArray[Any]:
+    """The first of these arrays that a file has, or its only one."""
+    arrays = load_npz(path)
+    name = next((name for name in names if name in arrays), None if len(arrays) > 1 else next(iter(arrays)))
+    if name is None:
+        raise InputError(f"{path}: expected an array `{names[0]}`, found {_found(arrays)}")
+    return arrays[name]
+
+
+def read_scans(arrays: Mapping[str, NDArray[Any]], bundle: Bundle, said: Said = NOTHING_SAID) -> Input:
+    """The same as `read_input`, of files in other forms too (services/rows/columns.py), in the order of the bundle's
+    measurements. It also reads files of presses (`touched` and `untouched`, a row of each for a press). Raises
+    InputError.
     """
-    order = measurement_order(arrays, bundle)
+    arrays, understood = read_columns(arrays, bundle, said)
+    unit = Input.unit
     if "delta" in arrays and "touched" not in arrays and "measurements" not in arrays:
-        arrays = {**arrays, **_beside_one(arrays, bundle)}
+        beside, unit = _beside_one(arrays, bundle)
+        arrays = {**arrays, **beside}
     if "touched" in arrays and "measurements" not in arrays:
-        own = {"reference": arrays["untouched"]} if "untouched" in arrays else {}
-        arrays = {"measurements": arrays["touched"], **own}
-    data = read_input(arrays, len(bundle.pattern))
-    untouched, reference = (None if a is None else a[:, order] for a in (data.untouched, data.reference))
-    return Input(data.measurements[:, order], untouched, reference)
+        arrays, more = _of_presses(arrays)
+        understood = "; ".join(filter(None, (understood, more)))
+    return replace(read_input(arrays, len(bundle.pattern)), understood=understood, unit=unit)
+
+
+def _of_presses(arrays: Mapping[str, NDArray[Any]]) -> tuple[dict[str, NDArray[Any]], str]:
+    rows = {"measurements": arrays["touched"]}
+    if "untouched" not in arrays:
+        return rows, ""
+    if len(arrays["untouched"]) == len(arrays["touched"]):
+        return rows | {"reference": arrays["untouched"]}, ""
+    return rows | {"untouched": arrays["untouched"]}, "`untouched` has no row for each of `touched`: all are of before"
 
 
 def read_input(arrays: Mapping[str, NDArray[Any]], k: int) -> Input:
@@ -80,6 +112,7 @@ def read_input(arrays: Mapping[str, NDArray[Any]], k: int) -> Input:
         both = "both" if "untouched" in arrays else "neither"
         raise InputError(
             f"expected either `untouched` (m, {k}) or `reference` (n, {k}), found {both}; arrays: {_found(arrays)}"
+            + ("" if both == "both" else "; --untouched says which rows, or which file, they are")
         )
     measurements = _matrix(arrays, "measurements", k)
     if "untouched" in arrays:
@@ -92,24 +125,23 @@ def read_input(arrays: Mapping[str, NDArray[Any]], k: int) -> Input:
     return Input(measurements, None, reference)
 
 
-def _beside_one(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> dict[str, NDArray[Any]]:
+def _beside_one(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> tuple[dict[str, NDArray[Any]], str]:
     """Measurements and their references of a file that has differences alone: in the unit that the skin was registered
     in, else so that they are as large as touches are. Every reference is the same, which says nothing of noise.
     """
     k = len(bundle.pattern)
     delta = _matrix(arrays, "delta", k)
+    if delta.dtype.kind == "c":
+        raise InputError("`delta` is complex, expected differences of amplitudes: give `measurements` with `untouched`")
+    if more := {"untouched", "reference"} & arrays.keys():
+        raise InputError(f"`delta` stands alone, found `{min(more)}` beside it: give `measurements` instead of `delta`")
     known = bundle.manifest.get("registration", {})
-    unit = known.get("delta_unit") if known.get("from_delta") else None
-    unit = delta_unit(delta, known.get("typical_difference", DELTA_LEVEL)) if unit is None else float(unit)
-    untouched = np.ones(k) if bundle.matrices.normalisation == "measured" else _in_file_order(bundle, arrays)
-    changed = np.maximum(untouched + delta * unit * untouched.mean(), 1e-3 * untouched)
-    return {"measurements": changed, "reference": np.broadcast_to(untouched, delta.shape).copy()}
-
-
-def _in_file_order(bundle: Bundle, arrays: Mapping[str, NDArray[Any]]) -> Array:
-    z0 = np.zeros(len(bundle.z0))
-    z0[measurement_order(arrays, bundle)] = bundle.z0
-    return z0
+    unit, said = known.get("delta_unit") if known.get("from_delta") else None, "as the skin was registered"
+    if unit is None:
+        unit, said = delta_unit(delta, known.get("typical_difference", DELTA_LEVEL)), UNIT_UNKNOWN
+    untouched = np.ones(k) if bundle.matrices.normalisation == "measured" else bundle.z0
+    changed = np.maximum(untouched + delta * float(unit) * untouched.mean(), 1e-3 * untouched)
+    return {"measurements": changed, "reference": np.broadcast_to(untouched, delta.shape).copy()}, said
 
 
 def delta_unit(delta: NDArray[Any], level: float = DELTA_LEVEL) -> float:
@@ -137,33 +169,6 @@ def frames_of(data: Input) -> Iterator[tuple[NDArray[Any], str]]:
         for before, row in zip(data.reference, data.measurements, strict=True):
             yield before, "reference"
             yield row, "full"
-
-
-def measurement_order(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> NDArray[np.intp]:
-    """The file's column of each measurement of the bundle. Raises InputError where one is not there."""
-    if "pattern" not in arrays:
-        return np.arange(len(bundle.pattern))
-    theirs = arrays["pattern"]
-    if theirs.ndim != 2 or theirs.shape[1] != 4 or theirs.dtype.kind not in "iu":
-        raise InputError(
-            f"`pattern` is {theirs.dtype} of shape {theirs.shape}, "
-            "expected integers (k, 4): drive+, drive-, sense+, sense-"
-        )
-    places = {_key(row): at for at, row in reversed(list(enumerate(theirs.tolist())))}
-    missing = [row for row in bundle.pattern.tolist() if _key(row) not in places]
-    if missing or len(theirs) != len(bundle.pattern):
-        detail = f", and lacks {missing[0]}" if missing else ""
-        raise InputError(
-            f"`pattern` has {len(theirs)} rows{detail}; the skin's bundle {bundle.name} measures "
-            f"{len(bundle.pattern)} ({bundle.skin.get('pattern', 'custom')}): choose the skin that was measured"
-        )
-    return np.array([places[_key(row)] for row in bundle.pattern.tolist()])
-
-
-def _key(row: list[int]) -> tuple[int, int, frozenset[int]]:
-    """An amplitude has no sign, so the sense pair may be either way round. The drive pair may not: on a real board the
-    two ways are two measurements."""
-    return row[0], row[1], frozenset(row[2:])
 
 
 def _amplitudes(arrays: Mapping[str, NDArray[Any]], name: str, k: int) -> Array:

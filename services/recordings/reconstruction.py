@@ -15,9 +15,10 @@ from models.prereconstruction import PreReconstructor, noise_of_frames
 from protocol.frames import RawFrame
 from services.estimation.first.baseline import Baseline, NoBaseline, take
 from services.estimation.values import numbers
+from services.estimation.values.judgement import Judgement, Verdict
 from services.mounting import MountingFit, needs_fit
 from services.pipeline import ALL, Pipeline, Result
-from services.recordings.npz_file import Input, frames_of
+from services.recordings.npz_file import TARE_ROWS, UNIT_UNKNOWN, Input, frames_of
 from services.runtime.config import ConfigError, Skin, load
 from services.runtime.stage import SEPARATE
 
@@ -30,6 +31,11 @@ ROW_NS = 45_000_000
 UNKNOWN_AGE_S = 300.0
 """Between the untouched rows of a file and its measurements, where nobody says: all the drift that is allowed for."""
 FEWEST_FOR_TARE = 16
+JOIN = " "  # of a row's reasons
+MOST_REASONS = 120  # characters
+AGE_OF_REFERENCE = "none: each row has its own `reference`"
+IN_ORDER = "in the skin's own order"
+UNSAID = {SEPARATE, "replay"}  # reasons of every row of a file
 
 
 def find_skin(name: str) -> tuple[Skin, Bundle]:
@@ -98,12 +104,13 @@ def reconstruct(
     sequence: bool = False,
     warn: Callable[[str], None] = lambda text: None,
     progress: Callable[[Iterable[int]], Iterable[int]] = lambda rows: rows,
-    age_s: float = UNKNOWN_AGE_S,
+    age_s: float | None = None,
     calibrate: bool = False,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of OUT.npz: see `skin reconstruct --help`. Rows are independent unless `sequence`.
 
-    age_s: of the untouched rows when the measurements, or the first of a sequence, were taken. A reference has none.
+    age_s: of the untouched rows when the measurements, or the first of a sequence, were taken; None: UNKNOWN_AGE_S. A
+    reference has none.
     calibrate: fit first how the skin is mounted, from the untouched rows, where the bundle does not predict them as it
     is (seconds).
 
@@ -121,7 +128,7 @@ def _reconstruct(
     sequence: bool,
     warn: Callable[[str], None],
     progress: Callable[[Iterable[int]], Iterable[int]],
-    age_s: float,
+    age_s: float | None,
     calibrate: bool,
 ) -> dict[str, NDArray[Any]]:
     if calibrate and data.untouched is not None:
@@ -132,16 +139,54 @@ def _reconstruct(
     rows = progress(range(len(data.measurements)))
     if data.untouched is None:
         _beside_references(data, pipeline, sequence, rows, out, warn)
-        return out
+        return _with_assumed(out, data, _noise_of_references(data, pipeline), AGE_OF_REFERENCE, "")
     baseline = baseline_of(data.untouched, pipeline.pre.pre, warn)
+    age = f"{age_s:g} s, as told" if age_s is not None else f"not said: up to {UNKNOWN_AGE_S:g} s of drift allowed for"
     for row in rows:
         if not sequence:
             pipeline.reset()
         if not sequence or row == 0:
             fresh = Baseline(**{**baseline.to_dict(), "z0": baseline.z0.copy()})
-            pipeline.pre.set_baseline(fresh, age_s=age_s)
+            pipeline.pre.set_baseline(fresh, age_s=UNKNOWN_AGE_S if age_s is None else age_s)
         _store(out, row, pipeline.run(raw_frame(data.measurements[row], row if sequence else 0)))
-    return out
+    noise = _noise(baseline.sigma, baseline.z0, baseline.frames, "`untouched`")
+    return _with_assumed(out, data, noise, age, _left_out(data.untouched, baseline))
+
+
+def _with_assumed(
+    out: dict[str, NDArray[Any]], data: Input, noise: str, age: str, left_out: str
+) -> dict[str, NDArray[Any]]:
+    """The arrays with what was assumed, as `assumed` (5, 2): of what, and what of it."""
+    if data.unit == UNIT_UNKNOWN:
+        out["force"][:], out["force_sigma"][:] = np.nan, np.nan
+        for row in np.flatnonzero(out["count"]):
+            others = [each for each in str(out["reasons"][row]).split() if each != "extrapolated"]  # a force of no unit
+            out["reasons"][row] = JOIN.join([*others, "uncalibrated_force"])
+    said = {"noise": noise, "age": age, "unit": data.unit, "columns": data.understood or IN_ORDER}
+    return out | {"assumed": np.array([*(said | {"left out": left_out or "nothing"}).items()])}
+
+
+def _noise(sigma: Array, z0: Array, rows: int, of: str) -> str:
+    known = np.isfinite(sigma) & (z0 > 0)
+    share = float(np.median(sigma[known] / z0[known])) if known.any() else np.nan
+    if share == numbers.TARE_ASSUMED:
+        return f"{share:.2g} of each measurement, assumed: {of} {'has one row' if rows == 1 else 'says nothing of it'}"
+    return f"{share:.2g} of each measurement, from {rows} rows of {of}"
+
+
+def _noise_of_references(data: Input, pipeline: Pipeline) -> str:
+    found = pipeline.pre.references.noise
+    if found is None or data.reference is None:
+        return "not known: no `reference` could be used"
+    return _noise(found, np.ones(len(found)), min(len(data.reference), TARE_ROWS), "`reference`")
+
+
+def _left_out(untouched: Array, baseline: Baseline) -> str:
+    """Rows and columns of `untouched` that do not count."""
+    rows, columns = len(untouched) - baseline.frames, int((~np.isfinite(baseline.sigma)).sum())
+    said = [f"{rows} of {len(untouched)} rows of `untouched`, which equal the first"] if rows else []
+    said += [f"{columns} of {untouched.shape[1]} measurements, which `untouched` does not give"] if columns else []
+    return "; ".join(said)
 
 
 def _beside_references(
@@ -192,6 +237,10 @@ def _empty(n: int) -> dict[str, NDArray[Any]]:
         "force": np.full((n, MOST_CONTACTS), np.nan),
         "force_sigma": np.full((n, MOST_CONTACTS), np.nan),
         "shape": np.full((n, MOST_CONTACTS), "", "<U12"),
+        "reasons": np.full(n, "", f"<U{MOST_REASONS}"),
+        "check": np.full(n, "", "<U16"),
+        "statistic": np.full(n, np.nan),
+        "limit": np.full(n, np.nan),
     }
 
 
@@ -200,6 +249,9 @@ def _store(out: dict[str, NDArray[Any]], row: int, result: Result) -> None:
     if image.size:
         out["image"][row] = np.nan_to_num(resampled(image, IMAGE_SIZE), posinf=0.0, neginf=0.0)
     contacts = [c for c in result.contact.contacts if c.state != "end"]
+    out["reasons"][row] = JOIN.join(reason for reason in result.contact.reasons if reason not in UNSAID)
+    if (found := _decided(result)) is not None:
+        out["check"][row], out["statistic"][row], out["limit"][row] = found.name, found.statistic, found.expected
     out["touched"][row] = result.delta.touched
     out["valid"][row] = result.contact.valid
     out["count"][row] = len(contacts)
@@ -208,6 +260,16 @@ def _store(out: dict[str, NDArray[Any]], row: int, result: Result) -> None:
         out["force"][row, place] = np.nan if contact.force_n is None else contact.force_n
         out["force_sigma"][row, place] = np.nan if contact.force_sigma_n is None else contact.force_sigma_n
         out["shape"][row, place] = contact.shape
+
+
+def _decided(result: Result) -> Judgement | None:
+    """What a row's verdict stands on: of a valid one whether something touches, else what is furthest beyond its limit;
+    None where its image or its contacts, which are made after all judgements, made it invalid.
+    """
+    refused = [each for each in result.judgements if each.verdict is Verdict.REFUSE]
+    if refused:
+        return max(refused, key=lambda each: each.ratio)
+    return next((each for each in result.judgements if each.name == "touch" and result.contact.valid), None)
 
 
 def resampled(image: NDArray[np.float32], n: int) -> NDArray[np.float32]:

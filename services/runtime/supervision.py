@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import shlex
 import signal
 import sys
 import time
@@ -104,10 +105,11 @@ def up(config: ConfigFile, extra: Sequence[Program] = (), wanted: Sequence[Progr
         running = list(programs(config) if wanted is None else wanted) + list(extra)
         _link(runtime / CONFIG_LINK, config.path.resolve())
         file = runtime / "supervisord.conf"
-        file.write_text(_settings(runtime, config, running), encoding="utf-8")
+        file.write_text(_settings(running), encoding="utf-8")
         options = ServerOptions()
         options.first, options.test = True, False
         options.realize(["-c", str(file), "-n"])
+        _complete(options, runtime, config, running)
         ctypes.CDLL(None)  # loaded before any fork
         try:
             _Service(options).main()
@@ -176,35 +178,25 @@ class _Stage(Subprocess):  # type: ignore[misc]
         super()._spawn_as_child(filename, argv)
 
 
-def _settings(runtime: Path, config: ConfigFile, running: Sequence[Program]) -> str:
-    """supervisord's configuration file."""
-    environment = {
-        "EITSKIN_RUNTIME": str(runtime),
-        "EITSKIN_CONFIG": str(config.path.resolve()),
-        "PYTHONUNBUFFERED": "1",
-    }
+def _settings(running: Sequence[Program]) -> str:
+    """supervisord's configuration file. No path stands in it: its syntax does not know all of them, see `_complete`."""
     lines = [
         "[supervisord]",
         "nodaemon=true",
         "logfile=/dev/null",
         "logfile_maxbytes=0",
         "loglevel=warn",
-        f"pidfile={_quoted(str(runtime / 'supervisord.pid'))}",
-        f"childlogdir={_quoted(str(runtime))}",
+        "childlogdir=/",
         "nocleanup=true",
-        "minfds=256",
-        "minprocs=32",
+        "minfds=0",  # services/runtime/room.py has looked
+        "minprocs=0",
     ]
     if os.getuid() == 0:
         lines.append("user=root")  # says that running as root is meant
     for program in running:
-        command = [sys.executable, "-m", program.module, *program.arguments]
-        variables = environment | program.environment
         lines += [
             f"[program:{program.name}]",
-            "command=" + " ".join(f'"{_quoted(part)}"' for part in command),
-            f"directory={_quoted(str(ROOT))}",
-            "environment=" + ",".join(f'{key}="{_quoted(value)}"' for key, value in variables.items()),
+            "command=completed",
             f"startsecs={HEALTHY_S}",
             "startretries=1000000000",
             "autorestart=true",
@@ -217,5 +209,17 @@ def _settings(runtime: Path, config: ConfigFile, running: Sequence[Program]) -> 
     return "\n".join(lines) + "\n"
 
 
-def _quoted(text: str) -> str:
-    return text.replace("%", "%%")
+def _complete(options: Any, runtime: Path, config: ConfigFile, running: Sequence[Program]) -> None:
+    """Gives supervisord's options what has a path in it."""
+    options.pidfile = str(runtime / "supervisord.pid")
+    environment = {
+        "EITSKIN_RUNTIME": str(runtime),
+        "EITSKIN_CONFIG": str(config.path.resolve()),
+        "PYTHONUNBUFFERED": "1",
+    }
+    by_name = {program.name: program for program in running}
+    for process in (each for group in options.process_group_configs for each in group.process_configs):
+        program = by_name[process.name]
+        process.command = shlex.join([sys.executable, "-m", program.module, *program.arguments])
+        process.environment = environment | program.environment
+        process.directory = str(ROOT)

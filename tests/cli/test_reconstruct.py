@@ -45,9 +45,12 @@ def fresh(noisy):
 def test_keys_shapes_and_types(out) -> None:
     numbers = {"image": ("<f4", (96, 96)), "touched": ("|b1", ()), "valid": ("|b1", ()), "count": ("<i8", ())}
     numbers |= {"position": ("<f8", (8, 2)), "shape": ("<U12", (8,))}
-    numbers |= {"force": ("<f8", (8,)), "force_sigma": ("<f8", (8,))}
-    assert {name: (a.dtype.str, a.shape[1:]) for name, a in out.items()} == numbers
-    assert {len(a) for a in out.values()} == {19} and np.isfinite(out["image"]).all()
+    numbers |= {"force": ("<f8", (8,)), "force_sigma": ("<f8", (8,)), "statistic": ("<f8", ()), "limit": ("<f8", ())}
+    numbers |= {"reasons": ("<U120", ()), "check": ("<U16", ())}
+    rows = {name: a for name, a in out.items() if name != "assumed"}
+    assert {name: (a.dtype.str, a.shape[1:]) for name, a in rows.items()} == numbers
+    assert {len(a) for a in rows.values()} == {19} and np.isfinite(out["image"]).all()
+    assert [*dict(out["assumed"])] == ["noise", "age", "unit", "columns", "left out"]
 
 
 def test_touches_are_seen_and_nothing_else(scenes, out, fresh) -> None:
@@ -78,7 +81,7 @@ def test_a_row_does_not_depend_on_the_others_unless_they_are_a_sequence(noisy, o
     """The baseline follows slow drift in a sequence, and only there."""
     rows = [4, 0, 11]
     alone = reconstructed({"measurements": noisy["measurements"][rows], "untouched": noisy["untouched"]})
-    for name in out:
+    for name in out.keys() - {"assumed"}:
         assert np.array_equal(alone[name], out[name][rows], equal_nan=out[name].dtype.kind == "f"), name
     drift = 1 + 2e-3 * np.linspace(0, 1, 30)[:, None]
     noise = 3e-4 * np.random.default_rng(2).standard_normal((30, 120))

@@ -1,14 +1,20 @@
 """Requests that cannot be met: one line that says what was found or expected, the exit status, and nothing made."""
 
+import errno
+import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import zmq
 
 from firmware_stub.rig import Rig
 from protocol.runtime import CONFIG_LINK
 from services.cli import board
-from services.cli.common import CliError
+from services.cli.common import ROOT, CliError
+from services.runtime import room
 
 K = 120
 STUB = '[skins.palm]\nport = "stub"\nbundle = "square16"\n'
@@ -97,14 +103,14 @@ REGISTER = "register in.npz --skin disc16 --out out"
 @pytest.mark.parametrize(
     ("command", "arrays", "says"),
     [
-        (RECONSTRUCT, {"voltages": np.ones((2, K))}, "no array `measurements`"),
+        (RECONSTRUCT, {"pressures": np.ones((2, K))}, "no array `measurements`"),
         (RECONSTRUCT, ROWS, "found neither"),
         (RECONSTRUCT, {**GOOD, "reference": np.ones((2, K))}, "found both"),
         (RECONSTRUCT, {**GOOD, "measurements": np.ones((2, 119))}, "expected numbers of shape (n, 120)"),
         (RECONSTRUCT, {**ROWS, "reference": np.ones((3, K))}, "expected one each"),
         (RECONSTRUCT, {**ROWS, "untouched": np.zeros((8, K))}, "in 0 of 120 columns, expected at least 60"),
         (RECONSTRUCT, {**ROWS, "untouched": [[np.nan] * 100 + [1.0] * 20] * 8}, "in 20 of 120 columns"),
-        (REGISTER, PRESSES | {"touched": np.array(3.0)}, "touched ()"),
+        (REGISTER, PRESSES | {"touched": np.array(3.0)}, "`touched` is float64 of shape ()"),
         ("import in.npz out --skin disc16", OTHER_PATTERN, "`pattern` has 192 rows, and lacks"),
     ],
 )
@@ -129,6 +135,26 @@ def test_values_out_of_range_cost_their_row_and_a_bundle_needs_no_configuration(
     assert ran.code == 0 and "Warning" not in ran.err, ran.err
     with np.load(folder / "out.npz") as out:
         assert not out["valid"][:2].any() and np.isfinite(out["image"]).all()
+
+
+LIMITS = {"-n 64": "of 64 open files, needed 112", "-v 300000": "of 292 MB of memory, needed 500 MB"}
+
+
+@pytest.mark.live
+@pytest.mark.parametrize(("limit", "says"), LIMITS.items())
+def test_little_room_is_said_before_anything_starts(folder: Path, runtime: Path, limit: str, says: str) -> None:
+    (folder / "mine.toml").write_text(STUB)
+    words = [sys.executable, ROOT / "skin", "up", "--config", "mine.toml"]
+    ran = subprocess.run(["bash", "-c", f'ulimit {limit}; exec "$@"', "", *words], capture_output=True, text=True)
+    assert ran.returncode == 1 and says in ran.stderr and len(ran.stderr.splitlines()) == 1, ran.stderr
+    assert f"ulimit {limit[:2]}" in ran.stderr and not ran.stdout
+
+
+def test_a_full_disk_and_other_lacks_are_said(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(room.os, "statvfs", lambda folder: SimpleNamespace(f_bavail=1, f_frsize=4096))
+    assert [f"{tmp_path} has 4096 bytes free" in each for each in room.lacking(1, 1, tmp_path)] == [True]
+    full, many = room.sentence(OSError(errno.ENOSPC, "", "a.npz")), room.sentence(zmq.ZMQError(errno.EMFILE))
+    assert full.startswith("a.npz: no room on the disk") and "ulimit -n" in many and not room.sentence(ValueError())
 
 
 TOUCHED, EARLY = "the skin is touched: free it and try again", "only 60 of 64 untouched frames: wait and try again"

@@ -60,7 +60,7 @@ def test_every_raw_frame_gives_one_frame_of_each_kind_and_the_same_frames_the_sa
     for always in (False, True):
         pipeline = Pipeline(skin, name="palm", always_reconstruct=always)
         results = [pipeline.run(frame) for frame in frames]
-        assert all([f.scan for f in result] == [raw.scan] * 3 for result, raw in zip(results, frames, strict=True))
+        assert all([f.scan for f in result[:3]] == [raw.scan] * 3 for result, raw in zip(results, frames, strict=True))
         assert list(results[-1].contact.stamps) == ["sample", "read", "preprocess", "infer", "publish"]
         assert results[71].image.image.size == always * 96 * 96 and not results[71].contact.contacts
         runs.append([[(c.position, c.force_n, c.id) for c in result.contact.contacts] for result in results])
