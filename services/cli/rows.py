@@ -46,7 +46,7 @@ DO = {
     "gain": "the amplification changed after `untouched`: give a `reference` (n, k), one for each row",
     "electrode_drift": "give `untouched` of just before, or a `reference` (n, k), one for each row",
     "uncalibrated_force": "give `measurements` with `untouched` for forces, not `delta`",
-    "changing": "nothing: the place is rougher than usual",
+    "changing": "nothing where it is valid, the place is only rougher; else give more rows of `untouched`",
     "extrapolated": "nothing: the force is a lower bound",
 }
 """About rows of a file, for which there is no board to look at and no tare."""

@@ -555,7 +555,8 @@ class Estimator:
         if measured.whole:
             self.taring.saw(bool(said) or z2 >= n.FALSE_ALARM_Z2)
         judgements.append(judge("touch", max([z2, *(touch.z2 for touch in said)]), n.FALSE_ALARM_Z2))
-        judgements.append(judge("changing", changing, 1.0))
+        alone = measured.scan.separate and not said  # no further row tells whether anything touches
+        judgements.append(judge("changing", changing, 1.0, turned=Verdict.REFUSE if alone else None))
         told = judge("explained", self.now.unexplained_s, n.CHANGING_S)
         judgements.append(told if self._tables.predicted else told._replace(verdict=Verdict.CANNOT))
         electrodes = np.zeros(self._tables.electrodes, np.uint8) if self.skin is None else self.skin.faults.states()

@@ -177,6 +177,7 @@ def test_rows_of_a_skin_that_drifted_since_its_untouched_ones(skin, bundle, back
     out = reconstruct(Input(rows, untouched, None), skin, bundle)
     fresh = reconstruct(Input(rows[:1], untouched, None), skin, bundle, age_s=0.0)
     assert bool(fresh["touched"][0]) == (background < 1), "who says that no time has passed is believed"
+    assert fresh["touched"][0] or not fresh["valid"][0], "never valid and empty where something may touch"
     assert out["valid"].all() and out["count"].tolist() == [0, 1, 1, 1]
     for k, touch in enumerate(TOUCHES):
         assert out["position"][k + 1, 0] == pytest.approx([METRES * touch.x, METRES * touch.y], abs=0.003)
