@@ -20,10 +20,26 @@ CMD ["python", "-m", "services.publisher"]
 
 # The same with what a bridge needs: `target` in docker-compose.yml.
 FROM service AS bridge
-ARG BRIDGE=ros2
+ARG BRIDGE=foxglove
 USER 0:0
 COPY requirements/${BRIDGE}.lock /tmp/bridge.lock
 RUN pip install --no-cache-dir --disable-pip-version-check --require-hashes -r /tmp/bridge.lock && rm /tmp/bridge.lock
 USER 1000:1000
+# A ROS node for each skin, with ROS 2 from PyPI's wheels; where a robot's own ROS runs it, no image of ours is needed.
+FROM python:3.11-slim AS ros2-built
+RUN apt-get update && apt-get install -y --no-install-recommends g++ make python3-dev
+WORKDIR /opt/eitskin
+COPY Makefile pyproject.toml README.md LICENSE ./
+COPY protocol protocol
+COPY bridges/ros2 bridges/ros2
+COPY tests/bridges/tf2_msgs tests/bridges/tf2_msgs
+RUN make ros-venv PYTHON=python
+
+FROM python:3.11-slim AS ros2
+COPY --from=ros2-built /opt/eitskin/.venv-ros /opt/eitskin/.venv-ros
+ENV PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1 EITSKIN_RUNTIME=/run/eitskin ROS_LOG_DIR=/tmp HOME=/tmp
+USER 1000:1000
+CMD ["/opt/eitskin/.venv-ros/lib/eitskin_ros/skin"]
+
 # What is built where no stage is named.
 FROM service

@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SKIN ?= square16
 # What else `make venv`, `make venv-dev` and `make test` install, as in EXTRAS=ros2,train: the extras of pyproject.toml.
-#   ros2, foxglove   what a bridge needs          offline   making a skin from a drawing or from presses
+#   foxglove, ros2   what that bridge, export needs  offline   making a skin from a drawing or from presses
 #   plots            matplotlib: pictures         train     the same, plots and PyTorch: several GB from PyPI
 #   peers            the same but PyTorch, and the other programs that benchmarks compare with
 #   docs             `make site`, which asks for it itself
@@ -53,14 +53,34 @@ $(VENV)/.dev: requirements/dev.lock | $(BIN)/python
 	$(LOCKED) $<
 	@touch $@ $(VENV)/.service
 
-# ROS 2 itself, as wheels, in an environment of its own: what tests/bridges/test_ros2_node.py listens with. 270 MB.
+# ROS 2 without a ROS installation: PyPI's wheels of it, and bridges/ros2 built with them by colcon, all in an environment
+# of its own. From Debian: g++, make, and Python's headers where Python is Debian's (python3-dev). 400 MB, one to three minutes.
 ROS ?= kilted
-ROS_VENV := .venv-ros$(if $(filter-out kilted,$(ROS)),-$(ROS))
-ROS_PACKAGES := rclpy rmw-fastrtps-cpp geometry-msgs sensor-msgs diagnostic-msgs visualization-msgs std-msgs std-srvs
+ROS_VENV := $(CURDIR)/.venv-ros$(if $(filter-out kilted,$(ROS)),-$(ROS))
+ROS_PACKAGES := rclpy rmw-fastrtps-cpp std-msgs geometry-msgs sensor-msgs diagnostic-msgs visualization-msgs std-srvs \
+  ament-cmake rosidl-default-generators rosidl-default-runtime
+# What these do not say that they need
+ROS_PACKAGES += ament-package ament-cmake-include-directories rosidl-core-generators rosidl-generator-py \
+  $(if $(filter jazzy,$(ROS)),ament-cmake-ros ament-cmake-gmock ament-cmake-gtest ament-cmake-pytest \
+  python-cmake-module fastrtps-cmake-module,ament-cmake-ros-core)
+COLCON := "setuptools<80" catkin-pkg $(patsubst %,colcon-%,core ros cmake recursive-crawl library-path)
 ros-venv: $(ROS_VENV)/.done
-$(ROS_VENV)/.done:
+$(ROS_VENV)/.wheels: Makefile
 	$(PYTHON) -m venv $(ROS_VENV)
-	$(ROS_VENV)/bin/python -m pip install --disable-pip-version-check numpy $(ROS_PACKAGES:%=ros-$(ROS)-%)
+	$(ROS_VENV)/bin/python -m pip install --disable-pip-version-check -q numpy $(COLCON) $(if $(shell command -v cmake),,cmake) \
+	  $(ROS_PACKAGES:%=ros-$(ROS)-%)
+	@touch $@
+# The headers of Python and numpy are where the wheels' build machine had them, in their cmake files: here they are.
+$(ROS_VENV)/.done: $(ROS_VENV)/.wheels $(shell find bridges/ros2 protocol tests/bridges/tf2_msgs -type f -not -name '*.pyc')
+	cd $(ROS_VENV) && include=$$(bin/python -c 'import sysconfig; print(sysconfig.get_path("include"))') && \
+	  numpy=$$(bin/python -c 'import numpy; print(numpy.get_include())') && \
+	  { grep -rlE '/opt/(_internal|python)/' share --include='*.cmake' || true; } | xargs -r sed -i -E \
+	  "s#/opt/(_internal|python)/[^\";]*/numpy/[^\";]*include#$$numpy#g; s#/opt/(_internal|python)/[^\";]*/include/python3[.0-9]+#$$include#g"
+	$(ROS_VENV)/bin/python -m pip install --disable-pip-version-check -q .
+	env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u PYTHONPATH -u LD_LIBRARY_PATH PATH="$(ROS_VENV)/bin:$$PATH" \
+	  AMENT_PREFIX_PATH=$(ROS_VENV) CMAKE_PREFIX_PATH=$(ROS_VENV) colcon --log-base build/ros-$(ROS)/log build --merge-install \
+	  --executor sequential --base-paths bridges/ros2 tests/bridges/tf2_msgs --build-base build/ros-$(ROS) \
+	  --install-base $(ROS_VENV) --cmake-args -DPython3_EXECUTABLE=$(ROS_VENV)/bin/python
 	@touch $@
 
 # First what is deterministic, on all cores, then what is live (processes, sockets, the real clock), one at a time. Only a

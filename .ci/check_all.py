@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 REPORT = ROOT / "build" / "check-all.json"
 PYTHON = ".venv/bin/python"
 PYTEST = f"{PYTHON} -m pytest"
-PACKAGES = "g++ libc6-dev cppzmq-dev libmsgpack-cxx-dev chromium fonts-dejavu-core iptables"
+PACKAGES = "g++ make libc6-dev python3-dev cppzmq-dev libmsgpack-cxx-dev chromium fonts-dejavu-core iptables"
 REQUIRED = ("REFERENCE", "BROWSER", "TRAIN", "PLOTS", "CPP", "ROS")  # tests/needs.py
 
 
@@ -67,13 +67,13 @@ STEPS = (
     ),
     Step(
         "ros",
-        "the ROS bridge heard by rclpy of two distributions",
+        "bridges/ros2 built by two distributions of ROS 2, each node heard by a stranger",
         f"make ros-venv; make ros-venv ROS=jazzy; {ROS_NODE};"
         f" EITSKIN_ROS_PYTHON=.venv-ros-jazzy/bin/python {ROS_NODE}",
         2400,
         ("extras",),
     ),
-    Step("compose", "compose file, with ROS", ".ci/compose page ros2 foxglove", 1200),
+    Step("compose", "compose file, with a ROS node", ".ci/compose page ros2 foxglove", 1200),
     Step(
         "rerun",
         "what skin export --rerun writes, read by rerun",

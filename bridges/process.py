@@ -23,7 +23,6 @@ import zmq
 from protocol import logs, transport
 from protocol.control import ControlServer
 from protocol.errors import EitskinError
-from protocol.frames import Frame
 from protocol.publishing import Publisher
 from protocol.runtime import AlreadyRunning, RuntimeDirError, lock
 from protocol.transport import Socket, Transport, TransportError
@@ -110,10 +109,6 @@ class Bridge(ABC):
     def serve(self, waited_ns: int) -> None:
         """Take what has arrived; we have waited for it since `waited_ns`."""
 
-    def frames(self) -> Iterable[Frame]:
-        """What it has heard in the other world for the service; sent as the bridge's own."""
-        return ()
-
     @abstractmethod
     def tick(self) -> None:
         """Every TICK_S: who wants what, what has fallen silent. Keeps `level`, `messages`, `idle` of each pulse."""
@@ -165,8 +160,6 @@ class _Loop:
                 waited_ns = time.monotonic_ns()
                 self._wait(next_tick - waited_ns * 1e-9)
                 self._bridge.serve(waited_ns)
-                for frame in self._bridge.frames():
-                    self._publisher.send(frame)
                 if time.monotonic() >= next_tick:
                     next_tick = time.monotonic() + TICK_S
                     self._tick()

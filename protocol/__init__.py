@@ -8,6 +8,7 @@ here; each is loaded when it is first used. Where to look:
     topics.py, frame_types.py          the table of topics; the frames' fields with types, ranges and units
     frames.py, fields.py, records.py   frames as messages and back, checked
     held.py                            the image that held frames stand for
+    views.py                           what is shown of frames: labels, totals, turns
     sockets.py, control.py             publishing, reading, commands
     metering.py                        a process's rates, latencies and CPU, for its status
     runtime.py, transport.py           where the sockets are, whose they are, TCP and keys

@@ -59,7 +59,6 @@ class EitskinError(Exception):
         ├── BridgeError                       bridges: a bridge cannot start
         ├── ReplayRefused                     the page does not record or replay now
         ├── NotUnderstood (ValueError)        what a page sent is no message
-        ├── Malformed (ValueError)            bytes that are no RTPS message, or not one that the bridge reads
         └── CliError                          ends a command with one line and an exit code
     """
 

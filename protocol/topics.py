@@ -11,12 +11,12 @@ from typing import Literal
 
 from . import frame_types as f
 
-BRIDGES = ("page", "ros2", "foxglove")
+BRIDGES = ("page", "foxglove")
 """Processes that show contacts, or hand them on to other worlds. On our side they publish their status alone."""
 RECORDER = "recorder"
 """The process that records; it publishes its status alone, too."""
 REFERENCE = "reference"
-"""The user's program that reads a force-torque sensor or a scale; it publishes the topic of that name alone."""
+"""What reads a force-torque sensor or a scale, a program of the user's or a ROS node; it publishes that topic alone."""
 OUR_PROCESSES = ("acquisition", "preprocessing", "inference", "publisher", "stub", *BRIDGES, RECORDER)
 """Our processes: each publishes its status."""
 PRODUCERS = (*OUR_PROCESSES, REFERENCE)
@@ -86,7 +86,7 @@ TOPICS: dict[str, Topic] = {
         Topic(
             "reference",
             f.ReferenceFrame,
-            (REFERENCE, "ros2"),
+            REFERENCE,
             100,
             False,
             False,

@@ -18,7 +18,7 @@ from protocol.errors import EitskinError
 from protocol.topics import BRIDGES
 from services.runtime.config import ROOT, ConfigError, ConfigFile, load
 
-NEEDS = {"page": "aiohttp", "ros2": "cyclonedds", "foxglove": "foxglove"}
+NEEDS = {"page": "aiohttp", "foxglove": "foxglove"}
 """What each needs: an extra of its own in pyproject.toml, the page's among the service's own packages."""
 
 

@@ -52,7 +52,9 @@ GET_CPP = "`apt-get install g++ cppzmq-dev libmsgpack-cxx-dev`"
 HEADERS = [Path("/usr/include/zmq.hpp"), Path("/usr/include/msgpack.hpp")]
 CPP = Need(GET_CPP, "EITSKIN_REQUIRE_CPP", programs=["g++"], files=HEADERS)
 ROS_PYTHON = Path(os.environ.get("EITSKIN_ROS_PYTHON") or ROOT / ".venv-ros" / "bin" / "python")
-ROS_2 = Need("`make ros-venv` (270 MB), or $EITSKIN_ROS_PYTHON names one", "EITSKIN_REQUIRE_ROS", files=[ROS_PYTHON])
+ROS_NODE = ROS_PYTHON.parents[1] / "lib" / "eitskin_ros" / "skin"
+GET_ROS = "`make ros-venv` (400 MB), or $EITSKIN_ROS_PYTHON names one"
+ROS_2 = Need(GET_ROS, "EITSKIN_REQUIRE_ROS", files=[ROS_PYTHON, ROS_NODE])
 REFERENCE = Path(os.environ.get("EITSKIN_REFERENCE") or ROOT / ".." / "shared" / "data").resolve()
 
 

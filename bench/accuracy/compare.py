@@ -123,7 +123,7 @@ def reconstructed(noisy: Frames, untouched: Array, skin: Skin) -> dict[str, Arra
             parts.append(reconstruct(Input(noisy.pairs[index], rows, None), skin, bundle, calibrate=True))
             order.append(index)
     back = np.argsort(np.concatenate(order))
-    return {k: np.concatenate([p[k] for p in parts])[back] for k in parts[0]}
+    return {k: np.concatenate([p[k] for p in parts])[back] for k in parts[0] if k != "assumed"}
 
 
 def floors(frames: Frames, level: str) -> Row:

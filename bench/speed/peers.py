@@ -1,9 +1,9 @@
-"""A relay of four hops between processes, beside others: bare pyzmq, the service's own frames, eclipse-zenoh, rospy.
+"""A relay of four hops between processes, beside others: bare pyzmq, the service's own frames, eclipse-zenoh, rclpy.
 
     skin bench peers [--frames 100] [--rounds 3] [--quick]
 
 Messages of the sizes of the service's hops, at 22 frames a second, the transports in turns. A peer that is not
-installed is left out and said so (Debian: python3-rospy, python3-roslaunch). Prints a table, writes peers.json. (The
+installed is left out and said so (`make ros-venv`, `make venv EXTRAS=peers`). Prints a table, writes peers.json. (The
 time of a frame in pyEIT and in our stages is in `skin bench accuracy`.)
 """
 
@@ -12,12 +12,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import socket
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.metadata import PackageNotFoundError, version
@@ -39,7 +37,7 @@ from models.command import whole
 from services.recordings.replay_session import stop
 
 RELAY = Path(__file__).with_name("relay.py")
-SYSTEM_PYTHON = "/usr/bin/python3"  # rospy is Debian's
+ROS_PYTHON = Path(__file__).parents[2] / ".venv-ros" / "bin" / "python"
 START_S = 30.0
 
 
@@ -81,41 +79,24 @@ class Relay:
 def relays(folder: Path, stack: ExitStack) -> tuple[dict[str, Relay], list[str]]:
     """The transports that there are, and what to say of those that there are not."""
     log, missing = folder / "log.txt", []
-    port = _free_ports(1 + len(HOPS))  # roscore's, then zenoh's
+    port = _free_ports(len(HOPS))
     found = {
         "bare pyzmq": Relay("zmq", str(folder), sys.executable, {}, log, stack),
         "eitskin": Relay("eitskin", str(folder), sys.executable, {}, log, stack),
     }
     try:
         title = f"eclipse-zenoh {version('eclipse-zenoh')}"
-        found[title] = Relay("zenoh", str(port + 1), sys.executable, {}, log, stack)
+        found[title] = Relay("zenoh", str(port), sys.executable, {}, log, stack)
     except PackageNotFoundError:
         missing.append("eclipse-zenoh is not installed (make venv EXTRAS=peers): left out")
-    ros = _ros_version()
-    if ros and shutil.which("roscore"):
-        at_home = {
-            "ROS_MASTER_URI": f"http://127.0.0.1:{port}",
-            "ROS_IP": "127.0.0.1",
-            "ROS_HOME": str(folder / "ros"),
-            "PYTHONPATH": "",
-        }
-        core = ["roscore", "-p", str(port)]
-        stack.enter_context(started(core, at_home, log, stdout=subprocess.DEVNULL))
-        _wait_for(port)
-        found[f"rospy {ros}"] = Relay("rospy", str(folder), SYSTEM_PYTHON, at_home, log, stack)
+    if ROS_PYTHON.is_file():
+        ask = "from importlib.metadata import version; print(version('ros-rclpy'))"
+        told = subprocess.run([ROS_PYTHON, "-c", ask], capture_output=True, text=True, check=True, timeout=START_S)
+        alone = {"ROS_DOMAIN_ID": "99", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        found[f"rclpy {told.stdout.strip()}"] = Relay("rclpy", str(folder), str(ROS_PYTHON), alone, log, stack)
     else:
-        missing.append("rospy is not installed (apt install python3-rospy python3-roslaunch): left out")
+        missing.append("rclpy is not installed (make ros-venv): left out")
     return found, missing
-
-
-def _ros_version() -> str:
-    """ "" where Debian's Python has no rospy."""
-    ask = "import rospy, std_msgs.msg, rosgraph; from importlib.metadata import version; print(version('rospy'))"
-    try:
-        done = subprocess.run([SYSTEM_PYTHON, "-c", ask], capture_output=True, text=True, timeout=START_S)
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.strip()
 
 
 def _free_ports(n: int) -> int:
@@ -129,16 +110,6 @@ def _free_ports(n: int) -> int:
             except OSError:
                 continue
     raise RuntimeError(f"no {n} free ports in a row on 127.0.0.1")
-
-
-def _wait_for(port: int) -> None:
-    end = time.monotonic() + START_S
-    while time.monotonic() < end:
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                return
-        time.sleep(0.1)
-    raise RuntimeError(f"roscore does not answer on port {port} after {START_S:.0f} s")
 
 
 def relayed(frames: int, rounds: int) -> tuple[dict[str, dict[str, float]], list[str]]:

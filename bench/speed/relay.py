@@ -4,8 +4,8 @@
 
 Position 0 is both ends: for each line on its input, a number of frames, it sends so many at 22 a second and prints how
 long each took to come back, ms, as JSON. Positions 1 to 3 are the nodes between. Imports nothing of the project but for
-the transport "eitskin": rospy runs in Debian's own Python. Messages have the sizes of the service's hops; their first
-16 bytes say which one and when it was sent.
+the transport "eitskin": rclpy runs in the Python of `make ros-venv`. Messages have the sizes of the service's hops;
+their first 16 bytes say which one and when it was sent.
 """
 
 from __future__ import annotations
@@ -96,22 +96,29 @@ class Zenoh(Bytes):
 
 
 class Ros(Bytes):
-    """rospy (ROS 1) over TCPROS without Nagle's delay."""
+    """rclpy (ROS 2), best effort, the newest message."""
 
     def __init__(self, where: str, reads: int, writes: int, size: int) -> None:
-        import rospy
+        import array
+        import threading
+
+        import rclpy
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
         from std_msgs.msg import UInt8MultiArray
 
         super().__init__(size)
-        rospy.init_node(f"relay{writes}", disable_signals=True)
-        self.message = UInt8MultiArray
-        self.out = rospy.Publisher(f"relay{writes}", UInt8MultiArray, queue_size=1)
-        self.into = rospy.Subscriber(
-            f"relay{reads}", UInt8MultiArray, lambda got: self.arrived.put(bytes(got.data)), tcp_nodelay=True
+        rclpy.init()
+        node = rclpy.create_node(f"relay{writes}")
+        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self.message: Any = lambda data: UInt8MultiArray(data=array.array("B", data))
+        self.out = node.create_publisher(UInt8MultiArray, f"relay{writes}", newest)
+        node.create_subscription(
+            UInt8MultiArray, f"relay{reads}", lambda got: self.arrived.put(got.data.tobytes()), newest
         )
+        threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
 
     def put(self, message: bytes) -> None:
-        self.out.publish(self.message(data=message))
+        self.out.publish(self.message(message))
 
 
 class Eitskin:
@@ -137,7 +144,7 @@ class Eitskin:
         return None if got is None else TOKEN.pack(got.scan, got.stamps["sample"])
 
 
-TRANSPORTS = {"zmq": Zmq, "zenoh": Zenoh, "rospy": Ros, "eitskin": Eitskin}
+TRANSPORTS = {"zmq": Zmq, "zenoh": Zenoh, "rclpy": Ros, "eitskin": Eitskin}
 
 
 def relay(link: Any) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import rerun
 
-from bridges import views
+from protocol import views
 from protocol.frames import ContactFrame, ImageFrame, InfoFrame
 
 from .entries import Entry

@@ -1,93 +1,119 @@
-"""MCAP as rosbag2 writes it: CDR, definitions inside. Any ROS 2 tool reads it, and PlotJuggler."""
+"""A bag of rosbag2 (MCAP), with the topics of the ROS node: what `ros2 bag record` would have kept of it."""
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections import Counter
 from collections.abc import Iterable
-from typing import IO
+from functools import partial
+from pathlib import Path
+from typing import Any
 
-from mcap.writer import CompressionType, Writer
+import numpy as np
+from rosbags.interfaces import Nodetype, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
-from bridges import views
-from bridges.ros2 import messages
-from bridges.ros2.cdr import Value, encode
-from bridges.ros2.definitions import definition, full_name
-from bridges.ros2.names import topic_base
+from bridges.ros2.eitskin_ros.eitskin_ros import messages
+from protocol import views
 from protocol.frames import ContactFrame, ImageFrame, InfoFrame, StatusFrame
 
 from .entries import Entry, frame_id
 
-_QOS = (
-    "- history: 1\n  depth: 10\n  reliability: {reliability}\n  durability: {durability}\n"
-    "  deadline: {{sec: 2147483647, nsec: 4294967295}}\n  lifespan: {{sec: 2147483647, nsec: 4294967295}}\n"
-    "  liveliness: 1\n  liveliness_lease_duration: {{sec: 2147483647, nsec: 4294967295}}\n"
-    "  avoid_ros_namespace_conventions: false\n"
-)
-"""Of a channel, as rosbag2 keeps it for `ros2 bag play`."""
+DEFINITIONS = Path(__file__).parents[1] / "ros2" / "eitskin_msgs" / "msg"
+BEST_EFFORT = ("eitskin_msgs/msg/ContactArray", "sensor_msgs/msg/PointCloud2")
+FOR_EVER = QosTime(2147483647, 4294967295)
 
 
-def write_ros2(entries: Iterable[Entry], out: IO[bytes]) -> Counter[str]:
+def write_ros2(entries: Iterable[Entry], out: Path) -> Counter[str]:
     """Write all entries; how many messages of each topic."""
-    writer = Bag(out)
-    shown: dict[str, set[int]] = {}
-    for entry in entries:
-        frame, ns, base = entry.frame, entry.ns, topic_base(entry.skin)
-        header = {"stamp": messages.stamp(ns), "frame_id": frame_id(frame)}
-        if isinstance(frame, ContactFrame):
-            writer.put(f"{base}/valid", "std_msgs/Bool", {"data": frame.valid}, ns)
-            if frame.valid:
-                _contacts(writer, base, header, frame, ns, shown.setdefault(base, set()))
-        elif isinstance(frame, ImageFrame) and frame.valid:
-            writer.put(f"{base}/pressure", "sensor_msgs/PointCloud2", messages.cloud(header, frame), ns)
-            writer.put(f"{base}/image", "sensor_msgs/Image", messages.image(header, frame), ns)
-        elif isinstance(frame, StatusFrame):
-            told = {"header": {"stamp": messages.stamp(ns)}, "status": [messages.of_status(frame, 0.0)]}
-            writer.put("/diagnostics", "diagnostic_msgs/DiagnosticArray", told, ns)
-        elif isinstance(frame, InfoFrame) and (moved := messages.transform(ns, frame)) is not None:
-            writer.put("/tf_static", "tf2_msgs/TFMessage", {"transforms": [moved]}, ns, latched=True)
-    writer.finish()
-    return writer.counts
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".bag") as folder:
+        writer = Writer(Path(folder) / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        with writer:
+            bag = _Bag(writer)
+            for entry in entries:
+                bag.put(entry)
+        shutil.move(Path(folder) / "bag" / "bag.mcap", out)
+    return bag.counts
 
 
-def _contacts(writer: Bag, base: str, header: messages.Message, frame: ContactFrame, ns: int, shown: set[int]) -> None:
-    contacts = views.present(frame)
-    if views.has_forces(frame):
-        writer.put(f"{base}/wrench", "geometry_msgs/WrenchStamped", messages.wrench(header, contacts), ns)
-        for k in range(messages.SLOTS):
-            each = messages.wrench(header, contacts[k : k + 1])
-            writer.put(f"{base}/contacts/slot{k}", "geometry_msgs/WrenchStamped", each, ns)
-    writer.put(f"{base}/contacts/poses", "geometry_msgs/PoseArray", messages.poses(header, frame), ns)
-    now = {contact.id for contact in contacts}
-    put = messages.markers(header, frame, shown - now)
-    writer.put(f"{base}/contacts", "visualization_msgs/MarkerArray", put, ns)
-    shown.clear()
-    shown |= now
-
-
-class Bag:
-    """An MCAP file of ROS 2 messages."""
-
-    def __init__(self, out: IO[bytes]) -> None:
-        self._writer = Writer(out, compression=CompressionType.ZSTD)
-        self._writer.start(profile="ros2", library="eitskin")
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
+class _Bag:
+    def __init__(self, writer: Writer) -> None:
+        self._writer, self._store = writer, typestore()
+        self._ros = messages.message_types(lambda of, name: partial(_message, self._store, f"{of}/msg/{name}"))
+        self._connections: dict[str, Any] = {}
         self.counts: Counter[str] = Counter()
 
-    def put(self, topic: str, message: str, value: Value, ns: int, latched: bool = False) -> None:
-        """Add a message."""
-        if message not in self._schemas:
-            data = definition(message).encode()
-            self._schemas[message] = self._writer.register_schema(full_name(message), "ros2msg", data)
-        if topic not in self._channels:
-            best_effort = message.startswith("sensor_msgs/")
-            qos = _QOS.format(reliability=2 if best_effort else 1, durability=1 if latched else 2)
-            self._channels[topic] = self._writer.register_channel(
-                topic, "cdr", self._schemas[message], {"offered_qos_profiles": qos}
+    def put(self, entry: Entry) -> None:
+        """Write what the node would have published of a frame."""
+        frame, ros, base = entry.frame, self._ros, f"/{messages.ros_name(entry.skin)}"
+        head = messages.header(ros, entry.ns, frame_id(frame))
+        found: dict[str, Any] = {}
+        if isinstance(frame, ContactFrame):
+            found[f"{base}/contacts"] = messages.contacts(ros, head, frame)
+            found[f"{base}/markers"] = messages.markers(ros, head, frame if frame.valid else None)
+            if frame.valid and views.has_forces(frame):
+                found[f"{base}/wrench"] = messages.wrench(ros, head, frame)
+        elif isinstance(frame, ImageFrame) and frame.valid:
+            found[f"{base}/conductivity_drop"] = messages.conductivity_drop(ros, head, frame)
+            found[f"{base}/image"] = messages.image(ros, head, frame)
+        elif isinstance(frame, StatusFrame):
+            of = messages.of_process(ros, frame, 0.0)
+            found["/diagnostics"] = ros.DiagnosticArray(header=messages.header(ros, entry.ns, ""), status=[of])
+        elif isinstance(frame, InfoFrame) and (moved := messages.transform(ros, entry.ns, frame.info)) is not None:
+            found["/tf_static"] = moved
+        for topic, message in found.items():
+            self._write(topic, entry.ns, message)
+
+    def _write(self, topic: str, ns: int, message: Any) -> None:
+        kind = message.__msgtype__
+        if topic not in self._connections:
+            profile = qos(kind in BEST_EFFORT, topic == "/tf_static")
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self._store, offered_qos_profiles=[profile]
             )
-        self._writer.add_message(self._channels[topic], ns, encode(message, value), ns, self.counts[topic])
+        self._writer.write(self._connections[topic], ns, self._store.serialize_cdr(message, kind))
         self.counts[topic] += 1
 
-    def finish(self) -> None:
-        """Write what ends the file."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
+
+def qos(best_effort: bool, latched: bool) -> Qos:
+    """As the node offers a topic, which `ros2 bag play` then does too; but for deadlines, that no bag can keep."""
+    reliability = QosReliability.BEST_EFFORT if best_effort else QosReliability.RELIABLE
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    depth, alive = 1 if latched else 5, QosLiveliness.AUTOMATIC
+    return Qos(QosHistory.KEEP_LAST, depth, reliability, durability, FOR_EVER, FOR_EVER, alive, FOR_EVER, False)
+
+
+def typestore() -> Typestore:
+    """The message types of ROS 2, and eitskin_msgs."""
+    store = get_typestore(Stores.ROS2_KILTED)
+    found: dict[str, Any] = {}
+    for file in sorted(DEFINITIONS.glob("*.msg")):
+        found |= get_types_from_msg(file.read_text(), f"eitskin_msgs/msg/{file.stem}")
+    store.register(found)
+    return store
+
+
+def _message(store: Typestore, kind: str, **values: Any) -> Any:
+    """A message of some fields, the others at their defaults, as rclpy makes them."""
+    fields = store.fielddefs[kind][1]
+    if unknown := values.keys() - dict(fields):
+        raise AttributeError(f"{kind} has no field {', '.join(sorted(unknown))}")
+    return store.types[kind](**{name: _value(store, field, values.get(name)) for name, field in fields})
+
+
+def _value(store: Typestore, field: Any, value: Any) -> Any:
+    """A field's value as rosbags has it; its default where it is None."""
+    node, of = field
+    if node == Nodetype.NAME:
+        return _message(store, of) if value is None else value
+    if node == Nodetype.BASE:
+        default = {"string": "", "bool": False}.get(of[0], 0)
+        return default if value is None else value[0] if isinstance(value, bytes) else value
+    (inner, name), length = of
+    if inner == Nodetype.NAME or name[0] == "string":
+        return [] if value is None else value
+    return np.asarray([0] * (length if node == Nodetype.ARRAY else 0) if value is None else value, name[0])

@@ -30,7 +30,7 @@ from foxglove.messages import (
     Vector3,
 )
 
-from bridges import views
+from protocol import views
 from protocol.frames import Contact, ContactFrame, ImageFrame, InfoFrame
 
 METRES_PER_NEWTON = 0.01

@@ -22,7 +22,7 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
-from bridges import views
+from protocol import views
 from protocol.ages import Ages
 from protocol.frame_types import ELECTRODE_STATES
 from protocol.frames import ContactFrame, DeltaFrame, StatusFrame

@@ -124,7 +124,7 @@ class ReferenceForce:
         if likeness[best] < -FOLLOWS:
             raise Doubtful(
                 "the reference fell while the skin was pressed, expected it to rise: change its sign (of a ROS topic: "
-                "`axis` in skin.toml)"
+                "the node's parameter reference_axis)"
             )
         if abs(likeness[best]) < FOLLOWS:
             raise Doubtful(

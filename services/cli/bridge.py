@@ -1,4 +1,4 @@
-"""`skin bridge NAME`: show contacts on the live page, hand them on to ROS 2 or Foxglove."""
+"""`skin bridge NAME`: show contacts on the live page, or hand them on to Foxglove."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ def register(app: typer.Typer) -> None:
 
 
 def bridge(
-    name: Annotated[str, typer.Argument(help="page, ros2 or foxglove; its section in skin.toml has its settings.")],
+    name: Annotated[str, typer.Argument(help="page or foxglove; its section in skin.toml has its settings.")],
 ) -> None:
     """Show contacts, or hand them on to another world, in the foreground, beside a running service; Ctrl-C ends it."""
     from protocol.topics import BRIDGES
     from services.bridge import MissingExtra, become
-    from services.runtime.config import load
+    from services.runtime.config import NO_ROS2, load
 
+    if name == "ros2":
+        fail(NO_ROS2, USAGE)
     if name not in BRIDGES:
         fail(f"no bridge {name!r}: expected {' or '.join(BRIDGES)}", USAGE)
     try:

@@ -19,7 +19,11 @@ if TYPE_CHECKING:
     from services.recordings.recording import RecordingReader
 
 SUFFIXES = {"foxglove": ".foxglove.mcap", "ros2": ".ros2.mcap", "csv": ".csv", "rerun": ".rrd"}
-NEEDS = {"foxglove": ("foxglove", "make venv EXTRAS=foxglove"), "rerun": ("rerun", ".venv/bin/pip install rerun-sdk")}
+NEEDS = {
+    "foxglove": ("foxglove", "make venv EXTRAS=foxglove"),
+    "ros2": ("rosbags", "make venv EXTRAS=ros2"),
+    "rerun": ("rerun", ".venv/bin/pip install rerun-sdk"),
+}
 
 
 def register(app: typer.Typer) -> None:
@@ -29,7 +33,7 @@ def register(app: typer.Typer) -> None:
 def export(
     file: Annotated[Path, typer.Argument(metavar="FILE.mcap", readable=False)],
     foxglove: Annotated[bool, typer.Option("--foxglove", help="MCAP with Foxglove's schemas.")] = False,
-    ros2: Annotated[bool, typer.Option("--ros2", help="MCAP as rosbag2 writes it.")] = False,
+    ros2: Annotated[bool, typer.Option("--ros2", help="MCAP as rosbag2 writes it, topics of docs/ros.md.")] = False,
     table: Annotated[bool, typer.Option("--csv", help="CSV, and an npz beside it: a row per contact.")] = False,
     rerun: Annotated[bool, typer.Option("--rerun", help="An .rrd file, where rerun-sdk is installed.")] = False,
     out: Annotated[Path | None, typer.Option(help="Default: beside FILE, by its name.")] = None,
@@ -89,8 +93,7 @@ def _write(kind: str, reader: RecordingReader, skin: str, parts: list[Path]) -> 
     if kind == "ros2":
         from bridges.export.to_ros2 import write_ros2
 
-        with open(parts[0], "xb") as binary:
-            return write_ros2(entries, binary)
+        return write_ros2(entries, parts[0])
     if kind == "foxglove":
         from bridges.export.to_foxglove import write_foxglove
 

@@ -32,7 +32,6 @@ from services.runtime.config_sections import (
     PageSection,
     RealTime,
     RecorderSection,
-    Ros2Section,
     Section,
     Security,
     Skip,
@@ -46,6 +45,12 @@ SKIN_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 
 Vector3 = tuple[Number, Number, Number]
 Quaternion = tuple[Number, Number, Number, Number]
+
+
+NO_ROS2 = (
+    "the bridge to ROS 2 is a node of ROS now, with parameters of its own: take `ros2` out of skin.toml, and start it "
+    "by `ros2 launch eitskin_ros skin.launch.py` (docs/ros.md)"
+)
 
 
 class ConfigError(EitskinError):
@@ -245,9 +250,8 @@ class ConfigFile(Section):
     security: Security = Security()
     realtime: RealTime = RealTime()
     skip: Skip = Skip()
-    bridges: tuple[Literal["page", "ros2", "foxglove"], ...] = ()  # that `skin up` starts too
+    bridges: tuple[Literal["page", "foxglove"], ...] = ()  # that `skin up` starts too
     page: PageSection = PageSection()
-    ros2: Ros2Section = Ros2Section()
     foxglove: FoxgloveSection = FoxgloveSection()
     recorder: RecorderSection | None = None  # without it, `skin up` starts no recorder
     logging: Logging = Logging()
@@ -326,6 +330,8 @@ def parse(raw: dict[str, Any], file: Path = Path("skin.toml")) -> ConfigFile:
     """Check a configuration that is already a dict; `file` is named in errors."""
     if wrong_text := _control_characters(raw):
         raise ConfigError("\n".join(f"{file}: {line}" for line in wrong_text))
+    if "ros2" in raw or (isinstance(raw.get("bridges"), list) and "ros2" in raw["bridges"]):
+        raise ConfigError(f"{file}: {NO_ROS2}")
     try:
         config = ConfigFile.model_validate(raw | {"path": file})
         return config.model_copy(update={"skins": {n: config._resolved(s) for n, s in config.skins.items()}})

@@ -148,33 +148,12 @@ class PageSection(Section):
     metrics: Switch = False  # /metrics, for Prometheus
 
 
-class ReferenceSection(Section):
-    """A force-torque sensor of the robot, for `skin calibrate --live`: bridges/ros2/reference.py."""
-
-    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*){1,16}$", max_length=200)]  # WrenchStamped
-    axis: Literal["x", "y", "z", "-x", "-y", "-z"] = "-z"  # of its force, that is above 0 where something presses
-
-
-# Of contacts, at most; one that begins, ends or comes to be known otherwise is told at once.
-ContactRate = Annotated[Number, Field(gt=0, le=1000)]
-
-
-class Ros2Section(Section):
-    """Topics for ROS 2: bridges/ros2, docs/ros.md."""
-
-    domain: Annotated[Count, Field(ge=0, le=232)] | None = None  # default: $ROS_DOMAIN_ID, else 0
-    interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:@-]{0,64}$")] = ""  # the only one; "lo": this host
-    commands: Switch = False  # the service `tare`: anybody in the ROS domain may call it
-    rate_hz: ContactRate = 100.0
-    replay: Switch = False  # replayed frames are published too
-    reference: dict[str, ReferenceSection] = {}  # skin -> what says the force on it
-
-
 class FoxgloveSection(Section):
     """The live server for Foxglove: bridges/foxglove."""
 
     host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
     port: Annotated[Count, Field(ge=0, le=65535)] = 8765
     names: tuple[HostName, ...] = ()  # further names it is asked for by
-    rate_hz: ContactRate = 60.0
+    # Of contacts, at most; one that begins, ends or comes to be known otherwise is told at once
+    rate_hz: Annotated[Number, Field(gt=0, le=1000)] = 60.0
     replay: Switch = False  # replayed frames are shown too

@@ -60,21 +60,28 @@ def recording(tmp_path: Path) -> Path:
     return path
 
 
-def test_ros2_is_read_by_mcap_ros2(skin, recording) -> None:  # noqa: F811
+def test_ros2_is_read_by_another_reader_and_has_the_nodes_topics(skin, recording) -> None:  # noqa: F811
     assert skin("export", recording, "--ros2").code == 0
+    out = recording.with_suffix(".ros2.mcap")
     of: dict[str, list[Any]] = defaultdict(list)
-    for message in read_ros2_messages(recording.with_suffix(".ros2.mcap")):
+    for message in read_ros2_messages(out):
         of[message.channel.topic].append(message.ros_msg)
-        assert message.channel.topic != "/eitskin/palm/wrench" or message.log_time_ns in MEASURED_NS
-    wrenches, clouds = of["/eitskin/palm/wrench"], of["/eitskin/palm/pressure"]
-    stamps = [w.header.stamp.sec * 10**9 + w.header.stamp.nanosec for w in wrenches]
-    assert stamps == [MEASURED_NS[k] for k in VALID] and {w.header.frame_id for w in wrenches} == {"palm"}
-    assert [w.wrench.force.z for w in wrenches] == [-3.0 if k >= 2 else 0.0 for k in VALID]
-    assert [v.data for v in of["/eitskin/palm/valid"]] == ARE_VALID
-    peaks = [float(np.frombuffer(bytes(c.data), "<f4").reshape(-1, 5)[:, 3].max()) for c in clouds]
-    assert peaks == [np.float32(0.3) if k >= 2 else 0.0 for k in VALID], "a held image is written again"
+    assert all(len(m.markers) == 1 for m, valid in zip(of["/palm/markers"], ARE_VALID, strict=True) if not valid)
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in of["/palm/contacts"]]
+    assert stamps == MEASURED_NS and [m.valid for m in of["/palm/contacts"]] == ARE_VALID
+    forces = [[c.force for c in m.contacts] for m in of["/palm/contacts"]]
+    assert forces == [[3.0] if k >= 2 and k in VALID else [] for k in range(FRAMES)]
+    assert [w.wrench.force.z for w in of["/palm/wrench"]] == [-3.0 if k >= 2 else 0.0 for k in VALID]
+    clouds = [np.frombuffer(bytes(c.data), "<f4").reshape(-1, 5) for c in of["/palm/conductivity_drop"]]
+    peaks = [np.float32(0.3) if k >= 2 else 0.0 for k in VALID]
+    assert [float(points[:, 3].max()) for points in clouds] == peaks, "a held image is written again"
     assert [tf.transforms[0].child_frame_id for tf in of["/tf_static"]] == ["palm"]
     assert of["/diagnostics"][0].status[0].message == "slow"
+    with open(out, "rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        offered = {c.topic: c.metadata["offered_qos_profiles"] for c in summary.channels.values()}
+    assert "reliability: best_effort" in offered["/palm/contacts"] and "transient_local" in offered["/tf_static"]
 
 
 def test_foxglove_is_read_by_the_schemas_inside(skin, recording) -> None:  # noqa: F811
@@ -118,13 +125,14 @@ def test_what_cannot_be_exported_is_said_in_a_line(skin, recording) -> None:  # 
     assert skin("export", recording, "--ros2", "--overwrite").code == 0 and out.stat().st_size > 1000
 
 
-def test_a_bridge_whose_packages_are_missing_is_refused_before_anything_starts(skin, tmp_path, monkeypatch) -> None:  # noqa: F811
+def test_a_bridge_that_is_missing_is_refused_before_anything_starts(skin, tmp_path, monkeypatch) -> None:  # noqa: F811
     config = tmp_path / "skin.toml"
-    config.write_text('bridges = ["ros2"]\n[skins.palm]\nport = "stub"\nbundle = "square16"\n')
-    monkeypatch.setitem(NEEDS, "ros2", "no_such_package")
-    for command in (("up",), ("bridge", "ros2")):
-        ran = skin(*command, "--config", config)
-        assert ran.code == 2 and "make venv EXTRAS=ros2" in ran.err and "Traceback" not in ran.err, ran.err
+    monkeypatch.setitem(NEEDS, "foxglove", "no_such_package")
+    for name, says in (("foxglove", "make venv EXTRAS=foxglove"), ("ros2", "start it by `ros2 launch")):
+        config.write_text(f'bridges = ["{name}"]\n[skins.palm]\nport = "stub"\nbundle = "square16"\n')
+        for command in (("up",), ("bridge", name)):
+            ran = skin(*command, "--config", config)
+            assert ran.code == 2 and says in ran.err and "Traceback" not in ran.err, ran.err
 
 
 def test_rerun_is_read_by_rerun(skin, recording) -> None:  # noqa: F811

@@ -180,14 +180,10 @@ def test_settings_in_skin_toml_reach_it_and_each_reason_has_its_advice() -> None
     for text in ("", "{", "[]", '{"skins": {}}'):
         with pytest.raises(BridgeError, match="skin bridge NAME"):
             Handed.read(text)
+    (block,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "page.md").read_text(), re.DOTALL)
     skins = {"palm": {"port": "stub", "bundle": "square16"}}
-    for page, name in (("page.md", "page"), ("ros.md", "ros2")):
-        blocks = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs" / page).read_text(), re.MULTILINE | re.DOTALL)
-        assert name in parse({**tomllib.loads("".join(blocks)), "skins": skins}).bridges
-    assert parse({"skins": skins}).ros2.commands is False
-    for wrong in ({"domain": 233}, {"domain": "0"}, {"interface": "a b"}, {"comands": True}):
-        with pytest.raises(Exception, match=r"ros2\.\w+: (found|unknown key)"):
-            parse({"ros2": wrong, "skins": skins})
+    page = parse(tomllib.loads(block) | {"skins": skins}).page
+    assert (page.host, page.names, page.metrics) == ("0.0.0.0", ("robot.lan",), True)
     assert ADVICE.keys() == REASONS.keys() and all(text.endswith(".") for text in ADVICE.values())
 
 

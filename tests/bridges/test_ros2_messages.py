@@ -1,76 +1,94 @@
-"""What the bridge to ROS 2 writes: read back by rosbags, whose definitions are its own."""
+"""What the ROS node publishes, made with the message types of rosbags, eitskin_msgs by its .msg files; needs no ROS."""
 
 from __future__ import annotations
 
 import math
-import time
-from types import SimpleNamespace as Of
+import re
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from bridges import views
-from bridges.clock import WallClock
-from bridges.ros2 import messages, reference
-from bridges.ros2.cdr import encode
-from bridges.ros2.definitions import TABLE, definition, full_name, nested
-from protocol.frames import Contact, ContactFrame, ImageFrame, InfoFrame, StatusFrame
+from bridges.export.to_ros2 import DEFINITIONS, _message, typestore
+from bridges.ros2.eitskin_ros.eitskin_ros import messages
+from protocol.frames import Contact, ContactFrame, ImageFrame, StatusFrame
+from tests.bridges.conftest import PLACED
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-HEADER = {"stamp": {"sec": 5, "nanosec": 7}, "frame_id": "palm"}
+STORE = typestore()
+ROS = messages.message_types(lambda of, name: partial(_message, STORE, f"{of}/msg/{name}"))
+HEAD = messages.header(ROS, 5_000_000_007, "palm")
 
 
-def read(message: str, value: dict[str, Any]) -> Any:
-    return STORE.deserialize_cdr(encode(message, value), full_name(message))
+def read(message: Any) -> Any:
+    """As a subscriber gets it."""
+    return STORE.deserialize_cdr(STORE.serialize_cdr(message, message.__msgtype__), message.__msgtype__)
 
 
-def contact(number: int, x: float, y: float, force: float, **more: Any) -> Contact:
-    wrench = [0.0, 0.0, -force, -y * force, x * force, 0.0]
-    at: dict[str, Any] = {"position": [x, y, 0.0], "area_m2": 3e-4, "wrench": wrench, "state": "hold"}
-    return Contact(id=number, force_sigma_n=0.1, **{**at, "force_n": force, **more})
+def contact(number: int, x: float, y: float, force: float | None, **more: Any) -> Contact:
+    wrench = [0.0, 0.0, -(force or 0), -y * (force or 0), x * (force or 0), 0.0]
+    return Contact(id=number, position=[x, y, 0.0], area_m2=3e-4, wrench=wrench, force_n=force, **more)
 
 
-def contacts(*found: Contact, reasons: tuple[str, ...] = ()) -> ContactFrame:
-    return ContactFrame(skin="palm", valid=True, valid_for_s=0.25, contacts=list(found), reasons=list(reasons))
+def contacts(*found: Contact, valid: bool = True) -> ContactFrame:
+    return ContactFrame(skin="palm", valid=valid, valid_for_s=0.25, contacts=list(found), reasons=["gap"])
 
 
-def test_every_message_is_read_by_others_as_they_define_it() -> None:
-    for message in TABLE:
-        found = read(message, {})
-        assert STORE.serialize_cdr(found, full_name(message)).tobytes() == encode(message, {}), message
-        parsed = get_types_from_msg(definition(message), full_name(message))
-        assert set(parsed) == {full_name(name) for name in [message, *nested(message)]}
-        assert all(fields == STORE.fielddefs[name][1] for name, (_, fields) in parsed.items()), message
+def test_the_definitions_are_documented_and_depend_on_what_their_package_names() -> None:
+    cmake = (DEFINITIONS.parent / "CMakeLists.txt").read_text()
+    package = (DEFINITIONS.parent / "package.xml").read_text()
+    assert {file.stem for file in DEFINITIONS.glob("*.msg")} == set(messages.TYPES["eitskin_msgs"].split())
+    for file in DEFINITIONS.glob("*.msg"):
+        text = file.read_text()
+        assert f'"msg/{file.name}"' in cmake and text.startswith("# ")
+        assert all(part.startswith("# ") for part in text.split("\n\n")), f"a field of {file.name} says nothing"
+        for of in set(re.findall(r"^(\w+)/", text, re.MULTILINE)):
+            assert f"find_package({of} REQUIRED)" in cmake and f"<depend>{of}</depend>" in package
 
 
-def test_the_wrench_is_the_sum_of_those_that_are_there() -> None:
-    frame = contacts(contact(1, 0.02, 0, 3.0), contact(2, -0.01, 0.03, 1.0), contact(3, 0, 0, 2.0, state="end"))
-    found = read("geometry_msgs/WrenchStamped", messages.wrench(HEADER, views.present(frame)))
+def test_contacts_carry_all_that_is_known_and_nothing_where_they_are_not_valid() -> None:
+    tilted = contact(
+        2**63,
+        0.02,
+        0.01,
+        2.0,
+        state="begin",
+        normal=[0.0, -math.sin(0.3), math.cos(0.3)],
+        orientation=0.4,
+        position_sigma=[0.002, 0.001, 0.5],
+        force_sigma_n=0.1,
+        pressure_pa=5e3,
+        velocity=[0.1, 0.0, 0.0],
+    )
+    frame = contacts(tilted, contact(3, 0, 0, None), contact(4, 0, 0, 1.0, state="end"))
+    found = read(messages.contacts(ROS, HEAD, frame))
     assert (found.header.stamp.sec, found.header.stamp.nanosec, found.header.frame_id) == (5, 7, "palm")
-    force, torque = found.wrench.force, found.wrench.torque
-    assert (force.x, force.y, force.z, torque.x, torque.y) == pytest.approx((0, 0, -4.0, -0.03, 0.05))
-    unknown = contacts(reasons=("uncalibrated_force",)), contacts(contact(1, 0, 0, 0.0, force_n=None))
-    assert [views.has_forces(each) for each in (contacts(), frame, *unknown)] == [True, True, False, False]
-
-
-def test_poses_have_z_along_the_normal_and_markers_end_by_themselves_and_when_the_contact_does() -> None:
-    tilted = contact(7, 0.02, 0, 2.0, normal=[0.0, -math.sin(0.3), math.cos(0.3)], orientation=0.4)
-    under = contact(2, 0, 0, 1.0, normal=[0.0, 0.0, -1.0])
-    poses = read("geometry_msgs/PoseArray", messages.poses(HEADER, contacts(tilted, under))).poses
-    q, down = (pose.orientation for pose in poses)
+    assert (found.valid, found.reasons, list(found.ended)) == (True, ["gap"], [4])
+    first, second = found.contacts
+    assert (first.id, first.state, second.state) == (2**63, messages.BEGIN, messages.HOLD)
+    assert (first.force, first.force_sigma, first.peak_pressure, first.velocity.x) == (2.0, 0.1, 5e3, 0.1)
+    assert (first.wrench.force.z, first.wrench.torque.x, first.wrench.torque.y) == (-2.0, -0.02, 0.04)
+    assert math.isnan(second.force) and math.isnan(second.peak_pressure) and second.pose.covariance[0] == -1
+    q = first.pose.pose.orientation
     up = [2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x**2 + q.y**2)]
-    assert up == pytest.approx(tilted.normal, abs=1e-6) and 1 - 2 * (down.x**2 + down.y**2) == pytest.approx(-1)
-    along = 1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y + q.w * q.z)
-    assert along[1] / along[0] == pytest.approx(math.tan(0.4) * math.cos(0.3), abs=1e-6)
-    found = read("visualization_msgs/MarkerArray", messages.markers(HEADER, contacts(contact(7, 0.02, 0, 2.0)), [3]))
-    kinds = ("patch", "force", "label")
-    assert {(m.ns, m.id, m.action) for m in found.markers} == {(ns, *at) for ns in kinds for at in ((7, 0), (3, 2))}
-    put = {marker.ns: marker for marker in found.markers if marker.action == 0}
-    assert all((m.lifetime.sec, m.lifetime.nanosec) == (0, 250_000_000) for m in put.values())
-    assert [p.z for p in put["force"].points] == pytest.approx([0.02, 0])  # from outside onto the skin
-    assert put["label"].text == "7 2.0 ± 0.1 N unknown"
+    assert up == pytest.approx(tilted.normal, abs=1e-9)
+    spread = first.pose.covariance.reshape(6, 6)
+    sigmas, axes = np.linalg.eigh(spread[:3, :3])
+    assert sigmas == pytest.approx([0, 0.001**2, 0.002**2], abs=1e-12) and not spread[3:].any()
+    assert abs(axes[:, 0] @ tilted.normal) == pytest.approx(1)
+    along = [math.cos(0.5), math.sin(0.5) * math.cos(0.3), math.sin(0.5) * math.sin(0.3)]
+    assert abs(axes[:, 2] @ along) == pytest.approx(1)
+    refused = read(messages.contacts(ROS, HEAD, contacts(tilted, valid=False)))
+    assert (refused.valid, refused.contacts, refused.reasons) == (False, [], ["gap"])
+
+
+def test_markers_delete_what_was_there_before_and_end_by_themselves() -> None:
+    found = read(messages.markers(ROS, HEAD, contacts(contact(7, 0.02, 0, 2.0, force_sigma_n=0.1)))).markers
+    assert [(m.action, m.ns, m.id) for m in found] == [(3, "", 0), *((0, ns, 7) for ns in ("patch", "force", "label"))]
+    assert all((m.lifetime.sec, m.lifetime.nanosec) == (0, 250_000_000) for m in found[1:])
+    assert [p.z for p in found[2].points] == pytest.approx([0.02, 0])  # from outside onto the skin
+    assert found[3].text == "7 2.0 ± 0.1 N unknown"
+    assert [m.action for m in read(messages.markers(ROS, HEAD, None)).markers] == [3]
 
 
 def test_cloud_and_image_say_the_same() -> None:
@@ -78,37 +96,24 @@ def test_cloud_and_image_say_the_same() -> None:
     drop[1, 4] = 0.5
     grid: dict[str, Any] = {"skin": "palm", "metres_per_pixel": 0.01, "origin": [-0.03, -0.02]}
     frame, untouched = ImageFrame(**grid, touched=True, image=drop, sigma=drop + 0.1), ImageFrame(**grid)
-    cloud, empty = (read("sensor_msgs/PointCloud2", messages.cloud(HEADER, each)) for each in (frame, untouched))
+    cloud, empty = (read(messages.conductivity_drop(ROS, HEAD, each)) for each in (frame, untouched))
     points, none = (np.frombuffer(each.data.tobytes(), "<f4").reshape(-1, 5) for each in (cloud, empty))
-    assert [field.name for field in cloud.fields] == ["x", "y", "z", "drop", "sigma"] and cloud.width == 24
+    assert [field.name for field in cloud.fields] == ["x", "y", "z", "conductivity_drop", "sigma"] and cloud.width == 24
     assert points[points[:, 3].argmax()] == pytest.approx([0.015, -0.005, 0, 0.5, 0.6])
     assert len(none) == 24 and not none[:, 3].any() and np.isnan(none[:, 4]).all() and not empty.is_dense
-    image = read("sensor_msgs/Image", messages.image(HEADER, frame))
+    image = read(messages.image(ROS, HEAD, frame))
     pixels = np.frombuffer(image.data.tobytes(), "<f4").reshape(image.height, image.width)
     assert image.encoding == "32FC1" and pixels[4 - 1 - 1, 4] == np.float32(0.5)  # row 0 is the highest y
 
 
-def test_the_pose_becomes_a_transform_or_nothing_and_a_process_that_says_nothing_more_is_stale() -> None:
-    told = {"pose": [0.1, 0.2, 0.3, 0.0, 0.0, 1.0, 0.0], "parent_frame_id": "wrist", "frame_id": "palm"}
-    made, *none = (messages.transform(10**9, InfoFrame(skin="palm", info=i)) for i in (told, {**told, "pose": [1]}, {}))
-    at = read("tf2_msgs/TFMessage", {"transforms": [made]}).transforms[0]
-    assert (at.header.frame_id, at.child_frame_id) == ("wrist", "palm") and none == [None, None]
-    assert (at.transform.translation.z, at.transform.rotation.z) == (0.3, 1.0)
+def test_a_pose_becomes_a_transform_or_nothing_a_silent_process_is_stale_and_names_are_those_of_ros() -> None:
+    made, *none = (messages.transform(ROS, 10**9, info) for info in (PLACED, {**PLACED, "pose": [1]}, {}))
+    at = read(made).transforms[0]
+    assert (at.header.frame_id, at.child_frame_id, at.transform.translation.x) == ("wrist", "palm", 0.1)
+    assert none == [None, None]
     frame = StatusFrame(skin="palm", process="inference", level="WARN", messages=["slow"], valid_for_s=3.0)
-    said = [(s["level"], s["message"]) for s in (messages.of_status(frame, age_s) for age_s in (0.5, 9.0))]
-    assert said == [(1, "slow"), (3, "no status for 9 s; the last: slow")]
-
-
-def test_a_wrench_of_the_robot_becomes_the_reference_by_its_own_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[Any] = []
-    monkeypatch.setattr(reference, "RosReader", lambda *of: Of(take=lambda: taken))
-    (palm,) = reference.references({"palm": {"topic": "/ft", "axis": "-z"}}, ["palm"], None, clock := WallClock())  # type: ignore[arg-type]
-    now, sent = time.monotonic_ns(), time.monotonic_ns() - 10**8
-    rows = [(now - 9 * 10**8 + clock.offset_ns, now - 9 * 10**8), (0, sent), (5 * 10**9, None)]
-    for stamp, sample in rows:  # a stamp of 0 is none, one of another clock is never a time
-        header = Of(stamp=Of(sec=stamp // 10**9, nanosec=stamp % 10**9))
-        info = Of(source_timestamp=sent + clock.offset_ns)
-        taken[:] = [Of(wrench=Of(force=Of(x=1.0, y=2.0, z=-2.5)), header=header, sample_info=info)]
-        (frame,) = palm.frames()
-        assert (frame.force_n, frame.valid, frame.reasons) == (2.5, sample is not None, [] if sample else ["clock"])
-        assert frame.stamps["sample"] == sample if sample else frame.stamps["sample"] >= now
+    said = [read(messages.of_process(ROS, frame, age_s)) for age_s in (0.5, 9.0)]
+    assert [(s.level, s.message) for s in said] == [(1, "slow"), (3, "no status for 9 s; the last: slow")]
+    electrodes = [read(messages.of_electrodes(ROS, "palm", states)) for states in (["ok", "open"], ["ok"], [])]
+    assert [(s.level, s.message) for s in electrodes] == [(1, "1 open"), (0, "all ok"), (3, "not known")]
+    assert [messages.ros_name(name) for name in ("palm", "left-arm", "2nd")] == ["palm", "left_arm", "_2nd"]

@@ -22,6 +22,16 @@ import zmq
 
 RUNTIME = os.environ["EITSKIN_RUNTIME"]
 ENGINE = "docker" if subprocess.run(["docker", "info"], capture_output=True).returncode == 0 else "podman"
+ROS_LISTENER = """
+import rclpy
+from eitskin_msgs.msg import ContactArray
+rclpy.init()
+node, valid = rclpy.create_node("stranger"), rclpy.Future()
+hear = lambda m: valid.done() or m.valid and valid.set_result(m)
+node.create_subscription(ContactArray, "/palm/contacts", hear, rclpy.qos.qos_profile_sensor_data)
+rclpy.spin_until_future_complete(node, valid, timeout_sec=10)
+raise SystemExit(not valid.done())
+"""
 KILLED = ("acquisition", "preprocessing", "inference", "publisher")
 
 
@@ -94,7 +104,10 @@ def works(bridge: str) -> bool:
             urllib.request.urlopen("http://127.0.0.1:8765", timeout=2).close()
         except urllib.error.HTTPError as refused:
             return refused.code == 403  # its door asks for a token
-    return ask(bridge, "status", 1000, skin="palm") if bridge == "ros2" else False
+    found = subprocess.run([ENGINE, "ps", "--format", "{{.Names}}"], capture_output=True, text=True, check=True)
+    name = next((name for name in found.stdout.split() if "ros2" in name), "")
+    hears = [ENGINE, "exec", name, "/opt/eitskin/.venv-ros/bin/python", "-c", ROS_LISTENER]
+    return bool(name) and subprocess.run(hears, capture_output=True).returncode == 0
 
 
 def main() -> None:

@@ -41,9 +41,9 @@ def test_a_bridge_runs_only_where_its_profile_is_named_and_is_seen_by_its_host_a
     for name in BRIDGES:
         assert found[name]["profiles"] == [name]
         assert found[name]["command"][:4] == ["python", "-m", "services.bridge", name]
-    for name in ("ros2", "foxglove"):
-        assert found[name]["build"] == {"context": ".", "target": "bridge", "args": {"BRIDGE": name}}
-        assert (ROOT / "requirements" / f"{name}.lock").is_file()
+    assert found["ros2"]["profiles"] == ["ros2"] and found["ros2"]["build"] == {"context": ".", "target": "ros2"}
+    assert found["foxglove"]["build"] == {"context": ".", "target": "bridge", "args": {"BRIDGE": "foxglove"}}
+    assert (ROOT / "requirements" / "foxglove.lock").is_file()
     for name, port in (("page", "${EITSKIN_PAGE_PORT:-8080}"), ("foxglove", "8765")):
         assert found[name]["ports"] == [f"127.0.0.1:{port}:{port}"]
         assert found[name]["command"][4:] == ["--host", "0.0.0.0", "--port", port], "whatever skin.toml says"

@@ -21,7 +21,7 @@ SHOWN = {  # what each command of README prints beside the service; typed shorte
     "./skin info touch.mcap": ("", "contact/palm +[0-9]+"),
 }
 # `make up` is how the service is started, node.py a program below; the others: tests/bridges, tests/cli
-ELSEWHERE = r"make .*|\./skin (bench .*|bridge ros2|doctor|replay .*)|skin reconstruct|.*node\.py"
+ELSEWHERE = r"make .*|ros2 .*|\./skin (bench .*|doctor|replay .*)|skin reconstruct|.*node\.py"
 # programs that read contacts: file, what is in it, and a line that it prints
 PROGRAMS = {"README.md": ("msgpack", r"^\d+ True \["), "docs/clients.md": ("ContactSubscriber", r"^\d+$")}
 

@@ -53,7 +53,9 @@ BESIDE = [
     ({"realtime": {"cpus": {"inference": [True]}}}, "cpus.inference.0: found True; allo"),
     ({"realtime": {"cpus": {"infrence": [0]}}}, "infrence"),
     ({"realtime": {"priority": 100}}, "realtime.priority"),
-    ({"loging": {}}, "unknown key; allowed here: skins, sockets, security, realtime, skip, bridges, page, ros2, "),
+    ({"loging": {}}, "unknown key; allowed here: skins, sockets, security, realtime, skip, bridges, page, foxglove, "),
+    ({"ros2": {"domain": 0}}, "take `ros2` out of skin.toml, and start it by `ros2 launch"),
+    ({"bridges": ["page", "ros2"]}, "take `ros2` out of skin.toml"),
 ]
 OF_SKINS = [
     ({}, "skins: found {}"),

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.frames import Contact, ContactFrame, ImageFrame
+from .frames import Contact, ContactFrame, ImageFrame
 
 
 def present(frame: ContactFrame) -> list[Contact]:

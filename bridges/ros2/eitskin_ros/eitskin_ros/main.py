@@ -1,0 +1,36 @@
+"""Runs the node of one skin: what eitskin says of it, as ROS topics. `ros2 launch eitskin_ros skin.launch.py`.
+
+A thread (reader.py) reads eitskin's sockets and publishes; rclpy's executor serves parameters, the service `tare` and
+the sensor that is the reference.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import rclpy
+from eitskin.errors import EitskinError
+from rclpy.exceptions import NameValidationException, ParameterException
+from rclpy.executors import ExternalShutdownException
+
+from .node import SkinNode
+from .reader import ReaderThread
+
+
+def main() -> int:
+    rclpy.init()
+    reader = None
+    try:
+        node = SkinNode()
+        reader = ReaderThread(node)
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (EitskinError, NameValidationException, ParameterException) as why:
+        print(f"skin: {why}", file=sys.stderr)
+        return 1
+    finally:
+        if reader is not None:
+            reader.close()
+        rclpy.try_shutdown()
+    return int(reader is not None and reader.failed)
