@@ -10,7 +10,6 @@ import typer
 
 from protocol.whole_file import write_whole
 from services.cli.common import ROOT, USAGE, JsonOption, emit, fail
-from services.runtime.config import SKIN_NAME
 
 if TYPE_CHECKING:
     from models.drawing import Drawing
@@ -46,6 +45,7 @@ def new(
     from models import drawing, geometry
     from models.meshing import MeshError, build
     from models.patterns import NAMES, PatternError
+    from services.runtime.config import SKIN_NAME
 
     if not SKIN_NAME.fullmatch(name):
         fail(f"found the name {name!r}, expected lower-case letters, digits, - and _, at most 32", USAGE)
