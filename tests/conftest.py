@@ -11,9 +11,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import hypothesis
 import pytest
@@ -37,10 +35,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the backgrou
 class FailuresAtOnce:
     """Names a test when it fails: a run that is cut off has not told its failures otherwise."""
 
-    def __init__(self, terminal: Any) -> None:
+    def __init__(self, terminal):
         self._terminal = terminal
 
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+    def pytest_runtest_logreport(self, report):
         if report.failed:
             self._terminal.write_line("")
             self._terminal.write_line(f"FAILED {report.nodeid}")
@@ -48,7 +46,7 @@ class FailuresAtOnce:
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     os.environ.pop("EITSKIN_RUNTIME", None)
     terminal = config.pluginmanager.get_plugin("terminalreporter")
     if terminal is not None and not hasattr(config, "workerinput"):
@@ -56,11 +54,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup() -> None:
+def pytest_runtest_setup():
     pinned.seed()
 
 
-def _folder(patch: pytest.MonkeyPatch) -> Iterator[Path]:
+def _folder(patch):
     """With a path short enough for sockets."""
     with tempfile.TemporaryDirectory(prefix="eit", dir="/tmp", ignore_cleanup_errors=True) as folder:
         patch.setenv("EITSKIN_RUNTIME", folder)
@@ -68,18 +66,18 @@ def _folder(patch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.fixture
-def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def runtime(monkeypatch):
     yield from _folder(monkeypatch)
 
 
 @pytest.fixture(autouse=True)
-def _no_runtime_of_the_user(request: pytest.FixtureRequest) -> None:
+def _no_runtime_of_the_user(request):
     """Every test has a runtime folder that no other test and no service of the user has."""
     if "EITSKIN_RUNTIME" not in os.environ:  # a service that a file shares has set its own
         request.getfixturevalue("runtime")
 
 
-def without_recorder(folder: Path, scan: str) -> Path:
+def without_recorder(folder, scan):
     """The shipped configuration without its recorder, which listens to every contact and keeps the publisher awake."""
     lines = (ROOT / "skin.toml").read_text().splitlines(keepends=True)
     begin = next(k for k, line in enumerate(lines) if line.startswith("[recorder]"))
@@ -92,7 +90,7 @@ def without_recorder(folder: Path, scan: str) -> Path:
 
 
 @contextlib.contextmanager
-def serving(folder: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
+def serving(folder, *options):
     """`skin up` with the stub board in this runtime folder, once valid contact frames come; ended afterwards."""
     from protocol.sockets import NewestReader  # here: numpy's threads are still to be limited by who needs it first
 
@@ -113,26 +111,26 @@ def serving(folder: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @pytest.fixture
-def service(runtime: Path) -> Iterator[subprocess.Popen[bytes]]:
+def service(runtime):
     with serving(runtime) as process:
         yield process
 
 
 @contextlib.contextmanager
-def _shared(without: bool, scan: str = "full") -> Iterator[Path]:
+def _shared(without, scan="full"):
     with pytest.MonkeyPatch.context() as patch, contextlib.contextmanager(_folder)(patch) as folder:
         with serving(folder, *(("--config", str(without_recorder(folder, scan))) if without else ())):
             yield folder
 
 
 @pytest.fixture(scope="module")
-def shared_service() -> Iterator[Path]:
+def shared_service():
     """The whole service, one for all tests of a file; gives its runtime folder, which $EITSKIN_RUNTIME names."""
     with _shared(without=False) as folder:
         yield folder
 
 
 @pytest.fixture(scope="module")
-def service_that_nobody_hears(request: pytest.FixtureRequest) -> Iterator[Path]:
+def service_that_nobody_hears(request):
     with _shared(without=True, scan=request.param) as folder:
         yield folder

@@ -7,13 +7,16 @@ import pytest
 from bench import ROOT
 from bench.trust import plans, runs
 from bench.trust.judge import Judge
+from bench.trust.runs import skin_of
 from bench.trust.scene import Trouble, TrustScene
 from bench.trust.score import TrustScore
-from bench.trust.session import SessionPlan
+from bench.trust.session import PlayedSession, SessionPlan
+from bench.trust.stages import Today
 from firmware_stub.worlds import table
 from protocol.frames import Contact, ContactFrame
+from simulation.host import loaded
+from simulation.scenes import DiscPress, script
 from simulation.truth import TruePaths
-from tests.bench.trust_sessions import played, press, scene
 
 FRAME_S = 0.0436
 
@@ -36,6 +39,36 @@ def contact(x: float, y: float, force: float, number: int = 1, sigma: float = 0.
     return Contact(id=number, position=[x, y, 0.0], force_n=force, **sigmas)
 
 
+def press(begin, end, force, x, y, radius=0.01):
+    """A disc whose force rises and falls within 0.1 s."""
+    return DiscPress(x, y, begin, end, force, 0.1, radius).path()
+
+
+def scene(seconds, *tracks, contact=(), tares=()):
+    return TrustScene(seconds, script(*tracks, contact=contact), (), tuple((t, "tare") for t in tares))
+
+
+def played(what, scan, seed=3, world="plain", sheet=None):
+    plan, bundle = SessionPlan(world, seed, what.seconds), loaded("square16")
+    return PlayedSession(plan, what, sheet or table.sheet(world, seed), skin_of(scan, "square16"), bundle)
+
+
+def today(session):
+    return Today(session.skin, loaded("square16"))
+
+
+def frames(what, scan, seed=3, world="plain"):
+    """(sample [s], frame) of the service's own stages."""
+    session = played(what, scan, seed, world)
+    for _, frame in session.contacts({"": today(session)}):
+        yield frame.stamps["sample"] * 1e-9, frame
+    session.host.close()
+
+
+def stronger(touch, share):
+    return replace(touch, drop=touch.drop * (1 + share))
+
+
 HELD = scene(12.0, press(7.0, 11.0, 3.0, 0.02, 0.0))
 BRIEFLY, NONE = "hidden briefly", "hidden briefly, none shown"
 
@@ -49,23 +82,20 @@ def test_nothing_is_counted_of_frames_that_are_right() -> None:
     assert score.percent("touched valid", "touched") == score.percent("untouched valid", "untouched") == 100.0
 
 
-@pytest.mark.parametrize(
-    ("says", "counted"),
-    [
-        ({6.5: [contact(0.0, 0.0, 1.0)], 6.6: None}, {"phantom": 2, "phantom incidents": 1}),
-        ({8.0: [contact(0.02, 0.016, 3.0)], 8.3: None}, {"phantom": 7, "phantom incidents": 1}),
-        ({8.0: [contact(0.02, 0.014, 3.0)], 8.3: None}, {"phantom": 0, "hidden": 0}),
-        ({8.0: [], 8.09: None}, {"wrong count": 0, "hidden": 0}),
-        ({8.0: [], 8.25: None}, {"wrong count": 1, "hidden": 0}),
-        ({8.0: [], 8.5: None}, {"wrong count": 1, "hidden": 1, "never shown": 0}),
-        ({6.0: []}, {"wrong count": 1, "hidden": 1, "never shown": 1}),
-        ({8.0: [contact(0.02, 0.0, 3.0, number=9)], 9.0: None}, {"id changed": 2}),
-        ({6.5: [], 7.13: None}, {BRIEFLY: 0, NONE: 0}),  # fully from 7.1 s on: their scans begin before
-        ({6.5: [], 7.16: None}, {BRIEFLY: 1, NONE: 1, "hidden": 0}),
-        ({8.0: [contact(0.02, 0.016, 3.0)], 8.09: None}, {BRIEFLY: 2, NONE: 0, "hidden": 0}),
-        ({8.0: [], 10.0: None}, {BRIEFLY: 7, NONE: 7, "hidden": 1}),  # the first 0.3 s
-    ],
-)
+@pytest.mark.parametrize(("says", "counted"), [
+    ({6.5: [contact(0.0, 0.0, 1.0)], 6.6: None}, {"phantom": 2, "phantom incidents": 1}),
+    ({8.0: [contact(0.02, 0.016, 3.0)], 8.3: None}, {"phantom": 7, "phantom incidents": 1}),
+    ({8.0: [contact(0.02, 0.014, 3.0)], 8.3: None}, {"phantom": 0, "hidden": 0}),
+    ({8.0: [], 8.09: None}, {"wrong count": 0, "hidden": 0}),
+    ({8.0: [], 8.25: None}, {"wrong count": 1, "hidden": 0}),
+    ({8.0: [], 8.5: None}, {"wrong count": 1, "hidden": 1, "never shown": 0}),
+    ({6.0: []}, {"wrong count": 1, "hidden": 1, "never shown": 1}),
+    ({8.0: [contact(0.02, 0.0, 3.0, number=9)], 9.0: None}, {"id changed": 2}),
+    ({6.5: [], 7.13: None}, {BRIEFLY: 0, NONE: 0}),  # fully from 7.1 s on: their scans begin before
+    ({6.5: [], 7.16: None}, {BRIEFLY: 1, NONE: 1, "hidden": 0}),
+    ({8.0: [contact(0.02, 0.016, 3.0)], 8.09: None}, {BRIEFLY: 2, NONE: 0, "hidden": 0}),
+    ({8.0: [], 10.0: None}, {BRIEFLY: 7, NONE: 7, "hidden": 1}),  # the first 0.3 s
+])  # fmt: skip
 def test_what_must_not_be_is_counted(says, counted) -> None:
     score = judged(HELD, says)
     assert {key: score.counts[key] for key in counted} == counted

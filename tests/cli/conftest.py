@@ -2,9 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 
@@ -17,11 +15,11 @@ class Ran:
 
 
 @pytest.fixture
-def skin(runtime: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
+def skin(runtime, monkeypatch, capsys):
     """`skin ARGUMENTS` in this process. A traceback, or an error of more than a line, fails the test."""
     from services.cli.app import run
 
-    def call(*arguments: object) -> Ran:
+    def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["skin", *map(str, arguments)])
         before = dict(os.environ)
         code = run()

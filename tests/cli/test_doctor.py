@@ -42,20 +42,17 @@ def doctor(skin, tmp_path: Path):
     return call
 
 
-@pytest.mark.parametrize(
-    ("bundle", "more", "code", "says"),
-    [
-        ("square16", "", 0, "every sha256 right"),
-        ("disc16", "", 0, "not checked with the bundle disc16: shorts"),
-        ("square16", 'indenter = { kind = "any" }', 0, "OK palm: indenter touches are refined by a fit"),
-        ("square16", "indenter = { radius_m = 0.5 }", 1, "found 0.5 m; expected 0.00052 to 0.05 m with bundle"),
-        ("square16", 'calibration = "none.json"', 1, "none.json is not there: correct `calibration`"),
-        ("square16", 'calibration = "good.json"', 0, "good.json: 8.5 N per S/m, to 5 N"),
-        ("square16", "{arm}, radius_m = 0.04 }", 0, "OK palm: surface cylinder of radius 0.04 m; contacts in 'arm'"),
-        ("square16", "{arm}, radius_m = 0.01 }", 1, "reaches 100 mm round"),
-        ("broken", "", 1, "was changed or damaged"),
-    ],
-)
+@pytest.mark.parametrize(("bundle", "more", "code", "says"), [
+    ("square16", "", 0, "every sha256 right"),
+    ("disc16", "", 0, "not checked with the bundle disc16: shorts"),
+    ("square16", 'indenter = { kind = "any" }', 0, "OK palm: indenter touches are refined by a fit"),
+    ("square16", "indenter = { radius_m = 0.5 }", 1, "found 0.5 m; expected 0.00052 to 0.05 m with bundle"),
+    ("square16", 'calibration = "none.json"', 1, "none.json is not there: correct `calibration`"),
+    ("square16", 'calibration = "good.json"', 0, "good.json: 8.5 N per S/m, to 5 N"),
+    ("square16", "{arm}, radius_m = 0.04 }", 0, "OK palm: surface cylinder of radius 0.04 m; contacts in 'arm'"),
+    ("square16", "{arm}, radius_m = 0.01 }", 1, "reaches 100 mm round"),
+    ("broken", "", 1, "was changed or damaged"),
+])  # fmt: skip
 def test_what_a_configuration_names_is_looked_at(doctor, tmp_path: Path, bundle, more, code, says) -> None:
     (tmp_path / "good.json").write_text('{"newtons_per_siemens": 8.5}')
     if bundle == "broken":
@@ -77,13 +74,10 @@ def test_a_port_is_looked_at(doctor, tmp_path: Path) -> None:
 
 
 @pytest.mark.live
-@pytest.mark.parametrize(
-    ("schema", "ends", "says"),
-    [
-        (link.SCHEMA_HASH, 0, "to scan at 50 kHz, N 128, raw, Hanning, 20 us: 22.9 a second"),
-        (0xBAD0F00D, 1, "speaks schema bad0f00d"),
-    ],
-)
+@pytest.mark.parametrize(("schema", "ends", "says"), [
+    (link.SCHEMA_HASH, 0, "to scan at 50 kHz, N 128, raw, Hanning, 20 us: 22.9 a second"),
+    (0xBAD0F00D, 1, "speaks schema bad0f00d"),
+])  # fmt: skip
 def test_the_board_is_asked_for_its_firmware(doctor, schema: int, ends: int, says: str) -> None:
     ours, theirs = pty.openpty()
     tty.setraw(ours)
@@ -117,16 +111,13 @@ def contact(*reasons: str) -> ContactFrame:
     return ContactFrame(skin="palm", valid=not reasons, reasons=list(reasons), valid_for_s=0.25)
 
 
-@pytest.mark.parametrize(
-    ("valid", "gap", "late", "level", "share"),
-    [
-        (0, 0, 0, "FAIL", "no contact frame came"),
-        (49, 51, 0, "FAIL", "49 of 100 frames of 3 s are valid (49 %)"),
-        (50, 50, 0, "WARN", "(50 %)"),
-        (94, 2, 4, "WARN", "(94 %)"),
-        (95, 5, 0, "OK", "(95 %)"),
-    ],
-)
+@pytest.mark.parametrize(("valid", "gap", "late", "level", "share"), [
+    (0, 0, 0, "FAIL", "no contact frame came"),
+    (49, 51, 0, "FAIL", "49 of 100 frames of 3 s are valid (49 %)"),
+    (50, 50, 0, "WARN", "(50 %)"),
+    (94, 2, 4, "WARN", "(94 %)"),
+    (95, 5, 0, "OK", "(95 %)"),
+])  # fmt: skip
 def test_contacts_are_judged_by_the_share_of_valid_frames(valid, gap, late, level: str, share: str) -> None:
     first, *others = validity("palm", [contact()] * valid + [contact("gap")] * gap + [contact("late")] * late)
     assert first.level == level and share in first.text
@@ -168,16 +159,13 @@ def test_the_order_of_electrodes_is_seen_in_the_baseline() -> None:
         assert finding.level == level and says in finding.text
 
 
-@pytest.mark.parametrize(
-    ("name", "place", "value", "says"),
-    [
-        ("field", 0, 0.0, ""),
-        ("contact", 5, np.log(4.0), "electrode 5: contact impedance 4 times the file's"),
-        ("shift", 7, 0.05, "electrode 7: 2.5 mm further along the outline"),
-        ("anisotropy", 1, 0.16, "17 % better along 45 degrees"),
-        ("after", 0, 0.01, "1.0 % of the untouched impedances stay unexplained"),
-    ],
-)
+@pytest.mark.parametrize(("name", "place", "value", "says"), [
+    ("field", 0, 0.0, ""),
+    ("contact", 5, np.log(4.0), "electrode 5: contact impedance 4 times the file's"),
+    ("shift", 7, 0.05, "electrode 7: 2.5 mm further along the outline"),
+    ("anisotropy", 1, 0.16, "17 % better along 45 degrees"),
+    ("after", 0, 0.01, "1.0 % of the untouched impedances stay unexplained"),
+])  # fmt: skip
 def test_what_looks_wrong_with_the_mounting_is_named(name: str, place: int, value: float, says: str) -> None:
     skin = geometry.load("square16")
     nominal = Mounting.nominal(skin, FieldModes(skin).count)

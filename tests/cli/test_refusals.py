@@ -1,6 +1,8 @@
-"""Requests that cannot be met: one line that says what was found or expected, the exit status, and nothing made."""
+"""Requests that cannot be met: one line that says why, the exit status, nothing made. `skin new`: a skin in one."""
 
 import errno
+import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,10 +13,47 @@ import pytest
 import zmq
 
 from firmware_stub.rig import Rig
+from models import geometry
 from protocol.runtime import CONFIG_LINK
 from services.cli import board
 from services.cli.common import ROOT, CliError
 from services.runtime import room
+
+DRAWING = """<svg xmlns="http://www.w3.org/2000/svg" width="100mm" height="100mm" viewBox="0 0 100 100">
+<path d="M 0 0 L 50 0 L 50 50 L 100 50 L 100 100 L 0 100 Z M 10 70 L 20 80"/><circle cx="20" cy="80" r="3"/></svg>"""
+
+
+def test_a_disc_and_a_drawing(skin, tmp_path):
+    """An L, by a path of several lines of which one is closed."""
+    ran = skin("new", "my-skin", "--disc", 0.06, "--electrodes", 12, "--out", tmp_path, "--json")
+    said = json.loads(ran.out)
+    assert ran.code == 0 and (said["electrodes"], said["measurements"], said["size_mm"]) == (12, 66, [60, 60])
+    assert geometry.load(tmp_path / "my-skin.toml").metres_per_unit == pytest.approx(0.03)
+    again = skin("new", "my-skin", "--disc", 0.06, "--out", tmp_path)
+    assert again.code == 2 and "is there already: choose another name, or give --overwrite" in again.err
+    (tmp_path / "ell.svg").write_text(DRAWING)
+    ran = skin("new", "ell", "--outline", tmp_path / "ell.svg", "--first", 0.0125, "--out", tmp_path)
+    assert ran.code == 0 and "a polygon of 6 corners, 100 x 100 mm, 16 electrodes 7.5 mm wide" in ran.out, ran.err
+    assert "1 closed lines inside the outline were left out" in ran.out
+    corner = geometry.load(tmp_path / "ell.toml").inside([[0.5, 0.5], [0.5, -0.5], [-0.5, 0.5]])
+    assert corner.tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    ("mine --disc 60", "found 60 m x 60 m, expected a longer side of 0.005 to 3 m: --disc takes metres"),
+    ("mine --disc 0.06 --electrodes 3", "--electrodes 3 electrodes: expected 4 to 64"),
+    (
+        "mine --disc 0.12 --electrodes 32 --pattern adjacent",
+        r"'adjacent' are 928 measurements, at most 512 .* 'pairs' \(496\) or at most 24 electrodes with 'adjacent'",
+    ),
+    ("mine --disc 0.12 --electrodes 33", "are 528 measurements, at most 512 .* choose at most 32 electrodes with"),
+    ("mine", "give either --disc METRES .* or --outline FILE"),
+    ("My_Skin --disc 0.06", "found the name 'My_Skin', expected lower-case letters"),
+])  # fmt: skip
+def test_what_cannot_be(skin, tmp_path, words, message):
+    ran = skin("new", *words.split(), "--out", tmp_path)
+    assert ran.code == 2 and not list(tmp_path.iterdir()) and re.search(message, ran.err), ran.err
+
 
 K = 120
 STUB = '[skins.palm]\nport = "stub"\nbundle = "square16"\n'
@@ -32,26 +71,23 @@ def refused(ran, code: int, says: str) -> None:
     assert ran.code == code and says in ran.err and not ran.out, (ran.code, ran.err, ran.out)
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "says"),
-    [
-        ("press --x 0 --y 0 --force 1 --to-x 0.01", 2, "both --to-x and --to-y"),
-        ("compare --seconds -3", 2, "'--seconds'"),
-        ("fault electrode_open electrode", 2, "expected key=value"),
-        ("top", 2, "the output is no terminal, expected one to draw on: give --once"),
-        ("snapshot", 3, "recorder does not run here"),
-        ("record /nowhere/x.mcap", 2, "cannot write /nowhere/x.mcap"),
-        ("replay a.mcap --from inf", 2, "--from: found inf, expected a finite number"),
-        ("golden text.txt", 2, "text.txt is no recording: expected FILE.mcap"),
-        ("limits --radius 0.06", 2, "no touch of radius 60 mm fits on skin 'square16'"),
-        ("bench acuracy", 2, "accuracy"),
-        ("up --config bad.toml", 2, "bad.toml: is not TOML"),
-        ("up --config port.toml", 2, "skins.palm.port"),
-        ("up --config bundle.toml", 2, "skins.palm.bundle: no bundle 'no-such': shipped are"),
-        ("up --config forces.toml", 2, "forces.json"),
-        ("collect presses.npz --stub 3 --config real.toml", 2, "palm has '/dev/ttyACM9': leave it out"),
-    ],
-)
+@pytest.mark.parametrize(("words", "code", "says"), [
+    ("press --x 0 --y 0 --force 1 --to-x 0.01", 2, "both --to-x and --to-y"),
+    ("compare --seconds -3", 2, "'--seconds'"),
+    ("fault electrode_open electrode", 2, "expected key=value"),
+    ("top", 2, "the output is no terminal, expected one to draw on: give --once"),
+    ("snapshot", 3, "recorder does not run here"),
+    ("record /nowhere/x.mcap", 2, "cannot write /nowhere/x.mcap"),
+    ("replay a.mcap --from inf", 2, "--from: found inf, expected a finite number"),
+    ("golden text.txt", 2, "text.txt is no recording: expected FILE.mcap"),
+    ("limits --radius 0.06", 2, "no touch of radius 60 mm fits on skin 'square16'"),
+    ("bench acuracy", 2, "accuracy"),
+    ("up --config bad.toml", 2, "bad.toml: is not TOML"),
+    ("up --config port.toml", 2, "skins.palm.port"),
+    ("up --config bundle.toml", 2, "skins.palm.bundle: no bundle 'no-such': shipped are"),
+    ("up --config forces.toml", 2, "forces.json"),
+    ("collect presses.npz --stub 3 --config real.toml", 2, "palm has '/dev/ttyACM9': leave it out"),
+])  # fmt: skip
 def test_mistakes_are_answered(skin, folder: Path, words: str, code: int, says: str) -> None:
     files = {
         "bad.toml": "[skins.palm\n",
@@ -100,20 +136,17 @@ RECONSTRUCT = "reconstruct in.npz out --skin square16 --no-calibrate"
 REGISTER = "register in.npz --skin disc16 --out out"
 
 
-@pytest.mark.parametrize(
-    ("command", "arrays", "says"),
-    [
-        (RECONSTRUCT, {"pressures": np.ones((2, K))}, "no array `measurements`"),
-        (RECONSTRUCT, ROWS, "found neither"),
-        (RECONSTRUCT, {**GOOD, "reference": np.ones((2, K))}, "found both"),
-        (RECONSTRUCT, {**GOOD, "measurements": np.ones((2, 119))}, "expected numbers of shape (n, 120)"),
-        (RECONSTRUCT, {**ROWS, "reference": np.ones((3, K))}, "expected one each"),
-        (RECONSTRUCT, {**ROWS, "untouched": np.zeros((8, K))}, "in 0 of 120 columns, expected at least 60"),
-        (RECONSTRUCT, {**ROWS, "untouched": [[np.nan] * 100 + [1.0] * 20] * 8}, "in 20 of 120 columns"),
-        (REGISTER, PRESSES | {"touched": np.array(3.0)}, "`touched` is float64 of shape ()"),
-        ("import in.npz out --skin disc16", OTHER_PATTERN, "`pattern` has 192 rows, and lacks"),
-    ],
-)
+@pytest.mark.parametrize(("command", "arrays", "says"), [
+    (RECONSTRUCT, {"pressures": np.ones((2, K))}, "no array `measurements`"),
+    (RECONSTRUCT, ROWS, "found neither"),
+    (RECONSTRUCT, {**GOOD, "reference": np.ones((2, K))}, "found both"),
+    (RECONSTRUCT, {**GOOD, "measurements": np.ones((2, 119))}, "expected numbers of shape (n, 120)"),
+    (RECONSTRUCT, {**ROWS, "reference": np.ones((3, K))}, "expected one each"),
+    (RECONSTRUCT, {**ROWS, "untouched": np.zeros((8, K))}, "in 0 of 120 columns, expected at least 60"),
+    (RECONSTRUCT, {**ROWS, "untouched": [[np.nan] * 100 + [1.0] * 20] * 8}, "in 20 of 120 columns"),
+    (REGISTER, PRESSES | {"touched": np.array(3.0)}, "`touched` is float64 of shape ()"),
+    ("import in.npz out --skin disc16", OTHER_PATTERN, "`pattern` has 192 rows, and lacks"),
+])  # fmt: skip
 def test_arrays_that_are_none_of_a_skin(skin, folder: Path, command: str, arrays, says: str) -> None:
     np.savez(folder / "in.npz", **arrays)
     words = command.replace(" out", " out.mcap" if command.startswith("import") else " out.npz", 1)

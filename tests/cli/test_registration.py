@@ -1,7 +1,5 @@
 """Registration: known similarities are found again; a real skin is located as docs/figures.md says."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -25,11 +23,11 @@ DISC = "hydrogel_disc16.npz"
 
 
 @pytest.fixture(scope="module")
-def bundle() -> Bundle:
+def bundle():
     return Bundle.load("disc16")
 
 
-def presses_of(bundle: Bundle, true: Similarity, n=60, reach=0.8, noise=1e-3, strength=1.0) -> Arrays:
+def presses_of(bundle, true, n=60, reach=0.8, noise=1e-3, strength=1.0):
     """What a skin lying at `true` in the machine's frame would measure: every measurement with a gain of its own."""
     rng = np.random.default_rng(8)
     radius, angle = reach * np.sqrt(rng.uniform(0, 1, n)), rng.uniform(0, 2 * np.pi, n)
@@ -46,7 +44,7 @@ def presses_of(bundle: Bundle, true: Similarity, n=60, reach=0.8, noise=1e-3, st
     "true",
     [PLAIN, Similarity(-1.9, 1.2, np.array([0.012, -0.02]), False), Similarity(2.6, 0.9, -np.ones(2) / 50, True)],
 )
-def test_a_known_similarity_is_found(bundle: Bundle, true: Similarity) -> None:
+def test_a_known_similarity_is_found(bundle, true):
     made = register(read_presses(presses_of(bundle, true), bundle), bundle)
     found = made.similarity
     assert found.mirrored == true.mirrored and made.explained > 0.9 and not made.doubts
@@ -61,7 +59,7 @@ def test_a_known_similarity_is_found(bundle: Bundle, true: Similarity) -> None:
 class Split:
     """Presses of the reference data that a map is made of, and others that it finds."""
 
-    def __init__(self, bundle: Bundle, train: slice, test: slice, shuffle: int = 0):
+    def __init__(self, bundle, train, test, shuffle=0):
         arrays = load_npz(needs.reference(DISC))
         count = len(arrays["xy"])
         order = np.random.default_rng(shuffle).permutation(count) if shuffle else np.arange(count)
@@ -76,7 +74,7 @@ class Split:
         self.beyond = np.sqrt(np.array(square) / NINETY)  # of the ellipse that 90 % are said to lie in
 
 
-def test_real_presses_are_found_within_3_mm(bundle: Bundle) -> None:
+def test_real_presses_are_found_within_3_mm(bundle):
     """Median over 200 presses that took no part, after 100 that did: 2.5 mm. (A plain one-step image: 14.9 mm.)"""
     real = Split(bundle, slice(0, 100), slice(100, 300))
     assert np.median(real.error) < 0.004 and real.error.mean() < 0.005
@@ -87,7 +85,7 @@ def test_real_presses_are_found_within_3_mm(bundle: Bundle) -> None:
     assert np.abs(depth - real.test.value).mean() < 0.0025  # their mean depth is off by 4
 
 
-def test_ten_real_presses_are_enough_to_begin_with_and_say_that_they_know_little(bundle: Bundle) -> None:
+def test_ten_real_presses_are_enough_to_begin_with_and_say_that_they_know_little(bundle):
     """A shuffle that leaves much of the skin untouched."""
     few = Split(bundle, slice(0, 10), slice(10, 500), shuffle=6)
     assert np.median(few.error) < 0.02
@@ -100,7 +98,7 @@ def test_ten_real_presses_are_enough_to_begin_with_and_say_that_they_know_little
             arrays_of(arrays | {name: wrong}, 192)
 
 
-def test_what_is_told_of_a_skin_is_kept(bundle: Bundle) -> None:
+def test_what_is_told_of_a_skin_is_kept(bundle):
     presses = read_presses(presses_of(bundle, Similarity(0.4, 1.1, np.zeros(2), True), n=12), bundle)
     found = register(presses, bundle, KnownPose(0.16 * 1.1, 0.4, True)).similarity
     assert found.mirrored and abs(found.scale / 1.1 - 1) < 0.025 and abs(found.angle - 0.4) < np.radians(6)
@@ -110,7 +108,7 @@ def test_what_is_told_of_a_skin_is_kept(bundle: Bundle) -> None:
         register(presses, bundle, KnownPose(diameter_m=0.05))
 
 
-def test_a_skin_is_no_larger_than_physics_allows(bundle: Bundle) -> None:
+def test_a_skin_is_no_larger_than_physics_allows(bundle):
     arrays = presses_of(bundle, PLAIN, n=80, reach=0.35)
     made = register(read_presses(arrays, bundle), bundle)
     xy = arrays["xy"]
@@ -121,7 +119,7 @@ def test_a_skin_is_no_larger_than_physics_allows(bundle: Bundle) -> None:
     assert abs(told.similarity.scale - 1.0) < 0.025 and told.explained > made.explained
 
 
-def test_presses_that_register_no_skin_are_refused(bundle: Bundle) -> None:
+def test_presses_that_register_no_skin_are_refused(bundle):
     many = presses_of(bundle, PLAIN)
     for arrays, says in (
         (many | {"xy": many["xy"][np.random.default_rng(3).permutation(60)]}, "row n of xy"),
@@ -136,7 +134,7 @@ def test_presses_that_register_no_skin_are_refused(bundle: Bundle) -> None:
             register(read_presses(arrays, bundle), bundle)
 
 
-def test_equal_untouched_rows_say_nothing_of_noise(bundle: Bundle) -> None:
+def test_equal_untouched_rows_say_nothing_of_noise(bundle):
     """Neither none nor 60 dB: what the presses themselves leave unexplained."""
     arrays, rng = presses_of(bundle, PLAIN, n=80, noise=0.0), np.random.default_rng(11)
     for level in (4e-3, 4e-4):
@@ -146,7 +144,7 @@ def test_equal_untouched_rows_say_nothing_of_noise(bundle: Bundle) -> None:
         assert 0.4 * level < np.median(noise) < 2.5 * level
 
 
-def test_presses_and_measurements_that_are_missing_are_left_out(bundle: Bundle) -> None:
+def test_presses_and_measurements_that_are_missing_are_left_out(bundle):
     """A dead measurement, a press of which nothing came, one with a gap, and one twice: the others tell as before."""
     arrays = presses_of(bundle, PLAIN, n=80)
     whole = register(read_presses(arrays, bundle), bundle).similarity
@@ -167,14 +165,14 @@ def test_presses_and_measurements_that_are_missing_are_left_out(bundle: Bundle) 
     assert np.hypot(touch.x - without.x, touch.y - without.y) < 0.004
 
 
-def test_contacts_of_a_registered_skin_say_how_deep_and_how_sure(bundle: Bundle, tmp_path: Path) -> None:
+def test_contacts_of_a_registered_skin_say_how_deep_and_how_sure(bundle, tmp_path):
     """Through the stages, from differences alone; a skin that was not registered says nothing of either."""
     arrays, rows = load_npz(needs.reference(DISC)), slice(120, 130)
     relative = arrays["touched"] / arrays["untouched"] - 1
     file = {"pattern": arrays["pattern"], "delta": 500.0 * relative, "xy": arrays["xy"], "depth": arrays["depth"]}
     register_presses(file, "disc16", 120, tmp_path / "mine")
 
-    def contacts_of(path: str) -> list:
+    def contacts_of(path):
         own, contacts = Bundle.load(path), []
         skin, data = Skin(port="stub", bundle=path, frame_id="skin"), read_scans(part(file, rows), own)
         pipeline = Pipeline(skin, bundle=own)
@@ -191,7 +189,7 @@ def test_contacts_of_a_registered_skin_say_how_deep_and_how_sure(bundle: Bundle,
     assert all(0 < c.position_sigma[1] <= c.position_sigma[0] < 0.02 for c in contacts)
 
 
-def test_forces_are_told_where_the_file_has_them(bundle: Bundle) -> None:
+def test_forces_are_told_where_the_file_has_them(bundle):
     force = np.random.default_rng(5).uniform(1, 5, 120)
     presses = read_presses(presses_of(bundle, PLAIN, n=120, strength=force / 3) | {"force": force}, bundle)
     made, _, crossed = build(presses, register(presses, bundle).similarity, bundle)
@@ -201,7 +199,7 @@ def test_forces_are_told_where_the_file_has_them(bundle: Bundle) -> None:
 
 
 @pytest.mark.live
-def test_readme_s_real_skin_works_word_for_word(skin, bundle: Bundle, tmp_path: Path, monkeypatch) -> None:
+def test_readme_s_real_skin_works_word_for_word(skin, bundle, tmp_path, monkeypatch):
     """Registered, imported, replayed from another folder, on presses of a skin turned, larger and moved."""
     true = Similarity(0.7, 1.25, np.array([0.01, -0.02]), False)
     np.savez(tmp_path / "FILE.npz", pattern=bundle.pattern, **presses_of(bundle, true, n=30))

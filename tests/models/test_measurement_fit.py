@@ -1,12 +1,17 @@
-"""States of touches, their course within a scan, and the fit of them: by closed forms, and by finite elements."""
+"""States of touches, their course in a scan, and fits of them: closed forms, finite elements, other outlines."""
 
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from firmware_stub.world import pressed
+from models import bundle, geometry, manifest
+from models.forward import ForwardModel, shared
+from models.linearise import linearise
 from models.measurement import touch as touches
 from models.measurement.course import TouchCourse
 from models.measurement.covariance.noise import NoiseModel
@@ -14,7 +19,13 @@ from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
 from models.measurement.responses.disc import DiscResponse
 from models.measurement.responses.grid import DiscGrid
+from models.measurement.responses.tables import SkinTables, tables_of
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, VX, TouchPrior, X, Y, anywhere, plain
+from models.response_error import frame_errors
+from models.response_tables import response_tables
+from models.shapes import Shape
+from models.touch_fit import TouchFit
+from models.touch_response import TouchResponse
 from tests.models.solved import UNIT_M, action_of, change, tables
 
 NOISE, SPAN_S = 1e-4, 0.0437
@@ -247,3 +258,80 @@ def test_two_touches_are_told_apart_by_the_grid_and_the_fit() -> None:
     assert two.evidence > one.evidence + 5 and two.chi2 < 1.45
     sd = np.sqrt(np.diag(two.covariance))[7:9]
     assert (np.abs(two.states[1, PLACE] - [0.3, -0.1]) < 3 * sd).all() and (sd < 0.06).all()
+
+
+ELECTRODES = {"width": 5, "count": 12}
+DISC12 = {"name": "disc12", "unit": "mm", "contact_impedance": 0.01, "radius": 30, "electrodes": ELECTRODES}
+SHORT_S, ACTS = 0.03, np.pi * 0.2**2
+PLACES = (0.1, 0.05), (0.45, -0.2), (0.62, 0.3)
+MOST = {  # % of the change at the places above: a touch of radius 0.2 and drop 0.4
+    ("pairs", False): (0.5, 1.0, 2.0),
+    ("adjacent", False): (1.2, 1.5, 2.5),
+    ("opposite", True): (0.3, 0.5, 1.0),  # half of the impedances are negative
+}
+
+
+@cache
+def model(pattern: str) -> ForwardModel:
+    return ForwardModel(geometry.from_dict(DISC12).with_pattern(pattern), mesh="stub")
+
+
+def disc_change(pattern: str, touch: Shape) -> np.ndarray:
+    of = model(pattern)
+    return np.abs(of.solve(of.touched([touch], 1.0)).impedances() / of.solve(1.0).impedances()) - 1
+
+
+def disc_tables(folder: Path, pattern: str, fine: bool) -> SkinTables:
+    """Of a round skin of 12 electrodes, relative to the untouched skin on the other mesh."""
+    skin = geometry.from_dict(DISC12).with_pattern(pattern)
+    own = ForwardModel(skin)
+    matrices, response = linearise(own, "model"), response_tables(own, coarse=24) if fine else None
+    bundle.write(folder / "own", manifest.describe("own", skin, matrices), matrices, response=response)
+    made = tables_of(bundle.Bundle.load(folder / "own"))
+    return made.relative_to(np.abs(model(pattern).solve(1.0).impedances()))
+
+
+@pytest.mark.parametrize(("pattern", "fine"), MOST)
+def test_a_press_is_explained_by_its_disc_and_found_where_it_is(tmp_path: Path, pattern: str, fine: bool) -> None:
+    known, rng = disc_tables(tmp_path, pattern, fine), np.random.default_rng(3)
+    response, k = DiscResponse(known), known.measurements
+    covariance, times_s = NoiseModel(known).covariance(0), ((np.arange(k) + 0.5) / k - 0.5) * SHORT_S
+    grid, white = DiscGrid(response), Whitening.of(covariance)
+    assert np.hypot(*grid.discs[:, :2].T).max() < 1.05 and (np.abs(grid.responses).max(axis=1) > 0).all()
+    for (x, y), most in zip(PLACES, MOST[pattern, fine], strict=True):
+        touch = Shape("circle", x, y, 0.2, 0.4)
+        acts, there = ACTS * touch.drop / (1 - touch.drop / 2), disc_change(pattern, touch)
+        said = acts * response(x, y, np.log(0.2))
+        scale = said @ there / (said @ said)
+        left = np.linalg.norm(there - scale * said) / np.linalg.norm(there)
+        assert scale == pytest.approx(1, abs=0.06), (x, y)
+        assert 100 * left < most and left < 2 * known.wrong, (x, y, left)
+        touch = Shape("circle", x, y, 0.2, 0.2)
+        values = np.log1p(disc_change(pattern, touch)) + NOISE * rng.standard_normal(k)
+        z2, disc, action = grid.likeliest(white.solve(values), grid.information(white))
+        start = anywhere(float(grid.discs[disc, 0]), float(grid.discs[disc, 1]), action, SHORT_S)
+        course = TouchCourse(response, times_s, SHORT_S)
+        fit = TouchFitter(FittedScan(values, covariance, course, known.misfit, k), [start], known.wrong).fit(10)
+        off, sd = fit.states[0, PLACE] - [x, y], np.sqrt(np.diag(fit.covariance))[PLACE]
+        assert z2 > 44 and fit.chi2 < 1.45
+        assert np.linalg.norm(off) < 0.03 and (np.abs(off) < 4 * sd + 0.005).all(), (x, y, off, sd)
+        assert fit.states[0, ACTION] == pytest.approx((ACTS * touch.drop / (1 - touch.drop / 2)), rel=0.08)
+
+
+SIGMA = np.full(120, 10 ** (-70 / 20))
+
+
+def test_a_fit_finds_a_touch_its_kind_and_says_what_no_touch_explains() -> None:
+    model = shared("square16", "inverse")
+    tables = response_tables(model, coarse=16, fine=32)
+    response = TouchResponse(tables, model.pattern, model.solve().impedances(), 10)
+    slope = model.solve().jacobian() / model.solve().impedances()[:, None]
+    touch, other = Shape("triangle", 0.4, 0.3, 0.4, 0.3, 0.5), Shape("circle", -0.5, -0.4, 0.2, 0.4)
+    d = response.of(touch) + SIGMA * np.random.default_rng(0).standard_normal(120)
+    errors = frame_errors(np.asarray((slope / model.areas) @ slope.T), SIGMA, d, 0.3)
+    near = Shape("circle", touch.x + 0.04, touch.y - 0.03, 0.25, 0.24)
+    found = TouchFit(response)(d, errors, near)
+    assert found.fits_frame and found.classes.argmax() == touch.shape_class
+    assert found.position == pytest.approx(touch.centroid, abs=0.02)
+    assert found.integral[0] == pytest.approx(touch.integral, rel=0.08)
+    assert not TouchFit(response)(d + response.of(other), errors, near, ("circle",)).fits_frame

@@ -53,26 +53,23 @@ def refused(data):
     return caught.value
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "found", "expected"),
-    [
-        ("schema", 4, "schema 4", "schema 3 at most: who sent it is newer, update this reader"),
-        ("schema", 0, "int 0", "int 1..3"),
-        ("skin", "other", "'other'", "'palm', as in the message's topic"),
-        ("skin", "pa/lm", "'pa/lm'", "text"),
-        ("session", "0123", "'0123'", "[0-9a-f]{16}"),
-        ("seq", -1, "int -1", "int 0.."),
-        ("seq", True, "bool True", "int 0.."),
-        ("scan", 2**63, "int 9223372036854775808", "2^63-1"),
-        ("stamps", {"sample": -1}, "int -1", "int 0.."),
-        ("source", "elsewhere", "'elsewhere'", '"board", "stub", "replay"'),
-        ("valid", 1, "int 1", "bool"),
-        ("reasons", "gap", "str 'gap'", "list of at most 64"),
-        ("valid_for_s", -0.5, "float -0.5", "float 0.."),
-        ("held", None, "None", "bool"),
-        ("contacts", {}, "dict {}", "list of at most 256"),
-    ],
-)
+@pytest.mark.parametrize(("field", "value", "found", "expected"), [
+    ("schema", 4, "schema 4", "schema 3 at most: who sent it is newer, update this reader"),
+    ("schema", 0, "int 0", "int 1..3"),
+    ("skin", "other", "'other'", "'palm', as in the message's topic"),
+    ("skin", "pa/lm", "'pa/lm'", "text"),
+    ("session", "0123", "'0123'", "[0-9a-f]{16}"),
+    ("seq", -1, "int -1", "int 0.."),
+    ("seq", True, "bool True", "int 0.."),
+    ("scan", 2**63, "int 9223372036854775808", "2^63-1"),
+    ("stamps", {"sample": -1}, "int -1", "int 0.."),
+    ("source", "elsewhere", "'elsewhere'", '"board", "stub", "replay"'),
+    ("valid", 1, "int 1", "bool"),
+    ("reasons", "gap", "str 'gap'", "list of at most 64"),
+    ("valid_for_s", -0.5, "float -0.5", "float 0.."),
+    ("held", None, "None", "bool"),
+    ("contacts", {}, "dict {}", "list of at most 256"),
+])  # fmt: skip
 def test_a_wrong_field_is_named_with_what_was_found_and_expected(field, value, found, expected):
     error = refused(message(contact_map(**{field: value})))
     assert error.topic == "contact" and error.field.startswith(field)
@@ -123,21 +120,18 @@ def test_a_wrong_field_inside_a_contact_is_named_with_its_place_although_others_
     assert refused(message(content)).field == f"contacts[0].{key}"
 
 
-@pytest.mark.parametrize(
-    ("dtype", "shape", "data", "expected"),
-    [
-        ("<f4", [2], bytes(8), "<c8"),
-        ("<c8", [2], bytes(15), "16 bytes"),
-        ("<c8", [1, 2], bytes(16), "(K)"),
-        ("<c8", [-2], bytes(16), "array"),
-        ("<c8", [2**62, 2**62], b"", "bytes for shape"),
-        ("<c8", [2**40, 2**40, 0], b"", "dimensions that multiply"),
-        ("object", [2], bytes(16), "one of"),
-        (None, [2], bytes(16), "array"),
-        (None, None, None, "array"),
-        ("<c8", [3], bytes(24), "length 3, as z has"),
-    ],
-)
+@pytest.mark.parametrize(("dtype", "shape", "data", "expected"), [
+    ("<f4", [2], bytes(8), "<c8"),
+    ("<c8", [2], bytes(15), "16 bytes"),
+    ("<c8", [1, 2], bytes(16), "(K)"),
+    ("<c8", [-2], bytes(16), "array"),
+    ("<c8", [2**62, 2**62], b"", "bytes for shape"),
+    ("<c8", [2**40, 2**40, 0], b"", "dimensions that multiply"),
+    ("object", [2], bytes(16), "one of"),
+    (None, [2], bytes(16), "array"),
+    (None, None, None, "array"),
+    ("<c8", [3], bytes(24), "length 3, as z has"),
+])  # fmt: skip
 def test_a_wrong_array_is_refused(dtype, shape, data, expected):
     given = {k: v for k, v in {"dtype": dtype, "shape": shape, "data": data}.items() if v is not None}
     raw = map_of(RawFrame(skin="palm", z=np.ones(2), status=np.zeros(2)))
@@ -223,22 +217,19 @@ def raw_line(body, seed=link.SCHEMA_HASH):
     return b"\0" + cobs_encode(body + zlib.crc32(body, seed).to_bytes(4, "little")) + b"\0"
 
 
-@pytest.mark.parametrize(
-    ("line", "what"),
-    [
-        (b"\0\5ab\0", "bad_cobs"),
-        (b"\0\2a\0", "bad_crc"),
-        (raw_line(b"\x84" + bytes(20), seed=1), "bad_crc"),
-        (raw_line(b"\x7e123"), "unknown"),
-        (raw_line(b"\x03"), "bad_payload"),
-        (raw_line(b"\x03\1\0\0"), "bad_payload"),
-        (raw_line(b"\x84" + bytes(18) + b"\0\0"), "bad_payload"),
-        (raw_line(b"\x84" + bytes(18) + b"\2\0" + bytes(9)), "bad_payload"),
-        (raw_line(b"\x02" + bytes(8) + b"\2\0" + bytes(4)), "bad_payload"),
-        (b"\0" + b"\xff" * 20_000 + b"\0", "oversize"),
-        (b"\xff" * 1_000_000, "oversize"),
-    ],
-)
+@pytest.mark.parametrize(("line", "what"), [
+    (b"\0\5ab\0", "bad_cobs"),
+    (b"\0\2a\0", "bad_crc"),
+    (raw_line(b"\x84" + bytes(20), seed=1), "bad_crc"),
+    (raw_line(b"\x7e123"), "unknown"),
+    (raw_line(b"\x03"), "bad_payload"),
+    (raw_line(b"\x03\1\0\0"), "bad_payload"),
+    (raw_line(b"\x84" + bytes(18) + b"\0\0"), "bad_payload"),
+    (raw_line(b"\x84" + bytes(18) + b"\2\0" + bytes(9)), "bad_payload"),
+    (raw_line(b"\x02" + bytes(8) + b"\2\0" + bytes(4)), "bad_payload"),
+    (b"\0" + b"\xff" * 20_000 + b"\0", "oversize"),
+    (b"\xff" * 1_000_000, "oversize"),
+])  # fmt: skip
 def test_each_kind_of_damage_is_counted_under_its_name_and_takes_no_memory(line, what):
     for step in (1, 1000, len(line)) if len(line) < 10**6 else (10_000,):
         decoder = link.Decoder()

@@ -65,18 +65,15 @@ def test_an_impostor_is_not_believed(site, context, its_keys):
 ROBOT, ARM = {"publisher": "keys/robot.key"}, "keys/arm.key_secret"
 
 
-@pytest.mark.parametrize(
-    ("keys", "says"),
-    [
-        ({"server_keys": ROBOT}, "secret_key too .found server_keys"),
-        ({"operators": "operators"}, "secret_key too .found operators"),
-        ({"secret_key": ARM}, "secret_key alone"),
-        ({"secret_key": "keys/arm.key", "server_keys": ROBOT}, "holds no secret key"),
-        ({"secret_key": ARM, "clients": "nobody"}, "clients: found no folder"),
-        ({"secret_key": ARM, "server_keys": ROBOT, "operators": "operators"}, "clients too.*found operators"),
-        ({"secret_key": ARM, "server_keys": {"publisher": "keys/none.key"}}, "No such file"),
-    ],
-)
+@pytest.mark.parametrize(("keys", "says"), [
+    ({"server_keys": ROBOT}, "secret_key too .found server_keys"),
+    ({"operators": "operators"}, "secret_key too .found operators"),
+    ({"secret_key": ARM}, "secret_key alone"),
+    ({"secret_key": "keys/arm.key", "server_keys": ROBOT}, "holds no secret key"),
+    ({"secret_key": ARM, "clients": "nobody"}, "clients: found no folder"),
+    ({"secret_key": ARM, "server_keys": ROBOT, "operators": "operators"}, "clients too.*found operators"),
+    ({"secret_key": ARM, "server_keys": {"publisher": "keys/none.key"}}, "No such file"),
+])  # fmt: skip
 def test_half_a_configuration_is_an_error_at_start(site, keys, says):
     whole = {k: {n: site / f for n, f in v.items()} if isinstance(v, dict) else site / v for k, v in keys.items()}
     with pytest.raises(TransportError, match=says):

@@ -2,17 +2,13 @@
 
 import time
 from collections import deque
-from pathlib import Path
 from typing import Any
 
 import msgpack
-import pytest
 
 from protocol.frames import Contact, ContactFrame, Frame, pack, unpack
 from services import recorder as service
-from services.recorder import RecorderService
 from services.recordings import patient_file, recorder, recording, rotation, snapshots
-from services.recordings.recorder import Recorder
 from services.recordings.recording import RecordingReader
 from tests.protocol import line
 from tests.protocol.line import S
@@ -21,49 +17,49 @@ from tests.protocol.line import S
 class Clock(line.Clock):
     strftime = staticmethod(time.strftime)
 
-    def time_ns(self) -> int:
+    def time_ns(self):
         return 17 * 10**17 + int(self.ns)
 
-    def gmtime(self) -> time.struct_time:
+    def gmtime(self):
         return time.gmtime(self.time_ns() / S)
 
 
 class Feed:
     """What AllReader and StateReader are to a recorder: frames that have come, and the stages' answers."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock):
         self.clock, self.skin, self.gaps, self.answered = clock, "palm", 0, 0
         self.coming: deque[tuple[Frame, bytes]] = deque()
         self.asked: list[tuple[str, str]] = []
 
-    def send(self, *frames: Frame) -> list[bytes]:
+    def send(self, *frames):
         self.coming.extend((frame, pack(frame)) for frame in frames)
         return [message for _, message in self.coming]
 
-    def recv_message(self, timeout_s: float) -> tuple[Frame, bytes] | None:
+    def recv_message(self, timeout_s):
         if self.coming:
             return self.coming.popleft()
         self.clock.go(timeout_s)
         return None
 
-    def ask(self, skin: str, purpose: str) -> None:
+    def ask(self, skin, purpose):
         self.asked.append((skin, purpose))
 
-    def answers(self) -> list[tuple[str, str, bytes]]:
+    def answers(self):
         new, self.answered = self.asked[self.answered :], len(self.asked)
         return [(*asked, msgpack.packb({"preprocessing": {"time": len(self.asked)}})) for asked in new]
 
-    def close(self) -> None: ...
+    def close(self): ...
 
 
-def set_clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def set_clock(monkeypatch):
     clock = Clock()
     for module in (service, recorder, recording, rotation, patient_file, snapshots):
         monkeypatch.setattr(module, "time", clock)
     return clock
 
 
-def fed(recorder_: Recorder, clock: Clock) -> Feed:
+def fed(recorder_, clock):
     recorder_.reader.close()
     recorder_.states.close()
     feed: Any = Feed(clock)
@@ -71,15 +67,15 @@ def fed(recorder_: Recorder, clock: Clock) -> Feed:
     return feed  # type: ignore[no-any-return]
 
 
-def command(of: RecorderService, name: str, **args: Any) -> dict[str, Any]:
+def command(of, name, **args):
     return of.control.handlers[name](args)
 
 
-def touched(*ids: int, **fields: Any) -> ContactFrame:
+def touched(*ids, **fields):
     contacts = [Contact(id=k, position=[0.0, 0.0, 0.0]) for k in ids]
     return ContactFrame(**{"skin": "palm", "contacts": contacts, "valid": True, **fields})
 
 
-def contacts_in(path: Path) -> list[ContactFrame]:
+def contacts_in(path):
     found = [unpack(message.wire) for message in RecordingReader(path).messages({"contact"})]
     return [frame for frame in found if isinstance(frame, ContactFrame)]

@@ -60,26 +60,23 @@ def put(at: int, *ids: int, **fields: object) -> list[golden.Line]:
     return lines
 
 
-@pytest.mark.parametrize(
-    ("found", "differs"),
-    [
-        (run(), []),
-        (run(begin=12), ["contact 7 begins at scan"]),
-        (run(end=47), ["contact 7 ends at scan"]),
-        (run(begin=14, parts=10), []),
-        (run(bad=range(70, 80, 2)), ["frames with gap", "frames with not valid"]),
-        (run(begin=11, end=49, bad=range(71, 81), held=22)[:98], []),
-        (run(held=23), ["frames with held"]),
-        (run()[:90], ["frame", "frames with frame"]),
-        (put(30, 7, force_n=3.07, x_mm=20.09), []),
-        (put(30, 7, force_n=3.09), ["contact 7 force_n"]),
-        (put(30, 7, x_mm=19.85), ["contact 7 x_mm"]),
-        (put(30, 7, quality=0.5), ["quality"]),
-        ([line(k["scan"], 7, shape="square") if k["contacts"] else k for k in run()], ["contact 7 states"]),
-        (put(30, 7, 8), ["contact 8"]),
-        (put(50, 7), ["contact 7 states"]),
-    ],
-)
+@pytest.mark.parametrize(("found", "differs"), [
+    (run(), []),
+    (run(begin=12), ["contact 7 begins at scan"]),
+    (run(end=47), ["contact 7 ends at scan"]),
+    (run(begin=14, parts=10), []),
+    (run(bad=range(70, 80, 2)), ["frames with gap", "frames with not valid"]),
+    (run(begin=11, end=49, bad=range(71, 81), held=22)[:98], []),
+    (run(held=23), ["frames with held"]),
+    (run()[:90], ["frame", "frames with frame"]),
+    (put(30, 7, force_n=3.07, x_mm=20.09), []),
+    (put(30, 7, force_n=3.09), ["contact 7 force_n"]),
+    (put(30, 7, x_mm=19.85), ["contact 7 x_mm"]),
+    (put(30, 7, quality=0.5), ["quality"]),
+    ([line(k["scan"], 7, shape="square") if k["contacts"] else k for k in run()], ["contact 7 states"]),
+    (put(30, 7, 8), ["contact 8"]),
+    (put(50, 7), ["contact 7 states"]),
+])  # fmt: skip
 def test_events_are_compared_with_room_for_other_processors(found: list[golden.Line], differs: list[str]) -> None:
     names = {d.name for d in golden.compare(run(parts=found[0].get("parts", 1)), found).differences}
     assert set(differs) <= names and bool(names) == bool(differs), names

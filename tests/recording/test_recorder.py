@@ -6,16 +6,14 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
 
 from protocol.control import ControlClient, ControlServer
-from protocol.frames import ContactFrame, Frame, InfoFrame, RawFrame, ReferenceFrame, StatusFrame, pack
+from protocol.frames import ContactFrame, InfoFrame, RawFrame, ReferenceFrame, StatusFrame, pack
 from protocol.sockets import AllReader, Publisher
 from services.recorder import RecorderService, keeping_of, rotation_of
 from services.recordings import patient_file, snapshots
@@ -30,16 +28,16 @@ from services.runtime.config_sections import RecorderSection
 from tests.protocol.peers import ROOT, served
 from tests.waiting import end, until
 
-from .feed import Clock, S, command, contacts_in, fed, set_clock, touched
+from .feed import S, command, contacts_in, fed, set_clock, touched
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def clock(monkeypatch):
     return set_clock(monkeypatch)
 
 
 @pytest.fixture
-def service(runtime: Path, clock: Clock, tmp_path: Path) -> Iterator[RecorderService]:
+def service(runtime, clock, tmp_path):
     with Recorder(keeping=Keeping(tmp_path / "kept", 10.0, 5.0)) as recorder:
         fed(recorder, clock)
         made = RecorderService(recorder, tmp_path / "kept", ["palm"])
@@ -47,13 +45,13 @@ def service(runtime: Path, clock: Clock, tmp_path: Path) -> Iterator[RecorderSer
         made.close()
 
 
-def turn(service: RecorderService, *frames: Frame) -> dict[str, Any]:
+def turn(service, *frames):
     service.recorder.reader.send(*frames)  # type: ignore[attr-defined]
     service.recorder.step()
     return service.status()
 
 
-def test_messages_are_recorded_byte_for_byte(runtime: Path, clock: Clock, tmp_path: Path) -> None:
+def test_messages_are_recorded_byte_for_byte(runtime, clock, tmp_path):
     z, status = np.full(120, 3, "c8"), np.zeros(120, "u1")
     raws = (RawFrame(skin="palm", scan=k, z=z, status=status) for k in range(20))
     with Recorder(tmp_path / "a.mcap") as recorder:
@@ -66,7 +64,7 @@ def test_messages_are_recorded_byte_for_byte(runtime: Path, clock: Clock, tmp_pa
         Recorder(tmp_path / "b.mcap", ["raw", "sound"])
 
 
-def test_the_stages_state_is_recorded_and_again_after_a_tare(runtime: Path, clock: Clock, tmp_path: Path) -> None:
+def test_the_stages_state_is_recorded_and_again_after_a_tare(runtime, clock, tmp_path):
     """Not where the baseline only drifted: all stages would be asked every few seconds."""
     with Recorder(tmp_path / "a.mcap", ["info"]) as recorder:
         feed = fed(recorder, clock)
@@ -79,7 +77,7 @@ def test_the_stages_state_is_recorded_and_again_after_a_tare(runtime: Path, cloc
     assert [state["preprocessing"]["time"] for state in states] == [1, 2]
 
 
-def test_what_it_is_told_to_do_and_says_that_it_does(service: RecorderService, clock: Clock, tmp_path: Path) -> None:
+def test_what_it_is_told_to_do_and_says_that_it_does(service, clock, tmp_path):
     """What is latched is in each file, though it was said long before; its files are their owner's alone."""
     said = turn(service, InfoFrame(skin="palm", info={"frame_id": "palm"}), *(touched(seq=k) for k in range(50)))
     assert said["messages"] == {"info/palm": 1, "contact/palm": 50}
@@ -106,7 +104,7 @@ def test_what_it_is_told_to_do_and_says_that_it_does(service: RecorderService, c
         assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (0o600, 0o700)
 
 
-def test_a_recording_that_is_taken_away_is_said_and_goes_on(service: RecorderService, tmp_path: Path) -> None:
+def test_a_recording_that_is_taken_away_is_said_and_goes_on(service, tmp_path):
     first = Path(command(service, "record", on=True)["file"])
     turn(service, *(touched(seq=k) for k in range(20)))
     service.recorder.step(0.6)
@@ -129,18 +127,18 @@ FULL, BROKEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), (errno.EIO, errno.EROF
 
 
 @pytest.fixture
-def disk(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def disk(monkeypatch):
     """Bytes that may still be written, and the error of those beyond."""
     room, real, real_cut = [10**9, errno.ENOSPC], os.write, os.ftruncate
 
-    def write(descriptor: int, data: bytes) -> int:
+    def write(descriptor, data):
         if room[0] <= 0:
             raise OSError(room[1], os.strerror(room[1]))
         count = real(descriptor, data[: room[0]])
         room[0] -= count
         return count
 
-    def ftruncate(descriptor: int, size: int) -> None:
+    def ftruncate(descriptor, size):
         if room[1] in BROKEN:
             raise OSError(room[1], os.strerror(room[1]))
         room[0] += os.fstat(descriptor).st_size - size
@@ -151,7 +149,7 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return room
 
 
-def test_a_full_disk_is_named_and_recording_goes_on_when_there_is_room(service: RecorderService, disk: list) -> None:
+def test_a_full_disk_is_named_and_recording_goes_on_when_there_is_room(service, disk):
     file = Path(command(service, "record", on=True)["file"])
     disk[0] = 300
     for k in range(100):
@@ -166,9 +164,7 @@ def test_a_full_disk_is_named_and_recording_goes_on_when_there_is_room(service: 
 
 
 @pytest.mark.parametrize("number", FULL + BROKEN)
-def test_what_cannot_be_written_to_the_end_is_counted_in_the_status_and_in_the_file(
-    service: RecorderService, disk: list[int], number: int
-) -> None:
+def test_what_cannot_be_written_to_the_end_is_counted_in_the_status_and_in_the_file(service, disk, number):
     file = Path(command(service, "record", on=True)["file"])
     disk[:] = [3000, number]
     for k in range(100):
@@ -182,7 +178,7 @@ def test_what_cannot_be_written_to_the_end_is_counted_in_the_status_and_in_the_f
     assert service.status()["lost"] == 101 - left and not reader.damage.whole
 
 
-def test_what_does_not_fit_is_kept_up_to_a_bound_then_dropped_and_counted(tmp_path, monkeypatch, disk, clock) -> None:
+def test_what_does_not_fit_is_kept_up_to_a_bound_then_dropped_and_counted(tmp_path, monkeypatch, disk, clock):
     monkeypatch.setattr(patient_file, "KEPT_BYTES", 100_000)
     disk[0], writer = 10_000, RecordingWriter(tmp_path / "a.mcap")
     data = [msgpack.packb({"n": n, "noise": os.urandom(1000)}) for n in range(1000)]
@@ -202,7 +198,7 @@ def test_what_does_not_fit_is_kept_up_to_a_bound_then_dropped_and_counted(tmp_pa
     assert str(reader.damage) == f"{lost} message(s) could not be written when it was recorded (contact/palm {lost})"
 
 
-def test_a_killed_recorder_loses_at_most_half_a_second(tmp_path: Path, clock: Clock) -> None:
+def test_a_killed_recorder_loses_at_most_half_a_second(tmp_path, clock):
     writer = RecordingWriter(tmp_path / "a.mcap")
     for k in range(200):
         writer.write("contact/palm", b"\x80", k)
@@ -214,12 +210,12 @@ def test_a_killed_recorder_loses_at_most_half_a_second(tmp_path: Path, clock: Cl
 
 
 @pytest.mark.live
-def test_as_a_process_it_is_commanded_and_its_file_is_whole_when_it_ends(runtime: Path, tmp_path: Path) -> None:
+def test_as_a_process_it_is_commanded_and_its_file_is_whole_when_it_ends(runtime, tmp_path):
     publisher, reader = Publisher("publisher"), AllReader(["status"], "palm")
     options = "--wait", "--folder", str(tmp_path / "kept")
     process = subprocess.Popen([sys.executable, "-m", "services.recorder", *options], cwd=ROOT)
 
-    def said(recording: int) -> list[str] | None:
+    def said(recording):
         frame = reader.recv(0.5)
         ours = isinstance(frame, StatusFrame) and frame.process == "recorder"
         return frame.messages if ours and frame.counters["recording"] == recording else None  # type: ignore[union-attr]
@@ -243,7 +239,7 @@ def test_as_a_process_it_is_commanded_and_its_file_is_whole_when_it_ends(runtime
 
 
 @pytest.mark.live
-def test_only_the_wanted_topics_and_skin_and_the_states_of_all_stages(runtime: Path, tmp_path: Path) -> None:
+def test_only_the_wanted_topics_and_skin_and_the_states_of_all_stages(runtime, tmp_path):
     publisher = Publisher("publisher")
     with Recorder(tmp_path / "a.mcap", topics=["contact"], skin="palm") as recorder:
         until(lambda: publisher.poll() or publisher.wanted("contact", "palm"))
@@ -260,33 +256,30 @@ def test_only_the_wanted_topics_and_skin_and_the_states_of_all_stages(runtime: P
 BAD = ["electrode_open"]
 
 
-def status(level: str, process: str = "acquisition") -> StatusFrame:
+def status(level, process="acquisition"):
     return StatusFrame(skin="palm", process=process, level=level)
 
 
-@pytest.mark.parametrize(
-    ("frames", "found"),
-    [
-        ([touched(*ids) for ids in ((), (1,), (1,), (1, 2), (2,), (), (3,))], "-c-c--c"),
-        ((touched(1), touched(1, valid=False), touched(1)), "cf-"),  # hidden by one that is not valid: no new one
-        ((touched(), touched(valid=False), touched(valid=False), touched()), "-f--"),
-        ((touched(), touched(reasons=BAD), touched(reasons=BAD), touched(reasons=[*BAD, "gap"])), "-f-f"),
-        ((touched(), touched(reasons=["changing"]), touched(reasons=["low_snr"])), "---"),
-        ((touched(valid=False, reasons=["stale_baseline"]), touched()), "--"),  # a start is none
-        (map(status, ("STALE", "OK", "WARN", "ERROR", "ERROR", "OK", "STALE")), "---f--f"),
-        ((status("OK", "recorder"), status("ERROR", "recorder")), "--"),  # a full disk is no reason to write more
-    ],
-)
-def test_what_begins_is_an_event(frames: list[Frame], found: str) -> None:
+@pytest.mark.parametrize(("frames", "found"), [
+    ([touched(*ids) for ids in ((), (1,), (1,), (1, 2), (2,), (), (3,))], "-c-c--c"),
+    ((touched(1), touched(1, valid=False), touched(1)), "cf-"),  # hidden by one that is not valid: no new one
+    ((touched(), touched(valid=False), touched(valid=False), touched()), "-f--"),
+    ((touched(), touched(reasons=BAD), touched(reasons=BAD), touched(reasons=[*BAD, "gap"])), "-f-f"),
+    ((touched(), touched(reasons=["changing"]), touched(reasons=["low_snr"])), "---"),
+    ((touched(valid=False, reasons=["stale_baseline"]), touched()), "--"),  # a start is none
+    (map(status, ("STALE", "OK", "WARN", "ERROR", "ERROR", "OK", "STALE")), "---f--f"),
+    ((status("OK", "recorder"), status("ERROR", "recorder")), "--"),  # a full disk is no reason to write more
+])  # fmt: skip
+def test_what_begins_is_an_event(frames, found):
     watch = TriggerWatch(TRIGGERS)
     assert "".join(event[0][0] if (event := watch(frame)) else "-" for frame in frames) == found
 
 
 class Heard:
-    def __init__(self, keeping: Keeping) -> None:
+    def __init__(self, keeping):
         self.ns, self.of = 0, Snapshots(keeping, lambda event: {"event": event})
 
-    def hear(self, *frames: Frame) -> None:
+    def hear(self, *frames):
         for frame in frames:
             self.ns += S // 10
             topic, _, data = pack(frame).partition(b"\0")
@@ -294,7 +287,7 @@ class Heard:
             self.of.mind(self.ns)
 
 
-def test_a_snapshot_has_the_time_before_and_after_its_event(tmp_path: Path) -> None:
+def test_a_snapshot_has_the_time_before_and_after_its_event(tmp_path):
     made = Heard(Keeping(tmp_path, before_s=2, after_s=1, triggers=("contact",)))
     made.hear(*(touched() for _ in range(100)), touched(1), *(touched(1) for _ in range(100)))
     (path,) = tmp_path.glob("*-contact.mcap")
@@ -304,7 +297,7 @@ def test_a_snapshot_has_the_time_before_and_after_its_event(tmp_path: Path) -> N
     assert str(RecordingReader(path).damage) == "whole" and not made.of.writing
 
 
-def test_a_second_event_makes_it_longer_up_to_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_event_makes_it_longer_up_to_a_bound(tmp_path, monkeypatch):
     monkeypatch.setattr(snapshots, "LONGEST_S", 3.0)
     made = Heard(Keeping(tmp_path, before_s=1, after_s=1, triggers=("contact",)))
     made.hear(touched(), *(touched(k // 5) for k in range(5, 100)))  # another contact every 0.5 s
@@ -312,7 +305,7 @@ def test_a_second_event_makes_it_longer_up_to_a_bound(tmp_path: Path, monkeypatc
     assert 2 <= len(lengths) <= 4 and max(lengths) <= 43
 
 
-def test_old_automatic_snapshots_go_those_asked_for_stay(tmp_path: Path) -> None:
+def test_old_automatic_snapshots_go_those_asked_for_stay(tmp_path):
     made = Heard(Keeping(tmp_path, before_s=1, after_s=0.2, triggers=("contact",), keep=2))
     made.hear(touched())
     asked = made.of.take("snapshot", "by hand", made.ns)
@@ -322,18 +315,18 @@ def test_old_automatic_snapshots_go_those_asked_for_stay(tmp_path: Path) -> None
     assert (made.of.taken, made.of.deleted) == (6, 3)
 
 
-def test_a_folder_that_cannot_be_written_to_is_said_and_counted(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_to_is_said_and_counted(tmp_path):
     (tmp_path / "file").touch()
     made = Heard(Keeping(tmp_path / "file", triggers=("contact",)))
     made.hear(touched(), touched(1), touched(1))
     assert made.of.missed == 1 and "no snapshot (contact: palm" in made.of.problem
 
 
-def test_nobody_fills_a_disk_by_asking_for_snapshots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_fills_a_disk_by_asking_for_snapshots(tmp_path, monkeypatch):
     monkeypatch.setattr(snapshots, "ASKED_IN_ALL", 11)
     made, files = Heard(Keeping(tmp_path, 0.1, 0.0)), list[Path]()
 
-    def ask(times: int, refused: str = "") -> None:
+    def ask(times, refused=""):
         for _ in range(times):
             files.append(made.of.take("snapshot", "again", made.ns))
             made.hear(touched())
@@ -347,7 +340,7 @@ def test_nobody_fills_a_disk_by_asking_for_snapshots(tmp_path: Path, monkeypatch
     ask(1, "found 11")
 
 
-def test_by_trigger_the_time_round_a_contact_is_written(runtime: Path, tmp_path: Path, clock: Clock) -> None:
+def test_by_trigger_the_time_round_a_contact_is_written(runtime, tmp_path, clock):
     with Recorder(keeping=Keeping(tmp_path, 5, 0.1, triggers=("contact",))) as recorder:
         feed = fed(recorder, clock)
         for k in range(34):
@@ -358,19 +351,19 @@ def test_by_trigger_the_time_round_a_contact_is_written(runtime: Path, tmp_path:
     assert len(contacts_in(path)) >= 9
 
 
-def test_the_configuration_is_in_megabytes_and_minutes(tmp_path: Path) -> None:
+def test_the_configuration_is_in_megabytes_and_minutes(tmp_path):
     section = RecorderSection(file_mb=500, file_minutes=2, keep_files=20, triggers=TRIGGERS)
     assert rotation_of(section) == Rotation(500_000_000, 120.0, 20)
     assert keeping_of(section, tmp_path) == Keeping(tmp_path, 10.0, 5.0, 64_000_000, TRIGGERS, 100)
 
 
-def rotating(path: Path, **limits: float) -> RotatingWriter:
+def rotating(path, **limits):
     head = [RecordedMessage("info/palm", 0, b"\x80")]
     rotation, named = Rotation(**limits), lambda k: path.with_stem(f"a-{k}")  # type: ignore[arg-type]
     return RotatingWriter(path, rotation, named, lambda: head, lambda: {"origin": "record"})
 
 
-def test_a_recording_goes_on_in_another_file_when_one_is_large_and_none_is_lost(tmp_path: Path) -> None:
+def test_a_recording_goes_on_in_another_file_when_one_is_large_and_none_is_lost(tmp_path):
     writer = rotating(tmp_path / "a.mcap", file_bytes=20_000)
     writer.begin()
     sent = [os.urandom(1000) for _ in range(200)]
@@ -384,7 +377,7 @@ def test_a_recording_goes_on_in_another_file_when_one_is_large_and_none_is_lost(
     assert writer.counts == {"raw/palm": 200, "info/palm": writer.files}
 
 
-def test_by_time_too_and_the_oldest_files_go_where_that_is_asked(tmp_path: Path, clock: Clock) -> None:
+def test_by_time_too_and_the_oldest_files_go_where_that_is_asked(tmp_path, clock):
     writer = rotating(tmp_path / "a.mcap", file_s=60, keep=2)
     for k in range(300):
         writer.write(RecordedMessage("raw/palm", k, b"\x80"))
@@ -394,7 +387,7 @@ def test_by_time_too_and_the_oldest_files_go_where_that_is_asked(tmp_path: Path,
     assert {path.name for path in tmp_path.iterdir()} == {"a-4.mcap", "a-5.mcap"}
 
 
-def test_where_no_further_file_can_begin_it_goes_on_in_the_one_there_is(tmp_path: Path, clock: Clock) -> None:
+def test_where_no_further_file_can_begin_it_goes_on_in_the_one_there_is(tmp_path, clock):
     writer = rotating(tmp_path / "a.mcap", file_s=60)
     (tmp_path / "a-2.mcap").touch()  # somebody else's
     for k in range(90):
@@ -407,15 +400,15 @@ def test_where_no_further_file_can_begin_it_goes_on_in_the_one_there_is(tmp_path
     assert writer.counts["raw/palm"] == 90
 
 
-def heard(topic: str, at_s: float, data: str = "", key: str = "", again: bool = False) -> RingEntry:
+def heard(topic, at_s, data="", key="", again=False):
     return RingEntry(RecordedMessage(topic, int(at_s * S), data.encode()), key, again)
 
 
-def told(found: list[RecordedMessage]) -> list[tuple[str, float, str]]:
+def told(found):
     return [(m.topic, m.log_time_ns / S, m.data.decode()) for m in found]
 
 
-def test_it_holds_the_last_seconds_and_what_was_latched_at_their_beginning() -> None:
+def test_it_holds_the_last_seconds_and_what_was_latched_at_their_beginning():
     ring = Ring(3.0, 10**6)
     for of, text in (("info/palm/pre", "first"), ("status/palm/acquisition", "board"), ("status/palm/stub", "s")):
         ring.add(heard(of.rpartition("/")[0], 0, text, of))
@@ -429,7 +422,7 @@ def test_it_holds_the_last_seconds_and_what_was_latched_at_their_beginning() -> 
     assert told(ring.since(8 * S)) == [*found, ("info/palm", 10, "within")]
 
 
-def test_it_begins_where_the_stages_state_is_known_and_leaves_later_ones_out() -> None:
+def test_it_begins_where_the_stages_state_is_known_and_leaves_later_ones_out():
     ring = Ring(100, 10**6)
     for k in range(10):
         if k % 3 == 0:
@@ -443,7 +436,7 @@ def test_it_begins_where_the_stages_state_is_known_and_leaves_later_ones_out() -
     assert [data for topic, _, data in found if topic == "raw/palm"] == ["3", "4", "5", "6", "7", "8", "9"]
 
 
-def test_each_skin_begins_with_its_own_state_also_where_it_fell_out_of_memory_which_is_bounded() -> None:
+def test_each_skin_begins_with_its_own_state_also_where_it_fell_out_of_memory_which_is_bounded():
     ring, short, small = Ring(100, 10**6), Ring(2.0, 10**6), Ring(1000, 10 * (100 + OVERHEAD_BYTES))
     for skin, at in (("palm", 1), ("sole", 2)):
         ring.add(heard(f"state/{skin}", at, skin, f"state/{skin}", again=True))

@@ -1,21 +1,40 @@
-"""Recordings that were cut, killed, damaged or made by others still give what was in them before."""
+"""Recordings: cut, killed or damaged, they give what was before; what they carry; a replay gives the same contacts."""
 
+import json
 import os
 import random
 import re
 import struct
+import tomllib
 import tracemalloc
+from dataclasses import asdict
 from pathlib import Path
 
+import msgpack
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import lz4, zstandard
 
-from protocol.frames import RawFrame, pack
+from models import bundle as bundles
+from models.bundle import Bundle
+from protocol.frames import ContactFrame, RawFrame, pack
+from protocol.runtime import lock
+from services.contacts.force import calibration_file as calibration
+from services.contacts.force.curve import Curve
+from services.pipeline import Pipeline
+from services.recordings import settings
 from services.recordings.damage import Damage
+from services.recordings.importing import import_arrays
 from services.recordings.mcap_scan import MAX_RECORD, McapScan, inner_records
+from services.recordings.recorder import metadata
 from services.recordings.recording import RecordedMessage, RecordingError, RecordingReader, RecordingWriter
+from services.recordings.replay import ReplayError, mark, steps
+from services.recordings.replay_session import configuration_of, replay_file
+from services.runtime.config import ROOT, ConfigFile, Skin, load, parse
+from tests.services.conftest import Board
+
+from .feed import contacts_in
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -90,21 +109,18 @@ def raws(path: Path, first: int, chunks: int) -> tuple[bytes, list[int]]:
     return path.read_bytes(), at
 
 
-@pytest.mark.parametrize(
-    ("what", "left", "says"),
-    [
-        ("magic", "0123456789", "8 bytes damaged in 1 place(s), the first at byte 0; no message is missing"),
-        ("first chunk", "123456789", "1 message(s) cannot be read: raw/palm 1 (up to scan 100)"),
-        ("chunks 3, 4 and 7", "01256 89", "3 message(s) cannot be read: raw/palm 3 (scans 103 to 104, scan 107)"),
-        ("last chunk", "012345678", "1 message(s) cannot be read: raw/palm 1 (after scan 108)"),
-        ("first chunk, cut", "12345", "cut short: it has no end; .*at least 1 message(s) cannot be read"),
-        ("end", "0123456789", "its index is damaged; how many messages are missing is not known"),
-        ("zeros behind", "0123456789", "5000 bytes zeros in 1 place(s), the first at byte .*; no message is missing"),
-        ("zeros from 6 on", "012345", "cut short: it has no end; .* bytes damaged in 1 place"),
-        ("joined", "01234567890123456789", "2 recordings joined$"),
-        ("cut, joined", "0123450123456789", "2 recordings joined; cut short"),
-    ],
-)
+@pytest.mark.parametrize(("what", "left", "says"), [
+    ("magic", "0123456789", "8 bytes damaged in 1 place(s), the first at byte 0; no message is missing"),
+    ("first chunk", "123456789", "1 message(s) cannot be read: raw/palm 1 (up to scan 100)"),
+    ("chunks 3, 4 and 7", "01256 89", "3 message(s) cannot be read: raw/palm 3 (scans 103 to 104, scan 107)"),
+    ("last chunk", "012345678", "1 message(s) cannot be read: raw/palm 1 (after scan 108)"),
+    ("first chunk, cut", "12345", "cut short: it has no end; .*at least 1 message(s) cannot be read"),
+    ("end", "0123456789", "its index is damaged; how many messages are missing is not known"),
+    ("zeros behind", "0123456789", "5000 bytes zeros in 1 place(s), the first at byte .*; no message is missing"),
+    ("zeros from 6 on", "012345", "cut short: it has no end; .* bytes damaged in 1 place"),
+    ("joined", "01234567890123456789", "2 recordings joined$"),
+    ("cut, joined", "0123450123456789", "2 recordings joined; cut short"),
+])  # fmt: skip
 def test_what_is_left_is_read_and_the_rest_counted(tmp_path: Path, what: str, left: str, says: str) -> None:
     path = tmp_path / "a.mcap"
     content, at = raws(path, 100, 10)
@@ -169,9 +185,192 @@ def test_a_chunk_that_unpacks_to_something_else_is_damaged(tmp_path: Path, compr
     assert most < 3 * len(packed) + 2 * declared + 2**20
 
 
-def test_200_kb_of_intact_chunks_that_unpack_to_gigabytes_of_messages_are_refused(tmp_path: Path) -> None:
-    message = struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0)
-    data = message * (MAX_RECORD // len(message))
-    one = chunk("zstd", len(data), zstandard.compress(data, 3))
-    with pytest.raises(RecordingError, match="unpack to more than"):
-        list(RecordingReader(made(tmp_path / "a.mcap", *[one] * (200_000 // len(one)))).messages())
+@pytest.fixture
+def touches() -> dict[str, np.ndarray]:
+    """30 rows of the bundle's own physics: nothing, then a touch that moves, then nothing; 80 dB."""
+    board = Board(Bundle.load("square16"), seed=5)
+    discs = [board.disc(0.03 * k, -0.2, 0.2, 0.3 * (8 <= k < 24)) for k in range(30)]
+    untouched, touched = ([board.frame(disc).z.real for disc in each] for each in ([0.0] * 64, discs))
+    return {"untouched": np.array(untouched), "measurements": np.array(touched)}
+
+
+@pytest.fixture
+def recording(touches: dict[str, np.ndarray], tmp_path: Path) -> Path:
+    path = tmp_path / "touches.mcap"
+    import_arrays(touches, Path("touches.npz"), path, "palm", 22.0)
+    return path
+
+
+def raws_of(path: Path) -> list[RawFrame]:
+    return [step.raw for step in steps(RecordingReader(path)) if step.raw is not None]
+
+
+def same(live: list[ContactFrame], path: Path) -> None:
+    for one, other in zip(live, contacts_in(path), strict=True):
+        assert (one.scan, one.part, one.valid, one.held) == (other.scan, other.part, other.valid, other.held)
+        assert [asdict(c) for c in one.contacts] == [asdict(c) for c in other.contacts], one.scan
+
+
+@pytest.mark.live
+def test_a_replay_of_a_file_that_was_cut_gives_the_contacts_of_one_process(recording: Path, tmp_path: Path) -> None:
+    pipeline, out, cut = Pipeline("square16", name="palm"), tmp_path / "out.mcap", tmp_path / "cut.mcap"
+    live = [pipeline.run(mark(raw) or raw).contact for raw in raws_of(recording)]
+    states = [[c.state for c in frame.contacts] for frame in live]
+    assert states[64:72] == [[]] * 8 and states[72] == ["begin"] and states[73:88] == [["hold"]] * 15
+    assert [s for s in states[88:] if s] == [["end"]], "it ends once, and is not there any more"
+    x = [frame.contacts[0].position[0] for frame in live[72:88]]
+    assert np.corrcoef(x, np.arange(8, 24))[0, 1] > 0.99 and abs(x[0] - 0.012) < 0.004
+    cut.write_bytes(recording.read_bytes()[: int(recording.stat().st_size * 0.9)])
+    report = replay_file(cut, None, out=out, private=True)
+    frames = report["frames"]
+    assert "cut short" in report["damage"] and report["warnings"] == [] and 72 < frames == report["contacts"] < 94
+    same(live[:frames], out)
+    again = contacts_in(out)
+    assert [f.seq for f in again] == list(range(frames))
+    assert all(f.source == "replay" and "replay" in f.reasons for f in again)
+    recorded = [m.log_time_ns for m in RecordingReader(recording).messages({"raw"})]
+    assert [m.log_time_ns for m in RecordingReader(out).messages({"contact"})] == recorded[:frames]
+
+
+def test_a_replayed_frame_says_so_and_counts_from_when_it_is_read() -> None:
+    raw = RawFrame(skin="palm", z=np.array([1, np.nan], "c8"), status=np.zeros(2, "u1"), source="board", host="x")
+    raw.stamps = {"sample": 5, "read": 6}
+    mark(raw)
+    assert (raw.source, raw.host, raw.stamps["sample"], raw.reasons) == ("replay", "", 5, ["replay"])
+    assert raw.stamps["read"] > 6
+
+
+def test_steps_begin_with_the_recorded_state(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        for k in range(10):
+            frame = RawFrame(skin="palm", scan=k, z=np.ones(120, "c8"), status=np.zeros(120, "u1"))
+            writer.write("raw/palm", pack(frame).partition(b"\0")[2], k * 10**8)
+            if k in (1, 6):
+                writer.write("state/palm", msgpack.packb({"preprocessing": {"k": k}}), k * 10**8 + 1)
+        writer.write("raw/palm", b"no frame", 10**9)
+
+    def told(start_s: float = 0.0) -> list[int]:
+        found = steps(RecordingReader(path), start_s)
+        return [-s.raw.scan if s.raw is not None else s.states.get("preprocessing", {}).get("k") for s in found]
+
+    assert told() == [1, 0, -1, -2, -3, -4, -5, -6, 6, -7, -8, -9]
+    assert told(start_s=0.75) == [6, -8, -9]
+
+
+def test_imported_frames_are_the_rows(recording: Path, touches: dict) -> None:
+    frames, rows = raws_of(recording), np.concatenate([touches["untouched"], touches["measurements"]]).astype("c8")
+    assert np.array_equal([frame.z for frame in frames], rows)
+    assert [frame.kind for frame in frames] == ["reference"] * 64 + ["full"] * 30
+
+
+HERE = Path("recording.mcap")
+
+
+@pytest.fixture
+def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ConfigFile:
+    bundle = Bundle.load("square16")
+    (tmp_path / "skin.toml").write_text(f"""
+skip.batch = false
+sockets.addresses.publisher = "tcp://127.0.0.1:47999"
+security = {{ insecure = true, secret_key = "SECRET.key_secret", clients = "SECRET-clients" }}
+skins.palm = {{ port = "/dev/ttySECRET", bundle = "{bundle.path}", frame_id = 'palm "left"', network = "fast", \
+pose = {{ parent = "wrist", position_m = [0.1, 0.0, -0.2] }}, indenter = {{ radius_m = 0.01 }}, \
+calibration = "SECRET.json", tare = {{ frames = 32 }}, touch = {{ hold = false }} }}
+""")
+    law = calibration.Calibration(Curve(7.0), "peak", 4.0, 0.1)
+    found = parse(tomllib.loads((tmp_path / "skin.toml").read_text()), tmp_path / "skin.toml")
+    calibration.save(tmp_path / "SECRET.json", law, "palm", found.skins["palm"], bundle)
+    monkeypatch.setenv("EITSKIN_CONFIG", str(tmp_path / "skin.toml"))
+    return load()
+
+
+def carried(tmp_path: Path, text: str) -> RecordingReader:
+    path = tmp_path / "carried.mcap"
+    with RecordingWriter(path, {settings.KEY: text}, overwrite=True) as writer:
+        frame = RawFrame(skin="palm", z=np.ones(120, "c8"), status=np.zeros(120, "u1"))
+        writer.write("raw/palm", pack(frame).partition(b"\0")[2], 10**18)
+    return RecordingReader(path)
+
+
+def test_the_stages_get_what_they_had_and_no_more(config: ConfigFile, tmp_path: Path, runtime: Path) -> None:
+    text = metadata(["raw"], None)[settings.KEY]
+    assert not [word for word in ("SECRET", "tcp://", "47999", "insecure", str(ROOT), "/dev") if word in text]
+    reader = carried(tmp_path, text)
+    (tmp_path / "SECRET.json").unlink()
+    os.environ["EITSKIN_CONFIG"] = str(tmp_path / "gone.toml")  # another machine (monkeypatch puts it back)
+    file, warnings = configuration_of(["palm"], reader, None, runtime)
+    again, before = load(file), config.skins["palm"]
+    skin = again.skins["palm"]
+    assert warnings == [] and again.skip == config.skip
+    assert again.sockets.addresses == {} and not again.security.insecure and again.security.secret_key is None
+    assert Bundle.load(skin.bundle).hash == Bundle.load(before.bundle).hash and skin.port == "stub"
+    same = ("frame_id", "pose", "network", "indenter", "tare", "touch", "scan", "dft_points", "rtia_ohm")
+    assert [getattr(skin, key) for key in same] == [getattr(before, key) for key in same]
+    assert skin.calibration is not None and skin.calibration.parent == runtime
+    law = calibration.load(skin.calibration, skin, Bundle.load(skin.bundle), "palm")
+    assert (law.curve.scale, law.most_n) == (7.0, 4.0)
+    other = tmp_path / "theirs.toml"  # how the service was configured, not who records
+    other.write_text('[skins.theirs]\nport = "stub"\nbundle = "square16"\n')
+    assert list(settings.read(metadata(["raw"], None, other)[settings.KEY], HERE).skins) == ["theirs"]
+    peak = settings.read(settings.text_of({"palm": Skin(port="stub", bundle="square16", reads="peak")}), HERE)
+    assert settings.configuration(peak, settings.Known.here(None), tmp_path)["skins"]["palm"]["reads"] == "peak"
+
+
+def palm(**changes: object) -> dict[str, object]:
+    return {"skins": {"palm": {"bundle": "square16", "bundle_hash": Bundle.load("square16").hash, **changes}}}
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ({"skins": {}, "sockets": {"addresses": {"publisher": "tcp://0.0.0.0:1"}}}, "sockets"),
+        ({"skins": {}, "security": {"insecure": True}}, "security"),
+        (palm(port="socket://evil:1"), "port"),
+        (palm(bundle="/tmp/evil"), "bundle"),
+        (palm(bundle_hash="../../evil"), "bundle_hash"),
+        (palm(calibration="/etc/passwd"), "calibration"),
+        ({"skins": {"x]\n[security]\ninsecure = true\n[y": palm()["skins"]["palm"]}}, "skin names"),  # type: ignore[index]
+        (palm(frame_id='a"\n[security]'), "frame_id"),
+        (palm(tare={"frames": 10**9}), "frames"),
+        ('"' + "x" * 2**21 + '"', "expected at most"),
+        ({"skins": {f"s{k}": palm()["skins"]["palm"] for k in range(65)}}, "64"),  # type: ignore[index]
+    ],
+    ids=range(11),
+)
+def test_settings_that_reach_further_or_cannot_be_are_refused(content: object, says: str) -> None:
+    with pytest.raises(RecordingError, match="its settings cannot be used") as refused:
+        settings.read(content if isinstance(content, str) else json.dumps(content), HERE)
+    assert says in str(refused.value) and str(HERE) in str(refused.value)
+
+
+def test_a_recorded_calibration_is_checked_like_a_file(tmp_path: Path) -> None:
+    for law, says in (({"newtons_per_siemens": -1}, "above 0"), ({"schema": "eitskin.force/2"}, "no calibration")):
+        found = settings.read(json.dumps(palm(calibration=law)), HERE)
+        with pytest.raises(RecordingError, match=says):
+            settings.configuration(found, settings.Known.here(None), tmp_path)
+
+
+def test_a_bundle_is_found_by_its_hash_and_never_by_a_path(tmp_path: Path, runtime: Path, monkeypatch) -> None:
+    shipped = Bundle.load("square16")
+    manifest = {k: v for k, v in shipped.manifest.items() if k not in ("files", "schema")} | {"name": "other"}
+    other = bundles.write(tmp_path / "square16", manifest | {"network": None}, shipped.matrices)
+    reader = carried(tmp_path, json.dumps(palm(bundle_hash=other.hash)))
+    monkeypatch.chdir(tmp_path)  # where a folder of the recorded name lies
+    with pytest.raises(RecordingError, match="is not installed.*--bundle PATH"):
+        configuration_of(["palm"], reader, None, runtime)
+    file, warnings = configuration_of(["palm"], reader, other.path, runtime)
+    assert load(file).skins["palm"].bundle == str(other.path) and warnings == []
+    file, warnings = configuration_of(["palm"], reader, shipped.path, runtime)
+    assert "contacts will differ" in warnings[0] and load(file).skins["palm"].bundle == str(shipped.path)
+
+
+def test_without_settings_ours_count_and_what_cannot_be_replayed_is_refused(runtime: Path, tmp_path: Path) -> None:
+    reader = carried(tmp_path, "")
+    assert load(configuration_of(["palm"], reader, None, runtime)[0]).skins["palm"].pose.parent == "wrist"
+    with pytest.raises(ReplayError, match="--bundle PATH"):
+        configuration_of(["elbow"], reader, None, runtime)
+    with pytest.raises(ReplayError, match="holds no skin 'sole', only palm"):
+        replay_file(reader.path, None, skin="sole")
+    with lock(process="acquisition"), pytest.raises(ReplayError, match=f"a board feeds the service .*{os.getpid()}"):
+        replay_file(reader.path, None)

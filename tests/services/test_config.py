@@ -93,16 +93,13 @@ def test_every_key_of_the_shipped_file_is_one_that_exists():
         config.skin("plam")
 
 
-@pytest.mark.parametrize(
-    ("key", "found", "expected"),
-    [
-        ("port", "presses.npz", "/robot/presses.npz"),
-        ("port", "socket://host:4000", "socket://host:4000"),
-        ("bundle", "unknown", "unknown"),  # so that the error that follows speaks of names
-        ("bundle", "calibration/palm", "/robot/calibration/palm"),
-        ("calibration", "palm.json", Path("/robot/palm.json")),
-    ],
-)
+@pytest.mark.parametrize(("key", "found", "expected"), [
+    ("port", "presses.npz", "/robot/presses.npz"),
+    ("port", "socket://host:4000", "socket://host:4000"),
+    ("bundle", "unknown", "unknown"),  # so that the error that follows speaks of names
+    ("bundle", "calibration/palm", "/robot/calibration/palm"),
+    ("calibration", "palm.json", Path("/robot/palm.json")),
+])  # fmt: skip
 def test_paths_are_relative_to_the_file_also_a_bundles_that_is_no_shipped_one(key, found, expected, tmp_path):
     config = parse({"skins": {"palm": PALM | {key: found}}}, Path("/robot/skin.toml"))
     assert getattr(config.skin("palm"), key) == expected

@@ -1,52 +1,30 @@
 """What touches a skin solved on a mesh of its own: raw frames in, contact frames out, in whole scans and in parts."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
 from firmware_stub.world import pressed
-from protocol.frames import ContactFrame
 from services.preprocessing import Preprocessing
 from simulation.host import tared
-from simulation.scenes import ContactCurves, ramp, script
-from tests.services.curves import (
-    FREE_S,
-    PARTS,
-    SCAN_S,
-    SKIN,
-    Board,
-    at_s,
-    between,
-    between_s,
-    bundle,
-    far_off,
-    free,
-    ids,
-    impedance,
-    lasting,
-    new_pipeline,
-    press,
-    run,
-    said,
-    shows,
-)
+from simulation.scenes import ramp, script
+from tests.services import curves
+from tests.services.curves import FREE_S, PARTS, at_s, between, between_s, far_off, ids, impedance, press, run, shows
 
 BOTH = pytest.mark.parametrize("parts", [1, PARTS], ids=["whole", "parts"])
 TOUCH = pressed("circle", 0.012, -0.018, 9e-3, 3.0)
 
 
 @BOTH
-def test_an_untouched_skin_that_warms_stays_untouched(parts: int) -> None:
+def test_an_untouched_skin_that_warms_stays_untouched(parts):
     """Half a degree a minute: 1 % of the conductivity in a minute."""
     seconds = 25.0 if parts == 1 else 8.0
     frames = run(between((0, impedance()), (FREE_S, impedance()), (60, impedance(background=1.01))), seconds, parts)
-    assert len(frames) > 0.9 * (seconds - FREE_S) / SCAN_S and shows(frames, 0)
+    assert len(frames) > 0.9 * (seconds - FREE_S) / curves.SCAN_S and shows(frames, 0)
 
 
 @BOTH
 @pytest.mark.parametrize(("radius", "force"), [(5e-3, 0.5), (20e-3, 6.0)])
-def test_a_press_is_shown_where_it_is_and_as_strong_as_it_is(parts: int, radius: float, force: float) -> None:
+def test_a_press_is_shown_where_it_is_and_as_strong_as_it_is(parts, radius, force):
     touch = pressed("circle", 0.012, -0.018, radius, force)
     shown = between_s(run(press(touch), FREE_S + 1.2, parts), FREE_S + 0.3)
     assert shows(shown, 1) and len(ids(shown)) == 1
@@ -59,7 +37,7 @@ def test_a_press_is_shown_where_it_is_and_as_strong_as_it_is(parts: int, radius:
     assert np.median(away) < 3 and np.max(away) < 6
 
 
-def test_a_touch_keeps_its_number_while_nothing_explains_the_scans() -> None:
+def test_a_touch_keeps_its_number_while_nothing_explains_the_scans():
     """0.09 s of an error in every measurement, beside a touch that is held: frames say `changing`, and go on."""
     steady, wrong_s = press(TOUCH), FREE_S + 0.6
     off = 1 + 8e-4 * np.random.default_rng(5).standard_normal(120)
@@ -70,18 +48,18 @@ def test_a_touch_keeps_its_number_while_nothing_explains_the_scans() -> None:
 
 
 @BOTH
-def test_a_touch_begins_is_held_and_ends_with_one_id_and_an_image(parts: int) -> None:
+def test_a_touch_begins_is_held_and_ends_with_one_id_and_an_image(parts):
     """It is shown within half a scan where it comes at once, and its end is said for fifty milliseconds."""
     frames = run(press(TOUCH, ramp_s=0.005, until_s=FREE_S + 0.6), FREE_S + 1.0, parts)
-    first = next(frame for frame in frames if lasting(frame))
-    assert at_s(first) - FREE_S < SCAN_S * (0.5 if parts > 1 else 1.5) and ids(frames) == {1}
+    first = next(frame for frame in frames if curves.lasting(frame))
+    assert at_s(first) - FREE_S < curves.SCAN_S * (0.5 if parts > 1 else 1.5) and ids(frames) == {1}
     found = [contact.state for frame in frames for contact in frame.contacts]
     assert [s for k, s in enumerate(found) if not k or found[k - 1] != s] == ["begin", "hold", "end"]
     held = next(f for f in frames if f.quality is not None and at_s(f) > FREE_S + 0.4)
     assert held.quality is not None and held.quality > 0.8
     assert held.contacts[0].shape != "unknown" and held.contacts[0].force_sigma_n is not None
     ended = [at_s(frame) for frame in frames if any(contact.state == "end" for contact in frame.contacts)]
-    assert FREE_S + 0.6 < ended[0] < FREE_S + 0.6 + 1.5 * SCAN_S
+    assert FREE_S + 0.6 < ended[0] < FREE_S + 0.6 + 1.5 * curves.SCAN_S
     assert parts == 1 or 0.03 < ended[-1] - ended[0] < 0.06
     assert shows(between_s(frames, ended[-1] + 0.01), 0)
 
@@ -90,7 +68,7 @@ def test_a_touch_begins_is_held_and_ends_with_one_id_and_an_image(parts: int) ->
 
 
 @BOTH
-def test_a_light_touch_that_comes_slowly_beside_a_held_one_is_told_from_its_outline(parts: int) -> None:
+def test_a_light_touch_that_comes_slowly_beside_a_held_one_is_told_from_its_outline(parts):
     """An outline that is learnt while both press explains both."""
     strong, light = pressed("circle", 0.0117, 0.0142, 7e-3, 2.2), pressed("circle", 0.0097, -0.0144, 10e-3, 0.5)
     none, one, both = impedance(), impedance(strong), impedance(strong, light)
@@ -102,7 +80,7 @@ def test_a_light_touch_that_comes_slowly_beside_a_held_one_is_told_from_its_outl
 
 
 @BOTH
-def test_three_touches_that_come_one_after_the_other_within_a_scan_are_three(parts: int) -> None:
+def test_three_touches_that_come_one_after_the_other_within_a_scan_are_three(parts):
     """Two discs explain them roughly, the second where nothing is: they are counted again."""
     three = (
         pressed("circle", 0.0047, 0.0223, 8.3e-3, 2.5),
@@ -121,14 +99,14 @@ def test_three_touches_that_come_one_after_the_other_within_a_scan_are_three(par
 # touches that change
 
 
-def way(x: float, to: float, y: float, points: int) -> list[tuple[float, np.ndarray]]:
+def way(x, to, y, points):
     """Shares of a way, and |Z| there."""
     shares = np.linspace(0, 1, points)
     return [(float(u), impedance(pressed("circle", x + (to - x) * u, y, 9e-3, 3.0))) for u in shares]
 
 
 @BOTH
-def test_a_slide_keeps_its_id_and_its_place(parts: int) -> None:
+def test_a_slide_keeps_its_id_and_its_place(parts):
     begin, lasts = FREE_S + 0.5, 0.4  # 0.1 m/s
     slid = way(-0.02, 0.02, 0.005, 13)
     points = [(0.0, impedance()), (FREE_S, impedance()), (FREE_S + 0.05, slid[0][1])]
@@ -142,7 +120,7 @@ def test_a_slide_keeps_its_id_and_its_place(parts: int) -> None:
 
 @BOTH
 @pytest.mark.parametrize(("first_n", "then_n", "ramp_s", "later_s"), [(5.0, 2.5, 0.02, 0.034), (2.5, 5, 1e-3, 0.0067)])
-def test_a_touch_whose_force_changes_at_once_goes_on(parts, first_n, then_n, ramp_s, later_s) -> None:
+def test_a_touch_whose_force_changes_at_once_goes_on(parts, first_n, then_n, ramp_s, later_s):
     """It is there in every frame, with its id. Half gone is no release, and what comes to it is no other touch."""
     first, then = (impedance(pressed("circle", 0.012, -0.018, 9e-3, force_n)) for force_n in (first_n, then_n))
     at = FREE_S + 0.4 + later_s
@@ -152,16 +130,16 @@ def test_a_touch_whose_force_changes_at_once_goes_on(parts, first_n, then_n, ram
 
 
 @BOTH
-def test_what_a_touch_leaves_in_the_foam_is_no_touch(parts: int) -> None:
+def test_what_a_touch_leaves_in_the_foam_is_no_touch(parts):
     frames = run(press(TOUCH, until_s=FREE_S + 1.0, left=0.03), FREE_S + (3.5 if parts == 1 else 2.5), parts)
     assert shows(between_s(frames, FREE_S + 1.4), 0)
 
 
-def test_after_refused_frames_the_skin_is_valid_again_within_two_seconds() -> None:
+def test_after_refused_frames_the_skin_is_valid_again_within_two_seconds():
     """Noise that no model has, and meanwhile the sheet has come to conduct 1 % better."""
     rng, ends = np.random.default_rng(9), FREE_S + 1.0
 
-    def curve(t: np.ndarray) -> np.ndarray:
+    def curve(t):
         noisy = impedance() * (1 + 0.1 * rng.standard_normal(120))
         return np.asarray(noisy if t.max() < ends else impedance(background=1.01))
 
@@ -174,37 +152,37 @@ def test_after_refused_frames_the_skin_is_valid_again_within_two_seconds() -> No
 
 
 @pytest.mark.parametrize(("parts", "since"), [(1, 0.0), (PARTS, FREE_S)])
-def test_measurements_that_the_board_marks_are_left_out(parts: int, since: float) -> None:
+def test_measurements_that_the_board_marks_are_left_out(parts, since):
     """They are no fault of the wires, though the baseline may lack them too."""
 
-    def marked() -> Iterator:
-        for raw in Board(press(TOUCH), parts).frames(FREE_S + 0.6, since):
+    def marked():
+        for raw in curves.Board(press(TOUCH), parts).frames(FREE_S + 0.6, since):
             raw.status[[3, 40]], raw.z[[3, 40]] = 1, np.nan
             yield raw
 
-    frames = said(free(parts) if since else new_pipeline(), marked())
+    frames = curves.said(curves.free(parts) if since else curves.new_pipeline(), marked())
     shown = between_s(frames, FREE_S + 0.3)
     assert shows(shown, 1) and all(far_off(frame.contacts[0], TOUCH) < 2e-3 for frame in shown)
-    assert since or shows(between_s(frames, FREE_S - 0.3, FREE_S - SCAN_S), 0)
+    assert since or shows(between_s(frames, FREE_S - 0.3, FREE_S - curves.SCAN_S), 0)
 
 
-def test_a_restart_under_a_touch_shows_it_at_once_under_another_id_and_does_not_say_that_it_began() -> None:
-    frames, pipeline = list(Board(press(TOUCH)).frames(FREE_S + 1.2)), new_pipeline()
-    cut = round((FREE_S + 0.6) / SCAN_S)
-    before = said(pipeline, frames[:cut])
+def test_a_restart_under_a_touch_shows_it_at_once_under_another_id_and_does_not_say_that_it_began():
+    frames, pipeline = list(curves.Board(press(TOUCH)).frames(FREE_S + 1.2)), curves.new_pipeline()
+    cut = round((FREE_S + 0.6) / curves.SCAN_S)
+    before = curves.said(pipeline, frames[:cut])
     kept = pipeline.pre.saved()
     assert kept is not None and before[-1].contacts
-    pipeline.pre = Preprocessing("palm", SKIN, bundle())
+    pipeline.pre = Preprocessing("palm", curves.SKIN, curves.bundle())
     pipeline.pre.restore(kept, 0.1)
-    after = said(pipeline, frames[cut:])
+    after = curves.said(pipeline, frames[cut:])
     assert shows(after, 1) and after[0].contacts[0].id != before[-1].contacts[0].id
     assert not any(contact.state == "begin" for frame in after for contact in frame.contacts)
 
 
-def test_suspicious_scans_seconds_apart_are_not_in_a_row() -> None:
+def test_suspicious_scans_seconds_apart_are_not_in_a_row():
     """A contact that is 8 % off for one scan, three times: the third time says no more than the first."""
 
-    def said_of(contact: ContactCurves) -> list[tuple[float, ContactFrame]]:
+    def said_of(contact):
         host = tared("full", seed=3, world="plain")
         host.rig.field.play(host.rig.timeline(script(contact=contact), 0.0), host.now)
         host.until(11.0)

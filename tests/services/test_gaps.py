@@ -64,17 +64,14 @@ def after_a_gap(scan: ScanMode, how: str, seconds: float, what: str, seed: int) 
     return right(host, start)
 
 
-@pytest.mark.parametrize(
-    ("how", "seconds", "what"),
-    [
-        ("lost", 0.3, "elsewhere"),
-        ("hang", 0.8, "beside"),
-        ("unplug", 0.3, "released"),
-        ("Preprocessing", 0.1, "elsewhere"),
-        ("Inference", 0.5, "begins"),
-        ("Publishing", 0.8, "elsewhere"),
-    ],
-)
+@pytest.mark.parametrize(("how", "seconds", "what"), [
+    ("lost", 0.3, "elsewhere"),
+    ("hang", 0.8, "beside"),
+    ("unplug", 0.3, "released"),
+    ("Preprocessing", 0.1, "elsewhere"),
+    ("Inference", 0.5, "begins"),
+    ("Publishing", 0.8, "elsewhere"),
+])  # fmt: skip
 @BOTH
 def test_nothing_is_hidden_behind_a_gap(scan: ScanMode, how: str, seconds: float, what: str) -> None:
     after_a_gap(scan, how, seconds, what, seed=1)

@@ -8,12 +8,13 @@ import pytest
 from models.bundle import Bundle
 from models.forward import shared
 from models.shapes import Shape
-from protocol.frames import STATUS_OPEN, RawFrame, pack, unpack
+from protocol.frames import STATUS_OPEN, pack, unpack
 from services.estimation.first.baseline import Baseline, NoBaseline, take
 from services.pipeline import Pipeline
 from services.runtime.config import Skin
 from simulation.host import LATE_S, SimulatedHost
 from simulation.scenes import DiscPress, script
+from tests.services.stub_skin import whole_scan
 
 TOUCH = Shape("circle", 0.4, 0.3, 0.25, 0.3)  # 3 N
 CENTRE_MM = 50 * TOUCH.centroid
@@ -68,12 +69,8 @@ class Stages:
         """The contact frame, once nothing that is no number has left a stage."""
         self.scan += 1
         with np.errstate(all="ignore"):
-            raw = RawFrame(
-                skin="skin", scan=self.scan, z=np.asarray(z).astype("c8"), stamps={"sample": self.scan * 45_000_000},
-                status=np.zeros(120, "u1") if status is None else status.astype("u1"),
-                source="board", valid=True, valid_for_s=0.1, board="bench",
-            )  # fmt: skip
-            result = self.pipeline.run(raw)
+            status = None if status is None else status.astype("u1")
+            result = self.pipeline.run(whole_scan(np.asarray(z), self.scan, status, skin="skin", board="bench"))
         delta, image, contact = result.delta, result.image, result.contact
         for array in (delta.difference, [delta.score, delta.threshold], image.image, image.sigma, image.classes):
             assert np.isfinite(array).all()

@@ -11,13 +11,13 @@ from models.bundle import Bundle
 from models.calibration_file import CalibrationFileError, found_by, pack, unpack
 from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
-from protocol.frames import RawFrame
 from services import mounting
 from services.estimation.first.baseline import Baseline
 from services.pipeline import Pipeline
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin, TareConfig
 from services.runtime.stage import Refused
+from tests.services.stub_skin import whole_scan
 from tests.waiting import until
 
 NOISE = 1e-4  # 80 dB
@@ -43,11 +43,7 @@ class Bench:
         for _ in range(frames):
             self.scan += 1
             noisy = z * (1 + NOISE * self.rng.standard_normal(len(z)))
-            raw = RawFrame(
-                skin="palm", scan=self.scan, z=noisy.astype(np.complex64), status=np.zeros(len(z), np.uint8),
-                stamps={"sample": self.scan * 45_000_000}, source="board", valid=True, board="b",
-            )  # fmt: skip
-            result = self.pipeline.run(raw)
+            result = self.pipeline.run(whole_scan(noisy, self.scan, board="b"))
         return result
 
     def tare(self, **args):

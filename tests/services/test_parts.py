@@ -1,52 +1,56 @@
-"""Scans in parts, bytes in, in simulated time: what is handed on, and touches followed from part to part."""
+"""Scans in parts: what is handed on, touches followed from part to part, changes within a scan, how many parts."""
 
-from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from firmware_stub.sheet import Sheet
 from models.mismatch import Mismatch
+from models.shapes import Shape
 from protocol import link
-from protocol.frames import Contact, ContactFrame, RawFrame, pack, unpack
+from protocol.frames import Contact, RawFrame, StatusFrame, pack, unpack
 from services.board.boardlink import BoardLink
 from services.board.newest_values import NewestValues
+from services.board.parts_or_whole import MOST_WAIT_S, PartsOrWhole
 from services.board.remarks import WHOLE, Remarks
 from services.contacts.lasting import LASTS_NS, LastingStates
 from services.runtime.stage import Health
 from simulation.host import SimulatedHost, tared
 from simulation.scenes import DiscPress, script
 from simulation.truth import SCAN_S, lasting
+from tests.services.stub_skin import METRES, StubSkin, present, transfer
 
 PART_HZ = 229
 MS = 1_000_000
 
 
 @pytest.fixture
-def host() -> Iterator[SimulatedHost]:
+def host():
     """After six seconds untouched."""
     made = tared("rolling", keep=True)
     yield made
     made.close()
 
 
-def during(host: SimulatedHost, seconds: float) -> list[tuple[float, ContactFrame]]:
+def during(host, seconds):
     """What comes meanwhile, and how long after its beginning."""
     began, first = host.now, len(host.contacts)
     host.until(began + seconds)
     return [(at - began, frame) for at, frame in host.contacts[first:]]
 
 
-def held(host: SimulatedHost, x: float, y: float, force: float = 2.0, radius: float = 0.01) -> None:
+def held(host, x, y, force=2.0, radius=0.01):
     host.press(x=x, y=y, force=force, radius=radius, seconds=60.0, finger="one")
 
 
-def over(frame: ContactFrame) -> bool:
+def over(frame):
     """Whether it says that nothing presses any more."""
     return frame.valid and not lasting(frame)
 
 
-def off_m(frame: ContactFrame, x: float, y: float) -> float:
+def off_m(frame, x, y):
     (contact,) = frame.contacts
     return float(np.hypot(contact.position[0] - x, contact.position[1] - y))
 
@@ -54,7 +58,7 @@ def off_m(frame: ContactFrame, x: float, y: float) -> float:
 # what acquisition hands on
 
 
-def part(seq: int, of: int = 5, n: int = 2, value: float = 1.0, config: int = 1) -> link.ScanFrame:
+def part(seq, of=5, n=2, value=1.0, config=1):
     z = np.full(n, value, np.complex64)
     return link.ScanFrame(seq, 1000 * seq, 900, config, z, np.zeros(n, "u1"), seq % of, of)
 
@@ -62,7 +66,7 @@ def part(seq: int, of: int = 5, n: int = 2, value: float = 1.0, config: int = 1)
 HEADER = RawFrame(skin="palm", z=np.zeros(2, "c8"), status=np.zeros(2, "u1"))
 
 
-def test_the_newest_values_have_their_places_their_ages_and_say_which_are_new() -> None:
+def test_the_newest_values_have_their_places_their_ages_and_say_which_are_new():
     order = np.array([3, 0, 9, 4, 1, 2, 5, 6, 8, 7])
     newest = NewestValues(order)
     assert [newest.take(part(seq, value=seq)) for seq in range(6)] == [False] * 4 + [True, True]
@@ -73,7 +77,7 @@ def test_the_newest_values_have_their_places_their_ages_and_say_which_are_new() 
     assert frame.age_us[[3, 0, 9, 4]] == pytest.approx([675, 225, 4675, 4225])
 
 
-def test_after_a_gap_nothing_from_before_it_is_handed_on() -> None:
+def test_after_a_gap_nothing_from_before_it_is_handed_on():
     newest = NewestValues(np.arange(10))
     taken = [newest.take(part(seq)) for seq in (0, 1, 2, 3, 4, 6, 7, 8, 9)]
     assert taken == [False] * 4 + [True] + [False] * 4
@@ -81,7 +85,7 @@ def test_after_a_gap_nothing_from_before_it_is_handed_on() -> None:
         assert newest.take(part(seq)) and newest.frame(HEADER, part(seq)).reasons == reasons
 
 
-def test_a_board_sends_parts_and_whole_scans_are_made_of_them(host: SimulatedHost) -> None:
+def test_a_board_sends_parts_and_whole_scans_are_made_of_them(host):
     """While nothing touches, a part makes no frame: contacts come at the rate of whole scans."""
     raw, frames = len(host.raws), [frame for _, frame in during(host, 2.0)]
     raws = host.raws[raw:]
@@ -95,7 +99,7 @@ def test_a_board_sends_parts_and_whole_scans_are_made_of_them(host: SimulatedHos
     assert all(at[f.scan] == f.stamps["sample"] for f in frames), "it stands for the instant of its newest part"
 
 
-def test_a_board_that_knows_no_parts_scans_whole_and_status_says_so() -> None:
+def test_a_board_that_knows_no_parts_scans_whole_and_status_says_so():
     host = SimulatedHost("rolling", snr_db=80.0, seed=3)
     host.rig.board.knows_parts = False
     host.until(4.0)
@@ -105,7 +109,7 @@ def test_a_board_that_knows_no_parts_scans_whole_and_status_says_so() -> None:
     host.close()
 
 
-def test_frames_of_another_cut_are_foreign(host: SimulatedHost) -> None:
+def test_frames_of_another_cut_are_foreign(host):
     scanning, cut = host.source.scanning, host.source.scanning.config
     assert scanning.sent(part(0, of=10, n=12, config=cut)) and not BoardLink(scanning, 0.0).knows_no_parts
     assert not any(scanning.sent(part(0, of=of, n=n, config=cut)) for of, n in ((5, 24), (10, 11), (1, 120)))
@@ -115,7 +119,7 @@ def test_frames_of_another_cut_are_foreign(host: SimulatedHost) -> None:
 # touches
 
 
-def test_a_touch_reaches_a_controller_within_three_parts_and_so_does_its_end(host: SimulatedHost) -> None:
+def test_a_touch_reaches_a_controller_within_three_parts_and_so_does_its_end(host):
     for x, y in ((0.02, -0.01), (-0.025, 0.02)):
         held(host, x, y)
         seen = [(t, f) for t, f in during(host, 0.25) if f.valid and f.contacts]
@@ -134,7 +138,7 @@ def test_a_touch_reaches_a_controller_within_three_parts_and_so_does_its_end(hos
     assert samples == sorted(samples)
 
 
-def test_contacts_of_a_held_and_then_sliding_touch_come_at_the_part_rate(host: SimulatedHost) -> None:
+def test_contacts_of_a_held_and_then_sliding_touch_come_at_the_part_rate(host):
     held(host, -0.02, 0.01)
     host.until(host.now + 0.2)
     frames = during(host, 0.3)
@@ -157,7 +161,7 @@ def test_contacts_of_a_held_and_then_sliding_touch_come_at_the_part_rate(host: S
 
 
 @pytest.mark.parametrize("x, y", [(0.037, -0.044), (-0.0137, 0.0436)])
-def test_a_touch_on_an_electrode_is_not_taken_for_its_contact(host: SimulatedHost, x: float, y: float) -> None:
+def test_a_touch_on_an_electrode_is_not_taken_for_its_contact(host, x, y):
     """The two whole scans after its beginning are of a contact that jumped, by what they show alone. A whole scan
     tells them apart: the first one after the beginning.
     """
@@ -166,7 +170,7 @@ def test_a_touch_on_an_electrode_is_not_taken_for_its_contact(host: SimulatedHos
     assert all(f.valid for _, f in frames) and next(t for t, f in frames if f.contacts) < SCAN_S
 
 
-def test_no_whole_scan_is_made_of_values_from_before_and_after_a_release(host: SimulatedHost) -> None:
+def test_no_whole_scan_is_made_of_values_from_before_and_after_a_release(host):
     """Of a release within the newest values too: such a scan looks like a contact that jumped, asking takes 20 ms."""
     for k in (0, 7):
         held(host, 0.03, -0.028, radius=0.0075)
@@ -177,7 +181,7 @@ def test_no_whole_scan_is_made_of_values_from_before_and_after_a_release(host: S
         assert next(t for t, f in after if over(f)) < 0.02
 
 
-def test_a_tare_makes_no_contact_and_is_followed_by_touches_again(host: SimulatedHost) -> None:
+def test_a_tare_makes_no_contact_and_is_followed_by_touches_again(host):
     """The differences that parts are compared with were to the baseline before."""
     host.until(7.0)
     host.pipeline.pre.command("tare", {"calibrate": False})
@@ -190,7 +194,7 @@ def test_a_tare_makes_no_contact_and_is_followed_by_touches_again(host: Simulate
 # begin and end stay long enough for a reader that takes the newest frame now and then
 
 
-def test_a_reader_of_30_hz_misses_neither_begin_nor_end(host: SimulatedHost) -> None:
+def test_a_reader_of_30_hz_misses_neither_begin_nor_end(host):
     host.press(x=0.01, y=0.02, force=2.0, radius=0.01, seconds=0.2)
     seen = during(host, 0.6)
     for phase in np.linspace(0, 1 / 30, 5):
@@ -202,8 +206,8 @@ def test_a_reader_of_30_hz_misses_neither_begin_nor_end(host: SimulatedHost) -> 
         assert 40e6 < said[-1][0] - said[0][0] < 60e6 and len({number for _, number in said}) == 1
 
 
-def test_begin_and_end_are_repeated_for_50_ms_and_go_with_a_recording() -> None:
-    def contact(number: int, state: str) -> Contact:
+def test_begin_and_end_are_repeated_for_50_ms_and_go_with_a_recording():
+    def contact(number, state):
         return Contact(id=number, state=state, position=[0.0, 0.0, 0.0])
 
     lasting = LastingStates()
@@ -224,7 +228,7 @@ def test_begin_and_end_are_repeated_for_50_ms_and_go_with_a_recording() -> None:
 
 
 @pytest.mark.release
-def test_parts_of_a_calibrated_skin_stand_on_its_calibration() -> None:
+def test_parts_of_a_calibrated_skin_stand_on_its_calibration():
     """Mounted wrong, after a tare that calibrates: a slide is followed with every part, as on its bundle's skin."""
     wrong = Mismatch(anisotropy=0.15, angle=0.6, field=0.1, shift=0.06, contact_spread=0.3, seed=2)
     host = SimulatedHost("rolling", 80.0, 3, sheet=Sheet("square16", wrong, mesh="world"))
@@ -235,3 +239,138 @@ def test_parts_of_a_calibrated_skin_stand_on_its_calibration() -> None:
     host.until(8.3)
     host.close()
     assert len([f for _, f in host.valid(7.1) if 7.35e9 < f.stamps["sample"] < 7.85e9 and f.contacts]) > 90
+
+
+PLACES = (0.8, 0.4, 0.25, 0.22), (-0.6, -0.5, 0.2, 0.4), (0.1, 0.25, 0.12, 0.3)
+TOUCHES = [Shape("circle", *place) for place in PLACES]
+RAMP = (0.0, 0.35, 0.79, 1.0)  # share of the force at the ends of the scans that a ramp of 0.1 s is in
+
+
+def levels(touch, shares):
+    return [transfer((replace(touch, drop=share * touch.drop),) if share else ()) for share in shares]
+
+
+@pytest.fixture
+def skin():
+    return StubSkin()
+
+
+@pytest.mark.parametrize("touch", TOUCHES)
+def test_a_touch_that_comes_and_goes_is_where_it_is_or_says_changing(skin, touch):
+    skin.rest(3)
+    up = levels(touch, RAMP)
+    begin = [skin.see(*scan) for scan in pairwise(up)]
+    held = [skin.see(up[-1]) for _ in range(8)]
+    end = [skin.see(*scan) for scan in pairwise(reversed(up))]
+    free = [skin.see(up[0]) for _ in range(6)]
+    every = [*begin, *held, *end, *free]
+    # Two frames in a row may be explained by a change: of an end in three scans the last may be refused.
+    assert all(r.contact.valid for r in [*begin, *held, *end[:-1], *free]), [r.contact.reasons for r in every]
+    assert not says_changing(held) and not says_changing(free)
+    assert says_changing(begin) <= 3 and says_changing(end) <= 2
+    whole_n = held[-1].contact.contacts[0].force_n
+    middles = [(a + b) / 2 for a, b in pairwise((*RAMP, *[1.0] * 8, *reversed(RAMP[:-1]), *[0.0] * 6))]
+    for result, share in zip(every, middles, strict=True):
+        rough = "changing" in result.contact.reasons
+        for contact in result.contact.contacts:
+            off = np.hypot(*(np.array(contact.position[:2]) - METRES * np.array([touch.x, touch.y])))
+            assert off < (0.015 if rough else 0.003)
+            if not rough and contact.state != "end":  # how strongly it pressed in the middle of the scan
+                assert contact.force_n == pytest.approx(share * whole_n, rel=0.15, abs=0.02 * whole_n)
+    assert all(len(present(r)) == 1 for r in held) and not present(free[-1])
+    # Where it presses in any part of the scan, its contact is there, or the frame says why not, or is not valid.
+    assert not any(hides(r) for r in [*begin, *end]), [r.contact.reasons for r in [*begin, *end]]
+
+
+def hides(result):
+    """Whether a person would take the frame for one in which nothing touches."""
+    return result.contact.valid and not present(result) and "changing" not in result.contact.reasons
+
+
+@pytest.mark.parametrize("touch", TOUCHES)
+@pytest.mark.parametrize("shares", [(1.0, 0.93, 0.5, 0.06), (1.0, 0.3, 0.0)])
+def test_no_frame_hides_a_touch_that_goes_while_it_is_scanned(skin, touch, shares):
+    skin.rest(3)
+    down = levels(touch, shares)
+    for _ in range(6):
+        skin.see(down[0])
+    going = [skin.see(*scan) for scan in pairwise(down)]
+    free = [skin.see(levels(touch, (0.0,))[0]) for _ in range(6)]
+    assert [hides(r) for r in going[:-1]] == [False] * (len(going) - 1), [r.contact.reasons for r in going]
+    assert not hides(going[-1]) or shares[-2] < 0.2  # what is left of a faint touch may be too little to be seen
+    assert says_changing(going) <= 2 and all(r.contact.valid and not present(r) for r in free[2:])
+
+
+def says_changing(results):
+    return sum("changing" in r.contact.reasons for r in results)
+
+
+class Machine:
+    """Skins of which so many fit in parts; each skin of too many loses its share."""
+
+    def __init__(self, skins, fit):
+        self.names = [f"skin{n}" for n in range(skins)]
+        self.choice, self.fit = PartsOrWhole(self.names), fit
+        self.now, self.behind, self.session, self.changes = 0.0, dict.fromkeys(self.names, 0.0), "a", 0
+
+    def run(self, seconds):
+        """How many scan in parts, each second."""
+        found = []
+        for _ in range(int(seconds)):
+            self.now += 1.0
+            before = [name for name in self.names if not self.choice.whole(name)]
+            for name in before:  # where touches begin, some are behind
+                self.behind[name] += 229.0 * (0.1 if len(before) <= self.fit else 0.7)
+            for name, behind in self.behind.items():
+                said = {"process": "preprocessing", "session": self.session, "drops": {"skipped": int(behind)}}
+                self.choice.heard(StatusFrame(skin=name, **said), self.now)
+            found.append(sum(not self.choice.whole(name) for name in self.names))
+            self.changes += found[-1] != len(before)
+        return found
+
+
+def test_as_many_stay_as_fit_attempts_grow_rare_and_they_come_back_when_the_load_is_gone():
+    assert (all_fit := Machine(4, fit=4.0)).run(60.0) == [4] * 60 and all_fit.changes == 0
+    machine = Machine(16, fit=5.5)
+    first = machine.run(20.0)
+    assert first[-1] <= 5 and min(first) >= 1  # within seconds
+    machine.run(3600.0)
+    before, hour = machine.changes, machine.run(3600.0)
+    assert max(hour) <= 6 and machine.changes - before <= 4 * 3600 / MOST_WAIT_S + 8
+    assert np.mean([count <= 5 for count in hour]) > 0.97
+    machine = Machine(8, fit=2.0)
+    assert machine.run(120.0)[-1] <= 2
+    machine.fit = 8.0
+    assert machine.run(3 * MOST_WAIT_S + 1)[-1] == 8
+
+
+def test_parts_that_come_no_sooner_than_whole_scans_are_given_up():
+    choice = PartsOrWhole(["palm"])
+    for second, p50 in enumerate((5.0, 30.0, 8.0, 30.0, 31.0, 30.0)):
+        choice.heard(StatusFrame(skin="palm", process="preprocessing", session="a", latency={"p50": p50}), second)
+        choice.heard(StatusFrame(skin="other", process="preprocessing", drops={"skipped": 200 * second}), second)
+        assert choice.whole("palm") == (second >= 4) and not choice.whole("other"), "one slow second is none"
+
+
+@pytest.mark.parametrize("touched", [False, True])
+def test_a_board_goes_from_parts_to_whole_scans_and_back(touched):
+    host = SimulatedHost("rolling", snr_db=80.0, seed=7)
+    host.until(4.0)
+    if touched:
+        host.press(x=0.02, y=-0.01, force=2.0, radius=0.01, seconds=60.0)
+    host.until(5.0)
+    baseline = host.pipeline.pre.baseline
+    for scanning, part in ((host.source.scanning.whole, 0), (host.source.scanning, 10)):
+        since, asked = len(host.contacts), host.now
+        host.link.scan_as(scanning, host.now)
+        host.newest = host.source.newest()
+        host.until(host.now + 2.0)
+        seen = host.contacts[since:]
+        good = [t for t, frame in seen if frame.valid and len(frame.contacts) == touched]
+        assert good[-1] > host.now - 0.06 and good[0] < asked + 0.25 and np.diff(good).max() < 0.15
+        assert sum(len(frame.contacts) != touched for _, frame in seen if frame.valid) == 0
+        assert len({contact.id for _, frame in seen for contact in frame.contacts}) == touched
+        parts = {frame.part for _, frame in seen[len(seen) // 2 :]}
+        assert part in parts and (part or parts == {0})
+    assert host.pipeline.pre.baseline is baseline
+    host.rig.close()

@@ -1,18 +1,26 @@
-"""Preprocessing: touch decision, hold, what is left out of a scan, what the baseline follows, and what info says."""
+"""Preprocessing: touch decision, hold, what is left out, learnt and told; the first baseline, tares, the judge."""
 
 import dataclasses
 import hashlib
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from models.bundle import Bundle
-from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA, RawFrame, pack, unpack
+from models.forward import shared
+from models.measurement.responses.tables import tables_of
+from models.mismatch import MismatchedSheet, named
+from models.shapes import Shape
+from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA, JudgementsFrame, RawFrame, pack, unpack
 from services.describe import EVERY_S, MOVED
 from services.estimation.faults import checks
-from services.estimation.first.baseline import Baseline
+from services.estimation.first.baseline import Baseline, NoBaseline, disagreement, take
+from services.estimation.first.start import JudgedStart, StartJudge, StartSays
+from services.estimation.first.tare import agreement
 from services.preprocessing import Preprocessing
-from services.runtime.config import Skin
+from services.runtime.config import Skin, TareConfig
+from services.runtime.stage import Refused
 from tests.services.conftest import FRAME_NS, Board, Fed
 
 
@@ -106,9 +114,7 @@ def test_failed_measurements_do_not_change_what_the_producer_says(tared, board, 
 @pytest.mark.parametrize(
     ("bit", "reason"), [(STATUS_CLIPPED, "saturated"), (STATUS_RTIA, "saturated"), (STATUS_FIFO, "fifo")]
 )
-def test_measurements_that_the_board_doubts_are_left_out_by_name_and_more_than_half_refuse_the_frame(
-    tared: Fed, board: Board, bit: int, reason: str
-) -> None:
+def test_measurements_that_the_board_doubts_are_left_out_and_more_than_half_refuse_it(tared, board, bit, reason):
     frame = board.frame()
     frame.status[[7, 30]] = bit
     frame.z[30] *= 1.5  # a number, but another measurement's
@@ -194,3 +200,246 @@ def test_info_says_what_frames_are_compared_with(tared: Fed) -> None:
     assert again is not None and again["baseline_hash"] != told[-1]["baseline_hash"]
     assert again["baseline_revision"] > revisions[-1] and tared.stage.info() is None
     assert not any(tared.feel(per_scan * 500) and tared.stage.info() for _ in range(150))
+
+
+Array = NDArray[np.float64]
+NOISE, SCANS = 1e-4, 64  # 80 dB
+
+
+def hand(board: Board) -> Array:
+    return np.asarray(3 * board.disc(0.5, -0.3, 0.3, 0.5))
+
+
+def refusal(fed: Fed) -> str:
+    with pytest.raises(Refused) as why:
+        fed.tare()
+    return str(why.value)
+
+
+def too_old(fed: Fed) -> Fed:
+    """As after a day: what was its baseline is only held against the first scans."""
+    saved = fed.stage.saved()
+    assert saved is not None
+    fed.stage.reset()
+    with pytest.raises(Refused, match="held against it"):
+        fed.stage.restore(saved, 1e5)
+    return fed
+
+
+def test_nothing_is_valid_before_the_baseline_nor_with_a_touch_in_its_scans(fed: Fed, board: Board) -> None:
+    """Nor with presses that come and go: each quarter of the scans holds some."""
+    come_and_go = board.disc(0.05, 0.0, 0.2, 0.3)
+    found = [fed.feel(come_and_go if k % 27 < 18 else 0.0)[0] for k in range(120)]
+    assert not any(each.valid for each in found) and "disagree" in fed.problem
+    assert all(each.reasons == ["stale_baseline"] for each in found[:60])
+    fed.feel(scans=41)
+    assert not fed.feel(board.disc(0.3, 0.0, 0.2, 0.3), 31)[-1].valid and "disagree" in fed.problem
+    found = fed.feel(scans=72)
+    assert found[-1].valid and not found[-1].touched
+
+
+def test_a_touch_at_the_start_is_named_and_ends_without_a_command(fed: Fed, board: Board) -> None:
+    """Touched all the time: the scans agree, so the bundle's prediction must tell."""
+    found = fed.feel(hand(board), 80)[-1]
+    assert not found.valid and found.reasons == ["touched_at_start"] and "skin tare" in fed.problem
+    _, said = fed.stage.everything(board.frame(hand(board)), frozenset({"delta", "judgements"}))
+    assert isinstance(said, JudgementsFrame)
+    row = said.names.index("start")
+    assert said.verdicts[row] == "refuse" and said.ratios[row] > 1
+    found = fed.feel(scans=96)[-1]
+    assert found.valid and not found.touched and fed.stage.health().level == "OK"
+
+
+def test_a_tare_under_a_touch_that_the_start_found_needs_force_and_ends_by_another(skin, bundle, board) -> None:
+    """Who forces it is believed. What comes then is refused after two scans that may be a touch that changes."""
+    fed = Fed(skin.model_copy(update={"tare": TareConfig(frames=12, calibrate=False)}), bundle, board)
+    fed.feel(hand(board), 20)
+    assert "free it" in refusal(fed) and "--force" in refusal(fed)
+    assert fed.feel(hand(board))[0].reasons == ["touched_at_start"]
+    fed.tare(force=True)
+    assert fed.feel(hand(board))[0].valid
+    outs = fed.feel(scans=14)  # no touch lowers an impedance
+    assert all(not out.valid and "out_of_distribution" in out.reasons for out in outs[2:])
+    assert not any(out.estimates for out in outs) and all("changing" in out.reasons for out in outs[:2])
+    fed.feel(3 * board.disc(-0.4, 0.3, 0.3, 0.5), 14)  # such a baseline has no word against a tare, the bundle has
+    assert "free it" in refusal(fed)
+    fed.feel(scans=14)
+    fed.tare()
+    (out,) = fed.feel()
+    assert out.valid and not out.touched
+
+
+def test_a_skin_unlike_its_bundle_is_not_valid_until_one_tare(fed: Fed) -> None:
+    """Every |Z| off in its own way. The tare's word is kept, and is enough for the next start."""
+    odd = 0.01 * np.random.default_rng(1).standard_normal(120)
+    out = fed.feel(odd, 80)[-1]
+    assert not out.valid and out.reasons == ["stale_baseline"]
+    assert any("skin tare" in message for message in fed.stage.health().messages)
+    fed.tare()
+    assert fed.feel(odd)[0].valid
+    out = too_old(fed).feel(odd, 80)[-1]
+    assert out.valid and not out.touched
+
+
+def test_a_touch_at_the_start_is_a_contact_where_an_old_baseline_is_trusted(fed: Fed, board: Board) -> None:
+    outs = too_old(fed.tared()).feel(board.disc(0.5, -0.3, 0.2, 0.3), 80)
+    assert not any(out.valid for out in outs[:60]) and outs[-1].valid and outs[-1].touched
+    assert not fed.feel(scans=10)[-1].touched
+
+
+def test_a_tare_waits_for_scans_and_for_the_touch_to_end(fed: Fed, board: Board) -> None:
+    fed.feel(scans=20)
+    assert "only 20 of 64 frames came so far: wait" in refusal(fed)
+    fed.feel(scans=52)
+    fed.feel(board.disc(0.0, 0.0, 0.2, 0.3), 10)
+    assert "the skin is touched" in refusal(fed)
+    fed.feel(scans=30)
+    assert "of 64 untouched frames since the last touch: wait" in refusal(fed)
+    fed.feel(scans=64)
+    assert fed.tare()["snr_db"] == pytest.approx(80, abs=1)
+    assert fed.feel()[0].valid
+
+
+@pytest.mark.parametrize(
+    ("snr_db", "words"), [(400.0, "identical"), (30.0, "trained for 0.56 %"), (40.0, "scatter by 1.0 %"), (50.0, "")]
+)
+def test_scans_that_are_the_same_or_too_noisy_are_doubted(skin, bundle, snr_db, words) -> None:
+    """Not even after a tare on command are they valid: looking at the skin does not mend it."""
+    fed = Fed(skin, bundle, Board(bundle, snr_db))
+    found = fed.feel(scans=80)[-1]
+    assert found.valid == (not words) == (not fed.problem) and not found.touched and words in fed.problem
+    if snr_db < 100:
+        fed.tare(force=True)
+        assert fed.feel()[0].valid == (not words)
+
+
+@pytest.mark.parametrize("reason", ["frozen", "clock"])
+def test_frames_that_acquisition_does_not_believe_are_no_baseline(fed: Fed, board: Board, reason: str) -> None:
+    for _ in range(80):
+        frame = board.frame()
+        frame.valid, frame.reasons = False, [reason]
+        received = unpack(pack(frame))
+        assert isinstance(received, RawFrame) and "stale_baseline" in fed.run(received).reasons
+    assert fed.stage.saved() is None and "0 of 64 frames" in refusal(fed)
+
+
+def test_what_failed_in_the_tare_counts_no_more_until_the_next(fed: Fed, board: Board) -> None:
+    for k in range(80):
+        frame = board.frame()
+        frame.z[3] = np.nan if k == 40 else frame.z[3]
+        found = fed.run(frame)
+    assert found.valid and np.flatnonzero(~np.isfinite(found.sigma)).tolist() == [3]
+    touched = fed.feel(board.disc(0.3, 0.0, 0.2, 0.3), 8)[-1]
+    assert touched.touched and not np.isfinite(touched.sigma[3])
+    fed.feel(scans=90)
+    fed.tare()
+    assert np.isfinite(fed.feel(scans=4)[-1].sigma).all()
+
+
+def test_the_baseline_survives_a_crash_but_not_another_board_bundle_or_day(tared: Fed, board: Board) -> None:
+    saved = tared.stage.saved()
+    assert saved is not None and tared.stage.saved() is None
+    again = tared.again()
+    again.stage.restore(saved, 60.0)
+    assert again.feel()[0].valid
+    out = again.run(board.frame(board="b2"))
+    assert not out.valid and "stale_baseline" in out.reasons and "board b1" in again.problem
+    for what, age_s, words in (
+        (saved, 1e6, "h old"),
+        (saved | {"bundle": "x"}, 1.0, "another bundle"),
+        ({"bundle": tared.bundle.hash}, 1.0, None),
+    ):
+        with pytest.raises(Refused, match=words):
+            tared.again().stage.restore(what, age_s)
+
+
+def test_recordings_and_their_reference_frames(tared: Fed, board: Board) -> None:
+    """A recording never meets the board's baseline; of it a reference frame is one."""
+    assert not tared.feel(source="replay")[0].valid and tared.stage.saved() is None
+    tared.feel(source="replay", scans=72)
+    shifted = 0.01 * np.cos(np.arange(120))
+    frame = board.frame(shifted, source="replay")
+    frame.kind = "reference"
+    tared.run(frame)
+    assert not tared.feel(shifted, source="replay")[0].touched
+    assert tared.feel(shifted + board.disc(0.0, 0.3, 0.2, 0.3), source="replay")[0].touched
+
+
+def test_noise_of_a_baseline(bundle: Bundle) -> None:
+    """Identical frames tell none: without noise of its own a skin would be touched by anything."""
+    z, pre, rng = np.asarray(bundle.z0, float), bundle.prereconstructor(), np.random.default_rng(0)
+    same = take(np.tile(z, (64, 1)), pre, "b1", 0)
+    assert "identical" in same.doubt and same.sigma == pytest.approx(1e-3 * z)
+    for relative in (1e-9, 1e-4):
+        frames = z * (1 + relative * rng.standard_normal((64, len(z))))
+        frames[5, 3] = np.nan
+        found = take(frames, pre, "b1", 0)
+        assert not found.doubt and np.flatnonzero(~np.isfinite(found.sigma)).tolist() == [3]
+        assert np.median(found.sigma / z) == pytest.approx(max(relative, 2e-6), rel=0.1)
+    with pytest.raises(NoBaseline, match="scatter"):
+        take(z * (1 + 0.2 * rng.standard_normal((64, 120))), pre, "", 0)
+    with pytest.raises(NoBaseline, match="measurements give values"):
+        take(np.where(np.arange(120) < 70, np.nan, z * np.ones((64, 120))), pre, "", 0)
+
+
+def test_a_skin_that_warms_is_tared_and_one_that_is_pressed_slowly_is_not(bundle: Bundle) -> None:
+    """Limits of agreement are so far away that noise stays below, and so near that a press is noticed."""
+    field, rng = tables_of(bundle).field[:, :3], np.random.default_rng(5)
+    quiet = [1e-3 * rng.standard_normal((SCANS, 120)) for _ in range(300)]
+    of_field = [(found := agreement(each, field)).statistic / found.limit for each in quiet]
+    of_all = [np.divide(*disagreement(1 + each)) for each in quiet]
+    assert 0.6 < max(of_field) < 1 and 0.6 < max(of_all) < 1
+    slope, noise = np.linspace(-0.5, 0.5, SCANS)[:, None], NOISE * rng.standard_normal((SCANS, 120))
+    warming = agreement(slope * 1e-3 * field[:, 0] + noise, field)
+    pressed = agreement(slope * Board(bundle).disc(0.3, 0.0, 0.2, 0.05) + noise, field)
+    assert warming.statistic < warming.limit and pressed.statistic > pressed.limit
+
+
+# the start, on the stub's own mesh
+
+
+def solved(*shapes: Shape, background: float = 1.0, contact: Array | float = 1.0) -> Array:
+    model = shared("square16", "stub")
+    conductivity = model.touched(list(shapes), background) if shapes else background
+    return np.asarray(np.abs(model.solve(conductivity, model.contact_impedance * contact).impedances()))
+
+
+def judged(z: Array, rng: np.random.Generator) -> JudgedStart:
+    sigma = NOISE / np.sqrt(SCANS)
+    mean = np.log(z) + sigma * rng.standard_normal(len(z))
+    judge = StartJudge(tables_of(Bundle.load("square16")))
+    return judge(mean, np.full(len(z), sigma**2), np.ones(len(z), bool), None)
+
+
+def any_skin(rng: np.random.Generator) -> dict[str, Array | float]:
+    """Contact impedances +- 30 %, background +- 5 %."""
+    return {"contact": 1 + 0.3 * rng.uniform(-1, 1, 16), "background": 1 + 0.05 * rng.uniform(-1, 1)}
+
+
+@pytest.mark.parametrize("touches", [
+    (),
+    (Shape("circle", 0.0, 0.0, 0.1, 0.1),),
+    (Shape("circle", 0.4, -0.2, 0.2, 0.1),),
+    (Shape("circle", -0.6, 0.6, 0.2, 0.5),),
+    (Shape("circle", 0.85, 0.1, 0.1, 0.3),),
+    (Shape("L", 0.1, 0.5, 0.4, 0.5, 0.7),),
+    (Shape("circle", -0.4, -0.4, 0.2, 0.4), Shape("circle", 0.5, 0.5, 0.2, 0.3)),
+])  # fmt: skip
+def test_a_touch_at_the_start_is_told_on_any_skin(touches: tuple[Shape, ...]) -> None:
+    for seed in range(3):
+        rng = np.random.default_rng([8, seed])
+        found = judged(1.7 * solved(*touches, **any_skin(rng)), rng)  # its gain is unknown
+        assert found.says is (StartSays.TOUCHED if touches else StartSays.UNTOUCHED)
+        assert not touches or found.sure or touches[0].kind == "L"
+        assert not touches or (found.fit is not None and len(found.fit) == len(touches))
+        for touch in touches if touches and touches[0].kind == "circle" else ():
+            assert np.hypot(*(found.fit.states[:, :2] - [touch.x, touch.y]).T).min() < 0.1  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("name", ["field10", "anisotropy5", "contacts"])
+def test_a_skin_that_is_not_as_in_its_file_is_never_said_to_be_untouched(name: str) -> None:
+    """Bare or under a hand; nor is one that is bare surely touched, so that its first tare needs no force."""
+    sheet, rng = MismatchedSheet("square16", named(name).seeded(1), "stub"), np.random.default_rng(1)
+    bare = judged(np.abs(sheet.solve().impedances()), rng)
+    touched = judged(np.abs(sheet.solve([Shape("circle", 0.3, -0.2, 0.1, 0.3)]).impedances()), rng)
+    assert bare.says is not StartSays.UNTOUCHED and not bare.sure and touched.says is not StartSays.UNTOUCHED

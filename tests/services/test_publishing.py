@@ -267,11 +267,19 @@ def test_an_image_tells_orientation_and_shape_with_its_probability(stage):
 
 def test_frames_that_stay_invalid_are_a_warning(stage):
     """Each process may be well, and still nobody learns of a touch."""
-    for scan in range(1, 130):
-        contacts(stage, dataclasses.replace(seen(scan), valid=False, reasons=["out_of_distribution"]))
-    assert (health := stage.health()).level == "WARN" and "out_of_distribution" in health.messages[0]
+
+    def invalid(scan, *reasons):
+        contacts(stage, dataclasses.replace(seen(scan), valid=False, reasons=[*reasons]))
+        return stage.health()
+
+    assert {invalid(scan, "stale_baseline").level for scan in range(1, 100)} == {"OK"}
+    said = [invalid(scan, "gap", "out_of_distribution") for scan in range(100, 130)][-1]
+    assert said.level == "WARN" and said.messages[0].startswith("no frame has been valid for 6 s: gap (")
+    assert "out_of_distribution" in said.messages[0] and "stale_baseline" not in said.messages[0]
     contacts(stage, seen(130))
     assert stage.health().level == "OK"
+    said = [invalid(scan, "gap") for scan in (2000, 4000, 131, 250)]  # a clock that begins anew begins the spell anew
+    assert [each.level for each in said] == ["OK", "WARN", "OK", "WARN"]
 
 
 def test_a_touch_of_a_preprocessing_that_began_anew_is_another_one(stage):

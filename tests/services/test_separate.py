@@ -1,13 +1,10 @@
 """Files of separate scans: what touches is found live as it is offline, whatever the order of the rows."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from models.bundle import Bundle
-from protocol.frames import ContactFrame, RawFrame
+from protocol.frames import RawFrame
 from services.calibration.presses import part
 from services.calibration.register_command import register_presses
 from services.estimation.first.references import alike, noise_of_references
@@ -18,29 +15,30 @@ from services.recordings.importing import import_arrays
 from services.recordings.npz_file import Input, frames_of, load_npz, read_scans
 from services.recordings.reconstruction import reconstruct
 from services.runtime.config import Skin
+from tests.services.conftest import Board
 from tests.services.stub_skin import lasting
 
 Arrays = dict[str, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def presses(reference: Path) -> Arrays:
+def presses(reference):
     return load_npz(reference / "hydrogel_disc16.npz")
 
 
 @pytest.fixture(scope="module")
-def registered(presses: Arrays, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+def registered(presses, tmp_path_factory):
     """The hydrogel skin, registered on the first 100 presses."""
     folder = tmp_path_factory.mktemp("skins") / "mine"
     register_presses(presses, "disc16", 100, folder)
     return Bundle.load(folder)
 
 
-def skin_of(bundle: Bundle, port: str = "stub") -> Skin:
+def skin_of(bundle, port="stub"):
     return Skin(port=port, bundle=str(bundle.path), frame_id="skin")
 
 
-def live(data: Input, bundle: Bundle, twin: Pipeline | None = None) -> Iterator[tuple[RawFrame, ContactFrame]]:
+def live(data, bundle, twin=None):
     """What the stages make of the file's frames. twin: goes on from the state in the middle."""
     pipeline = Pipeline(skin_of(bundle), bundle=bundle)
     for scan, (values, kind) in enumerate(frames_of(data), start=1):
@@ -55,11 +53,11 @@ def live(data: Input, bundle: Bundle, twin: Pipeline | None = None) -> Iterator[
         yield frame, made.contact
 
 
-def present(frame: ContactFrame) -> list[list[float]]:
+def present(frame):
     return [c.position[:2] for c in lasting(frame)]
 
 
-def test_real_presses_are_found_live_as_offline(presses: Arrays, registered: Bundle) -> None:
+def test_real_presses_are_found_live_as_offline(presses, registered):
     """40 of the presses that took no part in registration. (bench.real_presses has all 400.)"""
     data = read_scans(part(presses, slice(100, 140)), registered)
     offline = reconstruct(data, skin_of(registered), registered)
@@ -73,7 +71,7 @@ def test_real_presses_are_found_live_as_offline(presses: Arrays, registered: Bun
     assert agree >= 39
 
 
-def test_the_order_of_the_rows_does_not_matter(presses: Arrays, registered: Bundle) -> None:
+def test_the_order_of_the_rows_does_not_matter(presses, registered):
     """What is found in a shuffled file is what is found in the file as it was recorded, over hours of drift."""
     order, skin = np.random.default_rng(1).permutation(400) + 100, skin_of(registered)
     shuffled = {name: a if name == "pattern" else a[order] for name, a in presses.items()}
@@ -94,18 +92,17 @@ def test_the_order_of_the_rows_does_not_matter(presses: Arrays, registered: Bund
 
 
 @pytest.fixture(scope="module")
-def touches() -> Arrays:
+def touches():
     """Twenty presses of the bundle's own physics, each at a place of its own; gain drifts by a third between them."""
-    m, rng = Bundle.load("square16").matrices, np.random.default_rng(5)
-    side, places = -1 + 2 * (np.arange(24) + 0.5) / 24, rng.uniform(-0.5, 0.5, (20, 2))
+    board, rng = Board(Bundle.load("square16")), np.random.default_rng(5)
+    m, places = board.m, rng.uniform(-0.5, 0.5, (20, 2))
     gain = np.exp(np.cumsum(0.02 * rng.standard_normal((20, 1)), axis=0))
-    drops = [0.3 * (np.hypot(side[None] - x, side[:, None] - y) < 0.25).ravel() for x, y in places]
-    rows = m.z0 * (1 + np.array(drops) @ m.jacobian.T)
+    rows = m.z0 * (1 + np.array([board.disc(x, y, 0.25, 0.3) for x, y in places]))
     noise = 1 + 3e-4 * rng.standard_normal((2, 20, 120))
     return {"untouched": gain * m.z0 * noise[0], "touched": gain * rows * noise[1]}
 
 
-def test_each_touch_begins_and_ends(touches: Arrays) -> None:
+def test_each_touch_begins_and_ends(touches):
     """Under an id of its own, though the next press may be at the same place. A state in the middle is gone on from."""
     bundle = Bundle.load("square16")
     ids, twin = [], Pipeline(skin_of(bundle), bundle=bundle)
@@ -119,7 +116,7 @@ def test_each_touch_begins_and_ends(touches: Arrays) -> None:
     assert len(set(ids)) == 20
 
 
-def test_a_scan_whose_reference_was_lost_is_not_valid(touches: Arrays) -> None:
+def test_a_scan_whose_reference_was_lost_is_not_valid(touches):
     bundle = Bundle.load("square16")
     pipeline = Pipeline(skin_of(bundle), bundle=bundle)
     data = read_scans(touches, bundle)
@@ -135,7 +132,7 @@ def test_a_scan_whose_reference_was_lost_is_not_valid(touches: Arrays) -> None:
     assert pipeline.pre.health().messages == []
 
 
-def test_ports_and_recordings_give_the_same_frames(touches, tmp_path, monkeypatch) -> None:
+def test_ports_and_recordings_give_the_same_frames(touches, tmp_path, monkeypatch):
     """`port = "FILE.npz"` of presses in an order of its own, and `port = "FILE.mcap"` of what `skin import` made."""
     monkeypatch.setattr(file_source, "FILE_RATE_HZ", 1e4)
     bundle = Bundle.load("square16")

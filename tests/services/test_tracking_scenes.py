@@ -1,12 +1,10 @@
 """Id switches in scenes of touches that slide, cross, pass and meet: scans of the stub's sheet in, contacts out."""
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import optimize
 
 from models.shapes import KINDS, Shape
@@ -19,17 +17,17 @@ LOST = 0.02  # share of frames that do not arrive
 Scene = list[list[Shape]]  # frame by frame, each touch at its place in the list
 
 
-def touches(rng: np.random.Generator) -> Callable[[int, NDArray[np.floating]], Shape]:
+def touches(rng):
     radius, drop = rng.uniform(0.14, 0.22, 2), rng.uniform(0.2, 0.45, 2)
     kind = [KINDS[k] for k in rng.choice([0, 1, 3, 5], 2)]  # round, triangular, square
     return lambda n, at: Shape(kind[n], float(at[0]), float(at[1]), float(radius[n]), float(drop[n]))
 
 
-def direction(angle: float) -> NDArray[np.floating]:
+def direction(angle):
     return np.array([math.cos(angle), math.sin(angle)])
 
 
-def crossing(rng: np.random.Generator) -> Iterator[list[Shape]]:
+def crossing(rng):
     """Two slide through the same place at an angle."""
     make, first, speed = touches(rng), rng.uniform(0, 6), rng.uniform(0.5, 1.1)
     second = first + rng.uniform(0.7, math.pi)
@@ -37,7 +35,7 @@ def crossing(rng: np.random.Generator) -> Iterator[list[Shape]]:
         yield [make(n, direction(a) * speed * t) for n, a in enumerate((first, second))]
 
 
-def meeting(rng: np.random.Generator) -> Iterator[list[Shape]]:
+def meeting(rng):
     """Two slide towards each other until they touch, and back."""
     make, angle, speed = touches(rng), rng.uniform(0, 6), rng.uniform(0.4, 0.8)
     least = (make(0, np.zeros(2)).radius + make(1, np.zeros(2)).radius) / 2
@@ -46,7 +44,7 @@ def meeting(rng: np.random.Generator) -> Iterator[list[Shape]]:
         yield [make(0, -direction(angle) * half), make(1, direction(angle) * half)]
 
 
-def switches(skin: StubSkin, scene: Scene, rng: np.random.Generator) -> tuple[int, int]:
+def switches(skin, scene, rng):
     """(changes of a true touch's id, ids given)."""
     ids: dict[int, int] = {}
     given: set[int] = set()
@@ -74,7 +72,7 @@ NO_NETWORK = Skin(port="stub", bundle="square16", frame_id="palm", network="none
 
 
 @pytest.mark.parametrize("kind", [crossing, meeting])
-def test_ids_are_kept(kind: Callable[[np.random.Generator], Iterator[list[Shape]]]) -> None:
+def test_ids_are_kept(kind):
     """Where touches inside a patch are not followed, every crossing has a switch."""
     skin, changed, made = StubSkin(skin=NO_NETWORK), 0, 0
     for seed in range(2):
@@ -87,7 +85,7 @@ def test_ids_are_kept(kind: Callable[[np.random.Generator], Iterator[list[Shape]
 
 @pytest.mark.parametrize("lifted", [0, 1])
 @pytest.mark.parametrize("away", [0.15, 0.3])  # of their middles, in model units, when one of them ends
-def test_one_that_ends_while_two_overlap_is_gone(lifted: int, away: float) -> None:
+def test_one_that_ends_while_two_overlap_is_gone(lifted, away):
     """It is not kept for having come as one of two, and what stays has its own force and place again."""
     skin = StubSkin(skin=NO_NETWORK)
     strong, weak = Shape(KINDS[0], -0.5, 0.05, 0.2, 0.4), Shape(KINDS[0], 0.0, 0.05, 0.17, 0.3)
