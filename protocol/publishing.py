@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 import time
 from collections import Counter
@@ -61,6 +62,7 @@ class Publisher:
         """Called in `poll` with each new subscription's prefix."""
         self._subscriptions: Counter[bytes] = Counter()
         self._latched: dict[bytes, bytes] = {}
+        self._holders: dict[bytes, dict[int, int]] = {}  # of each prefix: descriptor -> inode of connections
         self._asked_by: dict[bytes, str] = {}  # who first subscribed to each prefix
         self._before: tuple[float, Counter[bytes]] = (0.0, Counter())  # until when, and what was subscribed to
         self._bytes = 0  # of all different subscriptions
@@ -102,6 +104,7 @@ class Publisher:
             flood = {prefix for prefix, who in self._asked_by.items() if who == peer}
             self._before = (self._before[0], Counter({p: n for p, n in self._before[1].items() if p not in flood}))
         self._subscriptions.clear()
+        self._holders.clear()
         self._asked_by.clear()
         self._bytes = 0
         return True
@@ -166,25 +169,43 @@ class Publisher:
             event = received.bytes
             prefix = event[1:]
             if event[:1] == b"\1":
-                self._subscriptions[prefix] += 1
+                self._join(prefix, received)
                 newcomers.append(prefix)
                 if self.on_join is not None:
                     self.on_join(prefix)
-                if prefix not in self._asked_by:
-                    self._asked_by[prefix] = peer_of(received, self._listening.secured)
-                    self._bytes += len(prefix)
-                if len(self._asked_by) > MOST_PREFIXES or self._bytes > MOST_BYTES:
-                    self._flooded_by = self._most()
             elif event[:1] == b"\0" and prefix in self._subscriptions:
-                self._subscriptions[prefix] -= 1
-                if self._subscriptions[prefix] <= 0:
-                    del self._subscriptions[prefix]
-                    self._bytes -= len(prefix)
-                    self._asked_by.pop(prefix, None)
+                self._leave(prefix, received)
         if newcomers:
             for message in self._latched.values():
                 if any(message.startswith(prefix) for prefix in newcomers):
                     self.socket.send(message, zmq.NOBLOCK)
+
+    def _join(self, prefix: bytes, received: zmq.Frame) -> None:
+        holders, descriptor = self._holders.setdefault(prefix, {}), _descriptor(received)
+        inode = _inode(descriptor)
+        if not inode or holders.get(descriptor) != inode:
+            self._subscriptions[prefix] += 1
+        holders[descriptor] = inode
+        if prefix not in self._asked_by:
+            self._asked_by[prefix] = peer_of(received, self._listening.secured)
+            self._bytes += len(prefix)
+        if len(self._asked_by) > MOST_PREFIXES or self._bytes > MOST_BYTES:
+            self._flooded_by = self._most()
+
+    def _leave(self, prefix: bytes, received: zmq.Frame) -> None:
+        """A subscription ends with its connection, of which nothing is known then, or by a word of its holder. Others
+        say that word too: a conflating reader's pipe holds one message, so of one that changes its mind before it is
+        connected nothing else comes. So the count never falls below the connections that hold it and are still there.
+        """
+        holders, descriptor = self._holders[prefix], _descriptor(received)
+        if descriptor >= 0 and holders.pop(descriptor, None) is None:
+            return
+        there = sum(inode > 0 and _inode(each) == inode for each, inode in holders.items())
+        self._subscriptions[prefix] = max(self._subscriptions[prefix] - 1, there)
+        if not self._subscriptions[prefix]:
+            del self._subscriptions[prefix], self._holders[prefix]
+            self._bytes -= len(prefix)
+            self._asked_by.pop(prefix, None)
 
     def close(self) -> None:
         """Close the socket; what is not yet sent is dropped."""
@@ -196,6 +217,22 @@ def covers(prefix: bytes, head: bytes) -> bool:
     b"contact/palm\0" too.
     """
     return head.startswith(prefix) or prefix.startswith(head)
+
+
+def _descriptor(event: zmq.Frame) -> int:
+    """Of the connection that an event comes from; -1 where that is lost."""
+    try:
+        return int(event.get(zmq.SRCFD))
+    except zmq.ZMQError:
+        return -1
+
+
+def _inode(descriptor: int) -> int:
+    """Tells connections apart that had the same descriptor one after the other; 0 of one that is closed."""
+    try:
+        return os.fstat(descriptor).st_ino
+    except OSError:
+        return 0
 
 
 def _covering(head: bytes, subscriptions: Counter[bytes]) -> int:

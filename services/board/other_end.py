@@ -107,7 +107,8 @@ class OtherEnd:
 
     def _foreign(self) -> str:
         said, text = quoted(self._quoted), text_share(self._heard) >= TEXT
-        if text and self.url.lower().startswith(NETWORK) and re.search(BUSY, self._heard.strip().splitlines()[0]):
+        first = self._heard.strip().partition(b"\n")[0]
+        if text and self.url.lower().startswith(NETWORK) and re.search(BUSY, first):
             return f"found a busy gateway, which sends {said}: close the other connection to it"
         for what, pattern, todo in KNOWN:
             if re.search(pattern, self._heard, re.DOTALL):

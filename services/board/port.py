@@ -4,12 +4,13 @@ in again.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import select
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -36,7 +37,9 @@ class Port:
         self.url = url
         try:
             made = serial.serial_for_url(url, baudrate=baud, timeout=0, exclusive=True, do_not_open=True)
-            if not url.lower().startswith(RFC2217):  # which has none
+            if url.lower().startswith(RFC2217):
+                made._telnet_read_loop = _quiet(made._telnet_read_loop)
+            else:
                 made.write_timeout = 1
             if url.lower().startswith("socket://"):  # pyserial would throw away what the other end says first
                 made.reset_input_buffer = lambda: None
@@ -93,6 +96,16 @@ class Port:
         if self.url.lower().startswith(NETWORK):
             return f"{self.url} is gone{said}: did the gateway restart, or another program take its port?"
         return f"{self.url} is gone{said}: is the cable plugged in?"
+
+
+def _quiet(listen: Callable[[], None]) -> Callable[[], None]:
+    """A thread of pyserial's that prints no traceback where the other end speaks no telnet: what it sends is named."""
+
+    def listening() -> None:
+        with contextlib.suppress(Exception):
+            listen()
+
+    return listening
 
 
 def _system(why: BaseException | None) -> OSError | None:

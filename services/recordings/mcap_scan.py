@@ -122,7 +122,10 @@ class McapScan:
         if kind == Opcode.CHUNK or _is_chunk(body, length):
             if not self._unpack:
                 return None, end if sound else at
-            return self._chunk(at, body, end, sound)
+            found, last = self._chunk(at, body, end, sound)
+            if found is not None and (kind != Opcode.CHUNK or last != end):  # its head alone is damaged
+                self.damage.lose(at, at)
+            return found, last
         if known is None:
             return None, at
         body = self.read(at + _HEAD.size, length)

@@ -37,19 +37,21 @@ class PatientFile:
         """Why nothing can be written now, as the system says it; "" while all is well."""
         self.closed = False
 
-    def replace(self) -> bool:
-        """Take the place of the file that is to be overwritten; where that cannot be, this one is gone."""
-        if not self.full:
+    def replace(self) -> None:
+        """Take the place of the file that is to be overwritten; where that cannot be, `full` says why."""
+        if self._now != self._path:
             try:
                 os.replace(self._now, self._path)
                 self._now = self._path
-                return True
             except OSError as bad:
                 self.full = os.strerror(bad.errno or 0)
-        self.closed = True
-        os.close(self._fd)
-        self.remove()
-        return False
+
+    def give_way(self) -> None:
+        """The same where nothing is in this one: what is there stays."""
+        if self._now != self._path and self._path.exists():
+            self.remove()
+        else:
+            self.replace()
 
     def remove(self) -> None:
         """Delete it: nothing is in it."""
@@ -73,7 +75,7 @@ class PatientFile:
         """ "" while the file is where it was made, else "deleted" or "moved"."""
         try:
             ours = os.fstat(self._fd)
-            there = os.stat(self._path)
+            there = os.stat(self._now)
         except (FileNotFoundError, NotADirectoryError):
             return "deleted" if ours.st_nlink == 0 else "moved"
         except OSError:  # the medium does not answer: `full` says so

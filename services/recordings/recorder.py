@@ -68,11 +68,10 @@ class Recorder:
             time.time_ns() - time.monotonic_ns()
         )  # a clock that is set meanwhile must not tear the file's times
         self._said = metadata(self.topics, skin, config)  # as the service was started: files may change meanwhile
+        self.reader, self.states = AllReader(self.topics, skin), StateReader()
         if path is not None:
             self.record(path, overwrite)
         self.snapshots = None if keeping is None else Snapshots(keeping, lambda event: self._metadata(event))
-        self.reader = AllReader(self.topics, skin)
-        self.states = StateReader()
 
     def record(self, path: Path, overwrite: bool = False, named_by_time: bool = False) -> None:
         """Begin a recording. named_by_time: its further files are too, else numbered. Raises RecordingError."""

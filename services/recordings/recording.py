@@ -72,7 +72,7 @@ class RecordingWriter:
     """
 
     def __init__(self, path: Path, metadata: dict[str, str] | None = None, overwrite: bool = False) -> None:
-        """overwrite: the file that is there stays until the new one has begun. Raises RecordingError."""
+        """overwrite: the file that is there stays until a message is in the new one. Raises RecordingError."""
         try:
             self._file = PatientFile(path, overwrite)
         except FileExistsError:
@@ -100,7 +100,9 @@ class RecordingWriter:
             self._writer.add_metadata(PROFILE, self._metadata)
         self._begin = self._file.tell()
         self._file.flush()
-        if overwrite and not self._file.replace():
+        if overwrite and self.full:
+            self._file.close()
+            self._file.remove()
             raise RecordingError(f"cannot write {path}: {self.full}; what was there stays")
 
     def write(self, topic: str, data: bytes, log_time_ns: int) -> None:
@@ -137,6 +139,8 @@ class RecordingWriter:
         """Closes the chunk and hands it to the operating system."""
         self._close_chunk()
         self._file.flush()
+        if self._chunks and self._chunks[0][0] <= self._file.written:
+            self._file.replace()
         self._oldest = None
         self.why = self.full or self.why
 
@@ -191,6 +195,10 @@ class RecordingWriter:
         self.why = self.full or self.why
         if self.full:
             self._cut_back()
+        if self._sequence:
+            self._file.replace()
+        else:
+            self._file.give_way()
         self._file.close()
         self.why = self.full or self.why
 

@@ -91,7 +91,9 @@ class RotatingWriter:
         """The file is no longer under its name; what a deleted one held is lost."""
         self._close_file()
         held = sum(self._writer.counts.values())
-        self._lost += held if how == "deleted" else 0
+        if how == "deleted":
+            self._lost += held
+            self._counts -= Counter(self._writer.counts)
         self.nowhere = True
         lost = f": its {held} messages are lost" if how == "deleted" else ""
         self._tear = f"{self.path} was {how} while it was recorded{lost}"
@@ -172,7 +174,7 @@ class RotatingWriter:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Messages taken so far, by topic, in all files."""
+        """Messages taken so far, by topic, in all files but those that somebody deleted meanwhile."""
         return dict(self._counts + Counter({} if self.nowhere else self._writer.counts))
 
     @property

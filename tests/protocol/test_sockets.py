@@ -171,6 +171,11 @@ def test_subscribers_are_counted_by_prefix_also_the_second_of_the_same(publisher
     assert not publisher.wanted("force", "palm")
     stage, acquisition = StageReader("raw", "palm", context), Publisher("acquisition", context)
     subscribed(acquisition, "raw")
+    hasty, heard = NewestReader("raw", "palm", context=context), []
+    hasty.listen(False)  # before it is connected: its pipe holds one message, and this is sent alone
+    leave, acquisition._leave = acquisition._leave, lambda *of: heard.append(leave(*of))
+    until(lambda: acquisition.poll() or heard)
+    assert acquisition.subscribers("raw", "palm") == 1, "what another reader holds is not ended by that"
     stage.listen(False)
     subscribed(acquisition, "raw", count=0)
     stage.ask_again()

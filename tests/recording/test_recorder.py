@@ -119,8 +119,10 @@ def test_a_recording_that_is_taken_away_is_said_and_goes_on(service, tmp_path):
     assert said["level"] == "WARN" and f"{first} was deleted" in said["problems"][0]
     assert (said["files"], said["lost"]) == (2, 22)  # a state among them
     turn(service, *(touched(seq=k) for k in range(20)))
-    last = Path(command(service, "record", on=False)["file"])
+    ended = command(service, "record", on=False)
+    last = Path(ended["file"])
     assert last != first and len(contacts_in(last)) == 20 and RecordingReader(last).metadata
+    assert f"22 of {22 + len(list(RecordingReader(last).messages()))} messages are not in" in ended["problems"][0]
 
 
 FULL, BROKEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), (errno.EIO, errno.EROFS, errno.ENODEV)

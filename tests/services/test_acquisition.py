@@ -264,6 +264,7 @@ AT_PORTS = {
     "cut": (b"".join(sent(n)[:200] + sent(n)[260:] for n in range(4)), "", "none of them whole"),
     "held": (b"", "socket://h:1", "the connection is taken and nothing is said"),
     "busy": (b"Port already in use\r\n", "socket://h:1", 'busy gateway, which sends "Port already in use", and closes'),
+    "blank lines": (b"\r\n" * 9, "socket://h:1", 'found text, "\\x0d\\x0a'),
     "telnet": (b"\xff\xfd\x18login: ", "socket://h:1", "found a telnet server"),
 }  # fmt: skip
 
