@@ -8,7 +8,7 @@ SKIN ?= square16
 #   foxglove, ros2   what that bridge, export needs  offline   making a skin from a drawing or from presses
 #   plots            matplotlib: pictures         train     the same, plots and PyTorch: several GB from PyPI
 #   peers            the same but PyTorch, and the other programs that benchmarks compare with
-#   docs             `make site`, which asks for it itself
+#   docs             `make site`, which asks for it itself   hdf5   rows in HDF5, MATLAB's v7.3
 EXTRAS ?=
 comma := ,
 WANTED := $(subst $(comma), ,$(EXTRAS))
@@ -35,7 +35,7 @@ $(VENV)/.service: requirements/service.lock | $(BIN)/python
 	$(LOCKED) $<
 	@touch $@
 
-$(VENV)/.ros2 $(VENV)/.foxglove $(VENV)/.docs $(VENV)/.offline $(VENV)/.plots $(VENV)/.peers: \
+$(VENV)/.ros2 $(VENV)/.foxglove $(VENV)/.hdf5 $(VENV)/.docs $(VENV)/.offline $(VENV)/.plots $(VENV)/.peers: \
     $(VENV)/.%: requirements/%.lock | $(VENV)/.service
 	@echo "installing the extra $*"
 	$(LOCKED) $<
@@ -126,7 +126,7 @@ lock:
 	set -e; \
 	lock service --extra service --extra stub; \
 	lock dev --extra service --extra stub --extra offline --extra ros2 --extra foxglove --extra dev; \
-	for extra in offline plots peers ros2 foxglove docs; do lock $$extra --extra $$extra; done; \
+	for extra in offline plots peers ros2 foxglove hdf5 docs; do lock $$extra --extra $$extra; done; \
 	lock train --extra offline --extra plots requirements/torch-needs.in
 
 clean:

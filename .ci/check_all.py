@@ -41,7 +41,7 @@ DETERMINISTIC = "-m 'not live and not release'"
 ROS_NODE = f"{PYTEST} -m 'release or not release' tests/bridges/test_ros2_node.py"
 STEPS = (
     Step("packages", "programs that tests need", f"apt-get update -q && apt-get install -y -q {PACKAGES}", 900),
-    Step("extras", "every extra, by its own lock", "make venv-dev EXTRAS=train,plots,peers,ros2,foxglove", 1800),
+    Step("extras", "every extra, by its own lock", "make venv-dev EXTRAS=train,plots,peers,ros2,foxglove,hdf5", 1800),
     Step("test", "lint, strict about PyTorch too, and make test", "make test", 1800, ("extras",)),
     Step(
         "release",

@@ -140,6 +140,7 @@ EXPECTED = {
     ("protocol.sockets", "ControlError"): FAILED,
     ("services.runtime.config", "ConfigError"): USAGE,
     ("services.runtime.room", "NoRoom"): FAILED,
+    ("services.rows.order", "InputError"): USAGE,
     ("services.recordings.recording", "RecordingError"): USAGE,
     ("services.recordings.replay", "ReplayError"): FAILED,
     ("services.recordings.importing", "ImportRefused"): USAGE,
@@ -258,14 +259,3 @@ def control(process: str, command: str, *, timeout_s: float = 2.0, **args: Any) 
         return answer
     except ControlError as error:
         raise CliError(str(error), NOT_RUNNING if error.kind in ("unreachable", "timeout") else FAILED) from None
-
-
-def load_npz(path: Path) -> dict[str, Any]:
-    """All arrays of a file. CliError where it is damaged, of no known kind, or holds pickled objects."""
-    from services.recordings import npz_file
-    from services.rows.order import InputError
-
-    try:
-        return npz_file.load_npz(path)
-    except InputError as error:
-        fail(str(error), USAGE)

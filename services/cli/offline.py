@@ -10,16 +10,8 @@ import typer
 
 from protocol.errors import interrupted
 from protocol.whole_file import whole_file
-from services.cli.common import FAILED, USAGE, JsonOption, emit, fail, load_npz
-from services.cli.rows import (
-    ColumnsOption,
-    PatternOption,
-    UntouchedOption,
-    counts,
-    read_rows,
-    say_understood,
-    verdicts,
-)
+from services.cli.common import FAILED, USAGE, JsonOption, emit, fail
+from services.cli.rows import ColumnsOption, PatternOption, UntouchedOption, counts, say_understood, verdicts
 
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
@@ -73,11 +65,13 @@ def reconstruct(
     """
     import numpy as np
 
+    from services.recordings.npz_file import read_file, said
     from services.recordings.reconstruction import find_skin
     from services.recordings.reconstruction import reconstruct as run
 
     found, bundle = find_skin(skin)
-    data = read_rows(source, bundle, columns, pattern, untouched)
+    data = read_file(source, bundle, said(columns, pattern, untouched))
+    say_understood(data.understood)
     if target.suffix != ".npz":  # numpy would add it and the file would not be where it was asked for
         fail(f"found {target.name}, expected a name ending in .npz", USAGE)
     if not target.parent.is_dir():
@@ -152,6 +146,7 @@ def register_frame(
 
     from services.calibration.register_command import register_presses
     from services.calibration.registration import KnownPose
+    from services.recordings.npz_file import load_npz
 
     if numbering not in (None, "clockwise", "counter-clockwise"):
         fail(f"found --numbering {numbering}, expected clockwise or counter-clockwise", USAGE)

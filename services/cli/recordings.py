@@ -18,12 +18,11 @@ from services.cli.common import (
     control,
     emit,
     fail,
-    load_npz,
     of_service,
     skin_name,
     use_configured_sockets,
 )
-from services.cli.rows import ColumnsOption, PatternOption, UntouchedOption, say_understood, told_of
+from services.cli.rows import ColumnsOption, PatternOption, UntouchedOption, say_understood
 
 DAYS_S = 1e7  # of a recording, at most
 
@@ -216,8 +215,9 @@ def import_file(
     scans, of which none follows another in time. pattern (k, 4), where the file has it, says their order.
     """
     from services.recordings.importing import import_arrays
+    from services.recordings.npz_file import load_npz, said
 
-    told = told_of(columns, pattern, untouched)
+    told = said(columns, pattern, untouched)
     report = import_arrays(load_npz(source), source, target, skin or skin_name(""), rate, overwrite, told)
     say_understood(report["understood"])
     if as_json:

@@ -4,17 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
-
-from services.cli.common import USAGE, fail, load_npz
-
-if TYPE_CHECKING:
-    from models.bundle import Bundle
-    from services.recordings.npz_file import Input
-    from services.rows.columns import Said
 
 ColumnsOption = Annotated[
     str,
@@ -45,36 +37,16 @@ DO = {
     "`untouched` is of just before",
     "gain": "the amplification changed after `untouched`: give a `reference` (n, k), one for each row",
     "electrode_drift": "give `untouched` of just before, or a `reference` (n, k), one for each row",
-    "uncalibrated_force": "give `measurements` with `untouched` for forces, not `delta`",
-    "changing": "nothing where it is valid, the place is only rougher; else give more rows of `untouched`",
+    "uncalibrated_force": "give `measurements` with `untouched`, not `delta`, and a skin with a force law",
+    "changing": "give more rows of `untouched`",
     "extrapolated": "nothing: the force is a lower bound",
 }
 """About rows of a file, for which there is no board to look at and no tare."""
-
-
-def read_rows(source: Path, bundle: Bundle, columns: str, pattern: str, untouched: str) -> Input:
-    """The rows of a file; what was understood of it is said. CliError where it cannot be read."""
-    from services.recordings.npz_file import read_scans
-    from services.rows.order import InputError
-
-    arrays, told = load_npz(source), told_of(columns, pattern, untouched)
-    try:
-        data = read_scans(arrays, bundle, told)
-    except InputError as why:
-        fail(f"{source}: {why}", USAGE)
-    say_understood(data.understood)
-    return data
-
-
-def told_of(columns: str, pattern: str, untouched: str) -> Said:
-    """What the three options say. CliError where they cannot be meant."""
-    from services.recordings.npz_file import said
-    from services.rows.order import InputError
-
-    try:
-        return said(columns, pattern, untouched)
-    except InputError as why:
-        fail(str(why), USAGE)
+MEANS = {
+    "changing": "something may touch, and where is known roughly or not at all",
+    "uncalibrated_force": "no force: its law or the unit of `delta` is not known",
+}
+"""Of reasons that mean something else in a running service."""
 
 
 def say_understood(text: str) -> None:
@@ -98,6 +70,6 @@ def verdicts(reasons: Any, valid: Any) -> list[str]:
     for rows, what in ((refused, "not valid"), (noted, "valid, but")):
         for reason, count in rows.most_common():
             do = f": {DO[reason]}" if reason in DO else ""
-            meaning = REASONS.get(reason, "no check decided")
+            meaning = MEANS.get(reason) or REASONS.get(reason, "no check decided")
             lines.append(f"{count} {'row' if count == 1 else 'rows'} {what} {reason} ({meaning}){do}")
     return lines

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from protocol.frames import FrameError, RawFrame, unpack
 from protocol.pause import pause
 from services.board.source import POLL_S, Source
-from services.recordings.npz_file import frames_of, load_npz, read_scans
+from services.recordings.npz_file import frames_of, read_file
 from services.rows.order import InputError
 from services.runtime.stage import SEPARATE, valid_for_s
 
@@ -70,10 +70,9 @@ class FileSource(Source):
     def frames(self) -> Iterator[RawFrame | None]:
         due = time.monotonic()
         try:
-            data = read_scans(load_npz(Path(self.skin.port)), self.bundle)
+            data = read_file(Path(self.skin.port), self.bundle)
         except InputError as why:
-            text = str(why)
-            yield from self._ended(text if self.skin.port in text else f"{self.skin.port}: {text}")
+            yield from self._ended(str(why))
         if data.understood:
             log.info("%s: %s read as: %s", self.name, self.skin.port, data.understood)
         for scan, (values, kind) in enumerate(frames_of(data)):

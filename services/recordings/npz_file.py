@@ -95,10 +95,18 @@ def read_scans(arrays: Mapping[str, NDArray[Any]], bundle: Bundle, said: Said = 
     return replace(read_input(arrays, len(bundle.pattern)), understood=understood, unit=unit)
 
 
+def read_file(path: Path, bundle: Bundle, said: Said = NOTHING_SAID) -> Input:
+    """The rows of a file. Raises InputError, which names it."""
+    try:
+        return read_scans(load_npz(path), bundle, said)
+    except InputError as why:
+        raise InputError(str(why) if str(path) in str(why) else f"{path}: {why}") from None
+
+
 def _of_presses(arrays: Mapping[str, NDArray[Any]]) -> tuple[dict[str, NDArray[Any]], str]:
     rows = {"measurements": arrays["touched"]}
     if "untouched" not in arrays:
-        return rows, ""
+        return {**arrays, **rows}, ""
     if len(arrays["untouched"]) == len(arrays["touched"]):
         return rows | {"reference": arrays["untouched"]}, ""
     return rows | {"untouched": arrays["untouched"]}, "`untouched` has no row for each of `touched`: all are of before"
@@ -192,7 +200,7 @@ def _matrix(arrays: Mapping[str, NDArray[Any]], name: str, k: int) -> NDArray[An
         )
     if not np.isfinite(a).any():
         raise InputError(f"`{name}` holds no finite number")
-    return a
+    return a if a.dtype.kind in "fc" else a.astype(float)  # the least integer has no amplitude among its kind
 
 
 def _found(arrays: Mapping[str, NDArray[Any]]) -> str:

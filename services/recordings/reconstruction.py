@@ -263,13 +263,14 @@ def _store(out: dict[str, NDArray[Any]], row: int, result: Result) -> None:
 
 
 def _decided(result: Result) -> Judgement | None:
-    """What a row's verdict stands on: of a valid one whether something touches, else what is furthest beyond its limit;
-    None where its image or its contacts, which are made after all judgements, made it invalid.
+    """What a row's verdict stands on: whether something touches, of a valid row and of one where that is not sure; else
+    what is furthest beyond its limit; None where its image or its contacts, made after all judgements, made it invalid.
     """
     refused = [each for each in result.judgements if each.verdict is Verdict.REFUSE]
-    if refused:
-        return max(refused, key=lambda each: each.ratio)
-    return next((each for each in result.judgements if each.name == "touch" and result.contact.valid), None)
+    if beyond := [each for each in refused if each.name != "changing"]:
+        return max(beyond, key=lambda each: each.ratio)
+    told = refused or result.contact.valid
+    return next((each for each in result.judgements if told and each.name == "touch"), None)
 
 
 def resampled(image: NDArray[np.float32], n: int) -> NDArray[np.float32]:

@@ -17,15 +17,17 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.patterns import NAMES, pattern
-from services.rows.order import ORDERS, InputError, Order, Places, by_pattern
+from services.rows.order import ORDERS, InputError, Places, by_pattern
 from services.rows.table import NamedColumns
 
 Arrays = dict[str, NDArray[Any]]
 
 OTHER_NAMES = {
-    "measurements": ("measurement", "data", "frames", "rows", "impedance", "impedances", "voltage", "voltages", "vi")
-    + ("real", "magnitude", "amplitude", "abs", "z"),
+    "measurements": ("measurement", "meas", "data", "frames", "rows", "impedance", "impedances", "voltage", "voltages")
+    + ("vi", "real", "magnitude", "amplitude", "abs", "z"),
     "untouched": ("baseline", "background", "homogeneous", "empty", "vh"),
+    "touched": (),
+    "reference": ("references", "ref"),
     "delta": ("deltas", "difference", "differences", "dv"),
 }
 """What people call them: vh and vi are EIDORS's."""
@@ -164,27 +166,23 @@ class Layout:
 
     def __init__(self, bundle: Bundle, said: str | NDArray[Any], theirs: NDArray[Any] | None) -> None:
         """said: by a person; theirs: the file's own pattern."""
-        if isinstance(said, str) and said and said not in ORDERS:
-            raise InputError(f"--pattern: found {said!r}, expected a file, or one of {', '.join(ORDERS)}")
         self.bundle, self.k = bundle, len(bundle.pattern)
         self.electrodes, rows = int(bundle.pattern.max()) + 1, np.asarray(bundle.pattern, np.int64)
         self.places = Places(rows, self.electrodes)
-        theirs = said if isinstance(said, np.ndarray) else None if said else theirs
-        self.unsaid = theirs is None and not isinstance(said, np.ndarray) and not said
+        table = said if isinstance(said, np.ndarray) else None if said else theirs
         self.name = said if isinstance(said, str) and said else "skin"
-        self.order: Order | None = None
-        self.own = self.whole = self.k
-        if isinstance(
-            bundle.skin.get("pattern"), str
-        ):  # of others nobody knows in which order the whole table would be
-            self.whole = self.places.shape[0] * self.places.shape[1]
-        if theirs is not None:
-            self.order = by_pattern(theirs, rows, bundle.name)
-            self.own = self.whole = max(np.shape(theirs))
+        self.unsaid = table is None and not said
+        self.order = None if table is None else by_pattern(table, rows, bundle.name)
+        self.own = self.whole = self.k if table is None else max(np.shape(table))
+        if table is None and isinstance(bundle.skin.get("pattern"), str):
+            self.whole = self.places.shape[0] * self.places.shape[1]  # of others nobody knows the whole table's order
 
     def fits(self, count: int) -> bool:
         """Whether rows of so many values can be read."""
-        return count in (self.own, self.whole) or count in (2 * self.own, 2 * self.whole)
+        return count in (self.own, self.whole) or self._is_doubled(count)
+
+    def _is_doubled(self, count: int) -> bool:
+        return count in (2 * self.own, 2 * self.whole)
 
     def taken(self, name: str, values: NDArray[Any]) -> tuple[NDArray[Any], str]:
         """(n, K) of (n, columns), and what was understood. Raises InputError."""
@@ -196,9 +194,7 @@ class Layout:
             return values[:, self.places.columns(self.name)], said
         if count == self.whole:
             return self._of_whole(name, values)
-        if values.ndim == 2 and count in (2 * self.own, 2 * self.whole):
-            raise InputError(self._doubled(name, values))
-        raise InputError(self._strange(name, values))
+        raise InputError((self._doubled if self._is_doubled(count) else self._strange)(name, values))
 
     def _of_whole(self, name: str, values: NDArray[Any]) -> tuple[NDArray[Any], str]:
         drives, senses = self.places.shape
@@ -250,7 +246,10 @@ class Layout:
                 )
         more = values.shape[1] - self.own
         if 0 < more <= MOST_BESIDE:
-            return f"{found}, {expected}: if times or numbers stand in its first columns, say --columns {more}:"
+            return (
+                f"{found}, {expected}: if times or numbers stand in its first columns, say --columns "
+                f"{more}:, in its last ones, :{self.own}"
+            )
         return f"{found}, {expected}"
 
 
@@ -283,11 +282,10 @@ def _upright(rows: Arrays, layout: Layout) -> tuple[Arrays, list[str]]:
     if not upright | lying and (blocks := _blocks(flat, layout)):
         rows |= {name: each.reshape(1, -1) for name, each in blocks.items()}
         return rows, [*notes, "one row each, as drive pairs by sense pairs"]
-    turned = lying - upright
-    if (either := lying & upright) and (turned or not upright - lying):
-        if upright - lying or not turned:
-            raise InputError(_either_way(min(either), flat[min(either)]))
-        turned |= either
+    turned, either = lying - upright, lying & upright
+    if either and bool(turned) == bool(upright - lying):
+        raise InputError(_either_way(min(either), flat[min(either)]))
+    turned |= either if turned else set()
     rows |= {name: flat[name].T for name in turned}
     if turned:
         notes.append(f"transposed: {', '.join(sorted(turned))}, whose columns stand as rows")

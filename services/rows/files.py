@@ -5,11 +5,14 @@ The first bytes say which it is, not the name. What is unpacked is bounded befor
 
 from __future__ import annotations
 
+import codecs
+import contextlib
 import gzip
 import importlib
 import io
 import math
 import os
+import re
 import zlib
 from collections.abc import Callable
 from typing import Any
@@ -25,6 +28,7 @@ Arrays = dict[str, NDArray[Any]]
 
 GZIP, ZIP, NPY, HDF5 = b"\x1f\x8b", b"PK", b"\x93NUMPY", b"\x89HDF\r\n\x1a\n"
 HDF5_AT = (0, 512)  # MATLAB puts a text of its own before it
+NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 KINDS = "npz, npy, mat, HDF5 or csv, gzipped or not"
 MAT_NUMBERS = {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
 
@@ -48,11 +52,16 @@ def read_arrays(path: str | os.PathLike[str]) -> Arrays:
         return _whole(name, "HDF5", lambda: _of_hdf5(data, name))
     if data.startswith(b"MATLAB") or name.lower().endswith(".mat"):
         return _whole(name, "mat", lambda: _of_mat(data, name))
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise FileError(f"{name}: found neither text nor a known kind of file, expected {KINDS}") from None
-    return parse_table(text, name)
+    return parse_table(_text(data, name), name)
+
+
+def _text(data: bytes, name: str) -> str:
+    """Of UTF-8 or UTF-16, or of an older Windows, whose signs of units stand in the names alone."""
+    with contextlib.suppress(UnicodeDecodeError):
+        return data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
+    if NO_TEXT.search(data):
+        raise FileError(f"{name}: found neither text nor a known kind of file, expected {KINDS}")
+    return data.decode("latin-1")
 
 
 def _whole(name: str, kind: str, read: Callable[[], Arrays]) -> Arrays:
@@ -96,12 +105,13 @@ def _of_hdf5(data: bytes, name: str) -> Arrays:
         h5py = importlib.import_module("h5py")
     except ImportError:
         raise FileError(
-            f"{name} is HDF5 (MATLAB's v7.3), which needs the Python package h5py: `.venv/bin/pip install h5py`, or "
-            "save it in MATLAB with '-v7'"
+            f"{name} is HDF5 (MATLAB's v7.3), which needs the Python package h5py: `make venv EXTRAS=hdf5`, or save it "
+            "in MATLAB with '-v7'"
         ) from None
     found: Arrays = {}
     with h5py.File(io.BytesIO(data), "r") as file:
-        numbers = {key: each for key, each in file.items() if isinstance(each, h5py.Dataset) and _is_number(each.dtype)}
+        own = {key: file[key] for key in file if isinstance(file.get(key, getlink=True), h5py.HardLink)}
+        numbers = {key: each for key, each in own.items() if isinstance(each, h5py.Dataset) and _holds_numbers(each)}
         _bounded(sum(each.size for each in numbers.values()), name)
         for key, each in numbers.items():
             values = np.asarray(each)
@@ -113,8 +123,12 @@ def _of_hdf5(data: bytes, name: str) -> Arrays:
     return found
 
 
-def _is_number(kind: np.dtype[Any]) -> bool:
-    return kind.kind in "biufc" or set(kind.names or ()) == {"real", "imag"}
+def _holds_numbers(array: Any) -> bool:
+    """Whether a dataset is one of numbers in this very file; MATLAB keeps text and the shape of an empty one so."""
+    if array.shape is None or array.external or array.is_virtual or "MATLAB_empty" in array.attrs:
+        return False
+    text = array.attrs.get("MATLAB_class") in (b"char", "char")
+    return not text and (array.dtype.kind in "biufc" or set(array.dtype.names or ()) == {"real", "imag"})
 
 
 def _bounded(values: int, name: str) -> None:

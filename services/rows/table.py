@@ -19,7 +19,7 @@ MOST_TEXT = 64 * 1024 * 1024
 LABELS = {"label", "kind", "state", "class", "type", "touched", "untouched"}
 UNTOUCHED = {"untouched", "reference", "ref", "baseline", "background", "empty", "homogeneous", "none"}
 BESIDE = re.compile(
-    r"(time|timestamp|date|frame|scan|row|index|idx|id|seq|sequence|number|no|n|t|x|y|force|depth|temperature|temp)"
+    r"(time|timestamp|date|frame|scan|row|index|idx|id|seq|sequence|number|no|n|t|x|y|force|depth|temperature|temp|unnamed)"
     r"([ _]?(s|ms|us|ns|m|mm|n|c|number|no|id|stamp))?(\W.*)?"
 )
 """Names of columns that stand beside measurements."""
@@ -41,12 +41,17 @@ def parse_table(text: str, name: str) -> NamedColumns:
     if len(text) > MOST_TEXT:
         raise FileError(f"{name}: found {len(text)} characters, expected at most {MOST_TEXT}: save it as npz")
     lines = [(at, line.strip()) for at, line in enumerate(text.splitlines(), start=1)]
+    remarks = [(at, line.strip("#% ")) for at, line in lines if line[:1] in "#%"]
     lines = [(at, line) for at, line in lines if line and line[0] not in "#%"]
     if not lines:
         raise FileError(f"{name}: found no line of numbers")
     split = _splitter(lines[-1][1])
     rows = [(at, split(line)) for at, line in lines]
-    names = [] if any(_number(cell) is not None for cell in rows[0][1]) else rows.pop(0)[1]
+    above = [split(line) for at, line in remarks if at < lines[0][0]][-1:]
+    if _are_names(rows[0][1]):
+        names = rows.pop(0)[1]
+    else:  # as numpy.savetxt writes them
+        names = above[0] if above and len(above[0]) == len(rows[0][1]) and _are_names(above[0]) else []
     width = len(names or rows[0][1]) if rows else 0
     if not rows or (width < 2 and len(rows) < 2):
         raise FileError(f"{name}: found no table of numbers, expected one row of measurements a line")
@@ -55,6 +60,13 @@ def parse_table(text: str, name: str) -> NamedColumns:
             raise FileError(f"{name}, line {at}: found {len(cells)} cells, expected {width} as in the first line")
     names = [cell.strip("\"' ") for cell in names]
     return _sorted_out(rows, [each.lower() for each in names] or [""] * width, name)
+
+
+def _are_names(cells: list[str]) -> bool:
+    """Whether the first line names columns: by text, or by their numbers, as pandas does. One of an index is empty."""
+    told = [cell for cell in cells if cell.strip("\"' ")]
+    numbered = [[str(at) for at in range(first, first + len(told))] for first in (0, 1)]
+    return all(_number(cell) is None for cell in told) or (len(told) > 2 and told in numbered)
 
 
 def _splitter(line: str) -> Any:
@@ -82,14 +94,15 @@ def _number(cell: str) -> complex | None:
 
 def _sorted_out(rows: list[tuple[int, list[str]]], names: list[str], name: str) -> NamedColumns:
     label = _label(rows, names)
-    beside = [at for at, each in enumerate(names) if each and at != label and BESIDE.fullmatch(each)]
+    index = 0 if any(names) and not names[0] else -1
+    beside = [at for at, each in enumerate(names) if at != label and (at == index or BESIDE.fullmatch(each))]
     measured = [at for at in range(len(names)) if at != label and at not in beside]
     while measured and not any(cells[measured[-1]] for _, cells in rows):  # a sign at the end of each line
         measured.pop()
     table, own, parts = _complex(_numbers(rows, measured, name), [names[at] for at in measured])
     untouched = np.array([label >= 0 and _untouched(cells[label], names[label]) for _, cells in rows])
     splits = untouched.any() and not untouched.all()
-    left = [names[at] for at in beside] + ([] if splits or label < 0 else [names[label] or str(label + 1)])
+    left = [names[at] or str(at + 1) for at in (*beside, *([] if splits or label < 0 else [label]))]
     said = [f"column {each} left out" for each in left] + ([parts] if parts else [])
     found = NamedColumns(measurements=table)
     if splits:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import os
 import shlex
 import signal
@@ -32,6 +33,7 @@ from supervisor.supervisord import Supervisor
 from protocol.part_size import BAUD
 from protocol.runtime import CONFIG_LINK, lock, runtime_dir
 from protocol.topics import RECORDER
+from services.runtime import room
 from services.runtime.config import BUNDLES, MANIFEST, ROOT, ConfigFile
 from services.runtime.stage import PROCESSES
 
@@ -167,6 +169,12 @@ class _Stage(Subprocess):  # type: ignore[misc]
         if new_state == ProcessStates.BACKOFF:
             self.delay = time.monotonic() + min(FIRST_RETRY_S * 2 ** (self.backoff - 1), LONGEST_RETRY_S)
         return changed
+
+    def record_spawnerr(self, msg: str) -> None:
+        """Says why it could not be started, at every try, where supervisord keeps it to itself."""
+        self.spawnerr = msg
+        lacking = f": {room.LACKS[errno.EAGAIN]}" if "process table" in msg else ""
+        self.config.options.logger.warn(f"{self.config.name} cannot be started ({msg}){lacking}")
 
     def _prepare_child_fds(self) -> None:
         """Our own stdout and stderr stay as they are; everything above is closed."""

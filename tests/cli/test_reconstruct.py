@@ -244,20 +244,36 @@ def as_text(rows, sign: str, decimal: str) -> bytes:
     return "\n".join([sign.join(names), *(line.replace(".", decimal) for line in lines)]).encode("utf-8-sig")
 
 
-@pytest.mark.parametrize("kind", ["names.csv", "names.csv.gz", "decimal_comma.csv", "v5.mat", "v4.mat", "bare.npy"])
+def numbered(rows) -> bytes:
+    """As pandas writes them, in an older Windows."""
+    lines = [f"{at}," + ",".join(f"{abs(v):.9g}" for v in row) for at, row in enumerate(rows)]
+    return "\n".join(["# \xb5V", "," + ",".join(map(str, range(120))), *lines]).encode("latin-1")
+
+
+def in_a_remark(rows) -> bytes:
+    """As numpy.savetxt names columns."""
+    return b"# " + as_text(rows, " ", ".").replace(b"time (s)", b"time").decode("utf-8-sig").encode()
+
+
+KINDS = ["names.csv", "names.csv.gz", "decimal_comma.csv", "remark.txt", "numbered.csv", "v5.mat", "v4.mat", "bare.npy"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_files_of_every_kind(tmp_path: Path, kind: str) -> None:
     """Cut anywhere, each gives a sentence, or fewer rows."""
     rows, out, path = rows_of(PAIRS), io.BytesIO(), tmp_path / kind
     {
         "names.csv": lambda: out.write(as_text(rows, ",", ".")),
         "decimal_comma.csv": lambda: out.write(as_text(rows, ";", ",")),
+        "remark.txt": lambda: out.write(in_a_remark(rows)),
+        "numbered.csv": lambda: out.write(numbered(np.roll(rows, M, axis=0))),
         "v5.mat": lambda: scipy.io.savemat(out, {"vi": rows[:N], "vh": rows[N:], "note": "foam"}, do_compression=True),
         "v4.mat": lambda: scipy.io.savemat(out, {"data": rows[:N].T, "baseline": rows[N:].T}, format="4"),
         "bare.npy": lambda: np.save(out, np.roll(rows, M, axis=0)),
     }[kind.removesuffix(".gz")]()
     whole = gzip.compress(out.getvalue()) if kind.endswith(".gz") else out.getvalue()
     path.write_bytes(whole)
-    found = read_scans(load_npz(path), PAIRS, said("", "", str(M) if kind == "bare.npy" else ""))
+    found = read_scans(load_npz(path), PAIRS, said("", "", str(M) if kind in ("bare.npy", "numbered.csv") else ""))
     np.testing.assert_allclose(abs(found.measurements), abs(rows[:N]), rtol=1e-7)
     np.testing.assert_allclose(found.untouched, abs(rows[N:]), rtol=1e-7)
     for cut in (0, 1, 5, len(whole) // 2, len(whole) - 3):
