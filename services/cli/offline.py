@@ -65,12 +65,12 @@ def reconstruct(
     """
     import numpy as np
 
-    from services.recordings.npz_file import read_file, said
+    from services.recordings.npz_file import read_file, reading_options
     from services.recordings.reconstruction import find_skin
     from services.recordings.reconstruction import reconstruct as run
 
     found, bundle = find_skin(skin)
-    data = read_file(source, bundle, said(columns, pattern, untouched))
+    data = read_file(source, bundle, reading_options(columns, pattern, untouched))
     say_understood(data.understood)
     if target.suffix != ".npz":  # numpy would add it and the file would not be where it was asked for
         fail(f"found {target.name}, expected a name ending in .npz", USAGE)

@@ -215,10 +215,10 @@ def import_file(
     scans, of which none follows another in time. pattern (k, 4), where the file has it, says their order.
     """
     from services.recordings.importing import import_arrays
-    from services.recordings.npz_file import load_npz, said
+    from services.recordings.npz_file import load_npz, reading_options
 
-    told = said(columns, pattern, untouched)
-    report = import_arrays(load_npz(source), source, target, skin or skin_name(""), rate, overwrite, told)
+    options = reading_options(columns, pattern, untouched)
+    report = import_arrays(load_npz(source), source, target, skin or skin_name(""), rate, overwrite, options)
     say_understood(report["understood"])
     if as_json:
         emit(report)

@@ -71,7 +71,7 @@ class Answering:
         own = replace(question, budget=budget, keeps=0.0)
         recount = Recount(hypotheses)
         other = found = recount(own, answer)
-        while scan.separate and other is not None:
+        while scan.separate and other is not None and not own.spent:
             other = recount(own, other)
             found = other or found
         if found is None or found.fit is None:

@@ -16,7 +16,7 @@ from services.recordings.file_source import file_frame
 from services.recordings.npz_file import frames_of, read_scans
 from services.recordings.reconstruction import find_skin
 from services.recordings.recording import RecordingError, RecordingWriter
-from services.rows.columns import NOTHING_SAID, Said
+from services.rows.columns import AS_DOCUMENTED, ReadingOptions
 from services.rows.order import InputError
 from services.runtime.config import SKIN_NAME
 from services.runtime.stage import valid_for_s
@@ -37,7 +37,7 @@ def import_arrays(
     skin: str,
     rate_hz: float,
     overwrite: bool = False,
-    told: Said = NOTHING_SAID,
+    options: ReadingOptions = AS_DOCUMENTED,
 ) -> dict[str, Any]:
     """Writes `target`; the report's keys: file, frames, measurements, seconds, understood. Raises ImportRefused,
     RecordingError.
@@ -50,7 +50,7 @@ def import_arrays(
     configured, bundle = find_skin(skin)
     skin = skin if SKIN_NAME.fullmatch(skin) else bundle.name  # a bundle given by its path
     try:
-        data = read_scans(arrays, bundle, told)
+        data = read_scans(arrays, bundle, options)
     except InputError as error:
         raise ImportRefused(f"{source}: {error}") from None
     if not SKIN_NAME.fullmatch(configured.frame_id):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.files import FileError
 from services.estimation.first.references import alike
-from services.rows.columns import NOTHING_SAID, Said, read_columns
+from services.rows.columns import AS_DOCUMENTED, ReadingOptions, read_columns
 from services.rows.files import read_arrays
 from services.rows.order import ORDERS, InputError
 
@@ -58,7 +58,7 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
         raise InputError(str(why)) from None
 
 
-def said(columns: str, pattern: str, untouched: str) -> Said:
+def reading_options(columns: str, pattern: str, untouched: str) -> ReadingOptions:
     """What the options of these names say. Raises InputError."""
     order: str | NDArray[Any] = pattern
     if pattern and pattern not in ORDERS:
@@ -66,8 +66,8 @@ def said(columns: str, pattern: str, untouched: str) -> Said:
             raise InputError(f"--pattern: found {pattern!r}, expected a file, or one of {', '.join(ORDERS)}")
         order = _one_of(Path(pattern), ("pattern", "measurements"))
     if not untouched or untouched.isdecimal():
-        return Said(columns, order, int(untouched[:9] or 0))
-    return Said(columns, order, _one_of(Path(untouched), ("untouched", "measurements", "reference")))
+        return ReadingOptions(columns, order, int(untouched[:9] or 0))
+    return ReadingOptions(columns, order, _one_of(Path(untouched), ("untouched", "measurements", "reference")))
 
 
 def _one_of(path: Path, names: tuple[str, ...]) -> NDArray[Any]:
@@ -79,12 +79,12 @@ def _one_of(path: Path, names: tuple[str, ...]) -> NDArray[Any]:
     return arrays[name]
 
 
-def read_scans(arrays: Mapping[str, NDArray[Any]], bundle: Bundle, said: Said = NOTHING_SAID) -> Input:
+def read_scans(arrays: Mapping[str, NDArray[Any]], bundle: Bundle, options: ReadingOptions = AS_DOCUMENTED) -> Input:
     """The same as `read_input`, of files in other forms too (services/rows/columns.py), in the order of the bundle's
     measurements. It also reads files of presses (`touched` and `untouched`, a row of each for a press). Raises
     InputError.
     """
-    arrays, understood = read_columns(arrays, bundle, said)
+    arrays, understood = read_columns(arrays, bundle, options)
     unit = Input.unit
     if "delta" in arrays and "touched" not in arrays and "measurements" not in arrays:
         beside, unit = _beside_one(arrays, bundle)
@@ -95,10 +95,10 @@ def read_scans(arrays: Mapping[str, NDArray[Any]], bundle: Bundle, said: Said = 
     return replace(read_input(arrays, len(bundle.pattern)), understood=understood, unit=unit)
 
 
-def read_file(path: Path, bundle: Bundle, said: Said = NOTHING_SAID) -> Input:
+def read_file(path: Path, bundle: Bundle, options: ReadingOptions = AS_DOCUMENTED) -> Input:
     """The rows of a file. Raises InputError, which names it."""
     try:
-        return read_scans(load_npz(path), bundle, said)
+        return read_scans(load_npz(path), bundle, options)
     except InputError as why:
         raise InputError(str(why) if str(path) in str(why) else f"{path}: {why}") from None
 

@@ -39,7 +39,7 @@ MOST_BESIDE = 8  # columns before the measurements, such as a time
 
 
 @dataclass(frozen=True)
-class Said:
+class ReadingOptions:
     """What a person says of a file: the options of these names."""
 
     columns: str = ""
@@ -47,7 +47,7 @@ class Said:
     untouched: NDArray[Any] | int = 0  # an array of another file, or how many rows come first
 
 
-NOTHING_SAID = Said()
+AS_DOCUMENTED = ReadingOptions()
 INTERLEAVED: dict[str, tuple[bool, bool]] = {  # whether in turn, whether complex
     "magnitude-phase": (True, False),
     "real-imaginary": (True, True),
@@ -59,31 +59,33 @@ SLICE = re.compile(r"(-?\d*)(:)?(-?\d*)(?::([1-9]\d*))?")
 HELP = f"{', '.join((*INTERLEAVED, TRANSPOSED))}, or which of them, as 1:, :120, 0:240:2"
 
 
-def read_columns(arrays: Mapping[str, NDArray[Any]], bundle: Bundle, said: Said = NOTHING_SAID) -> tuple[Arrays, str]:
+def read_columns(
+    arrays: Mapping[str, NDArray[Any]], bundle: Bundle, options: ReadingOptions = AS_DOCUMENTED
+) -> tuple[Arrays, str]:
     """The same arrays with rows (n, K), in the skin's order, and what was understood beside the documented form ("").
 
     Raises InputError.
     """
     found, notes = _named(arrays)
     notes[:0] = [arrays.understood] if isinstance(arrays, NamedColumns) and arrays.understood else []
-    if isinstance(said.untouched, np.ndarray) or said.untouched:
-        notes += _without_own(found, said.untouched)
+    if isinstance(options.untouched, np.ndarray) or options.untouched:
+        notes += _without_own(found, options.untouched)
     rows = {name: np.asarray(found[name]) for name in ROWS if name in found}
     rows = {name: each for name, each in rows.items() if each.dtype.kind in "biufc"}
-    for token in filter(None, said.columns.split(",")):
-        rows = {name: _told(each, token.strip()) for name, each in rows.items()}
-    notes += [f"columns {said.columns}, as told"] if said.columns else []
-    layout = Layout(bundle, said.order, found.get("pattern"))
+    for token in filter(None, options.columns.split(",")):
+        rows = {name: _selected(each, token.strip()) for name, each in rows.items()}
+    notes += [f"columns {options.columns}, as told"] if options.columns else []
+    layout = Layout(bundle, options.order, found.get("pattern"))
     rows, more = _upright(rows, layout)
     notes += more
     plain = next((rows[name] for name in ("untouched", "reference", "measurements") if name in rows), None)
     for name, each in rows.items():
         rows[name], note = layout.taken(name, each)
         notes += [note] if note else []
-    if plain is not None and layout.unsaid and bundle.matrices.normalisation == "model":
+    if plain is not None and layout.by_default and bundle.matrices.normalisation == "model":
         _doubt(plain, layout)
-    if isinstance(said.untouched, int) and said.untouched and "measurements" in rows:
-        rows |= _parted(rows["measurements"], said.untouched)
+    if isinstance(options.untouched, int) and options.untouched and "measurements" in rows:
+        rows |= _parted(rows["measurements"], options.untouched)
     found.pop("pattern", None)
     return {**found, **rows}, "; ".join(dict.fromkeys(notes))
 
@@ -133,7 +135,7 @@ def _parted(rows: NDArray[Any], first: int) -> Arrays:
     return {"untouched": rows[:first], "measurements": rows[first:]}
 
 
-def _told(values: NDArray[Any], token: str) -> NDArray[Any]:
+def _selected(values: NDArray[Any], token: str) -> NDArray[Any]:
     """What --columns says to take."""
     if values.ndim == 1:
         values = values[None]
@@ -164,14 +166,14 @@ def _interleaved(values: NDArray[Any], name: str) -> NDArray[Any]:
 class Layout:
     """How many columns a file for this skin may have, and which of them are the skin's measurements."""
 
-    def __init__(self, bundle: Bundle, said: str | NDArray[Any], theirs: NDArray[Any] | None) -> None:
-        """said: by a person; theirs: the file's own pattern."""
+    def __init__(self, bundle: Bundle, order: str | NDArray[Any], theirs: NDArray[Any] | None) -> None:
+        """order: as an option names it; theirs: the file's own pattern."""
         self.bundle, self.k = bundle, len(bundle.pattern)
         self.electrodes, rows = int(bundle.pattern.max()) + 1, np.asarray(bundle.pattern, np.int64)
         self.places = Places(rows, self.electrodes)
-        table = said if isinstance(said, np.ndarray) else None if said else theirs
-        self.name = said if isinstance(said, str) and said else "skin"
-        self.unsaid = table is None and not said
+        table = order if isinstance(order, np.ndarray) else None if order else theirs
+        self.name = order if isinstance(order, str) and order else "skin"
+        self.by_default = table is None and not order
         self.order = None if table is None else by_pattern(table, rows, bundle.name)
         self.own = self.whole = self.k if table is None else max(np.shape(table))
         if table is None and isinstance(bundle.skin.get("pattern"), str):
@@ -190,7 +192,7 @@ class Layout:
         if count == self.own and self.order is not None:
             return values[:, self.order.columns], self.order.said
         if count == self.own:
-            said = "" if self.unsaid else f"columns {ORDERS[self.name].said}, as told"
+            said = "" if self.by_default else f"columns {ORDERS[self.name].said}, as told"
             return values[:, self.places.columns(self.name)], said
         if count == self.whole:
             return self._of_whole(name, values)

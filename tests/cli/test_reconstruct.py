@@ -11,7 +11,7 @@ import scipy.io
 
 from models import patterns
 from models.bundle import Bundle
-from services.recordings.npz_file import Input, InputError, load_npz, read_input, read_scans, said
+from services.recordings.npz_file import Input, InputError, load_npz, read_input, read_scans, reading_options
 from services.recordings.reconstruction import baseline_of, reconstruct
 from services.runtime.config import Skin
 from tests import needs
@@ -217,7 +217,7 @@ def test_one_reading_fits(bundle, of, told: str | None, says: str) -> None:
         arrays = split(rows[:, shuffled]) | {"pattern": of(bundle.pattern[shuffled])}
     else:
         arrays = {name: of(each) for name, each in arrays.items()}
-    found = read_scans(arrays, bundle, said(given.get("columns", ""), given.get("pattern", ""), ""))
+    found = read_scans(arrays, bundle, reading_options(given.get("columns", ""), given.get("pattern", ""), ""))
     ratio = np.abs(found.measurements) / np.abs(rows[:N])
     np.testing.assert_allclose(ratio / ratio[0, 0], 1, rtol=1e-5)
     assert says in found.understood and bool(says) == bool(found.understood)
@@ -273,7 +273,8 @@ def test_files_of_every_kind(tmp_path: Path, kind: str) -> None:
     }[kind.removesuffix(".gz")]()
     whole = gzip.compress(out.getvalue()) if kind.endswith(".gz") else out.getvalue()
     path.write_bytes(whole)
-    found = read_scans(load_npz(path), PAIRS, said("", "", str(M) if kind in ("bare.npy", "numbered.csv") else ""))
+    untouched = str(M) if kind in ("bare.npy", "numbered.csv") else ""
+    found = read_scans(load_npz(path), PAIRS, reading_options("", "", untouched))
     np.testing.assert_allclose(abs(found.measurements), abs(rows[:N]), rtol=1e-7)
     np.testing.assert_allclose(found.untouched, abs(rows[N:]), rtol=1e-7)
     for cut in (0, 1, 5, len(whole) // 2, len(whole) - 3):

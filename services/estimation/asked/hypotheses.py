@@ -352,7 +352,7 @@ class Hypotheses:
         question.budget.left -= (fit.steps + 1) * len(fit)
         z2 = self.left_over.best(question, fit.pulled, fit.white, fit)[0]
         cost = n.COST_WIDE if wide and not self.wide else COSTS[cause]
-        score = fit.evidence + cost + question.begins * sum(place < 0 for place in kept)
+        score = fit.evidence + cost + question.touch_log_prior * sum(place < 0 for place in kept)
         near = question.separate and not apart(fit.states, kept)
         return ScoredAnswer(
             cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left, near=near, wide=wide
@@ -367,7 +367,7 @@ class Hypotheses:
         score, full = -np.inf, started_from(fit)
         while (len(fit) if fit else 0) < n.MOST_TOUCHES and not question.spent:
             z2, disc, action, since_s = self.left_over.best(question, pulled, white, fit, question.onsets)
-            if z2 < (n.ANOTHER_Z2 if question.separate else n.FALSE_ALARM_Z2):
+            if z2 < question.least_z2:
                 break
             x, y = self.grid.discs[disc, PLACE]
             new = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
@@ -377,7 +377,7 @@ class Hypotheses:
                 if found[0].explained:
                     break
             disc_alone = self.fitted(question, [*started_from(fit), plain(new)], kept, n.STEPS_COLD)
-            if disc_alone.score < score + question.another:
+            if disc_alone.score < score + question.least_gain:
                 break
             score, fit = disc_alone.score, disc_alone.fit
             assert fit is not None

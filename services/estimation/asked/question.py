@@ -66,12 +66,17 @@ class Question:
         return self.budget.left <= self.keeps
 
     @property
-    def begins(self) -> float:
-        """Log prior of a touch that begins [nat]."""
+    def touch_log_prior(self) -> float:
+        """Of a touch that begins [nat]."""
         return n.COST_TOUCH + (n.WIDE_START if self.separate else 0.0)
 
     @property
-    def another(self) -> float:
+    def least_z2(self) -> float:
+        """z^2 of a further disc that is tried."""
+        return float(n.ANOTHER_Z2 if self.separate else n.FALSE_ALARM_Z2)
+
+    @property
+    def least_gain(self) -> float:
         """Evidence that a further touch must add [nat]."""
         return 0.0 if self.separate else float(n.ANOTHER)
 

@@ -51,7 +51,7 @@ class Recount:
             same += ask.with_cause(question, begun, new, answer.cause, answer.left)
         discs = ask.fitted(question, [plain(prior) for prior in begun], new, n.STEPS_COLD)
         found = [discs, *self._one_more(question, begun, discs)]
-        enough = max(each.score for each in same) + question.another
+        enough = max(each.score for each in same) + question.least_gain
         assert same[0].fit is not None
         if (pair := neighbours(same[0].fit.states, new)) is not None:
             found.append(ask.merged(question, same[0], *pair))
