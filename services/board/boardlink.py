@@ -75,7 +75,7 @@ class BoardLink:
         waited, bad = self.decoder.waiting, self.decoder.bad
         messages = self.decoder.feed(data)
         if self.state == "hello":
-            self._other_end.took(data, messages)
+            self._other_end.receive(data, messages)
         dropped, waits = self.decoder.bad > bad, self.decoder.waiting
         began_s = self._pace.first_byte_s(now_s, waited=waited, dropped=dropped, complete=bool(messages), waits=waits)
         self.reasons.clear()

@@ -48,34 +48,34 @@ class OtherEnd:
 
     def __init__(self, url: str = "this port", baud: int = BAUD) -> None:
         self.url, self.baud = url, baud
-        self._heard = b""
+        self._received = b""
         self._kinds: Counter[type[link.Message]] = Counter()  # of the messages that were whole
         self._quoted = b""  # of the first bytes: it stays as it is, so that the same thing is said once
         self._named: tuple[int, str] = (-1, "")  # so many bytes were looked at, and what they are
 
     @property
-    def heard(self) -> bool:
+    def answered(self) -> bool:
         """Whether anything was said, beside what comes of a plug that is put in."""
-        return len(self._heard) >= GLITCH or bool(self._heard.strip(b"\0\xff"))
+        return len(self._received) >= GLITCH or bool(self._received.strip(b"\0\xff"))
 
-    def took(self, data: bytes, messages: list[link.Message]) -> None:
-        self._heard += data[: KEPT - len(self._heard)]
+    def receive(self, data: bytes, messages: list[link.Message]) -> None:
+        self._received += data[: KEPT - len(self._received)]
         self._kinds.update(map(type, messages))
 
     def sentence(self) -> str:
         """What answers instead of a board, for a person."""
-        if not self.heard:
+        if not self.answered:
             return f"no board at {self.url}: {self._silent()}"
         if len(self._quoted) < ENOUGH:
-            self._quoted = self._heard
-        if self._named[0] != len(self._heard):
-            self._named = len(self._heard), self._name()
+            self._quoted = self._received
+        if self._named[0] != len(self._received):
+            self._named = len(self._received), self._name()
         return f"no board at {self.url}: {self._named[1]}"
 
     def closed(self, why: str) -> str:
         """The same where the connection is lost, for which the port has a reason of its own."""
         network = self.url.lower().startswith(NETWORK)
-        if self.heard:
+        if self.answered:
             found, _, todo = self.sentence().rpartition(": ")
             return f"{found}, and {'closes the connection' if network else 'is gone'}: {todo}"
         if network:
@@ -91,7 +91,7 @@ class OtherEnd:
         return "no answer to HELLO, and nothing else comes: is the board powered, and is its firmware running?"
 
     def _name(self) -> str:
-        if link.Hello in self._kinds or HELLO in self._heard:
+        if link.Hello in self._kinds or HELLO in self._received:
             return "our own HELLO comes back: take the loopback plug away, or mend wires that touch"
         if self._kinds:
             return "it sends a board's messages and does not answer HELLO: look at the wire from here to the board"
@@ -99,25 +99,25 @@ class OtherEnd:
             return (
                 f"frames of schema {schema:08x}, this program speaks {link.SCHEMA_HASH:08x}: flash a matching firmware"
             )
-        pieces = [piece for piece in self._heard.split(b"\0") if len(piece) > 5]
+        pieces = [piece for piece in self._received.split(b"\0") if len(piece) > 5]
         ours = sum(piece[1] in BY_NUMBER and piece[1] > 0x80 for piece in pieces)
         if len(pieces) > 2 and ours > OURS * len(pieces):
             return "a board's frames, none of them whole: bytes are lost on the way; look at cable and hub"
         return self._foreign()
 
     def _foreign(self) -> str:
-        said, text = quoted(self._quoted), text_share(self._heard) >= TEXT
-        first = self._heard.strip().partition(b"\n")[0]
+        said, text = quoted(self._quoted), text_share(self._received) >= TEXT
+        first = self._received.strip().partition(b"\n")[0]
         if text and self.url.lower().startswith(NETWORK) and re.search(BUSY, first):
             return f"found a busy gateway, which sends {said}: close the other connection to it"
         for what, pattern, todo in KNOWN:
-            if re.search(pattern, self._heard, re.DOTALL):
+            if re.search(pattern, self._received, re.DOTALL):
                 return f"found {what}, which sends {said}: {todo}"
         if text:
             return f"found text, {said}: is it the board's port, and has the board its firmware?"
-        if not self._heard.strip(b"\0\xff"):
+        if not self._received.strip(b"\0\xff"):
             return f"found nothing but bytes of 0 or 255, {said}: is the board powered, and its wire connected?"
-        if sum(map(_runs, self._heard)) > SLOWER * len(self._heard):
+        if sum(map(_runs, self._received)) > SLOWER * len(self._received):
             what = f"bytes as from a line slower than our {self.baud} baud, {said}"
             return f"found {what}: set `baud` in skin.toml to the board's"
         what = f"bytes that are neither text nor a board's, {said}"
@@ -125,7 +125,7 @@ class OtherEnd:
 
     def _other_schema(self) -> int:
         """The hash of the schema by which two different frames have right checksums; 0 where there is none."""
-        seeds = Counter(_seed(body, crc) for body, crc in set(_frames(self._heard)))
+        seeds = Counter(_seed(body, crc) for body, crc in set(_frames(self._received)))
         schema, times = max(seeds.items(), key=lambda each: each[1], default=(0, 0))
         return schema if times > 1 else 0
 

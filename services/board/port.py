@@ -180,11 +180,11 @@ def _without_telnet(url: str) -> str:
         with socket.create_connection((parts.hostname, parts.port or 0), LISTEN_S) as raw:
             until = time.monotonic() + LISTEN_S
             while data := raw.recv(4096):
-                end.took(data, [])
+                end.receive(data, [])
                 if time.monotonic() > until:
                     return end.sentence()
     except OSError:
-        return end.sentence() if end.heard else ""
+        return end.sentence() if end.answered else ""
     return end.closed("")
 
 

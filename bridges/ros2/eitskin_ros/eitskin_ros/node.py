@@ -117,9 +117,9 @@ class SkinNode(Node):
 
     def place(self, info: dict[str, Any]) -> None:
         """Publish where the skin is; again only where it is elsewhere."""
-        told = [info.get(key) for key in ("pose", "parent_frame_id", "frame_id")]
-        if told != self._pose and (moved := messages.transform(self._ros, time.time_ns(), info)) is not None:
-            self._pose = told
+        known = [info.get(key) for key in ("pose", "parent_frame_id", "frame_id")]
+        if known != self._pose and (moved := messages.transform(self._ros, time.time_ns(), info)) is not None:
+            self._pose = known
             self._tf.publish(moved)
 
     def diagnose(self, processes: Iterable[tuple[StatusFrame, float]], electrodes: list[str]) -> None:

@@ -49,22 +49,22 @@ class ReaderThread:
                 rclpy.try_shutdown()
 
     def _read(self) -> None:
-        contacts, images, told = Contacts(self._node), Images(self._node), Told(self._node)
+        contacts, images, statuses = Contacts(self._node), Images(self._node), Statuses(self._node)
         next_tick = 0.0
         while not self._closing.is_set():
             poller = zmq.Poller()
-            for reader in (contacts.reader, told.reader, *images.readers):
+            for reader in (contacts.reader, statuses.reader, *images.readers):
                 poller.register(reader.socket, zmq.POLLIN)
             since_ns = time.monotonic_ns()
             ready = dict(poller.poll(max(0.0, min(next_tick, contacts.due) - since_ns * 1e-9) * 1000))
             contacts.take(since_ns, contacts.reader.socket in ready)
             images.take(since_ns)
-            told.take()
+            statuses.take()
             if time.monotonic() >= next_tick:
                 next_tick = time.monotonic() + TICK_S
                 contacts.reader.mind()
                 images.look()
-                told.look()
+                statuses.look()
 
 
 class Contacts:
@@ -125,7 +125,7 @@ class Images:
             self._node.show(frame, measured_ns)
 
 
-class Told:
+class Statuses:
     """What eitskin's processes say of themselves, and where the skin is."""
 
     def __init__(self, node: SkinNode) -> None:
