@@ -106,6 +106,7 @@ golden: venv-dev
 WITHOUT_TORCH := --allow-subclassing-any --allow-untyped-decorators --no-warn-return-any --no-warn-unused-ignores
 lint: venv-dev
 	$(BIN)/ruff check .
+	$(BIN)/complexipy --plain
 	$(BIN)/mypy protocol services bridges examples firmware_stub models bench simulation \
 	  $$($(BIN)/python -c 'import importlib.util as u; u.find_spec("torch") or print("$(WITHOUT_TORCH)")')
 
@@ -130,4 +131,4 @@ lock:
 	lock train --extra offline --extra plots requirements/torch-needs.in
 
 clean:
-	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .complexipy_cache .pytest_cache

@@ -19,6 +19,7 @@ import zmq
 from models.bundle import BundleError
 from models.mismatch import NAMED
 from protocol import logs
+from protocol.errors import in_words
 from protocol.frame_types import NAME
 from protocol.part_size import BAUD
 from protocol.runtime import RuntimeDirError, control_endpoint, runtime_dir
@@ -175,7 +176,7 @@ def main(argv: list[str] | None = None) -> int:
             log.info("board of %s at %s, scene %s%s", name, skin.port.url, options.scene, sheet)
         _run(list(skins.values()), publisher, stop, parent, options.leave)
     except (ValueError, OSError, RuntimeDirError, BundleError) as error:
-        log.error("%s", error)
+        log.error("%s", in_words(error))
         return 2
     except (zmq.ZMQError, TransportError) as error:
         log.error("sockets: %s", error)

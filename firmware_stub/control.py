@@ -35,7 +35,7 @@ class Control:
 
     def _bind(self) -> ControlServer:
         handlers = {
-            "press": lambda args: self._rig(args).press(_touch(args), self._clock()),
+            "press": lambda args: self._rig(args).press(args, self._clock()),
             "release": lambda args: self._rig(args).release(self._clock(), args.get("finger", "")),
             "scene": self._scene,
             "faults": self._fault,
@@ -85,10 +85,3 @@ class Control:
     def close(self) -> None:
         self._stop.set()
         self._thread.join(2.0)
-
-
-def _touch(args: dict[str, Any]) -> dict[str, Any]:
-    """The arguments of a press, where it says how firm it is."""
-    if "force" not in args and "drop" not in args:
-        raise ValueError("press needs force (N) or drop (S/m)")
-    return {key: value for key, value in args.items() if key != "skin"}

@@ -82,7 +82,11 @@ def touch(values: Mapping[str, Any]) -> Touch:
     kind = str(values.get("shape", "circle"))
     if kind not in SIMULATED:
         raise ValueError(f"shape {kind!r}: expected one of {', '.join(SIMULATED)}")
-    pose = {key: float(values[key]) for key in POSE & set(values)}
+    pose = {key: float(values[key]) for key in POSE if values.get(key) is not None}
+    if lacks := sorted({"x", "y"} - pose.keys()):
+        raise ValueError(f"position: found no {' and no '.join(lacks)}, expected x and y, in metres")
+    if values.get("force") is None and values.get("drop") is None:
+        raise ValueError("press needs force (N) or drop (S/m)")
     pose.setdefault("radius", 0.01)
     if not 0 < pose["radius"] <= 0.1:
         raise ValueError(f"radius {pose['radius']:g} m: expected above 0, up to 0.1 m")

@@ -51,6 +51,7 @@ from models.network import MMCNN, NetworkConfig, multiply_accumulates
 from models.prereconstruction import Array, Matrices, PreReconstructor
 from models.pruning import is_part
 from models.response_tables import response_tables
+from models.touch_response import ResponseTables
 from protocol.errors import EitskinError
 
 VALID = 1000
@@ -73,7 +74,7 @@ class Plan:
         rest = max(minutes - PACKAGING, minutes / 4)
         return Plan(scenes=int(max(500, min(20000, rest / 8 * 60 * 40))), full=0.58 * rest, fast=0.14 * rest)
 
-    def said(self, skin: str) -> str:
+    def announcement(self, skin: str) -> str:
         """What is to come, and until when on two idle cores."""
         whole = self.scenes / 40 / 60 + self.full + self.fast + PACKAGING
         end = datetime.now() + timedelta(minutes=whole)
@@ -90,15 +91,30 @@ class TooLittle(EitskinError):
     """A training was not enough for a bundle; the text says what to do."""
 
 
-def physics(
-    skin: geometry.SkinGeometry, scenes: Path, model: warped.WarpedModel | None = None
-) -> tuple[Matrices, samples.Samples]:
+class BuildTarget:
+    """What a bundle is built of, and where. model: of a skin that `skin register` wrote; work: scenes, checkpoints."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.skin, self.registered = geometry.load(args.skin), warped.registered(args.skin)
+        self.model = None if self.registered is None else warped.warped(self.registered)
+        self.own = None if self.model is None else self.model.own
+        self.name = self.skin.name if self.registered is None else self.registered.path.resolve().name
+        self.out: Path = args.out or (bundle.BUNDLES / self.name if self.registered is None else self.registered.path)
+        self.work: Path = args.work or data.WORK / self.name
+
+    def scenes(self, split: str, pre: PreReconstructor) -> samples.Samples:
+        """A split of `work`; of a registered skin, as that skin would have measured it."""
+        scenes = samples.load(self.work, split, pre)
+        return scenes if self.model is None else self.model.samples(scenes)
+
+
+def physics(target: BuildTarget) -> tuple[Matrices, samples.Samples]:
     """Matrices of a skin, and the held-out scenes in their normalisation."""
     # With z0 of the model as the divisor, contact impedances off by 30 % change d by 0.2 % instead of 0.5 %; but it
     # takes a converter that reads ohm. Skins recorded in counts of unknown gain a channel divide by their own baseline.
-    normalisation = "model" if skin.pattern_name == "pairs" else "measured"
-    matrices = linearise(ForwardModel(skin), normalisation) if model is None else model.matrices
-    held_out = _scenes(scenes, "valid", PreReconstructor(matrices), model)
+    normalisation = "model" if target.skin.pattern_name == "pairs" else "measured"
+    matrices = linearise(ForwardModel(target.skin), normalisation) if target.model is None else target.model.matrices
+    held_out = target.scenes("valid", PreReconstructor(matrices))
     return replace(matrices, level=samples.levels(held_out, PreReconstructor(matrices))), held_out
 
 
@@ -115,7 +131,7 @@ def networks(
     shapes. Raises CheckpointError.
     """
     made: dict[str, bytes] = {}
-    said: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     stack, context = calibration(pre, held_out, own=own)
     for variant in checkpoints(folder, only):
         model, state = restore(folder / f"{variant}.pt")
@@ -124,7 +140,7 @@ def networks(
             shape_class = class_temperature.seen_classes(presses, pre, predict(model)).said()
             class_temperature.cooled(model, shape_class["temperature"])
         made[variant] = export.to_onnx(model, stack[:32], context[:32])
-        said[variant] = {
+        entries[variant] = {
             "parameters": sum(p.numel() for p in model.parameters()),
             "multiply_accumulates": multiply_accumulates(model.config),
             "config": model.config.to_dict(),
@@ -137,22 +153,25 @@ def networks(
         }
     if "full" in made:
         made["int8"] = export.to_int8(made["full"], stack, context)
-        said["int8"] = {"from": "full", "calibration_frames": len(stack)}
+        entries["int8"] = {"from": "full", "calibration_frames": len(stack)}
     for variant, content in made.items():
         session = export.session(content)
-        said[variant]["run_time_ms"] = export.run_time_ms(content, stack, context)
-        said[variant]["held_out"] = {
-            level: {k: round(v, 4) for k, v in found.items()}
+        entries[variant]["run_time_ms"] = export.run_time_ms(content, stack, context)
+        entries[variant]["held_out"] = {
+            level: _rounded(evaluate(predict(session), held_out, pre, decibel, limit=400, own=own))
             for level, decibel in LEVELS.items()
-            for found in [evaluate(predict(session), held_out, pre, decibel, limit=400, own=own)]
         }
-        milliseconds = said[variant]["run_time_ms"]["median"]
+        milliseconds = entries[variant]["run_time_ms"]["median"]
         text = "; ".join(
             f"{level}: contact IoU {row['contact IoU']:.3f}, position {row['position % of side']:.2f} % of the side"
-            for level, row in said[variant]["held_out"].items()
+            for level, row in entries[variant]["held_out"].items()
         )
         print(f"{variant}: {len(content) / 1024:.0f} kB, {milliseconds:.2f} ms a frame; held out, {text}", flush=True)
-    return made, said
+    return made, entries
+
+
+def _rounded(figures: dict[str, float]) -> dict[str, float]:
+    return {name: round(value, 4) for name, value in figures.items()}
 
 
 def checkpoints(folder: Path, only: str | None = None) -> list[str]:
@@ -166,17 +185,18 @@ def checkpoints(folder: Path, only: str | None = None) -> list[str]:
     )
 
 
-def replace_one(variant: str, skin: geometry.SkinGeometry, shipped: bundle.Bundle, work: Path) -> bundle.Bundle:
+def replace_one(variant: str, target: BuildTarget) -> bundle.Bundle:
     """The bundle there is with the checkpoint of one variant; the other files stay as they are. Run times of all of its
     networks are measured anew, since those of two days cannot be compared.
     """
+    shipped, work = bundle.Bundle.load(target.out), target.work
     pre, cache = shipped.prereconstructor(), work / "presses.npz"
     held_out = samples.load(work, "valid", pre)
-    made, said = networks(work, pre, held_out, solved_presses.solve(skin, cache=cache), only=variant)
-    said[variant]["built"] = manifest.built()
+    made, entries = networks(work, pre, held_out, solved_presses.solve(target.skin, cache=cache), only=variant)
+    entries[variant]["built"] = manifest.built()
     if (curve := work / f"{variant}.png").is_file():
         shutil.copy(curve, shipped.path / f"training_{variant}.png")
-    entries = {**shipped.manifest["network"], variant: said[variant]}
+    entries = {**shipped.manifest["network"], variant: entries[variant]}
     replaced = bundle.replace_network(shipped, variant, made[variant], entries)
     stack, context = calibration(pre, held_out)
     for name, entry in entries.items():
@@ -208,7 +228,7 @@ def calibration(
     return batch.stack.numpy(), batch.context.numpy()
 
 
-def main(argv: list[str] | None = None) -> None:
+def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m models.build", description="Build a skin's bundle.")
     parser.add_argument(
         "--skin", default="square16", help="a shipped skin, a .toml file, or what `skin register` wrote"
@@ -228,113 +248,140 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--matrices", type=Path, help="with --package: the bundle the checkpoints were trained with")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)
-    args = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> None:
+    args = _arguments(argv)
     began = time.perf_counter()
-    skin, registered = geometry.load(args.skin), warped.registered(args.skin)
-    model = None if registered is None else warped.warped(registered)
-    own = None if model is None else model.own
-    name = skin.name if registered is None else registered.path.resolve().name
-    out = args.out or (bundle.BUNDLES / name if registered is None else registered.path)
-    work = args.work or data.WORK / name
+    target = BuildTarget(args)
     if args.response:
-        added = bundle.add_response(bundle.Bundle.load(out), response_tables(ForwardModel(skin)))
+        added = bundle.add_response(bundle.Bundle.load(target.out), response_tables(ForwardModel(target.skin)))
         print(f"{added.path}: response.npz added, {added.hash[:12]}, after {time.perf_counter() - began:.0f} s")
         return
     if args.package:
-        checkpoints(work, args.only)  # before what takes minutes
+        checkpoints(target.work, args.only)  # before what takes minutes
     if args.package and args.only:
-        replaced = replace_one(args.only, skin, bundle.Bundle.load(out), work)
+        replaced = replace_one(args.only, target)
         print(f"{replaced.path}: another {args.only} network, {replaced.hash[:12]}")
         return
-    plan = QUICK if args.quick else Plan.of(args.minutes) if args.minutes else FULL
-    if not (args.package or args.no_network):
-        print(plan.said(name), flush=True)
-    valid = VALID if plan.scenes >= 4 * VALID else max(100, plan.scenes // 5)
-    if not args.package:
-        if not args.no_network:
-            make_scenes(args.skin, work, plan.scenes, valid, args)
-        elif not data.chunk_files(work, "valid"):
-            make_scenes(args.skin, work, 0, 250, args)
-    if args.package:
-        matrices = bundle.Bundle.load(args.matrices or out).matrices  # a checkpoint fits those it was trained with
-        held_out = _scenes(work, "valid", PreReconstructor(matrices), model)
-    else:
-        matrices, held_out = physics(skin, work, model)
-    pre, made, said = PreReconstructor(matrices), dict[str, bytes](), dict[str, Any]()
+    build(target, args, began)
+
+
+def build(target: BuildTarget, args: argparse.Namespace, began: float) -> None:
+    """The whole bundle. Raises TooLittle."""
+    plan = Plan.of(args.minutes) if args.minutes else QUICK if args.quick else FULL
+    matrices, held_out = _prepared(target, args, plan)
+    pre, made, entries = PreReconstructor(matrices), dict[str, bytes](), dict[str, Any]()
     print(f"physics ready after {time.perf_counter() - began:.0f} s", flush=True)
     tables = None
-    if registered is None and matrices.normalisation == "model":
-        tables = response_tables(ForwardModel(skin))
+    if target.registered is None and matrices.normalisation == "model":
+        tables = response_tables(ForwardModel(target.skin))
     if not args.no_network:
-        bundle.check_room(out, matrices, tables)
+        bundle.check_room(target.out, matrices, tables)
         if not args.package:
-            scenes = _scenes(work, "train", pre, model)
-            start = None if registered is None else warped.start(registered)
-            trained = [("full", plan.full), ("fast", plan.fast)]
-            if start is not None:  # a registered skin: what its presses leave open no second network can know
-                trained = [("full", plan.full + plan.fast)]
-            teacher: Teacher | None = None
-            for variant, minutes in trained:
-                # What can be a part of the full network learns from it, which was trained before.
-                learns = teacher is not None and is_part(train.CONFIGS[variant], teacher.model.config)
-                trainer = train.train(
-                    variant,
-                    skin,
-                    pre,
-                    scenes,
-                    held_out,
-                    minutes,
-                    work / f"{variant}.pt",
-                    args.seed,
-                    args.jobs,
-                    start=start,
-                    own=own,
-                    teacher=teacher if learns else None,
-                    go_on=True,
-                )
-                teacher = teacher or trainer.as_teacher(variant)
+            _train(target, args, plan, pre, held_out)
         count = solved_presses.PRESSES if plan.scenes >= 4 * VALID else solved_presses.PRESSES // 4
-        presses = None if own else solved_presses.solve(skin, count, cache=work / "presses.npz")
-        made, said = networks(work, pre, held_out, presses, own)
-    if "full" in said:
-        judged = _verdict(args.skin, pre, held_out, said["full"], own)
-        said["full"]["verdict"] = judged.to_dict()
-        if judged.grade == "too little" and not args.anyway:
-            if registered is None:
-                raise TooLittle(
-                    f"verdict: {judged.text} {out} is not written, the checkpoint is in {work}: train longer, or have "
-                    "it written with --anyway (make train ANYWAY=1)"
-                )
-            print(f"verdict: {judged.text}\n{registered.path} is left as it was, the checkpoint is in {work}")
-            return
-    if registered is None or model is None:
-        about = manifest.describe(skin.name, skin, matrices, network=said or None)
-        written = bundle.write(out, about, matrices, made, response=tables)
-    else:
-        about = manifest.of_registered(registered, network=said or None, warped=model.said)
-        written = bundle.write(out, about, matrices, made, registered.locator)
-    for curve in work.glob("*.png") if made else ():
-        shutil.copy(curve, out / f"training_{curve.name}")
+        cache = target.work / "presses.npz"
+        presses = solved_presses.solve(target.skin, count, cache=cache) if target.own is None else None
+        made, entries = networks(target.work, pre, held_out, presses, target.own)
+    if "full" in entries and not _is_enough(target, args, pre, held_out, entries["full"]):
+        return
+    written = _write(target, matrices, made, entries, tables)
     size = sum(f.stat().st_size for f in written.path.iterdir()) / 2**20
     print(f"{written.path}: {size:.2f} MB, {written.hash[:12]}, after {(time.perf_counter() - began) / 60:.1f} minutes")
-    if "full" in said:
-        print(f"verdict: {said['full']['verdict']['text']}")
+    if "full" in entries:
+        print(f"verdict: {entries['full']['verdict']['text']}")
 
 
-def _scenes(folder: Path, split: str, pre: PreReconstructor, model: warped.WarpedModel | None) -> samples.Samples:
-    """A split of a folder; of a registered skin, as that skin would have measured it."""
-    scenes = samples.load(folder, split, pre)
-    return scenes if model is None else model.samples(scenes)
+def _prepared(target: BuildTarget, args: argparse.Namespace, plan: Plan) -> tuple[Matrices, samples.Samples]:
+    """The matrices, and the held-out scenes in their normalisation; makes the scenes that are missing."""
+    if args.package:
+        # A checkpoint fits the matrices that it was trained with.
+        matrices = bundle.Bundle.load(args.matrices or target.out).matrices
+        return matrices, target.scenes("valid", PreReconstructor(matrices))
+    if not args.no_network:
+        print(plan.announcement(target.name), flush=True)
+        valid = VALID if plan.scenes >= 4 * VALID else max(100, plan.scenes // 5)
+        make_scenes(args.skin, target.work, plan.scenes, valid, args)
+    elif not data.chunk_files(target.work, "valid"):
+        make_scenes(args.skin, target.work, 0, 250, args)
+    return physics(target)
 
 
-def _verdict(
-    skin: str, pre: PreReconstructor, held_out: samples.Samples, said: dict[str, Any], own: OwnSkin | None
-) -> verdict.TrainingVerdict:
-    training, without = said["training"], verdict.one_step(held_out, pre, own)
-    if own is not None:
-        return verdict.judge_registered(said["held_out"], training["batches"], training["minutes"], without)
-    floor = verdict.position_floor(skin, held_out)
-    return verdict.judge(said["held_out"], training["batches"], training["minutes"], without["contact IoU"], floor)
+def _train(
+    target: BuildTarget, args: argparse.Namespace, plan: Plan, pre: PreReconstructor, held_out: samples.Samples
+) -> None:
+    """Leaves a checkpoint of each network in `work`."""
+    scenes = target.scenes("train", pre)
+    start = None if target.registered is None else warped.start(target.registered)
+    minutes = {"full": plan.full, "fast": plan.fast}
+    if start is not None:  # a registered skin: what its presses leave open no second network can know
+        minutes = {"full": plan.full + plan.fast}
+    teacher: Teacher | None = None
+    for variant, budget in minutes.items():
+        # What can be a part of the full network learns from it, which was trained before.
+        learns = teacher is not None and is_part(train.CONFIGS[variant], teacher.model.config)
+        trainer = train.train(
+            variant,
+            target.skin,
+            pre,
+            scenes,
+            held_out,
+            budget,
+            target.work / f"{variant}.pt",
+            args.seed,
+            args.jobs,
+            start=start,
+            own=target.own,
+            teacher=teacher if learns else None,
+            go_on=True,
+        )
+        teacher = teacher or trainer.as_teacher(variant)
+
+
+def _is_enough(
+    target: BuildTarget,
+    args: argparse.Namespace,
+    pre: PreReconstructor,
+    held_out: samples.Samples,
+    entries: dict[str, Any],
+) -> bool:
+    """Whether the bundle is to be written; the verdict goes into `said`. Raises TooLittle."""
+    spent, without = entries["training"], verdict.one_step(held_out, pre, target.own)
+    if target.own is not None:
+        judged = verdict.judge_registered(entries["held_out"], spent["batches"], spent["minutes"], without)
+    else:
+        floor = verdict.position_floor(args.skin, held_out)
+        judged = verdict.judge(entries["held_out"], spent["batches"], spent["minutes"], without["contact IoU"], floor)
+    entries["verdict"] = judged.to_dict()
+    if judged.grade != "too little" or args.anyway:
+        return True
+    if target.registered is None:
+        raise TooLittle(
+            f"verdict: {judged.text} {target.out} is not written, the checkpoint is in {target.work}: train longer, or "
+            "have it written with --anyway (make train ANYWAY=1)"
+        )
+    print(f"verdict: {judged.text}\n{target.registered.path} is left as it was, the checkpoint is in {target.work}")
+    return False
+
+
+def _write(
+    target: BuildTarget,
+    matrices: Matrices,
+    made: dict[str, bytes],
+    entries: dict[str, Any],
+    tables: ResponseTables | None,
+) -> bundle.Bundle:
+    if target.registered is None or target.model is None:
+        about = manifest.describe(target.skin.name, target.skin, matrices, network=entries or None)
+        written = bundle.write(target.out, about, matrices, made, response=tables)
+    else:
+        about = manifest.of_registered(target.registered, network=entries or None, warped=target.model.said)
+        written = bundle.write(target.out, about, matrices, made, target.registered.locator)
+    for curve in target.work.glob("*.png") if made else ():
+        shutil.copy(curve, target.out / f"training_{curve.name}")
+    return written
 
 
 def make_scenes(skin: str, work: Path, scenes: int, valid: int, args: argparse.Namespace) -> None:

@@ -67,7 +67,8 @@ def all_finite(value: Any, place: str = "", depth: int = 0) -> None:
 
 def check_matrices(m: Matrices) -> None:
     """Shapes against each other, and numbers that the arithmetic of a scan can bear."""
-    k, e = len(m.pattern) if m.pattern.ndim else 0, m.contact.shape[-1] if m.contact.ndim else 0
+    k, c = (len(each) if each.ndim else 0 for each in (m.pattern, m.ladder))
+    e = m.contact.shape[-1] if m.contact.ndim else 0
     if not (1 <= k <= MOST_MEASUREMENTS and 2 <= e <= MOST_ELECTRODES and m.inside.ndim == 2):
         raise Wrong(
             "matrices.npz",
@@ -76,7 +77,6 @@ def check_matrices(m: Matrices) -> None:
         )
     if max(m.inside.shape) > MOST_PIXELS or not m.inside.size:
         raise Wrong("matrices.npz: inside", f"{m.inside.shape}", f"1 to {MOST_PIXELS} pixels along a side")
-    c = len(m.ladder) if m.ladder.ndim else 0
     shapes = {
         "pattern": (k, 4),
         "z0": (k,),
@@ -88,13 +88,21 @@ def check_matrices(m: Matrices) -> None:
         "level": (c,),
     }
     for name, shape in shapes.items():
-        array = getattr(m, name)
-        if array.shape != shape:
-            raise Wrong(f"matrices.npz: {name}", f"shape {array.shape}", f"{shape}")
-        if array.dtype.kind not in ("iu" if name == "pattern" else "iuf"):
-            raise Wrong(f"matrices.npz: {name}", array.dtype, "integers" if name == "pattern" else "numbers")
-        if not np.isfinite(array).all():
-            raise Wrong(f"matrices.npz: {name}", "NaN or infinity", "finite numbers")
+        _check_array(f"matrices.npz: {name}", getattr(m, name), shape, whole=name == "pattern")
+    _check_values(m, e, c)
+
+
+def _check_array(place: str, array: np.ndarray, shape: tuple[int, ...], whole: bool) -> None:
+    if array.shape != shape:
+        raise Wrong(place, f"shape {array.shape}", f"{shape}")
+    if array.dtype.kind not in ("iu" if whole else "iuf"):
+        raise Wrong(place, array.dtype, "integers" if whole else "numbers")
+    if not np.isfinite(array).all():
+        raise Wrong(place, "NaN or infinity", "finite numbers")
+
+
+def _check_values(m: Matrices, e: int, c: int) -> None:
+    """Of matrices whose shapes are right: e electrodes, c values of lambda."""
     if m.inside.dtype.kind != "b" or not m.inside.any():
         raise Wrong("matrices.npz: inside", m.inside.dtype, "booleans, some of them true")
     if m.pattern.min() < 0 or m.pattern.max() >= e:

@@ -78,23 +78,17 @@ def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: s
     for k in range(MOST_STEPS):
         left = live & (part == k % PARTS)
         step = _step(derivative, seen - now.log, variance, live & ~left, now.mounting)
-        was, better = _rms(seen - now.log, left), None
-        for share in SHORTER:
-            tried = now.mounting.with_vector(now.mounting.vector + share * step)
-            ahead = Predicted(skin, _bounded(tried, bounds), modes, mesh)
-            found = _rms(seen - ahead.log, left)
-            if found < was:
-                better = ahead
-                break
-        if better is not None:
-            now, derivative = better, better.derivative()
-            held_out.append(found)
-            if found < MODEL_ERROR:
-                break
-        if better is None or found > (1 - ENOUGH) * was:
+        misfit = _rms(seen - now.log, left)
+        tried = (Predicted(skin, _moved(now.mounting, share * step, bounds), modes, mesh) for share in SHORTER)
+        better = next((each for each in tried if _rms(seen - each.log, left) < misfit), None)
+        if better is None:
             misses += 1
-            if misses == PATIENCE:
-                break
+        else:
+            now, derivative = better, better.derivative()
+            held_out.append(_rms(seen - now.log, left))
+            misses += held_out[-1] > (1 - ENOUGH) * misfit
+        if misses == PATIENCE or min(held_out, default=np.inf) < MODEL_ERROR:
+            break
     sd = now.mounting.with_vector(_spread(derivative, variance, live, now.mounting))
     return CalibrationFit(now.mounting, sd, before, _rms(seen - now.log, live), tuple(held_out))
 
@@ -135,7 +129,8 @@ def _spread(derivative: Array, variance: Array, used: NDArray[np.bool_], state: 
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(information))))
 
 
-def _bounded(state: Mounting, shifts: Array) -> Mounting:
+def _moved(mounting: Mounting, step: Array, shifts: Array) -> Mounting:
+    state = mounting.with_vector(mounting.vector + step)
     size = float(np.hypot(*state.anisotropy))
     return replace(
         state,

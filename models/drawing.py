@@ -22,6 +22,8 @@ SUFFIXES = (".dxf", ".svg")
 FLAT = 1e-3  # of the drawing's size: how far a curve may be from the polygon that stands for it
 ROUND = 2e-3  # of its radius: how far a closed line's corners may be from a circle that it is taken for
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254, "in": 0.0254, "px": 0.0254 / 96, "pt": 0.0254 / 72}
+DXF_LINES = ("LWPOLYLINE", "POLYLINE", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "REGION")
+DXF_MARKS = {"POINT": "location", "CIRCLE": "center"}  # of electrodes: which attribute is the place
 DXF_UNITS = {1: "inch", 4: "mm", 5: "cm", 6: "m"}
 
 
@@ -98,7 +100,6 @@ def read(path: Path, unit: str = "") -> Drawing:
 
 def _dxf(path: Path, unit: str) -> tuple[list[Array], list[Any], float]:
     """Closed lines, electrodes' centres, metres of a unit."""
-    from ezdxf import path as paths
     from ezdxf.filemanagement import readfile
     from ezdxf.lldxf.const import DXFError
 
@@ -106,26 +107,33 @@ def _dxf(path: Path, unit: str) -> tuple[list[Array], list[Any], float]:
         document = readfile(path)
     except (OSError, DXFError, UnicodeDecodeError) as why:
         raise GeometryError(f"{path}: is no DXF file that can be read: {why}") from None
-    said = DXF_UNITS.get(int(document.header.get("$INSUNITS", 0)), "")
+    units = DXF_UNITS.get(int(document.header.get("$INSUNITS", 0)), "")
     lines, points = list[Array](), list[Any]()
     for entity in document.modelspace():
-        kind, marks = entity.dxftype(), entity.dxf.layer.lower().startswith("electrode")
-        if marks and kind in ("POINT", "CIRCLE"):
-            place = entity.dxf.location if kind == "POINT" else entity.dxf.center
+        kind = entity.dxftype()
+        if not entity.dxf.layer.lower().startswith("electrode"):
+            lines += _corners(entity) if kind in DXF_LINES else []
+        elif kind in DXF_MARKS:
+            place = entity.dxf.get(DXF_MARKS[kind])
             points.append((place.x, place.y))
-        elif not marks and kind in ("LWPOLYLINE", "POLYLINE", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "REGION"):
-            try:
-                made = paths.make_path(entity)
-            except TypeError:  # a kind that has no path
-                continue
-            shape = np.array([(p.x, p.y) for p in made.control_vertices()])
-            size = float(np.ptp(shape, axis=0).max()) if len(shape) else 0.0
-            if not 0 < size < np.inf:
-                continue
-            corners = np.array([(p.x, p.y) for p in made.flattening(FLAT * size / 4, segments=16)])
-            lines += _closed(corners, bool(made.is_closed or getattr(entity, "closed", False)))
     lines += _joined(document.modelspace())
-    return lines, points, METRES[_unit(path, said, unit)]
+    return lines, points, METRES[_unit(path, units, unit)]
+
+
+def _corners(entity: Any) -> list[Array]:
+    """The corners of an entity's closed line; nothing where it has none."""
+    from ezdxf import path as paths
+
+    try:
+        made = paths.make_path(entity)
+    except TypeError:  # a kind that has no path
+        return []
+    shape = np.array([(p.x, p.y) for p in made.control_vertices()])
+    size = float(np.ptp(shape, axis=0).max()) if len(shape) else 0.0
+    if not 0 < size < np.inf:
+        return []
+    corners = np.array([(p.x, p.y) for p in made.flattening(FLAT * size / 4, segments=16)])
+    return list(_closed(corners, bool(made.is_closed or getattr(entity, "closed", False))))
 
 
 def _joined(space: Any) -> Iterator[Array]:

@@ -195,17 +195,7 @@ def check_size(skin: SkinGeometry, do: str) -> None:
 def from_dict(data: dict[str, Any]) -> SkinGeometry:
     """The skin of a TOML's content (see skins/square16.toml). Raises GeometryError, PatternError."""
     where = f"skin '{data.get('name', 'unnamed')}': "
-    needed = {"name", "unit" if "unit" in data else "metres_per_unit", "contact_impedance", "electrodes"}
-    known = needed | {"outline", "radius", "pattern"}
-    for wrong, what in ((needed - set(data), "missing"), (set(data) - known, "unknown")):
-        if wrong:
-            raise GeometryError(f"{where}{what} key {min(wrong)!r}; expected {', '.join(sorted(known))}")
-    if not re.fullmatch(NAME, str(data["name"])) or not str(data["name"]).strip("."):
-        raise GeometryError(f"name: found {data['name']!r:.80}, expected at most 64 letters, digits, - . and _")
-    if ("outline" in data) == ("radius" in data):
-        raise GeometryError(f"{where}give either outline (a polygon) or radius (a disc)")
-    if not isinstance(data["electrodes"], dict):
-        raise GeometryError(f"{where}electrodes: found {data['electrodes']!r:.40}, expected a table [electrodes]")
+    _check_keys(data, where)
     on_outline = DRAWN_ON_OUTLINE if "unit" in data else ON_OUTLINE
     try:
         data = _in_model_units(data) if "unit" in data else data
@@ -246,6 +236,20 @@ def from_dict(data: dict[str, Any]) -> SkinGeometry:
         pattern_name=drive if isinstance(drive, str) else "custom",
         pattern=pattern,
     )
+
+
+def _check_keys(data: dict[str, Any], where: str) -> None:
+    needed = {"name", "unit" if "unit" in data else "metres_per_unit", "contact_impedance", "electrodes"}
+    known = needed | {"outline", "radius", "pattern"}
+    for wrong, what in ((needed - set(data), "missing"), (set(data) - known, "unknown")):
+        if wrong:
+            raise GeometryError(f"{where}{what} key {min(wrong)!r}; expected {', '.join(sorted(known))}")
+    if not re.fullmatch(NAME, str(data["name"])) or not str(data["name"]).strip("."):
+        raise GeometryError(f"name: found {data['name']!r:.80}, expected at most 64 letters, digits, - . and _")
+    if ("outline" in data) == ("radius" in data):
+        raise GeometryError(f"{where}give either outline (a polygon) or radius (a disc)")
+    if not isinstance(data["electrodes"], dict):
+        raise GeometryError(f"{where}electrodes: found {data['electrodes']!r:.40}, expected a table [electrodes]")
 
 
 def _in_model_units(data: dict[str, Any]) -> dict[str, Any]:

@@ -213,13 +213,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         if options.scan:
             return _scan_table(options)
-        if options.forces:
-            rows = [asdict(smallest(case.skin, case.noise, mm, options.grid)) for mm in RADII_MM]
-        elif options.rank:
-            ranked = rank_patterns(case, radius, options.drop, options.grid)
-            rows = [{"pattern": name} | _figures(floor) for name, floor in ranked]
-        else:
-            rows = table(case, radius, options.grid)
+        rows = _rows(options, case, radius)
         if options.map:
             draw(case, radius, options.drop, max(options.grid, MAP_SIDE), options.map)
     except (ValueError, BundleError) as error:
@@ -235,16 +229,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(
             "shown in 99.9 % of whole scans, and from where the force's standard deviation can be below a quarter of it"
         )
-        _print(rows)
-        return 0
-    size = "known" if options.known_radius else "unknown"
-    used = options.pattern or shared(options.skin, "inverse").skin.pattern_name
-    print(f"{options.skin}, {used}, {_noise(case.noise)}, touch of radius {_mm(options.skin, radius)}, size {size};")
-    print("standard deviations no estimator beats, root mean square over the skin, position in % of the side")
+    else:
+        size = "known" if options.known_radius else "unknown"
+        used = options.pattern or shared(options.skin, "inverse").skin.pattern_name
+        print(
+            f"{options.skin}, {used}, {_noise(case.noise)}, touch of radius {_mm(options.skin, radius)}, size {size};"
+        )
+        print("standard deviations no estimator beats, root mean square over the skin, position in % of the side")
     _print(rows)
     if options.map:
         print(f"maps: {options.map}")
     return 0
+
+
+def _rows(options: argparse.Namespace, case: Case, radius: float) -> list[dict[str, Any]]:
+    if options.forces:
+        return [asdict(smallest(case.skin, case.noise, mm, options.grid)) for mm in RADII_MM]
+    if options.rank:
+        ranked = rank_patterns(case, radius, options.drop, options.grid)
+        return [{"pattern": name} | _figures(floor) for name, floor in ranked]
+    return table(case, radius, options.grid)
 
 
 def _scan_table(options: argparse.Namespace) -> int:

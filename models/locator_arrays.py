@@ -82,6 +82,21 @@ def matern(a: Array, b: Array, length: float) -> Array:
     return np.asarray((1 + s + s * s / 3) * np.exp(-s))
 
 
+def _shapes(a: LocatorArrays, k: int) -> dict[str, tuple[int, ...]]:
+    """What each array of k measurements is to be, by what those are that say how many there are."""
+    p, f = int(a.allowed.sum()), a.rotation.shape[-1] if a.rotation.ndim == 2 else 0
+    live = int(a.measured.sum()) if a.measured.dtype.kind == "b" else -1
+    shapes: dict[str, tuple[int, ...]] = {"corner": (2,), "spacing": (), "map": (p, k), "error": (k, k), "noise": (k,)}
+    shapes |= {"measured": (k,), "misfit": (), "spread": (3,), "more": (2,), "reach": (3,)}
+    shapes |= {"loudness": (), "quantity": (), "rotation": (live, f), "middle": (live,)}
+    for name, outputs, inputs in (("place", 2, f + 2), ("press", 1, f + 3)):
+        n = len(getattr(a, f"{name}_centres"))
+        inputs = inputs if n else 0
+        shapes |= {f"{name}_centres": (n, inputs), f"{name}_weights": (n, outputs), f"{name}_length": ()}
+        shapes |= {f"{name}_{part}": (outputs,) for part in ("offset", "sigma", "spread")}
+    return shapes
+
+
 def arrays_of(data: Mapping[str, npt.NDArray[Any]], measurements: int) -> LocatorArrays:
     """From the arrays of a locator.npz. Raises ValueError, which says what is wrong."""
     names = LocatorArrays.__dataclass_fields__
@@ -91,27 +106,16 @@ def arrays_of(data: Mapping[str, npt.NDArray[Any]], measurements: int) -> Locato
     a = LocatorArrays(**{name: data[name] for name in names})
     if a.spread.shape == (2,):  # registered before there was a gap
         a = replace(a, spread=np.append(a.spread, 0.0))
-    sides = a.shape.tolist() if a.shape.shape == (2,) and a.shape.dtype.kind in "iu" else [0, 0]
-    if min(sides) < 1 or sides[0] * sides[1] > MOST_PLACES:
+    sides = a.shape.tolist() if a.shape.dtype.kind in "iu" else []
+    if np.shape(sides) != (2,) or min(sides) < 1 or sides[0] * sides[1] > MOST_PLACES:
         raise ValueError(f"shape: found {a.shape}, expected two sides of a grid of at most {MOST_PLACES} places")
     if a.allowed.shape != (sides[0] * sides[1],) or a.allowed.dtype.kind != "b" or not a.allowed.any():
         raise ValueError(f"allowed: found {a.allowed.dtype} {a.allowed.shape}, expected booleans, some of them true")
-    k, p, f = measurements, int(a.allowed.sum()), a.rotation.shape[-1] if a.rotation.ndim == 2 else 0
-    shapes: dict[str, tuple[int, ...]] = {"corner": (2,), "spacing": (), "map": (p, k), "error": (k, k), "noise": (k,)}
-    shapes |= {"measured": (k,), "misfit": (), "spread": (3,), "more": (2,), "reach": (3,)}
-    shapes |= {"loudness": (), "quantity": ()}
-    live = int(a.measured.sum()) if a.measured.dtype.kind == "b" else -1
-    shapes |= {"rotation": (live, f), "middle": (live,)}
-    for name, outputs, inputs in (("place", 2, f + 2), ("press", 1, f + 3)):
-        n = len(getattr(a, f"{name}_centres"))
-        inputs = inputs if n else 0
-        shapes |= {f"{name}_centres": (n, inputs), f"{name}_weights": (n, outputs), f"{name}_length": ()}
-        shapes |= {f"{name}_{part}": (outputs,) for part in ("offset", "sigma", "spread")}
-    for name, shape in shapes.items():
+    for name, shape in _shapes(a, measurements).items():
         array = getattr(a, name)
         if array.shape != shape or array.dtype.kind not in "biuf" or not np.isfinite(array).all():
             raise ValueError(f"{name}: found {array.dtype} {array.shape}, expected finite numbers {shape}")
-    positive = (a.spacing, a.misfit, a.place_length, a.press_length, np.diag(a.error), a.spread[:2])
-    if live < FEWEST_LIVE or not all((np.asarray(v) > 0).all() for v in positive) or int(a.quantity) not in (0, 1, 2):
+    positive = np.hstack([a.spacing, a.misfit, a.place_length, a.press_length, np.diag(a.error), a.spread[:2]])
+    if a.measured.sum() < FEWEST_LIVE or not (positive > 0).all() or int(a.quantity) not in (0, 1, 2):
         raise ValueError("numbers out of range")
     return a

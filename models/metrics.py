@@ -50,42 +50,43 @@ def basins(image: Array, least: float = 0.15, prominence: float = 0.4) -> NDArra
     top = flat.max(initial=0.0)
     order = np.argsort(-flat, kind="stable")
     order = order[flat[order] > max(0.5 * least * top, 0.0)]
-    n_rows, n_columns = image.shape
-    owner = np.full(flat.size, -1)
+    owner, parent, peak = _flooded(image, order, prominence)
+    root = np.array([*(_root(parent, k) for k in range(len(peak))), -1])
+    touches = sorted({k for k in root.tolist() if k >= 0 and peak[k] >= least * top}, key=lambda k: -peak[k])
+    labels = np.zeros(image.shape, int)
+    for number, k in enumerate(touches, start=1):
+        labels[(root[owner] == k) & (image > 0.5 * peak[k])] = number
+    return labels
+
+
+def _flooded(
+    image: Array, order: NDArray[np.intp], prominence: float
+) -> tuple[NDArray[np.int64], list[int], list[float]]:
+    """(n, n) the peak that each pixel was first flooded from (-1: not flooded); of each peak the one that it is a
+    shoulder of, itself where it is none, and its height.
+    """
+    owner = np.pad(np.full(image.shape, -1), 1, constant_values=-1)
     parent: list[int] = []
     peak: list[float] = []
-
-    def root(k: int) -> int:
-        while parent[k] != k:
-            k = parent[k]
-        return k
-
-    for index in order:
-        iy, ix = divmod(int(index), n_columns)
-        near = {
-            root(owner[jy * n_columns + jx])
-            for jy in range(max(0, iy - 1), min(n_rows, iy + 2))
-            for jx in range(max(0, ix - 1), min(n_columns, ix + 2))
-            if owner[jy * n_columns + jx] >= 0
-        }
+    for y, x in zip(*np.unravel_index(order, image.shape), strict=True):
+        around, value = owner[y : y + 3, x : x + 3], image[y, x]
+        near = {_root(parent, k) for k in around[around >= 0].tolist()}
         if not near:
-            owner[index] = len(peak)
+            near = {len(peak)}
             parent.append(len(peak))
-            peak.append(float(flat[index]))
-            continue
+            peak.append(float(value))
         highest = max(near, key=lambda k: peak[k])
-        owner[index] = highest
+        around[1, 1] = highest
         for other in near - {highest}:
-            if peak[other] - flat[index] < prominence * peak[other]:  # a shoulder, not a touch
+            if peak[other] - value < prominence * peak[other]:  # a shoulder, not a touch
                 parent[other] = highest
-    labels = np.zeros(flat.size, int)
-    touches = sorted({root(k) for k in range(len(peak)) if peak[root(k)] >= least * top}, key=lambda k: -peak[k])
-    number = {k: j + 1 for j, k in enumerate(touches)}
-    for index in order:
-        k = root(owner[index])
-        if k in number and flat[index] > 0.5 * peak[k]:
-            labels[index] = number[k]
-    return labels.reshape(image.shape)
+    return owner[1:-1, 1:-1], parent, peak
+
+
+def _root(parent: list[int], k: int) -> int:
+    while parent[k] != k:
+        k = parent[k]
+    return k
 
 
 def touch_masks(image: Array, shapes: Sequence[Shape]) -> list[Mask]:

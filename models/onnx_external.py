@@ -39,15 +39,21 @@ def external_data(content: bytes) -> str:
     waiting = [("ModelProto", memoryview(content))]
     while waiting:
         kind, message = waiting.pop()
-        for number, value in _fields(message):
-            if kind == "TensorProto":
-                if number == _EXTERNAL_DATA or (number == _DATA_LOCATION and value):
-                    return _location(message) or "not named"
-            elif (inner := _HOLDS[kind].get(number)) is not None:
-                if isinstance(value, int):
-                    raise ValueError(f"found a number for a {inner}")
-                waiting.append((inner, value))
+        if kind != "TensorProto":
+            waiting += _held(kind, message)
+        elif any(n == _EXTERNAL_DATA or (n == _DATA_LOCATION and value) for n, value in _fields(message)):
+            return _location(message) or "not named"
     return ""
+
+
+def _held(kind: str, message: memoryview) -> Iterator[tuple[str, memoryview]]:
+    """The messages in one that a tensor may be in, each with its kind. Raises ValueError."""
+    for number, value in _fields(message):
+        inner = _HOLDS[kind].get(number)
+        if inner is not None and isinstance(value, int):
+            raise ValueError(f"found a number for a {inner}")
+        if inner is not None and not isinstance(value, int):
+            yield inner, value
 
 
 def _location(tensor: memoryview) -> str:

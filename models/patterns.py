@@ -85,6 +85,16 @@ def _too_many(name: str, found: int, n: int) -> str:
     )
 
 
+def _wrong(row: list[int], n: int) -> str:
+    """What is wrong with a measurement of drive+, drive-, sense+, sense-; "" where nothing is."""
+    bad = [e for e in row if not 0 <= e < n]
+    if bad:
+        return f"names electrode {bad[0]}: there are {n}, numbered 0 to {n - 1}"
+    if row[0] == row[1]:
+        return "drives an electrode against itself"
+    return "senses an electrode against itself" if row[2] == row[3] else ""
+
+
 def check(spec: ArrayLike, n: int = 16, minimum_rank: int | None = None) -> NDArray[np.int64]:
     """Validate a custom pattern and return it as (K, 4) int64.
 
@@ -95,15 +105,9 @@ def check(spec: ArrayLike, n: int = 16, minimum_rank: int | None = None) -> NDAr
     if raw.ndim != 2 or raw.shape[1] != 4 or not np.issubdtype(raw.dtype, np.integer):
         raise PatternError(f"a pattern is rows of four integers, found an array of shape {raw.shape}, type {raw.dtype}")
     rows = raw.astype(np.int64)
-    for k, row in enumerate(rows):
-        bad = [int(e) for e in row if not 0 <= e < n]
-        if bad:
-            raise PatternError(
-                f"measurement {k} {row.tolist()} names electrode {bad[0]}: there are {n}, numbered 0 to {n - 1}"
-            )
-        if row[0] == row[1] or row[2] == row[3]:
-            side = "drives" if row[0] == row[1] else "senses"
-            raise PatternError(f"measurement {k} {row.tolist()} {side} an electrode against itself")
+    for k, row in enumerate(rows.tolist()):
+        if wrong := _wrong(row, n):
+            raise PatternError(f"measurement {k} {row} {wrong}")
     unseen = sorted(set(range(n)) - set(rows.ravel().tolist()))
     if unseen:
         raise PatternError(f"the pattern never uses electrode {', '.join(map(str, unseen))} of {n}")

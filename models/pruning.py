@@ -87,18 +87,45 @@ def is_part(config: NetworkConfig, larger: NetworkConfig) -> bool:
     return all(a <= b for a, b in sizes) and (config.lean or not larger.lean) and config.stack == larger.stack
 
 
+@dataclass(frozen=True)
+class _Left:
+    """The channels that are left: those that each module gives and reads, the attention's hidden units, the widest."""
+
+    rows: dict[str, Tensor]
+    columns: dict[str, Tensor]
+    hidden: Tensor
+    widest: Tensor
+
+    def of(self, place: list[str], value: Tensor) -> Tensor:
+        """What is left of the weight of this name."""
+        at = self.rows.get(place[0])
+        if "squeeze" in place or "excite" in place:
+            out, into = (self.hidden, self.widest) if "squeeze" in place else (self.widest, self.hidden)
+            return value[out] if value.ndim == 1 else value[out][:, into]
+        if "attention" in place or value.ndim == 0 or place[0] == "context":
+            return value
+        if "film" in place:  # gains and offsets
+            assert at is not None
+            return value[torch.cat([at, at + len(value) // 2])]
+        if place[-1] == "place":
+            return value[:, at]
+        value = value if at is None else value[at]
+        return value[:, self.columns[place[0]]] if value.ndim == 4 and place[0] in self.columns else value
+
+
+def _best(value: Tensor, count: int) -> Tensor:
+    return value.topk(count).indices.sort().values
+
+
 def part(model: MMCNN, config: NetworkConfig, lost: Worth) -> MMCNN:
     """The network of `config` with the weights of the most valuable channels. Raises NoPart."""
     mine = model.config
     if not is_part(config, mine):
         raise NoPart(f"{config} is no part of a network of {mine}: it may have fewer channels and blocks, not more")
 
-    def best(value: Tensor, count: int) -> Tensor:
-        return value.topk(count).indices.sort().values
-
-    a, b, c = (best(value, n) for value, n in zip(lost.channels, config.channels, strict=True))
-    hidden = best(lost.hidden, 0 if config.lean else len(c) // ATTENTION)
-    shuffled = {n: (4 * kept[:, None] + torch.arange(4)).reshape(-1) for n, kept in (("a", a), ("b", b))}
+    a, b, c = (_best(value, n) for value, n in zip(lost.channels, config.channels, strict=True))
+    hidden = _best(lost.hidden, 0 if config.lean else len(c) // ATTENTION)
+    shuffled = {n: (4 * left[:, None] + torch.arange(4)).reshape(-1) for n, left in (("a", a), ("b", b))}
     rows = {
         "stem": a, "told": a, "down1": b, "stage1": b, "down2": c, "stage2": c, "stage3": b,
         "up2": shuffled["b"], "up1": shuffled["a"],
@@ -107,29 +134,16 @@ def part(model: MMCNN, config: NetworkConfig, lost: Worth) -> MMCNN:
         "down1": a, "stage1": b, "down2": b, "stage2": c, "up2": c, "stage3": b, "up1": b,
         "out": a, "aside": a, "classes": b,
     }  # fmt: skip
-    kept = [best(value, n) for value, n in zip(lost.blocks, config.blocks, strict=True)]
+    left = _Left(rows, columns, hidden, c)
+    blocks = [_best(value, n) for value, n in zip(lost.blocks, config.blocks, strict=True)]
     source = model.state_dict()
     small = MMCNN(config)
     state = {}
     for name, wanted in small.state_dict().items():
         place = name.split(".")
         if place[1:2] == ["blocks"]:
-            place[2] = str(int(kept[int(place[0][-1]) - 1][int(place[2])]))
-        value, at = source[".".join(place)], rows.get(place[0])
-        if "squeeze" in place or "excite" in place:
-            out, into = (hidden, c) if "squeeze" in place else (c, hidden)
-            value = value[out] if value.ndim == 1 else value[out][:, into]
-        elif "attention" in place or value.ndim == 0 or place[0] == "context":
-            pass
-        elif "film" in place:  # gains and offsets
-            assert at is not None
-            value = value[torch.cat([at, at + len(value) // 2])]
-        elif place[-1] == "place":
-            value = value[:, at]
-        else:
-            value = value if at is None else value[at]
-            if value.ndim == 4 and place[0] in columns:
-                value = value[:, columns[place[0]]]
+            place[2] = str(int(blocks[int(place[0][-1]) - 1][int(place[2])]))
+        value = left.of(place, source[".".join(place)])
         assert value.shape == wanted.shape, name
         state[name] = value.clone()
     small.load_state_dict(state)

@@ -7,6 +7,9 @@ part, so that a fault of one shows in each.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import product
+
 import numpy as np
 
 from models.prereconstruction import Matrices
@@ -61,17 +64,23 @@ def _share_electrodes(chosen: list[list[int]], uses: Array) -> None:
         if not lacks.any():
             return
         part = int(lacks.any(axis=1).argmax())
-        best = None
-        for other, theirs in enumerate(chosen):
-            for wanted in [k for k in theirs if uses[k, lacks[part]].any()] if other != part else []:
-                for given in chosen[part]:
-                    change = uses[wanted].astype(int) - uses[given]
-                    left = ((counts[part] + change) == 0).sum() + ((counts[other] - change) == 0).sum()
-                    gain = int(lacks[part].sum() + lacks[other].sum() - left)
-                    if gain > 0 and (best is None or gain > best[0]):
-                        best = gain, other, wanted, given
-        if best is None:
+        exchanges = _exchanges(chosen, uses, counts, part)
+        gain, other, wanted, given = max(exchanges, key=lambda each: each[0], default=(0, 0, 0, 0))
+        if gain <= 0:
             return
-        _, other, wanted, given = best
         chosen[part][chosen[part].index(given)] = wanted
         chosen[other][chosen[other].index(wanted)] = given
+
+
+def _exchanges(chosen: list[list[int]], uses: Array, counts: Array, part: int) -> Iterator[tuple[int, int, int, int]]:
+    """What each exchange that gives `part` an electrode that it lacks gains, the other part, its measurement, and that
+    of `part`. counts (parts, E): how often a part uses an electrode.
+    """
+    lacks = (counts == 0) & uses.any(axis=0)
+    for other, theirs in enumerate(chosen):
+        if other == part:
+            continue
+        for wanted, given in product([k for k in theirs if uses[k, lacks[part]].any()], chosen[part]):
+            change = uses[wanted].astype(int) - uses[given]
+            left = ((counts[part] + change) == 0).sum() + ((counts[other] - change) == 0).sum()
+            yield int(lacks[part].sum() + lacks[other].sum() - left), other, wanted, given

@@ -123,12 +123,7 @@ class Trainer:
         return {name: value.detach() for name, value in terms.items()}
 
     def run(
-        self,
-        minutes: float,
-        path: Path,
-        quiet: bool = False,
-        folder: Path | None = None,
-        name: str = "training",
+        self, minutes: float, path: Path, quiet: bool = False, folder: Path | None = None, name: str = "training"
     ) -> None:
         """Trains until the budget (all runs together) is spent; a checkpoint every two minutes.
 
@@ -143,18 +138,16 @@ class Trainer:
         with TrainingBar(name, budget, quiet) as bar:
             while self.elapsed < budget or not self.steps:  # finding a part can take longer than a short budget
                 terms = self.step(self.elapsed / budget)
-                sums = {k: sums[k] + v if k in sums else v for k, v in terms.items()}
+                sums = {k: v + sums.get(k, 0.0) for k, v in terms.items()}
                 count += 1
                 self.elapsed = time.perf_counter() - began
                 bar.at(self.elapsed, self.steps)
-                if self.elapsed >= next_check or self.elapsed >= budget:
-                    row = self._check({k: float(v) / count for k, v in sums.items()})
-                    if folder and (found := len(data.chunk_files(folder))) > chunks:
-                        self.batches.add(samples.load(folder, "train", self.batches.pre, skip=chunks))
-                        chunks = found
+                if self.elapsed >= min(next_check, budget):
+                    row = self._check(sums, count)
+                    chunks = self._take_new(folder, chunks)
                     sums, count = {}, 0
-                    took = time.perf_counter() - began - self.elapsed
-                    next_check = self.elapsed + max(budget / 30, 15.0, 10 * took)
+                    check_s = time.perf_counter() - began - self.elapsed
+                    next_check = self.elapsed + max(budget / 30, 15.0, 10 * check_s)
                     bar.checked(row)
                     if self._no_better(row, budget):
                         print(f"no better on held-out scenes since minute {self.best_at / 60:.1f}: stopped")
@@ -165,9 +158,17 @@ class Trainer:
         self.finished = True
         self.save(path)
 
-    def _check(self, terms: dict[str, float]) -> dict[str, Any]:
-        """Held-out figures of the averaged network, as a row of the curve. terms: means since the last check."""
-        row: dict[str, Any] = {"minutes": self.elapsed / 60, "steps": self.steps, **terms}
+    def _take_new(self, folder: Path | None, known: int) -> int:
+        """Takes in the samples made since `folder` held so many chunks; returns how many it holds now."""
+        found = len(data.chunk_files(folder)) if folder else 0
+        if folder and found > known:
+            self.batches.add(samples.load(folder, "train", self.batches.pre, skip=known))
+        return max(found, known)
+
+    def _check(self, sums: dict[str, Tensor], count: int) -> dict[str, Any]:
+        """Held-out figures of the averaged network, as a row of the curve. sums: of `count` losses since the last."""
+        row: dict[str, Any] = {"minutes": self.elapsed / 60, "steps": self.steps}
+        row |= {k: float(v) / count for k, v in sums.items()}
         with self.pace.of("held-out"):
             for level, decibel in LEVELS.items():
                 own = self.batches.own

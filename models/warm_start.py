@@ -7,6 +7,8 @@ batches, and the scale and offset that undo them, so that training goes on from 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import onnx
 import torch
@@ -30,25 +32,29 @@ def restored(content: bytes, config: NetworkConfig) -> MMCNN:
     inputs = {n.name: list(n.input) for n in graph.node if n.op_type == "Conv"}
     model = MMCNN(config).eval()
     state = model.state_dict()
-    for path, module in model.named_modules():
-        if not isinstance(module, nn.Sequential) or len(module) < 2 or not isinstance(module[1], nn.BatchNorm2d):
-            continue
+    for path, normal in _normalisations(model):
         found = inputs.get(_node(path))
         if found is None or len(found) < 3:
             raise NoSuchNetwork(f"the file has no convolution {_node(path)!r}: it is of another network than {config}")
-        normal = module[1]
         stored[f"{path}.0.weight"], stored[f"{path}.1.bias"] = stored[found[1]], stored[found[2]]
         stored[f"{path}.1.weight"] = torch.full_like(normal.weight.data, (1 + normal.eps) ** 0.5)
         stored[f"{path}.1.running_mean"] = torch.zeros_like(normal.bias.data)
         stored[f"{path}.1.running_var"] = torch.ones_like(normal.bias.data)
         stored[f"{path}.1.num_batches_tracked"] = torch.zeros((), dtype=torch.long)
     for name, value in state.items():
-        if name not in stored or stored[name].shape != value.shape:
-            found_shape = tuple(stored[name].shape) if name in stored else "nothing"
+        shape = tuple(stored[name].shape) if name in stored else "nothing"
+        if shape != tuple(value.shape):
             wanted = f"{tuple(value.shape)} in a network of {config}"
-            raise NoSuchNetwork(f"weight {name!r} is {found_shape} in the file, {wanted}")
+            raise NoSuchNetwork(f"weight {name!r} is {shape} in the file, {wanted}")
     model.load_state_dict({name: stored[name] for name in state})
     return model
+
+
+def _normalisations(model: MMCNN) -> Iterator[tuple[str, nn.BatchNorm2d]]:
+    """Those that follow a convolution, and the name of what both are in."""
+    for path, module in model.named_modules():
+        if isinstance(module, nn.Sequential) and len(module) > 1 and isinstance(module[1], nn.BatchNorm2d):
+            yield path, module[1]
 
 
 def _node(path: str) -> str:

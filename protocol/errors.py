@@ -1,4 +1,4 @@
-"""The base of the project's exceptions, and which errors are a Ctrl-C."""
+"""The base of the project's exceptions, which errors are a Ctrl-C, and errors in words."""
 
 from __future__ import annotations
 
@@ -77,3 +77,10 @@ def interrupted(error: BaseException) -> bool:
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__ or cause.__context__
     return cause is not None
+
+
+def in_words(error: Exception) -> str:
+    """The text of an error; of one of the system's the file and the reason, without its number."""
+    if not isinstance(error, OSError) or not error.strerror:
+        return str(error)
+    return f"{error.filename}: {error.strerror}" if error.filename else error.strerror

@@ -195,13 +195,13 @@ class Vector(Check):
     unit: str = ""
 
     def decode(self, value: Any) -> list[float]:
-        if type(value) is list and len(value) == self.size:
-            for x in value:
-                if type(x) is not float:
-                    if type(x) is not int:
-                        raise self.refuse(value)
-                    return self.decode([float(y) if type(y) is int else y for y in value])
+        if type(value) is not list or len(value) != self.size:
+            raise self.refuse(value)
+        kinds = set(map(type, value))
+        if kinds == {float}:
             return value
+        if kinds <= {float, int}:
+            return [float(x) for x in value]
         raise self.refuse(value)
 
     def encode(self, value: Any) -> list[float]:

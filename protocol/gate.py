@@ -7,6 +7,7 @@ later works without a restart. (A peer that is told no never comes back, because
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -57,28 +58,28 @@ class Gate:
     def _answer(self) -> None:
         while not self._ending:
             try:
-                if not self._socket.poll(500):
-                    continue
-                asked = self._socket.recv_multipart()
+                if self._socket.poll(500):
+                    self._reply(self._socket.recv_multipart())
             except zmq.ZMQError:  # the context ends
                 break
-            if len(asked) < 8 or asked[1] != b"" or asked[2] != b"1.0":
-                continue
-            who, empty, version, request, domain, address, _, mechanism, *credentials = asked
-            peer = address.decode("ascii", "replace")
-            if mechanism == b"CURVE":
-                key = z85.encode(credentials[0]) if credentials and len(credentials[0]) == 32 else b""
-                allowed = self._allowed.get(domain.decode("ascii", "replace"))
-                if allowed is None or not allowed(key):
-                    continue
-                peer = key.decode()
-            if self._refused.get(peer, 0.0) > time.monotonic():
-                continue
-            try:
-                self._socket.send_multipart([who, empty, version, request, b"200", b"", peer.encode(), b""])
-            except zmq.ZMQError:  # the context ends, or who asked has gone
-                continue
         self._socket.close(0)
+
+    def _reply(self, request: list[bytes]) -> None:
+        """Let in who may come. Others get no reply."""
+        if len(request) < 8 or request[1:3] != [b"", b"1.0"]:
+            return
+        who, empty, version, number, domain, address, _, mechanism, *credentials = request
+        peer = address.decode("ascii", "replace")
+        if mechanism == b"CURVE":
+            key = z85.encode(credentials[0]) if credentials and len(credentials[0]) == 32 else b""
+            allowed = self._allowed.get(domain.decode("ascii", "replace"))
+            if allowed is None or not allowed(key):
+                return
+            peer = key.decode()
+        if self._refused.get(peer, 0.0) > time.monotonic():
+            return
+        with contextlib.suppress(zmq.ZMQError):  # the context ends, or the peer has gone
+            self._socket.send_multipart([who, empty, version, number, b"200", b"", peer.encode(), b""])
 
     def stop(self) -> None:
         """End the thread; no CURVE handshake of this context succeeds any more."""

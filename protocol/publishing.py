@@ -63,7 +63,7 @@ class Publisher:
         self._subscriptions: Counter[bytes] = Counter()
         self._latched: dict[bytes, bytes] = {}
         self._holders: dict[bytes, dict[int, int]] = {}  # of each prefix: descriptor -> inode of connections
-        self._asked_by: dict[bytes, str] = {}  # who first subscribed to each prefix
+        self._first_subscriber: dict[bytes, str] = {}  # who first subscribed to each prefix
         self._before: tuple[float, Counter[bytes]] = (0.0, Counter())  # until when, and what was subscribed to
         self._bytes = 0  # of all different subscriptions
         self._flooded_by: str | None = None
@@ -71,12 +71,7 @@ class Publisher:
             context or zmq.Context.instance(),
             zmq.XPUB,
             address or transport.current().data_address(producer),
-            {
-                zmq.XPUB_VERBOSER: 1,
-                zmq.SNDHWM: SEND_QUEUE,
-                zmq.RCVHWM: RECEIVE_QUEUE,
-                zmq.MAXMSGSIZE: MAX_SUBSCRIPTION,
-            },
+            {zmq.XPUB_VERBOSER: 1, zmq.SNDHWM: SEND_QUEUE, zmq.RCVHWM: RECEIVE_QUEUE, zmq.MAXMSGSIZE: MAX_SUBSCRIPTION},
         )
 
     @property
@@ -101,18 +96,18 @@ class Publisher:
             return False
         self._before = (time.monotonic() + RETURN_S, Counter(dict(self._subscriptions.most_common(MOST_PREFIXES))))
         if peer is not None:
-            flood = {prefix for prefix, who in self._asked_by.items() if who == peer}
+            flood = {prefix for prefix, who in self._first_subscriber.items() if who == peer}
             self._before = (self._before[0], Counter({p: n for p, n in self._before[1].items() if p not in flood}))
         self._subscriptions.clear()
         self._holders.clear()
-        self._asked_by.clear()
+        self._first_subscriber.clear()
         self._bytes = 0
         return True
 
     def _most(self) -> str:
         """The peer whose subscriptions are longest, all together."""
         sizes: Counter[str] = Counter()
-        for prefix, peer in self._asked_by.items():
+        for prefix, peer in self._first_subscriber.items():
             sizes[peer] += 1 + len(prefix)
         return sizes.most_common(1)[0][0]
 
@@ -159,26 +154,30 @@ class Publisher:
         A latched value goes to all who subscribe to it, not only to the newcomer: readers know it by its seq. Takes in
         EVENTS_AT_ONCE at most; the rest waits for the next call.
         """
-        newcomers = []
+        newcomers: list[bytes] = []
         for _ in range(EVENTS_AT_ONCE):
             if self._flooded_by is not None:  # until `mind`
                 break
             if not int(self.socket.get(zmq.EVENTS)) & zmq.POLLIN:  # cheaper than an exception with every frame
                 break
-            received = self.socket.recv(zmq.NOBLOCK, copy=False)
-            event = received.bytes
-            prefix = event[1:]
-            if event[:1] == b"\1":
-                self._join(prefix, received)
-                newcomers.append(prefix)
-                if self.on_join is not None:
-                    self.on_join(prefix)
-            elif event[:1] == b"\0" and prefix in self._subscriptions:
-                self._leave(prefix, received)
-        if newcomers:
-            for message in self._latched.values():
-                if any(message.startswith(prefix) for prefix in newcomers):
-                    self.socket.send(message, zmq.NOBLOCK)
+            newcomers += self._take(self.socket.recv(zmq.NOBLOCK, copy=False))
+        if not newcomers:
+            return
+        for message in self._latched.values():
+            if message.startswith(tuple(newcomers)):
+                self.socket.send(message, zmq.NOBLOCK)
+
+    def _take(self, received: zmq.Frame) -> list[bytes]:
+        """Takes in one subscription that begins or ends; returns the prefix of one that begins."""
+        event, prefix = received.bytes[:1], received.bytes[1:]
+        if event == b"\0" and prefix in self._subscriptions:
+            self._leave(prefix, received)
+        if event != b"\1":
+            return []
+        self._join(prefix, received)
+        if self.on_join is not None:
+            self.on_join(prefix)
+        return [prefix]
 
     def _join(self, prefix: bytes, received: zmq.Frame) -> None:
         holders, descriptor = self._holders.setdefault(prefix, {}), _descriptor(received)
@@ -186,10 +185,10 @@ class Publisher:
         if not inode or holders.get(descriptor) != inode:
             self._subscriptions[prefix] += 1
         holders[descriptor] = inode
-        if prefix not in self._asked_by:
-            self._asked_by[prefix] = peer_of(received, self._listening.secured)
+        if prefix not in self._first_subscriber:
+            self._first_subscriber[prefix] = peer_of(received, self._listening.secured)
             self._bytes += len(prefix)
-        if len(self._asked_by) > MOST_PREFIXES or self._bytes > MOST_BYTES:
+        if len(self._first_subscriber) > MOST_PREFIXES or self._bytes > MOST_BYTES:
             self._flooded_by = self._most()
 
     def _leave(self, prefix: bytes, received: zmq.Frame) -> None:
@@ -205,7 +204,7 @@ class Publisher:
         if not self._subscriptions[prefix]:
             del self._subscriptions[prefix], self._holders[prefix]
             self._bytes -= len(prefix)
-            self._asked_by.pop(prefix, None)
+            self._first_subscriber.pop(prefix, None)
 
     def close(self) -> None:
         """Close the socket; what is not yet sent is dropped."""

@@ -113,27 +113,29 @@ class Tree(Check):
         if depth > MAX_DEPTH:
             raise FieldError("deeper nesting", f"at most {MAX_DEPTH} levels")
         if isinstance(value, dict):
-            if array and len(value) == 3 and value.keys() == {"dtype", "shape", "data"}:
-                return array(value)
-            out = {}
-            for key, x in value.items():
-                if type(key) is not str:
-                    raise FieldError(f"key {brief(key)}", "text keys")
-                try:
-                    out[key] = self._walk(x, depth + 1, array)
-                except FieldError as bad:
-                    raise bad.below(f".{key}") from None
-            return out
+            return self._walk_map(value, depth, array)
         if isinstance(value, (list, tuple)):
             return [self._walk(x, depth + 1, array) for x in value]
-        if array is None:
-            if isinstance(value, np.ndarray):
-                return encode_array(np.ascontiguousarray(value))
-            if isinstance(value, np.generic):
-                return value.item()
+        if array is None and isinstance(value, np.ndarray):
+            return encode_array(np.ascontiguousarray(value))
+        if array is None and isinstance(value, np.generic):
+            return value.item()
         if value is None or isinstance(value, (bool, int, float, str, bytes)):
             return value
         raise self.refuse(value)
+
+    def _walk_map(self, value: dict[Any, Any], depth: int, array: Callable[[Any], NDArray[Any]] | None) -> Any:
+        if array and value.keys() == {"dtype", "shape", "data"}:
+            return array(value)
+        out = {}
+        for key, x in value.items():
+            if type(key) is not str:
+                raise FieldError(f"key {brief(key)}", "text keys")
+            try:
+                out[key] = self._walk(x, depth + 1, array)
+            except FieldError as bad:
+                raise bad.below(f".{key}") from None
+        return out
 
     def describe(self) -> str:
         return "free content"

@@ -188,15 +188,8 @@ class StageReader(_SkippingReader):
             got = self._receive(0.0 if n or self.more else timeout_s)
             if got is None:
                 break
-            frame = got[0]
-            self._count(frame)
-            if isinstance(frame, PartFrame):
-                self.skipped += self._part is not None
-                self._part = frame
-            else:
-                kept = [each for each in self._whole[:1] if _holds(frame, each)]
-                self.skipped += len(self._whole) - len(kept)
-                self._whole = [*kept, frame]
+            self._count(got[0])
+            self._enqueue(got[0])
         if self._whole:
             frame = self._whole.pop(0)
             self._after = frame.scan
@@ -207,6 +200,16 @@ class StageReader(_SkippingReader):
             return None
         part, self._part = self._part, None
         return part
+
+    def _enqueue(self, frame: Frame) -> None:
+        """Let a frame wait to be read, in place of those that it makes old."""
+        if isinstance(frame, PartFrame):
+            self.skipped += self._part is not None
+            self._part = frame
+            return
+        held = [each for each in self._whole[:1] if _holds(frame, each)]
+        self.skipped += len(self._whole) - len(held)
+        self._whole = [*held, frame]
 
 
 def _holds(frame: Frame, older: Frame) -> bool:

@@ -142,7 +142,7 @@ class Load:
         while (status := self._reader.recv()) is not None:
             board = self._boards.get(status.skin)
             if isinstance(status, StatusFrame) and status.process == "preprocessing" and board and board.in_parts:
-                self._choice.heard(status, time.monotonic())
+                self._choice.update(status, time.monotonic())
         if skin in self._boards:
             self._boards[skin].whole = self._choice.whole(skin)
 

@@ -14,7 +14,7 @@ import stat
 import sys
 from pathlib import Path, PurePosixPath
 
-from protocol.errors import EitskinError
+from protocol.errors import EitskinError, in_words
 
 MODE = 0o700
 
@@ -81,7 +81,7 @@ def main(arguments: list[str]) -> int:
         try:
             print(hand_over(folder, name, uid, gid, mounts))
         except (NotOurs, OSError) as why:
-            print(f"folders: {why}", file=sys.stderr)
+            print(f"folders: {in_words(why)}", file=sys.stderr)
             failed = 1
     return failed
 

@@ -84,15 +84,7 @@ class Inference(Stage):
         self._tare_frames = 0  # of the baseline that untouched frames are held against
         self._quiet: NDArray[np.float32] | None = None  # standard deviation that untouched frames state
         self._stated = 0  # how many have stated it, one after the other
-        names = (
-            "networks_run",
-            "held",
-            "untouched",
-            "unwanted",
-            "missed",
-            "uncalibrated",
-            "symmetric",
-        )
+        names = ("networks_run", "held", "untouched", "unwanted", "missed", "uncalibrated", "symmetric")
         self._counters = dict.fromkeys(names, 0)  # uncalibrated: frames whose calibration could not be found
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
@@ -101,12 +93,7 @@ class Inference(Stage):
             self._counters["unwanted"] += 1
             self._unseen = frame if frame.averaged else self._unseen
             return []
-        out = ImageFrame(
-            **inherited(frame),
-            touched=frame.touched,
-            after=frame.after,
-            estimates=frame.estimates,
-        )
+        out = ImageFrame(**inherited(frame), touched=frame.touched, after=frame.after, estimates=frame.estimates)
         if frame.calibration != self.linearisation.name and not self._follow(frame.calibration):
             out.valid = False
             add_reason(out.reasons, "stale_baseline")
@@ -190,15 +177,17 @@ class Inference(Stage):
         """Frames of several skins that wait at once: one run of the network for those that share it."""
         groups: dict[Network, list[tuple[Inference, DeltaFrame]]] = {}
         for stage, frame in work:
-            if isinstance(stage, Inference) and isinstance(frame, DeltaFrame) and stage._operator(frame) is not None:
-                if isinstance(stage._network, Network):
-                    groups.setdefault(stage._network, []).append((stage, frame))
+            if not (isinstance(stage, Inference) and isinstance(frame, DeltaFrame)):
+                continue
+            if isinstance(stage._network, Network) and stage._operator(frame) is not None:
+                groups.setdefault(stage._network, []).append((stage, frame))
         for shared, members in groups.items():
-            if len(members) > 1:
-                stacks = [stack for stage, frame in members if (stack := stage.stack(frame)) is not None]
-                made = shared.run_many(stacks)
-                for (stage, frame), stack, pictures in zip(members, stacks, made, strict=True):
-                    stage._ahead = frame, stack, pictures
+            if len(members) < 2:
+                continue
+            stacks = [stack for stage, frame in members if (stack := stage.stack(frame)) is not None]
+            made = shared.run_many(stacks)
+            for (stage, frame), stack, pictures in zip(members, stacks, made, strict=True):
+                stage._ahead = frame, stack, pictures
 
     def _rest(self, frame: DeltaFrame) -> None:
         """Learn the noise from an untouched frame. One that stands for no scan does not state it."""

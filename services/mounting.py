@@ -23,6 +23,7 @@ from models.bundle import Bundle
 from models.calibration_file import CalibrationFileError, unpack
 from models.files import FileError, read_bytes
 from models.measurement.responses.tables import SkinTables
+from protocol.errors import in_words
 from services.estimation.by_bundle import skin_tables
 from services.estimation.first.baseline import Baseline, implausibility
 from services.runtime import persistence
@@ -101,7 +102,7 @@ class MountingFit:
             self._begin(baseline)
         except OSError as why:  # no room, no process: the bundle is used as it is
             self._clear()
-            self.problem = f"the skin could not be calibrated: {why}"
+            self.problem = f"the skin could not be calibrated: {in_words(why)}"
 
     def _begin(self, baseline: Baseline) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="eitskin-fit-")
@@ -168,7 +169,7 @@ class MountingFit:
             found.make_ready()
             self._read = found
         except (CalibrationFileError, FileError, OSError) as why:
-            self.problem = f"the skin could not be calibrated: {why}"
+            self.problem = f"the skin could not be calibrated: {in_words(why)}"
 
     def _clear(self) -> None:
         if self._folder is not None:

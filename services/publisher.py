@@ -110,9 +110,13 @@ class Publishing(Stage):
         self._fit: tuple[RefinedTouch, float, float] | None = None  # and where its touch was then
         self._watched_ns: tuple[int, int] | None = None  # `sample` of the first and last frame of those that came
 
+    @property
+    def _present(self) -> list[Contact]:
+        return [c for c in self._shown if c.state != "end"]
+
     def _end_all(self) -> None:
         """What was shown ends with the next frame."""
-        self._untold += [c for c in self._shown if c.state != "end"]
+        self._untold += self._present
         self._shown, self._ids = [], {}
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
@@ -186,20 +190,18 @@ class Publishing(Stage):
         alone = self.each_alone or SEPARATE in frame.reasons
         if alone:
             self._end_all()
-        before = {c.id: c for c in self._shown if c.state != "end"}
-        if self._image_touches is None:
-            found = self._told(frame, before, alone)
-        else:
-            found = self._pictured(frame, before, self._watched or alone)
-            if isinstance(frame, ImageFrame) and frame.touched and out.valid and not found:
-                out.valid = False
-                add_reason(out.reasons, "out_of_distribution")
+        before = {c.id: c for c in self._present}
+        pictured = self._image_touches is not None and isinstance(frame, ImageFrame) and frame.touched
+        found = self._found(frame, before, alone)
+        if pictured and out.valid and not found:
+            out.valid = False
+            add_reason(out.reasons, "out_of_distribution")
         here = {contact.id for contact in found}
         gone = [c for c in (*self._untold, *before.values()) if c.id not in here]
         self._watched = out.valid
         if not out.valid:
             return found
-        if self._image_touches is not None and isinstance(frame, ImageFrame) and frame.touched:
+        if pictured and isinstance(frame, ImageFrame):
             self._image_of = frame.session, frame.reconstructed
         self._counters["contacts"] += sum(contact.id not in before for contact in found)
         ended = self._writer.gone(gone)
@@ -207,7 +209,7 @@ class Publishing(Stage):
         self._ids = {touch: known for touch, known in self._ids.items() if known[0] in here}
         return list(self._shown)
 
-    def _told(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact], alone: bool) -> list[Contact]:
+    def _measured(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact], alone: bool) -> list[Contact]:
         """As the measurements tell them. alone: what touches in this frame began with it."""
         now_ns = frame.stamps.get("sample", 0)
         self._looks, self._drops = {}, {}
@@ -215,9 +217,10 @@ class Publishing(Stage):
         found = self._fitted(found, frame)
         return sorted(found, key=lambda contact: -(contact.force_n or 0.0))
 
-    def _pictured(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact], watched: bool) -> list[Contact]:
-        """As the image shows them, or as they were where it is the one of before. watched: what is new began."""
-        assert self._image_touches is not None
+    def _found(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact], alone: bool) -> list[Contact]:
+        """As the measurements tell them, or as the image shows them, or as they were where it is the one of before."""
+        if self._image_touches is None:
+            return self._measured(frame, before, alone)
         if isinstance(frame, ImageFrame) and not frame.touched:
             return []
         image = (frame.session, frame.reconstructed) if isinstance(frame, ImageFrame) else self._image_of
@@ -231,7 +234,7 @@ class Publishing(Stage):
         for touch, known in zip(touches, numbers, strict=True):
             number = known or self._next_id
             self._next_id = max(self._next_id, number + 1)
-            state = "hold" if known or not watched else "begin"
+            state = "hold" if known or not (self._watched or alone) else "begin"
             self._looks[number], self._drops[number] = touch.looks, touch.segment.peak
             moves = self._image_touches.estimated(touch.looks, frame.estimates)
             if moves is not None:

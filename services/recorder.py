@@ -87,8 +87,8 @@ class RecorderService:
                 hint = ": before_s in [recorder] of skin.toml says how much is kept" if name == "before_s" else ""
                 raise RecordingError(f"found {name} {args[name]!r:.40}, expected 0 to {limit:g} s{hint}")
             wanted[name] = args[name]
-        asked = (args.get("why") or "by command")[:200]
-        path = snapshots.take("snapshot", asked, self.recorder.now_ns(), **wanted)
+        why = (args.get("why") or "by command")[:200]
+        path = snapshots.take("snapshot", why, self.recorder.now_ns(), **wanted)
         return {"file": str(path), "after_s": wanted.get("after_s", snapshots.keeping.after_s)}
 
     def status(self) -> dict[str, Any]:
@@ -102,7 +102,7 @@ class RecorderService:
             "recording": writer is not None,
             "folder": str(self.folder),
             "file": str(writer.path) if writer is not None and not writer.nowhere else "",
-            "messages": {f"{topic}/{skin}": n for (topic, skin), n in recorder.heard.items()},
+            "messages": {f"{topic}/{skin}": n for (topic, skin), n in recorder.received.items()},
             "gaps": recorder.gaps,
             "lost": recorder.lost + (snapshots.lost if snapshots else 0),
             "files": writer.files if writer is not None else 0,
@@ -123,17 +123,17 @@ class RecorderService:
         return found
 
     def _say(self) -> None:
-        now, said = time.monotonic(), self.status()
-        counters = {name: int(said[name]) for name in COUNTED if name in said}
-        doing = f"recording to {said['file'] or 'nowhere'}" if said["recording"] else "not recording"
-        if said.get("writing"):
-            doing += f"; a snapshot is being written: {said['snapshot']}"
+        now, status = time.monotonic(), self.status()
+        counters = {name: int(status[name]) for name in COUNTED if name in status}
+        doing = f"recording to {status['file'] or 'nowhere'}" if status["recording"] else "not recording"
+        if status.get("writing"):
+            doing += f"; a snapshot is being written: {status['snapshot']}"
         for skin, beat in self._beats.items():
             beat.meter.sent.update(
-                {t: n - beat.meter.sent[t] for (t, s), n in self.recorder.heard.items() if s == skin}
+                {t: n - beat.meter.sent[t] for (t, s), n in self.recorder.received.items() if s == skin}
             )
-            drops = {"gaps": said["gaps"], "lost": said["lost"], "forgotten": said.get("forgotten", 0)}
-            frame = beat.frame(said["level"], [doing, *said["problems"]], now, STATUS_S, drops, counters)
+            drops = {"gaps": status["gaps"], "lost": status["lost"], "forgotten": status.get("forgotten", 0)}
+            frame = beat.frame(status["level"], [doing, *status["problems"]], now, STATUS_S, drops, counters)
             if frame is not None:
                 self.publisher.send(frame)
 
@@ -216,15 +216,8 @@ def _run(args: argparse.Namespace, config: ConfigFile, stop: threading.Event) ->
             recorder.record(path, named_by_time=args.folder is not None)
             log.info("recording to %s", path)
         process = RecorderService(recorder, folder, [args.skin] if args.skin else list(config.skins))
-        full = False
         try:
-            while not stop.is_set():
-                process.turn()
-                if bool(recorder.problem) != full:
-                    full = not full
-                    log.log(logging.ERROR if full else logging.INFO, "%s", recorder.problem or "recording goes on")
-            with contextlib.suppress(OSError):
-                _wanted().unlink(missing_ok=True)  # nobody wants it after an ordered end
+            _record_until(stop, process)
         finally:
             process.close()
     counts = recorder.writer.counts if recorder.writer is not None else {}
@@ -233,6 +226,17 @@ def _run(args: argparse.Namespace, config: ConfigFile, stop: threading.Event) ->
         log.error("%s", recorder.problem)
         return INCOMPLETE
     return 0
+
+
+def _record_until(stop: threading.Event, process: RecorderService) -> None:
+    recorder, full = process.recorder, False
+    while not stop.is_set():
+        process.turn()
+        if bool(recorder.problem) != full:
+            full = not full
+            log.log(logging.ERROR if full else logging.INFO, "%s", recorder.problem or "recording goes on")
+    with contextlib.suppress(OSError):
+        _wanted().unlink(missing_ok=True)  # nobody wants it after an ordered end
 
 
 if __name__ == "__main__":

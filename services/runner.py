@@ -93,12 +93,11 @@ class Runner:
             ready = self._waiter.wait(timeout_s)
             stood = self._lateness.stood_still(timeout_s)
             self._serve([self._by_socket[socket] for socket in ready if socket in self._by_socket], stood)
-            for socket in ready:
-                if socket is self.control.socket:
-                    self.control.serve_once()
-                elif socket is self.publisher.socket:
-                    self.publisher.poll()
-                    next_tick = 0.0
+            if self.control.socket in ready:
+                self.control.serve_once()
+            if self.publisher.socket in ready:
+                self.publisher.poll()
+                next_tick = 0.0
             if time.monotonic() >= next_tick:
                 self._tick()
                 self._waiter.doubt()
@@ -147,7 +146,7 @@ class Runner:
     def _handle(self, channel: Channel, frame: Frame) -> None:
         beat, stage = channel.heartbeat, channel.stage
         now = time.monotonic_ns()
-        beat.heard(frame, now)
+        beat.received(frame, now)
         try:
             late = self._hand_on(channel, stage.process(frame, channel.wanted))
             self._hand_on(channel, stage.beside(channel.wanted), late)
@@ -236,33 +235,33 @@ class Runner:
         problems = self.problems + self._mind_sockets()
         now = time.monotonic()
         for channel in self.channels.values():
-            channel.wanted = self._wanted(channel.stage)
-            self._sleep_or_wake(channel)
-            if isinstance(channel.feed, StageReader):
-                channel.feed.mind()
-            beat = channel.heartbeat
-            beat.drops["malformed"], beat.drops["skipped"] = channel.feed.malformed, channel.feed.skipped
-            silent = "" if channel.asleep else beat.silence(SILENT_S, channel.stage.reads)
-            try:
-                channel.stage.between_frames()
-            except Exception as why:  # what could not be adopted is not in use
-                self._log_failure(channel, why, "%s: could not adopt (further such failures are counted)")
-            health = channel.stage.health().with_problems([*problems, *([channel.unkept] if channel.unkept else [])])
-            status = beat.status(health, silent, now, HEARTBEAT_S, asleep=channel.asleep)
-            if status is not None:
-                self._send(channel, status)
-            info = channel.stage.info()
-            if info is not None:
-                age = (
-                    {"tare_age_s": (time.monotonic_ns() - info["tare_sample_ns"]) * 1e-9}
-                    if info.get("tare_sample_ns")
-                    else {}
-                )
-                self._send(
-                    channel, InfoFrame(skin=channel.stage.skin, process=self.process, valid=True, info=info | age)
-                )
-            if channel.stage.persists and (saved := channel.stage.saved()) is not None:
-                channel.unkept = persistence.save(self.process, channel.stage.skin, saved)
+            self._mind(channel, problems, now)
+
+    def _mind(self, channel: Channel, problems: list[str], now: float) -> None:
+        """All that a channel needs between frames: what is wanted of it, its status and info, and its state kept."""
+        stage, feed, beat = channel.stage, channel.feed, channel.heartbeat
+        channel.wanted = self._wanted(stage)
+        self._sleep_or_wake(channel)
+        if isinstance(feed, StageReader):
+            feed.mind()
+        beat.drops["malformed"], beat.drops["skipped"] = feed.malformed, feed.skipped
+        silent = "" if channel.asleep else beat.silence(SILENT_S, stage.reads)
+        try:
+            stage.between_frames()
+        except Exception as why:  # what could not be adopted is not in use
+            self._log_failure(channel, why, "%s: could not adopt (further such failures are counted)")
+        health = stage.health().with_problems([*problems, *([channel.unkept] if channel.unkept else [])])
+        status = beat.status(health, silent, now, HEARTBEAT_S, asleep=channel.asleep)
+        if status is not None:
+            self._send(channel, status)
+        info = stage.info()
+        if info is not None:
+            age = {}
+            if info.get("tare_sample_ns"):
+                age["tare_age_s"] = (time.monotonic_ns() - info["tare_sample_ns"]) * 1e-9
+            self._send(channel, InfoFrame(skin=stage.skin, process=self.process, valid=True, info=info | age))
+        if stage.persists and (saved := stage.saved()) is not None:
+            channel.unkept = persistence.save(self.process, stage.skin, saved)
 
     def _sleep_or_wake(self, channel: Channel) -> None:
         """A stage whose frames nobody reads does not read either, so that upstream need not work for it."""

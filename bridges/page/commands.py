@@ -16,6 +16,7 @@ from typing import Any
 
 from bridges.door import Door
 from protocol.control import ControlClient, ControlError
+from protocol.errors import in_words
 from protocol.topics import RECORDER
 
 from .feed import SkinFeed
@@ -76,7 +77,7 @@ class Buttons:
         try:
             return {"ok": True, "result": await self._carry_out(button.process, skin, command, args)}
         except (ControlError, OSError, ReplayRefused) as why:
-            return _no(str(why))
+            return _no(in_words(why))
 
     async def _carry_out(self, process: str, skin: str, command: str, args: dict[str, Any]) -> dict[str, Any]:
         if process and process != RECORDER:

@@ -1,6 +1,6 @@
 """The host's end of the board's link: HELLO, IDENT, check, CONFIG, START, scans, TIME. A state machine without I/O.
 
-`received` takes bytes in, `to_send` gives bytes out; both are told the time. Nothing the board does, or fails to do,
+`received` takes bytes in, `to_send` gives bytes out; both are given the time. Nothing the board does, or fails to do,
 raises.
 """
 
@@ -44,14 +44,14 @@ class BoardLink:
         self._check = ScanCheck(self.clock)
         self.reasons = self._check.reasons  # of the scans received last, by number: gap, clock, frozen
         self._questions = TimeQuestions()
-        self._heard_us = 0  # newest time of the board's clock
+        self._newest_us = 0  # newest time of the board's clock
         self._start_s: float | None = None  # when START was sent first in this state
         self._pace = LinePace(now_s)
         self.ident: link.Ident | None = None
         self.problem = ""  # what stands in the way, for a person; "" when all is well
         self.counts: Counter[str] = Counter()  # scans, missing, repeated, foreign, events, restarts, garbled
         self.state, self._since, self._due_s, self._tries = "hello", now_s, now_s, 0
-        self._heard_s = self._asked_since = now_s
+        self._received_s = self._hello_since_s = now_s
         self._dead_scans, self._dead_s = 0, -DEAD_AGAIN_S
 
     @property
@@ -62,7 +62,7 @@ class BoardLink:
     @property
     def clock_unknown(self) -> bool:
         """Whether it is not known how old the board's scans are."""
-        return self.clock.unknown(self._heard_us)
+        return self.clock.unknown(self._newest_us)
 
     @property
     def frozen(self) -> bool:
@@ -82,9 +82,9 @@ class BoardLink:
         for n, message in enumerate(messages):
             if isinstance(message, link.ScanFrame):
                 first_byte_s = began_s if n == 0 else now_s
-                self._pace.took(now_s - first_byte_s)
+                self._pace.received(now_s - first_byte_s)
                 if self._is_ours(message, first_byte_s, now_s):
-                    self._heard_s = now_s
+                    self._received_s = now_s
                     scans.append(message)
                     self._watch(message, now_s)
             elif isinstance(message, link.Ident):
@@ -96,7 +96,7 @@ class BoardLink:
             elif isinstance(message, link.Event):
                 self._happened(message, now_s)
             elif isinstance(message, link.Time):
-                self._told_time(message, now_s)
+                self._answered_time(message, now_s)
         return scans
 
     def pause_s(self, now_s: float) -> float:
@@ -106,38 +106,33 @@ class BoardLink:
     def to_send(self, now_s: float) -> bytes:
         """Returns the bytes that are due now."""
         if self.state == "running":
-            if now_s - self._heard_s <= SILENT_S:
+            if now_s - self._received_s <= SILENT_S:
                 return self._asking(now_s)
             self._restart(now_s, f"the board went silent for {SILENT_S:g} s: asking it again")
         if self.state == "refused" and now_s - self._since >= REFUSED_AGAIN_S:
             self._to(now_s, "hello")
-        if now_s < self._due_s:
+        if self.state == "refused" or now_s < self._due_s:
             return b""
-        if self.state == "hello":
-            self._due_s = now_s + HELLO_EVERY_S
-            if now_s - self._asked_since > EXPLAIN_AFTER_S:
-                self.problem = self._other_end.sentence()
-            return link.encode(link.Hello(schema_hash=link.SCHEMA_HASH))
-        if self.state in ("config", "start"):
-            self._tries += 1
-            if self._tries > TRIES:
-                self._restart(now_s, f"the board does not answer {self.state.upper()}: asking it again")
-                return b""
-            self._due_s = now_s + ANSWER_S
-            s = self.scanning
-            if self.state == "config":
-                return link.encode(
-                    link.Config.of(
-                        s.setting,
-                        config=s.config,
-                        rtia_ohm=s.rtia_ohm,
-                        scan=s.scan_list.astype("u1"),
-                        parts=s.parts,
-                    )
-                )
+        if self.state != "hello":
+            return self._command(now_s)
+        self._due_s = now_s + HELLO_EVERY_S
+        if now_s - self._hello_since_s > EXPLAIN_AFTER_S:
+            self.problem = self._other_end.sentence()
+        return link.encode(link.Hello(schema_hash=link.SCHEMA_HASH))
+
+    def _command(self, now_s: float) -> bytes:
+        """Returns CONFIG or START, as the state is; after TRIES without an answer everything starts anew."""
+        self._tries += 1
+        if self._tries > TRIES:
+            self._restart(now_s, f"the board does not answer {self.state.upper()}: asking it again")
+            return b""
+        self._due_s = now_s + ANSWER_S
+        s = self.scanning
+        if self.state == "start":
             self._start_s = now_s if self._start_s is None else self._start_s
             return link.encode(link.Start(config=s.config))
-        return b""
+        rows = s.scan_list.astype("u1")
+        return link.encode(link.Config.of(s.setting, config=s.config, rtia_ohm=s.rtia_ohm, scan=rows, parts=s.parts))
 
     def scan_as(self, scanning: Scanning, now_s: float) -> None:
         """What the board is to scan from now on. One that runs is configured anew, and goes on after some messages."""
@@ -160,15 +155,15 @@ class BoardLink:
         """Returns a TIME_ASK where one is due."""
         if not self.clock.timed:
             return b""
-        width_ns = self.clock.width_ns(self._heard_us)
+        width_ns = self.clock.width_ns(self._newest_us)
         return self._questions.to_send(now_s, width_ns is not None and width_ns < GOOD_NS, self.decoder.waiting)
 
-    def _told_time(self, answer: link.Time, now_s: float) -> None:
-        asked_s = self._questions.asked_s(answer)
-        if asked_s is None or self.state != "running":
+    def _answered_time(self, answer: link.Time, now_s: float) -> None:
+        sent_s = self._questions.sent_s(answer)
+        if sent_s is None or self.state != "running":
             return
-        self._heard_us = max(self._heard_us, answer.device_us)
-        if not self.clock.answered(_ns(asked_s), answer.device_us, _ns(now_s)):
+        self._newest_us = max(self._newest_us, answer.device_us)
+        if not self.clock.answered(_ns(sent_s), answer.device_us, _ns(now_s)):
             self._clock_jumped(now_s)
 
     def _clock_jumped(self, now_s: float) -> None:
@@ -178,9 +173,9 @@ class BoardLink:
 
     def _to(self, now_s: float, state: str) -> None:
         self.state, self._since, self._due_s, self._tries = state, now_s, now_s, 0
-        self._heard_s, self._start_s = now_s, None
+        self._received_s, self._start_s = now_s, None
         if state == "hello":
-            self._asked_since = now_s
+            self._hello_since_s = now_s
             self._other_end = OtherEnd(self._other_end.url, self._other_end.baud)
 
     def _restart(self, now_s: float, why: str) -> None:
@@ -212,13 +207,13 @@ class BoardLink:
         elif self.state == "running" and ack.of == link.Start.number:
             self._check.started(ack.device_us)  # a START sent twice: scans count from 0 again
 
-    def _begin(self, ack: link.Ack, asked_s: float | None, now_s: float) -> None:
+    def _begin(self, ack: link.Ack, sent_s: float | None, now_s: float) -> None:
         """START was carried out: what comes now is from after it, and its answer says what the board's clock shows."""
         self._check.started(ack.device_us)
         self._questions.begin(now_s)
-        self._heard_us = ack.device_us
-        if ack.device_us and asked_s is not None:
-            self.clock.started(_ns(asked_s), ack.device_us, _ns(now_s))
+        self._newest_us = ack.device_us
+        if ack.device_us and sent_s is not None:
+            self.clock.started(_ns(sent_s), ack.device_us, _ns(now_s))
         else:
             self.clock.reset()
 
@@ -263,7 +258,7 @@ class BoardLink:
             self._clock_jumped(now_s)
         if what != "scans":
             return False
-        self._heard_us = max(self._heard_us, scan.device_us + scan.duration_us)
+        self._newest_us = max(self._newest_us, scan.device_us + scan.duration_us)
         self.counts["missing"] += self._check.missing
         self.counts["frozen"] += self._check.frozen
         return True

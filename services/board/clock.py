@@ -54,20 +54,18 @@ class DeviceClock:
         self._forget()
         self.resets += 1
 
-    # what is heard of the board's clock
-
-    def started(self, asked_ns: int, device_us: int, answered_ns: int) -> None:
+    def started(self, sent_ns: int, device_us: int, answered_ns: int) -> None:
         """The answer to a START said device_us: what is known goes on where it agrees, else it is forgotten."""
-        if not self.answered(asked_ns, device_us, answered_ns):
+        if not self.answered(sent_ns, device_us, answered_ns):
             self.reset()
-            self.answered(asked_ns, device_us, answered_ns)
+            self.answered(sent_ns, device_us, answered_ns)
 
-    def answered(self, asked_ns: int, device_us: int, answered_ns: int) -> bool:
-        """A question of asked_ns was answered with device_us, heard at answered_ns. False, and nothing is learnt, where
-        that cannot be by what is known: a clock has jumped.
+    def answered(self, sent_ns: int, device_us: int, answered_ns: int) -> bool:
+        """A question of sent_ns was answered with device_us at answered_ns. False, and nothing is learnt, where that
+        cannot be by what is known: a clock has jumped.
         """
         device_ns = device_us * 1000
-        least, most = asked_ns - device_ns, answered_ns - device_ns
+        least, most = sent_ns - device_ns, answered_ns - device_ns
         lower, upper = self._bounds(device_ns)
         if (upper is not None and least > upper + TOLERANCE_NS) or (lower is not None and most < lower - TOLERANCE_NS):
             return False
@@ -98,8 +96,6 @@ class DeviceClock:
             self._points.append(min(self._block, key=lambda point: point[1] - self._slope * point[0]))
             self._block.clear()
             self._fit()
-
-    # what is known of it
 
     def host_ns(self, device_us: int) -> int:
         """Returns the host monotonic time [ns] at which the board's clock showed device_us; where that is unknown, the

@@ -25,7 +25,7 @@ class LinePace:
         self._paused = self._paused and complete
         return began_s
 
-    def took(self, seconds: float) -> None:
+    def received(self, seconds: float) -> None:
         """Takes how long a scan took from its first byte to its last."""
         # Complete at the first look after a pause: the pause was too long.
         self._line_s = self._line_s / 2 if self._paused else (seconds if seconds < LONGEST_LINE_S else 0.0)

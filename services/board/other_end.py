@@ -15,7 +15,7 @@ from protocol.cobs import cobs_decode
 from protocol.link_messages import BY_NUMBER
 from protocol.part_size import BAUD
 
-KEPT = 16384  # first bytes of a connection that are looked at: three of the longest scans
+FIRST_BYTES = 16384  # first bytes of a connection that are looked at: three of the longest scans
 QUOTED = 60
 ENOUGH = 16  # bytes to quote
 GLITCH = 8  # fewer bytes of 0 or 255 come of a plug that is put in
@@ -51,7 +51,7 @@ class OtherEnd:
         self._received = b""
         self._kinds: Counter[type[link.Message]] = Counter()  # of the messages that were whole
         self._quoted = b""  # of the first bytes: it stays as it is, so that the same thing is said once
-        self._named: tuple[int, str] = (-1, "")  # so many bytes were looked at, and what they are
+        self._named: tuple[int, str, str] = (-1, "", "")  # of so many bytes: what they are, and what to do
 
     @property
     def answered(self) -> bool:
@@ -59,25 +59,25 @@ class OtherEnd:
         return len(self._received) >= GLITCH or bool(self._received.strip(b"\0\xff"))
 
     def receive(self, data: bytes, messages: list[link.Message]) -> None:
-        self._received += data[: KEPT - len(self._received)]
+        self._received += data[: FIRST_BYTES - len(self._received)]
         self._kinds.update(map(type, messages))
 
-    def sentence(self) -> str:
-        """What answers instead of a board, for a person."""
+    def sentence(self, and_then: str = "") -> str:
+        """What answers instead of a board, for a person, and what it did then."""
         if not self.answered:
             return f"no board at {self.url}: {self._silent()}"
         if len(self._quoted) < ENOUGH:
             self._quoted = self._received
         if self._named[0] != len(self._received):
-            self._named = len(self._received), self._name()
-        return f"no board at {self.url}: {self._named[1]}"
+            self._named = len(self._received), *self._name()
+        _, found, advice = self._named
+        return f"no board at {self.url}: {found}{and_then}: {advice}"
 
     def closed(self, why: str) -> str:
         """The same where the connection is lost, for which the port has a reason of its own."""
         network = self.url.lower().startswith(NETWORK)
         if self.answered:
-            found, _, todo = self.sentence().rpartition(": ")
-            return f"{found}, and {'closes the connection' if network else 'is gone'}: {todo}"
+            return self.sentence(and_then=f", and {'closes the connection' if network else 'is gone'}")
         if network:
             return (
                 f"no board at {self.url}: the connection is closed without a word: a gateway does so while another "
@@ -90,38 +90,41 @@ class OtherEnd:
             return "the connection is taken and nothing is said: is a board wired to that gateway, and powered?"
         return "no answer to HELLO, and nothing else comes: is the board powered, and is its firmware running?"
 
-    def _name(self) -> str:
+    def _name(self) -> tuple[str, str]:
+        """What the bytes are, and what to do."""
         if link.Hello in self._kinds or HELLO in self._received:
-            return "our own HELLO comes back: take the loopback plug away, or mend wires that touch"
+            return "our own HELLO comes back", "take the loopback plug away, or mend wires that touch"
         if self._kinds:
-            return "it sends a board's messages and does not answer HELLO: look at the wire from here to the board"
+            return "it sends a board's messages and does not answer HELLO", "look at the wire from here to the board"
         if schema := self._other_schema():
-            return (
-                f"frames of schema {schema:08x}, this program speaks {link.SCHEMA_HASH:08x}: flash a matching firmware"
-            )
+            ours = link.SCHEMA_HASH
+            return f"frames of schema {schema:08x}, this program speaks {ours:08x}", "flash a matching firmware"
         pieces = [piece for piece in self._received.split(b"\0") if len(piece) > 5]
-        ours = sum(piece[1] in BY_NUMBER and piece[1] > 0x80 for piece in pieces)
-        if len(pieces) > 2 and ours > OURS * len(pieces):
-            return "a board's frames, none of them whole: bytes are lost on the way; look at cable and hub"
+        like_ours = sum(piece[1] in BY_NUMBER and piece[1] > 0x80 for piece in pieces)
+        if len(pieces) > 2 and like_ours > OURS * len(pieces):
+            return "a board's frames, none of them whole", "bytes are lost on the way; look at cable and hub"
         return self._foreign()
 
-    def _foreign(self) -> str:
-        said, text = quoted(self._quoted), text_share(self._received) >= TEXT
-        first = self._received.strip().partition(b"\n")[0]
-        if text and self.url.lower().startswith(NETWORK) and re.search(BUSY, first):
-            return f"found a busy gateway, which sends {said}: close the other connection to it"
-        for what, pattern, todo in KNOWN:
+    def _foreign(self) -> tuple[str, str]:
+        first_bytes, text = quoted(self._quoted), text_share(self._received) >= TEXT
+        line = self._received.strip().partition(b"\n")[0]
+        if text and self.url.lower().startswith(NETWORK) and re.search(BUSY, line):
+            return f"found a busy gateway, which sends {first_bytes}", "close the other connection to it"
+        for what, pattern, advice in KNOWN:
             if re.search(pattern, self._received, re.DOTALL):
-                return f"found {what}, which sends {said}: {todo}"
+                return f"found {what}, which sends {first_bytes}", advice
         if text:
-            return f"found text, {said}: is it the board's port, and has the board its firmware?"
+            return f"found text, {first_bytes}", "is it the board's port, and has the board its firmware?"
         if not self._received.strip(b"\0\xff"):
-            return f"found nothing but bytes of 0 or 255, {said}: is the board powered, and its wire connected?"
+            return (
+                f"found nothing but bytes of 0 or 255, {first_bytes}",
+                "is the board powered, and its wire connected?",
+            )
         if sum(map(_runs, self._received)) > SLOWER * len(self._received):
-            what = f"bytes as from a line slower than our {self.baud} baud, {said}"
-            return f"found {what}: set `baud` in skin.toml to the board's"
-        what = f"bytes that are neither text nor a board's, {said}"
-        return f"found {what}: is `baud` ({self.baud}) the board's, and is it the board's port?"
+            what = f"found bytes as from a line slower than our {self.baud} baud, {first_bytes}"
+            return what, "set `baud` in skin.toml to the board's"
+        what = f"found bytes that are neither text nor a board's, {first_bytes}"
+        return what, f"is `baud` ({self.baud}) the board's, and is it the board's port?"
 
     def _other_schema(self) -> int:
         """The hash of the schema by which two different frames have right checksums; 0 where there is none."""

@@ -18,7 +18,7 @@ BEHIND_HZ = 115.0  # parts a second that were skipped: half of them
 OLD_MS = 22.0  # from the middle of a measurement to what is made of it: as old a whole scan is when it ends
 IN_A_ROW = 2  # statuses that say so: beginnings of touches take a process some milliseconds each
 LEAST_APART_S = 0.5  # of two statuses: one comes at once, too, where something changed
-SETTLES_S = 3.0  # after a change, before what is heard is of it: two statuses
+SETTLES_S = 3.0  # after a change, before statuses are of it: two statuses
 LEAST_WAIT_S, MOST_WAIT_S = 10.0, 640.0
 
 
@@ -30,14 +30,14 @@ class PartsOrWhole:
         self._last: dict[str, tuple[float, str, int]] = {}  # when, of which session, how many were behind
         self._behind_hz: dict[str, float] = {}  # parts a second that preprocessing did not read in time
         self._in_a_row: dict[str, int] = {}  # statuses that said that it is behind
-        self._changed_s = self._went_back_s = -math.inf
+        self._changed_s = self._retried_s = -math.inf
         self._wait_s = LEAST_WAIT_S
 
     def whole(self, skin: str) -> bool:
         """Whether this skin is to scan whole for now."""
         return self._whole.get(skin, False)
 
-    def heard(self, status: StatusFrame, now_s: float) -> None:
+    def update(self, status: StatusFrame, now_s: float) -> None:
         """A status of preprocessing, once a second of each skin."""
         skin = status.skin
         if skin not in self._whole:
@@ -57,7 +57,7 @@ class PartsOrWhole:
         if now_s - self._changed_s < SETTLES_S:
             return
         if any(count >= IN_A_ROW and not self._whole[skin] for skin, count in self._in_a_row.items()):
-            if now_s - self._went_back_s < self._wait_s:
+            if now_s - self._retried_s < self._wait_s:
                 self._wait_s = min(MOST_WAIT_S, 2 * self._wait_s)
             in_parts = [skin for skin, whole in self._whole.items() if not whole]
             in_parts.sort(key=lambda skin: self._behind_hz.get(skin, 0.0))
@@ -65,9 +65,9 @@ class PartsOrWhole:
             return
         waiting = [skin for skin, whole in self._whole.items() if whole]
         if waiting and now_s - self._changed_s > self._wait_s:
-            if now_s - self._went_back_s > 2 * self._wait_s:
+            if now_s - self._retried_s > 2 * self._wait_s:
                 self._wait_s = max(LEAST_WAIT_S, self._wait_s / 2)
-            self._went_back_s = now_s
+            self._retried_s = now_s
             self._change(waiting[:1], False, now_s)
 
     def _change(self, skins: list[str], whole: bool, now_s: float) -> None:

@@ -10,7 +10,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Generator, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from models.bundle import Bundle
 from models.measurement.responses.tables import tells_touches
@@ -80,6 +80,26 @@ def in_parts(scanning: Scanning, bundle: Bundle, baud: int) -> Scanning:
     return replace(scanning, parts=parts, order=rolling_order(bundle)) if parts > 1 else scanning
 
 
+@dataclass
+class _Connection:
+    """One connection to what is behind a port."""
+
+    port: ports.Port
+    board: BoardLink
+    suspensions: Suspensions
+    newest: NewestValues | None
+    opened_s: float
+    read_s: float  # when the port was read last
+    whole: bool = False  # whether the board scans whole for now
+    counted_s: float = 0.0
+    counted: Counter[str] = field(default_factory=Counter)
+
+    def is_stranger(self, must_be: str, now: float) -> bool:
+        """Whether this is not the board `must_be`, or does not say in time which one it is."""
+        late = now - self.opened_s > INTRODUCE_S
+        return bool(must_be) and self.board.board != must_be and bool(self.board.board or late)
+
+
 class BoardSource(Source):
     """A board behind a serial port. Opens, asks, configures, starts, and does so again whenever anything goes wrong."""
 
@@ -101,23 +121,28 @@ class BoardSource(Source):
     def frames(self) -> Iterator[RawFrame | None]:
         while True:
             for n, url in enumerate(ports.candidates(self.skin.port, self.name, self._usb_serial, bool(self._board))):
-                try:
-                    self._port = self.open_port(url)
-                except ports.PortError as why:
-                    self._trouble(str(why) if n == 0 else self.problem)  # the configured name is the one to speak of
-                    self._strangers += self.skin.port.lower().startswith(NETWORK)
-                    continue
-                try:
-                    stranger = yield from self._connection(self._port, must_be=self._board if n else "")
-                    if stranger:
-                        continue
-                except ports.PortError as why:
-                    self._trouble(str(why))
-                    self.counts["disconnects"] += 1
-                finally:
-                    self.close()
-                break
+                if (yield from self._attempt(url, configured=n == 0)):
+                    break
             yield from self._wait_to_reopen()
+
+    def _attempt(self, url: str, configured: bool) -> Generator[RawFrame | None, None, bool]:
+        """Yields the frames of what is at `url`; returns False where it cannot be opened, or is another board than ours
+        and not `configured`.
+        """
+        try:
+            self._port = self.open_port(url)
+        except ports.PortError as why:
+            self._trouble(str(why) if configured else self.problem)  # the configured name is the one to speak of
+            self._strangers += self.skin.port.lower().startswith(NETWORK)
+            return False
+        try:
+            return not (yield from self._frames_of(self._port, must_be="" if configured else self._board))
+        except ports.PortError as why:
+            self._trouble(str(why))
+            self.counts["disconnects"] += 1
+            return True
+        finally:
+            self.close()
 
     def _wait_to_reopen(self) -> Iterator[None]:
         again = self._now() + min(MOST_REOPEN_S, REOPEN_S * 2 ** min(self._strangers, 8))
@@ -137,60 +162,71 @@ class BoardSource(Source):
             self._port.close()
             self._port = None
 
-    def _connection(self, port: ports.Port, must_be: str) -> Generator[RawFrame | None, None, bool]:
+    def _frames_of(self, port: ports.Port, must_be: str) -> Generator[RawFrame | None, None, bool]:
         """Yields a connection's frames until the port is gone (PortError), or turns out to be another board than
         `must_be` (returns True).
         """
-        opened = last = self._now()
-        board = BoardLink(self.scanning, opened, OtherEnd(port.url, self.skin.baud))
-        suspensions = Suspensions(self.host)
-        newest, whole = self.newest(), False
-        seen: Counter[str] = Counter()
-        counted = 0.0
+        now = self._now()
+        board = BoardLink(self.scanning, now, OtherEnd(port.url, self.skin.baud))
+        connection = _Connection(port, board, Suspensions(self.host), self.newest(), opened_s=now, read_s=now)
         try:
             while True:
                 now = self._now()
-                if whole != self.whole:
-                    whole, newest = self.whole, self.newest()
-                    board.scan_as(self.scanning.whole if whole else self.scanning, now)
-                wait_s = POLL_S if board.state == "running" else 0.02
-                # After a standstill what waits is read first: the board was not silent, and not asked either.
-                due = board.to_send(now) if now - last < STOOD_STILL_S else b""
-                if due:
-                    port.write(due)
-                self.host.sleep(board.pause_s(self._now()))
-                data = port.read(wait_s)
-                stood_s = self._now() - last
-                if stood_s > STOOD_STILL_S:
-                    data += self._waiting(port)
-                if suspensions.happened():
-                    board.suspended(self._now())
+                data, stood_s = self._exchange(connection, now)
                 read_ns = self.host.now_ns()
-                last = read_ns * 1e-9
-                scans = board.received(data, last) if data else []
-                if must_be and (board.board or now - opened > INTRODUCE_S) and board.board != must_be:
+                connection.read_s = read_ns * 1e-9
+                scans = board.received(data, connection.read_s) if data else []
+                if connection.is_stranger(must_be, now):
                     return True
-                if board.state == "running" and self._board != board.board:
-                    self._board, self._usb_serial = board.board, ports.usb_serial_number(port.url)
-                if board.problem or board.state == "running":  # until then what was the matter is
-                    self._trouble(board.problem)
-                came = bool(scans)
+                self._recognise(connection)
                 if stood_s > STOOD_STILL_S:
-                    scans = self._newest(scans, board, stood_s, last)
-                frames = [self.handed_on(scan, board, read_ns, newest) for scan in scans]
-                if last - counted > COUNT_EVERY_S or not came:
-                    counted = last
-                    self._count(board, seen)
-                    self.remarks.look(board, last, whole)
-                    self.in_parts = self.scanning.parts > 1 and not board.knows_no_parts
+                    scans = self._newest(scans, board, stood_s, connection.read_s)
+                frames = [self.handed_on(scan, board, read_ns, connection.newest) for scan in scans]
+                self._report(connection, at_once=not scans)
                 yield from (frame for frame in frames if frame is not None)
-                if not came:
+                if not scans:
                     yield None
         except ports.PortError as why:
             self._strangers = 0 if board.counts["scans"] else self._strangers + 1
             raise ports.PortError(board.lost(str(why))) from None
         finally:
-            self._count(board, seen)
+            self._count(connection)
+
+    def _exchange(self, connection: _Connection, now: float) -> tuple[bytes, float]:
+        """Sends what is due. Returns what arrived, and for how long [s] nothing was read before it."""
+        board, port = connection.board, connection.port
+        if connection.whole != self.whole:
+            connection.whole, connection.newest = self.whole, self.newest()
+            board.scan_as(self.scanning.whole if connection.whole else self.scanning, now)
+        wait_s = POLL_S if board.state == "running" else 0.02
+        # After a standstill what waits is read first: the board was not silent, and not asked either.
+        due = board.to_send(now) if now - connection.read_s < STOOD_STILL_S else b""
+        if due:
+            port.write(due)
+        self.host.sleep(board.pause_s(self._now()))
+        data = port.read(wait_s)
+        stood_s = self._now() - connection.read_s
+        if stood_s > STOOD_STILL_S:
+            data += self._waiting(port)
+        if connection.suspensions.happened():
+            board.suspended(self._now())
+        return data, stood_s
+
+    def _recognise(self, connection: _Connection) -> None:
+        """Keeps which board runs here, to find it under another name; says what is the matter with it."""
+        board = connection.board
+        if board.state == "running" and self._board != board.board:
+            self._board, self._usb_serial = board.board, ports.usb_serial_number(connection.port.url)
+        if board.problem or board.state == "running":  # until then what was the matter is
+            self._trouble(board.problem)
+
+    def _report(self, connection: _Connection, at_once: bool) -> None:
+        """Brings counts and remarks up to date, every COUNT_EVERY_S where frames come."""
+        if at_once or connection.read_s - connection.counted_s > COUNT_EVERY_S:
+            connection.counted_s = connection.read_s
+            self._count(connection)
+            self.remarks.look(connection.board, connection.read_s, connection.whole)
+            self.in_parts = self.scanning.parts > 1 and not connection.board.knows_no_parts
 
     def _now(self) -> float:
         return self.host.now_ns() * 1e-9
@@ -267,10 +303,10 @@ class BoardSource(Source):
         else:
             log.info("%s: the board is running", self.name)
 
-    def _count(self, board: BoardLink, seen: Counter[str]) -> None:
+    def _count(self, connection: _Connection) -> None:
         """Adds what is new in the connection's counts to ours."""
+        board = connection.board
         now = board.counts + Counter({f"line_{what}": n for what, n in board.decoder.counts.items() if what != "good"})
-        if now != seen:
-            self.counts += now - seen
-            seen.clear()
-            seen.update(now)
+        if now != connection.counted:
+            self.counts += now - connection.counted
+            connection.counted = now

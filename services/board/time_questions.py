@@ -9,19 +9,19 @@ from protocol import link
 ASK_EVERY_S = 0.5
 ASK_OFTEN_S = 0.1  # while the board's clock is not known well
 PATIENCE_S = 0.2  # that a question waits for a moment when nothing is on the line, where answers come soonest
-KEPT = 128  # unanswered questions
+MOST_UNANSWERED = 128  # questions
 
 
 class TimeQuestions:
     """The time questions of one connection."""
 
     def __init__(self) -> None:
-        self._asked_s: dict[int, float] = {}
+        self._sent_s: dict[int, float] = {}
         self._due_s = 0.0
 
     def begin(self, now_s: float) -> None:
-        """The board has been started: ask it soon. What was asked before counts no more."""
-        self._asked_s.clear()
+        """The board has been started: ask it soon. What was sent before counts no more."""
+        self._sent_s.clear()
         self._due_s = now_s
 
     def to_send(self, now_s: float, well_known: bool, line_busy: bool) -> bytes:
@@ -30,11 +30,11 @@ class TimeQuestions:
             return b""
         self._due_s = now_s + (ASK_EVERY_S if well_known else ASK_OFTEN_S)
         nonce = int.from_bytes(os.urandom(4), "little")  # no answer of an earlier connection is taken for one of this
-        self._asked_s[nonce] = now_s
-        if len(self._asked_s) > KEPT:
-            self._asked_s.pop(next(iter(self._asked_s)))
+        self._sent_s[nonce] = now_s
+        if len(self._sent_s) > MOST_UNANSWERED:
+            self._sent_s.pop(next(iter(self._sent_s)))
         return link.encode(link.TimeAsk(nonce=nonce))
 
-    def asked_s(self, answer: link.Time) -> float | None:
-        """Returns when the question that this answers was asked; None for no question of ours."""
-        return self._asked_s.pop(answer.nonce, None)
+    def sent_s(self, answer: link.Time) -> float | None:
+        """Returns when the question that this answers was sent; None for no question of ours."""
+        return self._sent_s.pop(answer.nonce, None)

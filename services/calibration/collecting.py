@@ -57,14 +57,11 @@ class Collector:
         since_ns = None
         for image, z in self._pairs():
             now_ns = image.stamps.get("sample", 0)
-            if since_ns is None:
-                since_ns = now_ns
-            if image.touched or not image.valid:
-                since_ns = now_ns
+            if disturbance := _disturbance(image):
+                since_ns, why = now_ns, disturbance
                 self._quiet.clear()
-                reasons = f" ({', '.join(image.reasons)})" if image.reasons else ""
-                why = "something touches" if image.touched else f"the frames are not valid{reasons}"
                 continue
+            since_ns = now_ns if since_ns is None else since_ns
             if now_ns - since_ns < 1e9 * REPEATED_S:
                 continue
             self._quiet.append(z)
@@ -104,6 +101,14 @@ class Collector:
         if frame is None or not (frame.scan in self._raw and frame.scan in self._images):
             return None
         return self._images.pop(frame.scan), self._raw.pop(frame.scan)
+
+
+def _disturbance(image: ImageFrame) -> str:
+    """What keeps a scan from counting as untouched; "" where nothing does."""
+    if image.touched:
+        return "something touches"
+    reasons = f" ({', '.join(image.reasons)})" if image.reasons else ""
+    return "" if image.valid else f"the frames are not valid{reasons}"
 
 
 def _keep(of: dict[int, Any], scan: int, value: Any) -> None:

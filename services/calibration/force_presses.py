@@ -68,15 +68,15 @@ def wait_for_press(
 ) -> SeenTouch:
     """The next steady press. Raises CalibrationError where none comes."""
     steady, end = Steady(), clock() + patience_s
-    heard = False
+    received = False
     while clock() < end:
         frame = reader.recv(0.5)
         if isinstance(frame, ImageFrame):
-            heard = True
+            received = True
             pressed = steady(read(frame), frame.stamps.get("sample", 0))
             if pressed is not None:
                 return pressed
-    if not heard:
+    if not received:
         raise CalibrationError(f"no image came within {patience_s:g} s: start the service with `skin up`")
     raise CalibrationError(f"no steady press within {patience_s:g} s: {steady.trouble}")
 
@@ -99,9 +99,11 @@ def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None])
     """
     try:
         arrays, understood = read_columns(load_npz(path), bundle)
-        if "measurements" not in arrays and "touched" in arrays:
-            arrays = {**arrays, "measurements": arrays["touched"]}
-        data = read_input({k: arrays[k] for k in ("measurements", "untouched") if k in arrays}, len(bundle.pattern))
+        known = {
+            "measurements": arrays.get("measurements", arrays.get("touched")),
+            "untouched": arrays.get("untouched"),
+        }
+        data = read_input({k: each for k, each in known.items() if each is not None}, len(bundle.pattern))
     except InputError as why:
         raise CalibrationError(str(why) if str(path) in str(why) else f"{path}: {why}") from None
     assert data.untouched is not None  # read_input sees to it

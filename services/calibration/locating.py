@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from models.bundle import Bundle
-from models.locator import LEAST_LOUD, NINETY, Likely, Locator, one_more, second_of, share, unit
+from models.locator import LEAST_LOUD, NINETY, Likely, Locator, WhitenedMap, one_more, second_of, share, unit
 from models.locator_arrays import FEWEST_LIVE, QUANTITIES, LocatorArrays
 from services.calibration.fields import half_width, sample
 from services.calibration.kernel_machine import Machine, named, nothing_known, search
@@ -82,9 +82,9 @@ def build(presses: Presses, similarity: Similarity, bundle: Bundle) -> tuple[Loc
     left = places - stage
     machine, rotation, per_metre = _correction(form, stage - middle, reach, left)
     spread = np.sqrt((left**2).mean(axis=0))
-    kept = len(presses) >= FEWEST_FOR_CORRECTION and _better(machine.left, left)
+    corrected = len(presses) >= FEWEST_FOR_CORRECTION and _better(machine.left, left)
     near = np.hstack([(form - form.mean(axis=0)) @ rotation, (stage - middle) * per_metre])
-    left = machine.left if kept else left
+    left = machine.left if corrected else left
     covariance = np.array([s.covariance for s in seen])
     factor, floor, inside = ellipses(left, covariance)
     factor, floor = (each * len(left) / (len(left) - POSE_FREEDOM) for each in (factor, floor))
@@ -95,14 +95,14 @@ def build(presses: Presses, similarity: Similarity, bundle: Bundle) -> tuple[Loc
         middle=form.mean(axis=0),
         reach=np.array([per_metre, *middle]),
         spread=np.array([factor, floor, gap]),
-        **(named("place", machine, near, spread) if kept else {}),
+        **(named("place", machine, near, spread) if corrected else {}),
     )
     error = None
     if presses.value is not None and np.ptp(presses.value) > 0:
         found, error = _tells(presses.value, presses.quantity, near, amplitude, found, np.sqrt(rotation.shape[1]))
     distance = np.linalg.norm(left, axis=1)
     before = float(np.median(np.linalg.norm(places - stage, axis=1)))
-    return found, whole, Crossed(distance, inside, error, kept, before)
+    return found, whole, Crossed(distance, inside, error, corrected, before)
 
 
 def true_places(machine: Array, similarity: Similarity) -> Array:
@@ -170,7 +170,7 @@ def _left_out(presses: Presses, whole: ResponseFit, plain: LocatorArrays) -> tup
     machine = whole.similarity.to_machine(Locator(plain).places / whole.similarity.scale)
     found: dict[int, Likely] = {}
     forms = np.zeros((n, int(presses.measured.sum())))
-    seconds, thirds = [], []
+    further: list[tuple[float, float]] = []
     middle = plain.corner + 0.5 * float(plain.spacing) * (plain.shape[::-1] - 1)
     some = set(evenly(n, MOST_FOR_SECOND).tolist())
     for one in np.unique(fold):
@@ -186,15 +186,21 @@ def _left_out(presses: Presses, whole: ResponseFit, plain: LocatorArrays) -> tup
             seen, forms[row] = locator.seen(now, z), unit(z)
             found[row] = seen or Likely(middle, np.eye(2) * radius_of(presses.xy) ** 2, 0, LEAST_LOUD, 1.0)
             if seen is not None and row in some:
-                total, b = float(z @ z), now.r @ z
-                single = float(np.max(np.where(b > 0, b * b, 0.0) / now.q))
-                pair, double = second_of(now, b)
-                if len(pair):
-                    seconds.append(share(total, single, double, len(z)))
-                    triple, three = one_more(now, z, pair)
-                    thirds.append(share(total, double, three, len(z)) if len(triple) else 0.0)
-    more = [MARGIN * float(np.quantile(each, SINGLE)) if each else 1e30 for each in (seconds, thirds)]
-    return [found[row] for row in range(n)], forms, np.array(more)
+                further += _further(now, z)
+    more = MARGIN * np.quantile(further, SINGLE, axis=0) if further else np.array([1e30, 1e30])
+    return [found[row] for row in range(n)], forms, more
+
+
+def _further(now: WhitenedMap, z: Array) -> list[tuple[float, float]]:
+    """What a second and a third touch explain of a press that was one; nothing where no second one is possible."""
+    total, b = float(z @ z), now.r @ z
+    single = float(np.max(np.where(b > 0, b * b, 0.0) / now.q))
+    pair, double = second_of(now, b)
+    if not len(pair):
+        return []
+    triple, three = one_more(now, z, pair)
+    third = share(total, double, three, len(z)) if len(triple) else 0.0
+    return [(share(total, single, double, len(z)), third)]
 
 
 def _with_ones(error: Array, measured: NDArray[np.bool_]) -> Array:
@@ -281,6 +287,6 @@ def _tells(
     if machine.error > TELLS * spread:
         return found, None
     centres = np.hstack([near, weight * loud])
-    told = named("press", machine, centres, np.array([spread]))
-    told |= {"loudness": np.array(weight), "quantity": np.array(QUANTITIES.index(quantity))}
-    return replace(found, **told), machine.left[:, 0]
+    machine_arrays = named("press", machine, centres, np.array([spread]))
+    machine_arrays |= {"loudness": np.array(weight), "quantity": np.array(QUANTITIES.index(quantity))}
+    return replace(found, **machine_arrays), machine.left[:, 0]

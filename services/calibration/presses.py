@@ -74,17 +74,8 @@ def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
     except InputError as why:
         raise RegistrationError(str(why)) from None
     values = {name: np.asarray(arrays[name]) for name in PER_PRESS if name in arrays}
-    for name, array in values.items():
-        if array.dtype.kind not in ("iufc" if name in ("touched", "untouched") else "iuf"):
-            raise RegistrationError(f"{name} is {array.dtype}, expected numbers")
-    shapes = [values[name].shape for name in signal]
-    if len(set(shapes)) > 1 or len(shapes[0]) != 2 or shapes[0][1] != k:
-        found = " and ".join(f"{name} {shape}" for name, shape in zip(signal, shapes, strict=True))
-        raise RegistrationError(f"{found}: expected (n, {k}), one row per press")
-    n = shapes[0][0]
+    n = _count(values, signal, k)
     xy = values["xy"]
-    if xy.shape != (n, 2):
-        raise RegistrationError(f"xy {xy.shape}: expected ({n}, 2), metres")
     value, quantity = _pressed(values, n)
     with np.errstate(all="ignore"):
         if signal == ("delta",):
@@ -104,6 +95,21 @@ def read_presses(arrays: Mapping[str, NDArray[Any]], bundle: Bundle) -> Presses:
     strength = _strength(difference, value)
     made = Presses(difference, xy, strength, noise, measured, value, quantity, signal == ("delta",), unit, left_out)
     return replace(made[sequence], understood=understood)
+
+
+def _count(values: Mapping[str, NDArray[Any]], signal: tuple[str, ...], k: int) -> int:
+    """How many presses the arrays have. Raises RegistrationError where they are not numbers, or disagree."""
+    for name, array in values.items():
+        if array.dtype.kind not in ("iufc" if name in ("touched", "untouched") else "iuf"):
+            raise RegistrationError(f"{name} is {array.dtype}, expected numbers")
+    shapes = [values[name].shape for name in signal]
+    if len(set(shapes)) > 1 or len(shapes[0]) != 2 or shapes[0][1] != k:
+        found = " and ".join(f"{name} {shape}" for name, shape in zip(signal, shapes, strict=True))
+        raise RegistrationError(f"{found}: expected (n, {k}), one row per press")
+    n = shapes[0][0]
+    if values["xy"].shape != (n, 2):
+        raise RegistrationError(f"xy {values['xy'].shape}: expected ({n}, 2), metres")
+    return n
 
 
 def part(arrays: Mapping[str, NDArray[Any]], rows: Any) -> dict[str, NDArray[Any]]:

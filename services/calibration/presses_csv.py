@@ -19,6 +19,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from models.files import FileError, read_text
@@ -56,50 +57,51 @@ def read(path: Path, indenter_m: float | None = None, seen_in: Callable[[int], S
             f"expected {', '.join(wanted)}" + ("" if seen_in or "row" not in names else " (or --measurements FILE.npz)")
         )
     return [
-        _press(path, number, dict(zip(names, row, strict=False)), indenter_m, seen_in)
+        _press(_Line(f"{path}, line {number}", dict(zip(names, row, strict=False))), indenter_m, seen_in)
         for number, row in enumerate(rows[1:], start=2)
         if any(cell.strip() for cell in row)
     ]
 
 
-def _press(
-    path: Path,
-    number: int,
-    cells: dict[str, str],
-    indenter_m: float | None,
-    seen_in: Callable[[int], SeenTouch] | None,
-) -> Press:
-    where = f"{path}, line {number}"
+@dataclass(frozen=True)
+class _Line:
+    """One line of the file: where it stands, for a person, and its cells by column."""
 
-    def value(name: str, least: float = -math.inf) -> float:
-        text = cells.get(name, "").strip()
+    where: str
+    cells: dict[str, str]
+
+    def value(self, column: str, least: float = -math.inf) -> float:
+        """Raises CalibrationError for what is no number above `least`."""
+        text = self.cells.get(column, "").strip()
         try:
             found = float(text)
         except ValueError:
             found = math.nan
         if not (math.isfinite(found) and found > least):
             bound = "" if least == -math.inf else f" above {least:g}"
-            raise CalibrationError(f"{where}, column {name}: found {text!r}, expected a number{bound}")
+            raise CalibrationError(f"{self.where}, column {column}: found {text!r}, expected a number{bound}")
         return found
 
-    def given(name: str) -> float | None:
-        return value(name, 0.0) if cells.get(name, "").strip() else None
+    def optional(self, column: str) -> float | None:
+        return self.value(column, 0.0) if self.cells.get(column, "").strip() else None
 
-    force, tip = value("force_n", 0.0), given("tip_m")
+
+def _press(line: _Line, indenter_m: float | None, seen_in: Callable[[int], SeenTouch] | None) -> Press:
+    force, tip = line.value("force_n", 0.0), line.optional("tip_m")
     if seen_in is not None:
-        row = value("row", -1.0)
+        row = line.value("row", -1.0)
         try:
-            return Press(force, seen_in(int(row)), where, tip)
+            return Press(force, seen_in(int(row)), line.where, tip)
         except ValueError as why:
-            raise CalibrationError(f"{where}, column row: found {int(row)}: {why}") from None
-    known = given("indenter_m")
+            raise CalibrationError(f"{line.where}, column row: found {int(row)}: {why}") from None
+    known = line.optional("indenter_m")
     if (known is None) != (indenter_m is None) or not math.isclose(known or 0.0, indenter_m or 0.0, rel_tol=WRITTEN):
         raise CalibrationError(
-            f"{where}, column indenter_m: found {known}, skin.toml names {indenter_m}: quantities were read by another "
-            "one; press again, or put that `indenter` back"
+            f"{line.where}, column indenter_m: found {known}, skin.toml names {indenter_m}: quantities were read by "
+            "another one; press again, or put that `indenter` back"
         )
-    found = {of: Quantity(value(name, 0.0), given(f"{of}_relative")) for of, name in QUANTITIES.items()}
-    return Press(force, SeenTouch(value("x_m"), value("y_m"), found), where, tip)
+    found = {of: Quantity(line.value(name, 0.0), line.optional(f"{of}_relative")) for of, name in QUANTITIES.items()}
+    return Press(force, SeenTouch(line.value("x_m"), line.value("y_m"), found), line.where, tip)
 
 
 def write(path: Path, presses: Sequence[Press], indenter_m: float | None = None) -> None:

@@ -23,8 +23,8 @@ FEWEST = 10
 PRESS_BLUR = 2.0
 """Pixels of the bundle's grid over which sensitivities are averaged: about the width of a press."""
 SIZE = (1.0, 1.6)  # radius of the electrodes' circle beside that of the presses, where nobody tells the size
-TOLD_SIZE = 0.02  # relative: how far a size that was told may be off
-TOLD_ANGLE = np.radians(5.0)
+KNOWN_SIZE = 0.02  # relative: how far the known size may be off
+KNOWN_ANGLE = np.radians(5.0)
 MOST_FOR_POSE = 200  # presses from which the pose is found
 STARTS = 4  # the best of those on a grid, each followed to its optimum
 PARTS = 10  # of the jackknife that tells the width of the posterior
@@ -90,7 +90,7 @@ class _Pose:
         sizes                least and largest scale that are looked at
     """
 
-    def __init__(self, presses: Presses, bundle: Bundle, told: KnownPose) -> None:
+    def __init__(self, presses: Presses, bundle: Bundle, known: KnownPose) -> None:
         self.presses = presses[evenly(len(presses), MOST_FOR_POSE)]
         live = presses.measured
         self.fields, self.width = sensitivities(bundle, PRESS_BLUR)[live], half_width(bundle)
@@ -105,20 +105,20 @@ class _Pose:
         turning = at[:, 0] * np.roll(at[:, 1], -1) - at[:, 1] * np.roll(at[:, 0], -1)
         self.bundle_clockwise = bool(turning.sum() < 0)
         self.first = first
-        if told.diameter_m is None:
+        if known.diameter_m is None:
             self.sizes = (SIZE[0] * self.radius / self.circle, SIZE[1] * self.radius / self.circle)
         else:
-            size = 0.5 * told.diameter_m / self.circle
-            self.sizes = (size * (1 - TOLD_SIZE), size * (1 + TOLD_SIZE))
+            size = 0.5 * known.diameter_m / self.circle
+            self.sizes = (size * (1 - KNOWN_SIZE), size * (1 + KNOWN_SIZE))
         both = (False, True)
-        self.ways = both if told.clockwise is None else (told.clockwise != self.bundle_clockwise,)
-        self.told_angle = told.first_electrode
+        self.ways = both if known.clockwise is None else (known.clockwise != self.bundle_clockwise,)
+        self.known_angle = known.first_electrode
 
     def angles(self, mirrored: bool) -> Array:
         """Angles [rad] to start at."""
-        if self.told_angle is None:
+        if self.known_angle is None:
             return np.asarray(np.radians(np.arange(0, 360, 10)), float)
-        return np.array([self.told_angle + (self.first if mirrored else -self.first)])
+        return np.array([self.known_angle + (self.first if mirrored else -self.first)])
 
     def of(self, p: Array, mirrored: bool) -> Similarity:
         """The pose p as a similarity."""
@@ -138,9 +138,9 @@ class _Pose:
         wall = max(0.0, low - p[1]) + max(0.0, p[1] - high)
         out = np.linalg.norm(similarity.to_skin(self.presses.xy), axis=1) / self.circle - 1.0
         wall += max(0.0, float(out.max()))
-        if self.told_angle is not None:
+        if self.known_angle is not None:
             off = p[0] - self.angles(mirrored)[0]
-            wall += max(0.0, abs((off + np.pi) % (2 * np.pi) - np.pi) - TOLD_ANGLE)
+            wall += max(0.0, abs((off + np.pi) % (2 * np.pi) - np.pi) - KNOWN_ANGLE)
         return float(self.left(similarity, rows).mean() + 10.0 * wall)
 
     def start(self, angle: float) -> Array:
@@ -157,31 +157,21 @@ class _Pose:
         return np.asarray(found.x)
 
 
-def register(presses: Presses, bundle: Bundle, told: KnownPose | None = None) -> Registration:
+def register(presses: Presses, bundle: Bundle, known: KnownPose | None = None) -> Registration:
     """The pose that explains most. Raises RegistrationError where the presses cannot tell it."""
     if len(presses) < FEWEST:
         without = f" ({presses.left_out} others of the file cannot be used)" if presses.left_out else ""
         raise RegistrationError(f"{len(presses)} presses{without}: at least {FEWEST}, spread over the skin, are needed")
-    pose = _Pose(presses, bundle, told or KnownPose())
-    _fits(pose, told or KnownPose())
-    starts = [
-        (pose.cost(pose.start(angle), way), angle, way) for way in pose.ways for angle in pose.angles(way).tolist()
-    ]
-    _better_than_chance(pose, [(angle, way) for _, angle, way in starts])
-    starts.sort(key=lambda each: each[0])
-    found: dict[bool, tuple[float, Array]] = {}
-    for way in pose.ways:
-        for _, angle, _ in [each for each in starts if each[2] == way][:STARTS]:
-            p = pose.best(pose.start(angle), way, 250)
-            value = pose.cost(p, way)
-            if way not in found or value < found[way][0]:
-                found[way] = (value, p)
+    known = known or KnownPose()
+    pose = _Pose(presses, bundle, known)
+    _fits(pose, known)
+    found = _best_of_each_way(pose)
     way = min(found, key=lambda each: found[each][0])
     p = found[way][1]
     similarity = pose.of(p, way)
     explained = 1 - float(pose.left(similarity).mean())
     sigma = _widths(pose, p, way)
-    doubts = _doubts(pose, p, sigma, told or KnownPose())
+    doubts = _doubts(pose, p, sigma, known)
     if len(found) == 2:
         other = pose.left(pose.of(found[not way][1], not way)) - pose.left(similarity)
         error = float(other.std(ddof=1)) / np.sqrt(len(other))
@@ -189,7 +179,7 @@ def register(presses: Presses, bundle: Bundle, told: KnownPose | None = None) ->
             doubts.append(
                 "whether the electrodes are numbered clockwise is not decided by these presses: say --numbering"
             )
-    if sigma["angle"] > WIDEST_ANGLE and (told is None or told.first_electrode is None):
+    if sigma["angle"] > WIDEST_ANGLE and known.first_electrode is None:
         raise RegistrationError(
             f"these {len(presses)} presses leave the skin's angle open by {np.degrees(sigma['angle']):.0f} degrees: "
             "say where the first electrode is (--first-electrode), or press at more places"
@@ -198,16 +188,27 @@ def register(presses: Presses, bundle: Bundle, told: KnownPose | None = None) ->
     return Registration(Similarity(angle, similarity.scale, similarity.offset, way), explained, sigma, doubts)
 
 
-def _fits(pose: _Pose, told: KnownPose) -> None:
-    """Presses of a size that a skin has, and inside the one that was told."""
+def _best_of_each_way(pose: _Pose) -> dict[bool, tuple[float, Array]]:
+    """By whether the numbering is mirrored: the least cost, and its pose. Raises RegistrationError."""
+    starts = {way: [(pose.cost(pose.start(a), way), a) for a in pose.angles(way).tolist()] for way in pose.ways}
+    _better_than_chance(pose, [(angle, way) for way, each in starts.items() for _, angle in each])
+    found = {}
+    for way, each in starts.items():
+        best = [pose.best(pose.start(angle), way, 250) for _, angle in sorted(each)[:STARTS]]
+        found[way] = min(((pose.cost(p, way), p) for p in best), key=lambda pair: pair[0])
+    return found
+
+
+def _fits(pose: _Pose, known: KnownPose) -> None:
+    """Presses of a size that a skin has, and inside the known one."""
     if pose.radius < 1e-4:
         raise RegistrationError(
             f"all presses lie within {2e3 * pose.radius:.2g} mm: spread them over the skin (xy is in metres)"
         )
-    if told.diameter_m is not None and told.diameter_m < 2 * pose.radius * (1 - TOLD_SIZE):
+    if known.diameter_m is not None and known.diameter_m < 2 * pose.radius * (1 - KNOWN_SIZE):
         raise RegistrationError(
             f"presses lie up to {2e3 * pose.radius:.0f} mm apart, the skin's diameter is said to be "
-            f"{1e3 * told.diameter_m:.0f} mm: presses lie inside the skin; check both (metres)"
+            f"{1e3 * known.diameter_m:.0f} mm: presses lie inside the skin; check both (metres)"
         )
 
 
@@ -245,15 +246,15 @@ def _widths(pose: _Pose, p: Array, way: bool) -> dict[str, float]:
     return {"angle": float(spread[0]), "scale": float(spread[1]), "offset": float(np.hypot(spread[2], spread[3]))}
 
 
-def _doubts(pose: _Pose, p: Array, sigma: dict[str, float], told: KnownPose) -> list[str]:
+def _doubts(pose: _Pose, p: Array, sigma: dict[str, float], known: KnownPose) -> list[str]:
     found = []
     low, high = np.log(pose.sizes)
-    if told.diameter_m is None and (p[1] < low + 0.01 or p[1] > high - 0.01):
+    if known.diameter_m is None and (p[1] < low + 0.01 or p[1] > high - 0.01):
         end = SIZE[0] if p[1] < low + 0.01 else SIZE[1]
         found.append(
             f"the skin's size is at the end of what is looked at, {end:g} times the circle of the presses: "
             "say --diameter"
         )
-    if sigma["scale"] > 0.15 and told.diameter_m is None:
+    if sigma["scale"] > 0.15 and known.diameter_m is None:
         found.append(f"the skin's size is known to {100 * sigma['scale']:.0f} % only: say --diameter")
     return found

@@ -96,33 +96,31 @@ def run() -> int:
             raise room.NoRoom(lacking)
         app()
     except SystemExit as end:
-        return end.code if isinstance(end.code, int) else 0 if end.code is None else FAILED
-    except KeyboardInterrupt:
-        return 130
+        return FAILED if isinstance(end.code, str) else end.code or 0
     except BrokenPipeError:  # `skin echo contact | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except Exception as error:
-        if interrupted(error):
-            return 130
-        if (lacking := room.sentence(error)) and not os.environ.get("EITSKIN_DEBUG"):
-            print(f"skin: {lacking}", file=sys.stderr)
-            return FAILED
-        if isinstance(error, OSError) and error.filename and not os.environ.get("EITSKIN_DEBUG"):
-            print(f"skin: {error.filename}: {error.strerror or error}: name another file or folder", file=sys.stderr)
-            return USAGE
-        if isinstance(error, OSError) and error.errno in NO_ROOM and not os.environ.get("EITSKIN_DEBUG"):
-            print(f"skin: {error.strerror} where the output goes: send it to another file", file=sys.stderr)
-            return FAILED
-        code = expected_code(error)
-        if os.environ.get("EITSKIN_DEBUG"):
+    except (Exception, KeyboardInterrupt) as error:
+        if os.environ.get("EITSKIN_DEBUG") and not interrupted(error):
             raise
-        if code is None:
-            hint = "a fault of this program: set EITSKIN_DEBUG=1 to see where, and report it"
-            first = (str(error).splitlines() or [""])[0]
-            print(f"skin: {type(error).__name__}: {first} ({hint})", file=sys.stderr)
-            return FAILED
-        for line in str(error).splitlines():
-            print(f"skin: {line}", file=sys.stderr)
+        code, lines = _explained(error)
+        sys.stderr.writelines(f"skin: {line}\n" for line in lines)
         return code
     return 0
+
+
+def _explained(error: BaseException) -> tuple[int, list[str]]:
+    """The exit code of an error, and its lines for a person."""
+    if interrupted(error):
+        return 130, []
+    if lacking := room.sentence(error):
+        return FAILED, [lacking]
+    if isinstance(error, OSError) and error.filename:
+        return USAGE, [f"{error.filename}: {error.strerror or error}: name another file or folder"]
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
+        return FAILED, [f"{error.strerror} where the output goes: send it to another file"]
+    code, lines = expected_code(error), str(error).splitlines()
+    if code is not None:
+        return code, lines
+    hint = "a fault of this program: set EITSKIN_DEBUG=1 to see where, and report it"
+    return FAILED, [f"{type(error).__name__}: {(lines or [''])[0]} ({hint})"]

@@ -118,13 +118,17 @@ def fault(
         if name != "power_cycle":  # which happens at once
             print(f"{_lasts(answer)}, or until `skin fault {name} --clear`")
     else:
-        for fault_name, row in answer["known"].items():
-            listed = ", ".join(f"{key}={value}" for key, value in row["args"].items())
-            sticky = " (sticky)" if row["sticky"] else ""
-            print(f"{fault_name:20s} {row['what']}{sticky}" + (f"  [{listed}]" if listed else ""))
-        print("A sticky fault lasts until `skin fault power_cycle`; every other one for --seconds.")
-        if answer["faults"]:
-            print(f"in force now: {', '.join(answer['faults'])}")
+        _print_known(answer)
+
+
+def _print_known(answer: dict[str, Any]) -> None:
+    for name, row in answer["known"].items():
+        listed = ", ".join(f"{key}={value}" for key, value in row["args"].items())
+        sticky = " (sticky)" if row["sticky"] else ""
+        print(f"{name:20s} {row['what']}{sticky}" + (f"  [{listed}]" if listed else ""))
+    print("A sticky fault lasts until `skin fault power_cycle`; every other one for --seconds.")
+    if answer["faults"]:
+        print(f"in force now: {', '.join(answer['faults'])}")
 
 
 def _lasts(answer: dict[str, Any]) -> str:

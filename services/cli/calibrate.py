@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from models.bundle import Bundle
     from services.calibration.force_fit import Press
     from services.calibration.seen import TouchReader
+    from services.runtime.config import Skin
 
 PLAN = ((0, 0, 1), (0, 0, 3), (0, 0, 5), (1, 1, 2), (-1, 1, 4), (-1, -1, 2), (1, -1, 4))
 """Where to press (halves of the way to the edge), and about how firmly [N]; then again from the first, another tip."""
@@ -81,7 +82,6 @@ def force(
     either: two sizes tell whether force follows pressure, peak or integral.
     """
     from models.bundle import Bundle
-    from services.calibration import force_presses as calibration_presses
     from services.calibration import presses_csv as calibration_csv
     from services.calibration.force_fit import CalibrationError, fit, unknown
     from services.calibration.seen import TouchReader
@@ -98,15 +98,11 @@ def force(
         )
     if not live and tip:
         fail("--tip needs --live: by prompts it is asked for, in a CSV it is the column tip_m", USAGE)
-    if csv is None:
-        made = [] if live else _prompted(name, bundle, TouchReader(configured, bundle))
-    elif measurements is None:
-        made = calibration_csv.read(csv, indenter_m)
-    else:
-        warn = lambda text: print(f"skin: {text}", file=sys.stderr)  # noqa: E731
-        made = calibration_csv.read(csv, None, calibration_presses.of_file(measurements, configured, bundle, warn))
+    made = [] if csv is None else _from_csv(csv, measurements, configured, bundle)
     if live:
         made += calibrate_live.pressed(name, TouchReader(configured, bundle), made, tip, presses, any_tip)
+    elif csv is None:
+        made = _prompted(name, bundle, TouchReader(configured, bundle))
     out = out or Path("calibration", f"{name}-force.json")
     try:
         if save is not None:
@@ -130,10 +126,7 @@ def force(
         **found.said,
     }
     report |= {"curve": found.curve.to_dict(), "unknown": unknown(found, configured)}
-    if as_json:
-        emit(report)
-        return
-    _say(report)
+    emit(report) if as_json else _say(report)
 
 
 def _say(report: dict[str, Any]) -> None:
@@ -153,6 +146,18 @@ def _say(report: dict[str, Any]) -> None:
         print(report["unknown"])
     print(
         f"wrote {report['file']} ({report['sha256'][:12]}): name it as `calibration` in skin.toml, restart the service"
+    )
+
+
+def _from_csv(csv: Path, measurements: Path | None, skin: Skin, bundle: Bundle) -> list[Press]:
+    from services.calibration import presses_csv
+    from services.calibration.force_presses import of_file
+    from services.contacts.force.calibration_file import indenter_radius
+
+    if measurements is None:
+        return presses_csv.read(csv, indenter_radius(skin))
+    return presses_csv.read(
+        csv, None, of_file(measurements, skin, bundle, lambda text: print(f"skin: {text}", file=sys.stderr))
     )
 
 
@@ -189,10 +194,7 @@ def _prompted(name: str, bundle: Bundle, read: TouchReader) -> list[Press]:
         reader = AllReader(["image"], name)  # a new one each time: nothing of before the prompt is in it
         try:
             seen = wait_for_press(reader, read, time.monotonic)
-            print(
-                f"  {newton:g} N at ({seen.x * 1e3:+.1f}, {seen.y * 1e3:+.1f}) mm: release",
-                file=sys.stderr,
-            )
+            print(f"  {newton:g} N at ({seen.x * 1e3:+.1f}, {seen.y * 1e3:+.1f}) mm: release", file=sys.stderr)
             presses.append(Press(newton, seen, f"press {len(presses) + 1}", tip))
             wait_for_release(reader, time.monotonic)
         except CalibrationError as why:

@@ -59,12 +59,16 @@ def with_values(command: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(*args: Any, **given: Any) -> Any:
         for name, value in given.items():
             for one in value if isinstance(value, list) else [value]:
-                if expected := _not(one):
-                    found = f"{one:g}" if isinstance(one, float) else repr(one)
-                    fail(f"{_spelled(signature.parameters[name])}: found {found}, expected {expected}", USAGE)
+                _refuse(one, signature.parameters[name])
         return command(*args, **given)
 
     return wrapped
+
+
+def _refuse(value: Any, parameter: inspect.Parameter) -> None:
+    if expected := _not(value):
+        found = f"{value:g}" if isinstance(value, float) else repr(value)
+        fail(f"{_spelled(parameter)}: found {found}, expected {expected}", USAGE)
 
 
 def _not(value: Any) -> str:
@@ -81,8 +85,8 @@ def _not(value: Any) -> str:
 
 def _spelled(parameter: inspect.Parameter) -> str:
     """An option as it is typed, an argument by its name."""
-    for said in getattr(parameter.annotation, "__metadata__", ()):
-        for spelling in (getattr(said, "default", None), *(getattr(said, "param_decls", None) or ())):
+    for option in getattr(parameter.annotation, "__metadata__", ()):
+        for spelling in (getattr(option, "default", None), *(getattr(option, "param_decls", None) or ())):
             if isinstance(spelling, str) and spelling.startswith("--"):
                 return spelling
     return "--" + parameter.name.replace("_", "-")

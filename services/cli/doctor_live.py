@@ -91,7 +91,7 @@ def port(name: str, skin: Skin) -> Iterator[Finding]:
         level = "FAIL" if problem.level == "FAIL" else "WARN"
         yield Finding(level, f"{name}: port", f"{what}: {stub.text}; `skin fault --clear` ends it")
     elif problem.level == "FAIL":
-        yield Finding("FAIL", f"{name}: port", f"{what}: {problem.text}")
+        yield Finding("FAIL", f"{name}: port", problem.text if what in problem.text else f"{what}: {problem.text}")
     else:
         yield Finding("OK", f"{name}: port", f"{what}, in use by the service")
 

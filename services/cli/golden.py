@@ -22,32 +22,35 @@ def golden(
     everything: Annotated[bool, typer.Option("--all", help=f"All differences, not the first {ROWS}.")] = False,
 ) -> None:
     """Run recordings through the stages and compare the contacts with those accepted before (FILE.golden)."""
-    from services.recordings import golden as recorded
-
-    differ = 0
-    for file in files:
-        if not file.is_file():
-            fail(f"no file {file}: expected a recording, FILE.mcap", USAGE)
-        if file.suffix != ".mcap":
-            fail(f"{file} is no recording: expected FILE.mcap", USAGE)
-        before = _before(file, accept)
-        now = recorded.run(file)
-        found = recorded.compare(before, now) if before is not None else None
-        if found is not None:
-            rows = len(found.differences) if everything else ROWS
-            same = not found.differences
-            said = "as accepted" if same else f"{found.differing} differ from {recorded.golden_file(file).name}"
-            print(f"{file}: {found.frames} frames, {said}")
-            for line in (*map(str, found.differences[:rows]), *_more(len(found.differences), rows), *found.summary()):
-                print(f"  {line}")
-            differ += not same
-        if accept:
-            try:
-                print(f"accepted: {recorded.accept(file, now)}")
-            except OSError as why:
-                fail(f"cannot write {recorded.golden_file(file)}: {why.strerror}")
+    differ = sum([_differs(file, accept, everything) for file in files])
     if differ and not accept:
         fail(f"{differ} of {len(files)} recordings give other contacts: mend it, or accept them with --accept", FAILED)
+
+
+def _differs(file: Path, accept: bool, everything: bool) -> bool:
+    """Whether a recording gives other contacts than those accepted before; says which, and accepts them if told to."""
+    from services.recordings import golden as recorded
+
+    if not file.is_file():
+        fail(f"no file {file}: expected a recording, FILE.mcap", USAGE)
+    if file.suffix != ".mcap":
+        fail(f"{file} is no recording: expected FILE.mcap", USAGE)
+    before, now = _before(file, accept), recorded.run(file)
+    differences = []
+    if before is not None:
+        found = recorded.compare(before, now)
+        differences = found.differences
+        rows = len(differences) if everything else ROWS
+        verdict = f"{found.differing} differ from {recorded.golden_file(file).name}" if differences else "as accepted"
+        print(f"{file}: {found.frames} frames, {verdict}")
+        for line in (*map(str, differences[:rows]), *_more(len(differences), rows), *found.summary()):
+            print(f"  {line}")
+    if accept:
+        try:
+            print(f"accepted: {recorded.accept(file, now)}")
+        except OSError as why:
+            fail(f"cannot write {recorded.golden_file(file)}: {why.strerror}")
+    return bool(differences)
 
 
 def _before(file: Path, accept: bool) -> list[dict[str, object]] | None:

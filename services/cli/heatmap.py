@@ -57,22 +57,23 @@ def draw(
     text = Text()
     for row in range(cells // 2 - 1, -1, -1):
         for column in range(cells):
-            pair = values[[2 * row + 1, 2 * row], column]
-            on = covered[[2 * row + 1, 2 * row], column]
-            if (row, column) in marks:
-                style = f"bold white on {_rgb(pair[1])}" if coloured else ""
-                text.append("+" if coloured else "X", style=style)
-            elif not coloured:
-                letter = LETTERS[min(int(pair.max() * len(LETTERS)), len(LETTERS) - 1)]
-                text.append(letter if on.any() else " ")
-            elif on.all():
-                text.append("▀", style=f"{_rgb(pair[0])} on {_rgb(pair[1])}")
-            elif on.any():
-                text.append("▀" if on[0] else "▄", style=_rgb(pair[0 if on[0] else 1]))
-            else:
-                text.append(" ")
+            two = [2 * row + 1, 2 * row], column
+            text.append(*_character(values[two], covered[two], (row, column) in marks, coloured))
         text.append("\n")
     return text
+
+
+def _character(pair: NDArray[np.floating[Any]], on: NDArray[np.bool_], marked: bool, coloured: bool) -> tuple[str, str]:
+    """The character of two cells, the upper one first, and its style. on: which of them are on the skin."""
+    if marked:
+        return ("+", f"bold white on {_rgb(pair[1])}") if coloured else ("X", "")
+    if not on.any():
+        return " ", ""
+    if not coloured:
+        return LETTERS[min(int(pair.max() * len(LETTERS)), len(LETTERS) - 1)], ""
+    if on.all():
+        return "▀", f"{_rgb(pair[0])} on {_rgb(pair[1])}"
+    return ("▀", _rgb(pair[0])) if on[0] else ("▄", _rgb(pair[1]))
 
 
 def framed(skin: Text, half_width_m: float, full_scale: float, coloured: bool = True) -> Text:

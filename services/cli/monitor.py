@@ -101,7 +101,7 @@ class Monitor:
             self.topics[TOPIC_OF[type(frame)].name].add(frame, now_s)
 
     @property
-    def heard(self) -> bool:
+    def received(self) -> bool:
         return bool(self.processes) or any(row.last for row in self.topics.values())
 
     @property

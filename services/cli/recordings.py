@@ -31,6 +31,7 @@ RecordedSkin = Annotated[str, typer.Option("--skin", help="Which skin; default: 
 if TYPE_CHECKING:
     from protocol.frames import ContactFrame
     from services.recordings.recorder import Recorder
+    from services.recordings.triggers import Trigger
 
 
 def register(app: typer.Typer) -> None:
@@ -67,16 +68,9 @@ def record(
 
     from services.recordings.recorder import Recorder
     from services.recordings.rotation import Rotation
-    from services.recordings.snapshots import LONGEST_S, Keeping
-    from services.recordings.triggers import TRIGGERS
+    from services.recordings.snapshots import Keeping
 
-    wanted = tuple(name for name in TRIGGERS if name in (trigger or ()))
-    if trigger and set(trigger) - set(wanted):
-        fail(f"found --trigger {' '.join(trigger)}, expected some of {', '.join(TRIGGERS)}", USAGE)
-    if trigger and (file.suffix == ".mcap" or file.is_file()):
-        fail(f"found the file {file}, but --trigger writes a file for each event: name a folder", USAGE)
-    if not 0 < before <= 600 or after > LONGEST_S:
-        fail(f"found --before {before:g} --after {after:g}, expected above 0 to 600 and 0 to {LONGEST_S:g} s", USAGE)
+    wanted = _triggers(trigger or [], file, before, after)
     use_configured_sockets()
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -92,8 +86,30 @@ def record(
         with console.status(what) as status:
             while not stop.is_set() and time.monotonic() < end:
                 recorder.step(0.1)
-                said = f"  {recorder.problem}" if recorder.problem else ""
-                status.update(f"{what}: {_counted(recorder) or 'nothing yet'}{said}  (Ctrl-C ends it)")
+                problem = f"  {recorder.problem}" if recorder.problem else ""
+                status.update(f"{what}: {_counted(recorder) or 'nothing yet'}{problem}  (Ctrl-C ends it)")
+    _print_recorded(file, recorder, as_json)
+    if recorder.problem:
+        fail(f"{file}: {recorder.problem}", INCOMPLETE)
+    if not recorder.received:
+        fail("nothing was recorded: is the service running (`skin up`)?", 3)
+
+
+def _triggers(wanted: list[str], folder: Path, before: float, after: float) -> tuple[Trigger, ...]:
+    """The triggers that are wanted, in the order of TRIGGERS; refuses what is none, and what does not go with them."""
+    from services.recordings.snapshots import LONGEST_S
+    from services.recordings.triggers import TRIGGERS
+
+    if set(wanted) - set(TRIGGERS):
+        fail(f"found --trigger {' '.join(wanted)}, expected some of {', '.join(TRIGGERS)}", USAGE)
+    if wanted and (folder.suffix == ".mcap" or folder.is_file()):
+        fail(f"found the file {folder}, but --trigger writes a file for each event: name a folder", USAGE)
+    if not 0 < before <= 600 or after > LONGEST_S:
+        fail(f"found --before {before:g} --after {after:g}, expected above 0 to 600 and 0 to {LONGEST_S:g} s", USAGE)
+    return tuple(name for name in TRIGGERS if name in wanted)
+
+
+def _print_recorded(file: Path, recorder: Recorder, as_json: bool) -> None:
     result: dict[str, Any] = {"file": str(file), "messages": _counts(recorder), "gaps": recorder.gaps}
     if (writer := recorder.writer) is not None:
         result |= {"bytes": writer.bytes, "files": writer.files, "deleted": writer.deleted, "unwritten": writer.lost}
@@ -108,17 +124,13 @@ def record(
         size = f"{result['bytes'] / 1e6:.1f} MB{files}"
         missed = f"{recorder.gaps} messages missed, {result['unwritten']} not written"
         print(f"{file}: {_counted(recorder) or 'nothing'}; {size}; {missed}")
-    if recorder.problem:
-        fail(f"{file}: {recorder.problem}", INCOMPLETE)
-    if not recorder.heard:
-        fail("nothing was recorded: is the service running (`skin up`)?", 3)
 
 
 def _counts(recorder: Recorder) -> dict[str, int]:
     """Messages by topic: those recorded, or where snapshots alone are taken, those that came."""
     if recorder.writer is not None:
         return recorder.writer.counts
-    return {f"{topic}/{name}": n for (topic, name), n in recorder.heard.items()}
+    return {f"{topic}/{name}": n for (topic, name), n in recorder.received.items()}
 
 
 def _counted(recorder: Recorder) -> str:

@@ -24,7 +24,7 @@ def screen(monitor: Monitor, width: int, coloured: bool = True, live: bool = Fal
     """The whole page for a terminal of so many columns: 24 lines where it is narrower than WIDE."""
     now = monitor.snapshot()
     leaves = Text("\nq leaves", style="dim") if live else Text()
-    if not monitor.heard:
+    if not monitor.received:
         waiting = f"waiting for frames of skin {monitor.skin!r}: start the service with `skin up`"
         return Group(Text(waiting, style="yellow"), leaves)
     wide = width >= WIDE
@@ -132,7 +132,7 @@ def _skin(monitor: Monitor, coloured: bool) -> RenderableType:
     drop = image.image if image is not None else None
     geometry = monitor.info.get("geometry") or {}
     outline = np.asarray(geometry.get("outline", np.zeros((0, 2)))).tolist() or None
-    half = max((abs(v) for point in outline for v in point), default=0.05) if outline else 0.05
+    half = max((abs(v) for point in outline or () for v in point), default=0.05)
     if image is not None:
         half = max(half, -min(image.origin))
     marks = [c.on_sheet for c in contact.contacts if c.state != "end"] if contact else []

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
+from itertools import islice
 from statistics import median
 from typing import Any
 
@@ -44,33 +46,40 @@ def pairs(truth: TruthFrame, contact: ContactFrame) -> list[dict[str, Any]]:
 
 def compare_for(skin: str, seconds: float, count: int, as_json: bool) -> None:
     """Until `count` frames were compared (0: without end), or `seconds` have passed."""
+    rows: list[dict[str, Any]] = []
+    received: set[str] = set()
+    compared = 0
+    for truth, contact in islice(_paired(skin, time.monotonic() + seconds, received), count or None):
+        compared += 1
+        for row in pairs(truth, contact):
+            rows.append(row)
+            emit(row) if as_json else print(_line(row), flush=True)
+    if "contact" not in received:
+        fail(nobody(skin, seconds), NOT_RUNNING)
+    if "truth" not in received:
+        fail(f"no truth/{skin} came: only the stub board knows the truth", NOT_RUNNING)
+    _summary(rows, compared, as_json)
+
+
+def _paired(skin: str, end_s: float, received: set[str]) -> Iterator[tuple[TruthFrame, ContactFrame]]:
+    """The frames of each scan, which come over two sockets. received: gets the topics that came."""
     contacts, truths = AllReader(["contact"], skin), AllReader(["truth"], skin)
     known: dict[int, TruthFrame] = {}
     waiting: dict[int, ContactFrame] = {}
-    rows: list[dict[str, Any]] = []
-    end = time.monotonic() + seconds
-    heard_contact = heard_truth = False
-    compared = 0
-    while (now := time.monotonic()) < end and not 0 < count <= compared:
-        frame = contacts.recv(min(0.05, end - now))
+    while (now := time.monotonic()) < end_s:
+        frame = contacts.recv(min(0.05, end_s - now))
         if isinstance(frame, ContactFrame):
-            waiting[frame.scan], heard_contact = frame, True
+            waiting[frame.scan] = frame
+            received.add("contact")
         while (true := truths.recv(0.0)) is not None:
             if isinstance(true, TruthFrame):
-                known[true.scan], heard_truth = true, True
-        for scan in sorted(waiting.keys() & known.keys())[: count - compared if count else None]:
-            compared += 1
-            for row in pairs(known.pop(scan), waiting.pop(scan)):
-                rows.append(row)
-                emit(row) if as_json else print(_line(row), flush=True)
+                known[true.scan] = true
+                received.add("truth")
+        for scan in sorted(waiting.keys() & known.keys()):
+            yield known.pop(scan), waiting.pop(scan)
         for old in (known, waiting):
             while len(old) > 200:
                 old.pop(next(iter(old)))
-    if not heard_contact:
-        fail(nobody(skin, seconds), NOT_RUNNING)
-    if not heard_truth:
-        fail(f"no truth/{skin} came: only the stub board knows the truth", NOT_RUNNING)
-    _summary(rows, compared, as_json)
 
 
 def _line(row: dict[str, Any]) -> str:

@@ -46,23 +46,28 @@ def top(
         fail("the output is no terminal, expected one to draw on: give --once for one look, or --json", USAGE)
     use_configured_sockets()
     monitor = Monitor(skin_name(skin))
-    if once or as_json:
-        while True:
-            monitor.read(seconds)
-            if not monitor.heard:
-                fail(nobody(monitor.skin, seconds), NOT_RUNNING)
-            if as_json:
-                emit(monitor.snapshot())
-            else:
-                from rich.console import Console
+    if not (once or as_json):
+        _live(monitor)
+        return
+    _look(monitor, seconds, as_json)
+    while not once:
+        _look(monitor, seconds, as_json)
 
-                from services.cli.screen import screen
 
-                console = Console()
-                console.print(screen(monitor, console.width, coloured=console.is_terminal))
-            if once:
-                return
-    _live(monitor)
+def _look(monitor: Monitor, seconds: float, as_json: bool) -> None:
+    """Watches for so long, and prints what is there."""
+    monitor.read(seconds)
+    if not monitor.received:
+        fail(nobody(monitor.skin, seconds), NOT_RUNNING)
+    if as_json:
+        emit(monitor.snapshot())
+        return
+    from rich.console import Console
+
+    from services.cli.screen import screen
+
+    console = Console()
+    console.print(screen(monitor, console.width, coloured=console.is_terminal))
 
 
 def _live(monitor: Monitor) -> None:

@@ -63,32 +63,36 @@ class Damage:
         return not (any(found) or self.missing or self.unwritten)
 
     def __str__(self) -> str:
-        parts = [f"{self.recordings} recordings joined"] if self.recordings > 1 else []
-        parts += ["cut short: it has no end"] if self.truncated else []
-        parts += [f"reading failed: {self.medium}"] if self.medium else []
-        if self.places:
-            what = "zeros" if self.zeros == self.lost_bytes > 0 else "damaged"
-            parts += [f"{self.lost_bytes} bytes {what} in {self.places} place(s), the first at byte {self.first_place}"]
-        parts += [f"{self.bad_chunks} chunk(s) with a wrong checksum left out"] if self.bad_chunks else []
-        parts += [f"{self.too_large} chunk(s) of more than 16 MB left out"] if self.too_large else []
-        parts += ["its index is damaged"] if self.index else []
-        parts += [f"{self.nameless} message(s) of an unknown topic left out"] if self.nameless else []
-        parts += [self._missing()] if self.missing else []
-        if self.unwritten:
-            by_topic = ", ".join(f"{topic} {n}" for topic, n in self.unwritten.items())
-            parts += [f"{self.unwritten.total()} message(s) could not be written when it was recorded ({by_topic})"]
-        if not self.whole and not (self.missing or self.nameless or self.unwritten or self.truncated):
-            parts += ["no message is missing" if self.confirmed else "how many messages are missing is not known"]
-        return "; ".join(parts) or "whole"
+        what = "zeros" if self.zeros == self.lost_bytes > 0 else "damaged"
+        first = f"the first at byte {self.first_place}"
+        unwritten = ", ".join(f"{topic} {n}" for topic, n in self.unwritten.items())
+        in_form_alone = not (self.whole or self.missing or self.nameless or self.unwritten or self.truncated)
+        remarks = (
+            (self.recordings > 1, f"{self.recordings} recordings joined"),
+            (self.truncated, "cut short: it has no end"),
+            (self.medium, f"reading failed: {self.medium}"),
+            (self.places, f"{self.lost_bytes} bytes {what} in {self.places} place(s), {first}"),
+            (self.bad_chunks, f"{self.bad_chunks} chunk(s) with a wrong checksum left out"),
+            (self.too_large, f"{self.too_large} chunk(s) of more than 16 MB left out"),
+            (self.index, "its index is damaged"),
+            (self.nameless, f"{self.nameless} message(s) of an unknown topic left out"),
+            (self.missing, self._missing()),
+            (unwritten, f"{self.unwritten.total()} message(s) could not be written when it was recorded ({unwritten})"),
+            (
+                in_form_alone,
+                "no message is missing" if self.confirmed else "how many messages are missing is not known",
+            ),
+        )
+        return "; ".join(text for applies, text in remarks if applies) or "whole"
 
     def _missing(self) -> str:
-        said = []
+        topics = []
         for topic, count in self.missing.items():
             spans = [str(span) for span in self.scans if span.topic == topic]
             more = [f"and {len(spans) - SHOWN} more"] if len(spans) > SHOWN else []
-            said.append(f"{topic} {count}" + (f" ({', '.join(spans[:SHOWN] + more)})" if spans else ""))
+            topics.append(f"{topic} {count}" + (f" ({', '.join(spans[:SHOWN] + more)})" if spans else ""))
         least = "" if self.confirmed else "at least "
-        return f"{least}{self.missing.total()} message(s) cannot be read: {', '.join(said)}"
+        return f"{least}{self.missing.total()} message(s) cannot be read: {', '.join(topics)}"
 
 
 class MissingMessages:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.errors import in_words
 from protocol.frames import FrameError, RawFrame, unpack
 from protocol.pause import pause
 from services.board.source import POLL_S, Source
@@ -32,7 +33,7 @@ class RecordingSource(Source):
         try:
             yield from self._recorded(Path(self.skin.port))
         except (RecordingError, OSError) as why:
-            self.problem = str(why)
+            self.problem = in_words(why)
         yield from self._ended(f"the recording {self.skin.port} has ended")
 
     def _recorded(self, path: Path) -> Iterator[RawFrame | None]:

@@ -131,11 +131,11 @@ def _bundle(reader: RecordingReader, skins: list[str]) -> Path | None:
     is asked.
     """
     recorded = settings.read(reader.metadata.get(settings.KEY, ""), reader.path).skins
-    said = [recorded[name] for name in skins if name in recorded]
-    installed = {Bundle.load(one.bundle).hash for one in said if (BUNDLES / one.bundle).is_dir()}
-    if not said or all(one.bundle_hash in installed for one in said):
+    listed = [recorded[name] for name in skins if name in recorded]
+    installed = {Bundle.load(one.bundle).hash for one in listed if (BUNDLES / one.bundle).is_dir()}
+    if not listed or all(one.bundle_hash in installed for one in listed):
         return None
-    return BUNDLES / said[0].bundle if (BUNDLES / said[0].bundle).is_dir() else None
+    return BUNDLES / listed[0].bundle if (BUNDLES / listed[0].bundle).is_dir() else None
 
 
 def _lines(source: Iterator[Step], pipelines: dict[str, Pipeline]) -> Iterator[dict[str, Any]]:
@@ -239,35 +239,38 @@ class _Runs:
     def all(self) -> list[Difference]:
         flags = list(self._flags())
         few = len({d.scan for d in flags}) <= self.allowed
-        return [*self._touches(), *([] if few else flags), *self._counts()]
+        return [*self._touches(), *self._frames(), *([] if few else flags), *self._counts()]
 
     def _at(self, scan: int, name: str, accepted: Any, found: Any, limit: float | None = None) -> Difference:
         where = scan, self.lines[scan]["at_s"], self.lines[scan]["skin"], name, accepted, found
         return Difference(*where) if limit is None else Difference(*where, abs(found - accepted), limit)
 
     def _touches(self) -> Iterator[Difference]:
-        """Which contacts there are, when they begin and end, and their numbers while both are held."""
+        """Which contacts there are, and how those of both runs differ."""
         old, new = _touches(self.old), _touches(self.new)
         for key in sorted(old.keys() | new.keys()):
-            name = f"contact {key}"
-            if key not in old or key not in new:
-                there = (True, False) if key in old else (False, True)
-                yield self._at(min(old.get(key) or new[key]), name, *there)
-                continue
-            one, other = old[key], new[key]
-            spans = (min(one), max(one)), (min(other), max(other))
-            for what, was, found in zip(("begins at scan", "ends at scan"), *spans, strict=True):
-                if abs(was - found) > self.scan:
-                    yield self._at(found, f"{name} {what}", was, found, self.scan)
-            told = [sorted({contact["state"] for contact in run.values()}) for run in (one, other)]
-            if told[0] != told[1]:
-                yield self._at(max(other), f"{name} states", told[0], told[1])
-            same = spans[0] == spans[1]
-            first = max(min(one), min(other)) + (0 if same else self.scan)
-            last = min(max(one), max(other)) - (0 if same else self.scan)
-            for scan in sorted(one.keys() & other.keys()):
-                if first <= scan <= last and one[scan]["state"] == other[scan]["state"] == "hold":
-                    yield from self._numbers(scan, f"{name} ", one[scan], other[scan])
+            if key in old and key in new:
+                yield from self._touch(f"contact {key}", old[key], new[key])
+            else:
+                yield self._at(min(old.get(key) or new[key]), f"contact {key}", key in old, key in new)
+
+    def _touch(self, name: str, one: dict[int, Line], other: dict[int, Line]) -> Iterator[Difference]:
+        """When a contact begins and ends, its states, and its numbers while both runs hold it."""
+        spans = (min(one), max(one)), (min(other), max(other))
+        for what, was, found in zip(("begins at scan", "ends at scan"), *spans, strict=True):
+            if abs(was - found) > self.scan:
+                yield self._at(found, f"{name} {what}", was, found, self.scan)
+        before, now = (sorted({contact["state"] for contact in run.values()}) for run in (one, other))
+        if before != now:
+            yield self._at(max(other), f"{name} states", before, now)
+        margin = 0 if spans[0] == spans[1] else self.scan
+        both = range(max(min(one), min(other)) + margin, min(max(one), max(other)) - margin + 1)
+        for scan in sorted(one.keys() & other.keys()):
+            if scan in both and one[scan]["state"] == other[scan]["state"] == "hold":
+                yield from self._numbers(scan, f"{name} ", one[scan], other[scan])
+
+    def _frames(self) -> Iterator[Difference]:
+        """The numbers of frames that are valid in both runs."""
         for scan in sorted(self.old.keys() & self.new.keys()):
             if self.old[scan].get("valid") and self.new[scan].get("valid"):
                 yield from self._numbers(scan, "", self.old[scan], self.new[scan])
@@ -283,7 +286,7 @@ class _Runs:
 
     def _flags(self) -> Iterator[Difference]:
         """Frames where something is said that the other run says of no frame within one scan."""
-        old, new = _said(self.old), _said(self.new)
+        old, new = _flagged(self.old), _flagged(self.new)
         for name in old.keys() | new.keys():
             there = old.get(name, set()), new.get(name, set())
             for scan in sorted(there[0] ^ there[1]):
@@ -293,10 +296,10 @@ class _Runs:
 
     def _counts(self) -> Iterator[Difference]:
         """In how many frames each thing is said: a span may be longer or shorter by a scan at each of its ends."""
-        old, new = _said(self.old), _said(self.new)
-        for runs, said in ((self.old, old), (self.new, new)):
-            said["held"] = {scan for scan, line in runs.items() if line.get("held")}
-            said["changing"] = {scan for scan, line in runs.items() if "changing" in line.get("reasons", ())}
+        old, new = _flagged(self.old), _flagged(self.new)
+        for runs, flagged in ((self.old, old), (self.new, new)):
+            flagged["held"] = {scan for scan, line in runs.items() if line.get("held")}
+            flagged["changing"] = {scan for scan, line in runs.items() if "changing" in line.get("reasons", ())}
         for name in old.keys() | new.keys():
             was, found = old.get(name, set()), new.get(name, set())
             spans = sum(not any(near in was for near in range(scan - self.scan, scan)) for scan in was)
@@ -315,16 +318,16 @@ def _touches(lines: dict[int, Line]) -> dict[int, dict[int, Line]]:
     return found
 
 
-def _said(lines: dict[int, Line]) -> dict[str, set[int]]:
+def _flagged(lines: dict[int, Line]) -> dict[str, set[int]]:
     """What is said of a frame beside numbers -> the scans of those frames."""
     found: dict[str, set[int]] = {}
     for scan, line in lines.items():
-        said = ["frame", *(reason for reason in line.get("reasons", ()) if reason != "changing")]
-        said += [] if line.get("valid") else ["not valid"]
+        flagged = ["frame", *(reason for reason in line.get("reasons", ()) if reason != "changing")]
+        flagged += [] if line.get("valid") else ["not valid"]
         for contact in line["contacts"]:
             shape = [f"contact {contact['id']} {contact['shape']}"] if contact["state"] == "hold" else []
-            said += [f"contact {contact['id']} is there", *shape]
-        for name in said:
+            flagged += [f"contact {contact['id']} is there", *shape]
+        for name in flagged:
             found.setdefault(name, set()).add(scan)
     return found
 

@@ -117,7 +117,8 @@ class McapScan:
         if len(head) < _HEAD.size:
             return None, at
         kind, length = _HEAD.unpack_from(head)
-        body, sound = head[_HEAD.size :], (known := self._head(at)) is not None and self._follows(at + 9 + known[1])
+        known = self._head(at)
+        body, sound = head[_HEAD.size :], known is not None and self._follows(at + _HEAD.size + known[1])
         end = at + _HEAD.size + length
         if kind == Opcode.CHUNK or _is_chunk(body, length):
             if not self._unpack:
@@ -126,8 +127,11 @@ class McapScan:
             if found is not None and (kind != Opcode.CHUNK or last != end):  # its head alone is damaged
                 self.damage.lose(at, at)
             return found, last
-        if known is None:
-            return None, at
+        return (None, at) if known is None else self._plain(at, kind, length, sound)
+
+    def _plain(self, at: int, kind: int, length: int, sound: bool) -> tuple[ScannedRecord | None, int]:
+        """A record that is no chunk; sound: another one follows it."""
+        end = at + _HEAD.size + length
         body = self.read(at + _HEAD.size, length)
         for named in (kind, Opcode.METADATA):  # which may have lost its kind, and with it what a replay needs
             if named in _KINDS and parsed(named, body) is not None:

@@ -46,13 +46,6 @@ class PatientFile:
             except OSError as bad:
                 self.full = os.strerror(bad.errno or 0)
 
-    def give_way(self) -> None:
-        """The same where nothing is in this one: what is there stays."""
-        if self._now != self._path and self._path.exists():
-            self.remove()
-        else:
-            self.replace()
-
     def remove(self) -> None:
         """Delete it: nothing is in it."""
         with contextlib.suppress(OSError):

@@ -58,7 +58,7 @@ class Recorder:
                 raise RecordingError(f"no topic {name!r}: expected some of {', '.join(TOPICS)}")
         self.writer: RotatingWriter | None = None
         """What the recording goes to; None while none is made."""
-        self.heard: Counter[tuple[str, str]] = Counter()
+        self.received: Counter[tuple[str, str]] = Counter()
         """Messages that came, by topic and skin."""
         self._ended: RotatingWriter | None = None  # what the last one went to
         self._latched: dict[str, RecordedMessage] = {}
@@ -67,7 +67,7 @@ class Recorder:
         self._zero_ns = (
             time.time_ns() - time.monotonic_ns()
         )  # a clock that is set meanwhile must not tear the file's times
-        self._said = metadata(self.topics, skin, config)  # as the service was started: files may change meanwhile
+        self._origin = metadata(self.topics, skin, config)  # as the service was started: files may change meanwhile
         self.reader, self.states = AllReader(self.topics, skin), StateReader()
         if path is not None:
             self.record(path, overwrite)
@@ -133,8 +133,8 @@ class Recorder:
         name, _, data = message.partition(b"\0")
         found = RecordedMessage(name.decode(), self.now_ns(), data)
         counted = found.topic.partition("/")[0], frame.skin
-        if counted in self.heard or len(self.heard) < MOST_LATCHED:
-            self.heard[counted] += 1
+        if counted in self.received or len(self.received) < MOST_LATCHED:
+            self.received[counted] += 1
         key = ""
         if isinstance(frame, (StatusFrame, InfoFrame)):
             key = f"{found.topic}/{frame.process}"
@@ -143,11 +143,11 @@ class Recorder:
         self._put(RingEntry(found, key), frame)
         self._ask_states(frame)
 
-    def _put(self, heard: RingEntry, frame: Frame | None, in_file: bool = True) -> None:
-        if self.writer is not None and in_file and self.writer.write(heard.message):
+    def _put(self, entry: RingEntry, frame: Frame | None, in_file: bool = True) -> None:
+        if self.writer is not None and in_file and self.writer.write(entry.message):
             self._ask_for_file()
         if self.snapshots is not None:
-            self.snapshots.hear(heard, frame)
+            self.snapshots.hear(entry, frame)
 
     def _ask_states(self, frame: Frame) -> None:
         """Ask at the first frame of a skin, and after each tare: the state holds how drift is followed from there. For
@@ -155,11 +155,11 @@ class Recorder:
         """
         if isinstance(frame, StatusFrame):  # which comes before the stages answer
             return
-        now, asked = time.monotonic(), self._skins.get(frame.skin)
-        if asked is None and len(self._skins) < MOST_SKINS:
+        now, requested_s = time.monotonic(), self._skins.get(frame.skin)
+        if requested_s is None and len(self._skins) < MOST_SKINS:
             self._skins[frame.skin] = now
             self.states.ask(frame.skin, "ring" if self.writer is None else "file")
-        elif asked is not None and self.snapshots is not None and now - asked >= STATE_EVERY_S:
+        elif requested_s is not None and self.snapshots is not None and now - requested_s >= STATE_EVERY_S:
             self._skins[frame.skin] = now
             self.states.ask(frame.skin, "ring")
         if isinstance(frame, InfoFrame) and (found := frame.info.get("tare_sample_ns")) is not None:
@@ -191,7 +191,7 @@ class Recorder:
 
     def _metadata(self, event: str = "") -> dict[str, str]:
         started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        return {**self._said, "started": started} | ({"origin": "snapshot", "event": event} if event else {})
+        return {**self._origin, "started": started} | ({"origin": "snapshot", "event": event} if event else {})
 
     def close(self) -> None:
         self.states.close()

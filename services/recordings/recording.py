@@ -182,7 +182,9 @@ class RecordingWriter:
         return dict(self._sequence)
 
     def close(self) -> None:
-        """Ends the file, which is whole then: what could not be written is cut off, and the file says how much."""
+        """Ends the file, which is whole then: what could not be written is cut off, and the file says how much. Without
+        a message no file is left.
+        """
         if self._file.closed:
             return
         self._close_chunk()
@@ -198,7 +200,7 @@ class RecordingWriter:
         if self._sequence:
             self._file.replace()
         else:
-            self._file.give_way()
+            self._file.remove()
         self._file.close()
         self.why = self.full or self.why
 

@@ -48,30 +48,34 @@ def steps(reader: RecordingReader, start_s: float = 0.0, only: str = "") -> Iter
     The first state of a skin goes before its first frame: the recorder asked for it on seeing that frame. Malformed
     messages are left out. Raises ReplayError where nothing lies behind `start_s`.
     """
-    first_ns: int | None = None
-    last_ns, any_raw = 0, False
+    last_ns: int | None = None
+    any_raw = False
     latest = _first_states(reader)
     held = set(latest)
-    for message in reader.messages({"raw", STATE_TOPIC}):
-        first_ns = message.log_time_ns if first_ns is None else first_ns
-        step = _step(message)
-        if step is None or (only and step.skin != only):
-            continue
-        last_ns = message.log_time_ns
+    for last_ns, step in _timed_steps(reader, only):
         if step.raw is None and step.skin in held:
             held.remove(step.skin)  # that one is in `latest` already
-        elif message.log_time_ns - first_ns >= start_s * 1e9:
+        elif last_ns >= start_s * 1e9:
             if step.skin in latest:
                 yield latest.pop(step.skin)
             any_raw = any_raw or step.raw is not None
             yield step
         elif step.raw is None:
             latest[step.skin] = step
-    if start_s > 0 and not any_raw and first_ns is not None:
-        long_s = (last_ns - first_ns) * 1e-9
+    if start_s > 0 and not any_raw and last_ns is not None:
         raise ReplayError(
-            f"found --from {start_s:g}, but {reader.path} is only {long_s:.1f} s long: begin before its end"
+            f"found --from {start_s:g}, but {reader.path} is only {last_ns * 1e-9:.1f} s long: begin before its end"
         )
+
+
+def _timed_steps(reader: RecordingReader, only: str) -> Iterator[tuple[int, Step]]:
+    """The steps of one skin ("": of all), each with its time from the first message on [ns]."""
+    first_ns: int | None = None
+    for message in reader.messages({"raw", STATE_TOPIC}):
+        first_ns = message.log_time_ns if first_ns is None else first_ns
+        step = _step(message)
+        if step is not None and only in ("", step.skin):
+            yield message.log_time_ns - first_ns, step
 
 
 def _first_states(reader: RecordingReader) -> dict[str, Step]:

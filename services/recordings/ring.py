@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 
-from services.recordings.recording import STATE_TOPIC, RecordedMessage
+from services.recordings.recording import RecordedMessage
 
 OVERHEAD_BYTES = 200
 """Of a message in memory, beside its data."""
@@ -41,11 +41,11 @@ class Ring:
         self._held: deque[RingEntry] = deque()
         self._before: dict[str, RecordedMessage] = {}
 
-    def add(self, heard: RingEntry) -> None:
+    def add(self, entry: RingEntry) -> None:
         """A message, the newest."""
-        self._held.append(heard)
-        self.bytes += heard.size
-        oldest_ns = heard.message.log_time_ns - self.seconds * 1e9
+        self._held.append(entry)
+        self.bytes += entry.size
+        oldest_ns = entry.message.log_time_ns - self.seconds * 1e9
         while self._held[0].message.log_time_ns < oldest_ns or (self.bytes > self.most_bytes and len(self._held) > 1):
             gone = self._held.popleft()
             self.bytes -= gone.size
@@ -61,19 +61,12 @@ class Ring:
         states = [k for k, h in enumerate(held) if h.again and h.message.log_time_ns <= begin_ns]
         last_of = {held[k].key: k for k in states}
         first = min(last_of.values(), default=next((k for k, h in enumerate(held) if _at(h) >= begin_ns), len(held)))
-        latched, tail = dict(self._before), []
-        for k, h in enumerate(held):
-            if h.key in last_of and k == last_of[h.key]:
-                latched.pop(h.key, None)  # an older state of this skin
-                tail.append(h.message)
-            elif k < first:
-                if h.key:
-                    latched[h.key] = h.message
-            elif not h.again:
-                tail.append(h.message)
+        latched = self._before | {h.key: h.message for h in held[:first] if h.key}
+        for key in last_of:
+            latched.pop(key, None)  # an older state of this skin
+        tail = [h.message for k, h in enumerate(held[first:], first) if not h.again or last_of.get(h.key) == k]
         start_ns = tail[0].log_time_ns if tail else begin_ns
-        head = [m for key, m in latched.items() if not (key.startswith(f"{STATE_TOPIC}/") and key in last_of)]
-        return [replace(m, log_time_ns=start_ns) for m in head] + tail
+        return [replace(message, log_time_ns=start_ns) for message in latched.values()] + tail
 
     @property
     def held_s(self) -> float:
@@ -81,5 +74,5 @@ class Ring:
         return (_at(self._held[-1]) - _at(self._held[0])) * 1e-9 if self._held else 0.0
 
 
-def _at(heard: RingEntry) -> int:
-    return heard.message.log_time_ns
+def _at(entry: RingEntry) -> int:
+    return entry.message.log_time_ns

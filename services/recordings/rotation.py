@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from protocol.errors import in_words
 from services.recordings.recording import RecordedMessage, RecordingError, RecordingWriter
 
 RETRY_S = 10.0
@@ -59,7 +60,7 @@ class RotatingWriter:
         """Why no new file could begin; "" while all is well."""
         self.torn = ""
         """What became of the last file that was deleted or moved while it was written; "" where none was."""
-        self._tear, self._looked_s = "", self._began_s
+        self._tear, self._checked_s = "", self._began_s
         self.nowhere = False
         """Whether the file is gone and no other could begin: nothing is recorded."""
         self.ended = False
@@ -77,9 +78,9 @@ class RotatingWriter:
         """Whether a new file has begun, which lacks the stages' state, because the one before was deleted or moved.
         Looks every LOOK_S, or `now`.
         """
-        if not now and time.monotonic() - self._looked_s < LOOK_S:
+        if not now and time.monotonic() - self._checked_s < LOOK_S:
             return False
-        self._looked_s = time.monotonic()
+        self._checked_s = time.monotonic()
         if not self.nowhere:
             how = self._writer.elsewhere
             if not how:
@@ -105,7 +106,7 @@ class RotatingWriter:
             path.parent.mkdir(mode=PRIVATE, exist_ok=True)
             self._writer = RecordingWriter(path, self._metadata())
         except (RecordingError, OSError) as why:
-            self.torn = f"{self._tear}; nothing is recorded until a file can begin again: {why}"
+            self.torn = f"{self._tear}; nothing is recorded until a file can begin again: {in_words(why)}"
             return False
         self.nowhere, self.path = False, path
         self.torn = f"{self._tear}; the recording goes on in {path}"
@@ -129,7 +130,7 @@ class RotatingWriter:
         path = self._following(self.files + 1)
         try:
             following = RecordingWriter(path, self._metadata())
-        except (RecordingError, OSError) as why:
+        except RecordingError as why:
             self.problem, self._retry_s = f"{why}; recording goes on in {self.path}", time.monotonic() + RETRY_S
             log.error("%s", self.problem)
             return False
@@ -183,13 +184,13 @@ class RotatingWriter:
         lost, why = self.lost, (self.full or self._writer.why or self._why)
         found = [text for text in (self.problem, self.torn) if text]
         if self.ended:
-            said = f"{lost} of {lost + sum(self.counts.values())} messages are not in {self.path.parent}"
-            said = said if lost else f"it is not known whether all of {self.path} is on the medium"
-            return [f"{why or 'a file was taken away'}: {said}", *found] if lost or self.full else found
+            summary = f"{lost} of {lost + sum(self.counts.values())} messages are not in {self.path.parent}"
+            summary = summary if lost else f"it is not known whether all of {self.path} is on the medium"
+            return [f"{why or 'a file was taken away'}: {summary}", *found] if lost or self.full else found
         if self.full:
-            said = f"{lost} messages are lost so far" if lost else "nothing is lost yet"
+            summary = f"{lost} messages are lost so far" if lost else "nothing is lost yet"
             advice = ADVICE.get(self.full, "see what is wrong with {}").format(self.path.resolve().parent)
-            return [f"{self.full}: {advice}; {said}, recording goes on by itself when it can", *found]
+            return [f"{self.full}: {advice}; {summary}, recording goes on by itself when it can", *found]
         return [f"{lost} messages are lost so far: {why}", *found] if lost and not self.torn else found
 
     def close(self) -> None:

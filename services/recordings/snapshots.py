@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from protocol.errors import in_words
 from protocol.frames import Frame
 from services.recordings.recording import RecordingError, RecordingWriter
 from services.recordings.ring import Ring, RingEntry
@@ -112,7 +113,7 @@ class Snapshots:
         except (RecordingError, OSError) as why:
             self.missed += 1
             self._end()
-            self._failed(f"no snapshot ({event}): {why}")
+            self._failed(f"no snapshot ({event}): {in_words(why)}")
             raise RecordingError(self.problem) from None
         self.taken += 1
         self.last, self.problem = str(path), ""

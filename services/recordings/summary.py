@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from protocol.frames import ContactFrame, Frame, FrameError, StatusFrame, unpack
+from protocol.frames import Contact, ContactFrame, Frame, FrameError, StatusFrame, unpack
 from services.recordings.damage import Damage
 from services.recordings.recording import STATE_TOPIC, RecordedMessage, RecordingReader
 from services.recordings.triggers import NO_FAULTS
@@ -138,13 +138,13 @@ class _Reading:
         if isinstance(frame, ContactFrame):
             self._contact(frame, at_s)
         elif isinstance(frame, StatusFrame) and frame.level in ("ERROR", "STALE") and frame.process != "recorder":
-            said = "; ".join(frame.messages)
-            self._fault(frame.skin, f"{frame.process} {frame.level}{': ' if said else ''}{said:.120}", at_s, BACK_S)
+            text = "; ".join(frame.messages)
+            self._fault(frame.skin, f"{frame.process} {frame.level}{': ' if text else ''}{text:.120}", at_s, BACK_S)
 
     def _contact(self, frame: ContactFrame, at_s: float) -> None:
-        course = self.into.courses.setdefault(frame.skin, Course())
         present = [c for c in frame.contacts if c.state != "end"] if frame.valid else []
         known = frame.valid and all(c.force_n is not None for c in present)
+        course = self.into.courses.setdefault(frame.skin, Course())
         course.times_s.append(at_s)
         course.force_n.append(sum(c.force_n or 0.0 for c in present) if known else float("nan"))
         course.valid.append(frame.valid)
@@ -152,14 +152,18 @@ class _Reading:
         for reason in reasons or ([] if frame.valid else ["not valid"]):
             self._fault(frame.skin, reason, at_s)
         for c in present:
-            key = frame.skin, frame.session, c.id
-            span = self._contacts.get(key)
-            if span is None:
-                span = self._contacts[key] = ContactSpan(frame.skin, str(c.id), at_s, at_s)
-                self._listed("contacts", self.into.contacts, span)
-            span.end_s = at_s
-            if not span.place or (c.force_n is not None and c.force_n > (span.most_n or 0.0)):
-                span.most_n, span.place = c.force_n, tuple(c.position)
+            self._present(frame, c, at_s)
+
+    def _present(self, frame: ContactFrame, contact: Contact, at_s: float) -> None:
+        """A contact is there, for the first time or still."""
+        key = frame.skin, frame.session, contact.id
+        span = self._contacts.get(key)
+        if span is None:
+            span = self._contacts[key] = ContactSpan(frame.skin, str(contact.id), at_s, at_s)
+            self._listed("contacts", self.into.contacts, span)
+        span.end_s = at_s
+        if not span.place or (contact.force_n is not None and contact.force_n > (span.most_n or 0.0)):
+            span.most_n, span.place = contact.force_n, tuple(contact.position)
 
     def _fault(self, skin: str, what: str, at_s: float, lasts_s: float = 0.0) -> None:
         kind = "".join(c for c in what if not c.isdigit())  # a count that goes up is the same fault

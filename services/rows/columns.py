@@ -67,27 +67,25 @@ def read_columns(
     Raises InputError.
     """
     found, notes = _named(arrays)
-    notes[:0] = [arrays.understood] if isinstance(arrays, NamedColumns) and arrays.understood else []
     if isinstance(options.untouched, np.ndarray) or options.untouched:
         notes += _without_own(found, options.untouched)
-    rows = {name: np.asarray(found[name]) for name in ROWS if name in found}
-    rows = {name: each for name, each in rows.items() if each.dtype.kind in "biufc"}
+    rows = {name: each for name in ROWS if (each := np.asarray(found.get(name))).dtype.kind in "biufc"}
     for token in filter(None, options.columns.split(",")):
         rows = {name: _selected(each, token.strip()) for name, each in rows.items()}
-    notes += [f"columns {options.columns}, as told"] if options.columns else []
+    notes.append(options.columns and f"columns {options.columns}, as told")
     layout = Layout(bundle, options.order, found.get("pattern"))
     rows, more = _upright(rows, layout)
     notes += more
     plain = next((rows[name] for name in ("untouched", "reference", "measurements") if name in rows), None)
     for name, each in rows.items():
         rows[name], note = layout.taken(name, each)
-        notes += [note] if note else []
+        notes.append(note)
     if plain is not None and layout.by_default and bundle.matrices.normalisation == "model":
         _doubt(plain, layout)
     if isinstance(options.untouched, int) and options.untouched and "measurements" in rows:
         rows |= _parted(rows["measurements"], options.untouched)
     found.pop("pattern", None)
-    return {**found, **rows}, "; ".join(dict.fromkeys(notes))
+    return {**found, **rows}, "; ".join(dict.fromkeys(filter(None, notes)))
 
 
 def _named(arrays: Mapping[str, NDArray[Any]]) -> tuple[Arrays, list[str]]:
@@ -106,7 +104,9 @@ def _named(arrays: Mapping[str, NDArray[Any]]) -> tuple[Arrays, list[str]]:
 
 def _joined(arrays: Mapping[str, NDArray[Any]]) -> tuple[Arrays, list[str]]:
     """Two arrays that their names say are the parts of one are that one."""
-    found, notes = dict(arrays), []
+    found, notes = dict(arrays), list[str]()
+    if isinstance(arrays, NamedColumns) and arrays.understood:
+        notes.append(arrays.understood)
     by_small = {name.lower(): name for name in arrays}
     ends = [(small, *parts) for small in by_small for parts in PARTS if small.endswith(parts[0])]
     for small, first, second in ends:
@@ -279,19 +279,25 @@ def _upright(rows: Arrays, layout: Layout) -> tuple[Arrays, list[str]]:
     flat = {name: each for name, each in rows.items() if each.ndim == 2}
     if all(each.shape[1] == layout.own for each in flat.values()):
         return rows, notes
-    upright = {name for name, each in flat.items() if layout.fits(each.shape[1])}
-    lying = {name for name, each in flat.items() if layout.fits(each.shape[0])}
-    if not upright | lying and (blocks := _blocks(flat, layout)):
+    fitting = any(layout.fits(count) for each in flat.values() for count in each.shape)
+    if not fitting and (blocks := _blocks(flat, layout)):
         rows |= {name: each.reshape(1, -1) for name, each in blocks.items()}
         return rows, [*notes, "one row each, as drive pairs by sense pairs"]
-    turned, either = lying - upright, lying & upright
-    if either and bool(turned) == bool(upright - lying):
-        raise InputError(_either_way(min(either), flat[min(either)]))
-    turned |= either if turned else set()
+    turned = _turned(flat, layout)
     rows |= {name: flat[name].T for name in turned}
     if turned:
         notes.append(f"transposed: {', '.join(sorted(turned))}, whose columns stand as rows")
     return rows, notes
+
+
+def _turned(flat: Arrays, layout: Layout) -> set[str]:
+    """The arrays whose columns stand as rows. Raises InputError where that cannot be told."""
+    upright = {name for name, each in flat.items() if layout.fits(each.shape[1])}
+    lying = {name for name, each in flat.items() if layout.fits(each.shape[0])}
+    turned, either = lying - upright, lying & upright
+    if either and bool(turned) == bool(upright - lying):
+        raise InputError(_either_way(min(either), flat[min(either)]))
+    return lying if turned else set()
 
 
 def _flat(rows: Arrays, layout: Layout) -> tuple[Arrays, list[str]]:

@@ -47,26 +47,36 @@ def parse_table(text: str, name: str) -> NamedColumns:
         raise FileError(f"{name}: found no line of numbers")
     split = _splitter(lines[-1][1])
     rows = [(at, split(line)) for at, line in lines]
-    above = [split(line) for at, line in remarks if at < lines[0][0]][-1:]
-    if _are_names(rows[0][1]):
-        names = rows.pop(0)[1]
-    else:  # as numpy.savetxt writes them
-        names = above[0] if above and len(above[0]) == len(rows[0][1]) and _are_names(above[0]) else []
+    names = _names(rows, [split(line) for at, line in remarks if at < lines[0][0]])
+    width = _width(rows, names, name)
+    return _sorted_out(rows, [each.strip("\"' ").lower() for each in names] or [""] * width, name)
+
+
+def _width(rows: list[tuple[int, list[str]]], names: list[str], name: str) -> int:
+    """How many cells each row has. Raises FileError."""
     width = len(names or rows[0][1]) if rows else 0
     if not rows or (width < 2 and len(rows) < 2):
         raise FileError(f"{name}: found no table of numbers, expected one row of measurements a line")
     for at, cells in rows:
         if len(cells) != width:
             raise FileError(f"{name}, line {at}: found {len(cells)} cells, expected {width} as in the first line")
-    names = [cell.strip("\"' ") for cell in names]
-    return _sorted_out(rows, [each.lower() for each in names] or [""] * width, name)
+    return width
+
+
+def _names(rows: list[tuple[int, list[str]]], above: list[list[str]]) -> list[str]:
+    """The names of the columns: the first row, taken from `rows`, or the last remark above, as numpy.savetxt has it."""
+    first = rows[0][1]
+    if _are_names(first):
+        return rows.pop(0)[1]
+    last = above[-1] if above else []
+    return last if len(last) == len(first) and _are_names(last) else []
 
 
 def _are_names(cells: list[str]) -> bool:
     """Whether the first line names columns: by text, or by their numbers, as pandas does. One of an index is empty."""
-    told = [cell for cell in cells if cell.strip("\"' ")]
-    numbered = [[str(at) for at in range(first, first + len(told))] for first in (0, 1)]
-    return all(_number(cell) is None for cell in told) or (len(told) > 2 and told in numbered)
+    filled = [cell for cell in cells if cell.strip("\"' ")]
+    numbered = [[str(at) for at in range(first, first + len(filled))] for first in (0, 1)]
+    return all(_number(cell) is None for cell in filled) or (len(filled) > 2 and filled in numbered)
 
 
 def _splitter(line: str) -> Any:
@@ -94,24 +104,30 @@ def _number(cell: str) -> complex | None:
 
 def _sorted_out(rows: list[tuple[int, list[str]]], names: list[str], name: str) -> NamedColumns:
     label = _label(rows, names)
-    index = 0 if any(names) and not names[0] else -1
-    beside = [at for at, each in enumerate(names) if at != label and (at == index or BESIDE.fullmatch(each))]
-    measured = [at for at in range(len(names)) if at != label and at not in beside]
-    while measured and not any(cells[measured[-1]] for _, cells in rows):  # a sign at the end of each line
-        measured.pop()
+    measured, beside = _measured(rows, names, label)
     table, own, parts = _complex(_numbers(rows, measured, name), [names[at] for at in measured])
     untouched = np.array([label >= 0 and _untouched(cells[label], names[label]) for _, cells in rows])
     splits = untouched.any() and not untouched.all()
-    left = [names[at] or str(at + 1) for at in (*beside, *([] if splits or label < 0 else [label]))]
-    said = [f"column {each} left out" for each in left] + ([parts] if parts else [])
+    left = beside if splits or label < 0 else [*beside, label]
+    notes = [*(f"column {names[at] or at + 1} left out" for at in left), parts]
     found = NamedColumns(measurements=table)
     if splits:
         found |= {"measurements": table[~untouched], "untouched": table[untouched]}
-        said.append(f"{untouched.sum()} rows are `untouched`, as column {names[label] or label + 1} says")
+        notes.append(f"{untouched.sum()} rows are `untouched`, as column {names[label] or label + 1} says")
     if (pattern := _pattern(own)) is not None:
         found["pattern"] = pattern
-    found.understood = "; ".join(said)
+    found.understood = "; ".join(filter(None, notes))
     return found
+
+
+def _measured(rows: list[tuple[int, list[str]]], names: list[str], label: int) -> tuple[list[int], list[int]]:
+    """The columns of measurements, and those that their names set beside them."""
+    index = 0 if any(names) and not names[0] else -1
+    beside = [at for at, each in enumerate(names) if at != label and (at == index or BESIDE.fullmatch(each))]
+    measured = [at for at in range(len(names)) if at not in (label, *beside)]
+    while measured and not any(cells[measured[-1]] for _, cells in rows):  # a sign at the end of each line
+        measured.pop()
+    return measured, beside
 
 
 def _label(rows: list[tuple[int, list[str]]], names: list[str]) -> int:
@@ -147,20 +163,22 @@ def _complex(values: NDArray[np.complex128], names: list[str]) -> tuple[NDArray[
     parts = [PART.fullmatch(each) for each in names]
     if not names or not all(parts):
         return plain, names, ""
-    said = [(each[1], each[2].lower()) for each in parts if each is not None]
-    kept = [at for at, (_, part) in enumerate(said) if part in MAGNITUDE]
-    if kept:
-        return plain[:, kept], [said[at][0] for at in kept], "magnitudes by their names"
-    imaginary = {of: at for at, (of, part) in enumerate(said) if part in IMAGINARY}
-    real = [at for at, (_, part) in enumerate(said) if part in REAL]
-    if not real or len(imaginary) != len(real) or not all(said[at][0] in imaginary for at in real):
+    named = [(each[1], each[2].lower()) for each in parts if each is not None]
+    columns, own = _with_part(named, MAGNITUDE)
+    if columns:
+        return plain[:, columns], own, "magnitudes by their names"
+    columns, own = _with_part(named, REAL)
+    imaginary = {of: at for at, of in zip(*_with_part(named, IMAGINARY), strict=True)}
+    if not columns or len(imaginary) != len(columns) or not imaginary.keys() >= set(own):
         return plain, names, ""
-    own = [said[at][0] for at in real]
-    return (
-        plain[:, real] + 1j * plain[:, [imaginary[each] for each in own]],
-        own,
-        "real and imaginary parts by their names",
-    )
+    values = plain[:, columns] + 1j * plain[:, [imaginary[each] for each in own]]
+    return values, own, "real and imaginary parts by their names"
+
+
+def _with_part(named: list[tuple[str, str]], wanted: set[str]) -> tuple[list[int], list[str]]:
+    """The columns that are this part, and whose."""
+    found = [(at, of) for at, (of, part) in enumerate(named) if part in wanted]
+    return [at for at, _ in found], [of for _, of in found]
 
 
 def _pattern(names: list[str]) -> NDArray[np.int64] | None:
@@ -170,5 +188,5 @@ def _pattern(names: list[str]) -> NDArray[np.int64] | None:
     if widths not in ({2}, {4}):
         return None
     rows = np.array([[int(digits[:6]) for digits in each] for each in found])
-    told = rows.max() < MOST_ELECTRODES and len(np.unique(rows, axis=0)) == len(rows) and np.ptp(rows, axis=0).all()
-    return rows if told else None
+    counts = rows.max() < MOST_ELECTRODES and len(np.unique(rows, axis=0)) == len(rows) and np.ptp(rows, axis=0).all()
+    return rows if counts else None

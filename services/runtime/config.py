@@ -346,16 +346,13 @@ def _control_characters(raw: dict[str, Any]) -> list[str]:
         key, value = waiting.pop()
         if isinstance(value, str) and _controls(value):
             found.append(f"{key}: found {_shown(value)}; allowed: text without control characters")
-        elif isinstance(value, dict):
-            for name, inner in value.items():
-                if _controls(name):
-                    found.append(
-                        f"{key or '(top level)'}: found the name {_shown(name)}; allowed: printable characters"
-                    )
-                else:
-                    waiting.append((f"{key}.{name}".lstrip("."), inner))
-        elif isinstance(value, list):
-            waiting += [(f"{key}.{place}", inner) for place, inner in enumerate(value)]
+        if not isinstance(value, dict | list):
+            continue
+        for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            if _controls(str(name)):
+                found.append(f"{key or '(top level)'}: found the name {_shown(name)}; allowed: printable characters")
+            else:
+                waiting.append((f"{key}.{name}".lstrip("."), inner))
     return sorted(found)
 
 

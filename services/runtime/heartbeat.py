@@ -28,8 +28,8 @@ class Heartbeat:
         self.failures = self.unlogged = 0  # exceptions in the stage, and those of them that the log does not have
         self._late_at, self._late_by_s = -math.inf, 0.0
         self._failure, self._failed_at = "", 0.0
-        self._since = self._heard = time.monotonic()
-        self._heard_any = False
+        self._since = self._received_s = time.monotonic()
+        self._received_any = False
 
     @property
     def failure(self) -> str:
@@ -39,9 +39,9 @@ class Heartbeat:
     def failure(self, text: str) -> None:
         self._failure, self._failed_at = text, time.monotonic()
 
-    def heard(self, frame: Frame, now_ns: int) -> None:
+    def received(self, frame: Frame, now_ns: int) -> None:
         """A frame came."""
-        self._heard, self._heard_any = now_ns * 1e-9, True
+        self._received_s, self._received_any = now_ns * 1e-9, True
 
     def done(self, frame: Frame, began_ns: int, now_ns: int, late: bool = False) -> None:
         """A frame was processed and its successors were sent; `late`: too old to be acted on."""
@@ -55,15 +55,15 @@ class Heartbeat:
 
     def silence(self, limit_s: float, upstream: str) -> str:
         """The text for an input that gives nothing; "" while it gives frames."""
-        quiet = time.monotonic() - self._heard
+        quiet = time.monotonic() - self._received_s
         if quiet < limit_s:
             return ""
         what = f"{upstream}/{self.skin}" if upstream else "frames from the source"
-        return f"no {what} for {int(quiet)} s" if self._heard_any and quiet >= 1 else f"no {what}"
+        return f"no {what} for {int(quiet)} s" if self._received_any and quiet >= 1 else f"no {what}"
 
     def deadline(self, limit_s: float) -> float:
         """When the next status is due, or the silence since the last frame becomes one to speak of."""
-        silent_at = self._heard + limit_s
+        silent_at = self._received_s + limit_s
         last, due = self._beat.last, self._beat.next_s
         spoken_of = last is not None and last.stamps["publish"] * 1e-9 > silent_at
         return due if spoken_of else min(due, silent_at)
@@ -92,10 +92,10 @@ class Heartbeat:
 
     def summary(self, asleep: bool, silent_s: float) -> dict[str, Any]:
         """For the control command `status`."""
-        quiet = time.monotonic() - self._heard
+        quiet = time.monotonic() - self._received_s
         last = self._beat.last
         return {
-            "flowing": asleep or (self._heard_any and quiet < silent_s),
+            "flowing": asleep or (self._received_any and quiet < silent_s),
             "idle": asleep,
             "quiet_s": quiet,
             "level": last.level if last else "STALE",

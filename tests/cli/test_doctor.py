@@ -27,6 +27,7 @@ from services.cli.judged import turned
 from services.estimation.first.baseline import TAKING
 from services.estimation.values.judgement import judge
 from services.judged import judged
+from services.runtime.config import Skin
 
 
 @pytest.fixture
@@ -64,13 +65,17 @@ def test_what_a_configuration_names_is_looked_at(doctor, tmp_path: Path, bundle,
     assert found == code and says in said, said
 
 
-def test_a_port_is_looked_at(doctor, tmp_path: Path) -> None:
+def test_a_port_is_looked_at(doctor, tmp_path: Path, monkeypatch) -> None:
     code, said = doctor("/dev/ttyACM99")
     assert code == 1 and "/dev/ttyACM99 is not there: plug the board in" in said
     for there in (False, True):  # beside the configuration
         code, said = doctor("one.npz")
         assert code == (not there) and f"{tmp_path / 'one.npz'} is {'' if there else 'not '}there" in said
         (tmp_path / "one.npz").touch()
+    for text in ("/dev/a is gone: is the cable plugged in?", "no answer"):  # of the service's acquisition
+        monkeypatch.setattr(doctor_live, "_status", lambda *_, text=text: Finding("FAIL", "acquisition", text))
+        (found,) = doctor_live.port("palm", Skin(port="/dev/a", bundle="square16"))
+        assert found.text == ("/dev/a: " if text == "no answer" else "") + text
 
 
 @pytest.mark.live

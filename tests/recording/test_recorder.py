@@ -113,6 +113,7 @@ def test_a_recording_that_is_taken_away_is_said_and_goes_on(service, tmp_path):
     service.recorder.step(0.6)
     said = turn(service, touched())
     assert (said["level"], said["file"]) == ("ERROR", "") and "nothing is recorded" in said["problems"][0]
+    assert said["problems"][0].endswith(f"{first.parent}: {os.strerror(errno.EEXIST)}")
     first.parent.unlink()
     service.recorder.step(0.6)
     said = turn(service)

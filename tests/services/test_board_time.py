@@ -105,7 +105,7 @@ def test_answers_count_once_and_only_for_questions_that_were_asked():
     assert questions.to_send(10.45, True, False) == b""
     assert questions.to_send(10.5, True, True) == b"", "a scan is on the line"
     assert questions.to_send(10.5, True, False)
-    assert [questions.asked_s(link.Time(ask.nonce ^ k, 5)) for k in (1, 0, 0)] == [None, 10.0, None]
+    assert [questions.sent_s(link.Time(ask.nonce ^ k, 5)) for k in (1, 0, 0)] == [None, 10.0, None]
 
 
 def scan(seq, device_us, duration_us=44_000, config=1):

@@ -323,7 +323,7 @@ class Machine:
                 self.behind[name] += 229.0 * (0.1 if len(before) <= self.fit else 0.7)
             for name, behind in self.behind.items():
                 said = {"process": "preprocessing", "session": self.session, "drops": {"skipped": int(behind)}}
-                self.choice.heard(StatusFrame(skin=name, **said), self.now)
+                self.choice.update(StatusFrame(skin=name, **said), self.now)
             found.append(sum(not self.choice.whole(name) for name in self.names))
             self.changes += found[-1] != len(before)
         return found
@@ -347,8 +347,8 @@ def test_as_many_stay_as_fit_attempts_grow_rare_and_they_come_back_when_the_load
 def test_parts_that_come_no_sooner_than_whole_scans_are_given_up():
     choice = PartsOrWhole(["palm"])
     for second, p50 in enumerate((5.0, 30.0, 8.0, 30.0, 31.0, 30.0)):
-        choice.heard(StatusFrame(skin="palm", process="preprocessing", session="a", latency={"p50": p50}), second)
-        choice.heard(StatusFrame(skin="other", process="preprocessing", drops={"skipped": 200 * second}), second)
+        choice.update(StatusFrame(skin="palm", process="preprocessing", session="a", latency={"p50": p50}), second)
+        choice.update(StatusFrame(skin="other", process="preprocessing", drops={"skipped": 200 * second}), second)
         assert choice.whole("palm") == (second >= 4) and not choice.whole("other"), "one slow second is none"
 
 

@@ -76,16 +76,10 @@ def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None, class
     image; empty: none tells.
     """
     if area is not None:
-        weight, each = _of_area(touch.strength, touch.strength_sigma, area)
+        each = _of_area(touch.strength, touch.strength_sigma, area)
     else:
-        patches = [patch._replace(share=share) for patch, share in zip(PATCHES, _shares(classes), strict=True)]
-        sharp = [_seen_as(touch, patch) for patch in patches]
-        found = [_through(seen, edge, share) for seen in sharp for share, edge in EDGES]
-        weight = np.concatenate([one.weight for one in found])
-        if not weight.any():  # more than any patch does: a disc that conducts nothing
-            found, weight = sharp[:1], np.ones(sharp[0].area.size) / sharp[0].area.size
-        each = Discs(weight, np.concatenate([one.area for one in found]), np.concatenate([one.drop for one in found]))
-    weight = weight / weight.sum()
+        each = _of_any_patch(touch, classes)
+    weight = each.weight / each.weight.sum()
     drop = np.minimum(each.drop, FULL)
     pressure = foam.pressure(drop)
     beyond = (float(foam.pressure(FULL)) - pressure) * (drop > BLIND)
@@ -111,20 +105,31 @@ def _moments(values: Array, weight: Array, beyond: Array, creeps: float) -> tupl
     return mean, math.sqrt(variance + (creeps * mean) ** 2)
 
 
-def _of_area(strength: float, sigma: float, area: float) -> tuple[Array, Discs]:
+def _of_area(strength: float, sigma: float, area: float) -> Discs:
     """Under an indenter of known area: only how strongly it acts is open."""
     action_sd = math.hypot(sigma, ACTION_SIGMA * strength)
     seen = np.maximum(strength + action_sd * SPREAD, 0.0) / area
     drop = np.minimum(flat_drop(seen), TOLD)
-    return WEIGHT, Discs(WEIGHT, np.full(drop.shape, area), drop)
+    return Discs(WEIGHT, np.full(drop.shape, area), drop)
+
+
+def _of_any_patch(touch: EstimatedTouch, classes: Sequence[float]) -> Discs:
+    """Under what nobody knows: any of PATCHES, with any of EDGES."""
+    patches = [patch._replace(share=share) for patch, share in zip(PATCHES, _shares(classes), strict=True)]
+    sharp = [_seen_as(touch, patch) for patch in patches]
+    found = [_through(seen, edge, share) for seen in sharp for share, edge in EDGES]
+    each = Discs(*map(np.concatenate, zip(*found, strict=True)))
+    if not each.weight.any():  # more than any patch does: a disc that conducts nothing
+        return sharp[0]._replace(weight=np.ones(sharp[0].area.size) / sharp[0].area.size)
+    return each
 
 
 def pressure_under(strength: float, sigma: float, area: float, foam: Foam) -> float:
     """Pressure summed over an indenter of this area [m^2] [N], as `force_of` has it; strength and sigma: of how it
     acts, drop times m^2.
     """
-    weight, each = _of_area(strength, sigma, area)
-    return float(weight @ (each.area * foam.pressure(each.drop)))
+    each = _of_area(strength, sigma, area)
+    return float(each.weight @ (each.area * foam.pressure(each.drop)))
 
 
 def _seen_as(touch: EstimatedTouch, patch: PatchKind) -> Discs:
