@@ -10,12 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from models.prereconstruction import Array, Drift, Operator, PreReconstructor
-from models.response_error import misfit_factor
 
 # What two meshes or two solvers differ by, of |d|. It is no noise: it looks like the signal of a touch that is not
 # there, a thousandth of what is, and falls off with the Gram matrix's eigenvalues almost as touches do (their power 0.4
 # in amplitude, against 0.5). Independent errors of that size on each channel would bury the corners of every shape.
-MODEL_ERROR = 1.2e-3
+MODEL_ERROR, MISFIT_POWER = 1.2e-3, 0.4
 SERVICE_DRIFT = Drift(scale=2e-5, contact=1e-4)  # a little less than services allow for at rest
 
 
@@ -86,5 +85,12 @@ def condition(
         live[np.isin(m.pattern, electrodes).any(axis=1)] = False
     estimate = sigma * np.clip(1 + 0.06 * rng.standard_normal(k), 0.7, 1.3)
     operator = pre.condition(estimate, drift=drift, weights=live.astype(float))
-    error = (MODEL_ERROR * misfit_factor(m.gram.astype(float)) if own is None else own.error) * (not exact)
+    error = (MODEL_ERROR * _misfit_factor(m.gram.astype(float)) if own is None else own.error) * (not exact)
     return Condition(operator, sigma, drift, m.contact, error, live, 64)
+
+
+def _misfit_factor(gram: Array) -> Array:
+    """(K, K) factor of a covariance of trace 1 that lies where touches do: powers of the Gram matrix's eigenvalues."""
+    values, vectors = np.linalg.eigh(gram)
+    profile = np.maximum(values, 0) ** MISFIT_POWER
+    return np.asarray(vectors * (profile / np.linalg.norm(profile)))

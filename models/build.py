@@ -6,7 +6,7 @@
     python -m models.build --skin square16 --no-network    matrices only: the services show the one-step image
     python -m models.build --skin square16 --package       trains nothing: ships the checkpoints in models/work/SKIN
     python -m models.build --skin square16 --package --only fast   that checkpoint alone, into the bundle there is
-    python -m models.build --skin square16 --response      adds what a fit of touches needs to the bundle there is
+    python -m models.build --skin square16 --response      adds response.npz to the bundle there is
     python -m models.build --skin FOLDER --quick           of what `skin register` wrote: a network of that very skin,
                                                            kept where its images are better than those without
 

@@ -7,7 +7,7 @@
                             network_fast.onnx  "fast"
                             network_int8.onnx  "int8"
                             locator.npz        of a registered skin: see locator.LocatorArrays
-                            response.npz       what a touch does to it, without a mesh: see response_file.py
+                            response.npz       its fields while nothing touches: see response_file.py
 
 The manifest holds the hash of every other file, so the manifest's own hash covers the whole. Networks may be missing. A
 bundle without any is a working bundle: the services then show the one-step image.
@@ -38,9 +38,8 @@ from models.locator_arrays import LocatorArrays, arrays_of
 from models.npz import read_npz
 from models.onnx_external import external_data
 from models.prereconstruction import Matrices, PreReconstructor
-from models.response_file import arrays_of_tables, tables_of
+from models.response_file import ResponseTables, arrays_of_tables, tables_of
 from models.skin_limits import BUNDLE_BYTES, NAME, NETWORKS_BYTES
-from models.touch_response import ResponseTables
 from protocol.errors import EitskinError
 from protocol.whole_file import whole_file, write_whole
 
@@ -123,7 +122,7 @@ class Bundle:
 
     @property
     def has_response(self) -> bool:
-        """Whether it ships what a fit of touches needs."""
+        """Whether it ships its fields, finer than its Jacobian."""
         return RESPONSE in self.manifest["files"]
 
     def response(self) -> ResponseTables:

@@ -85,19 +85,6 @@ class ForwardModel(Elements):
             return patterns.pattern(pattern, self.skin.n_electrodes)
         return np.asarray(pattern, dtype=np.int64).reshape(-1, 4)  # any measurements, of whatever rank
 
-    def solve_sources(self, sources: Array) -> Array:
-        """(n_nodes, c) potentials on the untouched sheet of right-hand sides (n_nodes + n, c): of its nodes, then of
-        its electrodes, the last of which is the ground.
-        """
-        ordered = np.zeros((self._size, sources.shape[1]), order="F")
-        ordered[self._position] = sources[: self._size]
-        return np.asarray(self.factorise(self.matrix()).solve(ordered)[self._position[: self.n_nodes]])
-
-    def electrode_of(self, edges: NDArray[np.int64]) -> NDArray[np.int64]:
-        """(m,) electrode over each boundary edge (m, 2) of nodes, -1 where there is none."""
-        known = {frozenset(pair): int(e) for pair, e in zip(self._facets.tolist(), self._facet_electrode, strict=True)}
-        return np.array([known.get(frozenset(pair), -1) for pair in edges.tolist()])
-
     def matrix(self, conductivity: ArrayLike = 1.0, contact_impedance: ArrayLike | None = None) -> sparse.csc_matrix:
         """The system's matrix, nodes and all electrodes but the last, in the fill-reducing order (`currents` too)."""
         data = self._stiffness(conductivity) + self._from_contact @ (1 / self._contact(contact_impedance))

@@ -250,37 +250,6 @@ class LocatedTouch:
     value_sigma: float | None = wire(Maybe(Float(0)), "standard uncertainty of depth or force, or nil", None)
 
 
-KINDS = (*SHAPES, "hertz")
-"""Kinds of touch that a fit tells apart: a hertz contact is round, and its pressure falls off to its edge."""
-
-
-@dataclass(slots=True, kw_only=True, eq=False)
-class RefinedTouch:
-    """The only touch there is, as a fit of its shape to the measurements finds it."""
-
-    kind: str = wire(Text(32), "likeliest of " + ", ".join(KINDS))
-    probability: float = wire(Float(0, 1), "of `kind`", 1.0)
-    probabilities: list[float] = wire(Vector(len(SHAPES)), "of " + ", ".join(SHAPES) + "; hertz counts as circle")
-    position: list[float] = wire(Vector(2, "m"), "centroid, in the skin's frame")
-    sigma: list[float] = wire(Vector(3), "as a contact's `position_sigma`")
-    drop: float = wire(Float(0, unit="S/m"), "largest conductivity drop")
-    drop_sigma: float = wire(Float(0, unit="S/m"), "its standard uncertainty")
-    integral: float = wire(Float(0, unit="S/m m^2"), "drop integrated over the patch")
-    integral_sigma: float = wire(Float(0, unit="S/m m^2"), "its standard uncertainty")
-    area_m2: float = wire(Float(0, unit="m^2"), "area of the contact patch")
-    area_sigma_m2: float = wire(Float(0, unit="m^2"), "its standard uncertainty")
-    centre: list[float] = wire(Vector(2, "m"), "of the circle round the likeliest shape")
-    radius_m: float = wire(Float(0, unit="m"), "of that circle")
-    rotation: float = wire(Float(unit="rad"), "of the likeliest shape, counter-clockwise", 0.0)
-    aspect: float = wire(Float(0), "ratio of a rectangle's sides", 1.0)
-    scan: int = wire(_COUNT, "scan that it was fitted to; the touch has changed by little since", 0)
-    between_kinds: list[float] = wire(
-        Vector(2),
-        "how far the kinds that it may be differ in `drop` and in `area_m2`: relative standard deviations",
-        lambda: [0.0, 0.0],
-    )
-
-
 @dataclass(slots=True, kw_only=True, eq=False)
 class ImageFrame(Frame):
     """The conductivity drop over the skin's bounding box. A held frame's image was sent before: see the rules for
@@ -313,9 +282,6 @@ class ImageFrame(Frame):
     )
     touches: list[LocatedTouch] = wire(
         ListOf(Record(LocatedTouch), 16), "of a registered skin: where its touches are, sent with the image", list
-    )
-    refined: RefinedTouch | None = wire(
-        Maybe(Record(RefinedTouch)), "the touch refined by a fit, also in held frames; nil: there is none yet", None
     )
     after: int = wire(_COUNT, AFTER, 0)
     estimates: list[EstimatedTouch] = wire(
@@ -357,15 +323,6 @@ class Contact:
         Maybe(Float(0, unit="m")), "how deep the touch presses; nil where the skin was not registered with depths", None
     )
     indentation_sigma_m: float | None = wire(Maybe(Float(0, unit="m")), "its standard uncertainty, or nil", None)
-    refined: bool = wire(
-        Bool(),
-        "whether position, force, area and shape come from a fit of the touch's shape to the measurements; false: from "
-        "the image",
-        False,
-    )
-    kind: str = wire(Text(32), "of a refined touch: likeliest of " + ", ".join(KINDS) + "; else empty", "")
-    kind_probability: float | None = wire(Maybe(Float(0, 1)), "of `kind`, or nil", None)
-    area_sigma_m2: float | None = wire(Maybe(Float(0, unit="m^2")), "standard uncertainty of `area_m2`, or nil", None)
     pressure_pa: float | None = wire(
         Maybe(Float(0, unit="Pa")),
         "pressure on the skin where it is highest in the patch; nil where nobody knows; of a force that is "
@@ -411,7 +368,6 @@ class ForceFrame(Frame):
     )
     force_n: float | None = wire(Maybe(Float(unit="N")), "sum of the normal forces, or nil", None)
     force_sigma_n: float | None = wire(Maybe(Float(0, unit="N")), "its standard uncertainty, or nil", None)
-    refined: bool = wire(Bool(), "whether it comes from a fit, as the only contact's does", False)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -428,7 +384,6 @@ class ShapeFrame(Frame):
     probabilities: list[list[float]] = wire(
         ListOf(Vector(len(SHAPES)), 256), "probability of " + ", ".join(SHAPES), list
     )
-    refined: bool = wire(Bool(), "whether they come from a fit, as the only contact does", False)
 
 
 VERDICTS = ("pass", "note", "refuse", "not asked", "cannot")
@@ -486,7 +441,6 @@ INFO_KEYS = {
     'fault; touched, the rate that they reach while a touch is followed (`scan = "rolling"`: with every part); or nil: '
     "not yet known",
     "force_law": "map: kind and parameters of the force law, or nil",
-    "refinement": "whether touches are refined by a fit of their shape (`indenter` in skin.toml): on, or why not",
     "symmetry": "whether the image of a held touch becomes the mean over the skin's symmetries (`touch` in skin.toml): "
     "on, or why not",
     "mounting": "map: what the calibration to this very skin found (contacts, shifts, field, anisotropy, remarks); "

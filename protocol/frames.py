@@ -17,7 +17,6 @@ from .fields import FieldError, brief
 from .frame_types import (
     ELECTRODE_STATES,
     INFO_KEYS,
-    KINDS,
     NAME,
     REASONS,
     SCHEMA,
@@ -42,7 +41,6 @@ from .frame_types import (
     PartFrame,
     RawFrame,
     ReferenceFrame,
-    RefinedTouch,
     ShapeFrame,
     StackFrame,
     StatusFrame,
@@ -53,12 +51,12 @@ from .records import Record
 from .topics import TOPIC_OF, TOPICS
 
 __all__ = [
-    "ELECTRODE_STATES", "INFO_KEYS", "KINDS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
+    "ELECTRODE_STATES", "INFO_KEYS", "MAX_MESSAGE", "REASONS", "SCHEMA", "SHAPES", "SOURCES", "STAMPS",
     "STATUS_CLIPPED", "STATUS_FIFO", "STATUS_OPEN", "STATUS_RTIA", "VERDICTS",
     "Contact", "ContactFrame", "DeltaFrame", "EstimatedTouch", "ForceFrame",
     "Frame", "FrameError",
     "ImageFrame", "InfoFrame", "JudgementsFrame", "LocatedTouch", "PartFrame", "RawFrame", "ReferenceFrame",
-    "RefinedTouch", "ShapeFrame", "StackFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map",
+    "ShapeFrame", "StackFrame", "StatusFrame", "TrueTouch", "TruthFrame", "as_sent", "pack", "read_map",
     "unpack",
 ]  # fmt: skip
 

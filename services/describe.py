@@ -11,7 +11,6 @@ import numpy as np
 from models.bundle import Bundle
 from models.prereconstruction import ONE_STEP_LAMBDA
 from models.symmetries import symmetries
-from models.touch_parameters import HIGH, LOG_RADIUS, LOW
 from protocol.frames import RawFrame
 from services.contacts.force.law import ForceLaw
 from services.estimation.first.baseline import Baseline
@@ -23,7 +22,6 @@ CORNERS = 64  # of the polygon that stands for a disc
 MOVED = 2e-4  # relative: as two frames of 80 dB differ; a baseline that drifted by more is told again
 EVERY_S = 5.0  # but that at most so often
 RATE_FRAMES = 16  # of which the median time between two scans is taken
-ROUNDED = 1e-9  # relative: numbers that are the same
 RATE_CHANGED = 0.1  # relative: a rate that changed by more is told again
 
 UNITS = {"z": "ohm", "image": "S/m", "position": "m", "velocity": "m/s", "area_m2": "m^2", "force_n": "N"}
@@ -77,33 +75,6 @@ def _stack(bundle: Bundle) -> dict[str, Any]:
     ladder = np.asarray(bundle.matrices.ladder, dtype=float)
     nearest = np.argmin(np.abs(np.log(ladder) - 2 * np.log(ONE_STEP_LAMBDA)))
     return {"lambda_squared": ladder.tolist(), "one_step": int(nearest)}
-
-
-def refinement(skin: Skin, bundle: Bundle, calibrated: bool = False) -> str:
-    """Whether touches of this skin are refined by a fit: "on", or why not. calibrated: to the skin as it is mounted."""
-    if skin.indenter is None:
-        return "off: skin.toml names no `indenter`"
-    if not skin.indenter.refine:
-        return "off: `refine = false`"
-    if bundle.matrices.normalisation != "model" or bundle.locator is not None:
-        return f"off: bundle {bundle.name} is measured, not modelled, so a touch's response is not known"
-    if not bundle.has_response:
-        return (
-            f"off: bundle {bundle.name} has no response tables: "
-            f"`python -m models.build --skin {bundle.name} --response` adds them"
-        )
-    radius = skin.indenter.radius_m
-    least, most = (float(np.exp(each[LOG_RADIUS])) * bundle.metres_per_unit for each in (LOW, HIGH))
-    if radius is not None and not least * (1 - ROUNDED) <= radius <= most * (1 + ROUNDED):
-        return (
-            f"off: `radius_m` is {radius:g} m, and with bundle {bundle.name} a fit knows touches of radius "
-            f"{least:.3g} to {most:.3g} m"
-        )
-    if skin.network == "none" or bundle.network_path("full") is None:
-        return "off: a fit starts at a network's image, and there is no network"
-    if calibrated:
-        return "off: the skin is calibrated as it is mounted, the response tables are those of its file"
-    return ON
 
 
 def symmetry(skin: Skin, bundle: Bundle) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from models.measurement.responses.tables import tells_touches
 from models.prereconstruction import Operator
 from models.symmetries import symmetries
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch, StackFrame
-from services.describe import ON, refinement, symmetry
+from services.describe import ON, symmetry
 from services.estimation.images.averaging import MEANS, sigma_of_mean
 from services.estimation.images.operators import Operators
 from services.estimation.images.quality import Residual
@@ -28,10 +28,6 @@ from services.networks import Network, OneStep, Pictures, Stack, network, nothin
 from services.runtime.config import Skin
 from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
 from services.symmetry import SymmetryMean
-
-if TYPE_CHECKING:
-    from services.refine_process import RefineHere, RefineProcess
-    from services.refinement import Refinement
 
 TELLS = 0.6  # share of held-out touches whose class a registered skin's network must get right for it to be stated
 SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
@@ -57,10 +53,8 @@ class Inference(Stage):
         self.linearisation = Linearisation(name, bundle)
         self._use(bundle)
         self._tells_shapes = tells_shapes(bundle)
-        self.each_alone = False  # offline: frames that do not follow each other; each waits for its fit
         self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
-        self._refinement = _refinement(name, skin, bundle)
         self._symmetry: SymmetryMean | None = None
         if isinstance(self._network, Network) and symmetry(skin, bundle) == ON:
             turns = tuple(each.turn for each in symmetries(bundle.skin, bundle.pattern)[1:])
@@ -69,8 +63,6 @@ class Inference(Stage):
         self.reset()
 
     def reset(self) -> None:
-        if self._refinement is not None:
-            self._refinement.forget()
         if self._symmetry is not None:
             self._symmetry.forget()
         self._surer: Pictures | None = None  # the mean over the symmetries of the image that is held
@@ -111,23 +103,7 @@ class Inference(Stage):
             if self._symmetry is not None:
                 self._symmetry.forget()
             self._rest(frame)
-        if self._refinement is not None:
-            self._refine(frame, out)
         return [out]
-
-    def fit_by(self, fits: RefineProcess | RefineHere) -> None:
-        """Who fits touches, where any are: offline, in tests and to measure."""
-        if self._refinement is not None:
-            self._refinement.fit_by(fits)
-
-    def _refine(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        assert self._refinement is not None
-        if self.linearisation.name:  # the tables are those of the bundle as it is
-            return self._refinement.forget()
-        if self.each_alone:
-            self._refinement.fit_here()
-        operator = self._operator(frame)
-        out.refined = self._refinement(frame, out, 0.0 if operator is None else operator.drift)
 
     def _follow(self, calibration: str) -> bool:
         """Use the matrices that frames are made with from now on; False where they cannot be found."""
@@ -196,10 +172,6 @@ class Inference(Stage):
             self._stated += 1
         elif np.isfinite(sigma).any():
             self._quiet, self._stated = sigma, 1
-
-    def warm_up(self) -> None:
-        if self._refinement is not None:
-            self._refinement.warm_up()
 
     def prepare(self) -> bool:
         """Make the matrices that a touch would need now; not while the noise changes from frame to frame."""
@@ -314,20 +286,7 @@ class Inference(Stage):
     def health(self) -> Health:
         if isinstance(self._network, OneStep):
             return Health("OK", [f"bundle {self.bundle.name} has no network: one-step images"], dict(self._counters))
-        if self._refinement is None:
-            return Health("OK", [], dict(self._counters))
-        problem = self._refinement.problem
-        return Health(
-            "WARN" if problem else "OK", [problem] if problem else [], self._counters | self._refinement.counters
-        )
-
-
-def _refinement(name: str, skin: Skin, bundle: Bundle) -> Refinement | None:
-    if refinement(skin, bundle) != ON:
-        return None
-    from services.refinement import Refinement  # who refines nothing need not load what fits
-
-    return Refinement(name, skin, bundle)
+        return Health("OK", [], dict(self._counters))
 
 
 def tells_shapes(bundle: Bundle) -> bool:

@@ -51,7 +51,7 @@ class Pipeline:
         self.image: ImageFrame | None = None  # the newest one
         self.pre, self.inference, self.publishing = build_stages(name, skin, bundle)
         self.pre.always_reconstruct = always_reconstruct
-        self.pre.each_alone = self.inference.each_alone = self.publishing.each_alone = each_alone
+        self.pre.each_alone = self.publishing.each_alone = each_alone
 
     def run(self, raw: RawFrame) -> Result:
         """What the processes would publish for one raw frame, which is a whole scan; stamps are filled in."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from protocol.frames import DeltaFrame, EstimatedTouch, Frame, PartFrame, RawFrame, as_sent
 from services.contacts.lasting import LASTS_NS
-from services.describe import BaselineNews, FrameRate, describe, force, refinement, symmetry
+from services.describe import BaselineNews, FrameRate, describe, force, symmetry
 from services.estimation.by_bundle import skin_tables
 from services.estimation.estimator import LAYOUT, Estimator
 from services.estimation.faults import checks
@@ -486,7 +486,6 @@ class Preprocessing(Stage):
         if baseline is not None and baseline.hash != self._told_hash:
             self.revision, self._told_hash = self.revision + 1, baseline.hash
         said = describe(self.config, self.bundle, self._force, baseline, self.revision, rate_hz)
-        said["refinement"] = refinement(self.config, self.bundle, bool(self.linearisation.name))
         said["symmetry"] = self._symmetry
         return said | {"mounting": self.linearisation.found} if self.linearisation.found else said
 

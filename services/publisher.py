@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,6 @@ from protocol.frames import (
     Frame,
     ImageFrame,
     PartFrame,
-    RefinedTouch,
     ShapeFrame,
 )
 from protocol.held import HeldImage
@@ -36,7 +35,6 @@ from services.contacts.invalid_spell import InvalidSpell
 from services.contacts.lasting import LastingStates
 from services.contacts.placing import placement
 from services.contacts.reading import Appearance, Appearances
-from services.contacts.refined import area_of_image, both, refined_outline
 from services.describe import geometry
 from services.runtime.config import Skin
 from services.runtime.stage import HARMLESS, SEPARATE, Health, Stage, add_reason, inherited
@@ -86,7 +84,7 @@ class Publishing(Stage):
         self.held = HeldImage()
         self._end_all()
         self._forget()
-        self._counters = {"frames": 0, "contacts": 0, "unknown": 0, "refined": 0, "disagreed": 0}
+        self._counters = {"frames": 0, "contacts": 0, "unknown": 0}
         self._invalid = InvalidSpell()
 
     def new_session(self) -> None:
@@ -107,7 +105,6 @@ class Publishing(Stage):
         self._drops: dict[int, float] = {}  # S/m, at least
         self._anchors: dict[int, EstimatedTouch] = {}  # of contacts of an image, as the measurements tell them
         self._watched = False  # whether the frame before told what touched
-        self._fit: tuple[RefinedTouch, float, float] | None = None  # and where its touch was then
         self._watched_ns: tuple[int, int] | None = None  # `sample` of the first and last frame of those that came
 
     @property
@@ -179,11 +176,6 @@ class Publishing(Stage):
         elif frame.image.size and image != self._image_of and self._image_touches is None:
             self._appearances.see(frame)
             self._image_of = image
-        if frame.refined is None or len(frame.estimates) != 1:
-            self._fit = None
-        elif self._fit is None or self._fit[0] != frame.refined:  # it is less sure in an image that it was followed to
-            x, y = frame.estimates[0].position
-            self._fit = frame.refined, x, y
 
     def _contacts(self, frame: ImageFrame | PartFrame, out: ContactFrame) -> list[Contact]:
         """Those that are there, strongest first, then those that ended."""
@@ -214,7 +206,6 @@ class Publishing(Stage):
         now_ns = frame.stamps.get("sample", 0)
         self._looks, self._drops = {}, {}
         found = [self._contact(touch, now_ns, before, alone) for touch in frame.estimates]
-        found = self._fitted(found, frame)
         return sorted(found, key=lambda contact: -(contact.force_n or 0.0))
 
     def _found(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact], alone: bool) -> list[Contact]:
@@ -277,23 +268,6 @@ class Publishing(Stage):
         self._drops[number] = touch.drop - 3 * touch.drop_sigma
         return self._writer.of_estimate(number, state, touch, looks)
 
-    def _fitted(self, contacts: list[Contact], frame: ImageFrame | PartFrame) -> list[Contact]:
-        """The only contact as a fit of its shape has it, where both mean the same touch."""
-        if self._fit is None or len(contacts) != 1:
-            return contacts
-        fit, x, y = self._fit
-        touch = frame.estimates[0]
-        dx, dy = touch.position[0] - x, touch.position[1] - y
-        moved = replace(
-            fit,
-            position=[fit.position[0] + dx, fit.position[1] + dy],
-            centre=[fit.centre[0] + dx, fit.centre[1] + dy],
-            probabilities=both(fit.probabilities, self._appearances.of(touch).classes),
-        )
-        contact = self._writer.fitted(contacts[0], moved)
-        self._counters["disagreed" if contact is None else "refined"] += 1
-        return contacts if contact is None else [contact]
-
     def _note(self, frame: ImageFrame | PartFrame, out: ContactFrame) -> None:
         """What to know of these contacts."""
         if any((c.force_n or 0.0) > self.law.most_n or self.law.saturates(c.pressure_pa) for c in out.contacts):
@@ -318,25 +292,17 @@ class Publishing(Stage):
             wrench=wrench,
             force_n=total,
             force_sigma_n=math.hypot(*known) if known and len(known) == len(sigmas) else None,
-            refined=any(c.refined for c in present),
         )
 
     def _shape(self, out: ContactFrame) -> ShapeFrame:
         present = [c for c in out.contacts if c.state != "end"]
         looks = [self._looks[c.id] for c in present]
-        fit = self._fit[0] if self._fit is not None and any(c.refined for c in present) else None
-        outlines = [look.outline for look in looks]
-        probabilities = [look.classes or [0.0] * len(SHAPES) for look in looks]
-        if fit is not None and looks:
-            outlines = outlines if area_of_image(fit) else [refined_outline(fit)]
-            probabilities = [both(fit.probabilities, looks[0].classes)]
         return ShapeFrame(
             **inherited(out),
             ids=[c.id for c in present],
-            outlines=outlines,
+            outlines=[look.outline for look in looks],
             orientation=[c.orientation for c in present],
-            probabilities=probabilities,
-            refined=fit is not None,
+            probabilities=[look.classes or [0.0] * len(SHAPES) for look in looks],
         )
 
     def state(self) -> dict[str, Any]:
@@ -365,8 +331,8 @@ class Publishing(Stage):
             self._end_all()
         self._next_id = more + int(state["next_id"])
         self._ids = {int(touch): (more + int(number), int(born_ns)) for touch, number, born_ns in state["ids"]}
-        self._shown = [Contact(**(c | {"id": more + int(c["id"])})) for c in state["shown"]]
-        self._untold += [Contact(**(c | {"id": more + int(c["id"])})) for c in state["untold"]]
+        self._shown = [_contact(c, more) for c in state["shown"]]
+        self._untold += [_contact(c, more) for c in state["untold"]]
         watched = [int(each) for each in state["watched_ns"]]
         self._watched_ns = (watched[0], watched[1]) if watched else None
         self.lasting.load(state["lasting"])
@@ -381,6 +347,12 @@ class Publishing(Stage):
     def health(self) -> Health:
         problem = self._invalid.problem
         return Health("WARN" if problem else "OK", [problem] if problem else [], dict(self._counters))
+
+
+def _contact(said: Mapping[str, Any], more: int) -> Contact:
+    """One of a state, its number raised by `more`. Contacts of earlier versions had fields that are gone."""
+    known = {each.name: said[each.name] for each in fields(Contact) if each.name in said}
+    return Contact(**(known | {"id": more + int(said["id"])}))
 
 
 def _given(state: Mapping[str, Any]) -> list[Any]:

@@ -158,7 +158,7 @@ def _between_tips(presses: Sequence[Press], left_out: Array) -> float:
 def unknown(found: Calibration, skin: Skin) -> str:
     """What presses of one size of tip leave unknown, for a person; "" where there is nothing."""
     sizes = found.said.get("tips_m", [])
-    if len(sizes) > 1 or (skin.indenter is not None and skin.indenter.radius_m is not None):
+    if len(sizes) > 1 or skin.indenter is not None:
         return ""
     were = f"all presses were of one tip, radius {1e3 * sizes[0]:g} mm" if sizes else "nobody said what pressed"
     return (

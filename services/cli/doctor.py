@@ -26,7 +26,7 @@ from services.cli.doctor_live import Finding
 from services.cli.doctor_mounting import mounting_found
 from services.contacts.force.law import ForceLaw, known_radius
 from services.contacts.placing import placement
-from services.describe import ON, geometry, refinement, symmetry
+from services.describe import ON, geometry, symmetry
 from services.estimation.faults import checks
 from services.estimation.first.baseline import implausibility
 from services.runtime import room
@@ -105,7 +105,7 @@ def _skin(name: str, skin: Skin, running: bool, ours: bool) -> Iterator[Finding]
         yield Finding("FAIL", f"{name}: indenter", str(why))
         return
     if not ours:
-        yield from options(name, skin, {"refinement": refinement(skin, bundle), "symmetry": symmetry(skin, bundle)})
+        yield from options(name, skin, {"symmetry": symmetry(skin, bundle)})
     if skin.calibration is not None:
         yield _calibration(name, skin, bundle)
     if skin.reads is not None:
@@ -155,14 +155,9 @@ def _live(name: str, skin: Skin, bundle: Bundle) -> Iterator[Finding]:
 
 def options(name: str, skin: Skin, info: dict[str, Any]) -> Iterator[Finding]:
     """Whether what skin.toml asks for is done, or why not. info: of info/<skin>."""
-    asked = (
-        (skin.indenter is not None, "indenter", "refinement", "touches are refined by a fit of their shape"),
-        (skin.touch.symmetry, "symmetry", "symmetry", "a held touch's image becomes the mean over the symmetries"),
-    )
-    for wanted, what, key, good in asked:
-        if wanted and isinstance(said := info.get(key), str):
-            on = said == ON
-            yield Finding("OK" if on else "WARN", f"{name}: {what}", good if on else f"{key} {said}")
+    if skin.touch.symmetry and isinstance(said := info.get("symmetry"), str):
+        on, good = said == ON, "a held touch's image becomes the mean over the symmetries"
+        yield Finding("OK" if on else "WARN", f"{name}: symmetry", good if on else f"symmetry {said}")
 
 
 def _wrapped(name: str, skin: Skin, bundle: Bundle) -> Finding:

@@ -8,13 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from protocol.frames import SHAPES, Contact, EstimatedTouch, ImageFrame, RefinedTouch
+from protocol.frames import SHAPES, Contact, EstimatedTouch, ImageFrame
 from services.contacts.force.law import Force, ForceLaw, Look
 from services.contacts.images.of_image import ImageTouch
 from services.contacts.images.registered import registered
 from services.contacts.images.segmentation import Segment
 from services.contacts.reading import Appearance
-from services.contacts.refined import agrees, refined, settled
 from services.contacts.surface import Placed, Placement
 
 
@@ -97,14 +96,6 @@ class ContactWriter:
             )
             for c in contacts
         ]
-
-    def fitted(self, contact: Contact, touch: RefinedTouch) -> Contact | None:
-        """The contact as a fit has it; None where image and fit do not mean the same touch."""
-        force = self.law.of_fit(touch)
-        if not agrees(contact, touch, force):
-            return None
-        at, said = self.place(*touch.position), settled(contact, touch, force)
-        return refined(contact, touch, at, said, _wrench(at, said[0].newton or 0.0), flat=self.place.flat)
 
 
 def _wrench(at: Placed, force: float) -> list[float]:

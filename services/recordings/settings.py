@@ -79,6 +79,15 @@ class RecordedSkin(Section):
     touch: TouchConfig = TouchConfig()
     calibration: dict[str, Any] | None = None  # the content of its file, which calibration.load checks
 
+    @field_validator("indenter", mode="before")
+    @classmethod
+    def indenter_of_then(cls, indenter: Any) -> Any:
+        """Earlier versions knew a fit of what presses, whose radius they might not know."""
+        if not isinstance(indenter, dict):
+            return indenter
+        radius_m = indenter.get("radius_m")
+        return None if radius_m is None else {"radius_m": radius_m}
+
     @field_validator("scan", mode="before")
     @classmethod
     def scan_of_then(cls, scan: object) -> object:

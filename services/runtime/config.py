@@ -53,6 +53,12 @@ NO_ROS2 = (
 )
 
 
+NO_FIT = (
+    "`radius_m` alone: touches are no longer refined by a fit of their shape, as the measurements tell place, size and "
+    "force without one. Take {} out, and `indenter` too where no radius is known"
+)
+
+
 class ConfigError(EitskinError):
     """The configuration cannot be used. The text is for the person who must mend the file."""
 
@@ -117,32 +123,18 @@ class TouchConfig(Section):
 
 
 class Indenter(Section):
-    """What presses this skin, one touch at a time: touches are refined by a fit of that shape (services/refinement.py).
-
-    kind: "circle", a flat round face; "hertz", a ball or a fingertip, whose pressure falls off to its edge; "any",
-    found for each touch. A known radius fixes a circle's drop (contacts/force.py).
+    """What presses this skin: always one tip, flat and round. Its radius fixes the area of a force
+    (services/contacts/force/of_disc.py).
     """
 
-    kind: Literal["circle", "hertz", "any"] = "circle"
-    radius_m: Annotated[Number, Field(gt=0, le=1)] | None = None
-    refine: Switch = True  # switch of the fit
+    radius_m: Annotated[Number, Field(gt=0, le=1)]
 
     @model_validator(mode="before")
     @classmethod
-    def older(cls, given: Any) -> Any:
-        """Recordings from before there were kinds say `shape`."""
-        if isinstance(given, dict) and given.get("shape") == "circle" and "kind" not in given:
-            return {key: value for key, value in given.items() if key != "shape"}
+    def no_fit(cls, given: Any) -> Any:
+        if isinstance(given, dict) and (gone := [key for key in ("kind", "refine") if key in given]):
+            raise ValueError(NO_FIT.format(" and ".join(f"`{key}`" for key in gone)))
         return given
-
-    @model_validator(mode="after")
-    def a_radius_of_a_circle(self) -> Indenter:
-        if self.radius_m is not None and self.kind != "circle":
-            raise ValueError(
-                f'`radius_m` with kind = "circle" alone: how large a touch of kind {self.kind!r} is depends on how '
-                f"hard it presses (found {self.radius_m!r})"
-            )
-        return self
 
 
 LEAST_POINTS = 128

@@ -86,7 +86,7 @@ def test_contacts_are_scored_where_they_are_shown_and_counted_where_they_are_not
     assert (row["missed"], row["far"], row["not_valid"]) == (1, 0, 0)
 
 
-@pytest.mark.parametrize("name", sorted({each.name for each in page.BENCHMARKS} | {"refined"}))
+@pytest.mark.parametrize("name", sorted(each.name for each in page.BENCHMARKS))
 def test_each_program_refuses_what_is_no_number(name, capsys):
     with pytest.raises(SystemExit):
         option = {"latency": "--seconds", "peers": "--rounds", "trust": "--minutes"}.get(name, "--seed")

@@ -46,7 +46,6 @@ def doctor(skin, tmp_path: Path):
 @pytest.mark.parametrize(("bundle", "more", "code", "says"), [
     ("square16", "", 0, "every sha256 right"),
     ("disc16", "", 0, "not checked with the bundle disc16: shorts"),
-    ("square16", 'indenter = { kind = "any" }', 0, "OK palm: indenter touches are refined by a fit"),
     ("square16", "indenter = { radius_m = 0.5 }", 1, "found 0.5 m; expected 0.00052 to 0.05 m with bundle"),
     ("square16", 'calibration = "none.json"', 1, "none.json is not there: correct `calibration`"),
     ("square16", 'calibration = "good.json"', 0, "good.json: 8.5 N per S/m, to 5 N"),

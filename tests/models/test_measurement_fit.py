@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from firmware_stub.world import pressed
 from models import bundle, geometry, manifest
-from models.forward import ForwardModel, shared
+from models.forward import ForwardModel
 from models.linearise import linearise
 from models.measurement import touch as touches
 from models.measurement.course import TouchCourse
@@ -21,11 +21,8 @@ from models.measurement.responses.disc import DiscResponse
 from models.measurement.responses.grid import DiscGrid
 from models.measurement.responses.tables import SkinTables, tables_of
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, VX, TouchPrior, X, Y, anywhere, plain
-from models.response_error import frame_errors
 from models.response_tables import response_tables
 from models.shapes import Shape
-from models.touch_fit import TouchFit
-from models.touch_response import TouchResponse
 from tests.models.solved import UNIT_M, action_of, change, tables
 
 NOISE, SPAN_S = 1e-4, 0.0437
@@ -316,22 +313,3 @@ def test_a_press_is_explained_by_its_disc_and_found_where_it_is(tmp_path: Path, 
         assert z2 > 44 and fit.chi2 < 1.45
         assert np.linalg.norm(off) < 0.03 and (np.abs(off) < 4 * sd + 0.005).all(), (x, y, off, sd)
         assert fit.states[0, ACTION] == pytest.approx((ACTS * touch.drop / (1 - touch.drop / 2)), rel=0.08)
-
-
-SIGMA = np.full(120, 10 ** (-70 / 20))
-
-
-def test_a_fit_finds_a_touch_its_kind_and_says_what_no_touch_explains() -> None:
-    model = shared("square16", "inverse")
-    tables = response_tables(model, coarse=16, fine=32)
-    response = TouchResponse(tables, model.pattern, model.solve().impedances(), 10)
-    slope = model.solve().jacobian() / model.solve().impedances()[:, None]
-    touch, other = Shape("triangle", 0.4, 0.3, 0.4, 0.3, 0.5), Shape("circle", -0.5, -0.4, 0.2, 0.4)
-    d = response.of(touch) + SIGMA * np.random.default_rng(0).standard_normal(120)
-    errors = frame_errors(np.asarray((slope / model.areas) @ slope.T), SIGMA, d, 0.3)
-    near = Shape("circle", touch.x + 0.04, touch.y - 0.03, 0.25, 0.24)
-    found = TouchFit(response)(d, errors, near)
-    assert found.fits_frame and found.classes.argmax() == touch.shape_class
-    assert found.position == pytest.approx(touch.centroid, abs=0.02)
-    assert found.integral[0] == pytest.approx(touch.integral, rel=0.08)
-    assert not TouchFit(response)(d + response.of(other), errors, near, ("circle",)).fits_frame

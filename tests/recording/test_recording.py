@@ -321,6 +321,12 @@ def test_the_stages_get_what_they_had_and_no_more(config: ConfigFile, tmp_path: 
     other = tmp_path / "theirs.toml"  # how the service was configured, not who records
     other.write_text('[skins.theirs]\nport = "stub"\nbundle = "square16"\n')
     assert list(settings.read(metadata(["raw"], None, other)[settings.KEY], HERE).skins) == ["theirs"]
+    for then, now in (
+        ({"kind": "any", "radius_m": None, "refine": True}, None),
+        ({"shape": "circle", "radius_m": 0.01}, 0.01),
+    ):
+        indenter = settings.read(json.dumps(palm(indenter=then)), HERE).skins["palm"].indenter
+        assert (indenter and indenter.radius_m) == now
     peak = settings.read(settings.text_of({"palm": Skin(port="stub", bundle="square16", reads="peak")}), HERE)
     assert settings.configuration(peak, settings.Known.here(None), tmp_path)["skins"]["palm"]["reads"] == "peak"
 

@@ -1,4 +1,4 @@
-"""Segmentation: what is one touch, two, none; a held touch: a fit of its shape, the mean of its image."""
+"""Segmentation: what is one touch, two, none; a held touch: the mean of its image."""
 
 import math
 
@@ -10,8 +10,7 @@ from scipy import ndimage
 
 from models.shapes import KINDS, Shape, drop_image
 from services.contacts.images.segmentation import FLOOR, KERNEL, RELATIVE_FLOOR, segment
-from services.refine_process import RefineHere
-from services.runtime.config import Indenter, Skin, TouchConfig
+from services.runtime.config import Skin, TouchConfig
 from tests.services.stub_skin import StubSkin
 
 N = 96
@@ -87,30 +86,9 @@ def test_every_pixel_above_the_floor_is_one_touchs(scene, others, known):
         assert s.mask.any() and s.area > 0 and s.peak > 0 and 0 <= s.x <= n - 1 and 0 <= s.y <= n - 1
 
 
-UNIT = 0.05  # metres
-CIRCLE, OTHER = Shape("circle", 0.2, -0.1, 0.22, 0.3), Shape("circle", -0.5, 0.5, 0.22, 0.3)
-SKIN = Skin(port="stub", bundle="square16", frame_id="palm", indenter=Indenter(kind="circle"))
-
-
-def test_a_round_touch_is_refined_and_its_uncertainties_hold():
-    stub = StubSkin(85.0, skin=SKIN)
-    stub.pipeline.inference.fit_by(RefineHere())
-    found = [stub.feel((CIRCLE,)) for _ in range(3)][-1]
-    (contact,) = found.contact.contacts
-    assert found.contact.valid and contact.refined and contact.kind == "circle" and contact.kind_probability == 1.0
-    off = np.hypot(*(np.array(contact.position[:2]) - UNIT * CIRCLE.centroid))
-    assert off < 4 * contact.position_sigma[0] < 2e-3
-    assert abs(contact.force_n - CIRCLE.force(UNIT)) < 4 * contact.force_sigma_n < 1.5
-    assert abs(contact.area_m2 - CIRCLE.area * UNIT**2) < 4 * contact.area_sigma_m2
-    held = stub.feel((CIRCLE,)).contact.contacts[0]
-    assert held.refined and held.state == "hold"
-    two = [stub.feel((CIRCLE, OTHER)) for _ in range(4)][-1].contact.contacts
-    assert len(two) == 2 and not any(each.refined for each in two), "of two touches the image's answer stays"
-
-
 def test_a_held_touch_gets_the_mean_without_any_frame_that_waits():
     """A round touch, which one touch's model explains scan after scan, so that it is held."""
-    stub = StubSkin(85.0, skin=SKIN.model_copy(update={"touch": TouchConfig(symmetry=True)}))
+    stub = StubSkin(85.0, skin=Skin(port="stub", bundle="square16", touch=TouchConfig(symmetry=True)))
     inference, seen = stub.pipeline.inference, []
     for _ in range(20):
         seen.append(stub.feel((Shape("circle", 0.3, -0.2, 0.25, 0.3),)))

@@ -5,8 +5,8 @@
 The quantity is the pressure that the foam's drops stand for, summed over the touch's patch, in newtons of the shipped
 foam (models/pressure.py; the default, whose curve changes nothing). Or it is the touch's peak drop [S/m], right for one
 fixed indenter, or its integral over the patch [S/m m^2], as a bundle or a calibration of this very skin says
-(services/calibration/force_fit.py). A touch is known from the measurements (of_disc.py), from a fit of its shape to
-them, or, of a skin whose measurements do not tell its touches, from its image.
+(services/calibration/force_fit.py). A touch is known from the measurements (of_disc.py), or, of a skin whose
+measurements do not tell its touches, from its image.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from models.bundle import Bundle
 from models.pressure import FOAM, Foam, disc
-from protocol.frames import EstimatedTouch, ImageFrame, RefinedTouch
+from protocol.frames import EstimatedTouch, ImageFrame
 from services.contacts.force import calibration_file as calibration
 from services.contacts.force import of_disc
 from services.contacts.force.calibration_file import Of
@@ -178,17 +178,6 @@ class ForceLaw:
         spread = None if relative is None else relative * float(self.foam.gain(drop))
         return Quantity(pressure * area, spread, pressure, None if spread is None else pressure * spread)
 
-    def of_fit(self, touch: RefinedTouch) -> Force:
-        """Force and standard uncertainty of a touch that was fitted to the measurements."""
-        if self.curve is None or not (touch.drop > 0 and touch.integral > 0):
-            return NOTHING
-        if self.reads == "pressure":
-            return self._said(self._summed(touch), *touch.position)
-        value, sigma = (
-            (touch.drop, touch.drop_sigma) if self.reads == "peak" else (touch.integral, touch.integral_sigma)
-        )
-        return self._said(Quantity(value, sigma / value), *touch.position)
-
     def of_touch(self, touch: EstimatedTouch, classes: Sequence[float] = ()) -> Force:
         """Force and standard uncertainty of a touch as the estimator has it. classes: of its shape, by an image."""
         if self.curve is None or not touch.strength > 0:
@@ -206,16 +195,6 @@ class ForceLaw:
         if self.reads == "integral":
             return Quantity(touch.strength * (1 - min(touch.drop, 1.0) / 2), relative)
         return Quantity(drop, relative if area is not None else touch.drop_sigma / max(drop, 1e-9))
-
-    def _summed(self, touch: RefinedTouch) -> Quantity:
-        """Pressure summed over a fitted touch: its integrated drop, which is known best, by the foam at its peak."""
-        drop = min(touch.drop, TOLD)
-        pressure, gain = float(self.foam.pressure(drop)), float(self.foam.gain(drop))
-        share = 2 / 3 / self.foam.ball_mean(drop) if touch.kind == "hertz" else 1.0
-        newton = touch.integral * share * pressure / drop
-        of_drop = touch.drop_sigma / drop
-        relative = touch.integral_sigma / touch.integral + (gain - 1) * of_drop
-        return Quantity(newton, relative, pressure, pressure * gain * of_drop)
 
     def force(self, look: Look) -> Force:
         """Force and standard uncertainty of a touch as an image shows it."""
@@ -272,6 +251,6 @@ def known_radius(skin: Skin, bundle: Bundle, name: str = "") -> float | None:
         raise ConfigError(
             f"{_key(name, 'indenter.radius_m')}: found {radius:g} m; expected {least:.2g} to {most:.3g} m with bundle "
             f"{bundle.name}, from half a pixel of its images to half its shorter side: give the "
-            "radius in metres, or take `radius_m` away"
+            "radius in metres, or take `indenter` out"
         )
     return radius
